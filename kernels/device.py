@@ -1,0 +1,133 @@
+"""Device choice, pack width, and splitting a launch over CPU threads.
+
+On the CPU a Warp launch runs its threads one after another on one core and releases the GIL while it does, so a launch is
+cut into blocks that a thread pool runs side by side. On CUDA a launch is one launch.
+"""
+
+import os
+import sys
+import tempfile
+import threading
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from kernels.errors import DeviceError
+
+wp.config.log_level = wp.LOG_ERROR  # the caller reports the device; compiling shows as progress, not as lines
+
+PACK_CPU = 32
+"""Pixels per thread on the CPU: wide enough for the compiler to fill SIMD registers (docs/figures.md)."""
+PACK_CUDA = 4
+"""Pixels per thread on CUDA: one 8-byte load of half values per thread, coalesced over a warp."""
+BLOCKS_PER_WORKER = 4
+"""CPU blocks per thread, so that a slow block does not leave the other cores idle."""
+
+CPU_BLOCK = 1
+"""The block size that Warp launches CPU kernels with; loading ahead with another would compile the module twice."""
+
+_load_lock = threading.Lock()
+
+
+def resolve(name: str | None = None) -> str:
+    """Name the device to use.
+
+    Args:
+        name: "cpu", "cuda:0", … or None for the first CUDA device, else the CPU.
+
+    Returns:
+        The device's name as Warp spells it.
+
+    Raises:
+        DeviceError: the machine has no such device.
+    """
+    available = names()
+    if name is None:
+        return next((n for n in available if n.startswith("cuda")), "cpu")
+    wanted = "cuda:0" if name == "cuda" else name
+    if wanted not in available:
+        raise DeviceError(f"device {name} is not on this machine: choose one of {', '.join(available)}")
+    return wanted
+
+
+def names() -> list[str]:
+    """The devices of this machine, the CPU first."""
+    _start()
+    return ["cpu", *(d.alias for d in wp.get_cuda_devices())]
+
+
+def describe(device: str) -> str:
+    """One line that says which device this is, for reports."""
+    return f"cpu, {worker_count()} threads" if device == "cpu" else f"{device}, {wp.get_device(device).name}"
+
+
+def pack_width(device: str) -> int:
+    """How many pixels one thread takes on this device."""
+    _start()
+    return PACK_CPU if device == "cpu" else PACK_CUDA
+
+
+def worker_count() -> int:
+    """How many CPU threads a launch is split over: the cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def launch(kernel: Any, count: int, inputs: Sequence[Any], outputs: Sequence[Any], *, device: str) -> None:
+    """Run `count` independent threads of a kernel.
+
+    Args:
+        kernel: a Warp kernel whose first argument is `first: int`, the index that its thread 0 stands for, and
+            whose threads write to places of their own.
+        count: number of threads.
+        inputs: the kernel's inputs after `first`.
+        outputs: its outputs.
+        device: where to run.
+
+    Convention:
+        On the CPU the call returns when the work is done. On CUDA it returns at once; reading an output waits.
+    """
+    if count <= 0:
+        return
+    if device != "cpu":
+        wp.launch(kernel, dim=count, inputs=[0, *inputs], outputs=list(outputs), device=device)
+        return
+    with _load_lock:  # two threads must not compile one module at the same time
+        kernel.module.load("cpu", block_dim=CPU_BLOCK)
+    workers = worker_count()
+    blocks = min(count, workers * BLOCKS_PER_WORKER) if workers > 1 else 1
+    edges = [count * b // blocks for b in range(blocks + 1)]
+
+    def run(block: int) -> None:
+        first, last = edges[block], edges[block + 1]
+        wp.launch(kernel, dim=last - first, inputs=[first, *inputs], outputs=list(outputs), device="cpu")
+
+    if blocks == 1:
+        run(0)
+    else:
+        list(_pool(workers).map(run, range(blocks)))
+
+
+@cache
+def _start() -> None:
+    """Initialise Warp without its line about a missing CUDA driver: a machine without a GPU is an ordinary one here."""
+    sys.stderr.flush()
+    kept = os.dup(2)
+    with tempfile.TemporaryFile() as said:
+        os.dup2(said.fileno(), 2)
+        try:
+            wp.init()
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            said.seek(0)
+            for line in said.read().decode(errors="replace").splitlines():
+                if "NVIDIA CUDA driver" not in line:
+                    print(line, file=sys.stderr)
+
+
+@cache
+def _pool(workers: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(workers, thread_name_prefix="relit-kernel")

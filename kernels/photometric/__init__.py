@@ -1,0 +1,1 @@
+"""Normals and reflectance from images under known lights."""

@@ -1,0 +1,89 @@
+"""Diffuse albedo per channel from solved normals and the weights that the fit gave each light."""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from kernels.errors import ArrayError
+from kernels.packs import Band, as_packs, pack_type, scalars
+from kernels.photometric.lambert import NormalFit
+from kernels.photometric.readings import Lights, Readings
+
+
+def fit_albedo(band: Band, weights: Readings, fit: NormalFit, lights: Lights) -> wp.array:
+    """Weighted least squares of radiance = ρ/π · E · n·l in each channel.
+
+    Args:
+        band: the stack on the device.
+        weights: what the normal solver left in its readings: the weight of each light, 0…1.
+        fit: the normals.
+        lights: direction, irradiance and scale of each light.
+
+    Returns:
+        [3, pixels padded] float32 albedo ρ, scene-linear; 0 where there is no normal.
+
+    Raises:
+        ArrayError: a channel that no light reaches.
+    """
+    dead = [name for name, lit in zip("RGB", lights.irradiance.any(axis=0), strict=True) if not lit]
+    if dead:
+        raise ArrayError(f"irradiance is 0 in channel {dead[0]} of every light: its albedo cannot be known")
+    device = band.device
+    albedo = scalars(band.pixel_count, 3, wp.float32, device)
+    # E in stored units: radiance / scale = ρ/π · (E / scale) · n·l
+    stored = np.divide(lights.irradiance, lights.scale[:, None], out=np.zeros_like(lights.irradiance),
+                       where=lights.scale[:, None] > 0)
+    devices.launch(_albedo_kernel(devices.pack_width(device)), band.packs,
+                   [band.values, weights.values, weights.pack_stride, weights.light_stride, as_packs(fit.normal, device),
+                    wp.array(lights.direction, dtype=wp.vec3, device=device), wp.array(stored, dtype=wp.vec3, device=device)],
+                   [as_packs(albedo, device)], device=device)
+    return albedo
+
+
+@cache
+def _albedo_kernel(pack: int) -> Any:
+    half_pack, float_pack = pack_type(pack, wp.float16), pack_type(pack, wp.float32)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def albedo_kernel(first: int,
+                      values: wp.array3d(dtype=half_pack),  # [3, L, P] stored radiance
+                      weights: wp.array(dtype=float_pack),  # [P · L]
+                      pack_stride: int,
+                      light_stride: int,
+                      normal: wp.array2d(dtype=float_pack),  # [3, P]
+                      directions: wp.array(dtype=wp.vec3),  # [L]
+                      irradiance: wp.array(dtype=wp.vec3),  # [L] in stored units
+                      # outputs
+                      albedo: wp.array2d(dtype=float_pack)):  # [3, P]
+        p = first + wp.tid()
+        nx, ny, nz = normal[0, p], normal[1, p], normal[2, p]
+        above_r, above_g, above_b = float_pack(), float_pack(), float_pack()
+        below_r, below_g, below_b = float_pack(), float_pack(), float_pack()
+        for light in range(directions.shape[0]):
+            red, green, blue = values[0, light, p], values[1, light, p], values[2, light, p]
+            weight = weights[p * pack_stride + light * light_stride]
+            lx, ly, lz = directions[light][0], directions[light][1], directions[light][2]
+            er, eg, eb = irradiance[light][0], irradiance[light][1], irradiance[light][2]
+            for k in range(pack):
+                cosine = wp.max(nx[k] * lx + ny[k] * ly + nz[k] * lz, 0.0)
+                first_order = weight[k] * cosine
+                second_order = first_order * cosine
+                above_r[k] += first_order * er * float(red[k])
+                above_g[k] += first_order * eg * float(green[k])
+                above_b[k] += first_order * eb * float(blue[k])
+                below_r[k] += second_order * er * er
+                below_g[k] += second_order * eg * eg
+                below_b[k] += second_order * eb * eb
+        rho_r, rho_g, rho_b = float_pack(), float_pack(), float_pack()
+        for k in range(pack):
+            rho_r[k] = wp.where(below_r[k] > 0.0, wp.pi * wp.max(above_r[k], 0.0) / below_r[k], 0.0)
+            rho_g[k] = wp.where(below_g[k] > 0.0, wp.pi * wp.max(above_g[k], 0.0) / below_g[k], 0.0)
+            rho_b[k] = wp.where(below_b[k] > 0.0, wp.pi * wp.max(above_b[k], 0.0) / below_b[k], 0.0)
+        albedo[0, p] = rho_r
+        albedo[1, p] = rho_g
+        albedo[2, p] = rho_b
+
+    return albedo_kernel

@@ -1,0 +1,61 @@
+"""The weighted normal equations of b·l = reading, solved per pixel: shared by every Lambertian solver.
+
+With G = Σ w l lᵀ and r = Σ w y l, b = G⁻¹ r (Woodham 1980, equation 8, overdetermined); the normal is b/|b|. The standard error of
+the normal follows from the residual variance s² through cov(b) = s² G⁻¹, taken across the normal.
+"""
+
+import warp as wp
+
+from kernels.status import DARK, ILL_POSED, OK, TOO_FEW_LIGHTS
+
+MIN_DETERMINANT = 1.0e-6
+"""Least 27·det(G)/tr(G)³ (1 for evenly spread lights): lights within about one degree of a point or a great circle fall below."""
+PRIOR_RESIDUAL = 0.05
+"""One pseudo-observation with this residual, relative to |b|: three lights leave no residual, yet are not certain."""
+CONFIDENCE_HALF = 0.01745329
+"""Standard error of the normal, radians (one degree), at which confidence is one half."""
+
+
+@wp.struct
+class LambertFit:
+    """One pixel's fit."""
+
+    b: wp.vec3  # albedo / π · normal
+    across: float  # trace of G⁻¹ across the normal: variance of the normal, radians², for residuals of variance |b|²
+    residual: float  # Σ w (y - b·l)² / |b|²
+    status: int
+
+
+@wp.func
+def symmetric(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float) -> wp.mat33:
+    return wp.mat33(xx, xy, xz, xy, yy, yz, xz, yz, zz)
+
+
+@wp.func
+def fit_pixel(g: wp.mat33, r: wp.vec3, squares: float, count: int) -> LambertFit:
+    # g, r: normal equations; squares: Σ w y²; count: readings that were used
+    fit = LambertFit()
+    if count < 3:
+        fit.status = wp.where(count == 0, DARK, TOO_FEW_LIGHTS)
+        return fit
+    trace = g[0, 0] + g[1, 1] + g[2, 2]
+    unit = g / wp.max(trace, 1.0e-30)  # a pure number, whatever the weights
+    if 27.0 * wp.determinant(unit) < MIN_DETERMINANT:
+        fit.status = ILL_POSED
+        return fit
+    inverse = wp.inverse(unit)
+    b = inverse * (r / trace)
+    length = wp.max(wp.length(b), 1.0e-30)
+    n = b / length
+    fit.b = b
+    fit.across = wp.max((wp.trace(inverse) - wp.dot(n, inverse * n)) / trace, 0.0)
+    fit.residual = wp.max(squares - wp.dot(b, r), 0.0) / (length * length)
+    fit.status = OK
+    return fit
+
+
+@wp.func
+def confidence_of(across: float, residual: float, count: float) -> float:
+    # residual: Σ (y - b·l)² / |b|² over `count` readings; 1 / (1 + standard error of the normal / 1°)
+    variance = (residual + PRIOR_RESIDUAL * PRIOR_RESIDUAL) / (wp.max(count - 3.0, 0.0) + 1.0)
+    return 1.0 / (1.0 + wp.sqrt(across * variance) / CONFIDENCE_HALF)

@@ -1,0 +1,138 @@
+"""What every photometric solver starts from: the lights as arrays, and one grey reading per light and pixel.
+
+A grey reading is a weighted sum over the channels of radiance / irradiance, so that for a Lambertian surface it is b·l with
+b = albedo / π · normal, whatever the strength and colour of the lights. A reading of zero or less, or a saturated one, bounds
+the radiance but does not measure it: it is stored as 0, which means "no reading".
+"""
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from kernels.errors import ArrayError
+from kernels.packs import Band, pack_type
+
+UNIT_TOLERANCE = 1e-3
+"""How far a light direction's length may be from one."""
+
+
+class Lights(NamedTuple):
+    """Distant lights of a stack, padded as its light axis is; padding has zero irradiance."""
+
+    direction: np.ndarray  # [lights, 3] float32, unit, from the surface to the light
+    irradiance: np.ndarray  # [lights, 3] float32, relative, at normal incidence
+    scale: np.ndarray  # [lights] float32, radiance of a stored 1.0
+
+
+def pad_lights(direction: np.ndarray, irradiance: np.ndarray, scale: np.ndarray | None = None) -> Lights:
+    """Check distant lights and pad them to a multiple of 8.
+
+    Args:
+        direction: [n, 3] unit vectors from the surface to the light.
+        irradiance: [n, 3] above or equal 0, not all zero for a light.
+        scale: [n] or already padded; radiance of a stored 1.0; None: 1.
+
+    Raises:
+        ArrayError: shapes that do not fit, a direction that is not a unit vector, a light without irradiance.
+    """
+    direction = np.asarray(direction, dtype=np.float32)
+    irradiance = np.asarray(irradiance, dtype=np.float32)
+    count = len(direction)
+    if direction.shape != (count, 3) or irradiance.shape != (count, 3) or count == 0:
+        raise ArrayError(f"direction is {direction.shape}, irradiance {irradiance.shape}: give one row of three per light")
+    length = np.linalg.norm(direction, axis=1)
+    if not (np.abs(length - 1) < UNIT_TOLERANCE).all():
+        raise ArrayError(f"direction of light {int(np.argmax(np.abs(length - 1)))} is not a unit vector")
+    if not np.isfinite(irradiance).all() or (irradiance < 0).any() or not irradiance.any(axis=1).all():
+        raise ArrayError("irradiance must be finite, not negative, and above 0 in some channel of every light")
+    lights = -(-count // 8) * 8
+    extra = ((0, lights - count), (0, 0))
+    padded_scale = np.zeros(lights, dtype=np.float32)
+    padded_scale[:count] = 1 if scale is None else np.asarray(scale, dtype=np.float32)[:count]
+    return Lights(np.pad(direction, extra), np.pad(irradiance, extra), padded_scale)
+
+
+def grey_factors(lights: Lights, grey_weights: tuple[float, float, float]) -> np.ndarray:
+    """What each stored channel is multiplied by to give the grey reading.
+
+    Only channels that every light reaches are used, so that readings of differently coloured lights compare.
+
+    Returns:
+        [lights, 3] float32; 0 for padding.
+
+    Raises:
+        ArrayError: no channel is lit by every light.
+    """
+    real = lights.irradiance.any(axis=1)
+    common = (lights.irradiance[real] > 0).all(axis=0) & (np.array(grey_weights) > 0)
+    if not common.any():
+        raise ArrayError("no channel is lit by every light: grey readings of red, green and blue lights do not compare")
+    weights = np.where(common, grey_weights, 0)
+    weights = weights / weights.sum()
+    factors = np.zeros_like(lights.irradiance)
+    factors[real] = np.divide(weights, lights.irradiance[real], out=np.zeros_like(factors[real]), where=common)
+    return factors * lights.scale[:, None]
+
+
+class Readings(NamedTuple):
+    """Grey readings of a band, one pack after another on the CPU (a pack's lights stay in the first-level cache), one light
+    after another on CUDA (neighbouring threads read neighbouring packs): element (pack p, light l) is at
+    p · pack_stride + l · light_stride."""
+
+    values: wp.array  # [packs · lights] float packs
+    pack_stride: int
+    light_stride: int
+
+
+def grey_readings(band: Band, factors: np.ndarray) -> Readings:
+    """Compute the grey readings of a band.
+
+    Args:
+        band: the stack on the device.
+        factors: [lights, 3], of grey_factors.
+
+    Raises:
+        ArrayError: the band has other lights.
+    """
+    if factors.shape != (band.light_count, 3):
+        raise ArrayError(f"factors are {factors.shape}, the band has {band.light_count} lights")
+    pack = devices.pack_width(band.device)
+    packs, lights = band.packs, band.light_count
+    values = wp.empty(packs * lights, dtype=pack_type(pack, wp.float32), device=band.device)
+    readings = Readings(values, *((lights, 1) if band.device == "cpu" else (1, packs)))
+    devices.launch(_grey_kernel(pack), packs,
+                   [band.values, band.saturated, wp.array(factors, dtype=wp.float32, device=band.device),
+                    readings.pack_stride, readings.light_stride], [values], device=band.device)
+    return readings
+
+
+@cache
+def _grey_kernel(pack: int) -> Any:
+    half_pack, byte_pack, float_pack = pack_type(pack, wp.float16), pack_type(pack, wp.uint8), pack_type(pack, wp.float32)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def grey_kernel(first: int,
+                    values: wp.array3d(dtype=half_pack),  # [3, L, P] stored radiance
+                    saturated: wp.array2d(dtype=byte_pack),  # [L / 8, P] bits
+                    factors: wp.array2d(dtype=float),  # [L, 3]
+                    pack_stride: int,
+                    light_stride: int,
+                    # outputs
+                    readings: wp.array(dtype=float_pack)):
+        p = first + wp.tid()
+        for light in range(values.shape[1]):
+            red, green, blue = values[0, light, p], values[1, light, p], values[2, light, p]
+            bits = saturated[light / 8, p]
+            shift = light % 8
+            fr, fg, fb = factors[light, 0], factors[light, 1], factors[light, 2]
+            grey = float_pack()
+            for k in range(pack):
+                value = fr * float(red[k]) + fg * float(green[k]) + fb * float(blue[k])
+                cut = (int(bits[k]) >> shift) & 1
+                grey[k] = wp.where(cut == 0, wp.max(value, 0.0), 0.0)
+            readings[p * pack_stride + light * light_stride] = grey
+
+    return grey_kernel

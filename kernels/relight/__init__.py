@@ -1,0 +1,1 @@
+"""Relighting: environments to per-light weights, and weighted sums of the captured images."""

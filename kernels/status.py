@@ -1,0 +1,28 @@
+"""Per-pixel status codes of every solver: bad pixels are data, not exceptions."""
+
+from enum import IntEnum
+
+
+class Status(IntEnum):
+    """Why a pixel has, or has not, a result. Only OK pixels carry values; an unwritten pixel is never OK."""
+
+    UNSOLVED = 0
+    """Never reached by a solver (outside the mask)."""
+    OK = 1
+    """Solved."""
+    TOO_FEW_LIGHTS = 2
+    """Fewer usable lights than the unknowns need (shadow, saturation or rejection took the rest)."""
+    DARK = 3
+    """No light gave a reading above zero."""
+    ILL_POSED = 4
+    """The usable lights lie close to one plane, so that the normal is not determined."""
+    NOT_FACING = 5
+    """The best normal points away from the camera."""
+
+
+UNSOLVED = int(Status.UNSOLVED)
+OK = int(Status.OK)
+TOO_FEW_LIGHTS = int(Status.TOO_FEW_LIGHTS)
+DARK = int(Status.DARK)
+ILL_POSED = int(Status.ILL_POSED)
+NOT_FACING = int(Status.NOT_FACING)

@@ -1,0 +1,1 @@
+"""Surface from normals: heights, and what one part of a surface hides from another."""

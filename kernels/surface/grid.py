@@ -1,0 +1,144 @@
+"""How a picture lies in memory for the height solver, how a launch walks over it, and how it is summed.
+
+A grid of rows × cols pixels is stored flat with a ring of spare cells, `pitch` cells a row, so that the four neighbours
+of any pixel exist and lie at i ± 1 and i ± pitch. The pitch is odd, so that the parity of i is the colour of pixel i on a
+chessboard. Spare cells belong to no edge (their weights stay 0), which makes every kernel free of border cases.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import warp as wp
+
+from kernels import device as devices
+
+wp.set_module_options({"enable_backward": False})
+
+CPU_RUN = 8192
+"""Cells that one CPU thread takes in a row: 32 KB of float32, so that the cost of a thread disappears."""
+CUDA_SUM_THREADS = 65536
+"""Threads of a sum on CUDA: enough to fill the largest device, few enough for their partial sums to be cheap."""
+FOLD_THREADS = 256
+"""Threads of the second stage of a sum on CUDA; the third stage is one thread."""
+
+
+@wp.struct
+class Walk:
+    """Which cells thread t visits: start + stride·(t·across + k·along) for k < steps, below end."""
+
+    start: wp.int32
+    stride: wp.int32
+    across: wp.int32
+    along: wp.int32
+    steps: wp.int32
+    end: wp.int32
+
+
+class Sweep(NamedTuple):
+    """A walk and the number of threads that cover it."""
+
+    walk: Walk
+    threads: int
+
+
+class Grid(NamedTuple):
+    """The layout of one level."""
+
+    rows: int
+    cols: int
+    pitch: int
+    size: int
+    cells: Sweep  # every pixel, one cell a thread on CUDA
+    even: Sweep  # the pixels of even index
+    odd: Sweep
+    sums: Sweep  # every pixel, few threads with many cells each
+    device: str
+
+    def zeros(self, dtype: Any = wp.float32) -> wp.array:
+        """A new array of this layout, all zero."""
+        return wp.zeros(self.size, dtype=dtype, device=self.device)
+
+    def colour(self, parity: int) -> Sweep:
+        """The pixels of one chessboard colour."""
+        return self.odd if parity else self.even
+
+
+def make_grid(rows: int, cols: int, device: str) -> Grid:
+    """Lay out rows × cols pixels."""
+    pitch = cols + 1 + cols % 2
+    first, end = pitch, (rows + 1) * pitch
+    return Grid(
+        rows,
+        cols,
+        pitch,
+        (rows + 3) * pitch,
+        _sweep(first, end, 1, device),
+        _sweep(first + first % 2, end, 2, device),
+        _sweep(first + 1 - first % 2, end, 2, device),
+        _sweep(first, end, 1, device, threads=CUDA_SUM_THREADS),
+        device,
+    )
+
+
+def _sweep(start: int, end: int, stride: int, device: str, *, threads: int | None = None) -> Sweep:
+    count = max(0, -(-(end - start) // stride))
+    walk = Walk()
+    walk.start, walk.stride, walk.end = start, stride, end
+    if device == "cpu":  # neighbouring cells one after another
+        threads = max(1, math.ceil(count / CPU_RUN))
+        walk.steps = math.ceil(count / threads)
+        walk.across, walk.along = walk.steps, 1
+    else:  # neighbouring cells in neighbouring threads
+        threads = max(1, min(count, threads or count))
+        walk.steps = math.ceil(count / threads)
+        walk.across, walk.along = 1, threads
+    return Sweep(walk, threads)
+
+
+def run(kernel: Any, sweep: Sweep, inputs: list[Any], outputs: list[Any], *, device: str) -> None:
+    """Launch a kernel whose arguments begin with `first: int, walk: Walk`."""
+    devices.launch(kernel, sweep.threads, [sweep.walk, *inputs], outputs, device=device)
+
+
+@wp.func
+def cell_of(walk: Walk, t: int, k: int):
+    """The k-th cell of thread t."""
+    return walk.start + walk.stride * (t * walk.across + k * walk.along)
+
+
+@wp.kernel
+def _fold(
+    first: int,
+    partial: wp.array(dtype=wp.float64),  # type: ignore[valid-type]
+    count: int,
+    stride: int,
+    slot: int,
+    # outputs
+    total: wp.array(dtype=wp.float64),  # type: ignore[valid-type]
+):
+    t = first + wp.tid()
+    s = wp.float64(0.0)
+    for j in range(t, count, stride):
+        s += partial[j]
+    total[slot + t] = s
+
+
+class Summer:
+    """Adds up the partial sums that the threads of `grid.sums` leave, always in the same order.
+
+    The result goes to one slot of a device array: nothing is read back.
+    """
+
+    def __init__(self, grid: Grid):
+        self.grid = grid
+        self.partial = wp.zeros(grid.sums.threads, dtype=wp.float64, device=grid.device)
+        self._middle = wp.zeros(FOLD_THREADS, dtype=wp.float64, device=grid.device)
+
+    def finish(self, total: wp.array, slot: int) -> None:
+        """Write the sum of `partial` to total[slot]."""
+        device, count = self.grid.device, self.grid.sums.threads
+        if device == "cpu" or count <= FOLD_THREADS:
+            devices.launch(_fold, 1, [self.partial, count, 1, slot], [total], device=device)
+            return
+        devices.launch(_fold, FOLD_THREADS, [self.partial, count, FOLD_THREADS, 0], [self._middle], device=device)
+        devices.launch(_fold, 1, [self._middle, FOLD_THREADS, 1, slot], [total], device=device)

@@ -1,0 +1,191 @@
+"""Normals to height: least squares over all pairs of neighbours, breaking at discontinuities where asked."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from kernels.errors import ArrayError
+from kernels.surface.components import label_runs, place
+from kernels.surface.conjugate import Progress, Solver
+from kernels.surface.discontinuities import distrust_loops, reweigh
+from kernels.surface.grid import make_grid
+from kernels.surface.slopes import Slopes, pair_slopes, usable_pixels
+
+
+@dataclass(frozen=True, kw_only=True)
+class IntegrationOptions:
+    """How to integrate."""
+
+    tolerance: float = 1.0e-6
+    """Where conjugate gradients stop: residual over its first value, close to the relative error of the slopes."""
+    max_iterations: int = 200
+    """Of one solve; ten to twenty are usual."""
+    discontinuities: bool = False
+    """Whether the surface may break (bilateral normal integration): some twenty solves in place of one."""
+    sharpness: float = 2.0
+    """How fast an edge is given up as its misfit, in squared pixels, exceeds its neighbour's (k of Cao et al.)."""
+    max_reweightings: int = 40
+    """Solves at most with discontinuities."""
+    reweighting_tolerance: float = 1.0e-3
+    """They stop when the misfit changes by less than this fraction of itself."""
+    inner_tolerance: float = 1.0e-4
+    """Where each of those solves but the last stops."""
+    loop_scale: float = 0.1
+    permanent: bool = True
+
+
+class Integration(NamedTuple):
+    """Height of a surface."""
+
+    height: wp.array  # [rows, cols] float32, camera-frame z, 0 outside
+    components: int  # connected parts, each with a constant of its own
+    iterations: int  # of conjugate gradients, over all solves
+    residual: float  # of the last solve, relative
+    converged: bool
+
+
+def integrate_normals(
+    normal: np.ndarray | wp.array,  # [3, rows, cols] float32, camera frame
+    mask: np.ndarray | wp.array,  # [rows, cols] bool or uint8
+    x: np.ndarray | wp.array,  # [rows, cols] float32, right
+    y: np.ndarray | wp.array,  # [rows, cols] float32, up
+    *,
+    perspective: bool,
+    mean_z: float,
+    options: IntegrationOptions | None = None,
+    device: str,
+    progress: Callable[[float], None] | None = None,
+) -> Integration:
+    """Integrate a normal map to a height map.
+
+    Args:
+        normal: unit normals, n_z > 0 towards an orthographic viewer. A pixel whose normal is not finite, or shorter
+            than a half, counts as outside the mask.
+        mask: where there is surface; any shape, with holes, in any number of parts.
+        x: plane coordinates of the pixels: metres (or any unit of length) for an orthographic camera, the slope of the
+            ray, x of (x, y, −1), for a perspective one. Lens distortion is in these numbers.
+        y: the same, upwards.
+        perspective: which of the two the camera is.
+        mean_z: mean camera-frame z of the surface; negative for a perspective camera.
+        options: None for the defaults.
+        device: "cpu" or "cuda:0".
+        progress: told the fraction done, 0…1.
+
+    Returns:
+        Height, and how the solve went. Normals do not tell the distance between parts of the mask that do not touch, so
+        the mean of each part is mean_z.
+
+    Raises:
+        ArrayError: shapes do not fit, the mask is empty, or mean_z cannot be.
+
+    Convention:
+        Waits for the device: the mask of usable pixels and one number per mask run are read back, and the residual every
+        few iterations. Needs eleven float32 per pixel beyond the inputs (15 with discontinuities).
+    """
+    options = options or IntegrationOptions()
+    _check(normal, mask, x, y, perspective=perspective, mean_z=mean_z)
+    rows, cols = mask.shape
+    grid = make_grid(rows, cols, device)
+    spacing = _spacing(x, y)
+    inputs = [_upload(a, wp.float32, device) for a in (normal, x, y)]
+    usable = usable_pixels(inputs[0], _upload(mask, wp.uint8, device), *inputs[1:], device=device)
+    slopes = pair_slopes(inputs[0], usable, *inputs[1:], grid=grid, perspective=perspective, spacing=spacing)
+    runs = label_runs(usable.numpy())
+    del inputs, usable
+
+    h = grid.zeros()
+    if options.discontinuities:
+        done = _solve_breaking(h, slopes, grid, options, progress)
+    else:
+        solver = Solver(grid, slopes, max_iterations=options.max_iterations)
+        done = solver.solve(h, tolerance=options.tolerance, progress=progress)
+        del solver
+    height = place(h, runs, grid=grid, perspective=perspective, spacing=spacing, mean_z=mean_z)
+    if progress is not None:
+        progress(1.0)
+    return Integration(height, runs.count, done.iterations, done.residual, done.converged)
+
+
+def _solve_breaking(
+    h: wp.array, base: Slopes, grid, options: IntegrationOptions, progress: Callable[[float], None] | None
+) -> Progress:
+    """Solve, reweigh and solve again until the misfit settles; the last solve goes to the full tolerance."""
+    right_weight, down_weight = wp.clone(base.right_weight), wp.clone(base.down_weight)
+    if options.loop_scale > 0:
+        distrust_loops(base, scale=options.loop_scale, grid=grid, right_weight=right_weight, down_weight=down_weight)
+        if options.permanent:
+            base=Slopes(base.right,base.down,wp.clone(right_weight),wp.clone(down_weight))
+    solver = Solver(
+        grid, Slopes(base.right, base.down, right_weight, down_weight), max_iterations=options.max_iterations
+    )
+    done = solver.solve(h, tolerance=options.inner_tolerance)
+    reference, iterations, before = done.reference, done.iterations, float("inf")
+    total = wp.zeros(1, dtype=wp.float64, device=grid.device)
+    settled = False
+    for k in range(options.max_reweightings):
+        reweigh(
+            base,
+            h,
+            sharpness=options.sharpness,
+            grid=grid,
+            summer=solver.summer,
+            right_weight=right_weight,
+            down_weight=down_weight,
+            total=total,
+        )
+        solver.multigrid.refresh()
+        misfit = float(total.numpy()[0])
+        settled = abs(before - misfit) <= options.reweighting_tolerance * misfit
+        last = settled or k + 1 == options.max_reweightings
+        tolerance = options.tolerance if last else options.inner_tolerance
+        done = solver.solve(h, tolerance=tolerance, reference=reference)
+        iterations += done.iterations
+        if progress is not None:
+            progress((k + 1) / options.max_reweightings)
+        if settled:
+            break
+        before = misfit
+    return done._replace(iterations=iterations, converged=done.converged and settled)
+
+
+def _check(normal, mask, x, y, *, perspective: bool, mean_z: float) -> None:
+    if len(mask.shape) != 2:
+        raise ArrayError(f"mask has shape {tuple(mask.shape)}: give [rows, cols]")
+    if tuple(normal.shape) != (3, *mask.shape):
+        raise ArrayError(f"normal has shape {tuple(normal.shape)}, mask {tuple(mask.shape)}: give [3, rows, cols]")
+    for name, a in (("x", x), ("y", y)):
+        if tuple(a.shape) != tuple(mask.shape):
+            raise ArrayError(f"{name} has shape {tuple(a.shape)}, mask {tuple(mask.shape)}: give one value per pixel")
+    if not np.isfinite(mean_z):
+        raise ArrayError(f"mean_z is {mean_z}: give a finite height")
+    if perspective and mean_z >= 0.0:
+        raise ArrayError(f"mean_z is {mean_z}, and a perspective camera looks along −z: give a negative one")
+    if 0 in mask.shape or not (mask if isinstance(mask, np.ndarray) else mask.numpy()).any():
+        raise ArrayError("mask is empty: mark the pixels that show the surface")
+
+
+def _spacing(x: np.ndarray | wp.array, y: np.ndarray | wp.array) -> float:
+    """Mean distance between neighbours along the middle row (or column, where the picture is one pixel wide)."""
+    rows, cols = x.shape
+
+    def line(a: np.ndarray | wp.array) -> np.ndarray:
+        middle = a[rows // 2] if cols > 1 else a[:, 0]
+        return np.asarray(middle if isinstance(middle, np.ndarray) else middle.contiguous().numpy(), dtype=np.float64)
+
+    step = np.hypot(np.diff(line(x)), np.diff(line(y)))
+    step = step[np.isfinite(step)]
+    mean = float(step.mean()) if step.size else 0.0
+    return mean if mean > 0.0 else 1.0
+
+
+def _upload(a: np.ndarray | wp.array, dtype: type, device: str) -> wp.array:
+    """The array on the device, without a copy where it is there already."""
+    if isinstance(a, np.ndarray):
+        kind = np.uint8 if dtype is wp.uint8 else np.float32
+        flat = (a != 0).view(np.uint8) if kind is np.uint8 else np.ascontiguousarray(a, dtype=kind)
+        return wp.array(flat, dtype=dtype, device=device, copy=False)
+    moved = a.to(device)
+    return moved.view(dtype) if moved.dtype is wp.bool and dtype is wp.uint8 else moved

@@ -1,0 +1,48 @@
+"""The `relit` program: its commands, and one place that turns errors into a sentence and an exit code."""
+
+import os
+import sys
+from typing import Annotated
+
+import typer
+
+from service.cli import capture, demo, doctor, measure, results
+
+app = typer.Typer(name="relit", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
+                  help="Light-stage captures to normals, albedo, USD assets and relit frames.")
+for module in (demo, capture, results, doctor, measure):
+    module.register(app)
+
+BAD_INPUT, INTERRUPTED = 2, 130
+
+
+@app.callback(invoke_without_command=True)
+def _root(version: Annotated[bool, typer.Option("--version", help="Print the version and exit.", is_eager=True)] = False) -> None:
+    if version:
+        from service import __version__
+
+        print(f"relit {__version__}")
+        raise typer.Exit
+
+
+def main() -> None:
+    """Run the program; exit 2 with one sentence on bad input, 130 when interrupted."""
+    try:
+        app()
+    except KeyboardInterrupt:
+        print("relit: interrupted; results that are there are whole, run again to finish", file=sys.stderr)
+        sys.exit(INTERRUPTED)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader of our output is gone
+        sys.exit(1)
+    except Exception as error:
+        from service.errors import USER_ERRORS, sentence
+
+        if not isinstance(error, USER_ERRORS):
+            raise
+        print(f"relit: {sentence(error)}", file=sys.stderr)
+        sys.exit(BAD_INPUT)
+
+
+if __name__ == "__main__":
+    main()

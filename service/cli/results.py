@@ -1,0 +1,75 @@
+"""relit solve, relit relight, relit export: results out."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from service.cli.options import CacheOption, CaptureArgument, DeviceOption
+from service.methods import Method
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    app.command("solve")(solve)
+    app.command("relight")(relight)
+    app.command("export")(export)
+
+
+def solve(
+    capture: CaptureArgument,
+    out: Annotated[Path, typer.Option("--out", help="Folder for maps.exr and report.json.", show_default=False)],
+    method: Annotated[Method, typer.Option("--method", help="lambert: least squares on every light; robust: shadows and highlights "
+                                                            "rejected per pixel.")] = Method.ROBUST,
+    device: DeviceOption = None,
+    cache: CacheOption = None,
+) -> None:
+    """Normals, albedo and height of a light-stage capture."""
+    from service.cli.bar import Bar
+    from service.pipelines.solve import solve as run
+    from service.requests import SolveRequest
+
+    with Bar() as bar:
+        result = run(SolveRequest(capture=capture, out=out, method=method, device=device, cache=cache), bar)
+    print(f"maps     {result.maps_path}")
+    print(f"report   {result.report_path}")
+    print(f"pixels   {', '.join(f'{count} {name}' for name, count in result.counts.items() if count)}")
+
+
+def relight(
+    capture: CaptureArgument,
+    environment: Annotated[Path, typer.Option("--environment", help="Lat-long .exr or .hdr.", show_default=False)],
+    out: Annotated[str, typer.Option("--out", help="Path of the frames, #### for the number.", show_default=False)],
+    frames: Annotated[str, typer.Option("--frames", help="A number, or first-last.")] = "1",
+    spin_degrees: Annotated[float, typer.Option("--spin-degrees", help="Turn of the environment about +y over the whole range, from +z "
+                                                                       "towards +x; the first frame is unturned.")] = 0.0,
+    device: DeviceOption = None,
+    cache: CacheOption = None,
+) -> None:
+    """Frames of a capture under an HDR environment."""
+    from service.cli.bar import Bar
+    from service.pipelines.relight import relight as run
+    from service.requests import RelightRequest
+
+    request = RelightRequest(capture=capture, environment=environment, out=out, frames=frames, spin_degrees=spin_degrees,
+                             device=device, cache=cache)
+    with Bar() as bar:
+        result = run(request, bar)
+    last = f" … {result.frames[-1].name}" if len(result.frames) > 1 else ""
+    print(f"frames   {result.frames[0]}{last}")
+    if result.clipped:
+        print(f"clipped  {result.clipped} pixels are brighter than half can hold and stand at its largest value")
+
+
+def export(
+    maps: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with maps.exr.", show_default=False)],
+    out: Annotated[Path, typer.Option("--out", help="The asset: .usdz, .usda or .usdc.", show_default=False)],
+    name: Annotated[str | None, typer.Option("--name", help="Of the asset; without it the capture's.", show_default=False)] = None,
+) -> None:
+    """A USD asset with the estimated material."""
+    from service.cli.bar import Bar
+    from service.pipelines.export import export as run
+    from service.requests import ExportRequest
+
+    with Bar() as bar:
+        print(f"asset    {run(ExportRequest(maps=maps, out=out, name=name), bar)}")

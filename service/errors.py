@@ -1,0 +1,21 @@
+"""One table from what can go wrong to what a person is told.
+
+RequestError    a request asks for something that cannot be (frames backwards, a pattern without ####); names the option
+"""
+
+from kernels.errors import KernelError
+from service.usd.errors import AssetError
+from stage.errors import StageError
+
+
+class RequestError(ValueError):
+    """A request is wrong: the message names the option."""
+
+
+USER_ERRORS: tuple[type[Exception], ...] = (RequestError, StageError, KernelError, AssetError)
+"""Errors whose text is a sentence for the person who asked: exit code 2 on the command line."""
+
+
+def sentence(error: BaseException) -> str:
+    """The one line to show."""
+    return " ".join(str(error).split())

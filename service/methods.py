@@ -1,0 +1,12 @@
+"""The closed choices of requests; apart from them, so that the command line starts without pydantic."""
+
+from enum import StrEnum
+
+
+class Method(StrEnum):
+    """How normals are solved."""
+
+    LAMBERT = "lambert"
+    """Least squares on every light that gave a reading."""
+    ROBUST = "robust"
+    """Shadows and highlights rejected per pixel."""

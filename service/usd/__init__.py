@@ -1,0 +1,1 @@
+"""USD assets from solved maps: the only place with pxr."""

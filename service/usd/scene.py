@@ -1,0 +1,90 @@
+"""The prims of an asset: /Name with Geom/Mesh, Looks/Material and Camera, and what is known about it."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdShade, Vt
+
+from service.usd.materials import define_material
+from service.usd.mesh import SurfaceMesh
+from service.usd.rig import define_camera
+from service.usd.textures import Texture
+from stage.maps import SurfaceMaps
+
+UNIT_WITHOUT_SCALE_M = 0.001
+"""A capture without a scale: one pixel is taken as one millimetre, so that the asset has a size one can see."""
+
+SCALE_NOTE = "unknown: the capture gives no scale, so one pixel is taken as one millimetre"
+
+
+def define_asset(usd_stage: Usd.Stage, maps: SurfaceMaps, mesh: SurfaceMesh, textures: Mapping[str, Texture], *,
+                 name: str, texture_folder: str) -> None:
+    """Fill an empty stage with the asset.
+
+    Args:
+        textures: written beside the layer, in texture_folder ("./…").
+        name: free text; the root prim is named after it, with other characters than letters, digits and _ replaced.
+
+    Convention:
+        The asset is in the camera frame; world_from_camera, where the capture gives it, is the root's transform.
+    """
+    unit_m = 1.0 if maps.camera.metric else UNIT_WITHOUT_SCALE_M
+    UsdGeom.SetStageUpAxis(usd_stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(usd_stage, unit_m)
+    root = UsdGeom.Xform.Define(usd_stage, Sdf.Path.absoluteRootPath.AppendChild(Tf.MakeValidIdentifier(name)))
+    usd_stage.SetDefaultPrim(root.GetPrim())
+    _describe(usd_stage, root.GetPrim(), maps, name)
+    if maps.camera.world_from_camera is not None:
+        root.AddTransformOp().Set(_matrix(maps.camera.world_from_camera, unit_m))
+
+    path = root.GetPath()
+    UsdGeom.Scope.Define(usd_stage, path.AppendChild("Geom"))
+    usd_mesh = _define_mesh(usd_stage, path.AppendPath("Geom/Mesh"), mesh)
+    UsdGeom.Scope.Define(usd_stage, path.AppendChild("Looks"))
+    material = define_material(usd_stage, path.AppendPath("Looks/Material"), textures, texture_folder)
+    UsdShade.MaterialBindingAPI.Apply(usd_mesh.GetPrim()).Bind(material)
+    define_camera(usd_stage, path.AppendChild("Camera"), maps.camera, mesh.extent)
+
+    model = UsdGeom.ModelAPI.Apply(root.GetPrim())
+    model.SetExtentsHint(model.ComputeExtentsHint(UsdGeom.BBoxCache(Usd.TimeCode.Default(), [UsdGeom.Tokens.default_])))
+
+
+def _describe(usd_stage: Usd.Stage, root: Usd.Prim, maps: SurfaceMaps, name: str) -> None:
+    """What the asset is and where it comes from: kind, names, provenance, scale."""
+    model = Usd.ModelAPI(root)
+    model.SetKind(Kind.Tokens.component)
+    model.SetAssetName(name)
+    if root.GetName() != name and name:
+        root.SetDisplayName(name)
+    if not maps.camera.metric:
+        root.SetCustomDataByKey("relit:scale", SCALE_NOTE)
+    method = maps.provenance.get("relit:method")
+    usd_stage.GetRootLayer().documentation = (
+        f"{name}: a measured surface, exported by Relit{f' (method {method})' if method else ''}. Camera frame: "
+        "+x right, +y up, +z towards the viewer. Where it comes from is in customLayerData.")
+    known = {**maps.provenance, "relit:camera": maps.camera.model_dump_json(), "relit:color_space": maps.color_space}
+    for key, value in sorted(known.items()):
+        usd_stage.SetMetadataByDictKey("customLayerData", key, value)
+
+
+def _define_mesh(usd_stage: Usd.Stage, path: Sdf.Path, mesh: SurfaceMesh) -> UsdGeom.Mesh:
+    usd_mesh = UsdGeom.Mesh.Define(usd_stage, path)
+    usd_mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    usd_mesh.CreateDoubleSidedAttr(True)
+    usd_mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(mesh.points))
+    usd_mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(mesh.face_counts))
+    usd_mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(mesh.face_indices))
+    usd_mesh.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(mesh.extent))
+    usd_mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(mesh.normals))
+    usd_mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    coordinates = UsdGeom.PrimvarsAPI(usd_mesh).CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray,
+                                                              UsdGeom.Tokens.vertex)
+    coordinates.Set(Vt.Vec2fArray.FromNumpy(mesh.st))
+    return usd_mesh
+
+
+def _matrix(world_from_camera: tuple[tuple[float, ...], ...], unit_m: float) -> Gf.Matrix4d:
+    """A column-vector transform in metres as USD's row-vector transform in scene units."""
+    matrix = np.array(world_from_camera, dtype=np.float64)
+    matrix[:3, 3] /= unit_m
+    return Gf.Matrix4d(*matrix.T.ravel().tolist())

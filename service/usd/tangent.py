@@ -1,0 +1,93 @@
+"""The tangent frame of the exported mesh, and normals expressed in it.
+
+A normal map is read by renderers relative to the frame that they interpolate between the vertices: N, the vertex
+normal; T, the direction in which s grows, made perpendicular to N; B = N × T (the convention of MikkTSpace, which
+Blender and most DCCs follow). At full resolution a texel lies on its vertex, so that nothing is interpolated.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from service.usd.mesh import SurfaceMesh, face_to_vertex
+
+
+class TangentFrame(NamedTuple):
+    """The frame of the mesh at every texel; zero where no vertex is near."""
+
+    tangent: np.ndarray  # [rows, cols, 3] float32, unit, camera frame, towards growing s
+    normal: np.ndarray  # [rows, cols, 3] float32, unit, camera frame, the interpolated vertex normal
+    covered: np.ndarray  # [rows, cols] bool, True where the frame exists
+
+    def express(self, normal: np.ndarray) -> np.ndarray:
+        """Camera-frame normals in tangent space.
+
+        Args:
+            normal: [rows, cols, 3] unit, camera frame.
+
+        Returns:
+            [rows, cols, 3] float32: components along T, B = N × T, and N.
+        """
+        bitangent = np.cross(self.normal, self.tangent)
+        axes = (self.tangent, bitangent, self.normal)
+        return np.stack([np.einsum("rcx,rcx->rc", axis, normal) for axis in axes], axis=-1).astype(np.float32)
+
+
+def tangent_frame(mesh: SurfaceMesh, shape: tuple[int, int]) -> TangentFrame:
+    """The frame that a renderer interpolates over the mesh, at each texel centre.
+
+    Args:
+        shape: rows, cols of the texture; that of the height map.
+
+    Convention:
+        Between the vertices of a mesh with step > 1 the frame is interpolated bilinearly; renderers split the quads
+        into triangles, which differs in second order of the step.
+    """
+    normal = _spread(mesh.normals, mesh, shape)
+    tangent = _spread(vertex_tangents(mesh), mesh, shape)
+    normal, covered = _unit(normal)
+    tangent, _ = _unit(tangent - normal * np.einsum("rcx,rcx->rc", tangent, normal)[..., None])
+    return TangentFrame(tangent, normal, covered)
+
+
+def vertex_tangents(mesh: SurfaceMesh) -> np.ndarray:
+    """Unit tangents ∂P/∂s of the planar texture coordinates, perpendicular to the vertex normals.
+
+    Returns:
+        [V, 3] float32. Each face adds its ∂P/∂s, weighted by its area in the texture.
+    """
+    p, st = mesh.points.astype(np.float64), mesh.st.astype(np.float64)
+    top_left, bottom_left, bottom_right, top_right = mesh.quads.T
+    cell_t = st[top_left, 1:] - st[bottom_left, 1:]
+    quad_tangent = (p[top_right] - p[top_left] + p[bottom_right] - p[bottom_left]) / 2 * cell_t
+
+    a, b, c = mesh.triangles.T
+    edge_1, edge_2, st_1, st_2 = p[b] - p[a], p[c] - p[a], st[b] - st[a], st[c] - st[a]
+    triangle_tangent = (edge_1 * st_2[:, 1:] - edge_2 * st_1[:, 1:]) / 2  # ∂P/∂s times the signed area in (s, t)
+
+    total = face_to_vertex(quad_tangent, triangle_tangent, mesh.quads, mesh.triangles, len(p))
+    normals = mesh.normals.astype(np.float64)
+    total -= normals * np.einsum("vx,vx->v", total, normals)[:, None]
+    return (total / np.linalg.norm(total, axis=-1, keepdims=True)).astype(np.float32)
+
+
+def _spread(values: np.ndarray, mesh: SurfaceMesh, shape: tuple[int, int]) -> np.ndarray:
+    """Vertex values [V, 3] at every pixel, bilinear between the vertices; zero where there is none."""
+    step = mesh.step
+    grid = np.zeros((-(-shape[0] // step), -(-shape[1] // step), 3), dtype=np.float32)
+    grid[mesh.rows // step, mesh.cols // step] = values
+    for axis in (0, 1):
+        if step > 1:
+            position = np.arange(shape[axis]) / step
+            low = position.astype(np.int64)
+            high = np.minimum(low + 1, grid.shape[axis] - 1)
+            weight = np.expand_dims((position - low).astype(np.float32), tuple({0, 1, 2} - {axis}))
+            grid = np.take(grid, low, axis=axis) * (1 - weight) + np.take(grid, high, axis=axis) * weight
+    return grid
+
+
+def _unit(vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vectors of length one, zero where they were zero; and where they were not."""
+    length = np.linalg.norm(vectors, axis=-1)
+    present = length > 0
+    return vectors / np.where(present, length, 1)[..., None], present

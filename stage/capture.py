@@ -1,0 +1,127 @@
+"""A capture folder: its manifest, checked against the files that it names."""
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from stage import images
+from stage.camera import Camera
+from stage.errors import ManifestError, StageError, storage
+from stage.light import DistantLight, EnvironmentLight, ExtendedLight, FullLight, GradientLight, OffLight, PointLight
+from stage.manifest import FILE_NAME, Frame, Manifest, read_manifest
+
+SOURCES = (DistantLight, PointLight, ExtendedLight, GradientLight)
+"""Light types whose frames are measurements to solve or relight from."""
+
+HEADER_THREADS = 8
+
+LightKind = TypeVar("LightKind", DistantLight, PointLight, ExtendedLight, GradientLight, EnvironmentLight, OffLight, FullLight)
+
+
+@dataclass(frozen=True)
+class Capture:
+    """One folder, one camera position."""
+
+    folder: Path
+    manifest: Manifest
+
+    @classmethod
+    def open(cls, path: str | Path) -> "Capture":
+        """Open a capture and check every file's header.
+
+        Args:
+            path: the folder, or its capture.json.
+
+        Raises:
+            ManifestError: the manifest is wrong; names the field.
+            ImageError: a file has the wrong size or cannot be an image; names the file.
+            StorageError: a file cannot be read.
+        """
+        given = Path(path)
+        folder = given.parent if given.name == FILE_NAME else given
+        with storage("read", folder):
+            if not folder.is_dir():
+                raise ManifestError(f"{folder}: there is no such folder")
+            if not (folder / FILE_NAME).exists():
+                raise ManifestError(f"{folder}: holds no {FILE_NAME}: see `relit import` for data laid out another way")
+        capture = cls(folder, read_manifest(folder / FILE_NAME))
+        capture._check_files()
+        return capture
+
+    @property
+    def camera(self) -> Camera:
+        """The camera."""
+        return self.manifest.camera
+
+    @property
+    def name(self) -> str:
+        """What the capture is called."""
+        return self.manifest.name
+
+    def file(self, name: str) -> Path:
+        """The path of a file that the manifest names; never outside the folder.
+
+        Raises:
+            ManifestError: the name leads out of the folder.
+        """
+        if Path(name).is_absolute() or ".." in Path(name).parts or "\0" in name:
+            raise ManifestError(f"{self.folder / FILE_NAME}: {name} leads out of the capture's folder")
+        return self.folder / name
+
+    def lit_by(self, *kinds: type[LightKind]) -> list[tuple[Frame, LightKind]]:
+        """The frames that one of these light types lit, with their lights, in manifest order."""
+        return [(frame, frame.light) for frame in self.manifest.frames if isinstance(frame.light, kinds)]
+
+    def sources(self) -> list[Frame]:
+        """The frames whose light is a measurement: neither ambient, nor tracking, nor an environment reference."""
+        return [frame for frame in self.manifest.frames if isinstance(frame.light, SOURCES)]
+
+    def mask(self) -> np.ndarray:
+        """Where the object is.
+
+        Returns:
+            [rows, cols] bool; all True without a mask file.
+
+        Raises:
+            ImageError: the mask is empty or unreadable.
+        """
+        if self.manifest.mask is None:
+            return np.ones((self.camera.height, self.camera.width), dtype=bool)
+        return images.read_mask(self.file(self.manifest.mask), self.camera.resolution)
+
+    def files(self) -> Iterator[tuple[str, str]]:
+        """(field, file name) of every file that the manifest names."""
+        for field in ("mask", "dark", "flat"):
+            name = getattr(self.manifest, field)
+            if name is not None:
+                yield field, name
+        for index, frame in enumerate(self.manifest.frames):
+            yield f"frames[{index}].image", frame.image
+            if isinstance(frame.light, EnvironmentLight):
+                yield f"frames[{index}].light.image", frame.light.image
+
+    def _check_files(self) -> None:
+        def fault(item: tuple[str, str]) -> StageError | None:
+            field, name = item
+            try:
+                path = self.file(name)
+                if not path.exists():
+                    return ManifestError(f"{self.folder / FILE_NAME}: {field}: {name} is not in the folder")
+                if path.suffix.lower() == ".npy":
+                    return None  # time-of-flight arrays: checked by their own reader
+                if field.endswith(".light.image"):
+                    images.read_header(path)  # an environment has a size of its own
+                else:
+                    images.check_resolution(path, self.camera.resolution)
+            except StageError as error:
+                return error
+            return None
+
+        with ThreadPoolExecutor(HEADER_THREADS) as pool:
+            for error in pool.map(fault, self.files()):
+                if error is not None:
+                    raise error

@@ -1,0 +1,88 @@
+"""Recorded values → scene-linear radiance: colour space, dark, flat, exposure, ambient, saturation."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from stage import images
+from stage.capture import Capture
+from stage.colour import linearise
+from stage.errors import ImageError
+from stage.light import OffLight
+from stage.manifest import Frame
+
+
+class Radiance(NamedTuple):
+    """One corrected image."""
+
+    pixels: np.ndarray  # [rows, cols, 3] float32, scene-linear; may be below 0 by noise once dark or ambient is taken off
+    saturated: np.ndarray | None  # [rows, cols] bool, any channel at or above the capture's `saturation`
+
+
+@dataclass(frozen=True)
+class Correction:
+    """radiance = (linear(recorded) - dark) / flat / exposure - ambient, flat scaled to mean 1 over the mask."""
+
+    capture: Capture
+    dark: np.ndarray | None  # [rows, cols, 3] float32, linear; taken at the exposure of the frames
+    flat: np.ndarray | None  # [rows, cols, 3] float32, mean 1 in each channel
+    ambient: np.ndarray | None  # [rows, cols, 3] float32, mean of the `off` frames, corrected
+
+    @classmethod
+    def of(cls, capture: Capture) -> "Correction":
+        """Read the dark, flat and ambient frames of a capture.
+
+        Raises:
+            ImageError: one is unreadable, holds impossible values, or the flat is dark inside the mask.
+        """
+        manifest = capture.manifest
+        space = manifest.color_space
+        dark = flat = None
+        if manifest.dark is not None:
+            dark = linearise(_recorded(capture, manifest.dark), space)
+        if manifest.flat is not None:
+            flat = linearise(_recorded(capture, manifest.flat), space)
+            flat = flat - dark if dark is not None else flat
+            mask = capture.mask()
+            unlit = int((flat[mask] <= 0).any(axis=-1).sum())
+            if unlit:
+                raise ImageError(f"{capture.file(manifest.flat)}: flat is not above dark at {unlit} pixels of the mask")
+            flat = np.where(flat > 0, flat, 1) / flat[mask].mean(axis=0)
+        partial = cls(capture, dark, flat, None)
+        off = [frame for frame, _ in capture.lit_by(OffLight)]
+        if not off:
+            return partial
+        total = np.zeros((capture.camera.height, capture.camera.width, 3), dtype=np.float32)
+        for frame in off:
+            total += partial.apply(frame).pixels
+        return cls(capture, dark, flat, total / len(off))
+
+    def apply(self, frame: Frame) -> Radiance:
+        """Read one frame and correct it.
+
+        Raises:
+            ImageError: unreadable, or NaN, infinite or negative recorded values; names the file.
+        """
+        manifest = self.capture.manifest
+        recorded = _recorded(self.capture, frame.image)
+        saturated = None
+        if manifest.saturation is not None:
+            saturated = (recorded >= manifest.saturation).any(axis=-1)
+        pixels = linearise(recorded, manifest.color_space)
+        if self.dark is not None:
+            pixels = pixels - self.dark
+        if self.flat is not None:
+            pixels = pixels / self.flat
+        if frame.exposure_s is not None:
+            pixels = pixels / np.float32(frame.exposure_s)
+        if self.ambient is not None:
+            pixels = pixels - self.ambient
+        return Radiance(pixels, saturated)
+
+
+def _recorded(capture: Capture, name: str) -> np.ndarray:
+    path = capture.file(name)
+    pixels = images.read_pixels(path)
+    images.check_radiance(path, pixels)
+    return pixels.astype(np.float32, copy=False)

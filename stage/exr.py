@@ -1,0 +1,161 @@
+"""OpenEXR files: named channels in and out, with metadata; written whole or not at all."""
+
+import os
+import struct
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import OpenEXR
+
+from stage.errors import ImageError, StorageError, storage
+from stage.files import replacing
+
+SCANLINES_PER_CHUNK = {0: 1, 1: 1, 2: 1, 3: 16, 4: 32, 5: 16, 6: 32, 7: 32, 8: 32, 9: 256}
+"""Compression code of the file format → rows per chunk (OpenEXR file layout, "Scan line blocks")."""
+
+
+class Compression:
+    """Names for the compressions that relit writes."""
+
+    ZIP = OpenEXR.ZIP_COMPRESSION
+    PIZ = OpenEXR.PIZ_COMPRESSION
+    DWAA = OpenEXR.DWAA_COMPRESSION
+
+
+class Header(NamedTuple):
+    """What an EXR says about itself before any pixel is read."""
+
+    width: int
+    height: int
+    channels: tuple[str, ...]
+    metadata: dict[str, Any]
+
+
+def read_header(path: str | Path) -> Header:
+    """Read the header only.
+
+    Raises:
+        ImageError: not an EXR, truncated, of several parts, or deep.
+        StorageError: the file cannot be opened.
+    """
+    with storage("read", path), open(path, "rb") as stream:
+        start = stream.read(8)
+    if start[:4] != b"\x76\x2f\x31\x01":
+        raise ImageError(f"{path}: is not an OpenEXR file")
+    if start[5] & 0x18:  # version bits 11 and 12: deep data, several parts
+        raise ImageError(f"{path}: has several parts or deep data: give a single-part flat image")
+    try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            attributes = dict(file.header())
+    except (RuntimeError, ValueError, TypeError) as error:
+        raise ImageError(f"{path}: is damaged or truncated: its header cannot be read") from error
+    (left, top), (right, bottom) = attributes["dataWindow"]
+    names = tuple(channel.name for channel in attributes["channels"])
+    header = Header(int(right - left + 1), int(bottom - top + 1), names, attributes)
+    missing = _missing_bytes(path, header)
+    if missing:
+        raise ImageError(f"{path}: is truncated: at least {missing} bytes are missing")
+    return header
+
+
+def read(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Read every channel.
+
+    Returns:
+        channels: name → [rows, cols] in the type it is stored as; metadata: attribute → value.
+
+    Raises:
+        ImageError: not a readable flat single-part EXR.
+        StorageError: the file cannot be opened.
+    """
+    header = read_header(path)
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            channels = {name: channel.pixels for name, channel in file.channels().items()}
+    except (RuntimeError, ValueError) as error:
+        raise ImageError(f"{path}: cannot be decoded: its data is damaged") from error
+    return channels, header.metadata
+
+
+def write(path: str | Path, channels: Mapping[str, np.ndarray], *, color_space: str, metadata: Mapping[str, str],
+          compression: Any = Compression.ZIP) -> None:
+    """Write one single-part EXR.
+
+    Args:
+        channels: name → [rows, cols] float16 or float32.
+        color_space: a scene-linear colour space by its interchange name; kept as `colorInteropID`, with the
+            `chromaticities` that readers without that attribute understand.
+        metadata: further string attributes.
+        compression: one of Compression.
+
+    Raises:
+        StorageError: the file cannot be written; nothing is left behind.
+    """
+    header: dict[str, Any] = {"compression": compression, "type": OpenEXR.scanlineimage, "colorInteropID": color_space,
+                              **metadata}
+    chromaticities = OpenEXR.colorInteropIDToChromaticities(color_space)
+    if chromaticities is not None:
+        header["chromaticities"] = chromaticities
+    planes = {name: np.ascontiguousarray(plane) for name, plane in channels.items()}
+    with replacing(path) as temporary:
+        try:
+            OpenEXR.File(header, planes).write(str(temporary))
+        except RuntimeError as error:
+            raise StorageError(f"cannot write {path}: {_one_line(error)}") from error
+        try:
+            read_header(temporary)
+        except ImageError as error:
+            raise StorageError(f"cannot write {path}: the disk took only part of it") from error
+
+
+def color_space_of(metadata: Mapping[str, Any], default: str = "lin_rec709_scene") -> str:
+    """The colour space that a header names, else `default`."""
+    return str(metadata.get("colorInteropID", default))
+
+
+def _missing_bytes(path: str | Path, header: Header) -> int:
+    """How many bytes a scan-line file lacks at the least, judged by its last chunk; 0 when whole (or tiled: not judged).
+
+    The library reports a short file only while it decodes, and then on the terminal too.
+    """
+    if header.metadata["type"] != OpenEXR.scanlineimage:
+        return 0
+    chunks = -(-header.height // SCANLINES_PER_CHUNK.get(int(header.metadata["compression"]), 1))
+    size = os.path.getsize(path)
+    with open(path, "rb") as stream:
+        stream.seek(8)  # magic number and version
+        while _skip_attribute(stream):
+            pass
+        table = stream.read(8 * chunks)
+        if len(table) < 8 * chunks:
+            return 8 * chunks - len(table)
+        last = max(struct.unpack(f"<{chunks}Q", table))
+        stream.seek(last)
+        block = stream.read(8)
+        packed = struct.unpack("<ii", block)[1] if len(block) == 8 else 0
+        return max(0, last + 8 + packed - size)
+
+
+def _skip_attribute(stream: Any) -> bool:
+    """Step over one header attribute; False at the end of the header."""
+    if not _text(stream):
+        return False
+    _text(stream)
+    size = stream.read(4)
+    if len(size) < 4:
+        return False
+    stream.seek(struct.unpack("<i", size)[0], 1)
+    return True
+
+
+def _text(stream: Any) -> bytes:
+    text = bytearray()
+    while (byte := stream.read(1)) not in (b"", b"\0"):
+        text += byte
+    return bytes(text)
+
+
+def _one_line(error: BaseException) -> str:
+    return str(error).strip().splitlines()[0].rstrip(".") if str(error).strip() else type(error).__name__

@@ -1,0 +1,69 @@
+"""Frames and coordinates: a_from_b transforms, pixel centres, and the lat-long sphere.
+
+Camera frame: right-handed, +x right, +y up, +z towards the viewer; the camera looks along -z. Image coordinates (u, v) are
+continuous from the top-left corner of the image, u right and v down, so the centre of pixel (row r, column c) is (c + 0.5, r + 0.5).
+"""
+
+import math
+
+import numpy as np
+
+RIGID_TOLERANCE = 1e-4
+"""How far R Rᵀ may be from the identity: matrices are typed and printed with four or more digits."""
+
+
+def pixel_centres(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+    """Continuous image coordinates of every pixel centre.
+
+    Returns:
+        u [height, width] and v [height, width], float64, pixels.
+    """
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    return u, v
+
+
+def rigid_fault(matrix: np.ndarray) -> str | None:
+    """Why a 4×4 `a_from_b` is not a rotation and a translation, or None when it is."""
+    if not np.isfinite(matrix).all():
+        return "holds a value that is not finite"
+    if not np.allclose(matrix[3], (0, 0, 0, 1)):
+        return "has a last row other than 0 0 0 1"
+    rotation = matrix[:3, :3]
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=RIGID_TOLERANCE):
+        return "is not a rotation and a translation"
+    if np.linalg.det(rotation) < 0:
+        return "mirrors (its rotation has determinant -1)"
+    return None
+
+
+def rotation_about_y(degrees: float) -> np.ndarray:
+    """Rotation about +y, positive from +z towards +x.
+
+    Returns:
+        [3, 3] float64, column vectors: turned = rotation @ direction.
+    """
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+
+
+def latlong_directions(width: int, height: int) -> np.ndarray:
+    """Direction from the object to each texel centre of a lat-long map.
+
+    The top row is +y, the image centre +z, a quarter from the left +x, the left edge -z (OpenEXR, UsdLux DomeLight).
+
+    Returns:
+        [height, width, 3] float64 unit vectors.
+    """
+    u, v = pixel_centres(width, height)
+    azimuth, polar = 2 * np.pi * u / width, np.pi * v / height
+    return np.stack([np.sin(azimuth) * np.sin(polar), np.cos(polar), -np.cos(azimuth) * np.sin(polar)], axis=-1)
+
+
+def latlong_solid_angles(width: int, height: int) -> np.ndarray:
+    """Solid angle of the texels of each row, steradians.
+
+    Returns:
+        [height] float64: sin(πv)·(π/H)·(2π/W).
+    """
+    v = (np.arange(height) + 0.5) / height
+    return np.sin(np.pi * v) * (np.pi / height) * (2 * np.pi / width)

@@ -1,0 +1,145 @@
+"""Pixels in: header first, then pixels, from EXR, PNG, TIFF, HDR, JPEG and .npy."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import OpenImageIO as oiio
+
+from stage import exr
+from stage.errors import ImageError, storage
+
+OIIO_SUFFIXES = {".png", ".tif", ".tiff", ".hdr", ".jpg", ".jpeg", ".jxl", ".dpx"}
+SUFFIXES = {".exr", *OIIO_SUFFIXES}
+
+
+class ImageHeader(NamedTuple):
+    """Size and kind of an image, known before any pixel is decoded."""
+
+    width: int
+    height: int
+    channels: int  # 1 grey, 3 RGB; alpha is not counted
+
+
+def read_header(path: str | Path) -> ImageHeader:
+    """Read size and channels only.
+
+    Raises:
+        ImageError: not an image that relit reads; truncated (EXR); no grey or RGB channels.
+        StorageError: the file cannot be opened.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix == ".exr":
+        header = exr.read_header(path)
+        return ImageHeader(header.width, header.height, len(_colour_channels(path, header.channels)))
+    if suffix not in OIIO_SUFFIXES:
+        raise ImageError(f"{path}: has an unknown suffix: relit reads {', '.join(sorted(SUFFIXES))}")
+    source = _open(path)
+    try:
+        spec = source.spec()
+        return ImageHeader(spec.width, spec.height, 1 if spec.nchannels < 3 else 3)
+    finally:
+        source.close()
+
+
+def read_pixels(path: str | Path) -> np.ndarray:
+    """Read recorded values; integers become fractions of full scale, floating-point values stay as they are.
+
+    Returns:
+        [rows, cols, 3] float32 (or float16 where the file holds half values); grey images repeat their one channel.
+
+    Raises:
+        ImageError: the file is damaged or not an image that relit reads.
+        StorageError: the file cannot be opened.
+    """
+    if Path(path).suffix.lower() == ".exr":
+        channels, _ = exr.read(path)
+        planes = [channels[name] for name in _colour_channels(path, tuple(channels))]
+        if any(plane.dtype == np.uint32 for plane in planes):
+            raise ImageError(f"{path}: holds integer identifiers, not radiance")
+        pixels = np.stack(planes, axis=-1)
+    else:
+        source = _open(path)
+        try:
+            # float of the recorded value: 8- and 16-bit integers are divided by 255 or 65535
+            pixels = source.read_image(0, 0, 0, source.spec().nchannels, oiio.FLOAT)
+            if pixels is None:
+                raise ImageError(f"{path}: cannot be decoded: {_reason(source.geterror())}")
+        finally:
+            source.close()
+        pixels = pixels[..., : 1 if pixels.shape[-1] < 3 else 3]  # drop alpha
+    return np.repeat(pixels, 3, axis=-1) if pixels.shape[-1] == 1 else pixels
+
+
+def read_mask(path: str | Path, resolution: tuple[int, int]) -> np.ndarray:
+    """Read a mask: where the first channel is above one half.
+
+    Args:
+        resolution: the width and height that it must have.
+
+    Returns:
+        [rows, cols] bool.
+
+    Raises:
+        ImageError: wrong size, unreadable, or no pixel inside.
+    """
+    check_resolution(path, resolution)
+    mask = read_pixels(path)[..., 0] > 0.5
+    if not mask.any():
+        raise ImageError(f"{path}: the mask is empty: no pixel is above one half")
+    return mask
+
+
+def check_resolution(path: str | Path, resolution: tuple[int, int]) -> None:
+    """Compare the header with the size that the camera declares.
+
+    Raises:
+        ImageError: they differ.
+    """
+    header = read_header(path)
+    if (header.width, header.height) != resolution:
+        raise ImageError(f"{path}: is {header.width}x{header.height}, camera.resolution says {resolution[0]}x{resolution[1]}")
+
+
+def check_radiance(path: str | Path, pixels: np.ndarray) -> None:
+    """Refuse values that no light can have.
+
+    Raises:
+        ImageError: NaN, infinite or negative values; the message counts them and names the first.
+    """
+    finite = np.isfinite(pixels)
+    for name, bad in (("not finite (NaN or infinity)", ~finite), ("negative", finite & (pixels < 0))):
+        if bad.any():
+            where = bad.any(axis=-1)
+            row, column = np.argwhere(where)[0]
+            raise ImageError(f"{path}: {int(where.sum())} pixels are {name}, the first at row {row}, column {column}: "
+                             "mend the image, or clip it if this is noise around zero")
+
+
+def _open(path: str | Path) -> oiio.ImageInput:
+    with storage("read", path), open(path, "rb"):
+        pass  # a clear reason when it is missing or unreadable
+    config = oiio.ImageSpec()
+    config.attribute("oiio:UnassociatedAlpha", 1)  # colours as recorded, not multiplied by alpha
+    source = oiio.ImageInput.open(str(path), config)
+    if source is None:
+        raise ImageError(f"{path}: cannot be read: {_reason(oiio.geterror())}")
+    return source
+
+
+def _colour_channels(path: str | Path, names: tuple[str, ...]) -> tuple[str, ...]:
+    if {"R", "G", "B"} <= set(names):
+        return ("R", "G", "B")
+    if "Y" in names:
+        return ("Y",)
+    flat = [name for name in names if name != "A"]
+    if len(flat) == 1:
+        return (flat[0],)
+    raise ImageError(f"{path}: has channels {', '.join(names)}: an image needs R, G, B or one grey channel")
+
+
+def _reason(text: str) -> str:
+    lines = text.strip().splitlines()
+    return lines[0].rstrip(".") if lines else "its data is damaged"
+
+

@@ -1,0 +1,51 @@
+"""The DiLiGenT benchmark layout: filenames.txt, light_directions.txt, light_intensities.txt, mask.png, 16-bit PNG.
+
+Source: Shi et al., "A Benchmark Dataset and Evaluation for Non-Lambertian and Uncalibrated Photometric Stereo", TPAMI 2019.
+Its camera frame is ours (x right, y up, z to the camera); images are linear and are divided by the light intensities.
+"""
+
+from pathlib import Path
+
+from stage.errors import ManifestError, storage
+from stage.importers.layout import finish, image_resolution, read_table
+from stage.manifest import SCHEMA, Manifest
+
+
+def import_folder(source: Path, destination: Path) -> Path:
+    """Write a capture.json for a DiLiGenT object.
+
+    Args:
+        source: the object's folder.
+        destination: the capture's folder; the same, or another, which gets links to (or copies of) the images.
+
+    Returns:
+        The path of the manifest.
+
+    Raises:
+        ManifestError: a text file is missing, has the wrong count of rows, or names an image that is not there.
+    """
+    with storage("read", source / "filenames.txt"):
+        names = (source / "filenames.txt").read_text(encoding="utf-8").split()
+    directions = read_table(source / "light_directions.txt", 3)
+    intensities = read_table(source / "light_intensities.txt", 3)
+    for name, table in (("light_directions.txt", directions), ("light_intensities.txt", intensities)):
+        if len(table) != len(names):
+            raise ManifestError(f"{source / name}: has {len(table)} rows, filenames.txt names {len(names)} images")
+    if not names:
+        raise ManifestError(f"{source / 'filenames.txt'}: names no image")
+    zero = [i for i, row in enumerate(directions) if not row.any()]
+    if zero:
+        raise ManifestError(f"{source / 'light_directions.txt'}: row {zero[0] + 1} has zero length: give a direction")
+    mask = "mask.png" if (source / "mask.png").exists() else None
+    manifest = Manifest.model_validate({
+        "schema": SCHEMA,
+        "name": source.resolve().name,
+        "color_space": "lin_rec709_scene",
+        "camera": {"projection": "orthographic", "resolution": image_resolution(source / names[0])},
+        "mask": mask,
+        "frames": [
+            {"image": name, "light": {"type": "distant", "direction": list(direction), "irradiance": list(intensity)}}
+            for name, direction, intensity in zip(names, directions.tolist(), intensities.tolist(), strict=True)
+        ],
+    })
+    return finish(manifest, source, destination, [*names, *([mask] if mask else [])])

@@ -1,0 +1,99 @@
+"""RTI `.lp` files: a count, then one line an image: its name and the light direction x y z.
+
+The convention of RTIBuilder and the viewers that followed it: x right, y up, z towards the camera; the vector points to the light.
+Images of a camera are display-encoded, those of a linear workflow are not, and the file does not say which: 8-bit images
+are taken as sRGB and others as scene-linear, and the manifest says so.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from pydantic import ValidationError
+
+from stage.errors import ManifestError, storage
+from stage.importers.layout import finish, image_resolution
+from stage.manifest import SCHEMA, Manifest, describe
+
+DISPLAY_ENCODED = {".jpg", ".jpeg", ".png"}
+"""Suffixes whose 8-bit images are taken as sRGB."""
+
+
+def import_folder(source: Path, destination: Path) -> Path:
+    """Write a capture.json for an RTI capture.
+
+    Args:
+        source: the .lp file, or a folder with exactly one.
+        destination: the capture's folder; the same, or another, which gets links to (or copies of) the images.
+
+    Returns:
+        The path of the manifest.
+
+    Raises:
+        ManifestError: no or several .lp files, a bad line (named), or an image that is not there.
+    """
+    path = _find(source)
+    folder = path.parent
+    with storage("read", path):
+        lines = [line.strip() for line in path.read_text(encoding="utf-8", errors="replace").splitlines()]
+    lines = [line for line in lines if line]
+    if not lines or not lines[0].isdigit():
+        raise ManifestError(f"{path}: line 1: must be the count of images")
+    count, rows = int(lines[0]), lines[1:]
+    if count != len(rows):
+        raise ManifestError(f"{path}: says {count} images, holds {len(rows)}")
+    frames = [_frame(path, folder, number, row) for number, row in enumerate(rows, start=2)]
+    if not frames:
+        raise ManifestError(f"{path}: names no image")
+    first = folder / frames[0]["image"]
+    mask = "mask.png" if (folder / "mask.png").exists() else None
+    try:
+        manifest = Manifest.model_validate({
+            "schema": SCHEMA,
+            "name": path.stem,
+            "color_space": "srgb_texture" if _display_encoded(first) else "lin_rec709_scene",
+            "camera": {"projection": "orthographic", "resolution": image_resolution(first)},
+            "mask": mask,
+            "frames": frames,
+        })
+    except ValidationError as error:
+        raise ManifestError(f"{path}: {describe(error)}") from error
+    return finish(manifest, folder, destination, [f["image"] for f in frames] + ([mask] if mask else []))
+
+
+def _find(source: Path) -> Path:
+    if source.is_file():
+        return source
+    with storage("read", source):
+        found = sorted(p for p in source.iterdir() if p.suffix.lower() == ".lp")
+    if len(found) != 1:
+        raise ManifestError(f"{source}: holds {len(found)} .lp files: name the one to import")
+    return found[0]
+
+
+def _frame(path: Path, folder: Path, number: int, row: str) -> dict[str, object]:
+    parts = row.rsplit(maxsplit=3)  # a name may hold spaces
+    try:
+        direction = [float(part) for part in parts[1:]]
+    except ValueError:
+        direction = []
+    if len(direction) != 3 or not np.isfinite(direction).all():
+        raise ManifestError(f"{path}: line {number}: {row[:60]!r} is not an image name and three numbers")
+    if not any(direction):
+        raise ManifestError(f"{path}: line {number}: the light direction has zero length")
+    # names are often absolute or with folders of the machine that made the file: the images lie beside it
+    name = parts[0].replace("\\", "/")
+    relative = name if not name.startswith("/") and ":" not in name and (folder / name).is_file() else name.rsplit("/", 1)[-1]
+    return {"image": relative, "light": {"type": "distant", "direction": direction, "irradiance": [1.0, 1.0, 1.0]}}
+
+
+def _display_encoded(path: Path) -> bool:
+    import OpenImageIO as oiio
+
+    if path.suffix.lower() not in DISPLAY_ENCODED:
+        return False
+    source = oiio.ImageInput.open(str(path))
+    if source is None:
+        raise ManifestError(f"{path}: cannot be read as an image")
+    eight_bit = source.spec().format == oiio.UINT8
+    source.close()
+    return bool(eight_bit)

@@ -1,0 +1,170 @@
+"""Ingest: the images of a capture → its stack cache, keyed by content, decoded on a thread pool, written whole or not at all."""
+
+import hashlib
+import json
+import math
+import os
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+from stage import stack as stacks
+from stage.capture import Capture
+from stage.correction import Correction, Radiance
+from stage.errors import ManifestError, storage
+from stage.files import replacing, write_text
+from stage.fingerprint import Fingerprints
+from stage.light import OffLight
+from stage.manifest import Frame
+from stage.stack import CHANNELS, LIGHT_PAD, PIXEL_PAD, Stack
+
+LAYOUT = 1
+"""Raised when the layout or the arithmetic of the cache changes, so that older caches are rebuilt."""
+CACHE_FOLDER = ".relit"
+DECODE_BYTES = 1 << 30
+"""What the images being decoded at one time may take together."""
+BYTES_PER_PIXEL = 40
+"""Of one image while it is corrected: half and float RGB, masks and the planes to write."""
+TOP_EXPONENT = 15
+"""The brightest value of a light is stored in [2^14, 2^15): below half's largest, 65504, with 29 stops of normal values under it."""
+
+Progress = Callable[[int, int], None]
+"""Called with (done, total)."""
+
+
+def open_stack(capture: Capture, *, cache: Path | None = None, progress: Progress | None = None) -> Stack:
+    """The stack of a capture's light frames, from the cache or built now.
+
+    Args:
+        capture: an opened capture.
+        cache: folder for the cache; None: `.relit` in the capture's folder.
+        progress: called after every decoded frame when the stack is built.
+
+    Raises:
+        ManifestError: the capture has no frame that a light lit.
+        ImageError: an image is unreadable or holds impossible values; names the file.
+        StorageError: the cache cannot be written (no space, read-only folder); nothing is left behind.
+    """
+    frames = capture.sources()
+    if not frames:
+        raise ManifestError(f"{capture.folder}: frames: none is lit by a distant, point, extended or gradient light")
+    folder = cache if cache is not None else capture.folder / CACHE_FOLDER
+    fingerprints = Fingerprints(capture.folder, folder / "files.json")
+    key = _key(capture, frames, fingerprints)
+    found = stacks.find(folder, key)
+    if found is not None:
+        return found
+    hint = "" if cache is not None else " (--cache names another folder for it)"
+    with storage(f"make the stack cache{hint} in", folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    built = _build(capture, frames, folder, key, progress)
+    fingerprints.remember()
+    _drop_others(folder, key)
+    return built
+
+
+def _key(capture: Capture, frames: list[Frame], fingerprints: Fingerprints) -> str:
+    """A hash of all that the stored values depend on."""
+    manifest = capture.manifest
+    off = [frame for frame, _ in capture.lit_by(OffLight)]
+    corrections = [name for name in (manifest.dark, manifest.flat) if name is not None]
+    if manifest.flat is not None and manifest.mask is not None:
+        corrections.append(manifest.mask)  # the flat is scaled over the mask
+    images = [frame.image for frame in frames + off]
+    inputs = {
+        "layout": LAYOUT,
+        "resolution": manifest.camera.resolution,
+        "color_space": manifest.color_space,
+        "saturation": manifest.saturation,
+        "exposures": [frame.exposure_s for frame in frames + off],
+        "images": images,
+        "light_count": len(frames),
+        "corrections": [manifest.dark, manifest.flat],
+        "content": fingerprints.of([*images, *corrections]),
+    }
+    return hashlib.blake2b(json.dumps(inputs, sort_keys=True).encode(), digest_size=8).hexdigest()
+
+
+def _build(capture: Capture, frames: list[Frame], folder: Path, key: str, progress: Progress | None) -> Stack:
+    pixel_count = capture.camera.width * capture.camera.height
+    lights, pixels = stacks.padded(len(frames), LIGHT_PAD), stacks.padded(pixel_count, PIXEL_PAD)
+    scale = np.zeros(lights, dtype=np.float32)
+    saturated = np.zeros((lights // 8, pixels), dtype=np.uint8)
+    correction = Correction.of(capture)
+    done = 0
+    lock = threading.Lock()
+
+    values = stacks.values_path(folder, key)
+    with replacing(values) as temporary, open(temporary, "r+b") as file:
+        np.lib.format.write_array_header_1_0(
+            file, {"descr": "<f2", "fortran_order": False, "shape": (CHANNELS, lights, pixels)})
+        start = file.tell()
+        with storage("make the stack cache", values):
+            _reserve(file.fileno(), start + 2 * CHANNELS * lights * pixels)
+
+        def take(light: int) -> None:
+            nonlocal done
+            radiance = correction.apply(frames[light])
+            planes, scale[light] = _to_half(radiance)
+            for channel in range(CHANNELS):
+                plane = np.ascontiguousarray(planes[..., channel])
+                _write_all(file.fileno(), plane, start + 2 * (channel * lights + light) * pixels)
+            with lock:
+                if radiance.saturated is not None:
+                    saturated[light // 8, :pixel_count] |= radiance.saturated.reshape(-1).astype(np.uint8) << (light % 8)
+                done += 1
+                if progress is not None:
+                    progress(done, len(frames))
+
+        workers = max(1, min(os.cpu_count() or 1, DECODE_BYTES // (BYTES_PER_PIXEL * pixel_count)))
+        with ThreadPoolExecutor(workers, thread_name_prefix="relit-ingest") as pool:
+            jobs = [pool.submit(take, light) for light in range(len(frames))]
+            try:
+                for job in jobs:
+                    job.result()
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+    if saturated.any():
+        with replacing(stacks.saturated_path(folder, key)) as temporary, open(temporary, "wb") as file:
+            np.save(file, saturated)
+    index = {"frames": [frame.image for frame in frames], "scale": [float(s) for s in scale], "pixel_count": pixel_count}
+    write_text(stacks.index_path(folder, key), json.dumps(index))
+    return Stack(folder, key, tuple(index["frames"]), scale, pixel_count)
+
+
+def _to_half(radiance: Radiance) -> tuple[np.ndarray, float]:
+    """Stored half values and the radiance of a stored 1.0: a power of two, so that half images keep their bits."""
+    peak = max(float(radiance.pixels.max()), -float(radiance.pixels.min()))
+    if peak == 0.0:
+        return np.zeros_like(radiance.pixels, dtype=np.float16), 1.0
+    exponent = math.frexp(peak)[1] - TOP_EXPONENT
+    return np.ldexp(radiance.pixels, -exponent).astype(np.float16), math.ldexp(1.0, exponent)
+
+
+def _write_all(descriptor: int, plane: np.ndarray, offset: int) -> None:
+    """pwrite a whole plane; a full disk is an error here, where a write to a mapped file would kill the process."""
+    view = memoryview(plane).cast("B")
+    while view:
+        written = os.pwrite(descriptor, view, offset)
+        view, offset = view[written:], offset + written
+
+
+def _reserve(descriptor: int, size: int) -> None:
+    """Claim the space before the first frame is decoded, so that a full disk is known at once."""
+    if hasattr(os, "posix_fallocate"):
+        os.posix_fallocate(descriptor, 0, size)
+    else:
+        os.ftruncate(descriptor, size)
+
+
+def _drop_others(folder: Path, key: str) -> None:
+    """Remove the stacks of earlier inputs: index first, so that a half-removed stack is never found."""
+    for index in folder.glob("stack-*.json"):
+        old = index.stem.removeprefix("stack-")
+        if old != key:
+            for path in (index, stacks.values_path(folder, old), stacks.saturated_path(folder, old)):
+                path.unlink(missing_ok=True)

@@ -1,0 +1,51 @@
+"""The strict base of every manifest model: unknown keys are errors, numbers are finite, values are frozen."""
+
+from typing import Annotated
+
+import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+from stage.frames import rigid_fault
+
+
+class Strict(BaseModel):
+    """A frozen record whose unknown keys are errors that name the key."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+def _unit(vector: tuple[float, float, float]) -> tuple[float, float, float]:
+    length = float(np.linalg.norm(vector))
+    if length == 0.0:
+        raise ValueError("has zero length: give a direction")
+    x, y, z = (float(c) / length for c in vector)
+    return (x, y, z)
+
+
+def _non_negative(colour: tuple[float, float, float]) -> tuple[float, float, float]:
+    if min(colour) < 0:
+        raise ValueError("is negative")
+    if max(colour) == 0:
+        raise ValueError("is zero in every channel: a light gives light; use {\"type\": \"off\"} for ambient frames")
+    return colour
+
+
+def _rigid(rows: tuple[tuple[float, float, float, float], ...]) -> tuple[tuple[float, float, float, float], ...]:
+    fault = rigid_fault(np.array(rows, dtype=np.float64))
+    if fault:
+        raise ValueError(fault)
+    return rows
+
+
+Vector = tuple[float, float, float]
+Direction = Annotated[Vector, AfterValidator(_unit)]
+"""Given with any length above zero, kept with length one."""
+Rgb = Annotated[Vector, AfterValidator(_non_negative)]
+"""Red, green, blue; none negative, not all zero."""
+Row = tuple[float, float, float, float]
+Transform = Annotated[tuple[Row, Row, Row, Row], AfterValidator(_rigid)]
+"""A 4×4 `a_from_b`, rows; a rotation and a translation."""
+Positive = Annotated[float, Field(gt=0)]
+Count = Annotated[int, Field(ge=1)]
+Resolution = tuple[Count, Count]
+"""Width, height in pixels."""

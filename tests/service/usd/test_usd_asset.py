@@ -1,0 +1,291 @@
+"""Assets on disk: what is in them, what other tools say to them, and what is left when something fails."""
+
+import dataclasses
+import errno
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pxr import Usd, UsdGeom, UsdShade, UsdValidation
+
+from service.usd import asset, textures
+from service.usd.asset import write_asset
+from service.usd.errors import AssetError
+from stage.errors import StorageError
+from stage.maps import SurfaceMaps
+from tests.service.usd.surfaces import make_ball, make_sheet, make_wave
+
+SUFFIXES = (".usda", ".usdc", ".usdz")
+every_suffix = pytest.mark.parametrize("suffix", SUFFIXES)
+POSE = ((0.0, 0.0, 1.0, 0.3), (1.0, 0.0, 0.0, -0.1), (0.0, 1.0, 0.0, 2.0), (0.0, 0.0, 0.0, 1.0))
+
+SURFACES = {
+    "everything": make_ball(),
+    "diffuse only": make_ball(specular=None, roughness=None),
+    "height only": make_wave("perspective", world_from_camera=POSE),
+    "no scale": make_wave("orthographic"),
+    "bow tie": make_sheet(np.array([[1, 0, 0], [1, 1, 1], [0, 0, 1]], dtype=bool)),
+    "2x2": make_sheet(np.ones((2, 2), dtype=bool), diffuse_albedo=np.full((2, 2, 3), 0.5, dtype=np.float32)),
+}
+every_surface = pytest.mark.parametrize("maps", SURFACES.values(), ids=SURFACES)
+
+
+def listing(folder: Path) -> dict[str, bytes]:
+    """Every file below a folder with its bytes."""
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def tilted_ball() -> SurfaceMaps:
+    """A ball whose normal map does not compress, so that it is larger than the other textures."""
+    ball = make_ball(48)
+    noise = np.random.default_rng(1).normal(size=ball.normal.shape) * 0.1
+    return dataclasses.replace(ball, normal=(ball.normal + noise).astype(np.float32))
+
+
+def shader(usd_stage, name):
+    return UsdShade.Shader(usd_stage.GetPrimAtPath(f"/Ball/Looks/Material/{name}"))
+
+
+@every_suffix
+@every_surface
+def test_usd_validators_find_nothing(maps, suffix, tmp_path):
+    write_asset(maps, tmp_path / f"ball{suffix}", name="Ball")
+    usd_stage = Usd.Stage.Open(str(tmp_path / f"ball{suffix}"))
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    assert len(validators) >= 30
+    errors = UsdValidation.ValidationContext(validators).Validate(usd_stage)
+    assert [(e.GetName(), e.GetMessage()) for e in errors] == []
+
+
+@every_suffix
+@every_surface
+def test_nvidia_validator_finds_no_failure(maps, suffix, tmp_path):
+    nvidia = pytest.importorskip("usd_validation_nvidia", reason="usd-validation-nvidia is not installed")
+    write_asset(maps, tmp_path / f"ball{suffix}", name="Ball")
+    issues = nvidia.ValidationEngine().validate(str(tmp_path / f"ball{suffix}")).issues()
+    found = [(i.severity.name, i.rule.__name__ if i.rule else "", i.message) for i in issues]
+    # It advises against long arrays in text layers; text is what .usda asks for.
+    found = [issue for issue in found if not (suffix == ".usda" and issue[1] == "UsdAsciiPerformanceChecker")]
+    if maps is SURFACES["bow tie"]:  # two patches that meet in one pixel share its vertex: a warning, and true
+        assert {issue[:2] for issue in found} == {("WARNING", "ManifoldChecker")}
+    else:
+        assert found == []
+
+
+@every_suffix
+def test_prims_and_metadata(ball, suffix, tmp_path):
+    write_asset(ball, tmp_path / f"ball{suffix}", name="Ball")
+    usd_stage = Usd.Stage.Open(str(tmp_path / f"ball{suffix}"))
+    root = usd_stage.GetDefaultPrim()
+    assert root.GetPath() == "/Ball" and Usd.ModelAPI(root).GetKind() == "component"
+    assert UsdGeom.GetStageUpAxis(usd_stage) == "Y" and UsdGeom.GetStageMetersPerUnit(usd_stage) == 1.0
+    assert usd_stage.GetMetadataByDictKey("customLayerData", "relit:method") == "svbrdf"
+    assert usd_stage.GetMetadataByDictKey("customLayerData", "relit:camera") == ball.camera.model_dump_json()
+    assert not UsdGeom.Xformable(root).GetOrderedXformOps() and not root.HasCustomDataKey("relit:scale")
+
+    mesh = UsdGeom.Mesh(usd_stage.GetPrimAtPath("/Ball/Geom/Mesh"))
+    points = np.array(mesh.GetPointsAttr().Get())
+    extent = np.array(mesh.GetExtentAttr().Get())
+    np.testing.assert_array_equal(extent, [points.min(axis=0), points.max(axis=0)])
+    np.testing.assert_array_equal(np.array(UsdGeom.ModelAPI(root).GetExtentsHint()), extent)
+    assert mesh.GetSubdivisionSchemeAttr().Get() == "none" and mesh.GetDoubleSidedAttr().Get()
+    assert mesh.GetNormalsInterpolation() == "vertex" and len(mesh.GetNormalsAttr().Get()) == len(points)
+    bound, _ = UsdShade.MaterialBindingAPI(mesh).ComputeBoundMaterial()
+    assert bound.GetPath() == "/Ball/Looks/Material"
+
+
+def test_material_reads_the_textures(ball, tmp_path):
+    write_asset(ball, tmp_path / "ball.usda", name="Ball")
+    usd_stage = Usd.Stage.Open(str(tmp_path / "ball.usda"))
+    surface = shader(usd_stage, "Surface")
+    assert surface.GetInput("useSpecularWorkflow").Get() == 1 and not surface.GetInput("opacity")
+    expected = {"diffuseColor": ("diffuse_albedo", "sRGB"), "normal": ("normal", "raw"),
+                "specularColor": ("specular", "sRGB"), "roughness": ("roughness", "raw")}
+    for name, (layer, color_space) in expected.items():
+        source = surface.GetInput(name).GetConnectedSources()[0][0].source
+        image = UsdShade.Shader(source.GetPrim())
+        file = image.GetInput("file").Get()
+        assert file.path == f"./ball_textures/{layer}.png"
+        assert Path(file.resolvedPath) == (tmp_path / "ball_textures" / f"{layer}.png").resolve()
+        assert image.GetInput("sourceColorSpace").Get() == color_space
+        assert image.GetInput("wrapS").Get() == image.GetInput("wrapT").Get() == "clamp"
+    assert tuple(shader(usd_stage, "Normal").GetInput("scale").Get()) == (2, 2, 2, 1)
+    assert tuple(shader(usd_stage, "Normal").GetInput("bias").Get()) == (-1, -1, -1, 0)
+    assert str(tmp_path) not in (tmp_path / "ball.usda").read_text()  # nothing in the layer names this folder
+
+
+def test_without_specular_it_renders_as_the_fitted_lambertian(tmp_path):
+    write_asset(SURFACES["diffuse only"], tmp_path / "ball.usdc", name="Ball")
+    usd_stage = Usd.Stage.Open(str(tmp_path / "ball.usdc"))  # prims live no longer than their stage
+    surface = shader(usd_stage, "Surface")
+    assert tuple(surface.GetInput("specularColor").Get()) == (0, 0, 0) and surface.GetInput("roughness").Get() == 1
+    assert not surface.GetInput("roughness").HasConnectedSource()
+
+
+def test_pose_is_the_transform_of_the_root(ball, tmp_path):
+    for camera, unit_m in ((ball.camera, 1.0), (ball.camera.model_copy(update={"pixel_size_m": None}), 0.001)):
+        posed = dataclasses.replace(ball, camera=camera.model_copy(update={"world_from_camera": POSE}))
+        write_asset(posed, tmp_path / f"{unit_m}.usdc", name="Ball")
+        usd_stage = Usd.Stage.Open(str(tmp_path / f"{unit_m}.usdc"))
+        matrix = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(usd_stage.GetDefaultPrim())).T
+        np.testing.assert_allclose(matrix[:3, :3], np.array(POSE)[:3, :3])
+        np.testing.assert_allclose(matrix[:3, 3] * unit_m, np.array(POSE)[:3, 3])  # metres, whatever the scene unit
+
+
+def test_unknown_scale_is_said(tmp_path):
+    write_asset(SURFACES["no scale"], tmp_path / "ball.usdz", name="Ball")
+    usd_stage = Usd.Stage.Open(str(tmp_path / "ball.usdz"))
+    assert UsdGeom.GetStageMetersPerUnit(usd_stage) == 0.001
+    assert usd_stage.GetDefaultPrim().GetCustomDataByKey("relit:scale").startswith("unknown")
+
+
+@pytest.mark.parametrize("name, prim", [("owl 2", "owl_2"), ("2nd try", "_nd_try"), ("Eule – groß", None), ("", "_")])
+def test_prim_name_is_made_valid(name, prim, ball, tmp_path):
+    write_asset(ball, tmp_path / "ball.usdc", name=name)
+    usd_stage = Usd.Stage.Open(str(tmp_path / "ball.usdc"))
+    root = usd_stage.GetDefaultPrim()
+    assert root.GetDisplayName() == name and (prim is None or root.GetName() == prim)
+
+
+def test_usdz_is_the_layer_first_then_textures_stored_and_aligned(ball, tmp_path):
+    report = write_asset(ball, tmp_path / "ball.usdz", name="Ball")
+    assert [p.name for p in tmp_path.iterdir()] == ["ball.usdz"] and report.textures == ()
+    data = report.path.read_bytes()
+    entries = zipfile.ZipFile(report.path).infolist()
+    assert [e.filename for e in entries] == ["ball.usdc", *(f"ball_textures/{name}" for name in textures.FILE_NAMES)]
+    for entry in entries:
+        name_length, extra_length = (int.from_bytes(data[entry.header_offset + at:][:2], "little") for at in (26, 28))
+        assert entry.compress_type == zipfile.ZIP_STORED
+        assert (entry.header_offset + 30 + name_length + extra_length) % 64 == 0
+    usd_stage = Usd.Stage.Open(str(report.path))
+    file = shader(usd_stage, "Normal").GetInput("file").Get()
+    assert file.resolvedPath.endswith("ball.usdz[ball_textures/normal.png]")
+
+
+@every_suffix
+def test_the_report_says_what_was_written(suffix, tmp_path):
+    albedo = np.full((24, 24, 3), 2.0, dtype=np.float32)
+    told = []
+    maps = make_ball(diffuse_albedo=albedo)
+    report = write_asset(maps, tmp_path / f"a{suffix}", name="A", progress=lambda what, done: told.append((what, done)))
+    assert report.path == tmp_path / f"a{suffix}" and report.step == 1
+    assert report.clipped_pixels == {"diffuse_albedo": maps.mask.sum(), "normal": 0, "specular": 0, "roughness": 0}
+    assert all(p.is_file() for p in report.textures) and len(report.textures) == (0 if suffix == ".usdz" else 4)
+    fractions = [done for _, done in told]
+    assert told[0] == ("mesh", 0.0) and fractions == sorted(fractions) and fractions[-1] < 1
+
+
+@every_suffix
+def test_the_same_maps_give_the_same_bytes(ball, suffix, tmp_path):
+    for folder in ("one", "two"):
+        write_asset(ball, tmp_path / folder / f"ball{suffix}", name="Ball")
+    assert listing(tmp_path / "one") == listing(tmp_path / "two")
+
+
+@every_suffix
+def test_export_over_an_older_asset(ball, suffix, tmp_path):
+    write_asset(ball, tmp_path / f"ball{suffix}", name="Ball")
+    if suffix != ".usdz":
+        (tmp_path / "ball_textures" / "painted.png").write_bytes(b"by hand")
+    write_asset(SURFACES["diffuse only"], tmp_path / f"ball{suffix}", name="Ball")
+    usd_stage = Usd.Stage.Open(str(tmp_path / f"ball{suffix}"))
+    usd_stage.Reload()
+    assert shader(usd_stage, "Surface").GetInput("specularColor").Get() == (0, 0, 0)
+    if suffix != ".usdz":
+        kept = sorted(p.name for p in (tmp_path / "ball_textures").iterdir())
+        assert kept == ["diffuse_albedo.png", "normal.png", "painted.png"]  # what is not ours stays
+    assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")]
+
+
+@every_suffix
+@pytest.mark.parametrize("older", [False, True], ids=["nothing before", "older asset"])
+def test_full_disk_in_a_texture_leaves_no_trace(ball, suffix, older, tmp_path, monkeypatch):
+    target = tmp_path / f"ball{suffix}"
+    if older:
+        write_asset(SURFACES["diffuse only"], target, name="Ball")
+    before = listing(tmp_path)
+    written = textures.write_png
+
+    def fail(path, codes, *, srgb):
+        if path.name == "specular.png":  # the third of four
+            raise OSError(errno.ENOSPC, "No space left on device")
+        written(path, codes, srgb=srgb)
+
+    monkeypatch.setattr(textures, "write_png", fail)
+    with pytest.raises(StorageError, match="no space left on device") as raised:
+        write_asset(ball, target, name="Ball")
+    assert str(target) in str(raised.value)
+    assert listing(tmp_path) == before and all(not p.name.startswith(".") for p in tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("older", [False, True], ids=["nothing before", "older asset"])
+def test_failure_of_the_last_rename_brings_the_older_textures_back(ball, older, tmp_path, monkeypatch):
+    if older:
+        write_asset(SURFACES["diffuse only"], tmp_path / "ball.usda", name="Ball")
+    before = listing(tmp_path)
+
+    def fail(source, destination):
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(asset.os, "replace", fail)
+    with pytest.raises(StorageError, match="input/output error"):
+        write_asset(ball, tmp_path / "ball.usda", name="Ball")
+    assert listing(tmp_path) == before and all(not p.name.startswith(".") for p in tmp_path.iterdir())
+
+
+FILE_SIZE_LIMITED = """
+import resource, signal, sys
+from stage.errors import StorageError
+from stage.maps import SurfaceMaps
+from service.usd.asset import write_asset
+maps = SurfaceMaps.read(sys.argv[1])
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]), int(sys.argv[3])))
+try:
+    write_asset(maps, sys.argv[2], name="Ball")
+except StorageError as error:
+    sys.exit(f"refused: {error}")
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs a file size limit")
+@pytest.mark.parametrize("suffix, stops_in, spared", [(".usdc", "normal.png", 300), (".usda", "layer", 1),
+                                                      (".usdc", "layer", 1), (".usdz", "package", 1)])
+def test_a_disk_that_really_refuses(suffix, stops_in, spared, tmp_path):
+    """The operating system cuts the file off shortly before its end: writers that do not look would call that done."""
+    maps = tilted_ball()
+    maps.write(tmp_path / "maps.exr")
+    whole = write_asset(SurfaceMaps.read(tmp_path / "maps.exr"), tmp_path / f"whole{suffix}", name="Ball")
+    file = next((p for p in whole.textures if p.name == stops_in), whole.path)
+    limit = file.stat().st_size - spared
+    assert all(p.stat().st_size < limit for p in whole.textures if p != file and p.name < "normal.png")
+    target = tmp_path / "out" / f"whole{suffix}"
+    command = [sys.executable, "-c", FILE_SIZE_LIMITED, tmp_path / "maps.exr", target, str(limit)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[3])
+    assert done.returncode == 1 and f"refused: cannot write {target}: " in done.stderr, done.stderr
+    assert "pxr" not in done.stderr  # a sentence, not a place in the source of USD
+    assert (stops_in in done.stderr) == stops_in.endswith(".png")
+    assert list(target.parent.iterdir()) == []
+
+
+@pytest.mark.parametrize("suffix", [".usd", ".obj", ""])
+def test_unknown_suffix_names_the_known(ball, suffix, tmp_path):
+    with pytest.raises(AssetError, match=r"\.usda, \.usdc or \.usdz"):
+        write_asset(ball, tmp_path / f"ball{suffix}", name="Ball")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_maps_without_height_leave_nothing(ball, tmp_path):
+    with pytest.raises(AssetError, match="height"):
+        write_asset(dataclasses.replace(ball, height=None), tmp_path / "ball.usdz", name="Ball")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_maps_that_went_through_their_file_export_the_same_shape(ball, tmp_path):
+    ball.write(tmp_path / "maps.exr")
+    report = write_asset(SurfaceMaps.read(tmp_path / "maps.exr"), tmp_path / "sub" / "ball.usdc", name="Ball")
+    assert report.vertex_count == write_asset(ball, tmp_path / "direct.usdc", name="Ball").vertex_count
