@@ -72,5 +72,17 @@ def convert(pixels: np.ndarray, source: str, target: str) -> np.ndarray:
                                             colorconfig=CONFIG)
     if buffer.has_error:
         raise ValueError(f"cannot convert {source} to {target}: {buffer.geterror()}")
-    converted = buffer.get_pixels(oiio.FLOAT)
+    converted = pixels_of(buffer)
     return converted[..., :1] if grey else converted
+
+
+def pixels_of(buffer: oiio.ImageBuf) -> np.ndarray:
+    """The pixels of an OpenImageIO buffer, [rows, cols, channels] float32.
+
+    Raises:
+        ValueError: the buffer holds an error in place of pixels.
+    """
+    pixels = buffer.get_pixels(oiio.FLOAT)
+    if pixels is None:
+        raise ValueError(buffer.geterror())
+    return np.asarray(pixels)

@@ -66,9 +66,9 @@ class Correction:
         """
         manifest = self.capture.manifest
         recorded = _recorded(self.capture, frame.image)
-        saturated = None
+        saturated: np.ndarray | None = None
         if manifest.saturation is not None:
-            saturated = (recorded >= manifest.saturation).any(axis=-1)
+            saturated = np.any(recorded >= manifest.saturation, axis=-1)
         pixels = linearise(recorded, manifest.color_space)
         if self.dark is not None:
             pixels = pixels - self.dark

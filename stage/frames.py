@@ -1,7 +1,7 @@
 """Frames and coordinates: a_from_b transforms, pixel centres, and the lat-long sphere.
 
 Camera frame: right-handed, +x right, +y up, +z towards the viewer; the camera looks along -z. Image coordinates (u, v) are
-continuous from the top-left corner of the image, u right and v down, so the centre of pixel (row r, column c) is (c + 0.5, r + 0.5).
+continuous from the top-left corner of the image, u right and v down: the centre of pixel (row r, column c) is (c + 0.5, r + 0.5).
 """
 
 import math

@@ -62,12 +62,12 @@ def read_pixels(path: str | Path) -> np.ndarray:
         source = _open(path)
         try:
             # float of the recorded value: 8- and 16-bit integers are divided by 255 or 65535
-            pixels = source.read_image(0, 0, 0, source.spec().nchannels, oiio.FLOAT)
-            if pixels is None:
+            decoded = source.read_image(0, 0, 0, source.spec().nchannels, oiio.FLOAT)
+            if decoded is None:
                 raise ImageError(f"{path}: cannot be decoded: {_reason(source.geterror())}")
         finally:
             source.close()
-        pixels = pixels[..., : 1 if pixels.shape[-1] < 3 else 3]  # drop alpha
+        pixels = decoded[..., : 1 if decoded.shape[-1] < 3 else 3]  # drop alpha
     return np.repeat(pixels, 3, axis=-1) if pixels.shape[-1] == 1 else pixels
 
 

@@ -29,7 +29,7 @@ DECODE_BYTES = 1 << 30
 BYTES_PER_PIXEL = 40
 """Of one image while it is corrected: half and float RGB, masks and the planes to write."""
 TOP_EXPONENT = 15
-"""The brightest value of a light is stored in [2^14, 2^15): below half's largest, 65504, with 29 stops of normal values under it."""
+"""The brightest value of a light is stored in [2^14, 2^15): below half's largest, 65504, with 29 stops of normal values."""
 
 Progress = Callable[[int, int], None]
 """Called with (done, total)."""
@@ -129,11 +129,12 @@ def _build(capture: Capture, frames: list[Frame], folder: Path, key: str, progre
                 pool.shutdown(cancel_futures=True)
                 raise
     if saturated.any():
-        with replacing(stacks.saturated_path(folder, key)) as temporary, open(temporary, "wb") as file:
-            np.save(file, saturated)
-    index = {"frames": [frame.image for frame in frames], "scale": [float(s) for s in scale], "pixel_count": pixel_count}
+        with replacing(stacks.saturated_path(folder, key)) as temporary:
+            np.save(temporary, saturated)
+    names = tuple(frame.image for frame in frames)
+    index = {"frames": names, "scale": [float(s) for s in scale], "pixel_count": pixel_count}
     write_text(stacks.index_path(folder, key), json.dumps(index))
-    return Stack(folder, key, tuple(index["frames"]), scale, pixel_count)
+    return Stack(folder, key, names, scale, pixel_count)
 
 
 def _to_half(radiance: Radiance) -> tuple[np.ndarray, float]:
@@ -147,7 +148,7 @@ def _to_half(radiance: Radiance) -> tuple[np.ndarray, float]:
 
 def _write_all(descriptor: int, plane: np.ndarray, offset: int) -> None:
     """pwrite a whole plane; a full disk is an error here, where a write to a mapped file would kill the process."""
-    view = memoryview(plane).cast("B")
+    view = memoryview(plane.data).cast("B")
     while view:
         written = os.pwrite(descriptor, view, offset)
         view, offset = view[written:], offset + written

@@ -37,7 +37,8 @@ class Frame(Strict):
     def _check(self) -> Self:
         given = [name for name in ("light", "pattern", "laser", "tof") if getattr(self, name) is not None]
         if len(given) != 1:
-            raise ValueError(f"has {' and '.join(given) or 'nothing that lit it'}: give exactly one of light, pattern, laser, tof")
+            what = " and ".join(given) or "nothing that lit it"
+            raise ValueError(f"has {what}: give exactly one of light, pattern, laser, tof")
         return self
 
 

@@ -1,7 +1,7 @@
 """The weighted normal equations of b·l = reading, solved per pixel: shared by every Lambertian solver.
 
-With G = Σ w l lᵀ and r = Σ w y l, b = G⁻¹ r (Woodham 1980, equation 8, overdetermined); the normal is b/|b|. The standard error of
-the normal follows from the residual variance s² through cov(b) = s² G⁻¹, taken across the normal.
+With G = Σ w l lᵀ and r = Σ w y l, b = G⁻¹ r (Woodham 1980, equation 8, overdetermined); the normal is b/|b|. The standard error
+of the normal follows from the residual variance s² through cov(b) = s² G⁻¹, taken across the normal.
 """
 
 import warp as wp
@@ -28,12 +28,13 @@ class LambertFit:
 
 @wp.func
 def symmetric(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float) -> wp.mat33:
+    """The symmetric matrix with these entries."""
     return wp.mat33(xx, xy, xz, xy, yy, yz, xz, yz, zz)
 
 
 @wp.func
 def fit_pixel(g: wp.mat33, r: wp.vec3, squares: float, count: int) -> LambertFit:
-    # g, r: normal equations; squares: Σ w y²; count: readings that were used
+    """Solve one pixel: g, r are its normal equations, squares Σ w y², count the readings that were used."""
     fit = LambertFit()
     if count < 3:
         fit.status = wp.where(count == 0, DARK, TOO_FEW_LIGHTS)
@@ -56,6 +57,6 @@ def fit_pixel(g: wp.mat33, r: wp.vec3, squares: float, count: int) -> LambertFit
 
 @wp.func
 def confidence_of(across: float, residual: float, count: float) -> float:
-    # residual: Σ (y - b·l)² / |b|² over `count` readings; 1 / (1 + standard error of the normal / 1°)
+    """1 / (1 + standard error of the normal / 1°); residual is Σ (y - b·l)² / |b|² over `count` readings."""
     variance = (residual + PRIOR_RESIDUAL * PRIOR_RESIDUAL) / (wp.max(count - 3.0, 0.0) + 1.0)
     return 1.0 / (1.0 + wp.sqrt(across * variance) / CONFIDENCE_HALF)

@@ -1,9 +1,9 @@
-"""Photometric stereo that rejects shadows and highlights per pixel: middle brightness ranks of the lit lights, then Cauchy weights.
+"""Photometric stereo that rejects shadows and highlights per pixel: middle brightness ranks of the lit lights, Cauchy weights.
 
 Per pixel: a light whose reading is under a tenth of the bright end is in shadow; of the lit ones the darkest fifth (grazing,
-penumbra, interreflection) and the brightest three tenths (highlights) are set aside; the rest is solved by least squares, re-weighted
-against what still does not fit. On a Lambertian surface the middle ranks are exact; on real materials they are the part of
-the reflectance that is closest to it.
+penumbra, interreflection) and the brightest three tenths (highlights) are set aside; the rest is solved by least squares,
+re-weighted against what still does not fit. On a Lambertian surface the middle ranks are exact; on real materials they are
+the part of the reflectance that is closest to it.
 
 Source: position thresholding after Shi, Tan, Matsushita and Ikeuchi, "Bi-polynomial modeling of low-frequency reflectances",
 TPAMI 2014, section 5; Cauchy weights as in robust regression (Huber and Ronchetti, "Robust Statistics", 2009, chapter 7).

@@ -1,8 +1,8 @@
 """A lat-long environment → per-light RGB weights: the map is integrated over each light's cell of the sphere.
 
 The cell of a light is the part of the sphere nearer to it than to any other light (spherical Voronoi). Every texel, cut into
-samples half a degree apart, goes whole to its nearest light: no energy is lost, however small a sun, and nothing is resampled when
-the environment turns, because the lights are turned the other way instead.
+samples half a degree apart, goes whole to its nearest light: no energy is lost, however small a sun, and nothing is resampled
+when the environment turns, because the lights are turned the other way instead.
 
 Source: Debevec et al., SIGGRAPH 2000, section 3.3; the weight of a light of irradiance E is ∫ L dω over its cell, divided by E.
 """

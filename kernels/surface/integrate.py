@@ -11,7 +11,7 @@ from kernels.errors import ArrayError
 from kernels.surface.components import label_runs, place
 from kernels.surface.conjugate import Progress, Solver
 from kernels.surface.discontinuities import distrust_loops, reweigh
-from kernels.surface.grid import make_grid
+from kernels.surface.grid import Grid, make_grid
 from kernels.surface.slopes import Slopes, pair_slopes, usable_pixels
 
 
@@ -33,8 +33,6 @@ class IntegrationOptions:
     """They stop when the misfit changes by less than this fraction of itself."""
     inner_tolerance: float = 1.0e-4
     """Where each of those solves but the last stops."""
-    loop_scale: float = 0.1
-    permanent: bool = True
 
 
 class Integration(NamedTuple):
@@ -110,14 +108,11 @@ def integrate_normals(
 
 
 def _solve_breaking(
-    h: wp.array, base: Slopes, grid, options: IntegrationOptions, progress: Callable[[float], None] | None
+    h: wp.array, slopes: Slopes, grid: Grid, options: IntegrationOptions, progress: Callable[[float], None] | None
 ) -> Progress:
     """Solve, reweigh and solve again until the misfit settles; the last solve goes to the full tolerance."""
+    base = distrust_loops(slopes, grid=grid)
     right_weight, down_weight = wp.clone(base.right_weight), wp.clone(base.down_weight)
-    if options.loop_scale > 0:
-        distrust_loops(base, scale=options.loop_scale, grid=grid, right_weight=right_weight, down_weight=down_weight)
-        if options.permanent:
-            base=Slopes(base.right,base.down,wp.clone(right_weight),wp.clone(down_weight))
     solver = Solver(
         grid, Slopes(base.right, base.down, right_weight, down_weight), max_iterations=options.max_iterations
     )
@@ -151,7 +146,7 @@ def _solve_breaking(
     return done._replace(iterations=iterations, converged=done.converged and settled)
 
 
-def _check(normal, mask, x, y, *, perspective: bool, mean_z: float) -> None:
+def _check(normal, mask, x, y, *, perspective: bool, mean_z: float) -> None:  # noqa: ANN001
     if len(mask.shape) != 2:
         raise ArrayError(f"mask has shape {tuple(mask.shape)}: give [rows, cols]")
     if tuple(normal.shape) != (3, *mask.shape):

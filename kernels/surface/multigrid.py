@@ -183,23 +183,6 @@ def _prolong(
                 value[i] = value[i] + s / d
 
 
-@wp.func
-def _series(before: float, across: float, after: float):
-    g = wp.float32(0.0)
-    if across > 0.0:
-        r = 1.0 / across
-        if before > 0.0:
-            r += 0.5 / before
-        else:
-            r += 0.5 / across
-        if after > 0.0:
-            r += 0.5 / after
-        else:
-            r += 0.5 / across
-        g = wp.max(1.0 / r, 0.1*across)
-    return g
-
-
 @wp.kernel
 def _coarsen(
     first: int,
@@ -217,9 +200,8 @@ def _coarsen(
     c = p - r * cols
     i = (2 * r + 1) * pitch + 2 * c + 1
     k = (r + 1) * coarse_pitch + c + 1
-    j = i + pitch
-    coarse_wx[k] = _series(wx[i], wx[i + 1], wx[i + 2]) + _series(wx[j], wx[j + 1], wx[j + 2])
-    coarse_wy[k] = _series(wy[i], wy[j], wy[j + pitch]) + _series(wy[i + 1], wy[j + 1], wy[j + pitch + 1])
+    coarse_wx[k] = 0.5 * (wx[i + 1] + wx[i + 1 + pitch])
+    coarse_wy[k] = 0.5 * (wy[i + pitch] + wy[i + pitch + 1])
 
 
 class Multigrid:

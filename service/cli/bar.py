@@ -2,7 +2,11 @@
 
 import sys
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self
+
+if TYPE_CHECKING:
+    from rich.progress import Progress as RichProgress
+    from rich.progress import TaskID
 
 
 class Bar:
@@ -10,14 +14,14 @@ class Bar:
 
     def __init__(self) -> None:
         """Nothing is drawn before the first stage, and nothing at all when standard error is not a terminal."""
-        self._task: int | None = None
-        self._bar = None
+        self._task: TaskID | None = None
+        self._bar: RichProgress | None = None
         if sys.stderr.isatty():
+            from rich import progress
             from rich.console import Console
-            from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
-            from rich.progress import Progress as RichProgress
 
-            self._bar = RichProgress(TextColumn("{task.description:<9}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
+            text, part, elapsed = progress.TextColumn, progress.MofNCompleteColumn, progress.TimeElapsedColumn
+            self._bar = progress.Progress(text("{task.description:<9}"), progress.BarColumn(), part(), elapsed(),
                                      console=Console(stderr=True))
 
     def __enter__(self) -> Self:

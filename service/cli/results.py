@@ -19,8 +19,8 @@ def register(app: typer.Typer) -> None:
 def solve(
     capture: CaptureArgument,
     out: Annotated[Path, typer.Option("--out", help="Folder for maps.exr and report.json.", show_default=False)],
-    method: Annotated[Method, typer.Option("--method", help="lambert: least squares on every light; robust: shadows and highlights "
-                                                            "rejected per pixel.")] = Method.ROBUST,
+    method: Annotated[Method, typer.Option(
+        "--method", help="lambert: least squares on every light; robust: without shadows and highlights.")] = Method.ROBUST,
     device: DeviceOption = None,
     cache: CacheOption = None,
 ) -> None:
@@ -41,8 +41,8 @@ def relight(
     environment: Annotated[Path, typer.Option("--environment", help="Lat-long .exr or .hdr.", show_default=False)],
     out: Annotated[str, typer.Option("--out", help="Path of the frames, #### for the number.", show_default=False)],
     frames: Annotated[str, typer.Option("--frames", help="A number, or first-last.")] = "1",
-    spin_degrees: Annotated[float, typer.Option("--spin-degrees", help="Turn of the environment about +y over the whole range, from +z "
-                                                                       "towards +x; the first frame is unturned.")] = 0.0,
+    spin_degrees: Annotated[float, typer.Option(
+        "--spin-degrees", help="Turn of the environment about +y over the range, from +z towards +x; frame one is unturned.")] = 0.0,
     device: DeviceOption = None,
     cache: CacheOption = None,
 ) -> None:
@@ -64,7 +64,8 @@ def relight(
 def export(
     maps: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with maps.exr.", show_default=False)],
     out: Annotated[Path, typer.Option("--out", help="The asset: .usdz, .usda or .usdc.", show_default=False)],
-    name: Annotated[str | None, typer.Option("--name", help="Of the asset; without it the capture's.", show_default=False)] = None,
+    name: Annotated[str | None, typer.Option("--name", help="Of the asset; without it the capture's.",
+                                             show_default=False)] = None,
 ) -> None:
     """A USD asset with the estimated material."""
     from service.cli.bar import Bar

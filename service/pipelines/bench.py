@@ -56,14 +56,15 @@ def bench(device: str | None, repeats: int, progress: Progress | None = None) ->
     rows = []
 
     def row(what: str, ours: float, peer: str, theirs: float, count: int = pixels) -> None:
-        rows.append(f"| {what} | {1e3 * ours:.2f} | {count / ours / 1e6:.1f} | {peer} | {1e3 * theirs:.2f} | {theirs / ours:.2f} |")
+        rate = count / ours / 1e6
+        rows.append(f"| {what} | {1e3 * ours:.2f} | {rate:.1f} | {peer} | {1e3 * theirs:.2f} | {theirs / ours:.2f} |")
         timings.advance(len(rows))
 
     # one channel, as the target says: a single plane of the stack as a band of its own
     one = packs.upload(np.ascontiguousarray(np.broadcast_to(stack[:1], (1, LIGHTS, pixels))), device=name)
     single = _one_channel(one, weights[0, :1], name)
     row("relight, one frame, one channel", timed(single), "NumPy float32 BLAS", timed(lambda: weights[0, 0] @ dense[0]))
-    row("relight, one frame, RGB", timed(lambda: combine(band, weights[0])), "copy of the stack on the device", timed(_copy(band)))
+    row("relight, one frame, RGB", timed(lambda: combine(band, weights[0])), "copy of the stack", timed(_copy(band)))
     row(f"relight, {FRAMES} frames, RGB", timed(lambda: combine_batch(band, weights)), "NumPy float32 BLAS",
         timed(lambda: [weights[:, c] @ dense[c] for c in range(3)]), pixels * FRAMES)
     grey = np.tensordot(np.array(GREY_WEIGHTS, dtype=np.float32), dense, axes=1)

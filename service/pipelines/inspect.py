@@ -58,7 +58,8 @@ def inspect(path: Path, progress: Progress | None = None) -> Inspection:
     if levels:
         facts.append(("brightest", f"{max(level.peak for level in levels):.4g} recorded"))
     if capture.manifest.saturation is not None:
-        facts.append(("saturated", f"{sum(level.saturated for level in levels)} readings at or above {capture.manifest.saturation:g}"))
+        count = sum(level.saturated for level in levels)
+        facts.append(("saturated", f"{count} readings at or above {capture.manifest.saturation:g}"))
     try:
         mask = capture.mask()
         facts.append(("mask", f"{int(mask.sum())} of {mask.size} pixels"))

@@ -7,7 +7,7 @@ import numpy as np
 import OpenImageIO as oiio
 
 from stage import exr
-from stage.colour import CONFIG, convert
+from stage.colour import CONFIG, convert, pixels_of
 from stage.errors import StorageError
 from stage.files import replacing
 from stage.maps import SurfaceMaps
@@ -69,7 +69,7 @@ def _display(pixels: np.ndarray, space: str) -> np.ndarray:
     shown = oiio.ImageBufAlgo.ociodisplay(source, DISPLAY, VIEW, space, colorconfig=CONFIG)
     if shown.has_error:
         raise ValueError(f"cannot show {space}: {shown.geterror()}")
-    return np.maximum(shown.get_pixels(oiio.FLOAT), BACKGROUND * (pixels.max(axis=-1, keepdims=True) <= 0))
+    return np.maximum(pixels_of(shown), BACKGROUND * (pixels.max(axis=-1, keepdims=True) <= 0))
 
 
 def _relief(height: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -86,7 +86,7 @@ def _fit(image: np.ndarray) -> np.ndarray:
         return image
     width = max(1, round(cols * TILE / rows))
     source = oiio.ImageBuf(np.ascontiguousarray(image, dtype=np.float32))
-    return oiio.ImageBufAlgo.resize(source, roi=oiio.ROI(0, width, 0, TILE, 0, 1, 0, 3)).get_pixels(oiio.FLOAT)
+    return pixels_of(oiio.ImageBufAlgo.resize(source, roi=oiio.ROI(0, width, 0, TILE, 0, 1, 0, 3)))
 
 
 def _sheet(rows: list[list[tuple[str, np.ndarray]]]) -> oiio.ImageBuf:

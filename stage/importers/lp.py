@@ -1,11 +1,12 @@
 """RTI `.lp` files: a count, then one line an image: its name and the light direction x y z.
 
-The convention of RTIBuilder and the viewers that followed it: x right, y up, z towards the camera; the vector points to the light.
+The convention of RTIBuilder and its viewers: x right, y up, z towards the camera; the vector points to the light.
 Images of a camera are display-encoded, those of a linear workflow are not, and the file does not say which: 8-bit images
 are taken as sRGB and others as scene-linear, and the manifest says so.
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
@@ -70,7 +71,7 @@ def _find(source: Path) -> Path:
     return found[0]
 
 
-def _frame(path: Path, folder: Path, number: int, row: str) -> dict[str, object]:
+def _frame(path: Path, folder: Path, number: int, row: str) -> dict[str, Any]:
     parts = row.rsplit(maxsplit=3)  # a name may hold spaces
     try:
         direction = [float(part) for part in parts[1:]]

@@ -1,0 +1,52 @@
+# relit: `make demo` and `make test` from a clean clone need Python 3.11 or newer (with its venv module) and make.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+
+.PHONY: demo test lint bench figures samples lock clean
+demo: $(VENV)/installed
+	$(BIN)/relit demo
+
+test: $(VENV)/installed-dev
+	$(BIN)/python -m pytest -q
+
+lint: $(VENV)/installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+bench: $(VENV)/installed
+	$(BIN)/relit bench
+
+# the tables of docs/figures.md
+figures: $(VENV)/installed-dev
+	$(BIN)/python -m benchmarks.figures
+
+# render the sample captures again (tens of minutes; Mitsuba is installed for it)
+samples: $(VENV)/installed-dev
+	$(BIN)/python -m pip install --quiet -e '.[samples]'
+	$(BIN)/python samples/make_owl.py
+	$(BIN)/python samples/make_lambert.py
+
+# the lock records versions and hashes, and no download address
+lock:
+	uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-annotate \
+	  --custom-compile-command "make lock" --extra build pyproject.toml -o requirements.lock
+	uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-annotate \
+	  --custom-compile-command "make lock" --extra build --extra dev pyproject.toml -o requirements-dev.lock
+
+clean:
+	rm -rf $(VENV) relit-demo
+
+$(VENV)/bin/python:
+	$(PYTHON) -c 'import sys; sys.exit("relit needs Python 3.11 or newer: make PYTHON=python3.11 ...") if sys.version_info < (3, 11) else None'
+	$(PYTHON) -m venv $(VENV) || (rm -rf $(VENV); echo "the venv module is missing: on Debian, apt-get install python3-venv"; exit 1)
+
+$(VENV)/installed: requirements.lock pyproject.toml | $(VENV)/bin/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	touch $@
+
+$(VENV)/installed-dev: requirements-dev.lock pyproject.toml | $(VENV)/bin/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements-dev.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	touch $@ $(VENV)/installed
