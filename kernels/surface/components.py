@@ -80,11 +80,11 @@ def _join(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
 @wp.kernel
 def _sum_runs(
     first: int,
-    value: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    start: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-    length: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
+    value: wp.array(dtype=wp.float32),
+    start: wp.array(dtype=wp.int32),
+    length: wp.array(dtype=wp.int32),
     # outputs
-    total: wp.array(dtype=wp.float64),  # type: ignore[valid-type]
+    total: wp.array(dtype=wp.float64),
 ):
     m = first + wp.tid()
     s = wp.float64(0.0)
@@ -96,13 +96,13 @@ def _sum_runs(
 @wp.kernel
 def _sum_depths(
     first: int,
-    value: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    start: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-    length: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-    mean: wp.array(dtype=wp.float64),  # type: ignore[valid-type]
+    value: wp.array(dtype=wp.float32),
+    start: wp.array(dtype=wp.int32),
+    length: wp.array(dtype=wp.int32),
+    mean: wp.array(dtype=wp.float64),
     spacing: wp.float64,
     # outputs
-    total: wp.array(dtype=wp.float64),  # type: ignore[valid-type]
+    total: wp.array(dtype=wp.float64),
 ):
     m = first + wp.tid()
     s = wp.float64(0.0)
@@ -114,16 +114,16 @@ def _sum_depths(
 @wp.kernel
 def _write_heights(
     first: int,
-    value: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    start: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-    length: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-    row: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-    col: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-    mean: wp.array(dtype=wp.float64),  # type: ignore[valid-type]
+    value: wp.array(dtype=wp.float32),
+    start: wp.array(dtype=wp.int32),
+    length: wp.array(dtype=wp.int32),
+    row: wp.array(dtype=wp.int32),
+    col: wp.array(dtype=wp.int32),
+    mean: wp.array(dtype=wp.float64),
     spacing: wp.float64,
     mean_z: wp.float64,
     # outputs
-    height: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
+    height: wp.array2d(dtype=wp.float32),
 ):
     m = first + wp.tid()
     for k in range(length[m]):
@@ -133,16 +133,16 @@ def _write_heights(
 @wp.kernel
 def _write_depths(
     first: int,
-    value: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    start: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-    length: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-    row: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-    col: wp.array(dtype=wp.int32),  # type: ignore[valid-type]
-    mean: wp.array(dtype=wp.float64),  # type: ignore[valid-type]
+    value: wp.array(dtype=wp.float32),
+    start: wp.array(dtype=wp.int32),
+    length: wp.array(dtype=wp.int32),
+    row: wp.array(dtype=wp.int32),
+    col: wp.array(dtype=wp.int32),
+    mean: wp.array(dtype=wp.float64),
     spacing: wp.float64,
-    scale: wp.array(dtype=wp.float64),  # type: ignore[valid-type]
+    scale: wp.array(dtype=wp.float64),
     # outputs
-    height: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
+    height: wp.array2d(dtype=wp.float32),
 ):
     m = first + wp.tid()
     for k in range(length[m]):

@@ -1,7 +1,7 @@
 """Conjugate gradients for the heights: minimise Σ w (h_j − h_i − g)² over the edges of a grid.
 
-The scalars of the iteration stay on the device, one slot per iteration, so that a launch never waits for a sum; the host
-reads them only to decide whether to stop.
+The scalars of the iteration stay on the device, one slot per iteration, so that a launch never waits for a sum; the
+host reads them only to decide whether to stop.
 
 Float32 holds up because every product with the matrix is a sum of differences of neighbours (each exact to its own
 size), the sums of a picture run in float64, and the residual is carried along rather than recomputed: rounding of the
@@ -37,14 +37,14 @@ class Progress(NamedTuple):
 def _descent(
     first: int,
     walk: Walk,
-    gx: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    gy: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    wx: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    wy: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    h: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    gx: wp.array(dtype=wp.float32),
+    gy: wp.array(dtype=wp.float32),
+    wx: wp.array(dtype=wp.float32),
+    wy: wp.array(dtype=wp.float32),
+    h: wp.array(dtype=wp.float32),
     pitch: int,
     # outputs
-    residual: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    residual: wp.array(dtype=wp.float32),
 ):
     """Minus half the gradient of the least squares at h."""
     t = first + wp.tid()
@@ -60,13 +60,13 @@ def _descent(
 def _multiply(
     first: int,
     walk: Walk,
-    wx: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    wy: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    p: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    wx: wp.array(dtype=wp.float32),
+    wy: wp.array(dtype=wp.float32),
+    p: wp.array(dtype=wp.float32),
     pitch: int,
     # outputs
-    q: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    partial: wp.array(dtype=wp.float64),  # type: ignore[valid-type]
+    q: wp.array(dtype=wp.float32),
+    partial: wp.array(dtype=wp.float64),
 ):
     """q = A·p, and each thread's part of p·q."""
     t = first + wp.tid()
@@ -86,10 +86,10 @@ def _multiply(
 def _dot(
     first: int,
     walk: Walk,
-    a: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    b: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    a: wp.array(dtype=wp.float32),
+    b: wp.array(dtype=wp.float32),
     # outputs
-    partial: wp.array(dtype=wp.float64),  # type: ignore[valid-type]
+    partial: wp.array(dtype=wp.float64),
 ):
     t = first + wp.tid()
     total = wp.float64(0.0)
@@ -101,7 +101,7 @@ def _dot(
 
 
 @wp.func
-def _ratio(over: wp.array(dtype=wp.float64), i: int, under: wp.array(dtype=wp.float64), j: int):  # type: ignore[valid-type]
+def _ratio(over: wp.array(dtype=wp.float64), i: int, under: wp.array(dtype=wp.float64), j: int):
     """over[i] / under[j], and 0 once the iteration has nothing left to do."""
     q = wp.float32(0.0)
     if under[j] > wp.float64(0.0):
@@ -113,14 +113,14 @@ def _ratio(over: wp.array(dtype=wp.float64), i: int, under: wp.array(dtype=wp.fl
 def _advance(
     first: int,
     walk: Walk,
-    rz: wp.array(dtype=wp.float64),  # type: ignore[valid-type]
-    pq: wp.array(dtype=wp.float64),  # type: ignore[valid-type]
+    rz: wp.array(dtype=wp.float64),
+    pq: wp.array(dtype=wp.float64),
     step: int,
-    p: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    q: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    p: wp.array(dtype=wp.float32),
+    q: wp.array(dtype=wp.float32),
     # outputs
-    h: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    residual: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    h: wp.array(dtype=wp.float32),
+    residual: wp.array(dtype=wp.float32),
 ):
     t = first + wp.tid()
     alpha = _ratio(rz, step, pq, step)
@@ -135,11 +135,11 @@ def _advance(
 def _turn(
     first: int,
     walk: Walk,
-    rz: wp.array(dtype=wp.float64),  # type: ignore[valid-type]
+    rz: wp.array(dtype=wp.float64),
     step: int,
-    z: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    z: wp.array(dtype=wp.float32),
     # outputs
-    p: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    p: wp.array(dtype=wp.float32),
 ):
     """The next direction of search."""
     t = first + wp.tid()

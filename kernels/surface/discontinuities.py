@@ -1,21 +1,22 @@
 """Edge weights that let a surface break, in two steps.
 
-First, where the normals contradict themselves. Around four pixels the slopes of a surface add up to nothing. Where they do
-not, by more than noise explains, a break passes between the pixels; an edge that *crosses* a break has such loops on both
-sides of it, an edge that runs along one has them on one side only. So an edge keeps its weight by the better of its two
-loops. This needs no heights and no iteration, and finds a tear up to its tip.
+First, where the normals contradict themselves. Around four pixels the slopes of a surface add up to nothing. Where
+they do not, by more than noise explains, a break passes between the pixels; an edge that *crosses* a break has such
+loops on both sides of it, an edge that runs along one has them on one side only. So an edge keeps its weight by the
+better of its two loops. This needs no heights and no iteration, and finds a tear up to its tip.
 
-Second, where the heights contradict the normals: a break whose two sides have equal slopes leaves no trace in the loops.
-This is bilateral normal integration: a surface is taken to be continuous on one side of every pixel at least, along rows
-and along columns; each pixel shares its trust between its two edges by how badly the present heights fit them, the worse
-edge loses, and an edge that both of its pixels distrust carries nothing. Solve, reweigh, solve again.
+Second, where the heights contradict the normals: a break whose two sides have equal slopes leaves no trace in the
+loops. This is bilateral normal integration: a surface is taken to be continuous on one side of every pixel at least,
+along rows and along columns; each pixel shares its trust between its two edges by how badly the present heights fit
+them, the worse edge loses, and an edge that both of its pixels distrust carries nothing. Solve, reweigh, solve again.
+It moves a pixel or so a round, and where normals are noisy it can settle on a wrong break.
 
 What normals cannot tell stays unknown: a part that is broken off all around keeps its shape and floats in depth.
 
 Sources: the second step is Cao, Santo, Shi, Okura & Matsushita, "Bilateral Normal Integration", ECCV 2022, eq. 15–18,
-with the residual of an edge for its misfit where the paper has the height difference: a steep but continuous slope then
-takes no side. The first is ours; alone, on a torn sheet, it leaves a hundredth of the error that forty rounds of the
-second leave (tests/kernels/surface/test_discontinuities.py).
+with the residual of an edge for its misfit where the paper has the height difference: a steep but continuous slope
+then takes no side. The first is ours; alone, on a torn sheet, it leaves a hundredth of the error that forty rounds of
+the second leave (tests/kernels/surface/test_discontinuities.py).
 """
 
 import numpy as np
@@ -43,10 +44,10 @@ _TRUST = wp.constant(wp.float32(LEAST_TRUST))
 
 @wp.func
 def _loop_sum(
-    gx: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    gy: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    wx: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    wy: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    gx: wp.array(dtype=wp.float32),
+    gy: wp.array(dtype=wp.float32),
+    wx: wp.array(dtype=wp.float32),
+    wy: wp.array(dtype=wp.float32),
     i: int,
     pitch: int,
 ):
@@ -62,15 +63,15 @@ def _loop_sum(
 @wp.kernel
 def _sample_loops(
     first: int,
-    gx: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    gy: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    wx: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    wy: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    gx: wp.array(dtype=wp.float32),
+    gy: wp.array(dtype=wp.float32),
+    wx: wp.array(dtype=wp.float32),
+    wy: wp.array(dtype=wp.float32),
     start: int,
     stride: int,
     pitch: int,
     # outputs
-    loop: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    loop: wp.array(dtype=wp.float32),
 ):
     t = first + wp.tid()
     loop[t] = _loop_sum(gx, gy, wx, wy, start + t * stride, pitch)
@@ -90,15 +91,15 @@ def _loop_trust(one: float, other: float, scale: float):
 def _distrust_loops(
     first: int,
     walk: Walk,
-    gx: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    gy: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    wx: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    wy: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    gx: wp.array(dtype=wp.float32),
+    gy: wp.array(dtype=wp.float32),
+    wx: wp.array(dtype=wp.float32),
+    wy: wp.array(dtype=wp.float32),
     scale: float,
     pitch: int,
     # outputs
-    right_weight: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    down_weight: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    right_weight: wp.array(dtype=wp.float32),
+    down_weight: wp.array(dtype=wp.float32),
 ):
     t = first + wp.tid()
     for k in range(walk.steps):
@@ -133,9 +134,9 @@ def distrust_loops(slopes: Slopes, *, grid: Grid) -> Slopes:
 
 @wp.func
 def _misfit(
-    g: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    w: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    h: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    g: wp.array(dtype=wp.float32),
+    w: wp.array(dtype=wp.float32),
+    h: wp.array(dtype=wp.float32),
     i: int,
     step: int,
 ):
@@ -157,17 +158,17 @@ def _share(sharpness: float, here: float, other: float):
 def _reweigh(
     first: int,
     walk: Walk,
-    gx: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    gy: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    base_x: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    base_y: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    h: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    gx: wp.array(dtype=wp.float32),
+    gy: wp.array(dtype=wp.float32),
+    base_x: wp.array(dtype=wp.float32),
+    base_y: wp.array(dtype=wp.float32),
+    h: wp.array(dtype=wp.float32),
     sharpness: float,
     pitch: int,
     # outputs
-    wx: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    wy: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    partial: wp.array(dtype=wp.float64),  # type: ignore[valid-type]
+    wx: wp.array(dtype=wp.float32),
+    wy: wp.array(dtype=wp.float32),
+    partial: wp.array(dtype=wp.float64),
 ):
     """New weights, and each thread's part of the misfit under them."""
     t = first + wp.tid()
@@ -197,11 +198,11 @@ def reweigh(
     sharpness: float,
     grid: Grid,
     summer: Summer,
-    right_weight: wp.array,  # outputs, [size] float32
-    down_weight: wp.array,
+    working: Slopes,  # its weights are the output
     total: wp.array,  # [1] float64, the misfit under the new weights
 ) -> None:
     """Write the weights for the next solve from the misfit of the present heights. Nothing is read back."""
     inputs = [*base, h, sharpness, grid.pitch]
-    run(_reweigh, grid.sums, inputs, [right_weight, down_weight, summer.partial], device=grid.device)
+    outputs = [working.right_weight, working.down_weight, summer.partial]
+    run(_reweigh, grid.sums, inputs, outputs, device=grid.device)
     summer.finish(total, 0)

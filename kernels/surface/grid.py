@@ -1,8 +1,9 @@
 """How a picture lies in memory for the height solver, how a launch walks over it, and how it is summed.
 
-A grid of rows × cols pixels is stored flat with a ring of spare cells, `pitch` cells a row, so that the four neighbours
-of any pixel exist and lie at i ± 1 and i ± pitch. The pitch is odd, so that the parity of i is the colour of pixel i on a
-chessboard. Spare cells belong to no edge (their weights stay 0), which makes every kernel free of border cases.
+A grid of rows × cols pixels is stored flat with a ring of spare cells, `pitch` cells a row, so that the four
+neighbours of any pixel exist and lie at i ± 1 and i ± pitch. The pitch is odd, so that the parity of i is the colour
+of pixel i on a chessboard. Spare cells belong to no edge (their weights stay 0), which makes every kernel free of
+border cases.
 """
 
 import math
@@ -109,12 +110,12 @@ def cell_of(walk: Walk, t: int, k: int):
 @wp.kernel
 def _fold(
     first: int,
-    partial: wp.array(dtype=wp.float64),  # type: ignore[valid-type]
+    partial: wp.array(dtype=wp.float64),
     count: int,
     stride: int,
     slot: int,
     # outputs
-    total: wp.array(dtype=wp.float64),  # type: ignore[valid-type]
+    total: wp.array(dtype=wp.float64),
 ):
     t = first + wp.tid()
     s = wp.float64(0.0)

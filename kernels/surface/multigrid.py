@@ -2,15 +2,16 @@
 
 Levels halve by 2×2 cells. Two things keep the number of iterations independent of the size of the picture:
 
-- Carrying a cell's value unchanged to its four pixels makes the coarse problem twice too stiff in two dimensions, so an
-  edge between two cells has the mean, not the sum, of the two edges that cross (Braess 1995 corrects by a factor instead).
-- A correction reaches a pixel as the weighted mean of the cells of its four neighbours (one Jacobi step on the carried
-  values): (2a + b + c)/4 on a plain grid, exact on planes, and never drawn across a missing or weak edge (Kwak 1999,
-  with the weights of the operator).
+- Carrying a cell's value unchanged to its four pixels makes the coarse problem twice too stiff in two dimensions, so
+  an edge between two cells has the mean, not the sum, of the two edges that cross (Braess 1995 corrects by a factor
+  instead).
+- A correction reaches a pixel as the weighted mean of the cells of its four neighbours (one Jacobi step on the
+  carried values): (2a + b + c)/4 on a plain grid, exact on planes, and never drawn across a missing or weak edge
+  (Kwak 1999, with the weights of the operator).
 
-Smoothing is red-black Gauss-Seidel, red first on the way down and last on the way up. The restriction is the transpose
-of the prolongation, so the cycle is symmetric and positive definite whatever the coarse weights are, as conjugate
-gradients need. A pixel without edges gets 0.
+Smoothing is red-black Gauss-Seidel, red first on the way down and last on the way up. The restriction is the
+transpose of the prolongation, so the cycle is symmetric and positive definite whatever the coarse weights are, as
+conjugate gradients need. A pixel without edges gets 0.
 """
 
 from typing import NamedTuple
@@ -41,9 +42,9 @@ class Level(NamedTuple):
 
 @wp.func
 def edge_sum(
-    value: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    wx: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    wy: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    value: wp.array(dtype=wp.float32),
+    wx: wp.array(dtype=wp.float32),
+    wy: wp.array(dtype=wp.float32),
     i: int,
     pitch: int,
 ):
@@ -60,12 +61,12 @@ def edge_sum(
 def _smooth_from_zero(
     first: int,
     walk: Walk,
-    wx: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    wy: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    target: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    wx: wp.array(dtype=wp.float32),
+    wy: wp.array(dtype=wp.float32),
+    target: wp.array(dtype=wp.float32),
     pitch: int,
     # outputs
-    value: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    value: wp.array(dtype=wp.float32),
 ):
     t = first + wp.tid()
     for k in range(walk.steps):
@@ -82,12 +83,12 @@ def _smooth_from_zero(
 def _smooth(
     first: int,
     walk: Walk,
-    wx: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    wy: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    target: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    wx: wp.array(dtype=wp.float32),
+    wy: wp.array(dtype=wp.float32),
+    target: wp.array(dtype=wp.float32),
     pitch: int,
     # outputs
-    value: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    value: wp.array(dtype=wp.float32),
 ):
     t = first + wp.tid()
     for k in range(walk.steps):
@@ -104,13 +105,13 @@ def _smooth(
 def _scaled_residual(
     first: int,
     walk: Walk,
-    wx: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    wy: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    target: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    value: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    wx: wp.array(dtype=wp.float32),
+    wy: wp.array(dtype=wp.float32),
+    target: wp.array(dtype=wp.float32),
+    value: wp.array(dtype=wp.float32),
     pitch: int,
     # outputs
-    scaled: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    scaled: wp.array(dtype=wp.float32),
 ):
     """Residual over diagonal."""
     t = first + wp.tid()
@@ -127,14 +128,14 @@ def _scaled_residual(
 @wp.kernel
 def _restrict(
     first: int,
-    wx: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    wy: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    scaled: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    wx: wp.array(dtype=wp.float32),
+    wy: wp.array(dtype=wp.float32),
+    scaled: wp.array(dtype=wp.float32),
     pitch: int,
     cols: int,
     coarse_pitch: int,
     # outputs
-    target: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    target: wp.array(dtype=wp.float32),
 ):
     """The transpose of _prolong: a red pixel's residual goes to the cells of its neighbours. Black residuals are 0."""
     p = first + wp.tid()
@@ -153,13 +154,13 @@ def _restrict(
 def _prolong(
     first: int,
     walk: Walk,
-    wx: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    wy: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    coarse: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    wx: wp.array(dtype=wp.float32),
+    wy: wp.array(dtype=wp.float32),
+    coarse: wp.array(dtype=wp.float32),
     pitch: int,
     coarse_pitch: int,
     # outputs
-    value: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    value: wp.array(dtype=wp.float32),
 ):
     """Add the coarse correction at one colour; smoothing the other colour next replaces what it would get."""
     t = first + wp.tid()
@@ -186,14 +187,14 @@ def _prolong(
 @wp.kernel
 def _coarsen(
     first: int,
-    wx: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    wy: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    wx: wp.array(dtype=wp.float32),
+    wy: wp.array(dtype=wp.float32),
     pitch: int,
     cols: int,
     coarse_pitch: int,
     # outputs
-    coarse_wx: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-    coarse_wy: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+    coarse_wx: wp.array(dtype=wp.float32),
+    coarse_wy: wp.array(dtype=wp.float32),
 ):
     p = first + wp.tid()
     r = p // cols

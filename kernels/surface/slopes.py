@@ -1,28 +1,28 @@
 """Normals to the slope between each pixel and its right and lower neighbour, and how far that slope can be trusted.
 
-The chord between the surface points of two neighbours i, j is taken perpendicular to m = n_i + n_j: exact on a sphere,
-second order elsewhere. With r = (x, y, -1) along the line of sight and Δ = r_j − r_i:
+The chord between the surface points of two neighbours i, j is taken perpendicular to m = n_i + n_j: exact on a
+sphere, second order elsewhere. With r = (x, y, -1) along the line of sight and Δ = r_j − r_i:
 
     orthographic   z_j − z_i         = −Δ·m / m_z
     perspective    log d_j − log d_i = −log(1 + Δ·m / r_i·m)                  (p = d·r)
 
-The weight is the squared cosine between the mean normal and the line of sight, (m_z/2)² or (r_i·m/2)(r_j·m/2): what is
-made small is then the distance of each neighbour from the tangent plane, (m/2)·(p_j − p_i), in units of the pixel's
-footprint. Its product with the slope is polynomial in the normals, so noise of the normals averages out. The inverse
-variance of the slope, (m_z⁴/(m_x² + m_z²)), was tried and is worse: a pair that noise made steeper weighs less, which
-flattens everything into a bowl (3 to 6 times the error on a hemisphere with 0.05 to 0.15 rad of noise), and it makes the
-problem anisotropic at a rim, where multigrid takes 60 iterations in place of 7. Across a crease m is short and so is the
-weight. s, the distance between pixels in the plane of x and y, is the unit of the unknown heights, so that both
-projections give numbers of the order of pixels.
+The weight is the squared cosine between the mean normal and the line of sight, (m_z/2)² or (r_i·m/2)(r_j·m/2): what
+is made small is then the distance of each neighbour from the tangent plane, (m/2)·(p_j − p_i), in units of the
+pixel's footprint. Its product with the slope is polynomial in the normals, so noise of the normals averages out. The
+inverse variance of the slope, (m_z⁴/(m_x² + m_z²)), was tried and is worse: a pair that noise made steeper weighs
+less, which flattens everything into a bowl (3 to 6 times the error on a hemisphere with 0.05 to 0.15 rad of noise),
+and it makes the problem anisotropic at a rim, where multigrid takes 60 iterations in place of 7. Across a crease m is
+short and so is the weight. s, the distance between pixels in the plane of x and y, is the unit of the unknown
+heights, so that both projections give numbers of the order of pixels.
 
-A pair steeper than STEEPEST (or facing away, which no visible surface does) keeps the slope of STEEPEST at the smallest
-weight: dropping it would cut stray pixels off and send them to the mean height as spikes.
+A pair steeper than STEEPEST (or facing away, which no visible surface does) keeps the slope of STEEPEST at the
+smallest weight: dropping it would cut stray pixels off and send them to the mean height as spikes.
 
 Sources: Quéau, Durou & Aujol, "Normal Integration: A Survey", 2018, for log-depth under perspective; Cao et al., ECCV
 2022, eq. 9–11, for residuals weighted by the cosine.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import warp as wp
 
@@ -52,12 +52,12 @@ class Slopes(NamedTuple):
 @wp.kernel
 def _mark_usable(
     first: int,
-    normal: wp.array3d(dtype=wp.float32),  # type: ignore[valid-type]  # [3, rows, cols]
-    mask: wp.array2d(dtype=wp.uint8),  # type: ignore[valid-type]
-    x: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
-    y: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
+    normal: wp.array3d(dtype=wp.float32),  # [3, rows, cols]
+    mask: wp.array2d(dtype=wp.uint8),
+    x: wp.array2d(dtype=wp.float32),
+    y: wp.array2d(dtype=wp.float32),
     # outputs
-    usable: wp.array2d(dtype=wp.uint8),  # type: ignore[valid-type]
+    usable: wp.array2d(dtype=wp.uint8),
 ):
     p = first + wp.tid()
     r = p // mask.shape[1]
@@ -108,24 +108,24 @@ def perspective_slope(m: wp.vec3, ri: wp.vec3, rj: wp.vec3, spacing: float):
 
 
 @wp.func
-def _normal_at(normal: wp.array3d(dtype=wp.float32), r: int, c: int):  # type: ignore[valid-type]
+def _normal_at(normal: wp.array3d(dtype=wp.float32), r: int, c: int):
     return wp.normalize(wp.vec3(normal[0, r, c], normal[1, r, c], normal[2, r, c]))
 
 
 def _make_kernel(pair, name: str):
     def edges(
         first: int,
-        normal: wp.array3d(dtype=wp.float32),  # type: ignore[valid-type]
-        usable: wp.array2d(dtype=wp.uint8),  # type: ignore[valid-type]
-        x: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
-        y: wp.array2d(dtype=wp.float32),  # type: ignore[valid-type]
+        normal: wp.array3d(dtype=wp.float32),
+        usable: wp.array2d(dtype=wp.uint8),
+        x: wp.array2d(dtype=wp.float32),
+        y: wp.array2d(dtype=wp.float32),
         spacing: float,
         pitch: int,
         # outputs
-        right: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-        down: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-        right_weight: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
-        down_weight: wp.array(dtype=wp.float32),  # type: ignore[valid-type]
+        right: wp.array(dtype=wp.float32),
+        down: wp.array(dtype=wp.float32),
+        right_weight: wp.array(dtype=wp.float32),
+        down_weight: wp.array(dtype=wp.float32),
     ):
         p = first + wp.tid()
         r = p // usable.shape[1]
@@ -135,13 +135,14 @@ def _make_kernel(pair, name: str):
         i = (r + 1) * pitch + c + 1
         n = _normal_at(normal, r, c)
         ri = wp.vec3(x[r, c], y[r, c], -1.0)
-        if c + 1 < usable.shape[1]:
+        # nested, because a kernel evaluates both sides of `and`
+        if c + 1 < usable.shape[1]:  # noqa: SIM102
             if usable[r, c + 1] != wp.uint8(0):
                 rj = wp.vec3(x[r, c + 1], y[r, c + 1], -1.0)
                 edge = pair(n + _normal_at(normal, r, c + 1), ri, rj, spacing)
                 right[i] = edge[0]
                 right_weight[i] = edge[1]
-        if r + 1 < usable.shape[0]:
+        if r + 1 < usable.shape[0]:  # noqa: SIM102
             if usable[r + 1, c] != wp.uint8(0):
                 rj = wp.vec3(x[r + 1, c], y[r + 1, c], -1.0)
                 edge = pair(n + _normal_at(normal, r + 1, c), ri, rj, spacing)

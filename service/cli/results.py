@@ -42,7 +42,7 @@ def relight(
     out: Annotated[str, typer.Option("--out", help="Path of the frames, #### for the number.", show_default=False)],
     frames: Annotated[str, typer.Option("--frames", help="A number, or first-last.")] = "1",
     spin_degrees: Annotated[float, typer.Option(
-        "--spin-degrees", help="Turn of the environment about +y over the range, from +z towards +x; frame one is unturned.")] = 0.0,
+        "--spin-degrees", help="Turn of the environment about +y over the range, +z towards +x; frame one is unturned.")] = 0.0,
     device: DeviceOption = None,
     cache: CacheOption = None,
 ) -> None:

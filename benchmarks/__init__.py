@@ -1,0 +1,1 @@
+"""The figures that docs/figures.md shows, each measured by the code here."""

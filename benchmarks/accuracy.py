@@ -1,0 +1,105 @@
+"""Accuracy against ground truth: the shipped samples, and DiLiGenT objects where the data is at hand."""
+
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from service.methods import Method
+from service.pipelines.relight import relight
+from service.pipelines.solve import solve
+from service.requests import RelightRequest, SolveRequest
+from stage import exr
+from stage.capture import Capture
+from stage.importers import diligent
+from stage.maps import SurfaceMaps
+
+SAMPLES = Path(__file__).parents[1] / "samples"
+
+
+class SolveError(NamedTuple):
+    """A solved capture against its truth, over the capture's mask."""
+
+    coverage: float
+    """Fraction of the mask that was solved."""
+    mean_deg: float
+    median_deg: float
+    albedo_median: float
+    """Median relative error of diffuse albedo, all channels; NaN without a true one."""
+    height_rms: float
+    """RMS of height error over the relief (highest minus lowest true height); NaN without a true one."""
+
+
+def angles_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angle between unit vectors along the last axis, degrees."""
+    cross = np.linalg.norm(np.cross(a.astype(np.float64), b.astype(np.float64)), axis=-1)
+    return np.degrees(np.arctan2(cross, (a.astype(np.float64) * b).sum(axis=-1)))
+
+
+def read_truth(path: Path) -> dict[str, np.ndarray]:
+    """Layers of a truth.exr: normal and diffuse_albedo [rows, cols, 3], height and mask [rows, cols]."""
+    channels, _ = exr.read(path)
+    truth = {}
+    for name, suffixes in (("normal", "XYZ"), ("diffuse_albedo", "RGB"), ("height", "Z"), ("mask", "Y")):
+        planes = [channels[f"{name}.{s}"].astype(np.float64) for s in suffixes]
+        truth[name] = planes[0] if len(planes) == 1 else np.stack(planes, axis=-1)
+    return truth
+
+
+def compare(maps: SurfaceMaps, truth: dict[str, np.ndarray], mask: np.ndarray) -> SolveError:
+    """Errors of solved maps."""
+    assert maps.normal is not None and maps.diffuse_albedo is not None
+    solved = mask & maps.mask
+    angle = angles_deg(maps.normal, truth["normal"])[solved]
+    albedo = height = np.nan
+    if "diffuse_albedo" in truth:
+        true = truth["diffuse_albedo"][solved]
+        albedo = float(np.median(np.abs(maps.diffuse_albedo[solved] - true) / np.maximum(true, 1e-6)))
+    if "height" in truth and maps.height is not None:
+        difference = (maps.height - truth["height"])[solved]
+        relief = np.ptp(truth["height"][solved])
+        height = float(np.sqrt(np.mean((difference - difference.mean()) ** 2)) / relief)
+    return SolveError(float(solved.sum() / mask.sum()), float(angle.mean()), float(np.median(angle)), albedo, height)
+
+
+def sample_errors(name: str, method: Method) -> SolveError:
+    """Solve a shipped sample and compare it with its truth."""
+    with tempfile.TemporaryDirectory() as folder:
+        capture = SAMPLES / name
+        maps = solve(SolveRequest(capture=capture, out=Path(folder), method=method, cache=Path(folder))).maps
+        return compare(maps, read_truth(capture / "truth.exr"), Capture.open(capture).mask())
+
+
+def diligent_errors(source: Path, method: Method) -> SolveError:
+    """Solve a DiLiGenT object and compare it with its true normals."""
+    with tempfile.TemporaryDirectory() as folder:
+        capture = Path(folder) / "capture"
+        diligent.import_folder(source, capture)
+        maps = solve(SolveRequest(capture=capture, out=Path(folder), method=method)).maps
+        truth = {"normal": np.load(source / "normal_gt.npz")["normal"]}
+        return compare(maps, truth, Capture.open(capture).mask())
+
+
+def relight_error(reference: str) -> tuple[float, float]:
+    """The owl relit under its environment, against the path tracer.
+
+    Args:
+        reference: file of the path-traced picture.
+
+    Returns:
+        Relative RMSE over the mask, and the ratio of the total energies.
+    """
+    capture = SAMPLES / "owl"
+    mask = Capture.open(capture).mask()
+    with tempfile.TemporaryDirectory() as folder:
+        result = relight(RelightRequest(capture=capture, environment=capture / "environment.exr", cache=Path(folder),
+                                        out=str(Path(folder) / "frame.####.exr")))
+        ours = _rgb(result.frames[0])[mask]
+    truth = _rgb(capture / reference)[mask]
+    return float(np.sqrt(np.mean((ours - truth) ** 2) / np.mean(truth**2))), float(ours.sum() / truth.sum())
+
+
+def _rgb(path: Path) -> np.ndarray:
+    channels, _ = exr.read(path)
+    return np.stack([channels[c] for c in "RGB"], axis=-1).astype(np.float64)

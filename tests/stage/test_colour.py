@@ -1,0 +1,69 @@
+"""Colour: sRGB against its closed form, AP1 against the published matrix, and what stays untouched."""
+
+import numpy as np
+import pytest
+
+from stage.colour import convert, is_linear, linear_space, linearise
+
+AP1_TO_REC709 = np.array([[1.70505, -0.62179, -0.08326], [-0.13026, 1.14080, -0.01055], [-0.02400, -0.12897, 1.15297]])
+"""ACEScg to linear Rec.709 with Bradford adaptation, five digits, as ACES and its CTL publish it."""
+
+
+def srgb_to_linear(encoded):
+    """IEC 61966-2-1."""
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+def test_srgb_is_its_closed_form():
+    codes = np.arange(256, dtype=np.float32) / 255
+    pixels = np.repeat(codes.reshape(16, 16, 1), 3, axis=2)
+    linear = linearise(pixels, "srgb_texture")
+    # OpenColorIO's fast float power is good to 2e-6 (its own tolerance); an 8-bit step is 3e-4 at the least
+    assert np.allclose(linear, srgb_to_linear(pixels.astype(np.float64)), rtol=2e-5, atol=2e-6)
+
+
+def test_gamma_spaces_are_powers():
+    pixels = np.full((1, 1, 3), 0.5, dtype=np.float32)
+    assert np.allclose(linearise(pixels, "g22_rec709_scene"), 0.5**2.2, rtol=1e-5)
+    assert np.allclose(linearise(pixels, "g18_rec709_scene"), 0.5**1.8, rtol=1e-5)
+
+
+def test_linear_spaces_are_returned_as_they_are():
+    pixels = np.array([[[0.1, 7.0, -0.5]]], dtype=np.float32)
+    assert linearise(pixels, "lin_ap1_scene") is pixels
+    assert convert(pixels, "lin_ap1_scene", "lin_ap1_scene") is pixels
+    assert is_linear("lin_rec709_scene") and not is_linear("srgb_texture")
+
+
+def test_ap1_to_rec709_is_the_published_matrix():
+    pixels = np.eye(3, dtype=np.float32).reshape(1, 3, 3)
+    converted = convert(pixels, "lin_ap1_scene", "lin_rec709_scene")[0]
+    assert np.allclose(converted.T, AP1_TO_REC709, atol=2e-5)  # the last digit of the publication
+
+
+def test_white_stays_white_and_there_and_back_is_nothing():
+    grey = np.full((2, 2, 3), 0.18, dtype=np.float32)
+    assert np.allclose(convert(grey, "lin_ap1_scene", "lin_rec709_scene"), 0.18, rtol=1e-5)
+    pixels = np.random.default_rng(1).random((4, 4, 3), dtype=np.float32)
+    back = convert(convert(pixels, "lin_rec709_scene", "lin_ap1_scene"), "lin_ap1_scene", "lin_rec709_scene")
+    assert np.allclose(back, pixels, atol=1e-5)  # two float32 matrices
+
+
+def test_grey_keeps_one_channel():
+    grey = np.full((2, 3, 1), 0.5, dtype=np.float32)
+    linear = linearise(grey, "srgb_texture")
+    assert linear.shape == (2, 3, 1)
+    assert np.allclose(linear, srgb_to_linear(0.5), rtol=2e-5)
+
+
+def test_the_working_space_keeps_the_primaries():
+    assert linear_space("srgb_texture") == "lin_rec709_scene"
+    assert linear_space("srgb_p3d65_scene") == "lin_p3d65_scene"
+    assert linear_space("lin_ap0_scene") == "lin_ap0_scene"
+    with pytest.raises(ValueError, match="rgb is not a colour space"):
+        linear_space("rgb")
+
+
+def test_an_unknown_space_is_an_error():
+    with pytest.raises(ValueError, match="no_such_space"):
+        convert(np.zeros((1, 1, 3), dtype=np.float32), "no_such_space", "lin_rec709_scene")

@@ -1,0 +1,53 @@
+"""Files that appear whole or not at all."""
+
+import os
+import stat
+
+import pytest
+
+from stage.errors import StorageError
+from stage.files import replacing, write_text
+from tests.captures import files_in
+
+
+def test_the_temporary_lies_beside_the_target_and_keeps_its_suffix(tmp_path):
+    target = tmp_path / "new" / "a.exr"
+    with replacing(target) as temporary:
+        assert temporary.parent == target.parent and temporary.suffix == ".exr"
+        assert not target.exists()
+        temporary.write_bytes(b"whole")
+    assert target.read_bytes() == b"whole"
+    assert files_in(tmp_path) == {"new/a.exr"}
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, OSError])
+def test_an_error_keeps_the_old_file_and_leaves_nothing(tmp_path, error):
+    target = tmp_path / "a.txt"
+    target.write_text("old")
+    with pytest.raises((error, StorageError)), replacing(target) as temporary:
+        temporary.write_text("half")
+        raise error
+    assert target.read_text() == "old"
+    assert files_in(tmp_path) == {"a.txt"}
+
+
+def test_permissions_follow_the_umask(tmp_path):
+    before = os.umask(0o027)
+    try:
+        write_text(tmp_path / "a.txt", "x")
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "a.txt").stat().st_mode) == 0o640
+
+
+def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path):
+    (tmp_path / "file").write_text("")
+    target = tmp_path / "file" / "below.txt"
+    with pytest.raises(StorageError) as caught:
+        write_text(target, "x")
+    assert str(caught.value) == f"cannot write {target}: not a directory" or str(caught.value) == f"cannot write {target}: file exists"
+
+
+def test_text_is_utf8(tmp_path):
+    write_text(tmp_path / "a.txt", "ρ")
+    assert (tmp_path / "a.txt").read_bytes() == "ρ".encode()
