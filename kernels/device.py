@@ -15,7 +15,7 @@ from typing import Any
 
 import warp as wp
 
-from kernels.errors import DeviceError
+from kernels.errors import ArrayError, DeviceError
 
 wp.config.log_level = wp.LOG_ERROR  # the caller reports the device; compiling shows as progress, not as lines
 
@@ -28,6 +28,11 @@ BLOCKS_PER_WORKER = 4
 
 CPU_BLOCK = 1
 """The block size that Warp launches CPU kernels with; loading ahead with another would compile the module twice."""
+
+CUDA_BLOCK = 256
+"""Threads of a CUDA block."""
+MAX_THREADS = 2**31 - 1
+"""Of one launch: kernels count threads in 32 bits."""
 
 _load_lock = threading.Lock()
 
@@ -86,16 +91,21 @@ def launch(kernel: Any, count: int, inputs: Sequence[Any], outputs: Sequence[Any
         outputs: its outputs.
         device: where to run.
 
+    Raises:
+        ArrayError: more threads than a launch can have.
+
     Convention:
         On the CPU the call returns when the work is done. On CUDA it returns at once; reading an output waits.
     """
     if count <= 0:
         return
-    if device != "cpu":
-        wp.launch(kernel, dim=count, inputs=[0, *inputs], outputs=list(outputs), device=device)
-        return
+    if count > MAX_THREADS:
+        raise ArrayError(f"the work is {count} threads, a launch has at most {MAX_THREADS}: cut it into smaller bands")
     with _load_lock:  # two threads must not compile one module at the same time
-        kernel.module.load("cpu", block_dim=CPU_BLOCK)
+        kernel.module.load(device, block_dim=CPU_BLOCK if device == "cpu" else CUDA_BLOCK)
+    if device != "cpu":
+        wp.launch(kernel, dim=count, inputs=[0, *inputs], outputs=list(outputs), device=device, block_dim=CUDA_BLOCK)
+        return
     workers = worker_count()
     blocks = min(count, workers * BLOCKS_PER_WORKER) if workers > 1 else 1
     edges = [count * b // blocks for b in range(blocks + 1)]

@@ -15,7 +15,7 @@ class Status(IntEnum):
     DARK = 3
     """No light gave a reading above zero."""
     ILL_POSED = 4
-    """The usable lights lie close to one plane, so that the normal is not determined."""
+    """The usable lights lie close to one plane, or the readings are the same from every side: the normal is not determined."""
     NOT_FACING = 5
     """The best normal points away from the camera."""
 

@@ -1,21 +1,27 @@
 """One table from what can go wrong to what a person is told.
 
-RequestError    a request asks for something that cannot be (frames backwards, a pattern without ####); names the option
+RequestError       a request asks for something that cannot be (frames backwards, a pattern without ####); names the option
+ValidationError    pydantic's: a value of a request cannot be; names the field
 """
+
+from pydantic import ValidationError
 
 from kernels.errors import KernelError
 from service.usd.errors import AssetError
 from stage.errors import StageError
+from stage.manifest import describe
 
 
 class RequestError(ValueError):
     """A request is wrong: the message names the option."""
 
 
-USER_ERRORS: tuple[type[Exception], ...] = (RequestError, StageError, KernelError, AssetError)
+USER_ERRORS: tuple[type[Exception], ...] = (RequestError, ValidationError, StageError, KernelError, AssetError)
 """Errors whose text is a sentence for the person who asked: exit code 2 on the command line."""
 
 
 def sentence(error: BaseException) -> str:
     """The one line to show."""
+    if isinstance(error, ValidationError):
+        return describe(error)
     return " ".join(str(error).split())

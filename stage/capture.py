@@ -105,13 +105,15 @@ class Capture:
                 yield f"frames[{index}].light.image", frame.light.image
 
     def _check_files(self) -> None:
+        arrays = {f"frames[{index}].image" for index, frame in enumerate(self.manifest.frames) if frame.tof is not None}
+
         def fault(item: tuple[str, str]) -> StageError | None:
             field, name = item
             try:
                 path = self.file(name)
                 if not path.exists():
                     return ManifestError(f"{self.folder / FILE_NAME}: {field}: {name} is not in the folder")
-                if path.suffix.lower() == ".npy":
+                if field in arrays and path.suffix.lower() == ".npy":
                     return None  # time-of-flight arrays: checked by their own reader
                 if field.endswith(".light.image"):
                     images.read_header(path)  # an environment has a size of its own

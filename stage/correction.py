@@ -47,7 +47,7 @@ class Correction:
             mask = capture.mask()
             unlit = int((flat[mask] <= 0).any(axis=-1).sum())
             if unlit:
-                raise ImageError(f"{capture.file(manifest.flat)}: flat is not above dark at {unlit} pixels of the mask")
+                raise ImageError(f"{capture.file(manifest.flat)}: flat is not above dark at {unlit} of the mask's pixels")
             flat = np.where(flat > 0, flat, 1) / flat[mask].mean(axis=0)
         partial = cls(capture, dark, flat, None)
         off = [frame for frame, _ in capture.lit_by(OffLight)]

@@ -44,6 +44,8 @@ def read_header(path: str | Path) -> Header:
         start = stream.read(8)
     if start[:4] != b"\x76\x2f\x31\x01":
         raise ImageError(f"{path}: is not an OpenEXR file")
+    if len(start) < 8:
+        raise ImageError(f"{path}: is damaged or truncated: its header cannot be read")
     if start[5] & 0x18:  # version bits 11 and 12: deep data, several parts
         raise ImageError(f"{path}: has several parts or deep data: give a single-part flat image")
     try:
@@ -56,7 +58,7 @@ def read_header(path: str | Path) -> Header:
     header = Header(int(right - left + 1), int(bottom - top + 1), names, attributes)
     missing = _missing_bytes(path, header)
     if missing:
-        raise ImageError(f"{path}: is truncated: at least {missing} bytes are missing")
+        raise ImageError(f"{path}: is truncated: {missing} or more bytes are missing")
     return header
 
 
@@ -116,13 +118,13 @@ def color_space_of(metadata: Mapping[str, Any], default: str = "lin_rec709_scene
 
 
 def _missing_bytes(path: str | Path, header: Header) -> int:
-    """How many bytes a scan-line file lacks at the least, judged by its last chunk; 0 when whole (or tiled: not judged).
+    """How many bytes a file lacks at the least, judged by its last chunk; 0 when whole (or of several levels: not judged).
 
     The library reports a short file only while it decodes, and then on the terminal too.
     """
-    if header.metadata["type"] != OpenEXR.scanlineimage:
+    chunks, leader = _layout(header)
+    if chunks == 0:
         return 0
-    chunks = -(-header.height // SCANLINES_PER_CHUNK.get(int(header.metadata["compression"]), 1))
     size = os.path.getsize(path)
     with open(path, "rb") as stream:
         stream.seek(8)  # magic number and version
@@ -131,11 +133,24 @@ def _missing_bytes(path: str | Path, header: Header) -> int:
         table = stream.read(8 * chunks)
         if len(table) < 8 * chunks:
             return 8 * chunks - len(table)
-        last = max(struct.unpack(f"<{chunks}Q", table))
-        stream.seek(last)
-        block = stream.read(8)
-        packed = struct.unpack("<ii", block)[1] if len(block) == 8 else 0
-        return max(0, last + 8 + packed - size)
+        offsets = struct.unpack(f"<{chunks}Q", table)
+        last = max(offsets)
+        if min(offsets) < stream.tell() or last >= size:
+            return max(1, last - size)  # the table is written last: zeros where the writer stopped early
+        stream.seek(last + leader)
+        block = stream.read(4)
+        packed = struct.unpack("<i", block)[0] if len(block) == 4 else 0
+        return max(0, last + leader + 4 + packed - size)
+
+
+def _layout(header: Header) -> tuple[int, int]:
+    """Chunks of the file, and the bytes in front of a chunk's size: the row, or the tile's place and level. (0, 0): not known."""
+    if header.metadata["type"] == OpenEXR.scanlineimage:
+        return -(-header.height // SCANLINES_PER_CHUNK.get(int(header.metadata["compression"]), 1)), 4
+    tiles = header.metadata["tiles"]
+    if tiles.mode != OpenEXR.LevelMode.ONE_LEVEL:
+        return 0, 0
+    return -(-header.width // tiles.xSize) * -(-header.height // tiles.ySize), 16
 
 
 def _skip_attribute(stream: Any) -> bool:

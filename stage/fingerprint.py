@@ -20,9 +20,10 @@ class Fingerprints:
         self._memory = memory
         self._known: dict[str, list[int | str]] = {}
         try:
-            self._known = json.loads(memory.read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            self._known = {}  # a cache: hashed again
+            remembered = json.loads(memory.read_text(encoding="utf-8"))
+            self._known = {name: [*entry] for name, entry in remembered.items() if len(entry) == 3}
+        except (OSError, ValueError, AttributeError, TypeError):
+            pass  # a cache, and a damaged one: hashed again
 
     def of(self, names: Iterable[str]) -> dict[str, str]:
         """Content hash of each file.

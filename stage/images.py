@@ -1,4 +1,4 @@
-"""Pixels in: header first, then pixels, from EXR, PNG, TIFF, HDR, JPEG and .npy."""
+"""Pixels in: header first, then pixels, from EXR, PNG, TIFF, HDR, JPEG and their kin."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import OpenImageIO as oiio
 
-from stage import exr
+from stage import exr, integrity
 from stage.errors import ImageError, storage
 
 OIIO_SUFFIXES = {".png", ".tif", ".tiff", ".hdr", ".jpg", ".jpeg", ".jxl", ".dpx"}
@@ -25,7 +25,7 @@ def read_header(path: str | Path) -> ImageHeader:
     """Read size and channels only.
 
     Raises:
-        ImageError: not an image that relit reads; truncated (EXR); no grey or RGB channels.
+        ImageError: not an image that relit reads; truncated (EXR, PNG); no grey or RGB channels.
         StorageError: the file cannot be opened.
     """
     suffix = Path(path).suffix.lower()
@@ -34,6 +34,8 @@ def read_header(path: str | Path) -> ImageHeader:
         return ImageHeader(header.width, header.height, len(_colour_channels(path, header.channels)))
     if suffix not in OIIO_SUFFIXES:
         raise ImageError(f"{path}: has an unknown suffix: relit reads {', '.join(sorted(SUFFIXES))}")
+    if suffix == ".png":
+        integrity.check_png(path, contents=False)
     source = _open(path)
     try:
         spec = source.spec()
@@ -52,13 +54,18 @@ def read_pixels(path: str | Path) -> np.ndarray:
         ImageError: the file is damaged or not an image that relit reads.
         StorageError: the file cannot be opened.
     """
-    if Path(path).suffix.lower() == ".exr":
+    suffix = Path(path).suffix.lower()
+    if suffix == ".exr":
         channels, _ = exr.read(path)
         planes = [channels[name] for name in _colour_channels(path, tuple(channels))]
         if any(plane.dtype == np.uint32 for plane in planes):
             raise ImageError(f"{path}: holds integer identifiers, not radiance")
         pixels = np.stack(planes, axis=-1)
     else:
+        if suffix == ".png":
+            integrity.check_png(path, contents=True)
+        elif suffix in (".jpg", ".jpeg"):
+            integrity.check_jpeg(path)
         source = _open(path)
         try:
             # float of the recorded value: 8- and 16-bit integers are divided by 255 or 65535
@@ -112,7 +119,9 @@ def check_radiance(path: str | Path, pixels: np.ndarray) -> None:
         if bad.any():
             where = bad.any(axis=-1)
             row, column = np.argwhere(where)[0]
-            raise ImageError(f"{path}: {int(where.sum())} pixels are {name}, the first at row {row}, column {column}: "
+            count = int(where.sum())
+            found = f"{count} pixel is" if count == 1 else f"{count} pixels are"
+            raise ImageError(f"{path}: {found} {name}, the first at row {row}, column {column}: "
                              "mend the image, or clip it if this is noise around zero")
 
 

@@ -128,12 +128,16 @@ def _build(capture: Capture, frames: list[Frame], folder: Path, key: str, progre
             except BaseException:
                 pool.shutdown(cancel_futures=True)
                 raise
-    if saturated.any():
-        with replacing(stacks.saturated_path(folder, key)) as temporary:
-            np.save(temporary, saturated)
     names = tuple(frame.image for frame in frames)
     index = {"frames": names, "scale": [float(s) for s in scale], "pixel_count": pixel_count}
-    write_text(stacks.index_path(folder, key), json.dumps(index))
+    try:
+        if saturated.any():
+            with replacing(stacks.saturated_path(folder, key)) as temporary:
+                np.save(temporary, saturated)
+        write_text(stacks.index_path(folder, key), json.dumps(index))
+    except BaseException:
+        _remove(folder, key)
+        raise
     return Stack(folder, key, names, scale, pixel_count)
 
 
@@ -163,9 +167,14 @@ def _reserve(descriptor: int, size: int) -> None:
 
 
 def _drop_others(folder: Path, key: str) -> None:
-    """Remove the stacks of earlier inputs: index first, so that a half-removed stack is never found."""
+    """Remove the stacks of earlier inputs."""
     for index in folder.glob("stack-*.json"):
         old = index.stem.removeprefix("stack-")
         if old != key:
-            for path in (index, stacks.values_path(folder, old), stacks.saturated_path(folder, old)):
-                path.unlink(missing_ok=True)
+            _remove(folder, old)
+
+
+def _remove(folder: Path, key: str) -> None:
+    """Remove a stack: index first, so that a half-removed one is never found."""
+    for path in (stacks.index_path(folder, key), stacks.values_path(folder, key), stacks.saturated_path(folder, key)):
+        path.unlink(missing_ok=True)

@@ -4,7 +4,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from stage.model import Direction, Positive, Rgb, Strict, Vector
+from stage.model import Direction, LitRgb, Positive, Rgb, Strict, Text, Vector
 
 
 class DistantLight(Strict):
@@ -13,7 +13,7 @@ class DistantLight(Strict):
     type: Literal["distant"]
     direction: Direction
     """Unit vector from the surface to the light, camera frame."""
-    irradiance: Rgb
+    irradiance: LitRgb
     """At normal incidence, relative; one scale across a capture."""
 
 
@@ -22,7 +22,7 @@ class PointLight(Strict):
 
     type: Literal["point"]
     position_m: Vector
-    intensity: Rgb
+    intensity: LitRgb
     axis: Direction | None = None
     anisotropy: Annotated[float, Field(ge=0)] | None = None
 
@@ -47,6 +47,8 @@ class ExtendedLight(Strict):
         counts = len(self.directions), len(self.radiance), len(self.solid_angle)
         if len(set(counts)) > 1:
             raise ValueError("has {} directions, {} radiance and {} solid_angle entries: give one each".format(*counts))
+        if not any(map(any, self.radiance)):
+            raise ValueError("has no radiance above 0: a light gives light")
         return self
 
 
@@ -63,7 +65,7 @@ class EnvironmentLight(Strict):
     """Lit by a lat-long map: a real reference for relighting."""
 
     type: Literal["environment"]
-    image: Annotated[str, Field(min_length=1)]
+    image: Text
 
 
 class OffLight(Strict):

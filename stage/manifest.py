@@ -1,6 +1,7 @@
 """capture.json: the manifest of one capture, schema relit.capture/1, checked by name before any pixel is read."""
 
 import json
+import posixpath
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -11,7 +12,7 @@ from stage.colour import ColorSpaceName
 from stage.errors import ManifestError, storage
 from stage.files import write_text
 from stage.light import Light
-from stage.model import Positive, Strict
+from stage.model import Positive, Strict, Text
 from stage.pattern import Pattern
 from stage.projector import Projector
 from stage.ranging import Laser, TimeOfFlight
@@ -19,7 +20,7 @@ from stage.ranging import Laser, TimeOfFlight
 SCHEMA = "relit.capture/1"
 FILE_NAME = "capture.json"
 
-FileName = Annotated[str, Field(min_length=1)]
+FileName = Text
 """A file of the capture, relative to its folder."""
 
 
@@ -46,7 +47,7 @@ class Manifest(Strict):
     """Everything capture.json says."""
 
     schema_: Literal["relit.capture/1"] = Field(alias="schema")
-    name: Annotated[str, Field(min_length=1)]
+    name: Text
     color_space: ColorSpaceName = "lin_rec709_scene"
     camera: Camera
     projector: Projector | None = None
@@ -60,9 +61,10 @@ class Manifest(Strict):
     def _check(self) -> Self:
         first: dict[str, int] = {}
         for index, frame in enumerate(self.frames):
-            if frame.image in first:
-                raise ValueError(f"frames[{index}].image: {frame.image} is already the image of frames[{first[frame.image]}]")
-            first[frame.image] = index
+            name = posixpath.normpath(frame.image)
+            if name in first:
+                raise ValueError(f"frames[{index}].image: {frame.image} is already the image of frames[{first[name]}]")
+            first[name] = index
         timed = [frame.exposure_s is not None for frame in self.frames]
         if any(timed) and not all(timed):
             raise ValueError(f"frames[{timed.index(False)}].exposure_s: is missing: give it for every frame or for none")
@@ -87,11 +89,15 @@ def read_manifest(path: str | Path) -> Manifest:
         raise ManifestError(f"{path}: is not UTF-8 text") from error
     except json.JSONDecodeError as error:
         raise ManifestError(f"{path}: is not JSON: {error.msg} at line {error.lineno}, column {error.colno}") from error
+    except RecursionError as error:
+        raise ManifestError(f"{path}: is nested too deeply") from error
     except ValueError as error:
         raise ManifestError(f"{path}: {error}") from error
     if not isinstance(data, dict):
         raise ManifestError(f"{path}: must hold one JSON object")
-    schema = data.get("schema")
+    if "schema" not in data:
+        raise ManifestError(f"{path}: schema: is missing: this program reads {SCHEMA}")
+    schema = data["schema"]
     if schema != SCHEMA:
         raise ManifestError(f"{path}: schema: is {json.dumps(schema)}, this program reads {SCHEMA}")
     try:
@@ -101,20 +107,22 @@ def read_manifest(path: str | Path) -> Manifest:
 
 
 def write_manifest(manifest: Manifest, path: str | Path) -> None:
-    """Write capture.json, whole or not at all, without the keys that hold their default.
+    """Write capture.json, whole or not at all: `color_space` always, other keys unless they hold their default.
 
     Raises:
         StorageError: it cannot be written.
     """
     data = manifest.model_dump(mode="json", by_alias=True, exclude_defaults=True)
     frames = ",\n".join("    " + json.dumps(frame) for frame in data.pop("frames"))
-    body = json.dumps({"schema": SCHEMA, **{k: v for k, v in data.items() if k != "schema"}}, indent=2)
+    first = {"schema": data.pop("schema"), "name": data.pop("name"), "color_space": manifest.color_space}
+    body = json.dumps({**first, **data}, indent=2)
     write_text(path, body[:-2] + f',\n  "frames": [\n{frames}\n  ]\n}}\n')
 
 
 def describe(error: ValidationError) -> str:
     """The first fault of a pydantic error as `field: what is wrong`, with a count of the others."""
-    faults = error.errors()
+    places = {fault["loc"][:n] for fault in error.errors() for n in range(len(fault["loc"]))}
+    faults = [fault for fault in error.errors() if fault["loc"] not in places]  # not of a list what is said of its entries
     fault = faults[0]
     where = _field(fault["loc"])
     match fault["type"]:
@@ -127,8 +135,16 @@ def describe(error: ValidationError) -> str:
         case "union_tag_invalid":
             text = f"{fault['ctx']['discriminator'].strip(chr(39))} is {json.dumps(fault['ctx']['tag'])}, " \
                    f"must be one of {fault['ctx']['expected_tags']}"
+        case "too_short":
+            text = f"has {fault['ctx']['actual_length']} entries, needs {fault['ctx']['min_length']} or more"
+        case "too_long":
+            text = f"has {fault['ctx']['actual_length']} entries, must have {fault['ctx']['max_length']}"
+        case "tuple_type":
+            text = f"is {_short(fault['input'])}: must be a list"
+        case "model_type" | "model_attributes_type":
+            text = f"is {_short(fault['input'])}: must be an object"
         case "union_tag_not_found":
-            text = f"lacks the key {fault['ctx']['discriminator']}"
+            text = f"lacks the key {fault['ctx']['discriminator'].strip(chr(39))}"
         case _:
             text = f"is {_short(fault['input'])}: {fault['msg'][0].lower()}{fault['msg'][1:]}"
     more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""

@@ -1,11 +1,11 @@
 """Solved maps of one capture, and their file: maps.exr."""
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
 from stage import exr
 from stage.camera import Camera
@@ -83,7 +83,10 @@ class SurfaceMaps:
             raise ResultError(f"{path}: has no layer mask.Y")
         mask = found.pop("mask") > 0.5
         provenance = {k: v for k, v in metadata.items() if k.startswith("relit:") and k != "relit:camera"}
-        camera = Camera.model_validate(json.loads(metadata["relit:camera"]))
+        try:
+            camera = Camera.model_validate_json(str(metadata["relit:camera"]))
+        except ValidationError as error:
+            raise ResultError(f"{path}: its relit:camera attribute is not a camera") from error
         if mask.shape != (camera.height, camera.width):
             raise ResultError(f"{path}: is {mask.shape[1]}x{mask.shape[0]}, its camera {camera.width}x{camera.height}")
         return cls(camera=camera, mask=mask, color_space=exr.color_space_of(metadata), provenance=provenance, **found)

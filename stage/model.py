@@ -22,9 +22,7 @@ def _unit(vector: tuple[float, float, float]) -> tuple[float, float, float]:
     return (x, y, z)
 
 
-def _non_negative(colour: tuple[float, float, float]) -> tuple[float, float, float]:
-    if min(colour) < 0:
-        raise ValueError("is negative")
+def _lit(colour: tuple[float, float, float]) -> tuple[float, float, float]:
     if max(colour) == 0:
         raise ValueError("is zero in every channel: a light gives light; use {\"type\": \"off\"} for ambient frames")
     return colour
@@ -37,11 +35,22 @@ def _rigid(rows: tuple[tuple[float, float, float, float], ...]) -> tuple[tuple[f
     return rows
 
 
+def _not_blank(text: str) -> str:
+    if not text.strip():
+        raise ValueError("is blank")
+    return text
+
+
+Text = Annotated[str, AfterValidator(_not_blank)]
+"""A name: anything but nothing."""
 Vector = tuple[float, float, float]
 Direction = Annotated[Vector, AfterValidator(_unit)]
 """Given with any length above zero, kept with length one."""
-Rgb = Annotated[Vector, AfterValidator(_non_negative)]
-"""Red, green, blue; none negative, not all zero."""
+NotNegative = Annotated[float, Field(ge=0)]
+Rgb = tuple[NotNegative, NotNegative, NotNegative]
+"""Red, green, blue; none negative."""
+LitRgb = Annotated[Rgb, AfterValidator(_lit)]
+"""Not zero in every channel either: what a light of its own gives."""
 Row = tuple[float, float, float, float]
 Transform = Annotated[tuple[Row, Row, Row, Row], AfterValidator(_rigid)]
 """A 4×4 `a_from_b`, rows; a rotation and a translation."""

@@ -89,7 +89,7 @@ class Stack:
         with storage("read", path):
             try:
                 values = np.load(path, mmap_mode="r")
-            except ValueError as error:
+            except (ValueError, EOFError) as error:
                 raise StorageError(f"{path}: the cache is damaged: delete it and run again") from error
         if values.shape != shape:
             raise StorageError(f"{path}: the cache is damaged: delete it and run again")
@@ -115,8 +115,9 @@ def find(folder: Path, key: str) -> Stack | None:
     """The finished stack of this key, or None."""
     try:
         index = json.loads(index_path(folder, key).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        found = Stack(folder, key, tuple(index["frames"]), np.array(index["scale"], dtype=np.float32), int(index["pixel_count"]))
+    except (OSError, ValueError, KeyError, TypeError):  # a cache, and a damaged one: built again
         return None
     if not values_path(folder, key).exists():
         return None
-    return Stack(folder, key, tuple(index["frames"]), np.array(index["scale"], dtype=np.float32), index["pixel_count"])
+    return found

@@ -64,10 +64,10 @@ def write_image(path: Path, pixels: np.ndarray) -> Path:
     """Write [rows, cols] or [rows, cols, channels] with OpenImageIO; the array's type is the file's."""
     path.parent.mkdir(parents=True, exist_ok=True)
     values = np.ascontiguousarray(pixels if pixels.ndim == 3 else pixels[..., None])
-    spec = oiio.ImageSpec(values.shape[1], values.shape[0], values.shape[2], {"uint8": "uint8", "uint16": "uint16", "float16": "half",
-                                                                            "float32": "float"}[values.dtype.name])
-    if values.shape[2] in (2, 4):
-        spec.alpha_channel = values.shape[2] - 1
+    rows, cols, channels = values.shape
+    spec = oiio.ImageSpec(cols, rows, channels, {"float16": "half", "float32": "float"}.get(values.dtype.name, values.dtype.name))
+    if channels in (2, 4):
+        spec.alpha_channel = channels - 1
         spec.attribute("oiio:UnassociatedAlpha", 1)  # the values are what they are, not multiplied by alpha
     output = oiio.ImageOutput.create(str(path))
     assert output.open(str(path), spec), output.geterror()
@@ -85,8 +85,8 @@ def manifest_of(scene: Scene, **changes: Any) -> dict[str, Any]:
         "camera": {"projection": "orthographic", "resolution": [cols, rows]},
         "mask": "mask.png",
         "frames": [
-            {"image": f"{i:03d}.exr", "light": {"type": "distant", "direction": direction.tolist(), "irradiance": irradiance.tolist()}}
-            for i, (direction, irradiance) in enumerate(zip(scene.directions, scene.irradiance, strict=True))
+            {"image": f"{i:03d}.exr", "light": {"type": "distant", "direction": direction, "irradiance": irradiance}}
+            for i, (direction, irradiance) in enumerate(zip(scene.directions.tolist(), scene.irradiance.tolist(), strict=True))
         ],
         **changes,
     }

@@ -26,8 +26,11 @@ def fit_albedo(band: Band, weights: Readings, fit: NormalFit, lights: Lights) ->
         [3, pixels padded] float32 albedo ρ, scene-linear; 0 where there is no normal.
 
     Raises:
-        ArrayError: a channel that no light reaches.
+        ArrayError: a channel that no light reaches, or lights other than the band's.
     """
+    band.require_channels(3)
+    if len(lights.direction) != band.light_count:
+        raise ArrayError(f"there are {len(lights.direction)} padded lights, the band has {band.light_count}: give its lights")
     dead = [name for name, lit in zip("RGB", lights.irradiance.any(axis=0), strict=True) if not lit]
     if dead:
         raise ArrayError(f"irradiance is 0 in channel {dead[0]} of every light: its albedo cannot be known")
@@ -49,7 +52,7 @@ def _albedo_kernel(pack: int) -> Any:
 
     @wp.kernel(enable_backward=False, module="unique")
     def albedo_kernel(first: int,
-                      values: wp.array3d(dtype=half_pack),  # [3, L, P] stored radiance
+                      values: wp.array2d(dtype=half_pack),  # [3 · L, P] stored radiance
                       weights: wp.array(dtype=float_pack),  # [P · L]
                       pack_stride: int,
                       light_stride: int,
@@ -62,21 +65,24 @@ def _albedo_kernel(pack: int) -> Any:
         nx, ny, nz = normal[0, p], normal[1, p], normal[2, p]
         above_r, above_g, above_b = float_pack(), float_pack(), float_pack()
         below_r, below_g, below_b = float_pack(), float_pack(), float_pack()
-        for light in range(directions.shape[0]):
-            red, green, blue = values[0, light, p], values[1, light, p], values[2, light, p]
+        lights = directions.shape[0]
+        for light in range(lights):
+            red, green, blue = values[light, p], values[lights + light, p], values[2 * lights + light, p]
             weight = weights[p * pack_stride + light * light_stride]
             lx, ly, lz = directions[light][0], directions[light][1], directions[light][2]
             er, eg, eb = irradiance[light][0], irradiance[light][1], irradiance[light][2]
             for k in range(pack):
                 cosine = wp.max(nx[k] * lx + ny[k] * ly + nz[k] * lz, 0.0)
-                first_order = weight[k] * cosine
-                second_order = first_order * cosine
-                above_r[k] += first_order * er * float(red[k])
-                above_g[k] += first_order * eg * float(green[k])
-                above_b[k] += first_order * eb * float(blue[k])
-                below_r[k] += second_order * er * er
-                below_g[k] += second_order * eg * eg
-                below_b[k] += second_order * eb * eb
+                r = er * weight[k] * cosine
+                g = eg * weight[k] * cosine
+                b = eb * weight[k] * cosine
+                # a value that is not finite has weight 0, and their product is not a number
+                above_r[k] += wp.where(r > 0.0, r * float(red[k]), 0.0)
+                above_g[k] += wp.where(g > 0.0, g * float(green[k]), 0.0)
+                above_b[k] += wp.where(b > 0.0, b * float(blue[k]), 0.0)
+                below_r[k] += r * er * cosine
+                below_g[k] += g * eg * cosine
+                below_b[k] += b * eb * cosine
         rho_r, rho_g, rho_b = float_pack(), float_pack(), float_pack()
         for k in range(pack):
             rho_r[k] = wp.where(below_r[k] > 0.0, wp.pi * wp.max(above_r[k], 0.0) / below_r[k], 0.0)

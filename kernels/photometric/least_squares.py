@@ -9,7 +9,12 @@ import warp as wp
 from kernels.status import DARK, ILL_POSED, OK, TOO_FEW_LIGHTS
 
 MIN_DETERMINANT = 1.0e-6
-"""Least 27·det(G)/tr(G)³ (1 for evenly spread lights): lights within about one degree of a point or a great circle fall below."""
+"""Least 27·det(G)/tr(G)³ (1 for evenly spread lights): lights within about one degree of a point fall below."""
+MIN_OFF_CIRCLE = 7.6e-5
+"""Least det(g) over the sum of its principal minors, g = G/tr(G): the mean square sine by which lights leave a great circle, here
+half a degree. Float32 sums leave up to 1e-7 of exactly coplanar lights, and noise leaves nothing of such a normal."""
+MIN_EXPLAINED = 1.0e-6
+"""Least part of Σ w y² that b·l explains: below, as bright from every side, the readings have no direction."""
 PRIOR_RESIDUAL = 0.05
 """One pseudo-observation with this residual, relative to |b|: three lights leave no residual, yet are not certain."""
 CONFIDENCE_HALF = 0.01745329
@@ -41,15 +46,22 @@ def fit_pixel(g: wp.mat33, r: wp.vec3, squares: float, count: int) -> LambertFit
         return fit
     trace = g[0, 0] + g[1, 1] + g[2, 2]
     unit = g / wp.max(trace, 1.0e-30)  # a pure number, whatever the weights
-    if 27.0 * wp.determinant(unit) < MIN_DETERMINANT:
+    determinant = wp.determinant(unit)
+    minors = unit[0, 0] * unit[1, 1] + unit[0, 0] * unit[2, 2] + unit[1, 1] * unit[2, 2] - (
+        unit[0, 1] * unit[0, 1] + unit[0, 2] * unit[0, 2] + unit[1, 2] * unit[1, 2])
+    if 27.0 * determinant < MIN_DETERMINANT or determinant < MIN_OFF_CIRCLE * minors:
         fit.status = ILL_POSED
         return fit
     inverse = wp.inverse(unit)
     b = inverse * (r / trace)
+    if wp.dot(b, r) <= MIN_EXPLAINED * squares:
+        fit.status = ILL_POSED
+        return fit
     length = wp.max(wp.length(b), 1.0e-30)
     n = b / length
     fit.b = b
     fit.across = wp.max((wp.trace(inverse) - wp.dot(n, inverse * n)) / trace, 0.0)
+    # the difference cancels: in float32 an RMS residual below about 5e-4 |b|, twice half rounding, is that of the sums
     fit.residual = wp.max(squares - wp.dot(b, r), 0.0) / (length * length)
     fit.status = OK
     return fit

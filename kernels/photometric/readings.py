@@ -2,7 +2,7 @@
 
 A grey reading is a weighted sum over the channels of radiance / irradiance, so that for a Lambertian surface it is b·l with
 b = albedo / π · normal, whatever the strength and colour of the lights. A reading of zero or less, or a saturated one, bounds
-the radiance but does not measure it: it is stored as 0, which means "no reading".
+the radiance but does not measure it, and one that is not finite says nothing: it is stored as 0, which means "no reading".
 """
 
 from functools import cache
@@ -17,6 +17,8 @@ from kernels.packs import Band, pack_type
 
 UNIT_TOLERANCE = 1e-3
 """How far a light direction's length may be from one."""
+LARGEST = 1.0e15
+"""A grey reading above this counts as infinite: the solvers square readings and add them up in float32."""
 
 
 class Lights(NamedTuple):
@@ -36,7 +38,8 @@ def pad_lights(direction: np.ndarray, irradiance: np.ndarray, scale: np.ndarray 
         scale: [n] or already padded; radiance of a stored 1.0; None: 1.
 
     Raises:
-        ArrayError: shapes that do not fit, a direction that is not a unit vector, a light without irradiance.
+        ArrayError: shapes that do not fit, a direction that is not a unit vector, a light without irradiance, a scale that is
+            negative or not finite.
     """
     direction = np.asarray(direction, dtype=np.float32)
     irradiance = np.asarray(irradiance, dtype=np.float32)
@@ -50,8 +53,13 @@ def pad_lights(direction: np.ndarray, irradiance: np.ndarray, scale: np.ndarray 
         raise ArrayError("irradiance must be finite, not negative, and above 0 in some channel of every light")
     lights = -(-count // 8) * 8
     extra = ((0, lights - count), (0, 0))
+    scale = np.ones(count, dtype=np.float32) if scale is None else np.asarray(scale, dtype=np.float32)
+    if scale.shape not in ((count,), (lights,)):
+        raise ArrayError(f"scale is {scale.shape} for {count} lights: give one per light, or per padded light ({lights})")
+    if not np.isfinite(scale).all() or (scale < 0).any():
+        raise ArrayError("scale must be finite and not negative for every light")
     padded_scale = np.zeros(lights, dtype=np.float32)
-    padded_scale[:count] = 1 if scale is None else np.asarray(scale, dtype=np.float32)[:count]
+    padded_scale[:count] = scale[:count]
     return Lights(np.pad(direction, extra), np.pad(irradiance, extra), padded_scale)
 
 
@@ -95,12 +103,15 @@ def grey_readings(band: Band, factors: np.ndarray) -> Readings:
         factors: [lights, 3], of grey_factors.
 
     Raises:
-        ArrayError: the band has other lights.
+        ArrayError: the band has other lights or channels, or is too large to index.
     """
+    band.require_channels(3)
     if factors.shape != (band.light_count, 3):
         raise ArrayError(f"factors are {factors.shape}, the band has {band.light_count} lights")
     pack = devices.pack_width(band.device)
     packs, lights = band.packs, band.light_count
+    if packs * lights > devices.MAX_THREADS:
+        raise ArrayError(f"the band has {packs} packs of {lights} lights: cut it so that their product stays below 2**31")
     values = wp.empty(packs * lights, dtype=pack_type(pack, wp.float32), device=band.device)
     readings = Readings(values, *((lights, 1) if band.device == "cpu" else (1, packs)))
     devices.launch(_grey_kernel(pack), packs,
@@ -115,7 +126,7 @@ def _grey_kernel(pack: int) -> Any:
 
     @wp.kernel(enable_backward=False, module="unique")
     def grey_kernel(first: int,
-                    values: wp.array3d(dtype=half_pack),  # [3, L, P] stored radiance
+                    values: wp.array2d(dtype=half_pack),  # [3 · L, P] stored radiance
                     saturated: wp.array2d(dtype=byte_pack),  # [L / 8, P] bits
                     factors: wp.array2d(dtype=float),  # [L, 3]
                     pack_stride: int,
@@ -123,8 +134,9 @@ def _grey_kernel(pack: int) -> Any:
                     # outputs
                     readings: wp.array(dtype=float_pack)):
         p = first + wp.tid()
-        for light in range(values.shape[1]):
-            red, green, blue = values[0, light, p], values[1, light, p], values[2, light, p]
+        lights = factors.shape[0]
+        for light in range(lights):
+            red, green, blue = values[light, p], values[lights + light, p], values[2 * lights + light, p]
             bits = saturated[light / 8, p]
             shift = light % 8
             fr, fg, fb = factors[light, 0], factors[light, 1], factors[light, 2]
@@ -132,7 +144,8 @@ def _grey_kernel(pack: int) -> Any:
             for k in range(pack):
                 value = fr * float(red[k]) + fg * float(green[k]) + fb * float(blue[k])
                 cut = (int(bits[k]) >> shift) & 1
-                grey[k] = wp.where(cut == 0, wp.max(value, 0.0), 0.0)
+                measured = wp.where(value < LARGEST, wp.max(value, 0.0), 0.0)  # 0 also for NaN
+                grey[k] = wp.where(cut == 0, measured, 0.0)
             readings[p * pack_stride + light * light_stride] = grey
 
     return grey_kernel

@@ -35,8 +35,12 @@ CAUCHY_SCALE = 0.05
 """Residual, relative to |b|, at which a reading's weight is halved; relative noise of a good capture is below it."""
 REWEIGHTINGS = 5
 """Rounds of re-weighting; the normal moves under 0.01° after five on real data."""
-BISECTIONS = 16
-"""Steps that find a rank's value to 2⁻¹⁶ of the brightest reading, under the rounding of half values."""
+RANGE = 2.0**-26
+"""Of the brightest reading: the least value that the bright end can have. A lamp mirrored in black is 2²⁰ times brighter."""
+HALVINGS_OF_RATIO = 6
+"""Steps that halve the ratio between the bounds of a rank's value: 2²⁶ becomes 1.33, whatever the highlight."""
+BISECTIONS = 18
+"""Steps in all; the others halve the difference, and find the value to 10⁻⁴ of itself, under the rounding of half values."""
 
 
 def solve_robust(band: Band, readings: Readings, directions: np.ndarray) -> NormalFit:
@@ -54,6 +58,12 @@ def solve_robust(band: Band, readings: Readings, directions: np.ndarray) -> Norm
         ArrayError: directions do not match the band.
     """
     return run_normal_kernel(_robust_kernel, band, readings, directions)
+
+
+@wp.func
+def _between(low: float, high: float, step: int) -> float:
+    # the geometric mean first: a highlight far above all else must not take the steps
+    return wp.where(step < HALVINGS_OF_RATIO, wp.sqrt(low) * wp.sqrt(high), 0.5 * (low + high))
 
 
 @cache
@@ -83,21 +93,22 @@ def _robust_kernel(pack: int) -> Any:
             for k in range(pack):
                 top[k] = wp.max(top[k], y[k])
                 given[k] += wp.where(y[k] > 0.0, 1.0, 0.0)
-        low = float_pack()
-        high = float_pack()
+        low, high, middle = float_pack(), float_pack(), float_pack()
         for k in range(pack):
+            low[k] = RANGE * top[k]
             high[k] = top[k]
-        for _ in range(BISECTIONS):
+        for step in range(BISECTIONS):
             above = float_pack()
+            for k in range(pack):
+                middle[k] = _between(low[k], high[k], step)
             for light in range(light_count):
                 y = readings[start + light * light_stride]
                 for k in range(pack):
-                    above[k] += wp.where(y[k] > 0.5 * (low[k] + high[k]), 1.0, 0.0)
+                    above[k] += wp.where(y[k] > middle[k], 1.0, 0.0)
             for k in range(pack):
-                middle = 0.5 * (low[k] + high[k])
                 many = above[k] > wp.max(BRIGHT_FRACTION * given[k] - 0.5, 0.0)
-                low[k] = wp.where(many, middle, low[k])
-                high[k] = wp.where(many, high[k], middle)
+                low[k] = wp.where(many, middle[k], low[k])
+                high[k] = wp.where(many, high[k], middle[k])
 
         # of the lit lights, the values between which the kept ranks lie
         shadow = float_pack()
@@ -120,21 +131,23 @@ def _robust_kernel(pack: int) -> Any:
             dark_high[k] = top[k]
             bright_low[k] = shadow[k]
             bright_high[k] = top[k]
-        for _ in range(BISECTIONS):
+        dark_middle, bright_middle = float_pack(), float_pack()
+        for step in range(BISECTIONS):
             above_dark = float_pack()
             above_bright = float_pack()
+            for k in range(pack):
+                dark_middle[k] = _between(dark_low[k], dark_high[k], step)
+                bright_middle[k] = _between(bright_low[k], bright_high[k], step)
             for light in range(light_count):
                 y = readings[start + light * light_stride]
                 for k in range(pack):
-                    above_dark[k] += wp.where(y[k] > 0.5 * (dark_low[k] + dark_high[k]), 1.0, 0.0)
-                    above_bright[k] += wp.where(y[k] > 0.5 * (bright_low[k] + bright_high[k]), 1.0, 0.0)
+                    above_dark[k] += wp.where(y[k] > dark_middle[k], 1.0, 0.0)
+                    above_bright[k] += wp.where(y[k] > bright_middle[k], 1.0, 0.0)
             for k in range(pack):
-                middle = 0.5 * (dark_low[k] + dark_high[k])
-                dark_low[k] = wp.where(above_dark[k] >= keep_dark[k], middle, dark_low[k])
-                dark_high[k] = wp.where(above_dark[k] >= keep_dark[k], dark_high[k], middle)
-                middle = 0.5 * (bright_low[k] + bright_high[k])
-                bright_low[k] = wp.where(above_bright[k] > keep_bright[k], middle, bright_low[k])
-                bright_high[k] = wp.where(above_bright[k] > keep_bright[k], bright_high[k], middle)
+                dark_low[k] = wp.where(above_dark[k] >= keep_dark[k], dark_middle[k], dark_low[k])
+                dark_high[k] = wp.where(above_dark[k] >= keep_dark[k], dark_high[k], dark_middle[k])
+                bright_low[k] = wp.where(above_bright[k] > keep_bright[k], bright_middle[k], bright_low[k])
+                bright_high[k] = wp.where(above_bright[k] > keep_bright[k], bright_high[k], bright_middle[k])
 
         # least squares on the kept ranks, re-weighted
         bx, by, bz, across, code = float_pack(), float_pack(), float_pack(), float_pack(), int_pack()

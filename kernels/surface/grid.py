@@ -20,7 +20,7 @@ CPU_RUN = 8192
 CUDA_SUM_THREADS = 65536
 """Threads of a sum on CUDA: enough to fill the largest device, few enough for their partial sums to be cheap."""
 FOLD_THREADS = 256
-"""Threads of the second stage of a sum on CUDA; the third stage is one thread."""
+"""Threads of the second stage of a long sum; the third stage is one thread."""
 
 
 @wp.struct
@@ -138,7 +138,7 @@ class Summer:
     def finish(self, total: wp.array, slot: int) -> None:
         """Write the sum of `partial` to total[slot]."""
         device, count = self.grid.device, self.grid.sums.threads
-        if device == "cpu" or count <= FOLD_THREADS:
+        if count <= FOLD_THREADS:
             devices.launch(_fold, 1, [self.partial, count, 1, slot], [total], device=device)
             return
         devices.launch(_fold, FOLD_THREADS, [self.partial, count, FOLD_THREADS, 0], [self._middle], device=device)

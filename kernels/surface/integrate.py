@@ -25,7 +25,8 @@ class IntegrationOptions:
     """Of one solve; seven to fifteen are usual, mazes and scattered holes take more."""
     discontinuities: bool = False
     """Whether the surface may break: right for objects with parts in front of one another. On a smooth surface it
-    changes nothing but the share of noise (6 % more error at most in our trials) and doubles the time."""
+    changes nothing but the share of noise (6 % more error at most in our trials) and takes up to twice as long; where
+    there are breaks it takes several solves."""
     sharpness: float = 2.0
     """How fast an edge is given up as its misfit, in squared pixels, exceeds its neighbour's (k of Cao et al.)."""
     max_reweightings: int = 40
@@ -153,6 +154,9 @@ def _check(normal: Any, mask: Any, x: Any, y: Any, *, perspective: bool, mean_z:
     for name, a in (("x", x), ("y", y)):
         if tuple(a.shape) != tuple(mask.shape):
             raise ArrayError(f"{name} has shape {tuple(a.shape)}, mask {tuple(mask.shape)}: give one value per pixel")
+    for name, a in (("normal", normal), ("x", x), ("y", y)):
+        if isinstance(a, wp.array) and a.dtype is not wp.float32:
+            raise ArrayError(f"{name} holds {a.dtype.__name__}: give float32")
     if not np.isfinite(mean_z):
         raise ArrayError(f"mean_z is {mean_z}: give a finite height")
     if perspective and mean_z >= 0.0:

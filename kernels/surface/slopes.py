@@ -10,7 +10,7 @@ The weight is the squared cosine between the mean normal and the line of sight, 
 is made small is then the distance of each neighbour from the tangent plane, (m/2)·(p_j − p_i), in units of the
 pixel's footprint. Its product with the slope is polynomial in the normals, so noise of the normals averages out. The
 inverse variance of the slope, (m_z⁴/(m_x² + m_z²)), was tried and is worse: a pair that noise made steeper weighs
-less, which flattens everything into a bowl (3 to 6 times the error on a hemisphere with 0.05 to 0.15 rad of noise),
+less, which flattens everything into a bowl (2 to 5 times the error on a hemisphere with 0.05 to 0.15 rad of noise),
 and it makes the problem anisotropic at a rim, where multigrid takes 60 iterations in place of 7. Across a crease m is
 short and so is the weight. s, the distance between pixels in the plane of x and y, is the unit of the unknown
 heights, so that both projections give numbers of the order of pixels.
@@ -18,8 +18,8 @@ heights, so that both projections give numbers of the order of pixels.
 A pair steeper than STEEPEST (or facing away, which no visible surface does) keeps the slope of STEEPEST at the
 smallest weight: dropping it would cut stray pixels off and send them to the mean height as spikes.
 
-Sources: Quéau, Durou & Aujol, "Normal Integration: A Survey", 2018, for log-depth under perspective; Cao et al., ECCV
-2022, eq. 9–11, for residuals weighted by the cosine.
+Sources: Quéau, Durou & Aujol, "Normal Integration: A Survey", 2018, for log-depth under perspective; Cao et al.,
+"Bilateral Normal Integration", ECCV 2022, for residuals weighted by the cosine.
 """
 
 from typing import Any, NamedTuple
@@ -112,7 +112,9 @@ def _normal_at(normal: wp.array3d(dtype=wp.float32), r: int, c: int):
     return wp.normalize(wp.vec3(normal[0, r, c], normal[1, r, c], normal[2, r, c]))
 
 
-def _make_kernel(pair, name: str):
+def _make_kernel(pair: Any, name: str) -> Any:
+    """The kernel over all edges, for one projection."""
+
     def edges(
         first: int,
         normal: wp.array3d(dtype=wp.float32),

@@ -38,6 +38,7 @@ def info(capture: CaptureArgument) -> None:
     """Say what a capture holds, and what is wrong with it."""
     from service.cli.bar import Bar
     from service.pipelines.inspect import inspect
+    from stage.errors import StageError
 
     with Bar() as bar:
         found = inspect(capture, bar)
@@ -46,4 +47,5 @@ def info(capture: CaptureArgument) -> None:
     for fault in found.faults:
         print(f"{'wrong':<12} {fault}")
     if found.faults:
-        raise typer.Exit(2)
+        others = f" (and {len(found.faults) - 1} more, above)" if len(found.faults) > 1 else ""
+        raise StageError(f"{found.faults[0]}{others}")

@@ -5,6 +5,7 @@ import sys
 from typing import Annotated
 
 import typer
+from typer.exceptions import TyperException
 
 from service.cli import capture, demo, doctor, measure, results
 
@@ -28,10 +29,14 @@ def _root(version: Annotated[bool, typer.Option("--version", help="Print the ver
 def main() -> None:
     """Run the program; exit 2 with one sentence on bad input, 130 when interrupted."""
     try:
-        app()
-    except KeyboardInterrupt:
-        print("relit: interrupted; results that are there are whole, run again to finish", file=sys.stderr)
-        sys.exit(INTERRUPTED)
+        code = app(standalone_mode=False)  # so that wrong options, too, are one sentence
+        if code == INTERRUPTED:  # what typer makes of KeyboardInterrupt
+            print("relit: interrupted; results that are there are whole, run again to finish", file=sys.stderr)
+        sys.exit(code)
+    except TyperException as error:
+        if text := " ".join(error.format_message().replace("Value error, ", "").split()):  # else the help has been shown
+            print(f"relit: {text[0].lower()}{text[1:].removesuffix('.')}: see relit --help", file=sys.stderr)
+        sys.exit(error.exit_code)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader of our output is gone
         sys.exit(1)

@@ -12,6 +12,7 @@ import numpy as np
 from service.progress import Progress, Timings
 from stage import images
 from stage.capture import Capture
+from stage.correction import Correction
 from stage.errors import StageError
 from stage.light import DistantLight
 from stage.lighting import check_solvable
@@ -65,6 +66,11 @@ def inspect(path: Path, progress: Progress | None = None) -> Inspection:
         facts.append(("mask", f"{int(mask.sum())} of {mask.size} pixels"))
     except StageError as error:
         faults.append(str(error))
+    if not faults:
+        try:
+            Correction.of(capture)
+        except StageError as error:
+            faults.append(str(error))
     return Inspection(facts, faults)
 
 

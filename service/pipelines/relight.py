@@ -31,6 +31,8 @@ CHUNK_BYTES = 512 << 20
 """Of finished half frames that are held at one time: bounds the memory of a long range."""
 ENVIRONMENT_SUFFIXES = {".exr", ".hdr"}
 HALF_MAX = 65504.0
+MAX_FRAMES = 100_000
+"""Over an hour of film; more is a slip of the finger that would fill the memory before the first frame."""
 
 
 class RelightResult(NamedTuple):
@@ -49,7 +51,7 @@ def relight(request: RelightRequest, progress: Progress | None = None) -> Religh
         progress: told of every stage.
 
     Raises:
-        RequestError: a bad frame range or a pattern without ####.
+        RequestError: a bad frame range, a pattern without ####, or a frame that would replace an input.
         StageError, KernelError: bad input; names file and field.
         StorageError: a frame cannot be written; frames already there are whole.
     """
@@ -62,6 +64,10 @@ def relight(request: RelightRequest, progress: Progress | None = None) -> Religh
     lights = distant_lights(capture)
     space = linear_space(capture.manifest.color_space)
     environment = read_environment(request.environment, space)
+    inputs = {request.environment.resolve(), *(capture.file(name).resolve() for _, name in capture.files())}
+    for path in paths:
+        if path.resolve() in inputs:
+            raise RequestError(f"--out {request.out}: {path} is an input: choose another folder or name")
     timings.stage("ingest", len(capture.sources()))
     stack = open_stack(capture, cache=request.cache, progress=lambda done, _: timings.advance(done))
     timings.stage("weights", len(numbers))
@@ -96,7 +102,7 @@ def frame_numbers(text: str) -> list[int]:
     """`7` or `1-24` as numbers.
 
     Raises:
-        RequestError: not that form, or backwards.
+        RequestError: not that form, backwards, or more than MAX_FRAMES.
     """
     match = re.fullmatch(r"(\d+)(?:-(\d+))?", text.strip())
     if match is None:
@@ -105,6 +111,8 @@ def frame_numbers(text: str) -> list[int]:
     last = int(match[2]) if match[2] is not None else first
     if last < first:
         raise RequestError(f"--frames {text}: runs backwards: give {last}-{first}")
+    if last - first >= MAX_FRAMES:
+        raise RequestError(f"--frames {text}: asks for {last - first + 1} frames: {MAX_FRAMES} at most in one run")
     return list(range(first, last + 1))
 
 

@@ -12,7 +12,7 @@ from kernels.photometric.lambert import solve_lambert
 from kernels.photometric.readings import Lights, grey_factors, grey_readings, pad_lights
 from kernels.photometric.robust import solve_robust
 from kernels.status import Status
-from kernels.surface.integrate import Integration, integrate_normals
+from kernels.surface.integrate import Integration, IntegrationOptions, integrate_normals
 from service.methods import Method
 from service.progress import Progress, Timings
 from service.provenance import metadata, report
@@ -28,6 +28,9 @@ from stage.stack import Stack
 SOLVERS = {Method.LAMBERT: solve_lambert, Method.ROBUST: solve_robust}
 READING_BYTES = 4
 """A grey reading, per light and pixel, beside the stack's band."""
+INTEGRATION = IntegrationOptions(discontinuities=True, max_reweightings=0)
+"""The surface may break where slopes around a pixel contradict each other: objects hide parts of themselves. The bilateral rounds
+that may follow gain little more on real objects and can settle on a wrong break where normals are noisy (docs/figures.md)."""
 MAPS_FILE, REPORT_FILE = "maps.exr", "report.json"
 
 
@@ -152,7 +155,7 @@ def _integrate(capture: Capture, normal: np.ndarray, solved: np.ndarray, device:
         mean_z = -sum(camera.focal_px) / 2  # at this distance one pixel spans one unit
     x, y = camera.plane_coordinates()
     return integrate_normals(normal, solved, x.astype(np.float32), y.astype(np.float32), perspective=perspective, mean_z=mean_z,
-                             device=device, progress=lambda part: timings.advance(round(100 * part)))
+                             options=INTEGRATION, device=device, progress=lambda part: timings.advance(round(100 * part)))
 
 
 def _residual_statistics(residual: np.ndarray) -> dict[str, float]:

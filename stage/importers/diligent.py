@@ -8,7 +8,7 @@ from pathlib import Path
 
 from stage.errors import ManifestError, storage
 from stage.importers.layout import finish, image_resolution, read_table
-from stage.manifest import SCHEMA, Manifest
+from stage.manifest import SCHEMA
 
 
 def import_folder(source: Path, destination: Path) -> Path:
@@ -25,7 +25,8 @@ def import_folder(source: Path, destination: Path) -> Path:
         ManifestError: a text file is missing, has the wrong count of rows, or names an image that is not there.
     """
     with storage("read", source / "filenames.txt"):
-        names = (source / "filenames.txt").read_text(encoding="utf-8").split()
+        lines = (source / "filenames.txt").read_text(encoding="utf-8", errors="replace").splitlines()
+    names = [line.strip() for line in lines if line.strip()]
     directions = read_table(source / "light_directions.txt", 3)
     intensities = read_table(source / "light_intensities.txt", 3)
     for name, table in (("light_directions.txt", directions), ("light_intensities.txt", intensities)):
@@ -37,7 +38,7 @@ def import_folder(source: Path, destination: Path) -> Path:
     if zero:
         raise ManifestError(f"{source / 'light_directions.txt'}: row {zero[0] + 1} has zero length: give a direction")
     mask = "mask.png" if (source / "mask.png").exists() else None
-    manifest = Manifest.model_validate({
+    return finish({
         "schema": SCHEMA,
         "name": source.resolve().name,
         "color_space": "lin_rec709_scene",
@@ -47,5 +48,4 @@ def import_folder(source: Path, destination: Path) -> Path:
             {"image": name, "light": {"type": "distant", "direction": list(direction), "irradiance": list(intensity)}}
             for name, direction, intensity in zip(names, directions.tolist(), intensities.tolist(), strict=True)
         ],
-    })
-    return finish(manifest, source, destination, [*names, *([mask] if mask else [])])
+    }, source / "filenames.txt", destination)

@@ -4,13 +4,15 @@ import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
 from stage import images
 from stage.errors import ManifestError, storage
 from stage.files import replacing
-from stage.manifest import FILE_NAME, Manifest, write_manifest
+from stage.manifest import FILE_NAME, Manifest, describe, write_manifest
 
 
 def read_table(path: Path, columns: int) -> np.ndarray:
@@ -51,19 +53,21 @@ def place(source: Path, destination: Path, names: Sequence[str]) -> None:
     Files that are there already with the same size and time stay; other files of the same name are not overwritten.
 
     Raises:
-        ManifestError: a file is missing, or another file of that name is there already.
+        ManifestError: a file is missing, lies outside `source`, or another file of that name is there already; nothing is placed.
         StorageError: the file system refuses.
     """
-    if source.resolve() == destination.resolve():
-        return
+    wanted = []
     for name in names:
         origin, target = source / name, destination / name
+        if Path(name).is_absolute() or ".." in Path(name).parts:
+            raise ManifestError(f"{source}: {name} leads out of the folder")
         if not origin.is_file():
             raise ManifestError(f"{source}: {name} is not in the folder")
-        if target.exists():
-            if target.samefile(origin) or _alike(origin, target):
-                continue
+        if not target.exists():
+            wanted.append((origin, target))
+        elif not (target.samefile(origin) or _alike(origin, target)):
             raise ManifestError(f"{target}: is there already and differs from {origin}: choose another folder")
+    for origin, target in wanted:
         with storage("write", target):
             target.parent.mkdir(parents=True, exist_ok=True)
             try:
@@ -73,13 +77,23 @@ def place(source: Path, destination: Path, names: Sequence[str]) -> None:
                     shutil.copy2(origin, temporary)
 
 
-def finish(manifest: Manifest, source: Path, destination: Path, names: Sequence[str]) -> Path:
-    """Place the images and write the manifest last, so that a capture.json never names files that are not there.
+def finish(data: dict[str, Any], table: Path, destination: Path) -> Path:
+    """Check the manifest, place its images and write it last, so that a capture.json never names files that are not there.
+
+    Args:
+        data: the manifest as plain data.
+        table: the file that it was made from, beside the images; named when a value of it cannot be.
+        destination: the capture's folder.
 
     Returns:
         The path of the manifest.
     """
-    place(source, destination, names)
+    try:
+        manifest = Manifest.model_validate(data)
+    except ValidationError as error:
+        raise ManifestError(f"{table}: {describe(error)}") from error
+    names = [frame.image for frame in manifest.frames]
+    place(table.parent, destination, [*names, *([manifest.mask] if manifest.mask else [])])
     path = destination / FILE_NAME
     write_manifest(manifest, path)
     return path

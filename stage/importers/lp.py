@@ -9,14 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
 from stage.errors import ManifestError, storage
 from stage.importers.layout import finish, image_resolution
-from stage.manifest import SCHEMA, Manifest, describe
-
-DISPLAY_ENCODED = {".jpg", ".jpeg", ".png"}
-"""Suffixes whose 8-bit images are taken as sRGB."""
+from stage.manifest import SCHEMA
 
 
 def import_folder(source: Path, destination: Path) -> Path:
@@ -35,30 +31,27 @@ def import_folder(source: Path, destination: Path) -> Path:
     path = _find(source)
     folder = path.parent
     with storage("read", path):
-        lines = [line.strip() for line in path.read_text(encoding="utf-8", errors="replace").splitlines()]
-    lines = [line for line in lines if line]
-    if not lines or not lines[0].isdigit():
-        raise ManifestError(f"{path}: line 1: must be the count of images")
-    count, rows = int(lines[0]), lines[1:]
+        text = path.read_text(encoding="utf-8-sig", errors="replace")
+    lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
+    if not lines or not lines[0][1].isdecimal():
+        raise ManifestError(f"{path}: line {lines[0][0] if lines else 1}: must be the count of images")
+    count, rows = int(lines[0][1]), lines[1:]
     if count != len(rows):
         raise ManifestError(f"{path}: says {count} images, holds {len(rows)}")
-    frames = [_frame(path, folder, number, row) for number, row in enumerate(rows, start=2)]
+    frames = [_frame(path, folder, number, row) for number, row in rows]
     if not frames:
         raise ManifestError(f"{path}: names no image")
     first = folder / frames[0]["image"]
+    resolution = image_resolution(first)
     mask = "mask.png" if (folder / "mask.png").exists() else None
-    try:
-        manifest = Manifest.model_validate({
-            "schema": SCHEMA,
-            "name": path.stem,
-            "color_space": "srgb_texture" if _display_encoded(first) else "lin_rec709_scene",
-            "camera": {"projection": "orthographic", "resolution": image_resolution(first)},
-            "mask": mask,
-            "frames": frames,
-        })
-    except ValidationError as error:
-        raise ManifestError(f"{path}: {describe(error)}") from error
-    return finish(manifest, folder, destination, [f["image"] for f in frames] + ([mask] if mask else []))
+    return finish({
+        "schema": SCHEMA,
+        "name": path.stem,
+        "color_space": "srgb_texture" if _display_encoded(first) else "lin_rec709_scene",
+        "camera": {"projection": "orthographic", "resolution": resolution},
+        "mask": mask,
+        "frames": frames,
+    }, path, destination)
 
 
 def _find(source: Path) -> Path:
@@ -90,7 +83,7 @@ def _frame(path: Path, folder: Path, number: int, row: str) -> dict[str, Any]:
 def _display_encoded(path: Path) -> bool:
     import OpenImageIO as oiio
 
-    if path.suffix.lower() not in DISPLAY_ENCODED:
+    if path.suffix.lower() == ".exr":
         return False
     source = oiio.ImageInput.open(str(path))
     if source is None:

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
@@ -15,16 +15,18 @@ def perspective(**changes):
 
 
 coefficient = st.floats(-0.05, 0.05)
+tangential = st.floats(-0.005, 0.005)
 plane = st.floats(-0.5, 0.5)
 
 
-@given(k=st.tuples(coefficient, coefficient, coefficient), p=st.tuples(st.floats(-0.005, 0.005), st.floats(-0.005, 0.005)), x=plane, y=plane)
+@settings(deadline=None)
+@given(k=st.tuples(coefficient, coefficient, coefficient), p=st.tuples(tangential, tangential), x=plane, y=plane)
 def test_undo_is_the_inverse_of_apply(k, p, x, y):
     lens = Distortion(model="brown_conrady", k=k, p=p)
     x, y = np.array([x]), np.array([y])
     back = lens.undo(*lens.apply(x, y))
     # what the fixed point leaves after its iterations: its contraction is below 0.25 for these lenses, and 0.25^20 = 1e-12
-    assert np.allclose(back, (x, y), rtol=0, atol=1e-10)
+    assert np.allclose(back, (x, y), rtol=0, atol=1e-12)
 
 
 def test_distortion_is_opencvs():

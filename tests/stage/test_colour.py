@@ -18,14 +18,15 @@ def test_srgb_is_its_closed_form():
     codes = np.arange(256, dtype=np.float32) / 255
     pixels = np.repeat(codes.reshape(16, 16, 1), 3, axis=2)
     linear = linearise(pixels, "srgb_texture")
-    # OpenColorIO's fast float power is good to 2e-6 (its own tolerance); an 8-bit step is 3e-4 at the least
-    assert np.allclose(linear, srgb_to_linear(pixels.astype(np.float64)), rtol=2e-5, atol=2e-6)
+    # OpenColorIO joins the two pieces smoothly (slope 12.9232, not 12.92: 2.5e-4) and approximates the power to 2e-5; a step of
+    # 8 bits is 9e-3 at the least
+    assert np.allclose(linear, srgb_to_linear(pixels.astype(np.float64)), rtol=3e-4, atol=0)
 
 
 def test_gamma_spaces_are_powers():
     pixels = np.full((1, 1, 3), 0.5, dtype=np.float32)
-    assert np.allclose(linearise(pixels, "g22_rec709_scene"), 0.5**2.2, rtol=1e-5)
-    assert np.allclose(linearise(pixels, "g18_rec709_scene"), 0.5**1.8, rtol=1e-5)
+    assert np.allclose(linearise(pixels, "g22_rec709_scene"), 0.5**2.2, rtol=3e-5)
+    assert np.allclose(linearise(pixels, "g18_rec709_scene"), 0.5**1.8, rtol=3e-5)  # its fast power
 
 
 def test_linear_spaces_are_returned_as_they_are():
@@ -53,7 +54,7 @@ def test_grey_keeps_one_channel():
     grey = np.full((2, 3, 1), 0.5, dtype=np.float32)
     linear = linearise(grey, "srgb_texture")
     assert linear.shape == (2, 3, 1)
-    assert np.allclose(linear, srgb_to_linear(0.5), rtol=2e-5)
+    assert np.allclose(linear, srgb_to_linear(0.5), rtol=5e-5)
 
 
 def test_the_working_space_keeps_the_primaries():

@@ -14,7 +14,8 @@ from stage.pattern import Pattern
     ({"code": "kary", "axis": "row", "base": 1, "digit": 0, "digits": 1, "levels": [0]}, "base"),
     ({"code": "kary", "axis": "row", "base": 2, "digit": 2, "digits": 2, "levels": [0, 1]}, "digit 2 does not exist"),
     ({"code": "kary", "axis": "row", "base": 2, "digit": 0, "digits": 1}, "either levels or colors"),
-    ({"code": "kary", "axis": "row", "base": 2, "digit": 0, "digits": 1, "levels": [0, 1], "colors": [[1, 0, 0], [0, 1, 0]]}, "either"),
+    ({"code": "kary", "axis": "row", "base": 2, "digit": 0, "digits": 1, "levels": [0, 1], "colors": [[1, 0, 0], [0, 1, 0]]},
+     "either"),
     ({"code": "kary", "axis": "row", "base": 3, "digit": 0, "digits": 1, "levels": [0, 1]}, "levels has 2 entries, base is 3"),
     ({"code": "kary", "axis": "row", "base": 2, "digit": 0, "digits": 1, "levels": [0, 1.5]}, "levels"),
     ({"code": "ramp", "axis": "row", "direction": "left"}, "direction"),
@@ -30,5 +31,6 @@ def test_impossible_patterns_are_refused(data, words):
 
 def test_a_black_stripe_is_a_colour():
     colors = [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
-    pattern = TypeAdapter(Pattern).validate_python({"code": "kary", "axis": "row", "base": 3, "digit": 0, "digits": 1, "colors": colors})
+    data = {"code": "kary", "axis": "row", "base": 3, "digit": 0, "digits": 1, "colors": colors}
+    pattern = TypeAdapter(Pattern).validate_python(data)
     assert pattern.colors == ((0, 0, 0), (1, 0, 0), (0, 1, 0))

@@ -1,0 +1,65 @@
+"""Whether a PNG or JPEG is whole, known from its bytes.
+
+libpng reports damage on the terminal, and libjpeg fills what is missing with grey and calls it read.
+"""
+
+import re
+import struct
+import zlib
+from pathlib import Path
+
+from stage.errors import ImageError, storage
+
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+JPEG_MARKER = re.compile(rb"\xff+([^\x00\xd0-\xd7\xff])")
+"""A marker that ends entropy-coded data: neither a stuffed byte (00) nor a restart (D0 to D7), after any fill bytes."""
+JPEG_START, JPEG_END, JPEG_SCAN = b"\xd8", b"\xd9", b"\xda"
+
+
+def check_png(path: str | Path, *, contents: bool) -> None:
+    """Walk the chunks up to the last one (PNG, 3rd edition, section 5).
+
+    Args:
+        contents: read every chunk and compare its checksum; otherwise only where the chunks lie is read.
+
+    Raises:
+        ImageError: not a PNG, truncated, or damaged.
+        StorageError: the file cannot be read.
+    """
+    with storage("read", path), open(path, "rb") as stream:
+        if stream.read(8) != PNG_SIGNATURE:
+            raise ImageError(f"{path}: is not a PNG file")
+        size = Path(path).stat().st_size
+        kind = b""
+        while kind != b"IEND":
+            start = stream.read(8)
+            length, kind = struct.unpack(">I4s", start) if len(start) == 8 else (0, b"")
+            end = stream.tell() + length + 4
+            if not kind or end > size:
+                raise ImageError(f"{path}: is truncated: its last chunk is missing")
+            if contents:
+                checksum = zlib.crc32(stream.read(length), zlib.crc32(kind))
+                if stream.read(4) != struct.pack(">I", checksum):
+                    raise ImageError(f"{path}: cannot be decoded: its data is damaged")
+            else:
+                stream.seek(end)
+
+
+def check_jpeg(path: str | Path) -> None:
+    """Walk the segments up to the end marker (ITU-T T.81, annex B); what lies behind it is not looked at.
+
+    Raises:
+        ImageError: not a JPEG, or truncated.
+        StorageError: the file cannot be read.
+    """
+    with storage("read", path):
+        data = Path(path).read_bytes()
+    if data[:2] != b"\xff" + JPEG_START:
+        raise ImageError(f"{path}: is not a JPEG file")
+    found = JPEG_MARKER.match(data, 2)
+    while found is not None and found[1] != JPEG_END:
+        position = found.end()
+        end = position + int.from_bytes(data[position : position + 2], "big")
+        found = JPEG_MARKER.search(data, end) if found[1] == JPEG_SCAN else JPEG_MARKER.match(data, end)
+    if found is None:
+        raise ImageError(f"{path}: is truncated: its end marker is missing")

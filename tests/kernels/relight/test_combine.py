@@ -1,0 +1,145 @@
+import numpy as np
+import pytest
+import warp as wp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kernels import device as devices
+from kernels import packs
+from kernels.errors import ArrayError
+from kernels.packs import pack_type
+from kernels.relight import batch, combine
+from tests.kernels.scenes import cap, colours, shade, store
+from tests.reference.relight import weighted_sum
+
+PIXEL_COUNTS = [1, 31, 33, 4097]
+FRAMES = [1, 3, 7, 33]
+BLOCKS = 120_001
+"""Pixels of 40 lights that take more than one block of the CPU's matrix product."""
+
+
+def captured(lights, pixels, seed=0):
+    rng = np.random.default_rng(seed)
+    return store(rng.gamma(1.0, 1.0, (3, lights, pixels)))
+
+
+def drawn(shape, seed=1):
+    return np.random.default_rng(seed).normal(0, 1, shape).astype(np.float32)
+
+
+def close(got, stack, weights):
+    """Each sum over L lights in float32 is off by at most L · 2⁻²⁴ of the sum of its absolute terms."""
+    bound = weights.shape[-1] * 2.0**-24 * weighted_sum(np.abs(stack), np.abs(weights))
+    return (np.abs(got - weighted_sum(stack, weights)) <= bound).all()
+
+
+@pytest.mark.parametrize("pixels", PIXEL_COUNTS)
+@pytest.mark.parametrize("lights", [1, 8, 41])
+def test_one_frame_is_the_weighted_sum(lights, pixels, device):
+    stack = captured(lights, pixels)
+    weights = drawn((3, stack.shape[1]))
+    frame = combine.combine(packs.upload(stack, device=device), weights).numpy()
+    assert close(frame[:, :pixels], stack, weights)
+    assert (frame[:, pixels:] == 0).all()
+
+
+@pytest.mark.parametrize("frames", FRAMES)
+@pytest.mark.parametrize("pixels", [1, 33, 1000])
+def test_a_batch_is_its_frames(pixels, frames, device):
+    stack = captured(21, pixels)
+    weights = drawn((frames, 3, 24))
+    got = batch.combine_batch(packs.upload(stack, device=device), weights).numpy()
+    assert got.shape[:2] == (frames, 3)
+    for f in range(frames):
+        assert close(got[f, :, :pixels], stack, weights[f])
+
+
+def test_a_batch_of_several_blocks(device):
+    stack = captured(40, BLOCKS)
+    weights = drawn((2, 3, 40))
+    band = packs.upload(stack, device=device)
+    assert device != "cpu" or 4 * 40 * BLOCKS > batch.BLOCK_BYTES > 4 * 40 * 32
+    got = batch.combine_batch(band, weights).numpy()
+    for f in range(2):
+        assert close(got[f, :, :BLOCKS], stack, weights[f])
+        single = combine.combine(band, weights[f]).numpy()
+        assert close(single[:, :BLOCKS], stack, weights[f])
+
+
+def fours(stack):
+    """[3 · light, pack] in packs of four, as on CUDA, on the CPU."""
+    padded = np.pad(stack, ((0, 0), (0, 0), (0, -stack.shape[2] % 4)))
+    return wp.array(padded.reshape(-1, padded.shape[2] // 4, 4), dtype=pack_type(4, wp.float16), device="cpu")
+
+
+@pytest.mark.parametrize("pixels", [1, 4, 130])
+def test_the_kernels_of_cuda(pixels):
+    """The register kernels, packs of four, on the CPU."""
+    stack = captured(13, pixels)
+    values = fours(stack)
+    weights = drawn((8, 3, 16))
+    frame = wp.zeros((3, values.shape[1]), dtype=pack_type(4, wp.float32), device="cpu")
+    devices.launch(combine.register_kernel(4), 3 * values.shape[1],
+                   [values, wp.array(weights[0], dtype=wp.float32, device="cpu")], [frame], device="cpu")
+    assert close(frame.numpy().reshape(3, -1)[:, :pixels], stack, weights[0])
+    two = np.concatenate([weights, -2 * weights])  # two groups of register frames
+    frames = wp.zeros((16, 3, values.shape[1]), dtype=pack_type(4, wp.float32), device="cpu")
+    devices.launch(batch.register_kernel(4), 2 * 3 * values.shape[1],
+                   [values, wp.array(two, dtype=wp.float32, device="cpu")], [frames], device="cpu")
+    got = frames.numpy().reshape(16, 3, -1)[:, :, :pixels]
+    for f in range(16):
+        assert close(got[f], stack, two[f])
+
+
+@settings(max_examples=15, deadline=None)
+@given(chosen=st.permutations(range(20)), powers=st.lists(st.floats(0.0, 4.0), min_size=5, max_size=5))
+def test_superposition(chosen, powers):
+    """Five lights on at once look as the weighted sum of their images does."""
+    normal, albedo, direction, irradiance = cap(100, 80), colours(100), cap(20, 90), colours(20, seed=2)
+    alone = shade(normal, albedo, direction, irradiance)
+    lit = np.zeros(20)
+    lit[list(chosen[:5])] = powers
+    together = np.einsum("clp,l->cp", alone, lit)
+    weights = np.zeros((3, 24), dtype=np.float32)
+    weights[:, :20] = lit
+    frame = combine.combine(packs.upload(store(alone), device="cpu"), weights).numpy()[:, :100]
+    # half rounding of each stored image, its step below the normal range, and float32 weights and sums
+    assert (np.abs(frame - together) <= 2.0**-11 * 1.001 * together + lit.sum() * 2.0**-25 + 1e-30).all()
+
+
+@settings(max_examples=15, deadline=None)
+@given(a=st.floats(-4, 4, width=32), b=st.floats(-4, 4, width=32), seed=st.integers(0, 100))
+def test_frames_add_up_as_their_weights_do(a, b, seed):
+    stack, first, second = captured(16, 40, seed), drawn((3, 16), seed), drawn((3, 16), seed + 1)
+    band = packs.upload(stack, device="cpu")
+    both = combine.combine(band, a * first + b * second).numpy()[:, :40]
+    one, other = (combine.combine(band, w).numpy()[:, :40] for w in (first, second))
+    size = weighted_sum(stack, abs(a) * np.abs(first) + abs(b) * np.abs(second))
+    np.testing.assert_array_less(np.abs(both - (a * one + b * other)), 20 * 2.0**-23 * size + 1e-30)  # 16 sums and the mixing
+
+
+def test_no_frame_is_no_frame(device):
+    band = packs.upload(captured(8, 40), device=device)
+    assert batch.combine_batch(band, np.zeros((0, 3, 8), dtype=np.float32)).shape[0] == 0
+
+
+@pytest.mark.parametrize("weights, message", [
+    (np.zeros((3, 16)), r"weights are \(3, 16\), expected \(3, 8\): one for each channel and padded light"),
+    (np.zeros((1, 8)), r"weights are \(1, 8\), expected \(3, 8\)"),
+    (np.where(np.arange(24).reshape(3, 8) < 2, np.nan, 1), "weights hold 2 values that are not finite"),
+    (np.where(np.arange(24).reshape(3, 8) < 1, np.inf, 1), "weights hold 1 values that are not finite"),
+])
+def test_bad_weights_are_refused(weights, message, device):
+    band = packs.upload(captured(8, 4), device=device)
+    with pytest.raises(ArrayError, match=message):
+        combine.combine(band, weights)
+    frames = np.stack([np.zeros_like(weights), weights])
+    with pytest.raises(ArrayError, match=message.replace(r"\(", r"\(2, ") if "expected" in message else message):
+        batch.combine_batch(band, frames)
+
+
+def test_a_band_without_colour_is_refused(device):
+    band = packs.upload(np.zeros((1, 8, 4), dtype=np.float16), device=device)
+    for call in (lambda: combine.combine(band, np.zeros((3, 8))), lambda: batch.combine_batch(band, np.zeros((1, 3, 8)))):
+        with pytest.raises(ArrayError, match="the band has 1 channels, expected 3"):
+            call()

@@ -1,0 +1,21 @@
+"""The kernels as CUDA runs them go through the compiler that Warp brings along, on machines without a GPU too."""
+
+import pytest
+import warp as wp
+
+from kernels import device as devices
+from kernels.device import PACK_CUDA
+from kernels.photometric import albedo, lambert, readings, robust
+from kernels.relight import batch, combine, environment
+
+devices.names()
+OLDEST = min(wp.get_cuda_supported_archs(), default=None)
+
+
+@pytest.mark.skipif(OLDEST is None, reason="this build of Warp has no CUDA compiler")
+@pytest.mark.parametrize("make", [readings._grey_kernel, lambert._lambert_kernel, robust._robust_kernel, albedo._albedo_kernel,
+                                  combine.register_kernel, batch.register_kernel, environment._nearest_kernel])
+def test_kernel_compiles_for_cuda_and_keeps_its_packs_in_registers(make, tmp_path):
+    wp.compile_aot_module(make(PACK_CUDA).module, arch=OLDEST, module_dir=tmp_path, use_ptx=True)
+    ptx, = (path.read_text(encoding="latin-1") for path in tmp_path.glob("*.ptx"))
+    assert ".entry" in ptx and "__local_depot" not in ptx  # an array indexed at run time would lie in local memory: slow

@@ -1,0 +1,207 @@
+"""Importers: the layouts of DiLiGenT and RTI become captures, and bad rows are named by file and line."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from stage.capture import Capture
+from stage.errors import ImageError, ManifestError, StorageError
+from stage.importers import diligent, lp
+from tests.captures import files_in, write_exr, write_image
+
+NAMES = ["001.png", "002.png", "003.png", "004.png"]
+DIRECTIONS = [(0, 0, 1), (0.5, 0, 1), (0, 0.5, 1), (-0.5, -0.25, 1)]
+INTENSITIES = [(1, 1, 1), (2, 1, 0.5), (0.5, 1, 2), (1.5, 1.5, 1.5)]
+
+
+def table(rows) -> str:
+    return "".join(" ".join(f"{value:g}" for value in row) + "\n" for row in rows)
+
+
+@pytest.fixture
+def object_folder(tmp_path):
+    """A DiLiGenT object of 5 by 4 pixels."""
+    folder = tmp_path / "catPNG"
+    for index, name in enumerate(NAMES):
+        write_image(folder / name, np.full((4, 5, 3), 1000 * (index + 1), np.uint16))
+    write_image(folder / "mask.png", np.full((4, 5), 255, np.uint8))
+    (folder / "filenames.txt").write_text("\n".join(NAMES) + "\n")
+    (folder / "light_directions.txt").write_text(table(DIRECTIONS))
+    (folder / "light_intensities.txt").write_text(table(INTENSITIES))
+    return folder
+
+
+def test_a_diligent_object_in_place(object_folder):
+    before = files_in(object_folder)
+    path = diligent.import_folder(object_folder, object_folder)
+    assert path == object_folder / "capture.json"
+    assert files_in(object_folder) == before | {"capture.json"}
+    capture = Capture.open(object_folder)
+    assert (capture.name, capture.manifest.color_space, capture.camera.resolution) == ("catPNG", "lin_rec709_scene", (5, 4))
+    assert '"color_space": "lin_rec709_scene"' in path.read_text()
+    for frame, name, direction, intensity in zip(capture.manifest.frames, NAMES, DIRECTIONS, INTENSITIES, strict=True):
+        assert frame.image == name
+        assert np.allclose(frame.light.direction, np.array(direction) / np.linalg.norm(direction))
+        assert np.allclose(frame.light.irradiance, intensity)
+
+
+def test_a_diligent_object_elsewhere(object_folder, tmp_path):
+    diligent.import_folder(object_folder, tmp_path / "new" / "cat")
+    capture = Capture.open(tmp_path / "new" / "cat")
+    assert files_in(capture.folder) == {*NAMES, "mask.png", "capture.json"}
+    assert "capture.json" not in files_in(object_folder)
+    assert (capture.folder / "002.png").read_bytes() == (object_folder / "002.png").read_bytes()
+    diligent.import_folder(object_folder, tmp_path / "new" / "cat")  # again changes nothing
+
+
+def test_without_a_mask(object_folder):
+    (object_folder / "mask.png").unlink()
+    diligent.import_folder(object_folder, object_folder)
+    assert Capture.open(object_folder).mask().all()
+
+
+@pytest.mark.parametrize(("file", "text", "words"), [
+    ("light_directions.txt", "0 0 1\n0 up 1\n0 0 1\n0 0 1\n", r"light_directions\.txt: line 2: '0 up 1' is not 3 numbers"),
+    ("light_directions.txt", "0 0 1\n\n0 1\n0 0 1\n0 0 1\n", r"light_directions\.txt: line 3: '0 1' is not 3 numbers"),
+    ("light_directions.txt", "0 0 1\n0 nan 1\n0 0 1\n0 0 1\n", r"light_directions\.txt: line 2: '0 nan 1' is not 3 numbers"),
+    ("light_directions.txt", "0 0 1\n0 0 1\n0 0 0\n0 0 1\n", r"light_directions\.txt: row 3 has zero length"),
+    ("light_directions.txt", "0 0 1\n", r"light_directions\.txt: has 1 rows, filenames\.txt names 4 images"),
+    ("light_intensities.txt", "", r"light_intensities\.txt: has 0 rows, filenames\.txt names 4 images"),
+    ("light_intensities.txt", table([(1, 1, 1)] * 3 + [(1, -1, 1)]), r"frames\[3\]\.light\.irradiance\[1\]: is -1\.0"),
+    ("light_intensities.txt", table([(1, 1, 1)] * 3 + [(0, 0, 0)]), r"frames\[3\]\.light\.irradiance: is zero in every channel"),
+    ("filenames.txt", "001.png\n002.png\n001.png\n004.png\n", r"filenames\.txt: frames\[2\]\.image: 001\.png is already"),
+    ("filenames.txt", "001.png\n002.png\n009.png\n004.png\n", r"009\.png is not in the folder"),
+    ("filenames.txt", "009.png\n002.png\n003.png\n004.png\n", r"cannot read .*009\.png: no such file"),
+    ("filenames.txt", "001.png\n002.png\n../x.png\n004.png\n", r"\.\./x\.png leads out of the folder"),
+])
+@pytest.mark.parametrize("in_place", [True, False])
+def test_bad_rows_are_named_and_nothing_is_written(object_folder, tmp_path, file, text, words, in_place):
+    write_image(tmp_path / "x.png", np.zeros((4, 5, 3), np.uint16))
+    (object_folder / file).write_text(text)
+    before = files_in(tmp_path)
+    with pytest.raises((ManifestError, StorageError), match=words) as caught:
+        diligent.import_folder(object_folder, object_folder if in_place else tmp_path / "new")
+    assert "\n" not in str(caught.value)
+    assert files_in(tmp_path) == before
+
+
+@pytest.mark.parametrize("name", ["filenames.txt", "light_directions.txt", "light_intensities.txt"])
+def test_a_missing_table_is_named(object_folder, name):
+    (object_folder / name).unlink()
+    with pytest.raises(StorageError, match=rf"cannot read .*{name}: no such file"):
+        diligent.import_folder(object_folder, object_folder)
+
+
+def test_an_empty_object(object_folder):
+    for name in ("filenames.txt", "light_directions.txt", "light_intensities.txt"):
+        (object_folder / name).write_text("\n")
+    with pytest.raises(ManifestError, match=r"filenames\.txt: names no image"):
+        diligent.import_folder(object_folder, object_folder)
+
+
+def test_another_file_of_that_name_is_not_overwritten(object_folder, tmp_path):
+    other = write_image(tmp_path / "new" / "003.png", np.zeros((9, 9), np.uint8))
+    kept = other.read_bytes()
+    with pytest.raises(ManifestError, match=r"003\.png: is there already and differs"):
+        diligent.import_folder(object_folder, tmp_path / "new")
+    assert other.read_bytes() == kept
+    assert files_in(tmp_path / "new") == {"003.png"}
+
+
+def rti(folder, lines, *, dtype=np.uint8, suffix="jpg", names=("a 1", "b", "c")):
+    """Images and an .lp file of three rows."""
+    for name in names:
+        path = folder / f"{name}.{suffix}"
+        if suffix == "exr":
+            write_exr(path, np.full((4, 5, 3), 0.5))
+        else:
+            write_image(path, np.full((4, 5, 3), 100, dtype))
+    (folder / "dome.lp").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+GOOD = ["3", "a 1.jpg 0.0 0.0 1.0", "b.jpg 0.6 0 0.8", "c.jpg\t0 0.6\t0.8"]
+
+
+def test_an_rti_capture_with_a_space_in_a_name(tmp_path):
+    path = lp.import_folder(rti(tmp_path, GOOD), tmp_path)
+    capture = Capture.open(path)
+    assert [frame.image for frame in capture.manifest.frames] == ["a 1.jpg", "b.jpg", "c.jpg"]
+    assert np.allclose([frame.light.direction for frame in capture.manifest.frames], [(0, 0, 1), (0.6, 0, 0.8), (0, 0.6, 0.8)])
+    assert all(frame.light.irradiance == (1, 1, 1) for frame in capture.manifest.frames)
+    assert (capture.name, capture.camera.resolution) == ("dome", (5, 4))
+
+
+def test_the_lp_file_itself_may_be_named(tmp_path):
+    rti(tmp_path / "a", GOOD)
+    shutil.copy(tmp_path / "a" / "dome.lp", tmp_path / "a" / "second.lp")
+    with pytest.raises(ManifestError, match=r"holds 2 \.lp files: name the one to import"):
+        lp.import_folder(tmp_path / "a", tmp_path / "b")
+    lp.import_folder(tmp_path / "a" / "second.lp", tmp_path / "b")
+    assert Capture.open(tmp_path / "b").name == "second"
+
+
+def test_paths_of_another_machine(tmp_path):
+    (tmp_path / "sub").mkdir()
+    write_image(tmp_path / "sub" / "d.jpg", np.full((4, 5, 3), 100, np.uint8))
+    lines = ["4", "C:\\Users\\me\\My Dome\\a 1.jpg 0 0 1", "/home/me/b.jpg 0.6 0 0.8",
+             "elsewhere/c.jpg 0 0.6 0.8", "sub\\d.jpg -0.6 0 0.8"]
+    lp.import_folder(rti(tmp_path, lines), tmp_path)
+    assert [f.image for f in Capture.open(tmp_path).manifest.frames] == ["a 1.jpg", "b.jpg", "c.jpg", "sub/d.jpg"]
+
+
+@pytest.mark.parametrize(("suffix", "dtype", "space"), [
+    ("jpg", np.uint8, "srgb_texture"),
+    ("png", np.uint8, "srgb_texture"),
+    ("tif", np.uint8, "srgb_texture"),
+    ("png", np.uint16, "lin_rec709_scene"),
+    ("tif", np.float32, "lin_rec709_scene"),
+    ("exr", np.float32, "lin_rec709_scene"),
+])
+def test_eight_bits_are_taken_as_srgb(tmp_path, suffix, dtype, space):
+    lines = [line.replace(".jpg", f".{suffix}") for line in GOOD]
+    path = lp.import_folder(rti(tmp_path, lines, dtype=dtype, suffix=suffix), tmp_path)
+    assert f'"color_space": "{space}"' in path.read_text()
+    assert Capture.open(tmp_path).manifest.color_space == space
+
+
+@pytest.mark.parametrize(("lines", "words"), [
+    ([], r"dome\.lp: line 1: must be the count of images"),
+    (["three", *GOOD[1:]], r"dome\.lp: line 1: must be the count of images"),
+    (["²", *GOOD[1:]], r"dome\.lp: line 1: must be the count of images"),
+    (["4", *GOOD[1:]], r"dome\.lp: says 4 images, holds 3"),
+    (["0"], r"dome\.lp: names no image"),
+    (["3", GOOD[1], "b.jpg 0.6 0", GOOD[3]], r"dome\.lp: line 3: 'b\.jpg 0\.6 0' is not an image name and three numbers"),
+    (["3", "", GOOD[1], "", "b.jpg 0.6 0 up", GOOD[3]], r"dome\.lp: line 5: 'b\.jpg 0\.6 0 up' is not"),
+    (["3", GOOD[1], "b.jpg 0 inf 1", GOOD[3]], r"dome\.lp: line 3"),
+    (["3", GOOD[1], "b.jpg 0 0 0", GOOD[3]], r"dome\.lp: line 3: the light direction has zero length"),
+    (["3", GOOD[1], GOOD[2], GOOD[2]], r"dome\.lp: frames\[2\]\.image: b\.jpg is already the image of frames\[1\]"),
+    (["3", GOOD[1], "x.jpg 0 0 1", GOOD[3]], r"x\.jpg is not in the folder"),
+    (["3", "x.jpg 0 0 1", *GOOD[2:]], r"cannot read .*x\.jpg: no such file"),
+    (["3", GOOD[1], "../e.jpg 0 0 1", GOOD[3]], r"\.\./e\.jpg leads out of the folder"),
+])
+@pytest.mark.parametrize("in_place", [True, False])
+def test_bad_lp_files_are_named_and_nothing_is_written(tmp_path, lines, words, in_place):
+    rti(tmp_path / "a", lines)
+    write_image(tmp_path / "e.jpg", np.zeros((4, 5, 3), np.uint8))
+    before = files_in(tmp_path)
+    with pytest.raises((ManifestError, StorageError), match=words) as caught:
+        lp.import_folder(tmp_path / "a", tmp_path / ("a" if in_place else "b"))
+    assert "\n" not in str(caught.value)
+    assert files_in(tmp_path) == before
+
+
+def test_no_lp_file(tmp_path):
+    with pytest.raises(ManifestError, match=r"holds 0 \.lp files"):
+        lp.import_folder(tmp_path, tmp_path)
+    with pytest.raises(StorageError, match=r"cannot read .*none: no such file"):
+        lp.import_folder(tmp_path / "none", tmp_path)
+
+
+def test_a_first_image_that_is_none(tmp_path):
+    rti(tmp_path, GOOD)
+    (tmp_path / "a 1.jpg").write_bytes(b"no image")
+    with pytest.raises(ImageError, match=r"a 1\.jpg: cannot be read"):
+        lp.import_folder(tmp_path, tmp_path)
+    assert "capture.json" not in files_in(tmp_path)

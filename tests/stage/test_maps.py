@@ -1,0 +1,102 @@
+"""maps.exr: what is written comes back, and what was not estimated is not there."""
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from stage import exr
+from stage.camera import Camera, Distortion
+from stage.errors import ImageError, ResultError
+from stage.maps import LAYERS, SurfaceMaps
+from tests.captures import files_in
+
+ROWS, COLS = 5, 7
+RNG = np.random.default_rng(13)
+MASK = RNG.random((ROWS, COLS)) > 0.4
+CAMERA = Camera(projection="perspective", resolution=(COLS, ROWS), focal_px=(9.0, 10.0), surface_z_m=-0.5,
+                distortion=Distortion(model="brown_conrady", k=(0.1, 0, 0)))
+
+
+def make_maps(**changes) -> SurfaceMaps:
+    three, one = (lambda: RNG.random((ROWS, COLS, 3)).astype(np.float32)), (lambda: RNG.random((ROWS, COLS)).astype(np.float32))
+    layers = {"normal": three(), "diffuse_albedo": three(), "specular": three(), "roughness": one(), "height": one() - 1,
+              "confidence": one()}
+    return SurfaceMaps(**{"camera": CAMERA, "mask": MASK, "provenance": {"relit:capture": "owl"}, **layers, **changes})
+
+
+def test_every_layer_comes_back_in_the_type_it_is_stored_as(tmp_path):
+    maps = make_maps(color_space="lin_ap1_scene")
+    maps.write(tmp_path / "maps.exr")
+    back = SurfaceMaps.read(tmp_path / "maps.exr")
+    assert (back.camera, back.color_space, back.provenance) == (CAMERA, "lin_ap1_scene", {"relit:capture": "owl"})
+    assert back.mask.dtype == bool and np.array_equal(back.mask, MASK)
+    for name, layer in maps.layers().items():
+        if name != "mask":
+            stored = layer.astype(LAYERS[name][1]).astype(np.float32)
+            assert np.array_equal(getattr(back, name)[MASK], stored[MASK]), name
+            assert not getattr(back, name)[~MASK].any(), name
+
+
+def test_the_channels_are_those_of_the_contract(tmp_path):
+    make_maps().write(tmp_path / "maps.exr")
+    with OpenEXR.File(str(tmp_path / "maps.exr"), separate_channels=True) as file:
+        types = {name: channel.pixels.dtype.name for name, channel in file.channels().items()}
+        header = dict(file.header())
+    half = [f"{layer}.{c}" for layer in ("diffuse_albedo", "specular") for c in "RGB"] + ["roughness.Y", "confidence.Y", "mask.Y"]
+    floats = ["normal.X", "normal.Y", "normal.Z", "height.Z"]
+    assert types == {**dict.fromkeys(half, "float16"), **dict.fromkeys(floats, "float32")}
+    assert header["colorInteropID"] == "lin_rec709_scene" and "chromaticities" in header and "relit:camera" in header
+
+
+def test_nothing_is_left_outside_the_mask_not_even_nan(tmp_path):
+    normal = np.full((ROWS, COLS, 3), np.nan, np.float32)
+    normal[MASK] = (0, 0, 1)
+    make_maps(normal=normal).write(tmp_path / "maps.exr")
+    channels, _ = exr.read(tmp_path / "maps.exr")
+    for name, plane in channels.items():
+        assert not plane[~MASK].any(), name
+        assert np.isfinite(plane).all()
+
+
+@pytest.mark.parametrize("absent", [name for name in LAYERS if name != "mask"])
+def test_a_layer_that_was_not_estimated_is_absent_not_zero(tmp_path, absent):
+    make_maps(**{absent: None}).write(tmp_path / "maps.exr")
+    channels, _ = exr.read(tmp_path / "maps.exr")
+    assert {name.split(".")[0] for name in channels} == set(LAYERS) - {absent}
+    assert getattr(SurfaceMaps.read(tmp_path / "maps.exr"), absent) is None
+
+
+def write(path, channels, **metadata):
+    exr.write(path, channels, color_space="lin_rec709_scene", metadata=metadata)
+    return path
+
+
+def test_what_is_not_a_maps_file_is_named(tmp_path):
+    plane = np.ones((ROWS, COLS), np.float32)
+    camera = {"relit:camera": CAMERA.model_dump_json()}
+    with pytest.raises(ResultError, match=r"a\.exr: carries no relit:camera attribute"):
+        SurfaceMaps.read(write(tmp_path / "a.exr", {"Y": plane}))
+    with pytest.raises(ResultError, match=r"b\.exr: layer normal lacks channel normal\.Y"):
+        SurfaceMaps.read(write(tmp_path / "b.exr", {"normal.X": plane, "normal.Z": plane, "mask.Y": plane}, **camera))
+    with pytest.raises(ResultError, match=r"c\.exr: has no layer mask\.Y"):
+        SurfaceMaps.read(write(tmp_path / "c.exr", {"height.Z": plane}, **camera))
+    with pytest.raises(ResultError, match=r"d\.exr: is 3x5, its camera 7x5"):
+        SurfaceMaps.read(write(tmp_path / "d.exr", {"mask.Y": plane[:, :3].copy()}, **camera))
+    for name, text in (("e", "{"), ("f", "{}"), ("g", '{"projection": "fisheye"}')):
+        with pytest.raises(ResultError, match=rf"{name}\.exr: its relit:camera attribute is not a camera"):
+            SurfaceMaps.read(write(tmp_path / f"{name}.exr", {"mask.Y": plane}, **{"relit:camera": text}))
+
+
+def test_a_truncated_maps_file_is_named(tmp_path):
+    make_maps().write(tmp_path / "maps.exr")
+    (tmp_path / "maps.exr").write_bytes((tmp_path / "maps.exr").read_bytes()[:-10])
+    with pytest.raises(ImageError, match=r"maps\.exr: is truncated"):
+        SurfaceMaps.read(tmp_path / "maps.exr")
+    assert files_in(tmp_path) == {"maps.exr"}
+
+
+def test_two_writes_of_the_same_maps_are_the_same_file(tmp_path):
+    maps = make_maps()
+    maps.write(tmp_path / "a.exr")
+    maps.write(tmp_path / "b.exr")
+    assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()

@@ -1,0 +1,156 @@
+"""The floors of the house, read from the imports of every module."""
+
+import ast
+import subprocess
+import sys
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+HOME = Path(__file__).resolve().parents[1]
+ROOTS = ("stage", "kernels", "service")
+
+
+class Import(NamedTuple):
+    """One name that one module takes from another."""
+
+    importer: str
+    target: str
+    """The module, or module.name for `from module import name`."""
+    lazy: bool
+    """Inside a function: when it is called, not when the module is loaded."""
+
+
+def module_name(path: Path) -> str:
+    parts = path.relative_to(HOME).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def imports_of(path: Path) -> list[Import]:
+    found = []
+
+    def visit(node: ast.AST, lazy: bool) -> None:
+        if isinstance(node, ast.Import):
+            found.extend(Import(module_name(path), alias.name, lazy) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            found.extend(Import(module_name(path), f"{node.module}.{alias.name}", lazy) for alias in node.names)
+        inside = lazy or isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+        for child in ast.iter_child_nodes(node):
+            visit(child, inside)
+
+    visit(ast.parse(path.read_text(encoding="utf-8")), False)
+    return found
+
+
+FILES = {module_name(path): path for root in ROOTS for path in sorted((HOME / root).rglob("*.py"))}
+IMPORTS = [found for path in FILES.values() for found in imports_of(path)]
+
+
+def under(name: str, *packages: str) -> bool:
+    return any(name == package or name.startswith(f"{package}.") for package in packages)
+
+
+def top(name: str) -> str:
+    return name.partition(".")[0]
+
+
+def test_the_imports_are_read():
+    """If this fails, the others prove nothing."""
+    assert len(FILES) > 60
+    assert Import("service.pipelines.solve", "stage.capture.Capture", False) in IMPORTS
+    assert Import("service.cli.results", "service.pipelines.solve.solve", True) in IMPORTS
+    assert any(i.importer == "kernels.device" and i.target == "warp" for i in IMPORTS)
+
+
+@pytest.mark.parametrize(("floor", "allowed"), [
+    ("stage", {"stage", "numpy", "pydantic", "OpenEXR", "OpenImageIO"}),
+    ("kernels", {"kernels", "numpy", "warp"}),
+])
+def test_a_floor_knows_only_its_own_libraries(floor, allowed):
+    """So neither knows the other, nor the roof; and stage knows no Warp."""
+    others = {i for i in IMPORTS if top(i.importer) == floor and top(i.target) not in allowed | sys.stdlib_module_names}
+    assert not others
+
+
+@pytest.mark.parametrize(("library", "home"), [
+    ("pxr", "service.usd"), ("typer", "service.cli"), ("rich", "service.cli"),
+    ("fastapi", "service.api"), ("dbos", "service.jobs"),
+])
+def test_a_library_lives_in_one_place(library, home):
+    assert {i.importer for i in IMPORTS if top(i.target) == library and not under(i.importer, home)} == set()
+
+
+@pytest.mark.parametrize(("package", "forbidden"), [
+    ("service.pipelines", ("service.cli", "service.jobs", "service.api")),
+    ("service.usd", ("service.cli", "service.jobs", "service.api", "service.pipelines", "kernels", "warp")),
+    ("service.jobs", ("service.cli", "service.api")),
+    ("service.api", ("service.cli", "service.pipelines", "kernels", "warp")),
+])
+def test_what_a_part_of_the_roof_must_not_know(package, forbidden):
+    assert {i for i in IMPORTS if under(i.importer, package) and under(i.target, *forbidden)} == set()
+
+
+def test_stage_and_kernels_meet_in_pipelines_alone():
+    """service.errors is the table of what either may raise, and takes no more from kernels than that."""
+    meeting = {name for name in FILES
+               if {"stage", "kernels"} <= {top(i.target) for i in IMPORTS if i.importer == name}
+               and not under(name, "service.pipelines")}
+    assert meeting <= {"service.errors"}
+    taken = {i.target for i in IMPORTS if i.importer == "service.errors" and top(i.target) == "kernels"}
+    assert taken == {"kernels.errors.KernelError"}
+
+
+def test_the_command_line_knows_kernels_and_warp_lightly():
+    """relit doctor runs a kernel, which is a check of the installation and no pipeline; it may, when it is called."""
+    knowing = {i for i in IMPORTS if under(i.importer, "service.cli") and top(i.target) in ("kernels", "warp")}
+    assert all(i.lazy for i in knowing)
+    assert {i.importer for i in knowing} <= {"service.cli.doctor"}
+
+
+def test_the_roof_outside_pipelines_knows_no_warp():
+    assert {i for i in IMPORTS if top(i.importer) == "service" and top(i.target) == "warp"
+            and not under(i.importer, "service.pipelines")} == set()
+
+
+def test_no_module_takes_a_private_name_of_another():
+    """Above all no solver another solver's."""
+    def private(name: str) -> bool:
+        return name.startswith("_") and not name.startswith("__")
+
+    assert {i for i in IMPORTS if top(i.target) in ROOTS and private(i.target.rpartition(".")[2])} == set()
+    reached = []
+    for name, path in FILES.items():
+        modules = {alias.asname or alias.name for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+                   if isinstance(node, ast.ImportFrom) and node.module and top(node.module) in ROOTS
+                   for alias in node.names if f"{node.module}.{alias.name}" in FILES}
+        reached += [f"{name}: {node.value.id}.{node.attr}" for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+                    if isinstance(node, ast.Attribute) and private(node.attr)
+                    and isinstance(node.value, ast.Name) and node.value.id in modules]
+    assert reached == []
+
+
+def test_no_cycles():
+    graph: dict[str, set[str]] = {name: set() for name in FILES}
+    for found in IMPORTS:
+        target = found.target if found.target in FILES else found.target.rpartition(".")[0]
+        if not found.lazy and target in FILES and target != found.importer:
+            graph[found.importer].add(target)
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(" imports ".join(reversed(error.args[1])))
+
+
+def test_the_command_line_starts_without_heavy_libraries():
+    heavy = "warp", "pxr", "OpenEXR", "OpenImageIO", "numpy", "pydantic"
+    code = f"import sys, service.cli.main; print([name for name in {heavy!r} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=HOME, timeout=60, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_references_judge_without_what_they_judge():
+    for path in sorted((HOME / "tests" / "reference").glob("*.py")):
+        assert not {i.target for i in imports_of(path) if top(i.target) in ROOTS}, path.name
