@@ -21,9 +21,9 @@ def test_solve_finds_the_normals_and_albedo_that_were_rendered(relit, tmp_path, 
     assert outcome.out.splitlines()[2] == f"pixels   {SCENE.mask.sum()} ok"
     maps = SurfaceMaps.read(tmp_path / "out" / "maps.exr")
     assert np.array_equal(maps.mask, SCENE.mask)
-    # the stack's half rounding, 2^-12 of each reading on average, alone gives 0.02 degrees at this tilt of the lights
-    assert angles_degrees(maps.normal, SCENE.normal)[SCENE.mask].max() < 0.08
-    assert np.allclose(maps.diffuse_albedo[SCENE.mask], SCENE.albedo[SCENE.mask], rtol=2e-3)  # that, and half in the file
+    # half rounding in the stack, up to 2^-11 of each reading, gives 0.02 degrees at this tilt of the lights
+    assert angles_degrees(maps.normal, SCENE.normal)[SCENE.mask].max() < 0.05
+    assert np.allclose(maps.diffuse_albedo[SCENE.mask], SCENE.albedo[SCENE.mask], rtol=1.5e-3)  # that, and half in the file
     assert maps.specular is None and maps.roughness is None
 
 
@@ -36,8 +36,8 @@ def test_solve_finds_the_height_of_the_cap(relit, tmp_path):
     truth = np.sqrt(np.where(SCENE.mask, radius**2 - x**2 - y**2, radius**2))
     truth -= truth[SCENE.mask].mean()
     assert maps.height[SCENE.mask].mean() == pytest.approx(0, abs=1e-7)
-    # a mean of two slopes stands for the slope between two pixels: the second difference of a sphere, 0.1 pixel over 8
-    assert np.abs(maps.height - truth)[SCENE.mask].max() < 0.1 * 0.01
+    # normals that are 0.02 degrees off, all to one side, would tilt the cap by that over its radius of 0.08 m
+    assert np.abs(maps.height - truth)[SCENE.mask].max() < 0.08 * np.radians(0.02)
 
 
 def test_the_report_and_the_maps_say_where_they_come_from(relit, tmp_path):

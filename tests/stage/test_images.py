@@ -19,6 +19,7 @@ def test_integers_are_fractions_of_full_scale(tmp_path, suffix, dtype, full):
     codes = RNG.integers(0, full, (5, 7, 3), endpoint=True).astype(dtype)
     codes[0, 0], codes[0, 1] = 0, full
     pixels = read_pixels(write_image(tmp_path / f"a.{suffix}", codes))
+    assert read_header(tmp_path / f"a.{suffix}") == (7, 5, 3)
     assert pixels.dtype == np.float32
     # codes / full in float32: half a unit in the last place either way
     assert np.allclose(pixels, codes / full, rtol=1.2e-7, atol=0)

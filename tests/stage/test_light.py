@@ -30,6 +30,8 @@ def test_direction_is_kept_with_length_one(vector):
     ({"type": "point", "position_m": [0, 0, 1], "intensity": [1, 1, 1], "axis": [0, 0, 1], "anisotropy": -1}, "anisotropy"),
     ({"type": "extended", "directions": [[0, 0, 1]], "radiance": [[1, 1, 1]], "solid_angle": [0.1, 0.2]},
      "1 directions, 1 radiance and 2"),
+    ({"type": "extended", "directions": [[0, 0, 1]], "radiance": [[1, 1, 1]] * 2, "solid_angle": [0.1]},
+     "1 directions, 2 radiance and 1"),
     ({"type": "extended", "directions": [[0, 0, 1]], "radiance": [[0, 0, 0]], "solid_angle": [0.1]},
      "no radiance above 0"),
     ({"type": "extended", "directions": [], "radiance": [], "solid_angle": []}, "directions"),

@@ -1,0 +1,38 @@
+"""The reflectance model as Warp functions: Burley's diffuse lobe and GGX with Smith height-correlated masking and Schlick's Fresnel.
+
+All directions point away from the surface; nl, nv, nh, hv are cosines between normal, light, viewer and half vector; alpha = roughness².
+Values are BRDF · n·l, so that a reading (radiance / irradiance) is their sum.
+
+Sources: Walter et al., "Microfacet models for refraction through rough surfaces", EGSR 2007, equation 33 (distribution); Heitz,
+"Understanding the masking-shadowing function", JCGT 2014, equation 99 (height-correlated masking); Schlick 1994 (Fresnel);
+Burley, "Physically-based shading at Disney", 2012, section 5.3 (diffuse).
+"""
+
+import warp as wp
+
+INVERSE_PI = 0.31830988618
+
+
+@wp.func
+def schlick(hv: float) -> float:
+    """(1 - h·v)⁵: F = F0 + (1 - F0) · this."""
+    u = wp.max(1.0 - hv, 0.0)
+    u2 = u * u
+    return u2 * u2 * u
+
+
+@wp.func
+def ggx(nl: float, nv: float, nh: float, alpha: float) -> float:
+    """D · V · n·l without Fresnel; 0 for a light below the horizon."""
+    a2 = alpha * alpha
+    bottom = nh * nh * (a2 - 1.0) + 1.0
+    distribution = a2 * INVERSE_PI / (bottom * bottom)
+    masking = nl * wp.sqrt(nv * nv * (1.0 - a2) + a2) + nv * wp.sqrt(nl * nl * (1.0 - a2) + a2)
+    return wp.where(nl > 0.0, distribution * 0.5 * nl / wp.max(masking, 1.0e-6), 0.0)
+
+
+@wp.func
+def diffuse(nl: float, nv: float, hv2: float, rough: float, slope: float) -> float:
+    """π · diffuse BRDF of albedo 1 · n·l: Burley's lobe of roughness `rough` (below 0: Lambert's) times 1 + slope · (1 - n·l)."""
+    retro = wp.where(rough >= 0.0, 2.0 * rough * hv2 - 0.5, 0.0)
+    return nl * (1.0 + slope * (1.0 - nl)) * (1.0 + retro * schlick(nl)) * (1.0 + retro * schlick(nv))

@@ -1,0 +1,292 @@
+"""Normals by hypothesis and test: each candidate normal is judged by how well a non-negative mixture of lobes explains the readings.
+
+For a candidate the readings are expected to be Σ x_k f_k(l), x ≥ 0, with f_0 a diffuse lobe and the others GGX lobes of fixed widths.
+The mixture is fitted by re-weighted non-negative least squares with Cauchy weights relative to the noise σ = s0 + s1 · reading, and the candidate's cost is
+Σ log(1 + r²/σ²) over the lights. A light that reads far below its prediction is in cast shadow, which costs a fixed sum: any normal
+may be shadowed, none may be brighter than its lobes. Candidates are rings about the best normal so far, coarse to fine.
+
+Source: hypothesised normals after Hui and Sankaranarayanan, "Shape and spatially-varying reflectance estimation from virtual
+exemplars", TPAMI 2017; here with analytic lobes in place of measured materials, and robust.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from kernels.errors import ArrayError
+from kernels.microfacet import diffuse, ggx, schlick
+from kernels.packs import pack_type
+from kernels.photometric.samples import Samples, per_pixel, to_host
+
+LOBES = (0.08, 0.15, 0.25, 0.4, 0.6)
+"""Widths α of the GGX lobes of the mixture: roughness 0.28 to 0.77, a factor of 1.5 to 2 apart, as wide as the lobes are."""
+MIXTURE = 1 + len(LOBES)
+MIXTURE_F0 = 0.04
+"""Reflectance at normal incidence whose Fresnel rise the lobes have; readings at grazing half vectors hardly tell it."""
+GEOMETRY = 2
+"""Scratch beside the lobes for each light: 1 / |l + v| and (1 - h·v)⁵."""
+LEAST_NZ = 0.02
+"""Cosine to the viewer that candidates keep at the least: a visible surface faces the viewer."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Diffuse:
+    """Shape of the diffuse lobe, shared by the pixels of a material."""
+
+    rough: float = -1.0
+    """Roughness of Burley's lobe, 0…1; below 0: Lambert's."""
+    slope: float = 0.0
+    """Further factor 1 + slope · (1 - n·l)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchOptions:
+    """How candidates are judged."""
+
+    noise_floor: float = 0.1
+    """s0, relative to the pixel's level: what the lobes cannot explain on a good pixel."""
+    noise_slope: float = 0.02
+    """s1: relative noise of bright readings."""
+    reweightings: int = 5
+    """Rounds of the robust fit; three lose 0.1° on real data."""
+    sweeps: int = 12
+    """Coordinate sweeps of each non-negative solve."""
+    shadow_cost: float = 1.0
+    """What a cast shadow costs, in units of the cost of a residual (1.0: of 1.3 σ)."""
+    shadow_depth: float = 0.3
+    """A reading below this fraction of its prediction may be a cast shadow."""
+
+
+WIDE = ((5.0, 10.0, 16.0, 24.0, 34.0, 46.0), 30)
+"""First rings, degrees from the start, and how many candidates the last one has."""
+FINE = (((2.5, 5.0), 10), ((0.9, 1.8), 8), ((0.4,), 6), ((0.2,), 6))
+"""The rings that follow, each about the best so far."""
+
+
+class Search(NamedTuple):
+    """What a search found for each sampled pixel."""
+
+    normal: np.ndarray  # [n, 3] float32, unit
+    cost: np.ndarray  # [n] float32, per light
+    curvature: np.ndarray  # [n] float32, mean rise of the cost over the last ring, per light
+
+
+def rings(degrees: tuple[float, ...], last_count: int) -> np.ndarray:
+    """Offsets of candidates from a centre: the centre, then rings.
+
+    Returns:
+        [candidates, 4] float32: sine and cosine of the angle from the centre, cosine and sine of the azimuth.
+    """
+    offsets = [(0.0, 1.0, 1.0, 0.0)]
+    for index, angle in enumerate(degrees):
+        count = max(6, int(last_count * min(1.0, 1.2 * angle / degrees[-1])))
+        for step in range(count):
+            azimuth = 2 * math.pi * step / count + 0.5 * index  # rings do not line up
+            offsets.append((math.sin(math.radians(angle)), math.cos(math.radians(angle)), math.cos(azimuth), math.sin(azimuth)))
+    return np.array(offsets, dtype=np.float32)
+
+
+def search_normals(samples: Samples, start: np.ndarray, directions: np.ndarray, *, shape: Diffuse,
+                   options: SearchOptions | None = None, wide: tuple[tuple[float, ...], int] = WIDE,
+                   fine: tuple[tuple[tuple[float, ...], int], ...] = FINE) -> Search:
+    """Search the normals of sampled pixels.
+
+    Args:
+        samples: their readings.
+        start: [n, 3] unit normals to begin from.
+        directions: [lights, 3] unit, without padding.
+        shape: of the diffuse lobe.
+        options: how candidates are judged.
+        wide, fine: the rings.
+
+    Returns:
+        The best candidates. Waits for the device.
+
+    Raises:
+        ArrayError: shapes that do not fit.
+    """
+    options = options or SearchOptions()
+    if start.shape != (samples.pixel_count, 3) or directions.shape != (samples.light_count, 3):
+        raise ArrayError(f"start is {start.shape}, directions {directions.shape}: give {(samples.pixel_count, 3)} "
+                         f"and {(samples.light_count, 3)}")
+    device, lanes, packs, lights = samples.device, samples.lanes, samples.packs, samples.light_count
+    lane_type = pack_type(lanes, wp.float32)
+    normal = per_pixel(samples, start)
+    cost = wp.empty(packs, dtype=lane_type, device=device)
+    curvature = wp.empty(packs, dtype=lane_type, device=device)
+    held = MIXTURE + GEOMETRY
+    scratch = wp.empty(packs * lights * held, dtype=lane_type, device=device)
+    strides = (lights * held, 1) if device == "cpu" else (1, packs)
+    toward = wp.array(directions.astype(np.float32), dtype=wp.vec3, device=device)
+    noise = wp.vec2(options.noise_floor, options.noise_slope)
+    shadow = wp.vec2(options.shadow_cost, options.shadow_depth)
+    form = wp.vec2(shape.rough, shape.slope)
+    for degrees, count in (wide, *fine):
+        offsets = wp.array(rings(degrees, count), dtype=wp.vec4, device=device)
+        devices.launch(_search_kernel(lanes, options.reweightings, options.sweeps), packs,
+                       [samples.grey, samples.view, toward, offsets, noise, shadow, form, samples.pack_stride, samples.light_stride,
+                        *strides], [scratch, normal, cost, curvature], device=device)
+    return Search(to_host(samples, normal), to_host(samples, cost), to_host(samples, curvature))
+
+
+@cache
+def _search_kernel(lanes: int, reweightings: int, sweeps: int) -> Any:
+    lane_type = pack_type(lanes, wp.float32)
+    coefficients = wp.types.matrix(shape=(MIXTURE, lanes), dtype=wp.float32)
+    gram = wp.types.matrix(shape=(MIXTURE * (MIXTURE + 1) // 2, lanes), dtype=wp.float32)
+    widths = wp.types.vector(length=len(LOBES), dtype=wp.float32)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
+    def search_kernel(first: int,
+                      grey: wp.array(dtype=lane_type),  # [P · L] readings / level
+                      view: wp.array2d(dtype=lane_type),  # [3, P]
+                      directions: wp.array(dtype=wp.vec3),  # [L]
+                      offsets: wp.array(dtype=wp.vec4),  # [candidates]
+                      noise: wp.vec2,  # s0, s1
+                      shadow: wp.vec2,  # cost, depth
+                      form: wp.vec2,  # diffuse roughness, slope
+                      pack_stride: int,
+                      light_stride: int,
+                      scratch_pack: int,
+                      scratch_step: int,
+                      # outputs
+                      scratch: wp.array(dtype=lane_type),  # [P · L · (lobes + 2)]
+                      normal: wp.array2d(dtype=lane_type),  # [3, P] in: start, out: best
+                      cost: wp.array(dtype=lane_type),  # [P]
+                      curvature: wp.array(dtype=lane_type)):  # [P]
+        p = first + wp.tid()
+        light_count = directions.shape[0]
+        alphas = widths(wp.static(LOBES[0]), wp.static(LOBES[1]), wp.static(LOBES[2]), wp.static(LOBES[3]), wp.static(LOBES[4]))
+        vx, vy, vz = view[0, p], view[1, p], view[2, p]
+        base = p * scratch_pack
+        # what depends on light and view alone
+        for light in range(light_count):
+            l = directions[light]
+            at = base + light * wp.static(MIXTURE + GEOMETRY) * scratch_step
+            inverse, rise = lane_type(), lane_type()
+            for k in range(lanes):
+                lv = l[0] * vx[k] + l[1] * vy[k] + l[2] * vz[k]
+                inverse[k] = 1.0 / wp.sqrt(wp.max(2.0 + 2.0 * lv, 1.0e-6))
+                rise[k] = schlick(wp.sqrt(wp.max(0.5 + 0.5 * lv, 0.0)))
+            scratch[at + wp.static(MIXTURE) * scratch_step] = inverse
+            scratch[at + wp.static(MIXTURE + 1) * scratch_step] = rise
+        # tangent frame about the start
+        cx, cy, cz = normal[0, p], normal[1, p], normal[2, p]
+        tx, ty, tz, ux, uy, uz = lane_type(), lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
+        best, bx, by, bz, centre, ring = lane_type(), lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
+        for k in range(lanes):
+            n = wp.vec3(cx[k], cy[k], cz[k])
+            up = wp.where(wp.abs(n[2]) < 0.9, wp.vec3(0.0, 0.0, 1.0), wp.vec3(1.0, 0.0, 0.0))
+            tangent = wp.normalize(wp.cross(up, n))
+            other = wp.cross(n, tangent)
+            tx[k] = tangent[0]
+            ty[k] = tangent[1]
+            tz[k] = tangent[2]
+            ux[k] = other[0]
+            uy[k] = other[1]
+            uz[k] = other[2]
+            best[k] = 1.0e30
+
+        for candidate in range(offsets.shape[0]):
+            o = offsets[candidate]
+            nx, ny, nz, nv = lane_type(), lane_type(), lane_type(), lane_type()
+            for k in range(lanes):
+                x = o[1] * cx[k] + o[0] * (o[2] * tx[k] + o[3] * ux[k])
+                y = o[1] * cy[k] + o[0] * (o[2] * ty[k] + o[3] * uy[k])
+                z = o[1] * cz[k] + o[0] * (o[2] * tz[k] + o[3] * uz[k])
+                # back to the visible hemisphere, along the view
+                lack = wp.max(LEAST_NZ - (x * vx[k] + y * vy[k] + z * vz[k]), 0.0)
+                x = x + lack * vx[k]
+                y = y + lack * vy[k]
+                z = z + lack * vz[k]
+                scale = 1.0 / wp.sqrt(x * x + y * y + z * z)
+                nx[k] = x * scale
+                ny[k] = y * scale
+                nz[k] = z * scale
+                nv[k] = nx[k] * vx[k] + ny[k] * vy[k] + nz[k] * vz[k]
+            # the lobes at this candidate
+            for light in range(light_count):
+                l = directions[light]
+                at = base + light * wp.static(MIXTURE + GEOMETRY) * scratch_step
+                inverse = scratch[at + wp.static(MIXTURE) * scratch_step]
+                rise = scratch[at + wp.static(MIXTURE + 1) * scratch_step]
+                nl, nh, fresnel, lobe = lane_type(), lane_type(), lane_type(), lane_type()
+                for k in range(lanes):
+                    nl[k] = wp.max(nx[k] * l[0] + ny[k] * l[1] + nz[k] * l[2], 0.0)
+                    nh[k] = (nx[k] * l[0] + ny[k] * l[1] + nz[k] * l[2] + nv[k]) * inverse[k]
+                    fresnel[k] = wp.static(0.1 / MIXTURE_F0) * (MIXTURE_F0 + (1.0 - MIXTURE_F0) * rise[k])
+                    lobe[k] = diffuse(nl[k], nv[k], 0.25 / (inverse[k] * inverse[k]), form[0], form[1])
+                scratch[at] = lobe
+                for a in range(wp.static(len(LOBES))):
+                    width = alphas[a]
+                    for k in range(lanes):
+                        lobe[k] = fresnel[k] * ggx(nl[k], nv[k], nh[k], width)
+                    scratch[at + (1 + a) * scratch_step] = lobe
+            # the robust non-negative mixture
+            x_best = coefficients()
+            total = lane_type()
+            for turn in range(reweightings + 1):
+                g = gram()
+                r = coefficients()
+                total = lane_type()
+                for light in range(light_count):
+                    at = base + light * wp.static(MIXTURE + GEOMETRY) * scratch_step
+                    reading = grey[p * pack_stride + light * light_stride]
+                    predicted, w = lane_type(), lane_type()
+                    for a in range(wp.static(MIXTURE)):
+                        f = scratch[at + a * scratch_step]
+                        for k in range(lanes):
+                            predicted[k] += f[k] * x_best[a, k]
+                    for k in range(lanes):
+                        sigma = 1.0 / (noise[0] + noise[1] * wp.max(reading[k], 0.0))
+                        off = (reading[k] - predicted[k]) * sigma
+                        off2 = wp.where(turn == 0, 0.0, off * off)
+                        charge = wp.log(1.0 + off2)
+                        dark = wp.where(reading[k] < shadow[1] * predicted[k], 1, 0) * wp.where(charge > shadow[0], 1, 0)
+                        given = wp.where(reading[k] >= 0.0, 1.0, 0.0)
+                        total[k] += given * wp.where(dark == 1, shadow[0], charge)
+                        w[k] = given * sigma * sigma * wp.where(dark == 1, 0.1, 1.0) / (1.0 + off2)
+                    if turn < reweightings:
+                        for a in range(wp.static(MIXTURE)):
+                            f = scratch[at + a * scratch_step]
+                            wf = lane_type()
+                            for k in range(lanes):
+                                wf[k] = w[k] * f[k]
+                                r[a, k] += wf[k] * reading[k]
+                            for b in range(a + 1):
+                                h = scratch[at + b * scratch_step]
+                                for k in range(lanes):
+                                    g[a * (a + 1) / 2 + b, k] += wf[k] * h[k]
+                if turn < reweightings:
+                    for _ in range(sweeps):
+                        for a in range(wp.static(MIXTURE)):
+                            for k in range(lanes):
+                                rest = r[a, k]
+                                for b in range(wp.static(MIXTURE)):
+                                    high = wp.max(a, b)
+                                    rest -= g[high * (high + 1) / 2 + wp.min(a, b), k] * x_best[b, k]
+                                x_best[a, k] = wp.max(x_best[a, k] + rest / (g[a * (a + 1) / 2 + a, k] + 1.0e-8), 0.0)
+            for k in range(lanes):
+                ring[k] += wp.where(candidate > 0, total[k], 0.0)
+                centre[k] = wp.where(candidate == 0, total[k], centre[k])
+                better = total[k] < best[k]
+                best[k] = wp.where(better, total[k], best[k])
+                bx[k] = wp.where(better, nx[k], bx[k])
+                by[k] = wp.where(better, ny[k], by[k])
+                bz[k] = wp.where(better, nz[k], bz[k])
+        normal[0, p] = bx
+        normal[1, p] = by
+        normal[2, p] = bz
+        share, bend = lane_type(), lane_type()
+        for k in range(lanes):
+            share[k] = best[k] / float(light_count)
+            bend[k] = (ring[k] / wp.max(float(offsets.shape[0] - 1), 1.0) - best[k]) / float(light_count)
+        cost[p] = share
+        curvature[p] = bend
+
+    return search_kernel

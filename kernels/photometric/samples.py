@@ -1,0 +1,175 @@
+"""Readings of chosen pixels, gathered pixel by pixel for solvers that work hard on each: what lies outside the mask costs nothing."""
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from kernels.errors import ArrayError
+from kernels.packs import Band, pack_type
+from kernels.photometric.readings import LARGEST, Lights
+
+LANES_CPU = 8
+"""Pixels of one thread on the CPU: one AVX register of float32, since a thread keeps dozens of sums for each pixel."""
+LANES_CUDA = 1
+"""On CUDA a thread keeps the sums of one pixel in registers."""
+SHADOW_FRACTION = 0.1
+"""Readings under this fraction of the level of all are left out of the level."""
+
+
+class Samples(NamedTuple):
+    """Readings of chosen pixels; element (pack p, light l) of an array is at p · pack_stride + l · light_stride.
+
+    The last pack repeats its last pixel.
+    """
+
+    grey: wp.array  # [packs · lights] float packs: grey reading / level; below 0 where there is no reading
+    colour: wp.array  # [3, packs · lights] float packs: radiance / irradiance; below 0 where there is no reading
+    level: wp.array  # [packs] float packs: how bright the lit readings of the pixel are, grey
+    view: wp.array  # [3, packs] float packs: unit direction to the viewer
+    pixel_count: int
+    packs: int
+    light_count: int
+    lanes: int
+    pack_stride: int
+    light_stride: int
+    device: str
+
+
+def lanes_of(device: str) -> int:
+    """Pixels of one thread on this device."""
+    return LANES_CPU if device == "cpu" else LANES_CUDA
+
+
+def gather(band: Band, pixels: np.ndarray, view: np.ndarray, lights: Lights, factors: np.ndarray, light_count: int) -> Samples:
+    """Gather the readings of some pixels of a band.
+
+    Args:
+        band: the stack on the device.
+        pixels: [n] int32 positions in the band, one or more.
+        view: [n, 3] unit directions from the surface to the viewer.
+        lights: irradiance and scale of each light.
+        factors: [lights, 3], of readings.grey_factors.
+        light_count: lights without padding.
+
+    Returns:
+        The samples on the device.
+
+    Raises:
+        ArrayError: no pixel, or positions outside the band.
+    """
+    if len(pixels) == 0 or pixels.min() < 0 or pixels.max() >= band.pixel_count:
+        raise ArrayError(f"pixels must be one or more positions from 0 to {band.pixel_count - 1}")
+    if view.shape != (len(pixels), 3):
+        raise ArrayError(f"view is {view.shape}, expected {(len(pixels), 3)}")
+    device, lanes = band.device, lanes_of(band.device)
+    packs = -(-len(pixels) // lanes)
+    last = len(pixels) - 1
+    order = np.minimum(np.arange(packs * lanes), last)
+    pack_stride, light_stride = (light_count, 1) if device == "cpu" else (1, packs)
+    lane_type = pack_type(lanes, wp.float32)
+    grey = wp.empty(packs * light_count, dtype=lane_type, device=device)
+    colour = wp.empty((3, packs * light_count), dtype=lane_type, device=device)
+    level = wp.empty(packs, dtype=lane_type, device=device)
+    width = devices.pack_width(device)
+    flat = wp.array(ptr=band.values.ptr, shape=(band.values.shape[0], band.values.shape[1] * width),
+                    strides=(band.values.strides[0], 2), dtype=wp.float16, device=device, copy=False)
+    bits = wp.array(ptr=band.saturated.ptr, shape=(band.saturated.shape[0], band.saturated.shape[1] * width),
+                    strides=(band.saturated.strides[0], 1), dtype=wp.uint8, device=device, copy=False)
+    per_channel = np.divide(lights.scale[:, None], lights.irradiance, out=np.zeros_like(lights.irradiance),
+                            where=lights.irradiance > 0)
+    where = wp.array(pixels[order].astype(np.int32), dtype=wp.int32, device=device)
+    devices.launch(_gather_kernel(lanes), packs,
+                   [flat, bits, where, wp.array(factors, dtype=wp.vec3, device=device),
+                    wp.array(per_channel.astype(np.float32), dtype=wp.vec3, device=device), light_count, pack_stride, light_stride],
+                   [grey, colour, level], device=device)
+    planes = np.ascontiguousarray(view[order].astype(np.float32).T).reshape(3, packs, lanes)
+    return Samples(grey, colour, level, wp.array(planes, dtype=lane_type, device=device), len(pixels), packs, light_count, lanes,
+                   pack_stride, light_stride, device)
+
+
+def per_pixel(samples: Samples, values: np.ndarray) -> wp.array:
+    """[n, k] host values of the sampled pixels as [k, packs] packs on the device."""
+    order = np.minimum(np.arange(samples.packs * samples.lanes), samples.pixel_count - 1)
+    planes = np.ascontiguousarray(values[order].astype(np.float32).T).reshape(values.shape[1], samples.packs, samples.lanes)
+    return wp.array(planes, dtype=pack_type(samples.lanes, wp.float32), device=samples.device)
+
+
+def to_host(samples: Samples, packs: wp.array) -> np.ndarray:
+    """[k, packs] or [packs] packs as [n, k] or [n] host values; waits for the device."""
+    values = packs.numpy()
+    flat = values.reshape(*values.shape[:-2], -1) if values.ndim > 1 else values
+    flat = flat.reshape(-1, samples.packs * samples.lanes)[:, : samples.pixel_count]
+    return flat[0] if packs.ndim == 1 else flat.T
+
+
+@cache
+def _gather_kernel(lanes: int) -> Any:
+    lane_type = pack_type(lanes, wp.float32)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
+    def gather_kernel(first: int,
+                      values: wp.array2d(dtype=wp.float16),  # [3 · L padded, N] stored radiance
+                      saturated: wp.array2d(dtype=wp.uint8),  # [L / 8, N] bits
+                      pixels: wp.array(dtype=wp.int32),  # [P · lanes]
+                      grey_factors: wp.array(dtype=wp.vec3),  # [L padded]
+                      channel_factors: wp.array(dtype=wp.vec3),  # [L padded]
+                      light_count: int,
+                      pack_stride: int,
+                      light_stride: int,
+                      # outputs
+                      grey: wp.array(dtype=lane_type),
+                      colour: wp.array2d(dtype=lane_type),
+                      level: wp.array(dtype=lane_type)):
+        p = first + wp.tid()
+        padded = grey_factors.shape[0]
+        root, given = lane_type(), lane_type()
+        for light in range(light_count):
+            at = p * pack_stride + light * light_stride
+            f, g = grey_factors[light], channel_factors[light]
+            y, red, green, blue = lane_type(), lane_type(), lane_type(), lane_type()
+            for k in range(lanes):
+                n = pixels[p * lanes + k]
+                r = float(values[light, n])
+                gr = float(values[padded + light, n])
+                b = float(values[2 * padded + light, n])
+                sound = wp.where((int(saturated[light / 8, n]) >> (light % 8)) & 1 == 0, 1, 0)
+                value = f[0] * r + f[1] * gr + f[2] * b
+                sound = wp.where(value < LARGEST, sound, 0)  # 0 also for NaN
+                y[k] = wp.where(sound == 1, wp.max(value, 0.0), -1.0)
+                red[k] = wp.where(sound == 1, wp.max(g[0] * r, 0.0), -1.0)
+                green[k] = wp.where(sound == 1, wp.max(g[1] * gr, 0.0), -1.0)
+                blue[k] = wp.where(sound == 1, wp.max(g[2] * b, 0.0), -1.0)
+                root[k] += wp.where(value > 0.0, wp.sqrt(wp.max(y[k], 0.0)), 0.0)
+                given[k] += wp.where(y[k] > 0.0, 1.0, 0.0)
+            grey[at] = y
+            colour[0, at] = red
+            colour[1, at] = green
+            colour[2, at] = blue
+        # the level: mean root of the lit readings, squared; highlights hardly move it
+        first_level, lit_root, lit = lane_type(), lane_type(), lane_type()
+        for k in range(lanes):
+            mean = root[k] / wp.max(given[k], 1.0)
+            first_level[k] = mean * mean
+        for light in range(light_count):
+            y = grey[p * pack_stride + light * light_stride]
+            for k in range(lanes):
+                shines = wp.where(y[k] > SHADOW_FRACTION * first_level[k], 1.0, 0.0)
+                lit[k] += shines
+                lit_root[k] += shines * wp.sqrt(wp.max(y[k], 0.0))
+        scale = lane_type()
+        for k in range(lanes):
+            mean = lit_root[k] / wp.max(lit[k], 1.0)
+            scale[k] = wp.max(mean * mean, 1.0e-20)
+        level[p] = scale
+        for light in range(light_count):
+            at = p * pack_stride + light * light_stride
+            y = grey[at]
+            relative = lane_type()
+            for k in range(lanes):
+                relative[k] = wp.where(y[k] >= 0.0, y[k] / scale[k], -1.0)
+            grey[at] = relative
+
+    return gather_kernel
