@@ -29,32 +29,40 @@ FOOTPRINT_SUBSAMPLES = 8  # per pixel side, for the mean normal that a box filte
 CLAY, SLATE = np.array([0.70, 0.42, 0.25]), np.array([0.25, 0.42, 0.55])
 
 
-HILLS = (  # direction, height in centimetres, angular half-width in radians
-    ((0.05, 0.02, 1.0), 1.6, 0.20),
-    ((-0.42, 0.30, 0.85), 1.4, 0.24),
-    ((0.45, 0.38, 0.80), 1.0, 0.18),
-    ((0.34, -0.42, 0.83), 1.5, 0.26),
-    ((-0.36, -0.40, 0.84), 1.0, 0.18),
-)
+HILL_COUNT = 11
+HILL_SPREAD_DEGREES = 42.0  # from +z: further out a hill would hide what lies behind it
+HILL_HEIGHT_CM, HILL_WIDTH = (0.8, 1.15), (0.15, 0.2)  # the width is an angle in radians
+
+
+def hills() -> list[tuple[np.ndarray, float, float]]:
+    """Direction, height and angular half-width of each hill: a Fibonacci lattice on a cap, sizes in turn."""
+    i = np.arange(HILL_COUNT) + 0.5
+    z = 1 - (1 - np.cos(np.radians(HILL_SPREAD_DEGREES))) * i / HILL_COUNT
+    azimuth, ring = np.pi * (1 + 5**0.5) * i, np.sqrt(1 - z * z)
+    size = (i * 0.381966) % 1
+    return [
+        (np.array([r * np.cos(a), r * np.sin(a), c]), float(np.interp(t, [0, 1], HILL_HEIGHT_CM)), float(np.interp(t, [0, 1], HILL_WIDTH)))
+        for r, a, c, t in zip(ring, azimuth, z, size, strict=True)
+    ]
 
 
 def distance(p: np.ndarray) -> np.ndarray:
-    """Bumpy ball with five hills that throw shadows and yet hide nothing from the camera, in centimetres.
+    """Bumpy ball with hills that throw shadows and yet hide nothing from the camera, in centimetres.
 
     Nothing is hidden, because normals cannot tell the depth of what stands before a hidden part.
     """
     radius = np.linalg.norm(p, axis=-1)
     unit = p / np.maximum(radius, 1e-9)[..., None]
     surface = 4.05 + 0.05 * np.sin(4 * unit[..., 0] + 1) * np.cos(5 * unit[..., 1])
-    for direction, height, width in HILLS:
-        apart = 2 - 2 * unit @ (np.array(direction) / np.linalg.norm(direction))
+    for direction, height, width in hills():
+        apart = 2 - 2 * unit @ direction
         surface = surface + height * np.exp(-apart / (2 * width**2))
     return radius - surface
 
 
 def build(*, detail: float = 0.02) -> Surface:
     """The object in metres, camera frame, with two albedos blending smoothly; `detail` in centimetres."""
-    points, faces = surface_nets(distance, [-4.9] * 3, [4.9, 4.9, 5.6], 4 * detail)
+    points, faces = surface_nets(distance, [-4.9] * 3, [4.9, 4.9, 6.0], 4 * detail)
     for _ in range(2):
         points, faces = subdivide(project(distance, points, step=0.01), faces)
     points = project(distance, points, step=0.01, rounds=2)

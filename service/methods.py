@@ -10,3 +10,7 @@ class Method(StrEnum):
     """Least squares on every light that gave a reading."""
     ROBUST = "robust"
     """Shadows and highlights rejected per pixel."""
+    GRADIENT = "gradient"
+    """Diffuse and specular normals from spherical gradient frames."""
+    SVBRDF = "svbrdf"
+    """Normal, diffuse albedo, specular and roughness; the default where there are lights enough."""

@@ -24,15 +24,18 @@ def versions() -> dict[str, str]:
     return found
 
 
-def metadata(request: BaseModel, *, capture: str, inputs: str) -> dict[str, str]:
+def metadata(request: BaseModel, *, capture: str, inputs: str, method: str | None = None) -> dict[str, str]:
     """String attributes for result files. Nothing in them changes between two runs on the same inputs.
 
     Args:
         request: what was asked; paths and device are left out, so that results do not depend on where they were made.
         capture: its name.
         inputs: content hash of the images.
+        method: the one that was used, where the request left the choice open.
     """
     options = request.model_dump(mode="json", exclude={"capture", "out", "maps", "environment", "cache", "device"})
+    if method is not None:
+        options["method"] = str(method)
     return {"relit:version": __version__, "relit:capture": capture, "relit:inputs": inputs,
             "relit:options": json.dumps(options, sort_keys=True)}
 

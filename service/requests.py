@@ -24,7 +24,8 @@ class SolveRequest(Request):
     capture: Path
     out: Path
     """Folder for maps.exr and report.json."""
-    method: Method = Method.ROBUST
+    method: Method | None = None
+    """None: gradient where there are gradient frames; else svbrdf where there are lights enough, else robust."""
 
 
 class RelightRequest(Request):

@@ -86,7 +86,10 @@ class Camera(Strict):
             (x, y, -1) is along the line of sight. Orthographic: camera-frame x and y of the line, in metres,
             or in pixels when the capture has no scale.
         """
-        u, v = pixel_centres(self.width, self.height)
+        return self.plane_at(*pixel_centres(self.width, self.height))
+
+    def plane_at(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """`plane_coordinates` at any continuous image coordinates, which may lie between pixel centres or off the image."""
         cu, cv = self.principal_px or (self.width / 2, self.height / 2)
         if self.projection == "orthographic":
             pixel = self.pixel_size_m or 1.0

@@ -77,8 +77,12 @@ class Capture:
         return [(frame, frame.light) for frame in self.manifest.frames if isinstance(frame.light, kinds)]
 
     def sources(self) -> list[Frame]:
-        """The frames whose light is a measurement: neither ambient, nor tracking, nor an environment reference."""
-        return [frame for frame in self.manifest.frames if isinstance(frame.light, SOURCES)]
+        """The frames whose light is a measurement: neither ambient, nor tracking, nor an environment reference.
+
+        Beside gradient frames a `full` frame is one: it is what they are compared with.
+        """
+        kinds = (*SOURCES, FullLight) if self.lit_by(GradientLight) else SOURCES
+        return [frame for frame in self.manifest.frames if isinstance(frame.light, kinds)]
 
     def mask(self) -> np.ndarray:
         """Where the object is.

@@ -3,6 +3,7 @@
 StageError
 ├── ManifestError    capture.json (or another description) is not what it must be; names the field
 ├── ImageError       a file cannot be read as the pixels it should hold; names the file
+├── CalibrationError the images do not show what is to be measured in them (no spot on the ball); names frame or ball
 ├── ResultError      a result file (maps.exr, …) lacks what is asked of it; names the file
 └── StorageError     the disk refuses: no space, no permission, unreadable folder; names the path
 """
@@ -22,6 +23,10 @@ class ManifestError(StageError, ValueError):
 
 class ImageError(StageError, ValueError):
     """An image cannot be used: the message names the file."""
+
+
+class CalibrationError(StageError, ValueError):
+    """A calibration cannot be had from these images: the message names the frame, the ball or the field."""
 
 
 class ResultError(StageError, ValueError):

@@ -6,7 +6,7 @@ import numpy as np
 
 from stage.capture import SOURCES, Capture
 from stage.errors import ManifestError
-from stage.light import DistantLight
+from stage.light import DistantLight, GradientLight
 from stage.manifest import FILE_NAME
 
 MIN_SPREAD = 1e-3
@@ -29,7 +29,8 @@ def distant_lights(capture: Capture) -> DistantLights:
     where = capture.folder / FILE_NAME
     for index, frame in enumerate(capture.manifest.frames):
         if isinstance(frame.light, SOURCES) and not isinstance(frame.light, DistantLight):
-            raise ManifestError(f"{where}: frames[{index}].light: is {frame.light.type}: this needs distant lights")
+            hint = " (relit solve --method gradient solves gradients)" if isinstance(frame.light, GradientLight) else ""
+            raise ManifestError(f"{where}: frames[{index}].light: is {frame.light.type}: this needs distant lights{hint}")
     lights = [light for _, light in capture.lit_by(DistantLight)]
     if not lights:
         raise ManifestError(f"{where}: frames: none is lit by a distant light")
@@ -57,6 +58,15 @@ def check_solvable(capture: Capture) -> DistantLights:
     unlit = np.flatnonzero(~(lights.irradiance > 0).any(axis=0))
     if len(unlit):
         raise ManifestError(f"{where}: frames[].light.irradiance: channel {'RGB'[unlit[0]]} is 0 for every light")
-    if capture.camera.width * capture.camera.height == 1:
-        raise ManifestError(f"{where}: camera.resolution: is 1x1: a surface needs two pixels or more")
+    check_surface(capture)
     return lights
+
+
+def check_surface(capture: Capture) -> None:
+    """Refuse an image of one pixel.
+
+    Raises:
+        ManifestError: it is one.
+    """
+    if capture.camera.width * capture.camera.height == 1:
+        raise ManifestError(f"{capture.folder / FILE_NAME}: camera.resolution: is 1x1: a surface needs two pixels or more")

@@ -85,6 +85,19 @@ class Stack:
             return np.zeros((shape[0], stop - start), dtype=np.uint8)
         return self._map(path, shape)[:, start:stop]
 
+    def pick(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The stored values and saturation bits of single pixels.
+
+        Args:
+            pixels: [n] positions, row-major.
+
+        Returns:
+            [3, lights padded, n] float16 and [lights padded / 8, n] uint8, copies.
+        """
+        values = self._map(values_path(self.folder, self.key), self.shape)[:, :, pixels]
+        bits = [self.saturated(position, position + 1)[:, 0] for position in pixels]
+        return np.ascontiguousarray(values), np.stack(bits, axis=1)
+
     def _map(self, path: Path, shape: tuple[int, ...]) -> np.ndarray:
         with storage("read", path):
             try:

@@ -30,6 +30,8 @@ MIXTURE_F0 = 0.04
 """Reflectance at normal incidence whose Fresnel rise the lobes have; readings at grazing half vectors hardly tell it."""
 GEOMETRY = 2
 """Scratch beside the lobes for each light: 1 / |l + v| and (1 - h·v)⁵."""
+SHADOW_TRUST = 0.1
+"""Weight that a reading of zero, or far below its prediction, keeps in the fit: it bounds the radiance and hardly measures it."""
 LEAST_NZ = 0.02
 """Cosine to the viewer that candidates keep at the least: a visible surface faces the viewer."""
 
@@ -124,7 +126,7 @@ def search_normals(samples: Samples, start: np.ndarray, directions: np.ndarray, 
     strides = (lights * held, 1) if device == "cpu" else (1, packs)
     toward = wp.array(directions.astype(np.float32), dtype=wp.vec3, device=device)
     noise = wp.vec2(options.noise_floor, options.noise_slope)
-    shadow = wp.vec2(options.shadow_cost, options.shadow_depth)
+    shadow = wp.vec2(math.expm1(options.shadow_cost), options.shadow_depth)
     form = wp.vec2(shape.rough, shape.slope)
     for degrees, count in (wide, *fine):
         offsets = wp.array(rings(degrees, count), dtype=wp.vec4, device=device)
@@ -148,7 +150,7 @@ def _search_kernel(lanes: int, reweightings: int, sweeps: int) -> Any:
                       directions: wp.array(dtype=wp.vec3),  # [L]
                       offsets: wp.array(dtype=wp.vec4),  # [candidates]
                       noise: wp.vec2,  # s0, s1
-                      shadow: wp.vec2,  # cost, depth
+                      shadow: wp.vec2,  # r²/σ² of equal cost, depth
                       form: wp.vec2,  # diffuse roughness, slope
                       pack_stride: int,
                       light_stride: int,
@@ -246,11 +248,15 @@ def _search_kernel(lanes: int, reweightings: int, sweeps: int) -> Any:
                         sigma = 1.0 / (noise[0] + noise[1] * wp.max(reading[k], 0.0))
                         off = (reading[k] - predicted[k]) * sigma
                         off2 = wp.where(turn == 0, 0.0, off * off)
-                        charge = wp.log(1.0 + off2)
-                        dark = wp.where(reading[k] < shadow[1] * predicted[k], 1, 0) * wp.where(charge > shadow[0], 1, 0)
+                        dark = wp.where(reading[k] < shadow[1] * predicted[k], 1, 0) * wp.where(off2 > shadow[0], 1, 0)
                         given = wp.where(reading[k] >= 0.0, 1.0, 0.0)
-                        total[k] += given * wp.where(dark == 1, shadow[0], charge)
-                        w[k] = given * sigma * sigma * wp.where(dark == 1, 0.1, 1.0) / (1.0 + off2)
+                        trust = wp.where(reading[k] > 0.0, wp.where(dark == 1, SHADOW_TRUST, 1.0), SHADOW_TRUST)
+                        w[k] = given * trust * sigma * sigma / (1.0 + off2)
+                        off2 = wp.where(dark == 1, shadow[0], off2)
+                        predicted[k] = given * off2
+                    if turn == reweightings:
+                        for k in range(lanes):
+                            total[k] += wp.log(1.0 + predicted[k])
                     if turn < reweightings:
                         for a in range(wp.static(MIXTURE)):
                             f = scratch[at + a * scratch_step]

@@ -11,10 +11,8 @@ from kernels.errors import ArrayError
 from kernels.packs import Band, pack_type
 from kernels.photometric.readings import LARGEST, Lights
 
-LANES_CPU = 8
-"""Pixels of one thread on the CPU: one AVX register of float32, since a thread keeps dozens of sums for each pixel."""
 LANES_CUDA = 1
-"""On CUDA a thread keeps the sums of one pixel in registers."""
+"""Pixels of one thread on CUDA: it keeps the dozens of sums of one pixel in registers. On the CPU they are a whole pack."""
 SHADOW_FRACTION = 0.1
 """Readings under this fraction of the level of all are left out of the level."""
 
@@ -40,7 +38,7 @@ class Samples(NamedTuple):
 
 def lanes_of(device: str) -> int:
     """Pixels of one thread on this device."""
-    return LANES_CPU if device == "cpu" else LANES_CUDA
+    return devices.pack_width(device) if device == "cpu" else LANES_CUDA
 
 
 def gather(band: Band, pixels: np.ndarray, view: np.ndarray, lights: Lights, factors: np.ndarray, light_count: int) -> Samples:

@@ -19,8 +19,11 @@ def register(app: typer.Typer) -> None:
 def solve(
     capture: CaptureArgument,
     out: Annotated[Path, typer.Option("--out", help="Folder for maps.exr and report.json.", show_default=False)],
-    method: Annotated[Method, typer.Option(
-        "--method", help="lambert: least squares on every light; robust: without shadows and highlights.")] = Method.ROBUST,
+    method: Annotated[Method | None, typer.Option(
+        "--method", show_default=False,
+        help="lambert: least squares on every light; robust: without shadows and highlights; "
+             "svbrdf: with specular and roughness; gradient: from spherical gradient frames. "
+             "Without it what the capture's frames allow.")] = None,
     device: DeviceOption = None,
     cache: CacheOption = None,
 ) -> None:

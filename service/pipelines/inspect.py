@@ -14,6 +14,7 @@ from stage import images
 from stage.capture import Capture
 from stage.correction import Correction
 from stage.errors import StageError
+from stage.gradients import gradient_frames, has_gradients
 from stage.light import DistantLight
 from stage.lighting import check_solvable
 from stage.manifest import Frame
@@ -52,7 +53,10 @@ def inspect(path: Path, progress: Progress | None = None) -> Inspection:
     faults = [level.fault for level in levels if level.fault is not None]
     if capture.sources():
         try:
-            check_solvable(capture)
+            if has_gradients(capture):
+                gradient_frames(capture)
+            else:
+                check_solvable(capture)
         except StageError as error:
             faults.append(str(error))
     facts = list(_facts(capture))

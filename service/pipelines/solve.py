@@ -6,28 +6,26 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kernels import device as devices
-from kernels import packs
-from kernels.photometric.albedo import fit_albedo
-from kernels.photometric.lambert import solve_lambert
-from kernels.photometric.readings import Lights, grey_factors, grey_readings, pad_lights
-from kernels.photometric.robust import solve_robust
+from kernels.photometric.readings import pad_lights
 from kernels.status import Status
 from kernels.surface.integrate import Integration, IntegrationOptions, integrate_normals
 from service.methods import Method
+from service.pipelines.gradient import solve_gradients
+from service.pipelines.normals import solve_normals
 from service.progress import Progress, Timings
 from service.provenance import metadata, report
 from service.requests import SolveRequest
 from stage.capture import Capture
-from stage.colour import GREY_WEIGHTS, linear_space
+from stage.colour import linear_space
 from stage.files import write_text
+from stage.gradients import GradientFrames, gradient_frames, has_gradients
 from stage.ingest import open_stack
 from stage.lighting import check_solvable
 from stage.maps import SurfaceMaps
-from stage.stack import Stack
 
-SOLVERS = {Method.LAMBERT: solve_lambert, Method.ROBUST: solve_robust}
-READING_BYTES = 4
-"""A grey reading, per light and pixel, beside the stack's band."""
+SVBRDF_LIGHTS = 12
+"""From this many lights on the general solver is the default: it fits six lobes and a direction to each pixel, and was better than
+robust on every object tried with eight to 96 lights (docs/figures.md)."""
 INTEGRATION = IntegrationOptions(discontinuities=True, max_reweightings=0)
 """The surface may break where slopes around a pixel contradict each other: objects hide parts of themselves. The bilateral rounds
 that may follow gain little more on real objects and can settle on a wrong break where normals are noisy (docs/figures.md)."""
@@ -42,14 +40,6 @@ class SolveResult(NamedTuple):
     report_path: Path
     counts: dict[str, int]
     """Pixels of the mask per status."""
-
-
-class _Solution(NamedTuple):
-    normal: np.ndarray  # [3, pixels] float32
-    albedo: np.ndarray  # [3, pixels] float16
-    confidence: np.ndarray  # [pixels] float16
-    residual: np.ndarray  # [pixels] float16
-    status: np.ndarray  # [pixels] uint8
 
 
 def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResult:
@@ -67,13 +57,16 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
     device = devices.resolve(request.device)
     timings.stage("open", 1)
     capture = Capture.open(request.capture)
-    lights = check_solvable(capture)
+    method = request.method or _default_method(capture)
+    lights = gradient_frames(capture) if method is Method.GRADIENT else check_solvable(capture)
     mask = capture.mask()
     timings.stage("ingest", len(capture.sources()))
     stack = open_stack(capture, cache=request.cache, progress=lambda done, _: timings.advance(done))
-    padded = pad_lights(lights.direction, lights.irradiance, stack.scale)
-    timings.stage("normals", stack.shape[2])
-    solution = _solve_bands(request.method, stack, padded, mask, device, timings)
+    if isinstance(lights, GradientFrames):
+        solution = solve_gradients(lights, stack, capture.camera, mask, device, timings)
+    else:
+        padded = pad_lights(lights.direction, lights.irradiance, stack.scale)
+        solution = solve_normals(method, stack, padded, capture.camera, mask, device, timings)
     rows, cols = mask.shape
     status = solution.status.reshape(rows, cols)
     normal = np.moveaxis(solution.normal.reshape(3, rows, cols), 0, -1)
@@ -86,10 +79,14 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
         mask=solved,
         normal=normal,
         diffuse_albedo=np.moveaxis(solution.albedo.reshape(3, rows, cols), 0, -1),
+        specular=None if solution.specular is None else np.moveaxis(solution.specular.reshape(3, rows, cols), 0, -1),
+        roughness=None if solution.roughness is None else solution.roughness.reshape(rows, cols),
+        specular_normal=None if solution.specular_normal is None else np.moveaxis(
+            solution.specular_normal.reshape(3, rows, cols), 0, -1),
         height=None if integration is None else integration.height.numpy(),
         confidence=solution.confidence.reshape(rows, cols),
         color_space=linear_space(capture.manifest.color_space),
-        provenance=metadata(request, capture=capture.name, inputs=stack.key),
+        provenance=metadata(request, method=method, capture=capture.name, inputs=stack.key),
     )
     timings.stage("write", 1)
     maps_path, report_path = request.out / MAPS_FILE, request.out / REPORT_FILE
@@ -98,8 +95,9 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
     write_text(report_path, report(
         inputs={"capture": str(request.capture), "name": capture.name, "content": stack.key, "frames": len(stack.frames),
                 "resolution": list(capture.camera.resolution), "color_space": capture.manifest.color_space},
-        method=str(request.method),
+        method=str(method),
         options=request.model_dump(mode="json", include={"method"}),
+        found=solution.facts or {},
         device=devices.describe(device),
         timings_s=timings.close(),
         pixels={"mask": int(mask.sum()), **counts},
@@ -110,28 +108,10 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
     return SolveResult(maps, maps_path, report_path, counts)
 
 
-def _solve_bands(method: Method, stack: Stack, lights: Lights, mask: np.ndarray, device: str, timings: Timings) -> _Solution:
-    pixels = stack.pixel_count
-    result = _Solution(np.zeros((3, pixels), np.float32), np.zeros((3, pixels), np.float16), np.zeros(pixels, np.float16),
-                       np.zeros(pixels, np.float16), np.zeros(pixels, np.uint8))
-    factors = grey_factors(lights, GREY_WEIGHTS)
-    inside = mask.reshape(-1)
-    for start, stop in stack.bands(READING_BYTES * stack.shape[1]):
-        here = slice(start, min(stop, pixels))
-        if inside[here].any():
-            band = packs.upload(stack.band(start, stop), stack.saturated(start, stop), device=device)
-            readings = grey_readings(band, factors)
-            fit = SOLVERS[method](band, readings, lights.direction)
-            albedo = fit_albedo(band, readings, fit, lights)
-            count = here.stop - start
-            kept = inside[here]
-            result.normal[:, here] = np.where(kept, fit.normal.numpy()[:, :count], 0)
-            result.albedo[:, here] = np.where(kept, albedo.numpy()[:, :count], 0)
-            result.confidence[here] = np.where(kept, fit.confidence.numpy()[:count], 0)
-            result.residual[here] = np.where(kept, fit.residual.numpy()[:count], 0)
-            result.status[here] = np.where(kept, fit.status.numpy()[:count], int(Status.UNSOLVED))
-        timings.advance(stop)
-    return result
+def _default_method(capture: Capture) -> Method:
+    if has_gradients(capture):
+        return Method.GRADIENT
+    return Method.SVBRDF if len(capture.sources()) >= SVBRDF_LIGHTS else Method.ROBUST
 
 
 def _mark_not_facing(capture: Capture, normal: np.ndarray, status: np.ndarray) -> None:

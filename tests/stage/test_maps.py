@@ -20,7 +20,7 @@ CAMERA = Camera(projection="perspective", resolution=(COLS, ROWS), focal_px=(9.0
 def make_maps(**changes) -> SurfaceMaps:
     three, one = (lambda: RNG.random((ROWS, COLS, 3)).astype(np.float32)), (lambda: RNG.random((ROWS, COLS)).astype(np.float32))
     layers = {"normal": three(), "diffuse_albedo": three(), "specular": three(), "roughness": one(), "height": one() - 1,
-              "confidence": one()}
+              "confidence": one(), "specular_normal": three()}
     return SurfaceMaps(**{"camera": CAMERA, "mask": MASK, "provenance": {"relit:capture": "owl"}, **layers, **changes})
 
 
@@ -43,7 +43,7 @@ def test_the_channels_are_those_of_the_contract(tmp_path):
         types = {name: channel.pixels.dtype.name for name, channel in file.channels().items()}
         header = dict(file.header())
     half = [f"{layer}.{c}" for layer in ("diffuse_albedo", "specular") for c in "RGB"] + ["roughness.Y", "confidence.Y", "mask.Y"]
-    floats = ["normal.X", "normal.Y", "normal.Z", "height.Z"]
+    floats = [f"{layer}.{c}" for layer in ("normal", "specular_normal") for c in "XYZ"] + ["height.Z"]
     assert types == {**dict.fromkeys(half, "float16"), **dict.fromkeys(floats, "float32")}
     assert header["colorInteropID"] == "lin_rec709_scene" and "chromaticities" in header and "relit:camera" in header
 

@@ -1,0 +1,57 @@
+"""The shape of the diffuse lobe that the pixels of an object share, chosen by how well the object is explained as a whole.
+
+Real diffuse reflection is darker than Lambert's at grazing angles on smooth plastics and brighter on rough ceramics. A pixel alone
+cannot tell that shape from a tilt of its normal; all pixels together can: the shape with the least total cost of the
+hypothesis search is also the one with the least error of the normals (docs/figures.md).
+"""
+
+import itertools
+
+import numpy as np
+
+from kernels.photometric.hypotheses import Diffuse, SearchOptions, search_normals
+from kernels.photometric.samples import Samples
+
+ROUGHNESSES = (-1.0, 0.05, 0.2, 0.35, 0.5, 0.65, 0.8)
+"""Of Burley's lobe; below 0: Lambert's."""
+SLOPES = (-0.3, -0.2, -0.1, 0.0, 0.1)
+"""Further slope of the lobe."""
+REFINEMENT = 0.5
+"""Second look: half a step about the best of the first."""
+NEARBY = (((2.0, 4.0, 7.0), 14), (((0.9, 1.8), 8),))
+"""Rings that follow a changed shape from the normals of Lambert's: a few degrees."""
+
+
+def choose_diffuse(samples: Samples, start: np.ndarray, directions: np.ndarray, *,
+                   options: SearchOptions | None = None) -> tuple[Diffuse, np.ndarray]:
+    """Choose the shape under which the sampled pixels cost least.
+
+    Args:
+        samples: some hundreds of pixels, spread over the object.
+        start: [n, 3] unit normals to begin from.
+        directions: [lights, 3] unit, without padding.
+        options: of the search.
+
+    Returns:
+        The shape, and [shapes tried, 3] float64: roughness, slope, mean cost of each.
+    """
+    normal = search_normals(samples, start, directions, shape=Diffuse(), options=options).normal
+    wide, fine = NEARBY
+    tried: dict[Diffuse, float] = {}
+
+    def cost(rough: float, slope: float) -> float:
+        shape = Diffuse(rough=round(rough, 4), slope=round(slope, 4))
+        if shape not in tried:
+            found = search_normals(samples, normal, directions, shape=shape, options=options, wide=wide, fine=fine)
+            tried[shape] = float(np.mean(found.cost, dtype=np.float64))
+        return tried[shape]
+
+    for rough, slope in itertools.product(ROUGHNESSES, SLOPES):
+        cost(rough, slope)
+    best = min(tried, key=tried.__getitem__)
+    rough_step, slope_step = ROUGHNESSES[2] - ROUGHNESSES[1], SLOPES[1] - SLOPES[0]
+    for across, along in itertools.product((-1, 0, 1), repeat=2):
+        rough = best.rough if best.rough < 0 else float(np.clip(best.rough + across * REFINEMENT * rough_step, 0, 1))
+        cost(rough, best.slope + along * REFINEMENT * slope_step)
+    best = min(tried, key=tried.__getitem__)
+    return best, np.array([(shape.rough, shape.slope, value) for shape, value in tried.items()])

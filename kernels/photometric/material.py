@@ -1,0 +1,199 @@
+"""Material of pixels with known normals: diffuse albedo, F0 and roughness of the contract's BRDF, by a search over roughness.
+
+For each roughness the readings of a channel are linear in albedo ρ and F0: y = ρ f_d + F0 (1 - s) f_s + s f_s, with f_d the diffuse
+lobe, f_s the GGX lobe without Fresnel and s Schlick's rise; both are fitted by re-weighted non-negative least squares, three channels
+on their own. The roughness of least cost is taken from a grid and halved steps about its best.
+"""
+
+import math
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from kernels.microfacet import INVERSE_PI, diffuse, ggx, schlick
+from kernels.packs import pack_type
+from kernels.photometric.hypotheses import SHADOW_TRUST, Diffuse, SearchOptions
+from kernels.photometric.samples import Samples, per_pixel, to_host
+
+ROUGHNESS_FIRST, ROUGHNESS_STEP, ROUGHNESS_COUNT = 0.1, 0.075, 13
+"""Grid of roughness, 0.1 to 1; below 0.1 a lobe is narrower than lights of any rig are apart."""
+HALVINGS = 3
+"""Of the step about the best: to a resolution of 0.01."""
+REWEIGHTINGS = 4
+"""Rounds of the robust fit at each roughness."""
+
+
+class Material(NamedTuple):
+    """What was fitted for each sampled pixel."""
+
+    diffuse_albedo: np.ndarray  # [n, 3] float32
+    specular: np.ndarray  # [n, 3] float32, F0, 0…1
+    roughness: np.ndarray  # [n] float32
+
+
+def fit_material(samples: Samples, normal: np.ndarray, directions: np.ndarray, *, shape: Diffuse,
+                 options: SearchOptions | None = None) -> Material:
+    """Fit the material of sampled pixels.
+
+    Args:
+        samples: their readings.
+        normal: [n, 3] unit normals.
+        directions: [lights, 3] unit, without padding.
+        shape: of the diffuse lobe.
+        options: noise and shadows, as in the search.
+
+    Returns:
+        The materials. The albedo is that of the Lambertian lobe closest to the fitted diffuse lobe under the capture's lights, so that
+        an asset renders as fitted. Waits for the device.
+    """
+    options = options or SearchOptions()
+    device, lanes, packs = samples.device, samples.lanes, samples.packs
+    lane_type = pack_type(lanes, wp.float32)
+    fitted = wp.empty((7, packs), dtype=lane_type, device=device)
+    devices.launch(_material_kernel(lanes), packs,
+                   [samples.colour, samples.level, samples.view, per_pixel(samples, normal),
+                    wp.array(directions.astype(np.float32), dtype=wp.vec3, device=device),
+                    wp.vec2(options.noise_floor, options.noise_slope),
+                    wp.vec2(math.expm1(options.shadow_cost), options.shadow_depth),
+                    wp.vec2(shape.rough, shape.slope), samples.pack_stride, samples.light_stride], [fitted], device=device)
+    values = to_host(samples, fitted)
+    return Material(values[:, :3], values[:, 3:6], values[:, 6])
+
+
+@cache
+def _material_kernel(lanes: int) -> Any:
+    lane_type = pack_type(lanes, wp.float32)
+    channels = wp.types.matrix(shape=(3, lanes), dtype=wp.float32)
+    trials = ROUGHNESS_COUNT + 2 * HALVINGS
+
+    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
+    def material_kernel(first: int,
+                        colour: wp.array2d(dtype=lane_type),  # [3, P · L] radiance / irradiance
+                        level: wp.array(dtype=lane_type),  # [P]
+                        view: wp.array2d(dtype=lane_type),  # [3, P]
+                        normal: wp.array2d(dtype=lane_type),  # [3, P]
+                        directions: wp.array(dtype=wp.vec3),  # [L]
+                        noise: wp.vec2,  # s0, s1
+                        shadow: wp.vec2,  # r²/σ² of equal cost, depth
+                        form: wp.vec2,  # diffuse roughness, slope
+                        pack_stride: int,
+                        light_stride: int,
+                        # outputs
+                        fitted: wp.array2d(dtype=lane_type)):  # [7, P] albedo, F0, roughness
+        p = first + wp.tid()
+        light_count = directions.shape[0]
+        vx, vy, vz = view[0, p], view[1, p], view[2, p]
+        nx, ny, nz = normal[0, p], normal[1, p], normal[2, p]
+        bright = level[p]
+        best_cost, best_rough, nv = lane_type(), lane_type(), lane_type()
+        best_rho, best_f0 = channels(), channels()
+        for k in range(lanes):
+            best_cost[k] = 1.0e30
+            nv[k] = wp.max(nx[k] * vx[k] + ny[k] * vy[k] + nz[k] * vz[k], 1.0e-3)
+        step = float(ROUGHNESS_STEP)
+        for trial in range(trials):
+            # the grid, then two trials a halving on either side of the best
+            late = trial - ROUGHNESS_COUNT
+            if late >= 0 and late % 2 == 0:
+                step = step * 0.5
+            rough = lane_type()
+            for k in range(lanes):
+                side = wp.where(late % 2 == 0, step, -step)
+                around = wp.clamp(best_rough[k] + side, wp.static(0.5 * ROUGHNESS_FIRST), 1.0)
+                rough[k] = wp.where(late < 0, ROUGHNESS_FIRST + ROUGHNESS_STEP * float(trial), around)
+            rho, f0 = channels(), channels()
+            cost = lane_type()
+            for turn in range(wp.static(REWEIGHTINGS + 1)):
+                dd, ds, ss, rd, rs = channels(), channels(), channels(), channels(), channels()
+                cost = lane_type()
+                for light in range(light_count):
+                    l = directions[light]
+                    at = p * pack_stride + light * light_stride
+                    fd, fs, fixed = lane_type(), lane_type(), lane_type()
+                    for k in range(lanes):
+                        lv = l[0] * vx[k] + l[1] * vy[k] + l[2] * vz[k]
+                        hv2 = wp.max(0.5 + 0.5 * lv, 2.5e-7)
+                        nl = wp.max(nx[k] * l[0] + ny[k] * l[1] + nz[k] * l[2], 0.0)
+                        nh = (nx[k] * l[0] + ny[k] * l[1] + nz[k] * l[2] + nv[k]) * 0.5 / wp.sqrt(hv2)
+                        rise = schlick(wp.sqrt(hv2))
+                        lobe = ggx(nl, nv[k], nh, rough[k] * rough[k])
+                        fd[k] = INVERSE_PI * diffuse(nl, nv[k], hv2, form[0], form[1])
+                        fs[k] = (1.0 - rise) * lobe
+                        fixed[k] = rise * lobe
+                    # one weight a light for all channels: a shadow is one in each of them
+                    off2, shining, expected, w = lane_type(), lane_type(), lane_type(), lane_type()
+                    for c in range(3):
+                        y = colour[c, at]
+                        for k in range(lanes):
+                            predicted = rho[c, k] * fd[k] + f0[c, k] * fs[k] + fixed[k]
+                            sigma = wp.max(noise[0] * bright[k] + noise[1] * wp.max(y[k], 0.0), 1.0e-20)
+                            off = (y[k] - predicted) / sigma
+                            off2[k] += wp.where(turn == 0, 0.0, off * off / 3.0)
+                            shining[k] += y[k]
+                            expected[k] += predicted
+                    for k in range(lanes):
+                        dark = wp.where(shining[k] < shadow[1] * expected[k], 1, 0) * wp.where(off2[k] > shadow[0], 1, 0)
+                        given = wp.where(shining[k] >= 0.0, 1.0, 0.0)
+                        cost[k] += given * wp.log(1.0 + wp.where(dark == 1, shadow[0], off2[k]))
+                        sigma = wp.max(noise[0] * bright[k] + noise[1] * wp.max(shining[k], 0.0) / 3.0, 1.0e-20)
+                        relative = bright[k] / sigma
+                        trust = wp.where(shining[k] > 0.0, wp.where(dark == 1, SHADOW_TRUST, 1.0), SHADOW_TRUST)
+                        w[k] = given * trust * relative * relative / (1.0 + off2[k])
+                    for c in range(3):
+                        y = colour[c, at]
+                        for k in range(lanes):
+                            left = y[k] - fixed[k]
+                            dd[c, k] += w[k] * fd[k] * fd[k]
+                            ds[c, k] += w[k] * fd[k] * fs[k]
+                            ss[c, k] += w[k] * fs[k] * fs[k]
+                            rd[c, k] += w[k] * fd[k] * left
+                            rs[c, k] += w[k] * fs[k] * left
+                if turn < wp.static(REWEIGHTINGS):
+                    for c in range(3):
+                        for k in range(lanes):
+                            # two non-negative unknowns: the free solution, or the better one alone
+                            bottom = dd[c, k] * ss[c, k] - ds[c, k] * ds[c, k]
+                            safe = bottom > 1.0e-6 * dd[c, k] * ss[c, k]
+                            a = (ss[c, k] * rd[c, k] - ds[c, k] * rs[c, k]) / wp.where(safe, bottom, 1.0)
+                            b = (dd[c, k] * rs[c, k] - ds[c, k] * rd[c, k]) / wp.where(safe, bottom, 1.0)
+                            only_a = wp.max(rd[c, k], 0.0) / wp.max(dd[c, k], 1.0e-20)
+                            only_b = wp.clamp(wp.max(rs[c, k], 0.0) / wp.max(ss[c, k], 1.0e-20), 0.0, 1.0)
+                            gain_a = only_a * (2.0 * rd[c, k] - only_a * dd[c, k])
+                            gain_b = only_b * (2.0 * rs[c, k] - only_b * ss[c, k])
+                            both = wp.where(safe, 1, 0) * wp.where(a >= 0.0, 1, 0) * wp.where(b >= 0.0, 1, 0)
+                            full = wp.where(b > 1.0, 1, 0)  # F0 at its bound: the albedo takes what is left
+                            rest = wp.max(rd[c, k] - ds[c, k], 0.0) / wp.max(dd[c, k], 1.0e-20)
+                            alone_a = wp.where(gain_a >= gain_b, only_a, 0.0)
+                            alone_b = wp.where(gain_a >= gain_b, 0.0, only_b)
+                            rho[c, k] = wp.where(both == 1, wp.where(full == 1, rest, a), alone_a)
+                            f0[c, k] = wp.where(both == 1, wp.min(b, 1.0), alone_b)
+            for k in range(lanes):
+                better = cost[k] < best_cost[k]
+                best_cost[k] = wp.where(better, cost[k], best_cost[k])
+                best_rough[k] = wp.where(better, rough[k], best_rough[k])
+                for c in range(3):
+                    best_rho[c, k] = wp.where(better, rho[c, k], best_rho[c, k])
+                    best_f0[c, k] = wp.where(better, f0[c, k], best_f0[c, k])
+        # the Lambertian lobe closest to the diffuse one under these lights
+        above, below = lane_type(), lane_type()
+        for light in range(light_count):
+            l = directions[light]
+            for k in range(lanes):
+                lv = l[0] * vx[k] + l[1] * vy[k] + l[2] * vz[k]
+                nl = wp.max(nx[k] * l[0] + ny[k] * l[1] + nz[k] * l[2], 0.0)
+                above[k] += nl * diffuse(nl, nv[k], wp.max(0.5 + 0.5 * lv, 0.0), form[0], form[1])
+                below[k] += nl * nl
+        for c in range(3):
+            out = lane_type()
+            for k in range(lanes):
+                out[k] = best_rho[c, k] * above[k] / wp.max(below[k], 1.0e-20)
+            fitted[c, p] = out
+            for k in range(lanes):
+                out[k] = best_f0[c, k]
+            fitted[3 + c, p] = out
+        fitted[6, p] = best_rough
+
+    return material_kernel

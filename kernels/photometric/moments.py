@@ -1,0 +1,230 @@
+"""The responses of each pixel to the sphere of light, from spherical gradient frames.
+
+Under L(ω) = mean + dipole·ω a pixel's radiance is mean · M₀ + dipole · M, whatever its reflectance: M₀ = ∫ R dω is its radiance
+under the full sphere, M = ∫ R ω dω under L = ω, with R the reflectance times the cosine and the visibility. Gradient frames
+(mean 1/2, dipole ±e_a/2) and full frames (mean 1) are rows of that linear system; here it is solved by least squares.
+
+Source: Ma, Hawkins, Peers, Chabert, Weiss and Debevec, "Rapid Acquisition of Specular and Diffuse Normal Maps from Polarized
+Spherical Gradient Illumination", EGSR 2007, section 3; complements: Wilson et al., "Temporal Upsampling of Performance
+Geometry Using Photometric Alignment", TOG 2010, section 3.
+"""
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from kernels.errors import ArrayError
+from kernels.packs import Band, as_packs, pack_type, scalars
+from kernels.status import DARK, OK, TOO_FEW_LIGHTS
+
+LARGEST_HALF = 65504.0
+"""A stored value above it, or one that does not compare, is not a number that was measured."""
+MIN_PIVOT = 0.1
+"""What elimination leaves of M₀'s equation: at least 1/2 (a pair of opposites, or a full frame), 0 when it is not determined."""
+
+
+class Moments(NamedTuple):
+    """Responses of a band; the last axis is pixels, padded to whole packs. Only pixels with status OK have values."""
+
+    values: wp.array  # [12, pixels] float32, radiance: row 4·channel + i, i = 0 for M₀, 1…3 for M along x, y, z
+    variance: wp.array  # [pixels] float32, of a component of M (mean over axes) when a reading has variance one
+    residual: wp.array  # [pixels] float32, RMS of the grey readings about the fit, over the grey M₀
+    spare: wp.array  # [pixels] float32, readings beyond the four unknowns
+    tilt: wp.array  # [pixels] float32, radians that a highlight which is still inside may tilt the normal by
+    status: wp.array  # [pixels] int32, kernels.status.Status
+
+
+def fit_moments(band: Band, rows: np.ndarray, scale: np.ndarray, grey_weights: tuple[float, float, float]) -> Moments:
+    """Least squares of radiance = mean · M₀ + dipole · M in each channel.
+
+    A reading of zero or below is a measurement here (a mirror that shows the dark end of a gradient reads zero); a saturated
+    one, or one that is not finite in every channel, is not.
+
+    Args:
+        band: the stack on the device.
+        rows: [lights, 4] mean and dipole of each frame, along one axis at most; 0 for frames that do not take part.
+        scale: [lights] radiance of a stored 1.0.
+        grey_weights: of the channels, for the residual; they add up to one.
+
+    Returns:
+        The responses on the device; not synchronised on CUDA.
+
+    Raises:
+        ArrayError: rows or scale do not match the band, no frame takes part, or a gradient has several axes.
+    """
+    band.require_channels(3)
+    if rows.shape != (band.light_count, 4) or scale.shape != (band.light_count,):
+        raise ArrayError(f"rows are {rows.shape}, scale {scale.shape}, the band has {band.light_count} lights: give one for each")
+    if (np.count_nonzero(rows[:, 1:], axis=1) > 1).any():
+        raise ArrayError("rows hold a gradient along several axes: give each frame one axis")
+    frames = np.flatnonzero(rows.any(axis=1))
+    if len(frames) == 0:
+        raise ArrayError("rows are all zero: give the mean and dipole of the gradient frames")
+    device, count = band.device, band.pixel_count
+    fit = Moments(scalars(count, 12, wp.float32, device), *(scalars(count, None, wp.float32, device) for _ in range(4)),
+                  scalars(count, None, wp.int32, device))
+    devices.launch(_moments_kernel(devices.pack_width(device)), band.packs,
+                   [band.values, band.saturated, wp.array(frames.astype(np.int32), dtype=wp.int32, device=device),
+                    wp.array(rows[frames].astype(np.float32), dtype=wp.vec4, device=device),
+                    wp.array(scale[frames].astype(np.float32), dtype=wp.float32, device=device), wp.vec3(*grey_weights)],
+                   [as_packs(array, device) for array in (fit.values, fit.variance, fit.residual, fit.spare, fit.status)],
+                   device=device)
+    return fit
+
+
+@wp.struct
+class _Solved:
+    """One channel's M₀ and M."""
+
+    m0: float
+    m: wp.vec3
+
+
+@wp.func
+def _solve(pivot: float, g0: wp.vec3, gg: wp.vec3, r0: float, r: wp.vec3) -> _Solved:
+    # the axes do not share a frame: each is eliminated by itself
+    found = _Solved()
+    u = wp.cw_div(g0, gg)
+    found.m0 = (r0 - wp.dot(u, r)) / pivot
+    found.m = wp.cw_div(r - found.m0 * g0, gg)
+    return found
+
+
+@cache
+def _moments_kernel(pack: int) -> Any:
+    half_pack, byte_pack = pack_type(pack, wp.float16), pack_type(pack, wp.uint8)
+    float_pack, int_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def moments_kernel(first: int,
+                       values: wp.array2d(dtype=half_pack),  # [3 · L, P] stored radiance
+                       saturated: wp.array2d(dtype=byte_pack),  # [L / 8, P] bits
+                       frames: wp.array(dtype=int),  # [F] lights of the stack that take part
+                       rows: wp.array(dtype=wp.vec4),  # [F] mean, dipole
+                       scale: wp.array(dtype=float),  # [F]
+                       grey: wp.vec3,
+                       # outputs
+                       moments: wp.array2d(dtype=float_pack),  # [12, P]
+                       variance: wp.array(dtype=float_pack),  # [P]
+                       residual: wp.array(dtype=float_pack),  # [P]
+                       spare: wp.array(dtype=float_pack),  # [P]
+                       status: wp.array(dtype=int_pack)):  # [P]
+        p = first + wp.tid()
+        lights = values.shape[0] / 3
+
+        # normal equations: shared by the channels, then the right-hand side of each
+        count, g00 = float_pack(), float_pack()
+        g0x, g0y, g0z, gxx, gyy, gzz = float_pack(), float_pack(), float_pack(), float_pack(), float_pack(), float_pack()
+        r0, rx, ry, rz = float_pack(), float_pack(), float_pack(), float_pack()
+        s0, sx, sy, sz = float_pack(), float_pack(), float_pack(), float_pack()
+        b0, bx, by, bz = float_pack(), float_pack(), float_pack(), float_pack()
+        for frame in range(frames.shape[0]):
+            light = frames[frame]
+            red, green, blue = values[light, p], values[lights + light, p], values[2 * lights + light, p]
+            bits = saturated[light / 8, p]
+            shift = light % 8
+            unit = scale[frame]
+            mean, x, y, z = rows[frame][0], rows[frame][1], rows[frame][2], rows[frame][3]
+            for k in range(pack):
+                top = wp.max(wp.max(wp.abs(float(red[k])), wp.abs(float(green[k]))), wp.abs(float(blue[k])))
+                total = float(red[k]) + float(green[k]) + float(blue[k])
+                clear = ((int(bits[k]) >> shift) & 1) == 0
+                used = clear and top <= LARGEST_HALF and total == total  # a maximum may pass over a NaN, a sum does not
+                w = wp.where(used, 1.0, 0.0)
+                vr = wp.where(used, unit * float(red[k]), 0.0)
+                vg = wp.where(used, unit * float(green[k]), 0.0)
+                vb = wp.where(used, unit * float(blue[k]), 0.0)
+                count[k] += w
+                g00[k] += w * mean * mean
+                g0x[k] += w * mean * x
+                g0y[k] += w * mean * y
+                g0z[k] += w * mean * z
+                gxx[k] += w * x * x
+                gyy[k] += w * y * y
+                gzz[k] += w * z * z
+                r0[k] += mean * vr
+                rx[k] += x * vr
+                ry[k] += y * vr
+                rz[k] += z * vr
+                s0[k] += mean * vg
+                sx[k] += x * vg
+                sy[k] += y * vg
+                sz[k] += z * vg
+                b0[k] += mean * vb
+                bx[k] += x * vb
+                by[k] += y * vb
+                bz[k] += z * vb
+
+        # solve; what was accumulated gives way to the solution
+        code, spread, beyond = int_pack(), float_pack(), float_pack()
+        for k in range(pack):
+            g0 = wp.vec3(g0x[k], g0y[k], g0z[k])
+            gg = wp.vec3(gxx[k], gyy[k], gzz[k])
+            known = wp.min(gg) > 0.0
+            gg = wp.where(known, gg, wp.vec3(1.0, 1.0, 1.0))
+            u = wp.cw_div(g0, gg)
+            pivot = g00[k] - wp.dot(u, g0)
+            known = known and pivot > MIN_PIVOT
+            pivot = wp.where(known, pivot, 1.0)
+            fit_r = _solve(pivot, g0, gg, r0[k], wp.vec3(rx[k], ry[k], rz[k]))
+            fit_g = _solve(pivot, g0, gg, s0[k], wp.vec3(sx[k], sy[k], sz[k]))
+            fit_b = _solve(pivot, g0, gg, b0[k], wp.vec3(bx[k], by[k], bz[k]))
+            lit = grey[0] * fit_r.m0 + grey[1] * fit_g.m0 + grey[2] * fit_b.m0 > 0.0
+            code[k] = wp.where(known, wp.where(lit, OK, DARK), TOO_FEW_LIGHTS)
+            on = wp.where(code[k] == OK, 1.0, 0.0)
+            spread[k] = on * (1.0 / gg[0] + 1.0 / gg[1] + 1.0 / gg[2] + wp.dot(u, u) / pivot) / 3.0
+            beyond[k] = on * (count[k] - 4.0)
+            r0[k] = on * fit_r.m0
+            rx[k] = on * fit_r.m[0]
+            ry[k] = on * fit_r.m[1]
+            rz[k] = on * fit_r.m[2]
+            s0[k] = on * fit_g.m0
+            sx[k] = on * fit_g.m[0]
+            sy[k] = on * fit_g.m[1]
+            sz[k] = on * fit_g.m[2]
+            b0[k] = on * fit_b.m0
+            bx[k] = on * fit_b.m[0]
+            by[k] = on * fit_b.m[1]
+            bz[k] = on * fit_b.m[2]
+
+        # how well the fit says what was read
+        squares = float_pack()
+        for frame in range(frames.shape[0]):
+            light = frames[frame]
+            seen_r, seen_g, seen_b = values[light, p], values[lights + light, p], values[2 * lights + light, p]
+            cut = saturated[light / 8, p]
+            shift = light % 8
+            unit = scale[frame]
+            mean, x, y, z = rows[frame][0], rows[frame][1], rows[frame][2], rows[frame][3]
+            for k in range(pack):
+                read = unit * (grey[0] * float(seen_r[k]) + grey[1] * float(seen_g[k]) + grey[2] * float(seen_b[k]))
+                said = (grey[0] * (mean * r0[k] + x * rx[k] + y * ry[k] + z * rz[k])
+                        + grey[1] * (mean * s0[k] + x * sx[k] + y * sy[k] + z * sz[k])
+                        + grey[2] * (mean * b0[k] + x * bx[k] + y * by[k] + z * bz[k]))
+                off = wp.where(((int(cut[k]) >> shift) & 1) == 0, read - said, 0.0)
+                squares[k] += wp.where(wp.abs(off) < wp.inf, off * off, 0.0)
+        error = float_pack()
+        for k in range(pack):
+            if code[k] == OK:
+                error[k] = wp.sqrt(squares[k] / count[k]) / (grey[0] * r0[k] + grey[1] * s0[k] + grey[2] * b0[k])
+        moments[0, p] = r0
+        moments[1, p] = rx
+        moments[2, p] = ry
+        moments[3, p] = rz
+        moments[4, p] = s0
+        moments[5, p] = sx
+        moments[6, p] = sy
+        moments[7, p] = sz
+        moments[8, p] = b0
+        moments[9, p] = bx
+        moments[10, p] = by
+        moments[11, p] = bz
+        variance[p] = spread
+        residual[p] = error
+        spare[p] = beyond
+        status[p] = code
+
+    return moments_kernel

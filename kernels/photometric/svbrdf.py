@@ -1,0 +1,89 @@
+"""The general solver: normal, diffuse albedo, F0 and roughness of each pixel, without learning.
+
+Normals come from the hypothesis search under the diffuse shape that the object shares, averaged over shapes close to it, each weighted
+by how well it explains the pixel; the material then follows for the normal found.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from kernels.photometric.hypotheses import FINE, Diffuse, SearchOptions, search_normals
+from kernels.photometric.material import fit_material
+from kernels.photometric.samples import Samples
+
+NEIGHBOURS = ((-0.15, 0.0), (0.15, 0.0), (0.0, -0.1), (0.0, 0.1))
+"""Shapes close to the shared one, differences in roughness and slope: what a material varies by over an object."""
+NEAR = (((0.7, 1.5, 2.5), 10), (((0.4,), 6),))
+"""Rings that follow a changed shape from the normal of the shared one."""
+TEMPERATURE = 0.4
+"""A shape whose cost is this fraction above the best has 1/e of its weight: costs a third apart cannot be told from misfit."""
+RING_DEGREES = FINE[-1][0][-1]
+"""Radius of the last ring of the search, whose rise in cost gives the standard error."""
+
+
+class SvbrdfFit(NamedTuple):
+    """What was found for each sampled pixel, on the host."""
+
+    normal: np.ndarray  # [n, 3] float32, unit
+    diffuse_albedo: np.ndarray  # [n, 3] float32
+    specular: np.ndarray  # [n, 3] float32, F0
+    roughness: np.ndarray  # [n] float32
+    confidence: np.ndarray  # [n] float32: 1 / (1 + standard error of the normal / 1°)
+    residual: np.ndarray  # [n] float32: root of the mean cost per light, in units of the noise
+
+
+def solve_svbrdf(samples: Samples, start: np.ndarray, directions: np.ndarray, *, shape: Diffuse,
+                 options: SearchOptions | None = None) -> SvbrdfFit:
+    """Solve sampled pixels.
+
+    Args:
+        samples: their readings.
+        start: [n, 3] unit normals to begin from, within some 50° of the truth.
+        directions: [lights, 3] unit, without padding.
+        shape: of the diffuse lobe, from diffuse_shape.choose_diffuse.
+        options: how candidates are judged.
+
+    Returns:
+        The fit. Waits for the device.
+
+    Raises:
+        ArrayError: shapes that do not fit.
+    """
+    found = search_normals(samples, start, directions, shape=shape, options=options)
+    wide, fine = NEAR
+    normals, costs = [found.normal], [found.cost]
+    for rough, slope in NEIGHBOURS:
+        if rough and shape.rough < 0:
+            continue
+        nearby = Diffuse(rough=max(shape.rough + rough, 0.0) if shape.rough >= 0 else shape.rough, slope=shape.slope + slope)
+        other = search_normals(samples, found.normal, directions, shape=nearby, options=options, wide=wide, fine=fine)
+        normals.append(other.normal)
+        costs.append(other.cost)
+    normal, spread = average_normals(np.stack(normals), np.stack(costs))
+    material = fit_material(samples, normal, directions, shape=shape, options=options)
+    # least squares: variance of the normal = 2 · cost · ring² / (lights · rise), cost and rise per light
+    rise = np.maximum(found.curvature, 1e-12)
+    variance = 2 * found.cost * RING_DEGREES**2 / (samples.light_count * rise) + spread**2
+    return SvbrdfFit(normal, material.diffuse_albedo, material.specular, material.roughness,
+                     (1 / (1 + np.sqrt(variance))).astype(np.float32), np.sqrt(found.cost))
+
+
+def average_normals(normals: np.ndarray, costs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean of a pixel's normals under several shapes, each weighted by exp(-(cost - best) / (temperature · best)).
+
+    Args:
+        normals: [shapes, n, 3] unit.
+        costs: [shapes, n].
+
+    Returns:
+        [n, 3] unit normals, and [n] their weighted RMS spread in degrees.
+    """
+    best = costs.min(axis=0)
+    weights = np.exp(-(costs - best) / np.maximum(TEMPERATURE * best, 1e-6))
+    weights /= weights.sum(axis=0)
+    mean = np.einsum("sn,snc->nc", weights, normals)
+    mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
+    cosine = np.clip(np.einsum("snc,nc->sn", normals, mean), -1, 1)
+    spread = np.sqrt(np.einsum("sn,sn->n", weights, np.degrees(np.arccos(cosine)) ** 2))
+    return mean.astype(np.float32), spread.astype(np.float32)

@@ -1,0 +1,107 @@
+"""Spherical gradient frames → diffuse and specular normals and albedo, band by band."""
+
+from typing import Any
+
+import numpy as np
+
+from kernels import packs
+from kernels.photometric.gradient import diffuse_normals, specular_normals
+from kernels.photometric.moments import Moments, fit_moments
+from kernels.photometric.separation import separate_by_colour, separate_polarised
+from kernels.status import Status
+from service.pipelines.normals import Solution
+from service.progress import Timings
+from stage.camera import Camera
+from stage.colour import GREY_WEIGHTS
+from stage.gradients import GradientFrames
+from stage.stack import Stack
+
+BYTES_PER_PIXEL = 256
+"""Responses of up to three kinds of frames, separation, view and results, beside the stack's band."""
+CROSSED_GAIN = 2.0
+"""A crossed analyser passes half of the diffuse light, which has lost its polarisation (Malus)."""
+
+
+def solve_gradients(frames: GradientFrames, stack: Stack, camera: Camera, mask: np.ndarray, device: str,
+                    timings: Timings) -> Solution:
+    """Solve the gradient frames of a stack.
+
+    Args:
+        frames: which frames of the stack measure what.
+        stack: the ingested capture.
+        camera: for the lines of sight.
+        mask: [rows, cols] bool.
+        device: where.
+        timings: told of every band.
+    """
+    timings.stage("normals", stack.shape[2])
+    pixels = stack.pixel_count
+    view = view_vectors(camera, stack.shape[2])
+    inside = mask.reshape(-1)
+    by_colour = not frames.polarised
+    result = Solution.empty(pixels)
+    if by_colour or frames.parallel is not None:
+        result.specular_normal = np.zeros((3, pixels), np.float32)
+    length, separated = np.zeros(pixels, np.float32), np.zeros(pixels, bool)
+    gain = CROSSED_GAIN if frames.polarised else 1.0
+    for start, stop in stack.bands(BYTES_PER_PIXEL):
+        here = slice(start, min(stop, pixels))
+        count, kept = here.stop - start, inside[here]
+        if kept.any():
+            band = packs.upload(stack.band(start, stop), stack.saturated(start, stop), device=device)
+            toward = view if view.shape[1] == 1 else view[:, start:stop]
+            diffuse = _moments(band, frames.diffuse, stack)
+            parts = None
+            if by_colour:
+                parts = separate_by_colour(diffuse, toward, pixel_count=band.pixel_count, device=device)
+            elif frames.parallel is not None:
+                parallel = _moments(band, frames.parallel, stack)
+                parts = separate_polarised(diffuse, parallel, GREY_WEIGHTS, pixel_count=band.pixel_count, device=device)
+            if parts is not None:
+                diffuse = parts.diffuse
+                normals = specular_normals(parts, GREY_WEIGHTS, toward, gain=gain, pixel_count=band.pixel_count, device=device)
+                assert result.specular_normal is not None
+                result.specular_normal[:, here] = np.where(kept, normals.numpy()[:, :count], 0)
+            fit = diffuse_normals(diffuse, GREY_WEIGHTS, gain=gain, pixel_count=band.pixel_count, device=device)
+            result.normal[:, here] = np.where(kept, fit.normal.numpy()[:, :count], 0)
+            result.albedo[:, here] = np.where(kept, fit.albedo.numpy()[:, :count], 0)
+            result.confidence[here] = np.where(kept, fit.confidence.numpy()[:count], 0)
+            result.residual[here] = np.where(kept, diffuse.residual.numpy()[:count], 0)
+            result.status[here] = np.where(kept, fit.status.numpy()[:count], int(Status.UNSOLVED))
+            length[here] = np.where(kept, fit.length.numpy()[:count], 0)
+            separated[here] = kept & (diffuse.tilt.numpy()[:count] == 0)
+        timings.advance(stop)
+    result.facts = _facts(frames, result, length, separated)
+    if result.specular_normal is not None and not result.specular_normal.any():
+        result.specular_normal = None  # a layer that holds nothing is absent
+    return result
+
+
+def view_vectors(camera: Camera, padded: int) -> np.ndarray:
+    """Unit vectors from the surface to the camera: [3, padded] float32, 0 in the padding, or [3, 1] when all are the same."""
+    if camera.projection == "orthographic":
+        return np.array([[0.0], [0.0], [1.0]], dtype=np.float32)
+    x, y = camera.plane_coordinates()
+    toward = np.stack([-x.reshape(-1), -y.reshape(-1), np.ones(x.size)])
+    toward /= np.linalg.norm(toward, axis=0)
+    return np.pad(toward.astype(np.float32), ((0, 0), (0, padded - x.size)))
+
+
+def _facts(frames: GradientFrames, result: Solution, length: np.ndarray, separated: np.ndarray) -> dict[str, Any]:
+    """What the report says beside the statistics that every method has."""
+    solved = result.status == Status.OK
+    how = "colour" if not frames.polarised else "polarisation" if frames.parallel is not None else "crossed polariser"
+    facts: dict[str, Any] = {"separation": how, "pixels_separated": int((solved & separated).sum()),
+                             "pixels_taken_as_diffuse": int((solved & ~separated).sum()), "frames_unused": list(frames.unused)}
+    if result.specular_normal is not None:
+        facts["pixels_with_specular_normal"] = int((solved & result.specular_normal.any(axis=0)).sum())
+    if solved.any():  # of the response vector, (3/2)|M|/M0: one on a convex Lambertian surface
+        middle, low = np.percentile(length[solved], [50, 5])
+        facts["response_length"] = {"median": round(float(middle), 5), "p5": round(float(low), 5)}
+    return facts
+
+
+def _moments(band: packs.Band, rows: np.ndarray, stack: Stack) -> Moments:
+    padded = np.zeros((band.light_count, 4))
+    padded[: len(rows)] = rows
+    return fit_moments(band, padded, stack.scale, GREY_WEIGHTS)

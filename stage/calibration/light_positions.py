@@ -1,0 +1,57 @@
+"""Two or more mirror balls → where a near light is: the point nearest to the reflected lines of sight (Powell et al. 2001)."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from stage.errors import CalibrationError
+
+MIN_CONVERGENCE_DEGREES = 1.0
+"""Rays closer to parallel than this meet nowhere in particular: one pixel of error moves the light by its own distance."""
+MISS_DEGREES = 1.0
+"""Flagged: the nearest point is seen from a ball farther than this off its ray."""
+
+
+class Position(NamedTuple):
+    """One near light."""
+
+    position: np.ndarray  # [3] float64, in the unit of the balls
+    residual: float
+    """Root mean square distance from the rays, same unit."""
+    uncertainty: float
+    """Standard error of the position, same unit: the uncertainty of the rays, carried through the least squares."""
+    flags: tuple[str, ...]
+
+
+def nearest_point(points: np.ndarray, directions: np.ndarray, uncertainty_degrees: np.ndarray) -> Position:
+    """The point with the least sum of squared distances from rays: Σ (I - d dᵀ)(x - p) = 0.
+
+    Args:
+        points: [balls, 3] where each ray leaves its ball.
+        directions: [balls, 3] unit.
+        uncertainty_degrees: [balls] standard error of each direction.
+
+    Raises:
+        CalibrationError: the rays are nearly parallel, or meet behind a ball.
+    """
+    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    normal = across.sum(axis=0)
+    # of two rays at an angle γ the eigenvalues are 1 - cos γ, 1 + cos γ and 2
+    least = float(np.linalg.eigvalsh(normal)[0])
+    angle = math.degrees(math.acos(max(-1.0, 1 - 2 * least / len(points))))
+    if angle < MIN_CONVERGENCE_DEGREES:
+        raise CalibrationError(f"the rays from the balls are {angle:.2f}° from parallel: the light is too far to be placed: "
+                               "move the balls apart, or take it as distant with mirror-ball")
+    position = np.linalg.solve(normal, (across @ points[:, :, None]).sum(axis=0))[:, 0]
+    way = position - points
+    distance = np.linalg.norm(way, axis=1)
+    if ((way * directions).sum(axis=1) <= 0).any():
+        raise CalibrationError("the rays from the balls meet behind them: the balls are given in the wrong place or order, or of "
+                               "the wrong radius")
+    miss = np.linalg.norm((across @ way[:, :, None])[:, :, 0], axis=1)
+    spread = np.radians(uncertainty_degrees) * distance
+    inverse = np.linalg.inv(normal)
+    covariance = inverse @ (across * (spread**2)[:, None, None]).sum(axis=0) @ inverse
+    flags = ("rays miss",) if np.degrees(np.arctan2(miss, distance)).max() > MISS_DEGREES else ()
+    return Position(position, float(np.sqrt((miss**2).mean())), math.sqrt(float(np.trace(covariance))), flags)

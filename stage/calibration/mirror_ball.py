@@ -1,0 +1,162 @@
+"""Mirror ball → where the light is: the line of sight of the bright spot, reflected at the ball.
+
+The normal at the spot is half way between the viewer and the light; it is not the light's direction.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from stage.calibration.ball import Ball, BallView
+from stage.errors import CalibrationError
+
+RIM_COSINE = 0.1
+"""Pixels whose normal is flatter than this to the line of sight are not looked at: they mix ball and background."""
+MIN_COSINE = 0.2
+"""A spot flatter than this (a light more than 157° from the view axis) has an unsure direction: 1 px is 10/radius rad there."""
+NEAR_RIM_COSINE = 0.35
+"""Flagged: a light more than 139° from the view axis."""
+MAX_SPOT_SHARE = 0.1
+"""A spot larger than this part of the ball is no spot: a light of 37° half angle, or an exposure that drowns the ball."""
+PROMINENCE = 8.0
+"""How many standard deviations of the ball's other pixels the peak must rise above their median; noise alone reaches 4 or 5."""
+MIN_CONTRAST = 2.0
+"""And how many times that median."""
+RIVAL_SHARE = 0.5
+"""Flagged: another spot as bright with more than this part of the found one's light."""
+MAX_PARTS = 8
+"""Bright parts that are looked at."""
+SMALL_SPOT = 4
+"""Flagged: pixels under which a centroid knows little of what lies between them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpotOptions:
+    """How the spot is told from the rest."""
+
+    level: float = 0.5
+    """The spot is what is brighter than this part of the peak and connected to it."""
+
+
+class Spot(NamedTuple):
+    """The reflection of one light in a mirror ball."""
+
+    uv: np.ndarray  # [2] float64, centroid, continuous image coordinates
+    direction: np.ndarray  # [3] float64, unit, the reflected line of sight: from the ball to the light, camera frame
+    point: np.ndarray  # [3] float64, on the ball at the centroid, in the ball's unit
+    spot_degrees: float
+    """Root mean square angle between the light of the spot and its mean: the apparent size of the light."""
+    uncertainty_degrees: float
+    """Standard error of the direction from the pixel grid and the outline of the ball."""
+    pixels: int
+    flags: tuple[str, ...]
+
+
+def find_spot(radiance: np.ndarray, saturated: np.ndarray | None, ball: Ball, view: BallView,
+              options: SpotOptions = SpotOptions()) -> Spot:
+    """The direction of one light.
+
+    Every pixel of the spot is a measurement of the light in its own reflected direction; the result is their mean, weighted
+    by how far each rises above the spot's level. On an orthographic mirror ball equal areas of the image are equal solid
+    angles, so that this is the centroid of the light itself. Saturated pixels count as the brightest.
+
+    Args:
+        radiance: [h, w, 3] scene-linear, the box of `view`.
+        saturated: [h, w] bool, or None.
+        ball, view: the ball and what its pixels show.
+        options: how the spot is told from the rest.
+
+    Raises:
+        CalibrationError: there is no spot, it covers the ball, or it is at the rim; the message does not name the frame.
+    """
+    facing = (view.normal * view.to_viewer).sum(axis=-1)
+    looked_at = view.inside & (facing > RIM_COSINE)
+    value = np.where(looked_at, radiance.astype(np.float64).mean(axis=-1), 0)
+    clipped = looked_at & saturated if saturated is not None else np.zeros_like(looked_at)
+    if clipped.any():
+        value[clipped] = value.max()
+    _check_prominence(value[looked_at])
+    peak = float(value.max())
+    above = value > options.level * peak
+    spot, rival = _brightest(np.where(above, value - options.level * peak, 0), value == peak)
+    count, ball_pixels = int(spot.sum()), int(view.inside.sum())
+    if count > max(MAX_SPOT_SHARE * ball_pixels, SMALL_SPOT):
+        raise CalibrationError(f"the bright spot covers {count / ball_pixels:.0%} of the ball: shorten the exposure or make the "
+                               "light smaller")
+    weight = (value[spot] - options.level * peak) / (value[spot] - options.level * peak).sum()
+    rows, cols = np.nonzero(spot)
+    uv = np.array([weight @ cols + view.box[1].start + 0.5, weight @ rows + view.box[0].start + 0.5])
+    cosine = float(weight @ facing[spot])
+    if cosine < MIN_COSINE:
+        degrees = math.degrees(math.acos(cosine))
+        raise CalibrationError(f"the bright spot is at the rim of the ball, its normal {degrees:.0f}° off the line of sight: "
+                               "the light is behind the object, or the ball's outline is too large")
+    reflected = reflect(view.to_viewer[spot], view.normal[spot])
+    mean = weight @ reflected
+    direction = mean / np.linalg.norm(mean)
+    off = np.arctan2(np.linalg.norm(np.cross(reflected, direction), axis=-1), reflected @ direction)
+    point = weight @ view.point[spot]
+    outward = point - ball.centre
+    flags = [("near the rim", cosine < NEAR_RIM_COSINE), ("several spots", rival > RIVAL_SHARE),
+             ("saturated", clipped[spot].sum() > count / 2), ("small spot", count < SMALL_SPOT)]
+    return Spot(uv, direction, ball.centre + outward * ball.radius / np.linalg.norm(outward),
+                math.degrees(math.sqrt(float(weight @ off**2))), _uncertainty_degrees(ball, cosine, count), count,
+                tuple(name for name, raised in flags if raised))
+
+
+def reflect(to_viewer: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """The mirror direction 2(n·v)n - v of the way to the viewer, [..., 3]: the way to what the mirror shows."""
+    return 2 * (normal * to_viewer).sum(axis=-1, keepdims=True) * normal - to_viewer
+
+
+def _uncertainty_degrees(ball: Ball, cosine: float, count: int) -> float:
+    """Of a centroid of `count` pixels: a pixel is uniform over its width, 1/√12, and the outline has its own error.
+
+    Across the ball a shift of one pixel turns the normal by 1/(radius cos) and the reflection by twice that.
+    """
+    shift_px = math.sqrt(1 / (12 * count) + ball.outline_error_px**2)
+    return math.degrees(2 * shift_px / (ball.radius_px * cosine))
+
+
+def _check_prominence(values: np.ndarray) -> None:
+    peak, median = float(values.max()), float(np.median(values))
+    spread = 1.4826 * float(np.median(np.abs(values - median)))  # the standard deviation, were it noise alone
+    if peak <= 0 or peak < median + PROMINENCE * spread or peak < MIN_CONTRAST * median:
+        raise CalibrationError("there is no bright spot on the ball")
+
+
+def _brightest(weight: np.ndarray, peak: np.ndarray) -> tuple[np.ndarray, float]:
+    """The connected part of `weight > 0` that holds a peak and most light, and the share of the next part in its light."""
+    left = weight > 0
+    spots: list[tuple[float, np.ndarray]] = []
+    rivals = [0.0]
+    for _ in range(MAX_PARTS):
+        if not left.any():
+            break
+        part = _connected(left, int(np.argmax(np.where(left, weight, 0))))
+        total = float(weight[part].sum())
+        if peak[part].any():
+            spots.append((total, part))
+        else:
+            rivals.append(total)
+        left &= ~part
+    spots.sort(key=lambda spot: spot[0], reverse=True)
+    rivals += [total for total, _ in spots[1:]]
+    return spots[0][1], max(rivals) / spots[0][0]
+
+
+def _connected(allowed: np.ndarray, seed: int) -> np.ndarray:
+    """The part of `allowed` that is connected to the pixel of flat index `seed`, over sides and corners."""
+    rows, cols = allowed.shape
+    left = np.pad(allowed, 1).reshape(-1)  # a border, so that neighbours of the edge exist
+    front = np.array([(seed // cols + 1) * (cols + 2) + seed % cols + 1])
+    around = np.array([r * (cols + 2) + c for r in (-1, 0, 1) for c in (-1, 0, 1)])
+    part = np.zeros_like(left)
+    while len(front):
+        part[front] = True
+        left[front] = False
+        front = np.unique(front[:, None] + around)
+        front = front[left[front]]
+    return part.reshape(rows + 2, cols + 2)[1:-1, 1:-1]

@@ -1,0 +1,90 @@
+"""A ball from a mask: its outline at sub-pixel places, without what holds the ball."""
+
+import numpy as np
+
+from stage.calibration.ball import Ball, ball_from_outline, lines_of_sight
+from stage.camera import Camera
+from stage.errors import CalibrationError
+
+LEVEL = 0.5
+"""Of the mask: the outline runs where coverage is one half."""
+RANSAC_ROUNDS = 300
+"""With half the outline true, three points all lie on it in one round of eight: 300 rounds miss with probability 1e-17."""
+INLIER_PX = 1.0
+"""Binary masks round the outline to half a pixel either way; a stand or a second object is farther off."""
+MIN_SHARE = 0.4
+"""Least part of the found circle's length that the mask's outline must cover."""
+POINTS_PER_PX = 1.27
+"""Outline points a pixel of a circle's length: 4/π crossings of the rows and columns of the grid, on average."""
+
+
+def ball_from_mask(camera: Camera, coverage: np.ndarray, *, radius_m: float | None = None, z_m: float | None = None) -> Ball:
+    """The ball that a mask shows.
+
+    Three random outline points at a time propose a circle (a cone for a perspective camera); the one with most points
+    within a pixel is kept and fitted to those (RANSAC, Fischler and Bolles 1981), so that a stand or a hole does not pull it.
+
+    Args:
+        coverage: [rows, cols], 0 outside to 1 inside; binary or anti-aliased.
+        radius_m, z_m: as `ball_from_outline` takes them.
+
+    Raises:
+        CalibrationError: the mask is empty, or its outline is no circle.
+    """
+    outline = outline_points(coverage)
+    if len(outline) < 12:
+        raise CalibrationError(f"the mask of the ball has an outline of {len(outline)} points: a ball needs a few pixels")
+    rng = np.random.default_rng(0)
+    best, best_ball = np.zeros(len(outline), dtype=bool), None
+    for _ in range(RANSAC_ROUNDS):
+        try:
+            ball = ball_from_outline(camera, outline[rng.choice(len(outline), 3, replace=False)], error_px=0.0)
+        except CalibrationError:
+            continue
+        near = np.abs(_distance_px(ball, camera, outline)) < INLIER_PX
+        if near.sum() > best.sum():
+            best, best_ball = near, ball
+    if best_ball is None:
+        raise CalibrationError("the outline of the ball's mask lies on a line")
+    for _ in range(3):  # the points near the fitted circle are a few more than those near the proposal
+        best_ball = ball_from_outline(camera, outline[best], error_px=0.0)
+        distance = _distance_px(best_ball, camera, outline)
+        best = np.abs(distance) < INLIER_PX
+    share = best.sum() / (POINTS_PER_PX * 2 * np.pi * best_ball.radius_px)
+    if share < MIN_SHARE:
+        raise CalibrationError(f"the mask of the ball is not round: {share:.0%} of the best circle's outline is in it")
+    error_px = float(np.sqrt((distance[best] ** 2).mean() * 2 / best.sum()))
+    return ball_from_outline(camera, outline[best], error_px=error_px, radius_m=radius_m, z_m=z_m)
+
+
+def outline_points(coverage: np.ndarray) -> np.ndarray:
+    """Where a mask crosses one half between neighbouring pixel centres, by linear interpolation.
+
+    Args:
+        coverage: [rows, cols], 0 to 1.
+
+    Returns:
+        [points, 2] float64 u, v.
+    """
+    values = coverage.astype(np.float64)
+    found = []
+    for axis in (0, 1):
+        first, second = (values[:-1], values[1:]) if axis == 0 else (values[:, :-1], values[:, 1:])
+        row, col = np.nonzero((first > LEVEL) != (second > LEVEL))
+        a, b = first[row, col], second[row, col]
+        part = (LEVEL - a) / (b - a)
+        found.append(np.stack([col + 0.5 + (part if axis == 1 else 0), row + 0.5 + (part if axis == 0 else 0)], axis=-1))
+    return np.concatenate(found)
+
+
+def _distance_px(ball: Ball, camera: Camera, outline: np.ndarray) -> np.ndarray:
+    """How far outside the ball's outline image points lie, in pixels."""
+    origin, direction = lines_of_sight(camera, outline[:, 0], outline[:, 1])
+    if camera.projection == "orthographic":
+        distance = np.linalg.norm(origin[:, :2] - ball.centre[:2], axis=1) - ball.radius
+        return distance / (camera.pixel_size_m or 1.0)
+    to_centre = np.linalg.norm(ball.centre)
+    axis = ball.centre / to_centre
+    angle = np.arctan2(np.linalg.norm(np.cross(direction, axis), axis=1), direction @ axis)
+    assert camera.focal_px is not None  # the camera's validator saw to it
+    return (angle - np.arcsin(ball.radius / to_centre)) * sum(camera.focal_px) / 2

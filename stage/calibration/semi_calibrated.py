@@ -1,0 +1,166 @@
+"""Lights of known direction and unknown brightness, from images of the object itself ("semi-calibrated" photometric stereo).
+
+Cho, Matsushita, Tai and Kweon, "Semi-Calibrated Photometric Stereo", TPAMI 2018: readings y_lp = e_l · l·b_p of a Lambertian
+surface are linear in q_l = 1/e_l and b_p together, q_l y_lp - l·b_p = 0. Here every b_p is eliminated in closed form, which leaves
+one small symmetric eigenvalue problem in q; weights take out shadows and highlights, and the last rounds alternate between b and e.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from stage.errors import CalibrationError
+
+MIN_LIGHTS = 4
+"""Two equations a light against eight unknowns of the ambiguity."""
+MIN_PIXELS = 30
+MIN_DETERMINED = 1e-3
+"""Least singular value of the equations for the ambiguity, relative to the largest: below it brightness is not determined."""
+SHADOW = 0.1
+"""A reading under this part of the pixel's bright end, or of |b|, is shadow or grazing light."""
+WEIGHT_SCALE = 2.385
+"""Cauchy weights, as in grey_ball."""
+BRIGHT_END = 0.9
+"""Quantile of a pixel's readings that stands for its brightest one."""
+ROUNDS = 60
+LINEAR_ROUNDS = range(10, 25)
+"""Of the rounds, those that solve the eigenvalue problem."""
+CONVERGED = 1e-7
+TINY = 1e-200
+"""Below any reading: against division by zero."""
+
+
+class Intensities(NamedTuple):
+    """Brightness of each light."""
+
+    irradiance: np.ndarray  # [lights, 3] float64, mean 1 over the lights in every channel
+    residual: np.ndarray  # [lights, 3] float64, weighted root mean square of the residual over |b|
+    uncertainty: np.ndarray  # [lights, 3] float64, standard error relative to the value, from that residual
+    pixels: int
+    """Pixels that took part."""
+
+
+def fit_intensities(readings: np.ndarray, usable: np.ndarray, directions: np.ndarray) -> Intensities:
+    """Irradiance of every light, up to one factor a channel.
+
+    Args:
+        readings: [lights, pixels, 3] scene-linear radiance of pixels of the object.
+        usable: [lights, pixels] bool, unsaturated.
+        directions: [lights, 3] unit.
+
+    Raises:
+        CalibrationError: too few lights or pixels, or directions that do not determine the brightness.
+    """
+    check_directions(directions)
+    fits = [_fit_channel(readings[..., channel].astype(np.float64), usable, directions, "RGB"[channel]) for channel in range(3)]
+    irradiance, residual, uncertainty = (np.stack([fit[part] for fit in fits], axis=-1) for part in range(3))
+    return Intensities(irradiance, residual, uncertainty, min(fit[3] for fit in fits))
+
+
+def check_directions(directions: np.ndarray) -> None:
+    """Refuse directions under which brightness and shape cannot be told apart.
+
+    Another brightness e' explains the same images when there is a 3×3 matrix G with Gᵀ l parallel to l for every light; only
+    multiples of the identity are harmless. l × Gᵀ l = 0 is linear in G: its null space must have one dimension.
+
+    Raises:
+        CalibrationError: fewer than four lights, or lights in one plane but for one.
+    """
+    if len(directions) < MIN_LIGHTS:
+        raise CalibrationError(f"{len(directions)} distant lights: brightness needs {MIN_LIGHTS} or more")
+    x, y, z = directions.T
+    zero = np.zeros_like(x)
+    cross = np.stack([np.stack([zero, -z, y], -1), np.stack([z, zero, -x], -1), np.stack([-y, x, zero], -1)], axis=1)
+    equations = np.einsum("lij,lk->lijk", cross, directions).reshape(-1, 9)
+    singular = np.linalg.svd(equations, compute_uv=False)
+    if singular[7] < MIN_DETERMINED * singular[0]:
+        raise CalibrationError("all lights but one lie in one plane (or on a line): brightness cannot be told from shape")
+
+
+def _fit_channel(reading: np.ndarray, usable: np.ndarray, directions: np.ndarray,
+                 name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    """Irradiance [lights] of one channel with its residual, its uncertainty and the count of pixels.
+
+    Channels are fitted apart: under lights of different colours the grey of a coloured surface is no product of the two.
+    """
+    lit = usable & (reading > 0)
+    enough = lit.sum(axis=0) >= MIN_LIGHTS
+    count = int(enough.sum())
+    if count < MIN_PIXELS:
+        raise CalibrationError(f"channel {name}: {count} pixels are lit and unsaturated under {MIN_LIGHTS} or more lights: "
+                               f"{MIN_PIXELS} are needed")
+    reading, lit = reading[:, enough], lit[:, enough]
+    reading = reading / np.where(lit, reading, 0).max(axis=0)  # every pixel counts alike, however dark its albedo
+    e = np.ones(len(directions))
+    for step in range(ROUNDS):
+        weight = _weights(reading, lit, e, directions)
+        _check_lit(weight, name)
+        before = e
+        # the first rounds only alternate: they are slow to converge, but highlights cannot make them negative
+        e = _linear(reading, weight, directions, e) if step in LINEAR_ROUNDS else e
+        b = _normals(reading / e[:, None], weight * e[:, None] ** 2, directions)
+        e = _scale(reading, directions @ b, weight)
+        e /= e.mean()
+        if step > LINEAR_ROUNDS.stop and np.abs(e / before - 1).max() < CONVERGED:
+            break
+    error = np.where(weight > 0, (reading / e[:, None] - directions @ b) / np.maximum(np.linalg.norm(b, axis=0), TINY), 0)
+    total = weight.sum(axis=1)
+    residual = np.sqrt((weight * error**2).sum(axis=1) / total)
+    return e, residual, residual / np.sqrt(total), count
+
+
+def _check_lit(weight: np.ndarray, name: str) -> None:
+    few = (weight > 0).sum(axis=1)
+    if few.min() < MIN_PIXELS:
+        raise CalibrationError(f"channel {name}: {int(few.min())} pixels are lit, unsaturated and like a Lambertian "
+                               f"surface under light {int(np.argmin(few)) + 1} of {len(few)}: {MIN_PIXELS} are needed")
+
+
+def _linear(reading: np.ndarray, weight: np.ndarray, directions: np.ndarray, e: np.ndarray) -> np.ndarray:
+    """e from the least of q D Σ_p w_p y_p (I - projection on the lights) y_p D q, D each light's own (Σ w y²)^-1/2, q = 1/e.
+
+    The given `e` where the result is negative: outliers are not out yet.
+    """
+    gram = _gram(weight, directions)
+    values, vectors = np.linalg.eigh(gram)
+    root = vectors / np.sqrt(np.maximum(values, 1e-9 * values[:, 2:] + TINY))[:, None, :]
+    spread = np.einsum("lp,li,pij->lpj", weight * reading, directions, root, optimize=True).reshape(len(reading), -1)
+    scale = 1 / np.sqrt((weight * reading**2).sum(axis=1))
+    q = np.linalg.eigh(np.eye(len(reading)) - scale[:, None] * (spread @ spread.T) * scale)[1][:, 0] * scale
+    q = q * np.sign(q.sum())
+    return len(q) / q / (1 / q).sum() if (q > 0).all() else e
+
+
+def _weights(reading: np.ndarray, lit: np.ndarray, e: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Cauchy weights of the residual over |b|; zero in shadow, as readings and as the model say."""
+    scaled = reading / e[:, None]
+    top = np.quantile(np.where(lit, scaled, 0), BRIGHT_END, axis=0)
+    bright = lit & (scaled > SHADOW * top)
+    weight = bright.astype(np.float64)
+    for _ in range(3):
+        b = _normals(scaled, weight, directions)
+        model, length = directions @ b, np.maximum(np.linalg.norm(b, axis=0), TINY)
+        relative = (scaled - model) / length
+        chosen = bright & (model > SHADOW * length)
+        spread = 1.4826 * np.median(np.abs(relative[chosen])) if chosen.any() else 1.0
+        weight = chosen / (1 + (relative / (WEIGHT_SCALE * spread + 1e-9)) ** 2)
+    weight[:, (weight > 0.1).sum(axis=0) < MIN_LIGHTS] = 0  # three readings fit any brightness
+    return weight
+
+
+def _normals(scaled: np.ndarray, weight: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """b of every pixel by weighted least squares, [3, pixels]."""
+    gram = _gram(weight, directions)
+    gram += (1e-12 * np.trace(gram, axis1=1, axis2=2) + TINY)[:, None, None] * np.eye(3)  # pixels of no weight get no b
+    return np.linalg.solve(gram, ((weight * scaled).T @ directions)[:, :, None])[:, :, 0].T
+
+
+def _gram(weight: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Normal equations of every pixel, [pixels, 3, 3]."""
+    outer = (directions[:, :, None] * directions[:, None, :]).reshape(-1, 9)
+    return (weight.T @ outer).reshape(-1, 3, 3)
+
+
+def _scale(reading: np.ndarray, model: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Least squares factor of each light's readings on its model, [lights]."""
+    return (weight * reading * model).sum(axis=1) / (weight * model**2).sum(axis=1)

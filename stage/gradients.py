@@ -1,0 +1,86 @@
+"""The spherical gradient frames of a capture as arrays, and whether they determine a normal.
+
+Under radiance L(ω) = mean + dipole·ω a pixel's radiance is mean · M₀ + dipole · M, with M₀ its response to the full sphere and M
+its response to L = ω. A gradient (1 ± ω_a)/2 is mean 1/2 and dipole ±e_a/2; the full sphere is mean 1. So a frame is one row of
+a linear system in (M₀, M), whatever the reflectance is.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from stage.capture import Capture
+from stage.errors import ManifestError
+from stage.light import FullLight, GradientLight
+from stage.lighting import check_surface
+from stage.manifest import FILE_NAME
+
+AXES = "xyz"
+
+
+class GradientFrames(NamedTuple):
+    """What each frame of the capture's stack measures, per polarization that the solve uses."""
+
+    diffuse: np.ndarray  # [frames, 4] float64, (mean, dipole x, y, z); 0 for frames that do not take part
+    parallel: np.ndarray | None  # the same of the parallel-polarised frames, or None
+    polarised: bool
+    """Whether `diffuse` are cross-polarised frames: then they hold half of the diffuse light and nothing of the highlight."""
+    unused: tuple[str, ...]
+    """Images of gradient or full frames that the solve does not need."""
+
+
+def has_gradients(capture: Capture) -> bool:
+    """Whether any frame is lit by a gradient light."""
+    return bool(capture.lit_by(GradientLight))
+
+
+def gradient_frames(capture: Capture) -> GradientFrames:
+    """The gradient and full frames of a capture, in the order of its stack.
+
+    Cross-polarised frames are the diffuse ones where there are any, parallel ones add the specular; else unpolarised frames.
+    A `full` frame, which says nothing of a polariser, counts as an unpolarised gradient frame of axis `full`.
+
+    Raises:
+        ManifestError: no gradient frames, or they lack what a normal needs; names it.
+    """
+    where = capture.folder / FILE_NAME
+    if not has_gradients(capture):
+        raise ManifestError(f"{where}: frames: none is lit by a gradient light, which --method gradient needs")
+    rows: dict[str, np.ndarray] = {}
+    frames = capture.sources()
+    for index, frame in enumerate(frames):
+        light = frame.light
+        if isinstance(light, FullLight):
+            light = GradientLight(type="gradient", axis="full")
+        if isinstance(light, GradientLight):
+            rows.setdefault(light.polarization, np.zeros((len(frames), 4)))[index] = _row(light)
+    if "parallel" in rows and "cross" not in rows:
+        raise ManifestError(f"{where}: frames: gradient capture has parallel frames without cross ones: separation needs both; "
+                            "frames of one polariser alone are polarization none")
+    polarised = "cross" in rows
+    solved = [kind for kind in ("cross", "parallel") if kind in rows] if polarised else ["none"]
+    for kind in solved:
+        _check(f"{where}: frames: gradient capture", rows[kind], kind)
+    taken = np.any([rows[kind].any(axis=1) for kind in solved], axis=0)
+    unused = tuple(frame.image for frame, used in zip(frames, taken, strict=True)
+                   if not used and isinstance(frame.light, GradientLight | FullLight))
+    check_surface(capture)
+    return GradientFrames(rows[solved[0]], rows.get("parallel") if polarised else None, polarised, unused)
+
+
+def _row(light: GradientLight) -> tuple[float, float, float, float]:
+    if light.axis == "full":
+        return (1.0, 0.0, 0.0, 0.0)
+    x, y, z = (0.5 * light.sign if light.axis == axis else 0.0 for axis in AXES)
+    return (0.5, x, y, z)
+
+
+def _check(what: str, rows: np.ndarray, polarization: str) -> None:
+    """Refuse rows that leave M₀ or a component of M open."""
+    lack = [axis for a, axis in enumerate(AXES) if not rows[:, 1 + a].any()]
+    which = "" if polarization == "none" else f" with polarization {polarization}"
+    if lack:
+        raise ManifestError(f"{what} lacks axis {' and '.join(lack)}{which}: a normal needs x, y and z")
+    if np.linalg.matrix_rank(rows) < 4:
+        raise ManifestError(f"{what} lacks a full frame{which}, or the opposite sign of one axis: "
+                            "without it albedo and normal cannot be told apart")

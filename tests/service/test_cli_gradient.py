@@ -1,0 +1,120 @@
+"""relit solve on gradient captures: from images on disk to maps.exr, with a known truth."""
+
+import json
+
+import numpy as np
+import pytest
+
+from stage import exr
+from stage.maps import SurfaceMaps
+from tests.captures import angles_degrees, make_scene, write_exr, write_image, write_manifest
+from tests.reference import gradient as reference
+
+SIZE, ROUGHNESS = 12, 0.2
+PAIRS = [(axis, sign) for axis in "xyz" for sign in (1, -1)]
+SCENE = make_scene(size=SIZE)
+CAMERA = {"projection": "orthographic", "resolution": [SIZE, SIZE]}
+
+
+def shaded(shade) -> np.ndarray:
+    """[frame, rows, cols] of a function of normal, axis and sign, inside the mask."""
+    image = np.zeros((len(PAIRS), SIZE, SIZE))
+    for r, c in np.argwhere(SCENE.mask):
+        image[:, r, c] = [shade(SCENE.normal[r, c], axis, sign) for axis, sign in PAIRS]
+    return image[..., None]
+
+
+@pytest.fixture(scope="module")
+def diffuse() -> np.ndarray:
+    return shaded(reference.lambert) * SCENE.albedo
+
+
+@pytest.fixture(scope="module")
+def highlight() -> np.ndarray:
+    view = np.array([0.0, 0.0, 1.0])
+    return shaded(lambda n, axis, sign: reference.ggx(n, view, axis, sign, alpha=ROUGHNESS**2, f0=0.04, nodes=40, turns=60))
+
+
+def write(folder, groups: dict[str, np.ndarray], **changes):
+    """A capture of the six gradients in each polarisation."""
+    frames = []
+    for kind, images in groups.items():
+        for (axis, sign), image in zip(PAIRS, images, strict=True):
+            name = f"{kind}-{axis}{'+' if sign > 0 else '-'}.exr"
+            write_exr(folder / name, image)
+            frames.append({"image": name, "light": {"type": "gradient", "axis": axis, "sign": sign, "polarization": kind}})
+    write_image(folder / "mask.png", (SCENE.mask * 255).astype(np.uint8))
+    write_manifest(folder, {"schema": "relit.capture/1", "name": "head", "mask": "mask.png", "camera": CAMERA, "frames": frames,
+                            **changes})
+    return folder
+
+
+def solve(relit, folder, *arguments):
+    outcome = relit("solve", folder, "--out", folder / "out", *arguments)
+    assert (outcome.code, outcome.err) == (0, "")
+    return SurfaceMaps.read(folder / "out" / "maps.exr"), json.loads((folder / "out" / "report.json").read_text())
+
+
+def test_polarised_frames_give_both_normals(relit, tmp_path, diffuse, highlight):
+    write(tmp_path, {"cross": diffuse / 2, "parallel": diffuse / 2 + highlight})
+    maps, report = solve(relit, tmp_path, "--method", "gradient")
+    inside = SCENE.mask
+    assert np.array_equal(maps.mask, inside)
+    assert angles_degrees(maps.normal, SCENE.normal)[inside].max() < 0.08  # half rounding of six readings
+    assert angles_degrees(maps.specular_normal, SCENE.normal)[inside].max() < 0.5  # that of a difference, and the lobe's lean
+    assert np.allclose(maps.diffuse_albedo[inside], SCENE.albedo[inside], rtol=2e-3)
+    channels, _ = exr.read(tmp_path / "out" / "maps.exr")
+    layers = {name.partition(".")[0] for name in channels}
+    assert layers == {"normal", "specular_normal", "diffuse_albedo", "height", "confidence", "mask"}
+    assert all(np.isfinite(plane).all() for plane in channels.values())
+    assert report["method"] == "gradient" and report["found"]["separation"] == "polarisation"
+    assert report["found"]["pixels_with_specular_normal"] == report["pixels"]["ok"] == inside.sum()
+    assert report["found"]["response_length"]["median"] == pytest.approx(1, abs=1e-3)
+    assert report["residual"]["p95"] < 1e-3
+
+
+def test_gradient_is_the_default_for_gradient_frames(relit, tmp_path, diffuse, highlight):
+    """And without a polariser colour tells the highlight from the diffuse light, but for the middle, where the cap is nearly grey."""
+    write(tmp_path, {"none": diffuse + highlight})
+    maps, report = solve(relit, tmp_path)
+    assert report["method"] == "gradient" and report["found"]["separation"] == "colour"
+    grey = report["found"]["pixels_taken_as_diffuse"]
+    assert 0 < grey < report["pixels"]["ok"] / 2 and report["found"]["pixels_separated"] == report["pixels"]["ok"] - grey
+    error, sure = angles_degrees(maps.normal, SCENE.normal), maps.confidence
+    told = SCENE.mask & (maps.specular_normal.any(axis=-1))
+    assert told.sum() == report["found"]["pixels_separated"]
+    assert error[told].max() < 0.5  # half rounding over a chroma of a tenth
+    assert sure[SCENE.mask & ~told].max() < 0.16 and np.median(sure[told]) > 0.16
+
+
+def test_a_grey_object_is_taken_as_diffuse_and_the_report_says_so(relit, tmp_path, diffuse):
+    write(tmp_path, {"none": np.repeat(diffuse[..., :1], 3, axis=-1)})
+    maps, report = solve(relit, tmp_path)
+    assert maps.specular_normal is None
+    assert report["found"]["pixels_taken_as_diffuse"] == report["pixels"]["ok"] == SCENE.mask.sum()
+    assert angles_degrees(maps.normal, SCENE.normal)[SCENE.mask].max() < 0.08
+
+
+def test_a_perspective_camera(relit, tmp_path, diffuse):
+    camera = {"projection": "perspective", "resolution": [SIZE, SIZE], "focal_px": [40, 40], "principal_px": [6, 6]}
+    write(tmp_path, {"cross": diffuse / 2}, camera=camera)
+    maps, report = solve(relit, tmp_path)
+    assert maps.specular_normal is None and report["found"]["separation"] == "crossed polariser"
+    assert angles_degrees(maps.normal, SCENE.normal)[maps.mask].max() < 0.08
+
+
+def test_info_takes_gradient_frames_and_names_what_is_missing(relit, tmp_path, diffuse):
+    write(tmp_path, {"none": diffuse})
+    outcome = relit("info", tmp_path)
+    assert outcome.code == 0 and "6 gradient light" in outcome.out
+    data = json.loads((tmp_path / "capture.json").read_text())
+    write_manifest(tmp_path, {**data, "frames": data["frames"][:4]})
+    for command in (["info", tmp_path], ["solve", tmp_path, "--out", tmp_path / "out"]):
+        outcome = relit(*command)
+        assert outcome.code == 2 and "gradient capture lacks axis z" in outcome.err
+
+
+def test_distant_methods_say_which_one_solves_gradients(relit, tmp_path, diffuse):
+    write(tmp_path, {"none": diffuse})
+    outcome = relit("solve", tmp_path, "--method", "lambert", "--out", tmp_path / "out")
+    assert outcome.code == 2 and "--method gradient" in outcome.err and not (tmp_path / "out").exists()
