@@ -44,7 +44,7 @@ class BallRequest(LightsRequest):
 class MirrorBallRequest(BallRequest):
     """Directions of far lights from one mirror ball."""
 
-    level: Annotated[float, Field(gt=0, lt=1)] = 0.5
+    level: Annotated[float, Field(gt=0, lt=1)] = 0.1
     """The spot is what is brighter than this part of its peak."""
 
 

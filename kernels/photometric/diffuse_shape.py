@@ -22,27 +22,26 @@ NEARBY = (((2.0, 4.0, 7.0), 14), (((0.9, 1.8), 8),))
 """Rings that follow a changed shape from the normals of Lambert's: a few degrees."""
 
 
-def choose_diffuse(samples: Samples, start: np.ndarray, directions: np.ndarray, *,
+def choose_diffuse(samples: Samples, start: np.ndarray, *,
                    options: SearchOptions | None = None) -> tuple[Diffuse, np.ndarray]:
     """Choose the shape under which the sampled pixels cost least.
 
     Args:
         samples: some hundreds of pixels, spread over the object.
         start: [n, 3] unit normals to begin from.
-        directions: [lights, 3] unit, without padding.
         options: of the search.
 
     Returns:
         The shape, and [shapes tried, 3] float64: roughness, slope, mean cost of each.
     """
-    normal = search_normals(samples, start, directions, shape=Diffuse(), options=options).normal
+    normal = search_normals(samples, start, shape=Diffuse(), options=options).normal
     wide, fine = NEARBY
     tried: dict[Diffuse, float] = {}
 
     def cost(rough: float, slope: float) -> float:
         shape = Diffuse(rough=round(rough, 4), slope=round(slope, 4))
         if shape not in tried:
-            found = search_normals(samples, normal, directions, shape=shape, options=options, wide=wide, fine=fine)
+            found = search_normals(samples, normal, shape=shape, options=options, wide=wide, fine=fine)
             tried[shape] = float(np.mean(found.cost, dtype=np.float64))
         return tried[shape]
 

@@ -93,7 +93,7 @@ def rings(degrees: tuple[float, ...], last_count: int) -> np.ndarray:
     return np.array(offsets, dtype=np.float32)
 
 
-def search_normals(samples: Samples, start: np.ndarray, directions: np.ndarray, *, shape: Diffuse,
+def search_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse,
                    options: SearchOptions | None = None, wide: tuple[tuple[float, ...], int] = WIDE,
                    fine: tuple[tuple[tuple[float, ...], int], ...] = FINE) -> Search:
     """Search the normals of sampled pixels.
@@ -101,7 +101,6 @@ def search_normals(samples: Samples, start: np.ndarray, directions: np.ndarray, 
     Args:
         samples: their readings.
         start: [n, 3] unit normals to begin from.
-        directions: [lights, 3] unit, without padding.
         shape: of the diffuse lobe.
         options: how candidates are judged.
         wide, fine: the rings.
@@ -113,9 +112,8 @@ def search_normals(samples: Samples, start: np.ndarray, directions: np.ndarray, 
         ArrayError: shapes that do not fit.
     """
     options = options or SearchOptions()
-    if start.shape != (samples.pixel_count, 3) or directions.shape != (samples.light_count, 3):
-        raise ArrayError(f"start is {start.shape}, directions {directions.shape}: give {(samples.pixel_count, 3)} "
-                         f"and {(samples.light_count, 3)}")
+    if start.shape != (samples.pixel_count, 3):
+        raise ArrayError(f"start is {start.shape}: give one normal for each of the {samples.pixel_count} pixels")
     device, lanes, packs, lights = samples.device, samples.lanes, samples.packs, samples.light_count
     lane_type = pack_type(lanes, wp.float32)
     normal = per_pixel(samples, start)
@@ -124,15 +122,14 @@ def search_normals(samples: Samples, start: np.ndarray, directions: np.ndarray, 
     held = MIXTURE + GEOMETRY
     scratch = wp.empty(packs * lights * held, dtype=lane_type, device=device)
     strides = (lights * held, 1) if device == "cpu" else (1, packs)
-    toward = wp.array(directions.astype(np.float32), dtype=wp.vec3, device=device)
     noise = wp.vec2(options.noise_floor, options.noise_slope)
     shadow = wp.vec2(math.expm1(options.shadow_cost), options.shadow_depth)
     form = wp.vec2(shape.rough, shape.slope)
     for degrees, count in (wide, *fine):
         offsets = wp.array(rings(degrees, count), dtype=wp.vec4, device=device)
         devices.launch(_search_kernel(lanes, options.reweightings, options.sweeps), packs,
-                       [samples.grey, samples.view, toward, offsets, noise, shadow, form, samples.pack_stride, samples.light_stride,
-                        *strides], [scratch, normal, cost, curvature], device=device)
+                       [samples.grey, samples.toward, samples.view, offsets, noise, shadow, form, lights, samples.pack_stride,
+                        samples.light_stride, *strides], [scratch, normal, cost, curvature], device=device)
     return Search(to_host(samples, normal), to_host(samples, cost), to_host(samples, curvature))
 
 
@@ -146,12 +143,13 @@ def _search_kernel(lanes: int, reweightings: int, sweeps: int) -> Any:
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
     def search_kernel(first: int,
                       grey: wp.array(dtype=lane_type),  # [P · L] readings / level
+                      toward: wp.array2d(dtype=lane_type),  # [3, P · L]
                       view: wp.array2d(dtype=lane_type),  # [3, P]
-                      directions: wp.array(dtype=wp.vec3),  # [L]
                       offsets: wp.array(dtype=wp.vec4),  # [candidates]
                       noise: wp.vec2,  # s0, s1
                       shadow: wp.vec2,  # r²/σ² of equal cost, depth
                       form: wp.vec2,  # diffuse roughness, slope
+                      light_count: int,
                       pack_stride: int,
                       light_stride: int,
                       scratch_pack: int,
@@ -162,17 +160,17 @@ def _search_kernel(lanes: int, reweightings: int, sweeps: int) -> Any:
                       cost: wp.array(dtype=lane_type),  # [P]
                       curvature: wp.array(dtype=lane_type)):  # [P]
         p = first + wp.tid()
-        light_count = directions.shape[0]
         alphas = widths(wp.static(LOBES[0]), wp.static(LOBES[1]), wp.static(LOBES[2]), wp.static(LOBES[3]), wp.static(LOBES[4]))
         vx, vy, vz = view[0, p], view[1, p], view[2, p]
         base = p * scratch_pack
         # what depends on light and view alone
         for light in range(light_count):
-            l = directions[light]
             at = base + light * wp.static(MIXTURE + GEOMETRY) * scratch_step
+            element = p * pack_stride + light * light_stride
+            wx, wy, wz = toward[0, element], toward[1, element], toward[2, element]
             inverse, rise = lane_type(), lane_type()
             for k in range(lanes):
-                lv = l[0] * vx[k] + l[1] * vy[k] + l[2] * vz[k]
+                lv = wx[k] * vx[k] + wy[k] * vy[k] + wz[k] * vz[k]
                 inverse[k] = 1.0 / wp.sqrt(wp.max(2.0 + 2.0 * lv, 1.0e-6))
                 rise[k] = schlick(wp.sqrt(wp.max(0.5 + 0.5 * lv, 0.0)))
             scratch[at + wp.static(MIXTURE) * scratch_step] = inverse
@@ -213,14 +211,16 @@ def _search_kernel(lanes: int, reweightings: int, sweeps: int) -> Any:
                 nv[k] = nx[k] * vx[k] + ny[k] * vy[k] + nz[k] * vz[k]
             # the lobes at this candidate
             for light in range(light_count):
-                l = directions[light]
+                reading_at = p * pack_stride + light * light_stride
+                lx, ly, lz = toward[0, reading_at], toward[1, reading_at], toward[2, reading_at]
                 at = base + light * wp.static(MIXTURE + GEOMETRY) * scratch_step
                 inverse = scratch[at + wp.static(MIXTURE) * scratch_step]
                 rise = scratch[at + wp.static(MIXTURE + 1) * scratch_step]
                 nl, nh, fresnel, lobe = lane_type(), lane_type(), lane_type(), lane_type()
                 for k in range(lanes):
-                    nl[k] = wp.max(nx[k] * l[0] + ny[k] * l[1] + nz[k] * l[2], 0.0)
-                    nh[k] = (nx[k] * l[0] + ny[k] * l[1] + nz[k] * l[2] + nv[k]) * inverse[k]
+                    cosine = nx[k] * lx[k] + ny[k] * ly[k] + nz[k] * lz[k]
+                    nl[k] = wp.max(cosine, 0.0)
+                    nh[k] = (cosine + nv[k]) * inverse[k]
                     fresnel[k] = wp.static(0.1 / MIXTURE_F0) * (MIXTURE_F0 + (1.0 - MIXTURE_F0) * rise[k])
                     lobe[k] = diffuse(nl[k], nv[k], 0.25 / (inverse[k] * inverse[k]), form[0], form[1])
                 scratch[at] = lobe

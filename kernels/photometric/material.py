@@ -34,14 +34,13 @@ class Material(NamedTuple):
     roughness: np.ndarray  # [n] float32
 
 
-def fit_material(samples: Samples, normal: np.ndarray, directions: np.ndarray, *, shape: Diffuse,
+def fit_material(samples: Samples, normal: np.ndarray, *, shape: Diffuse,
                  options: SearchOptions | None = None) -> Material:
     """Fit the material of sampled pixels.
 
     Args:
         samples: their readings.
         normal: [n, 3] unit normals.
-        directions: [lights, 3] unit, without padding.
         shape: of the diffuse lobe.
         options: noise and shadows, as in the search.
 
@@ -54,11 +53,10 @@ def fit_material(samples: Samples, normal: np.ndarray, directions: np.ndarray, *
     lane_type = pack_type(lanes, wp.float32)
     fitted = wp.empty((7, packs), dtype=lane_type, device=device)
     devices.launch(_material_kernel(lanes), packs,
-                   [samples.colour, samples.level, samples.view, per_pixel(samples, normal),
-                    wp.array(directions.astype(np.float32), dtype=wp.vec3, device=device),
+                   [samples.colour, samples.toward, samples.level, samples.view, per_pixel(samples, normal),
                     wp.vec2(options.noise_floor, options.noise_slope),
                     wp.vec2(math.expm1(options.shadow_cost), options.shadow_depth),
-                    wp.vec2(shape.rough, shape.slope), samples.pack_stride, samples.light_stride], [fitted], device=device)
+                    wp.vec2(shape.rough, shape.slope), samples.light_count, samples.pack_stride, samples.light_stride], [fitted], device=device)
     values = to_host(samples, fitted)
     return Material(values[:, :3], values[:, 3:6], values[:, 6])
 
@@ -72,19 +70,19 @@ def _material_kernel(lanes: int) -> Any:
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
     def material_kernel(first: int,
                         colour: wp.array2d(dtype=lane_type),  # [3, P · L] radiance / irradiance
+                        toward: wp.array2d(dtype=lane_type),  # [3, P · L]
                         level: wp.array(dtype=lane_type),  # [P]
                         view: wp.array2d(dtype=lane_type),  # [3, P]
                         normal: wp.array2d(dtype=lane_type),  # [3, P]
-                        directions: wp.array(dtype=wp.vec3),  # [L]
                         noise: wp.vec2,  # s0, s1
                         shadow: wp.vec2,  # r²/σ² of equal cost, depth
                         form: wp.vec2,  # diffuse roughness, slope
+                        light_count: int,
                         pack_stride: int,
                         light_stride: int,
                         # outputs
                         fitted: wp.array2d(dtype=lane_type)):  # [7, P] albedo, F0, roughness
         p = first + wp.tid()
-        light_count = directions.shape[0]
         vx, vy, vz = view[0, p], view[1, p], view[2, p]
         nx, ny, nz = normal[0, p], normal[1, p], normal[2, p]
         bright = level[p]
@@ -110,14 +108,15 @@ def _material_kernel(lanes: int) -> Any:
                 dd, ds, ss, rd, rs = channels(), channels(), channels(), channels(), channels()
                 cost = lane_type()
                 for light in range(light_count):
-                    l = directions[light]
                     at = p * pack_stride + light * light_stride
+                    lx, ly, lz = toward[0, at], toward[1, at], toward[2, at]
                     fd, fs, fixed = lane_type(), lane_type(), lane_type()
                     for k in range(lanes):
-                        lv = l[0] * vx[k] + l[1] * vy[k] + l[2] * vz[k]
+                        lv = lx[k] * vx[k] + ly[k] * vy[k] + lz[k] * vz[k]
                         hv2 = wp.max(0.5 + 0.5 * lv, 2.5e-7)
-                        nl = wp.max(nx[k] * l[0] + ny[k] * l[1] + nz[k] * l[2], 0.0)
-                        nh = (nx[k] * l[0] + ny[k] * l[1] + nz[k] * l[2] + nv[k]) * 0.5 / wp.sqrt(hv2)
+                        cosine = nx[k] * lx[k] + ny[k] * ly[k] + nz[k] * lz[k]
+                        nl = wp.max(cosine, 0.0)
+                        nh = (cosine + nv[k]) * 0.5 / wp.sqrt(hv2)
                         rise = schlick(wp.sqrt(hv2))
                         lobe = ggx(nl, nv[k], nh, rough[k] * rough[k])
                         fd[k] = INVERSE_PI * diffuse(nl, nv[k], hv2, form[0], form[1])
@@ -180,10 +179,11 @@ def _material_kernel(lanes: int) -> Any:
         # the Lambertian lobe closest to the diffuse one under these lights
         above, below = lane_type(), lane_type()
         for light in range(light_count):
-            l = directions[light]
+            at = p * pack_stride + light * light_stride
+            wx, wy, wz = toward[0, at], toward[1, at], toward[2, at]
             for k in range(lanes):
-                lv = l[0] * vx[k] + l[1] * vy[k] + l[2] * vz[k]
-                nl = wp.max(nx[k] * l[0] + ny[k] * l[1] + nz[k] * l[2], 0.0)
+                lv = wx[k] * vx[k] + wy[k] * vy[k] + wz[k] * vz[k]
+                nl = wp.max(nx[k] * wx[k] + ny[k] * wy[k] + nz[k] * wz[k], 0.0)
                 above[k] += nl * diffuse(nl, nv[k], wp.max(0.5 + 0.5 * lv, 0.0), form[0], form[1])
                 below[k] += nl * nl
         for c in range(3):

@@ -26,6 +26,7 @@ class Samples(NamedTuple):
     grey: wp.array  # [packs · lights] float packs: grey reading / level; below 0 where there is no reading
     colour: wp.array  # [3, packs · lights] float packs: radiance / irradiance; below 0 where there is no reading
     level: wp.array  # [packs] float packs: how bright the lit readings of the pixel are, grey
+    toward: wp.array  # [3, packs · lights] float packs: unit direction from the surface to the light
     view: wp.array  # [3, packs] float packs: unit direction to the viewer
     pixel_count: int
     packs: int
@@ -70,6 +71,7 @@ def gather(band: Band, pixels: np.ndarray, view: np.ndarray, lights: Lights, fac
     lane_type = pack_type(lanes, wp.float32)
     grey = wp.empty(packs * light_count, dtype=lane_type, device=device)
     colour = wp.empty((3, packs * light_count), dtype=lane_type, device=device)
+    toward = wp.empty((3, packs * light_count), dtype=lane_type, device=device)
     level = wp.empty(packs, dtype=lane_type, device=device)
     width = devices.pack_width(device)
     flat = wp.array(ptr=band.values.ptr, shape=(band.values.shape[0], band.values.shape[1] * width),
@@ -81,10 +83,11 @@ def gather(band: Band, pixels: np.ndarray, view: np.ndarray, lights: Lights, fac
     where = wp.array(pixels[order].astype(np.int32), dtype=wp.int32, device=device)
     devices.launch(_gather_kernel(lanes), packs,
                    [flat, bits, where, wp.array(factors, dtype=wp.vec3, device=device),
-                    wp.array(per_channel.astype(np.float32), dtype=wp.vec3, device=device), light_count, pack_stride, light_stride],
-                   [grey, colour, level], device=device)
+                    wp.array(per_channel.astype(np.float32), dtype=wp.vec3, device=device),
+                    wp.array(lights.direction, dtype=wp.vec3, device=device), light_count, pack_stride, light_stride],
+                   [grey, colour, toward, level], device=device)
     planes = np.ascontiguousarray(view[order].astype(np.float32).T).reshape(3, packs, lanes)
-    return Samples(grey, colour, level, wp.array(planes, dtype=lane_type, device=device), len(pixels), packs, light_count, lanes,
+    return Samples(grey, colour, level, toward, wp.array(planes, dtype=lane_type, device=device), len(pixels), packs, light_count, lanes,
                    pack_stride, light_stride, device)
 
 
@@ -114,19 +117,26 @@ def _gather_kernel(lanes: int) -> Any:
                       pixels: wp.array(dtype=wp.int32),  # [P · lanes]
                       grey_factors: wp.array(dtype=wp.vec3),  # [L padded]
                       channel_factors: wp.array(dtype=wp.vec3),  # [L padded]
+                      directions: wp.array(dtype=wp.vec3),  # [L padded]
                       light_count: int,
                       pack_stride: int,
                       light_stride: int,
                       # outputs
                       grey: wp.array(dtype=lane_type),
                       colour: wp.array2d(dtype=lane_type),
+                      toward: wp.array2d(dtype=lane_type),
                       level: wp.array(dtype=lane_type)):
         p = first + wp.tid()
         padded = grey_factors.shape[0]
         root, given = lane_type(), lane_type()
         for light in range(light_count):
             at = p * pack_stride + light * light_stride
-            f, g = grey_factors[light], channel_factors[light]
+            f, g, way = grey_factors[light], channel_factors[light], directions[light]
+            for c in range(3):
+                same = lane_type()
+                for k in range(lanes):
+                    same[k] = way[c]
+                toward[c, at] = same
             y, red, green, blue = lane_type(), lane_type(), lane_type(), lane_type()
             for k in range(lanes):
                 n = pixels[p * lanes + k]

@@ -33,14 +33,13 @@ class SvbrdfFit(NamedTuple):
     residual: np.ndarray  # [n] float32: root of the mean cost per light, in units of the noise
 
 
-def solve_svbrdf(samples: Samples, start: np.ndarray, directions: np.ndarray, *, shape: Diffuse,
+def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse,
                  options: SearchOptions | None = None) -> SvbrdfFit:
     """Solve sampled pixels.
 
     Args:
         samples: their readings.
         start: [n, 3] unit normals to begin from, within some 50° of the truth.
-        directions: [lights, 3] unit, without padding.
         shape: of the diffuse lobe, from diffuse_shape.choose_diffuse.
         options: how candidates are judged.
 
@@ -50,18 +49,18 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, directions: np.ndarray, *,
     Raises:
         ArrayError: shapes that do not fit.
     """
-    found = search_normals(samples, start, directions, shape=shape, options=options)
+    found = search_normals(samples, start, shape=shape, options=options)
     wide, fine = NEAR
     normals, costs = [found.normal], [found.cost]
     for rough, slope in NEIGHBOURS:
         if rough and shape.rough < 0:
             continue
         nearby = Diffuse(rough=max(shape.rough + rough, 0.0) if shape.rough >= 0 else shape.rough, slope=shape.slope + slope)
-        other = search_normals(samples, found.normal, directions, shape=nearby, options=options, wide=wide, fine=fine)
+        other = search_normals(samples, found.normal, shape=nearby, options=options, wide=wide, fine=fine)
         normals.append(other.normal)
         costs.append(other.cost)
     normal, spread = average_normals(np.stack(normals), np.stack(costs))
-    material = fit_material(samples, normal, directions, shape=shape, options=options)
+    material = fit_material(samples, normal, shape=shape, options=options)
     # least squares: variance of the normal = 2 · cost · ring² / (lights · rise), cost and rise per light
     rise = np.maximum(found.curvature, 1e-12)
     variance = 2 * found.cost * RING_DEGREES**2 / (samples.light_count * rise) + spread**2

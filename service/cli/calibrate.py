@@ -41,7 +41,7 @@ def mirror_ball(
     capture: CaptureArgument,
     ball: BallOption = None,
     ball_mask: BallMaskOption = None,
-    level: LevelOption = 0.5,
+    level: LevelOption = 0.1,
     drop_failed: DropOption = False,
     apply_to: ApplyOption = None,
     out: OutOption = None,
@@ -67,7 +67,7 @@ def light_positions(
     ball_z_m: Annotated[list[float] | None, typer.Option(
         "--ball-z-m", help="Camera-frame z of the centres, for an orthographic camera; without it surface_z_m.",
         show_default=False)] = None,
-    level: LevelOption = 0.5,
+    level: LevelOption = 0.1,
     drop_failed: DropOption = False,
     apply_to: ApplyOption = None,
     out: OutOption = None,

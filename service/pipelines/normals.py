@@ -24,8 +24,8 @@ from stage.stack import Stack
 
 READING_BYTES = 4
 """A grey reading, per light and pixel, beside the stack's band."""
-SAMPLE_BYTES = 4 * (4 + MIXTURE + GEOMETRY)
-"""Of the general solver, per light and pixel: grey and colour readings, lobes."""
+SAMPLE_BYTES = 4 * (4 + 3 + MIXTURE + GEOMETRY)
+"""Of the general solver, per light and pixel: grey and colour readings, direction, lobes."""
 BATCH_BYTES = 256 << 20
 """Of samples that are solved at one time."""
 SHAPE_PIXELS = 384
@@ -98,7 +98,7 @@ def _place(result: Solution, here: slice, kept: np.ndarray, fit: NormalFit) -> N
 def _solve_material(stack: Stack, lights: Lights, camera: Camera, mask: np.ndarray, device: str, timings: Timings) -> Solution:
     """The general solver: start from `robust`, choose the diffuse shape on some pixels, then solve all in batches."""
     pixels, count = stack.pixel_count, stack.light_count
-    directions, factors = lights.direction[:count], grey_factors(lights, GREY_WEIGHTS)
+    factors = grey_factors(lights, GREY_WEIGHTS)
     view = view_directions(camera)
     inside = np.flatnonzero(mask.reshape(-1))
     timings.stage("shape", 1)
@@ -124,7 +124,7 @@ def _solve_material(stack: Stack, lights: Lights, camera: Camera, mask: np.ndarr
                 part = solved[first : first + batch]
                 where = start + part
                 samples = gather(band, part, view(where), lights, factors, count)
-                found = solve_svbrdf(samples, result.normal[:, where].T, directions, shape=shape)
+                found = solve_svbrdf(samples, result.normal[:, where].T, shape=shape)
                 result.normal[:, where] = found.normal.T
                 result.albedo[:, where] = found.diffuse_albedo.T
                 result.specular[:, where] = found.specular.T
@@ -147,7 +147,7 @@ def _shape(stack: Stack, lights: Lights, factors: np.ndarray, view: Callable[[np
     if not len(solved):
         return Diffuse(), np.zeros((0, 3))
     samples: Samples = gather(band, solved, view(chosen[solved]), lights, factors, stack.light_count)
-    return choose_diffuse(samples, fit.normal.numpy()[:, solved].T, lights.direction[: stack.light_count])
+    return choose_diffuse(samples, fit.normal.numpy()[:, solved].T)
 
 
 def view_directions(camera: Camera) -> Callable[[np.ndarray], np.ndarray]:

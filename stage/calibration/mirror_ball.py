@@ -36,8 +36,11 @@ SMALL_SPOT = 4
 class SpotOptions:
     """How the spot is told from the rest."""
 
-    level: float = 0.5
-    """The spot is what is brighter than this part of the peak and connected to it."""
+    level: float = 0.1
+    """The spot is what is brighter than this part of the peak, and than the noise of the ball, and connected to the peak.
+
+    Low, because a small light is a spot of few pixels, whose foot tells best what lies between them.
+    """
 
 
 class Spot(NamedTuple):
@@ -77,15 +80,15 @@ def find_spot(radiance: np.ndarray, saturated: np.ndarray | None, ball: Ball, vi
     clipped = looked_at & saturated if saturated is not None else np.zeros_like(looked_at)
     if clipped.any():
         value[clipped] = value.max()
-    _check_prominence(value[looked_at])
     peak = float(value.max())
-    above = value > options.level * peak
-    spot, rival = _brightest(np.where(above, value - options.level * peak, 0), value == peak)
+    floor = max(options.level * peak, _noise_ceiling(value[looked_at]))
+    rise = np.maximum(value - floor, 0)
+    spot, rival = _brightest(rise, value == peak)
     count, ball_pixels = int(spot.sum()), int(view.inside.sum())
     if count > max(MAX_SPOT_SHARE * ball_pixels, SMALL_SPOT):
         raise CalibrationError(f"the bright spot covers {count / ball_pixels:.0%} of the ball: shorten the exposure or make the "
                                "light smaller")
-    weight = (value[spot] - options.level * peak) / (value[spot] - options.level * peak).sum()
+    weight = rise[spot] / rise[spot].sum()
     rows, cols = np.nonzero(spot)
     uv = np.array([weight @ cols + view.box[1].start + 0.5, weight @ rows + view.box[0].start + 0.5])
     cosine = float(weight @ facing[spot])
@@ -120,11 +123,13 @@ def _uncertainty_degrees(ball: Ball, cosine: float, count: int) -> float:
     return math.degrees(2 * shift_px / (ball.radius_px * cosine))
 
 
-def _check_prominence(values: np.ndarray) -> None:
+def _noise_ceiling(values: np.ndarray) -> float:
+    """What the ball's noise does not reach; refuses a ball that nothing stands out of."""
     peak, median = float(values.max()), float(np.median(values))
     spread = 1.4826 * float(np.median(np.abs(values - median)))  # the standard deviation, were it noise alone
-    if peak <= 0 or peak < median + PROMINENCE * spread or peak < MIN_CONTRAST * median:
+    if peak <= 0 or peak <= median + PROMINENCE * spread or peak < MIN_CONTRAST * median:
         raise CalibrationError("there is no bright spot on the ball")
+    return median + PROMINENCE * spread
 
 
 def _brightest(weight: np.ndarray, peak: np.ndarray) -> tuple[np.ndarray, float]:

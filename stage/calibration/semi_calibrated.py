@@ -1,8 +1,9 @@
 """Lights of known direction and unknown brightness, from images of the object itself ("semi-calibrated" photometric stereo).
 
 Cho, Matsushita, Tai and Kweon, "Semi-Calibrated Photometric Stereo", TPAMI 2018: readings y_lp = e_l · l·b_p of a Lambertian
-surface are linear in q_l = 1/e_l and b_p together, q_l y_lp - l·b_p = 0. Here every b_p is eliminated in closed form, which leaves
-one small symmetric eigenvalue problem in q; weights take out shadows and highlights, and the last rounds alternate between b and e.
+surface are linear in q_l = 1/e_l and b_p together, q_l y_lp - l·b_p = 0. Here every b_p is eliminated in closed form, which
+leaves one small symmetric eigenvalue problem in q; weights take out shadows and highlights, and the last rounds alternate
+between b and e.
 """
 
 from typing import NamedTuple

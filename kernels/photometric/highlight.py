@@ -1,0 +1,179 @@
+"""The highlight of each pixel as a GGX lobe: normal, F₀ and roughness from its responses to spherical gradients.
+
+The halfway vector of view and lobe centroid is the normal only of a lobe that is symmetric about the mirror direction; masking,
+the cosine, Fresnel and the horizon make real lobes lean, by degrees when they are rough. How concentrated a lobe is, |M|/M₀,
+tells its roughness almost without regard to the angle, and roughness and angle tell the lean and the part F₀ A + B of the light
+that is reflected. So: the angle of the halfway vector, the roughness of that concentration at that angle, the lean of that
+roughness, a better angle, and so on; then F₀ = (M₀ - B)/A in each channel.
+
+Source: the responses are those of Ma et al. 2007, section 3.2; the inversion of a lobe's moments for its width as in Ghosh et
+al., "Estimating Specular Roughness and Anisotropy from Second Order Spherical Gradient Illumination", EGSR 2009, here from the
+first order and for the contract's lobe.
+"""
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from kernels.packs import as_packs, pack_type, scalars
+from kernels.photometric.lobe_table import ANGLE_STEPS, MAX_ANGLE, MAX_ROUGHNESS, MIN_ROUGHNESS, ROUGHNESS_STEPS, lobe_table
+from kernels.photometric.separation import Separation, upload_view
+
+MIN_HIGHLIGHT = 0.01
+"""Least specular over diffuse response: half rounding of the readings alone leaves a tenth of it."""
+MIN_LOBE, MAX_LOBE = 0.1, 1.1
+"""|M|/M₀ of a highlight: 1 for a mirror, near 0.6 for the roughest lobe; outside these it is noise."""
+MIN_HALFWAY = 0.02
+"""Least |r + v|: a mirror direction opposite the view is beyond grazing."""
+ROUNDS = 10
+"""Of angle and roughness in turn: each leaves at most half of the error of the angle, for the roughest lobe."""
+BISECTIONS = 10
+"""Of the roughness: 2⁻¹⁰ of its range."""
+
+
+class Highlights(NamedTuple):
+    """Specular result of a band; the last axis is pixels, padded to whole packs. 0 where no highlight was found."""
+
+    normal: wp.array  # [3, pixels] float32, unit
+    f0: wp.array  # [3, pixels] float32
+    roughness: wp.array  # [pixels] float32, MIN_ROUGHNESS…1; 1 where no highlight was found
+
+
+def fit_highlights(parts: Separation, grey_weights: tuple[float, float, float], view: np.ndarray, *, gain: float,
+                   pixel_count: int, device: str) -> Highlights:
+    """Normal, F₀ and roughness of the lobe that has the highlight's responses.
+
+    Args:
+        parts: responses told apart by polarisation; radiance under a full sphere of radiance one.
+        grey_weights: of the channels; they add up to one.
+        view: [3, pixels] float32 unit vectors from the surface to the camera, or [3, 1] for one that all share.
+        gain: diffuse light over what the frames hold of it, for what counts as a highlight.
+        pixel_count: pixels of the band.
+        device: where the responses are.
+
+    Returns:
+        The highlights on the device; not synchronised on CUDA.
+
+    Raises:
+        ArrayError: view has another number of pixels.
+    """
+    toward = upload_view(view, pixel_count, device)
+    found = Highlights(scalars(pixel_count, 3, wp.float32, device), scalars(pixel_count, 3, wp.float32, device),
+                       scalars(pixel_count, None, wp.float32, device))
+    table = wp.array(lobe_table().reshape(-1, 6), dtype=_Row, device=device)
+    inputs = [as_packs(array, device) for array in (parts.specular, parts.diffuse.values, toward)]
+    devices.launch(_highlight_kernel(devices.pack_width(device)), inputs[0].shape[1],
+                   [*inputs, table, wp.vec3(*grey_weights), gain], [as_packs(array, device) for array in found], device=device)
+    return found
+
+
+_Row = wp.types.vector(length=6, dtype=wp.float32)
+
+
+@wp.func
+def is_highlight(s0: float, s: wp.vec3, diffuse: float) -> bool:
+    """Whether specular responses tell a direction, beside diffuse light of this radiance."""
+    lobe = wp.length(s) / wp.max(s0, 1.0e-30)
+    return s0 > MIN_HIGHLIGHT * diffuse and s0 > 0.0 and lobe > MIN_LOBE and lobe < MAX_LOBE
+
+
+@wp.func
+def halfway(s: wp.vec3, v: wp.vec3) -> wp.vec3:
+    """The unit normal halfway between centroid and view; 0 when they are opposite."""
+    h = wp.normalize(s) + v
+    return wp.where(wp.length(h) > MIN_HALFWAY, wp.normalize(h), wp.vec3(0.0, 0.0, 0.0))
+
+
+@wp.func
+def _look_up(table: wp.array(dtype=_Row), roughness: float, angle: float) -> _Row:
+    y = (roughness - MIN_ROUGHNESS) * wp.static(float((ROUGHNESS_STEPS - 1) / (MAX_ROUGHNESS - MIN_ROUGHNESS)))
+    x = angle * wp.static(float((ANGLE_STEPS - 1) / MAX_ANGLE))
+    i = wp.clamp(int(y), 0, wp.static(ROUGHNESS_STEPS - 2))
+    j = wp.clamp(int(x), 0, wp.static(ANGLE_STEPS - 2))
+    fy, fx = y - float(i), x - float(j)
+    at = i * ANGLE_STEPS + j
+    low = (1.0 - fx) * table[at] + fx * table[at + 1]
+    high = (1.0 - fx) * table[at + ANGLE_STEPS] + fx * table[at + ANGLE_STEPS + 1]
+    return (1.0 - fy) * low + fy * high
+
+
+@wp.func
+def _vector_at(row: _Row, s0: float) -> wp.vec2:
+    # (Mx, Mz) of the lobe of which M₀ is s0
+    f0 = wp.max((s0 - row[3]) / wp.max(row[0], 1.0e-6), 0.0)
+    return wp.vec2(f0 * row[1] + row[4], f0 * row[2] + row[5]) / wp.max(f0 * row[0] + row[3], 1.0e-12)
+
+
+@wp.func
+def _fit_lobe(table: wp.array(dtype=_Row), s0: float, lobe: float, spread: float) -> wp.vec2:
+    # angle between normal and view, and roughness; spread is the angle between centroid and view
+    angle = wp.clamp(0.5 * spread, 0.0, wp.static(float(MAX_ANGLE)))
+    roughness = float(MIN_ROUGHNESS)
+    for _ in range(ROUNDS):
+        low = float(MIN_ROUGHNESS)
+        high = float(MAX_ROUGHNESS)
+        for _b in range(BISECTIONS):
+            middle = 0.5 * (low + high)
+            sharper = wp.length(_vector_at(_look_up(table, middle, angle), s0)) > lobe
+            low = wp.where(sharper, middle, low)
+            high = wp.where(sharper, high, middle)
+        roughness = 0.5 * (low + high)
+        m = _vector_at(_look_up(table, roughness, angle), s0)
+        lean = wp.atan2(m[0], m[1]) - angle
+        angle = wp.clamp(0.5 * (spread - lean), 0.0, wp.static(float(MAX_ANGLE)))
+    return wp.vec2(angle, roughness)
+
+
+@cache
+def _highlight_kernel(pack: int) -> Any:
+    float_pack = pack_type(pack, wp.float32)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def highlight_kernel(first: int,
+                         specular: wp.array2d(dtype=float_pack),  # [6, P]
+                         diffuse: wp.array2d(dtype=float_pack),  # [12, P]
+                         view: wp.array2d(dtype=float_pack),  # [3, P]
+                         table: wp.array(dtype=_Row),
+                         grey: wp.vec3,
+                         gain: float,
+                         # outputs
+                         normal: wp.array2d(dtype=float_pack),  # [3, P]
+                         f0: wp.array2d(dtype=float_pack),  # [3, P]
+                         roughness: wp.array(dtype=float_pack)):  # [P]
+        p = first + wp.tid()
+        sr, sg, sb, sx, sy, sz = specular[0, p], specular[1, p], specular[2, p], specular[3, p], specular[4, p], specular[5, p]
+        dr, dg, db = diffuse[0, p], diffuse[4, p], diffuse[8, p]
+        vx, vy, vz = view[0, p], view[1, p], view[2, p]
+        nx, ny, nz, fr, fg, fb, rough = (float_pack(), float_pack(), float_pack(), float_pack(), float_pack(), float_pack(),
+                                         float_pack())
+        for k in range(pack):
+            s0 = grey[0] * sr[k] + grey[1] * sg[k] + grey[2] * sb[k]
+            s = wp.vec3(sx[k], sy[k], sz[k])
+            v = wp.vec3(vx[k], vy[k], vz[k])
+            rough[k] = 1.0
+            if is_highlight(s0, s, gain * (grey[0] * dr[k] + grey[1] * dg[k] + grey[2] * db[k])):
+                n = halfway(s, v)
+                if wp.length(n) > 0.0:
+                    side = s - wp.dot(s, v) * v
+                    fit = _fit_lobe(table, s0, wp.length(s) / s0, wp.atan2(wp.length(side), wp.dot(s, v)))
+                    n = wp.cos(fit[0]) * v + wp.sin(fit[0]) * wp.normalize(side)
+                    row = _look_up(table, fit[1], fit[0])
+                    nx[k] = n[0]
+                    ny[k] = n[1]
+                    nz[k] = n[2]
+                    fr[k] = wp.max((sr[k] - row[3]) / wp.max(row[0], 1.0e-6), 0.0)
+                    fg[k] = wp.max((sg[k] - row[3]) / wp.max(row[0], 1.0e-6), 0.0)
+                    fb[k] = wp.max((sb[k] - row[3]) / wp.max(row[0], 1.0e-6), 0.0)
+                    rough[k] = fit[1]
+        normal[0, p] = nx
+        normal[1, p] = ny
+        normal[2, p] = nz
+        f0[0, p] = fr
+        f0[1, p] = fg
+        f0[2, p] = fb
+        roughness[p] = rough
+
+    return highlight_kernel
