@@ -17,9 +17,9 @@ lint: $(VENV)/installed-dev
 bench: $(VENV)/installed
 	$(BIN)/relit bench
 
-# the tables of docs/figures.md
+# the tables of docs/figures.md; FIGURES="--data DIR --glossy DIR --large DIR" measures what needs data or space
 figures: $(VENV)/installed-dev
-	$(BIN)/python -m benchmarks.figures
+	$(BIN)/python -m benchmarks.figures $(FIGURES)
 
 # render the sample captures again (tens of minutes; Mitsuba is installed for it)
 samples: $(VENV)/installed-dev

@@ -61,8 +61,8 @@ def large_rows(folder: Path, side: int = 4096, lights: int = 64) -> list[str]:
     rows = []
     try:
         for what, arguments in (
-            ("ingest and solve, robust", ("solve", str(capture), "--out", str(out))),
-            ("solve again, from the cache", ("solve", str(capture), "--out", str(out))),
+            ("ingest and solve, robust", ("solve", str(capture), "--out", str(out), "--method", "robust")),
+            ("solve again, from the cache", ("solve", str(capture), "--out", str(out), "--method", "robust")),
             ("relight, 4 frames", ("relight", str(capture), "--environment", str(capture / "environment.exr"),
                                    "--out", str(out / "frame.####.exr"), "--frames", "1-4")),
         ):

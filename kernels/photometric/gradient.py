@@ -1,26 +1,20 @@
-"""Normals from responses to spherical gradients: diffuse ones along M, specular ones halfway between M and the view.
+"""Diffuse normals and albedo from responses to spherical gradients.
 
 Lambertian and convex: M₀ = ρ/π ∫ cos θ dω = ρ and M = ρ/π ∫ ω cos θ dω = (2/3) ρ n over the hemisphere about n, so the normal is
 M/|M|, the albedo M₀, and (3/2)|M|/M₀ is one. Occlusion and light from neighbours make it less: the confidence says so.
 
-Specular: M/M₀ is the centroid of the lobe. For a lobe that is symmetric about the mirror direction r it points along r, and the
-normal is halfway between r and the view v. The cosine, masking, Fresnel and the horizon make real lobes lean: docs/methods.md
-has the measured bias.
-
 Source: Ma et al., "Rapid Acquisition of Specular and Diffuse Normal Maps from Polarized Spherical Gradient Illumination",
-EGSR 2007, sections 3.1 and 3.2.
+EGSR 2007, section 3.1.
 """
 
 from functools import cache
 from typing import Any, NamedTuple
 
-import numpy as np
 import warp as wp
 
 from kernels import device as devices
 from kernels.packs import as_packs, pack_type, scalars
 from kernels.photometric.moments import Moments
-from kernels.photometric.separation import Separation, upload_view
 from kernels.status import DARK, ILL_POSED, OK
 
 MIN_LENGTH = 0.05
@@ -34,12 +28,6 @@ ROUNDING = 2.0**-12
 """Of a half reading, relative: what the length of M may be off by although the fit leaves no residual."""
 CONFIDENCE_HALF = 0.01745329
 """Standard error of the normal, radians (one degree), at which confidence is one half."""
-MIN_HIGHLIGHT = 0.01
-"""Least specular over diffuse response: half rounding of the readings alone leaves a tenth of it."""
-MIN_LOBE, MAX_LOBE = 0.1, 1.1
-"""|M|/M₀ of a highlight: 1 for a mirror, near 0.6 for the roughest lobe; outside these it is noise."""
-MIN_HALFWAY = 0.02
-"""Least |r + v|: a mirror direction opposite the view is beyond grazing."""
 
 
 class GradientFit(NamedTuple):
@@ -78,32 +66,6 @@ def diffuse_normals(diffuse: Moments, grey_weights: tuple[float, float, float], 
     devices.launch(_diffuse_kernel(devices.pack_width(device)), inputs[0].shape[1], [*inputs, wp.vec3(*grey_weights), gain],
                    [as_packs(array, device) for array in fit], device=device)
     return fit
-
-
-def specular_normals(parts: Separation, grey_weights: tuple[float, float, float], view: np.ndarray, *, gain: float,
-                     pixel_count: int, device: str) -> wp.array:
-    """Normals halfway between the view and the centroid of the highlight.
-
-    Args:
-        parts: responses told apart.
-        grey_weights: of the channels; they add up to one.
-        view: [3, pixels] float32 unit vectors from the surface to the camera, or [3, 1] for one that all share.
-        gain: as for diffuse_normals.
-        pixel_count: pixels of the band.
-        device: where the responses are.
-
-    Returns:
-        [3, pixels padded] float32, unit; 0 where there is no highlight to tell a normal from.
-
-    Raises:
-        ArrayError: view has another number of pixels.
-    """
-    toward = upload_view(view, pixel_count, device)
-    normal = scalars(pixel_count, 3, wp.float32, device)
-    inputs = [as_packs(array, device) for array in (parts.specular, parts.diffuse.values, toward)]
-    devices.launch(_specular_kernel(devices.pack_width(device)), inputs[0].shape[1], [*inputs, wp.vec3(*grey_weights), gain],
-                   [as_packs(normal, device)], device=device)
-    return normal
 
 
 @cache
@@ -168,38 +130,3 @@ def _diffuse_kernel(pack: int) -> Any:
         status[p] = code
 
     return diffuse_kernel
-
-
-@cache
-def _specular_kernel(pack: int) -> Any:
-    float_pack = pack_type(pack, wp.float32)
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def specular_kernel(first: int,
-                        specular: wp.array2d(dtype=float_pack),  # [4, P]
-                        diffuse: wp.array2d(dtype=float_pack),  # [12, P]
-                        view: wp.array2d(dtype=float_pack),  # [3, P]
-                        grey: wp.vec3,
-                        gain: float,
-                        # outputs
-                        normal: wp.array2d(dtype=float_pack)):  # [3, P]
-        p = first + wp.tid()
-        s0, sx, sy, sz = specular[0, p], specular[1, p], specular[2, p], specular[3, p]
-        red, green, blue = diffuse[0, p], diffuse[4, p], diffuse[8, p]
-        vx, vy, vz = view[0, p], view[1, p], view[2, p]
-        nx, ny, nz = float_pack(), float_pack(), float_pack()
-        for k in range(pack):
-            s = wp.vec3(sx[k], sy[k], sz[k])
-            lobe = wp.length(s) / wp.max(s0[k], 1.0e-30)
-            halfway = wp.normalize(s) + wp.vec3(vx[k], vy[k], vz[k])
-            seen = s0[k] > MIN_HIGHLIGHT * gain * (grey[0] * red[k] + grey[1] * green[k] + grey[2] * blue[k]) and s0[k] > 0.0
-            if seen and lobe > MIN_LOBE and lobe < MAX_LOBE and wp.length(halfway) > MIN_HALFWAY:
-                n = wp.normalize(halfway)
-                nx[k] = n[0]
-                ny[k] = n[1]
-                nz[k] = n[2]
-        normal[0, p] = nx
-        normal[1, p] = ny
-        normal[2, p] = nz
-
-    return specular_kernel

@@ -70,6 +70,32 @@ def fit_highlights(parts: Separation, grey_weights: tuple[float, float, float], 
     return found
 
 
+def specular_normals(parts: Separation, grey_weights: tuple[float, float, float], view: np.ndarray, *, gain: float,
+                     pixel_count: int, device: str) -> wp.array:
+    """Normals halfway between the view and the centroid of the highlight: of a lobe symmetric about the mirror direction.
+
+    Args:
+        parts: responses told apart, by polarisation or by colour.
+        grey_weights: of the channels; they add up to one.
+        view: [3, pixels] float32 unit vectors from the surface to the camera, or [3, 1] for one that all share.
+        gain: as for diffuse_normals.
+        pixel_count: pixels of the band.
+        device: where the responses are.
+
+    Returns:
+        [3, pixels padded] float32, unit; 0 where there is no highlight to tell a normal from.
+
+    Raises:
+        ArrayError: view has another number of pixels.
+    """
+    toward = upload_view(view, pixel_count, device)
+    normal = scalars(pixel_count, 3, wp.float32, device)
+    inputs = [as_packs(array, device) for array in (parts.specular, parts.diffuse.values, toward)]
+    devices.launch(_specular_kernel(devices.pack_width(device)), inputs[0].shape[1], [*inputs, wp.vec3(*grey_weights), gain],
+                   [as_packs(normal, device)], device=device)
+    return normal
+
+
 _Row = wp.types.vector(length=6, dtype=wp.float32)
 
 
@@ -177,3 +203,36 @@ def _highlight_kernel(pack: int) -> Any:
         roughness[p] = rough
 
     return highlight_kernel
+
+
+@cache
+def _specular_kernel(pack: int) -> Any:
+    float_pack = pack_type(pack, wp.float32)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def specular_kernel(first: int,
+                        specular: wp.array2d(dtype=float_pack),  # [6, P]
+                        diffuse: wp.array2d(dtype=float_pack),  # [12, P]
+                        view: wp.array2d(dtype=float_pack),  # [3, P]
+                        grey: wp.vec3,
+                        gain: float,
+                        # outputs
+                        normal: wp.array2d(dtype=float_pack)):  # [3, P]
+        p = first + wp.tid()
+        sr, sg, sb, sx, sy, sz = specular[0, p], specular[1, p], specular[2, p], specular[3, p], specular[4, p], specular[5, p]
+        dr, dg, db = diffuse[0, p], diffuse[4, p], diffuse[8, p]
+        vx, vy, vz = view[0, p], view[1, p], view[2, p]
+        nx, ny, nz = float_pack(), float_pack(), float_pack()
+        for k in range(pack):
+            s0 = grey[0] * sr[k] + grey[1] * sg[k] + grey[2] * sb[k]
+            s = wp.vec3(sx[k], sy[k], sz[k])
+            if is_highlight(s0, s, gain * (grey[0] * dr[k] + grey[1] * dg[k] + grey[2] * db[k])):
+                n = halfway(s, wp.vec3(vx[k], vy[k], vz[k]))
+                nx[k] = n[0]
+                ny[k] = n[1]
+                nz[k] = n[2]
+        normal[0, p] = nx
+        normal[1, p] = ny
+        normal[2, p] = nz
+
+    return specular_kernel

@@ -17,8 +17,8 @@ MIN_ROUGHNESS, MAX_ROUGHNESS = 0.05, 1.0
 """Below, a lobe under a gradient is a mirror to four digits."""
 MAX_ANGLE = np.radians(85.0)
 """Between normal and view; beyond, a pixel's width covers every angle."""
-ROUGHNESS_STEPS, ANGLE_STEPS = 39, 35
-"""Steps of 0.025 and 2.5°: linear interpolation is then good to 0.002 of a response."""
+ROUGHNESS_STEPS, ANGLE_STEPS = 39, 69
+"""Steps of 0.025 and 1.25°: linear interpolation is then good to 0.003 of a response."""
 _NODES, _TURNS = 40, 48
 _ANGLE_CHUNK = 6
 """Angles of view integrated at one time: bounds the memory."""

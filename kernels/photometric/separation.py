@@ -39,7 +39,7 @@ class Separation(NamedTuple):
     """Responses of a band, told apart; the last axis is pixels, padded to whole packs."""
 
     diffuse: Moments
-    specular: wp.array  # [4, pixels] float32, grey M₀ and M of the highlight; 0 where it was not separated
+    specular: wp.array  # [6, pixels] float32, of the highlight: M₀ in red, green, blue, then grey M; 0 where not separated
 
 
 def separate_polarised(cross: Moments, parallel: Moments, grey_weights: tuple[float, float, float], *,
@@ -53,7 +53,7 @@ def separate_polarised(cross: Moments, parallel: Moments, grey_weights: tuple[fl
         pixel_count: pixels of the band.
         device: where the responses are.
     """
-    specular = scalars(pixel_count, 4, wp.float32, device)
+    specular = scalars(pixel_count, 6, wp.float32, device)
     inputs = [as_packs(array, device) for array in (cross.values, cross.status, parallel.values, parallel.status)]
     devices.launch(_difference_kernel(devices.pack_width(device)), inputs[0].shape[1], [*inputs, wp.vec3(*grey_weights)],
                    [as_packs(specular, device)], device=device)
@@ -77,7 +77,7 @@ def separate_by_colour(mixed: Moments, view: np.ndarray, *, pixel_count: int, de
     """
     toward = upload_view(view, pixel_count, device)
     diffuse = Moments(*(wp.clone(array) for array in mixed))
-    specular = scalars(pixel_count, 4, wp.float32, device)
+    specular = scalars(pixel_count, 6, wp.float32, device)
     outputs = [as_packs(array, device) for array in (diffuse.values, diffuse.variance, diffuse.tilt, specular)]
     devices.launch(_colour_kernel(devices.pack_width(device)), outputs[0].shape[1],
                    [as_packs(toward, device), as_packs(mixed.status, device)], outputs, device=device)
@@ -110,17 +110,23 @@ def _difference_kernel(pack: int) -> Any:
                           parallel_status: wp.array(dtype=int_pack),  # [P]
                           grey: wp.vec3,
                           # outputs
-                          specular: wp.array2d(dtype=float_pack)):  # [4, P]
+                          specular: wp.array2d(dtype=float_pack)):  # [6, P]
         p = first + wp.tid()
-        for i in range(4):
-            found = float_pack()
+        both = float_pack()
+        for k in range(pack):
+            both[k] = wp.where(cross_status[p][k] == OK and parallel_status[p][k] == OK, 1.0, 0.0)
+        for c in range(3):
+            level = float_pack()
             for k in range(pack):
-                both = cross_status[p][k] == OK and parallel_status[p][k] == OK
-                off = (grey[0] * (parallel[i, p][k] - cross[i, p][k])
-                       + grey[1] * (parallel[4 + i, p][k] - cross[4 + i, p][k])
-                       + grey[2] * (parallel[8 + i, p][k] - cross[8 + i, p][k]))
-                found[k] = wp.where(both, off, 0.0)
-            specular[i, p] = found
+                level[k] = both[k] * (parallel[4 * c, p][k] - cross[4 * c, p][k])
+            specular[c, p] = level
+        for i in range(1, 4):
+            along = float_pack()
+            for k in range(pack):
+                along[k] = both[k] * (grey[0] * (parallel[i, p][k] - cross[i, p][k])
+                                      + grey[1] * (parallel[4 + i, p][k] - cross[4 + i, p][k])
+                                      + grey[2] * (parallel[8 + i, p][k] - cross[8 + i, p][k]))
+            specular[2 + i, p] = along
 
     return difference_kernel
 
@@ -137,7 +143,7 @@ def _colour_kernel(pack: int) -> Any:
                       moments: wp.array2d(dtype=float_pack),  # [12, P] in: mixed, out: diffuse
                       variance: wp.array(dtype=float_pack),  # [P] in: of the mixed, out: of the diffuse responses
                       tilt: wp.array(dtype=float_pack),  # [P]
-                      specular: wp.array2d(dtype=float_pack)):  # [4, P]
+                      specular: wp.array2d(dtype=float_pack)):  # [6, P]
         p = first + wp.tid()
         r0, rx, ry, rz = moments[0, p], moments[1, p], moments[2, p], moments[3, p]
         g0, gx, gy, gz = moments[4, p], moments[5, p], moments[6, p], moments[7, p]
@@ -196,8 +202,10 @@ def _colour_kernel(pack: int) -> Any:
         variance[p] = spread
         tilt[p] = hidden
         specular[0, p] = s0
-        specular[1, p] = sx
-        specular[2, p] = sy
-        specular[3, p] = sz
+        specular[1, p] = s0
+        specular[2, p] = s0
+        specular[3, p] = sx
+        specular[4, p] = sy
+        specular[5, p] = sz
 
     return colour_kernel

@@ -1,11 +1,12 @@
-"""Spherical gradient frames → diffuse and specular normals and albedo, band by band."""
+"""Spherical gradient frames → diffuse and specular normals, albedo and, behind polarisers, F₀ and roughness, band by band."""
 
 from typing import Any
 
 import numpy as np
 
 from kernels import packs
-from kernels.photometric.gradient import diffuse_normals, specular_normals
+from kernels.photometric.gradient import diffuse_normals
+from kernels.photometric.highlight import fit_highlights, specular_normals
 from kernels.photometric.moments import Moments, fit_moments
 from kernels.photometric.separation import separate_by_colour, separate_polarised
 from kernels.status import Status
@@ -38,38 +39,40 @@ def solve_gradients(frames: GradientFrames, stack: Stack, camera: Camera, mask: 
     pixels = stack.pixel_count
     view = view_vectors(camera, stack.shape[2])
     inside = mask.reshape(-1)
-    by_colour = not frames.polarised
     result = Solution.empty(pixels)
-    if by_colour or frames.parallel is not None:
+    if not frames.polarised or frames.parallel is not None:
         result.specular_normal = np.zeros((3, pixels), np.float32)
+    if frames.parallel is not None:
+        result.specular, result.roughness = np.zeros((3, pixels), np.float16), np.zeros(pixels, np.float16)
     length, separated = np.zeros(pixels, np.float32), np.zeros(pixels, bool)
     gain = CROSSED_GAIN if frames.polarised else 1.0
     for start, stop in stack.bands(BYTES_PER_PIXEL):
         here = slice(start, min(stop, pixels))
-        count, kept = here.stop - start, inside[here]
+        kept = inside[here]
         if kept.any():
             band = packs.upload(stack.band(start, stop), stack.saturated(start, stop), device=device)
             toward = view if view.shape[1] == 1 else view[:, start:stop]
             diffuse = _moments(band, frames.diffuse, stack)
-            parts = None
-            if by_colour:
+            if not frames.polarised:
                 parts = separate_by_colour(diffuse, toward, pixel_count=band.pixel_count, device=device)
+                diffuse = parts.diffuse
+                normal = specular_normals(parts, GREY_WEIGHTS, toward, gain=gain, pixel_count=band.pixel_count, device=device)
+                _keep(result.specular_normal, here, kept, normal)
             elif frames.parallel is not None:
                 parallel = _moments(band, frames.parallel, stack)
                 parts = separate_polarised(diffuse, parallel, GREY_WEIGHTS, pixel_count=band.pixel_count, device=device)
-            if parts is not None:
-                diffuse = parts.diffuse
-                normals = specular_normals(parts, GREY_WEIGHTS, toward, gain=gain, pixel_count=band.pixel_count, device=device)
-                assert result.specular_normal is not None
-                result.specular_normal[:, here] = np.where(kept, normals.numpy()[:, :count], 0)
+                highlight = fit_highlights(parts, GREY_WEIGHTS, toward, gain=gain, pixel_count=band.pixel_count, device=device)
+                _keep(result.specular_normal, here, kept, highlight.normal)
+                _keep(result.specular, here, kept, highlight.f0)
+                _keep(result.roughness, here, kept, highlight.roughness)
             fit = diffuse_normals(diffuse, GREY_WEIGHTS, gain=gain, pixel_count=band.pixel_count, device=device)
-            result.normal[:, here] = np.where(kept, fit.normal.numpy()[:, :count], 0)
-            result.albedo[:, here] = np.where(kept, fit.albedo.numpy()[:, :count], 0)
-            result.confidence[here] = np.where(kept, fit.confidence.numpy()[:count], 0)
-            result.residual[here] = np.where(kept, diffuse.residual.numpy()[:count], 0)
-            result.status[here] = np.where(kept, fit.status.numpy()[:count], int(Status.UNSOLVED))
-            length[here] = np.where(kept, fit.length.numpy()[:count], 0)
-            separated[here] = kept & (diffuse.tilt.numpy()[:count] == 0)
+            _keep(result.normal, here, kept, fit.normal)
+            _keep(result.albedo, here, kept, fit.albedo)
+            _keep(result.confidence, here, kept, fit.confidence)
+            _keep(result.residual, here, kept, diffuse.residual)
+            _keep(result.status, here, kept, fit.status)
+            _keep(length, here, kept, fit.length)
+            separated[here] = kept & (diffuse.tilt.numpy()[: len(kept)] == 0)
         timings.advance(stop)
     result.facts = _facts(frames, result, length, separated)
     if result.specular_normal is not None and not result.specular_normal.any():
@@ -99,6 +102,12 @@ def _facts(frames: GradientFrames, result: Solution, length: np.ndarray, separat
         middle, low = np.percentile(length[solved], [50, 5])
         facts["response_length"] = {"median": round(float(middle), 5), "p5": round(float(low), 5)}
     return facts
+
+
+def _keep(target: np.ndarray | None, here: slice, kept: np.ndarray, found: Any) -> None:
+    """Bring a band's result over; 0 outside the mask, which as a status is UNSOLVED."""
+    assert target is not None
+    target[..., here] = np.where(kept, found.numpy()[..., : len(kept)], 0)
 
 
 def _moments(band: packs.Band, rows: np.ndarray, stack: Stack) -> Moments:

@@ -65,7 +65,8 @@ def test_polarised_frames_give_both_normals(relit, tmp_path, diffuse, highlight)
     assert np.allclose(maps.diffuse_albedo[inside], SCENE.albedo[inside], rtol=2e-3)
     channels, _ = exr.read(tmp_path / "out" / "maps.exr")
     layers = {name.partition(".")[0] for name in channels}
-    assert layers == {"normal", "specular_normal", "diffuse_albedo", "height", "confidence", "mask"}
+    assert layers == {"normal", "specular_normal", "diffuse_albedo", "specular", "roughness", "height", "confidence", "mask"}
+    assert np.allclose(maps.specular[inside], 0.04, atol=0.002) and np.allclose(maps.roughness[inside], ROUGHNESS, atol=0.03)
     assert all(np.isfinite(plane).all() for plane in channels.values())
     assert report["method"] == "gradient" and report["found"]["separation"] == "polarisation"
     assert report["found"]["pixels_with_specular_normal"] == report["pixels"]["ok"] == inside.sum()
@@ -78,6 +79,7 @@ def test_gradient_is_the_default_for_gradient_frames(relit, tmp_path, diffuse, h
     write(tmp_path, {"none": diffuse + highlight})
     maps, report = solve(relit, tmp_path)
     assert report["method"] == "gradient" and report["found"]["separation"] == "colour"
+    assert maps.specular is None and maps.roughness is None  # light that leaks between the parts hides how sharp the lobe is
     grey = report["found"]["pixels_taken_as_diffuse"]
     assert 0 < grey < report["pixels"]["ok"] / 2 and report["found"]["pixels_separated"] == report["pixels"]["ok"] - grey
     error, sure = angles_degrees(maps.normal, SCENE.normal), maps.confidence

@@ -4,14 +4,14 @@ import numpy as np
 
 from stage.camera import Camera
 
-WIDTH, HEIGHT = 200, 160
+WIDTH, HEIGHT = 240, 160
 ORTHOGRAPHIC = Camera(projection="orthographic", resolution=(WIDTH, HEIGHT), pixel_size_m=0.001)
 PERSPECTIVE = Camera(projection="perspective", resolution=(WIDTH, HEIGHT), focal_px=(400.0, 400.0))
 
 SCENES = {
     # 60 px ball, off the grid so that no symmetry helps
     "orthographic": (ORTHOGRAPHIC, {"centre": np.array([0.0123, -0.0071, 0.0]), "radius": 0.06, "pixel_size": 0.001}),
-    # the same size, 10 degrees off the axis: its outline is an ellipse
+    # the same size, 6 degrees off the axis: its outline is an ellipse
     "perspective": (PERSPECTIVE, {"centre": np.array([0.08, -0.02, -0.8]), "radius": 0.12, "focal": 400.0}),
 }
 

@@ -63,7 +63,7 @@ def test_lights_near_two_rendered_balls(projection, camera):
             sigmas.append(spot.uncertainty_degrees)
         found = nearest_point(np.array(points), np.array(directions), np.array(sigmas))
         assert np.linalg.norm(found.position - position) < 0.01
-        assert found.residual < 0.002 and found.uncertainty < 0.03 and found.flags == ()
+        assert found.residual < 0.002 and found.uncertainty < 0.05 and found.flags == ()
 
 
 def test_rays_that_meet_nowhere():

@@ -1,0 +1,120 @@
+"""What each part of the general solver buys: normals of the same pixels with the parts added one at a time."""
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.accuracy import angles_deg, read_truth
+from kernels import packs
+from kernels.photometric.diffuse_shape import choose_diffuse
+from kernels.photometric.hypotheses import Diffuse, SearchOptions, search_normals
+from kernels.photometric.lambert import NormalFit, solve_lambert
+from kernels.photometric.readings import Lights, grey_factors, grey_readings, pad_lights
+from kernels.photometric.robust import solve_robust
+from kernels.photometric.samples import Samples, gather
+from kernels.photometric.svbrdf import solve_svbrdf
+from kernels.status import Status
+from service.pipelines.normals import SHAPE_PIXELS
+from stage.capture import Capture
+from stage.colour import GREY_WEIGHTS
+from stage.importers import diligent
+from stage.ingest import open_stack
+from stage.lighting import distant_lights
+
+PIXELS = 4000
+"""Of each object, at even steps: enough for a mean to two digits."""
+NO_SHADOW = SearchOptions(shadow_cost=30.0)
+"""A charge that no residual reaches: shadows are outliers like any other."""
+
+
+@dataclass
+class Case:
+    """Pixels of one object, ready to be solved."""
+
+    name: str
+    truth: np.ndarray  # [n, 3] unit
+    lambert: np.ndarray  # [n, 3]
+    robust: np.ndarray  # [n, 3]
+    samples: Samples
+    shape: Diffuse
+    """The shared diffuse shape, chosen on SHAPE_PIXELS of them."""
+
+
+def load_case(name: str, capture: Capture, truth: np.ndarray, cache: Path) -> Case:
+    """Read a capture of distant lights.
+
+    Args:
+        name: for the table.
+        capture: orthographic.
+        truth: [rows, cols, 3] true normals.
+        cache: folder for the stack.
+    """
+    stack = open_stack(capture, cache=cache)
+    lit = distant_lights(capture)
+    lights = pad_lights(lit.direction, lit.irradiance, stack.scale)
+    factors = grey_factors(lights, GREY_WEIGHTS)
+    inside = np.flatnonzero(capture.mask())
+    chosen = inside[np.unique(np.linspace(0, len(inside) - 1, min(PIXELS, len(inside))).astype(int))]
+    band = packs.upload(*stack.pick(chosen), device="cpu")
+
+    def normals(solver: Callable[..., NormalFit]) -> tuple[np.ndarray, np.ndarray]:
+        fit = solver(band, grey_readings(band, factors), lights.direction)
+        return fit.normal.numpy()[:, : len(chosen)].T, fit.status.numpy()[: len(chosen)] == Status.OK
+
+    lambert, robust = normals(solve_lambert), normals(solve_robust)
+    solved = np.flatnonzero(lambert[1] & robust[1])
+    samples = _gather(band, solved, lights, factors, stack.light_count)
+    few = solved[np.unique(np.linspace(0, len(solved) - 1, min(SHAPE_PIXELS, len(solved))).astype(int))]
+    shape, _ = choose_diffuse(_gather(band, few, lights, factors, stack.light_count), robust[0][few])
+    return Case(name, truth.reshape(-1, 3)[chosen[solved]], lambert[0][solved], robust[0][solved], samples, shape)
+
+
+def _gather(band: packs.Band, pixels: np.ndarray, lights: Lights, factors: np.ndarray, count: int) -> Samples:
+    view = np.tile(np.array([0, 0, 1], dtype=np.float32), (len(pixels), 1))
+    return gather(band, pixels, view, lights, factors, count)
+
+
+VARIANTS: dict[str, Callable[[Case], np.ndarray]] = {
+    "`lambert`": lambda case: case.lambert,
+    "`robust`": lambda case: case.robust,
+    "hypotheses × Lambert and five GGX lobes, Cauchy weights":
+        lambda case: search_normals(case.samples, case.robust, shape=Diffuse(), options=NO_SHADOW).normal,
+    "+ cast shadow as a hypothesis of its own": lambda case: search_normals(case.samples, case.robust, shape=Diffuse()).normal,
+    "+ diffuse shape shared by the object": lambda case: search_normals(case.samples, case.robust, shape=case.shape).normal,
+    "+ averaged over nearby shapes (`svbrdf`)": lambda case: solve_svbrdf(case.samples, case.robust, shape=case.shape).normal,
+}
+
+
+def ablation_table(data: Path | None, glossy: Path | None) -> list[str] | None:
+    """Mean and median angular error of each variant on each object that is at hand.
+
+    Args:
+        data: folder with diligent_ball and diligent_cat.
+        glossy: folder with glossy and glossy_metal of samples/make_glossy.py.
+
+    Returns:
+        Lines of Markdown, or None without any data.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        cases = []
+        for name in ("diligent_ball", "diligent_cat") if data else ():
+            capture = Path(folder) / name
+            diligent.import_folder(data / name, capture)
+            truth = np.load(data / name / "normal_gt.npz")["normal"]
+            cases.append(load_case(name, Capture.open(capture), truth, capture / ".relit"))
+        for name in ("glossy", "glossy_metal") if glossy else ():
+            truth = read_truth(glossy / name / "truth.exr")["normal"]
+            cases.append(load_case(name, Capture.open(glossy / name), truth, Path(folder) / f"{name}-stack"))
+        if not cases:
+            return None
+        lines = ["Angular error of normals, degrees, mean / median, over some 4000 pixels of each object:", "",
+                 "| | " + " | ".join(case.name for case in cases) + " |", "|---|" + "---|" * len(cases)]
+        for what, solve in VARIANTS.items():
+            errors = [angles_deg(solve(case), case.truth) for case in cases]
+            lines.append(f"| {what} | " + " | ".join(f"{e.mean():.2f} / {np.median(e):.2f}" for e in errors) + " |")
+        shapes = "; ".join(f"{c.name}: " + ("Lambert" if c.shape.rough < 0 else f"roughness {c.shape.rough:g}")
+                           + f", slope {c.shape.slope:g}" for c in cases)
+        return [*lines, "", f"Shapes chosen: {shapes}."]

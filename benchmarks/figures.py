@@ -1,0 +1,166 @@
+"""Write docs/figures.md: every figure in it is measured here. A section whose data is not at hand keeps what it said before.
+
+    python -m benchmarks.figures [--data DIR] [--glossy DIR] [--large DIR] [--only NAME ...]
+"""
+
+import argparse
+import os
+import platform
+import re
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from datetime import date
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.ablation import ablation_table
+from benchmarks.accuracy import SolveError, compare, diligent_errors, read_truth, relight_error, sample_errors
+from benchmarks.large import large_rows, measure
+from service.methods import Method
+from service.pipelines.bench import bench
+from service.pipelines.solve import solve
+from service.requests import SolveRequest
+from stage import exr
+from stage.capture import Capture
+from stage.files import write_text
+
+TARGET = Path(__file__).parents[1] / "docs" / "figures.md"
+DISTANT = (Method.LAMBERT, Method.ROBUST, Method.SVBRDF)
+HEAD = "| method | solved | mean ° | median ° | albedo, median | height, RMS of relief |\n|---|---|---|---|---|---|"
+
+Section = Callable[[argparse.Namespace], list[str] | None]
+
+
+def row(name: str, error: SolveError) -> str:
+    """One line of an accuracy table."""
+    def percent(value: float) -> str:
+        return "–" if np.isnan(value) else f"{100 * value:.3g} %"
+
+    return (f"| {name} | {100 * error.coverage:.1f} % | {error.mean_deg:.4g} | {error.median_deg:.3g} | "
+            f"{percent(error.albedo_median)} | {percent(error.height_rms)} |")
+
+
+def lambert(_: argparse.Namespace) -> list[str]:
+    """The path-traced Lambertian sample."""
+    return ["`samples/lambert`: a bumpy ball, 32 distant lights of unequal colour and strength, direct light with cast shadows, path "
+            "traced.", "", HEAD, *(row(f"`{method}`", sample_errors("lambert", method)) for method in DISTANT)]
+
+
+def real(given: argparse.Namespace) -> list[str] | None:
+    """DiLiGenT."""
+    if given.data is None:
+        return None
+    lines = ["DiLiGenT objects, 96 real lights; the cat at every second pixel. `lambert` leaves out readings of zero; with them NumPy's "
+             "`lstsq` gives 4.17 and 8.46.", "", HEAD]
+    for name in ("ball", "cat"):
+        lines += [row(f"{name}, `{method}`", diligent_errors(given.data / f"diligent_{name}", method)) for method in DISTANT]
+    return lines
+
+
+def glossy(given: argparse.Namespace) -> list[str] | None:
+    """Path-traced dielectric and metal."""
+    if given.glossy is None:
+        return None
+    lines = ["`samples/make_glossy.py`: Mitsuba's `principled`, roughness 0.3 to 0.75, 64 lights, full interreflection. Of the metal, "
+             "albedo is F0; roughness error is absolute.", "",
+             "| object | mean ° | median ° | albedo or F0, median | roughness, median |", "|---|---|---|---|---|"]
+    for name in ("glossy", "glossy_metal"):
+        folder = given.glossy / name
+        truth, mask = read_truth(folder / "truth.exr"), Capture.open(folder).mask()
+        with tempfile.TemporaryDirectory() as out:
+            maps = solve(SolveRequest(capture=folder, out=Path(out), method=Method.SVBRDF, cache=Path(out))).maps
+        error = compare(maps, truth, mask)
+        channels, _ = exr.read(folder / "truth.exr")
+        assert maps.roughness is not None and maps.specular is not None
+        rough = np.median(np.abs(maps.roughness - channels["roughness.Y"])[mask & maps.mask])
+        colour = error.albedo_median
+        if name == "glossy_metal":
+            true = truth["diffuse_albedo"][mask & maps.mask]
+            colour = float(np.median(np.abs(maps.specular[mask & maps.mask] - true) / true))
+        lines.append(f"| {name} | {error.mean_deg:.3g} | {error.median_deg:.3g} | {100 * colour:.2g} % | {rough:.2g} |")
+    return lines
+
+
+def ablation(given: argparse.Namespace) -> list[str] | None:
+    """Parts of the general solver, one at a time."""
+    return ablation_table(given.data, given.glossy)
+
+
+def relighting(_: argparse.Namespace) -> list[str]:
+    """The owl under its sky."""
+    error, energy = relight_error("reference_environment.exr")
+    return ["`samples/owl` under `environment.exr` (a sun of 3° and a sky), linear combination of 96 captured lights against the path "
+            f"tracer: relative RMSE {error:.3f}, total energy {energy:.3f} of the truth."]
+
+
+def speed(_: argparse.Namespace) -> list[str]:
+    """The table of `relit bench`."""
+    return bench(None, 9)
+
+
+def demo(_: argparse.Namespace) -> list[str]:
+    """Seconds of `relit demo`, kernels compiled and not."""
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["WARP_CACHE_PATH"] = str(Path(folder) / "kernels")
+        cold, _ = measure("demo", "--out", str(Path(folder) / "cold"))
+        warm, peak = measure("demo", "--out", str(Path(folder) / "warm"))
+        del os.environ["WARP_CACHE_PATH"]
+    return [f"`relit demo` takes {cold:.0f} s the first time, when its kernels are compiled, and {warm:.0f} s after; "
+            f"peak memory {peak:.2f} GiB."]
+
+
+def memory(given: argparse.Namespace) -> list[str] | None:
+    """Peak memory of a large capture."""
+    if given.large is None:
+        return None
+    return ["A synthetic capture of 4096 × 4096 pixels and 64 lights (6.4 GB as a stack), whole image unmasked:", "",
+            "| | seconds | peak resident memory, GiB |", "|---|---|---|", *large_rows(given.large)]
+
+
+SECTIONS: dict[str, tuple[str, Section]] = {
+    "lambert": ("Lambertian surface with cast shadows", lambert),
+    "real": ("Real objects", real),
+    "glossy": ("Glossy and metallic objects", glossy),
+    "ablation": ("What each part of `svbrdf` buys", ablation),
+    "relighting": ("Relighting", relighting),
+    "speed": ("Speed", speed),
+    "demo": ("The demo", demo),
+    "memory": ("Memory", memory),
+}
+INTRODUCTION = ("# Figures\n\nWritten by `make figures` (`python -m benchmarks.figures`); each section says when and where it was "
+                "measured. Times are of a shared machine: ratios travel, seconds do not.\n")
+
+
+def machine() -> str:
+    """Where this runs."""
+    return f"{date.today()}, {os.cpu_count()} CPU cores, Python {platform.python_version()}"
+
+
+def main() -> None:
+    """Measure the sections that can be measured here and write the file."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--data", type=Path, help="folder with diligent_ball and diligent_cat")
+    parser.add_argument("--glossy", type=Path, help="folder with glossy and glossy_metal of samples/make_glossy.py")
+    parser.add_argument("--large", type=Path, help="folder where some 12 GiB may be written and are removed again")
+    parser.add_argument("--only", nargs="+", choices=SECTIONS, help="sections to measure (default: all)")
+    given = parser.parse_args()
+    before = TARGET.read_text(encoding="utf-8") if TARGET.exists() else ""
+    parts = [INTRODUCTION]
+    for name, (title, section) in SECTIONS.items():
+        began = time.perf_counter()
+        lines = section(given) if given.only is None or name in given.only else None
+        if lines is None:
+            kept = re.search(rf"## {re.escape(title)}\n.*?(?=\n## |\Z)", before, flags=re.DOTALL)
+            if kept is not None:
+                parts.append(kept[0].rstrip() + "\n")
+            continue
+        print(f"{name}: {time.perf_counter() - began:.0f} s", file=sys.stderr)
+        parts.append(f"## {title}\n\n" + "\n".join(lines) + f"\n\n*{machine()}*\n")
+    write_text(TARGET, "\n".join(parts))
+
+
+if __name__ == "__main__":
+    main()
