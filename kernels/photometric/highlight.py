@@ -190,9 +190,9 @@ def _highlight_kernel(pack: int) -> Any:
                     nx[k] = n[0]
                     ny[k] = n[1]
                     nz[k] = n[2]
-                    fr[k] = wp.max((sr[k] - row[3]) / wp.max(row[0], 1.0e-6), 0.0)
-                    fg[k] = wp.max((sg[k] - row[3]) / wp.max(row[0], 1.0e-6), 0.0)
-                    fb[k] = wp.max((sb[k] - row[3]) / wp.max(row[0], 1.0e-6), 0.0)
+                    fr[k] = wp.clamp((sr[k] - row[3]) / wp.max(row[0], 1.0e-6), 0.0, 1.0)  # a reflectance
+                    fg[k] = wp.clamp((sg[k] - row[3]) / wp.max(row[0], 1.0e-6), 0.0, 1.0)
+                    fb[k] = wp.clamp((sb[k] - row[3]) / wp.max(row[0], 1.0e-6), 0.0, 1.0)
                     rough[k] = fit[1]
         normal[0, p] = nx
         normal[1, p] = ny

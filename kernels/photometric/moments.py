@@ -21,7 +21,7 @@ from kernels.packs import Band, as_packs, pack_type, scalars
 from kernels.status import DARK, OK, TOO_FEW_LIGHTS
 
 LARGEST_HALF = 65504.0
-"""A stored value above it, or one that does not compare, is not a number that was measured."""
+"""The largest half: a stored value above it, or one that does not compare, is not a number that was measured."""
 MIN_PIVOT = 0.1
 """What elimination leaves of M₀'s equation: at least 1/2 (a pair of opposites, or a full frame), 0 when it is not determined."""
 
@@ -209,7 +209,8 @@ def _moments_kernel(pack: int) -> Any:
         error = float_pack()
         for k in range(pack):
             if code[k] == OK:
-                error[k] = wp.sqrt(squares[k] / count[k]) / (grey[0] * r0[k] + grey[1] * s0[k] + grey[2] * b0[k])
+                level = grey[0] * r0[k] + grey[1] * s0[k] + grey[2] * b0[k]
+                error[k] = wp.min(wp.sqrt(squares[k] / count[k]) / level, LARGEST_HALF)  # of noise about black: kept as half
         moments[0, p] = r0
         moments[1, p] = rx
         moments[2, p] = ry

@@ -115,7 +115,7 @@ def grey_ball(request: GreyBallRequest, progress: Progress | None = None) -> Cal
                      heights=() if request.ball_z_m is None else (request.ball_z_m,))
     near = next((lit for lit in captures.lit if isinstance(lit.light, PointLight)), None)
     if near is not None:
-        where = f"{captures.source.folder / FILE_NAME}: frames[{near.index}].light: is point"
+        where = f"{captures.source.folder / FILE_NAME}: frames[{near.number}].light: is point"
         if request.refine_direction:
             raise ManifestError(f"{where}: --refine-direction is for distant lights")
         if not ball.metric:

@@ -17,10 +17,14 @@ from stage.colour import GREY_WEIGHTS
 from stage.gradients import GradientFrames
 from stage.stack import Stack
 
-BYTES_PER_PIXEL = 256
+BYTES_PER_PIXEL = 400
 """Responses of up to three kinds of frames, separation, view and results, beside the stack's band."""
 CROSSED_GAIN = 2.0
 """A crossed analyser passes half of the diffuse light, which has lost its polarisation (Malus)."""
+MIN_DIFFUSE = 0.01
+"""Diffuse over specular light, below which a pixel is metal: what is left of the diffuse is noise, and its direction too."""
+METAL_CONFIDENCE = 0.2
+"""Of a normal that only a highlight tells: a standard error of four degrees, since no second reading checks the lobe."""
 
 
 def solve_gradients(frames: GradientFrames, stack: Stack, camera: Camera, mask: np.ndarray, device: str,
@@ -44,7 +48,7 @@ def solve_gradients(frames: GradientFrames, stack: Stack, camera: Camera, mask: 
         result.specular_normal = np.zeros((3, pixels), np.float32)
     if frames.parallel is not None:
         result.specular, result.roughness = np.zeros((3, pixels), np.float16), np.zeros(pixels, np.float16)
-    length, separated = np.zeros(pixels, np.float32), np.zeros(pixels, bool)
+    length, separated, metal = np.zeros(pixels, np.float32), np.zeros(pixels, bool), np.zeros(pixels, bool)
     gain = CROSSED_GAIN if frames.polarised else 1.0
     for start, stop in stack.bands(BYTES_PER_PIXEL):
         here = slice(start, min(stop, pixels))
@@ -72,9 +76,12 @@ def solve_gradients(frames: GradientFrames, stack: Stack, camera: Camera, mask: 
             _keep(result.residual, here, kept, diffuse.residual)
             _keep(result.status, here, kept, fit.status)
             _keep(length, here, kept, fit.length)
+            if frames.parallel is not None:
+                metal[here] = _take_highlight(result, here, parts.specular.numpy()[:3, : len(kept)])
+                result.residual[here] = np.where(metal[here], parallel.residual.numpy()[: len(kept)], result.residual[here])
             separated[here] = kept & (diffuse.tilt.numpy()[: len(kept)] == 0)
         timings.advance(stop)
-    result.facts = _facts(frames, result, length, separated)
+    result.facts = _facts(frames, result, length, separated, metal)
     if result.specular_normal is not None and not result.specular_normal.any():
         result.specular_normal = None  # a layer that holds nothing is absent
     return result
@@ -90,7 +97,8 @@ def view_vectors(camera: Camera, padded: int) -> np.ndarray:
     return np.pad(toward.astype(np.float32), ((0, 0), (0, padded - x.size)))
 
 
-def _facts(frames: GradientFrames, result: Solution, length: np.ndarray, separated: np.ndarray) -> dict[str, Any]:
+def _facts(frames: GradientFrames, result: Solution, length: np.ndarray, separated: np.ndarray,
+           metal: np.ndarray) -> dict[str, Any]:
     """What the report says beside the statistics that every method has."""
     solved = result.status == Status.OK
     how = "colour" if not frames.polarised else "polarisation" if frames.parallel is not None else "crossed polariser"
@@ -98,10 +106,23 @@ def _facts(frames: GradientFrames, result: Solution, length: np.ndarray, separat
                              "pixels_taken_as_diffuse": int((solved & ~separated).sum()), "frames_unused": list(frames.unused)}
     if result.specular_normal is not None:
         facts["pixels_with_specular_normal"] = int((solved & result.specular_normal.any(axis=0)).sum())
+        facts["pixels_by_highlight_alone"] = int(metal.sum())
+    solved &= ~metal
     if solved.any():  # of the response vector, (3/2)|M|/M0: one on a convex Lambertian surface
         middle, low = np.percentile(length[solved], [50, 5])
         facts["response_length"] = {"median": round(float(middle), 5), "p5": round(float(low), 5)}
     return facts
+
+
+def _take_highlight(result: Solution, here: slice, specular: np.ndarray) -> np.ndarray:
+    """Where the highlight is all there is, as on metal, its normal is the normal; says where."""
+    assert result.specular_normal is not None
+    normal = result.specular_normal[:, here]
+    metal = normal.any(axis=0) & (result.albedo[:, here].astype(np.float32).sum(axis=0) <= MIN_DIFFUSE * specular.sum(axis=0))
+    result.normal[:, here][:, metal] = normal[:, metal]
+    result.confidence[here][metal] = METAL_CONFIDENCE
+    result.status[here][metal] = int(Status.OK)
+    return metal
 
 
 def _keep(target: np.ndarray | None, here: slice, kept: np.ndarray, found: Any) -> None:

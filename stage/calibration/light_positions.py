@@ -39,7 +39,7 @@ def nearest_point(points: np.ndarray, directions: np.ndarray, uncertainty_degree
     normal = across.sum(axis=0)
     # of two rays at an angle γ the eigenvalues are 1 - cos γ, 1 + cos γ and 2
     least = float(np.linalg.eigvalsh(normal)[0])
-    angle = math.degrees(math.acos(max(-1.0, 1 - 2 * least / len(points))))
+    angle = math.degrees(math.acos(np.clip(1 - 2 * least / len(points), -1, 1)))
     if angle < MIN_CONVERGENCE_DEGREES:
         raise CalibrationError(f"the rays from the balls are {angle:.2f}° from parallel: the light is too far to be placed: "
                                "move the balls apart, or take it as distant with mirror-ball")

@@ -144,7 +144,7 @@ def _weights(reading: np.ndarray, lit: np.ndarray, e: np.ndarray, directions: np
         relative = (scaled - model) / length
         chosen = bright & (model > SHADOW * length)
         spread = 1.4826 * np.median(np.abs(relative[chosen])) if chosen.any() else 1.0
-        weight = chosen / (1 + (relative / (WEIGHT_SCALE * spread + 1e-9)) ** 2)
+        weight = chosen / (1 + (np.where(chosen, relative, 0) / (WEIGHT_SCALE * spread + 1e-9)) ** 2)
     weight[:, (weight > 0.1).sum(axis=0) < MIN_LIGHTS] = 0  # three readings fit any brightness
     return weight
 

@@ -74,8 +74,18 @@ def test_polarised_frames_give_both_normals(relit, tmp_path, diffuse, highlight)
     assert report["residual"]["p95"] < 1e-3
 
 
+def test_metal_has_the_normal_of_its_highlight(relit, tmp_path, highlight):
+    bright = 10 * highlight
+    write(tmp_path, {"cross": np.full_like(bright, 1e-5).repeat(3, -1), "parallel": bright.repeat(3, -1) + 1e-5})
+    maps, report = solve(relit, tmp_path)
+    assert np.array_equal(maps.mask, SCENE.mask)
+    assert report["found"]["pixels_by_highlight_alone"] == SCENE.mask.sum()
+    assert angles_degrees(maps.normal, SCENE.normal)[SCENE.mask].max() < 1  # ten times a dielectric's lobe is not quite a metal's
+    assert np.allclose(maps.confidence[SCENE.mask], 0.2, atol=1e-3) and not maps.diffuse_albedo.any()
+
+
 def test_gradient_is_the_default_for_gradient_frames(relit, tmp_path, diffuse, highlight):
-    """And without a polariser colour tells the highlight from the diffuse light, but for the middle, where the cap is nearly grey."""
+    """And without a polariser colour tells the highlight from the diffuse, but where the cap is nearly grey."""
     write(tmp_path, {"none": diffuse + highlight})
     maps, report = solve(relit, tmp_path)
     assert report["method"] == "gradient" and report["found"]["separation"] == "colour"

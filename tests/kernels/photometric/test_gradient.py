@@ -126,11 +126,12 @@ def test_twice_the_radiance_is_twice_the_albedo_and_the_same_normal(device):
 
 
 @pytest.mark.parametrize("f0", [0.04, 0.6])
-@pytest.mark.parametrize(("roughness", "lean"), [(0.1, (0.04, 0.03)), (0.2, (0.25, 0.35)), (0.3, (0.38, 1.37)), (0.4, (0.75, 3.5)),
-                                                 (0.5, (2.4, 6.9)), (0.7, (9.9, 16.2))])
+@pytest.mark.parametrize(("roughness", "lean"), [
+    (0.1, (0.04, 0.03)), (0.2, (0.25, 0.35)), (0.3, (0.38, 1.37)), (0.4, (0.75, 3.5)), (0.5, (2.4, 6.9)), (0.7, (9.9, 16.2)),
+])
 def test_polarisation_tells_diffuse_and_specular_apart(device, roughness, lean, f0):
     """Up to 60 degrees from the view. The halfway vector is off by the lean of the lobe (docs/methods.md); a lobe fitted to the
-    responses is off by half rounding of parallel - cross, of which a dielectric's highlight is a tenth, and by the table's steps."""
+    responses is off by half rounding of parallel - cross, of which a dielectric's highlight is a tenth, and by table steps."""
     normal = cap(30, 60)
     cross = tinted(lambert_shading(normal, PAIRS), 0.5 * colours(30))
     parallel = cross + lobe_shading(normal, PAIRS, roughness=roughness, f0=f0)
@@ -153,7 +154,7 @@ def test_metal_keeps_its_colour_and_no_highlight_is_no_specular(device):
     lobe = lobe_shading(normal, PAIRS, roughness=0.3, f0=0.5)
     cross = np.full((3, 6, 20), 0.2) * (0.5 + normal[:, 2])
     red = lobe_shading(normal, PAIRS, roughness=0.3, f0=0.9)
-    band = upload(np.concatenate([cross, cross + [red, lobe, lobe], cross], axis=1), device)
+    band = upload(np.concatenate([cross, cross + np.stack([red, lobe, lobe]), cross], axis=1), device)
     dull, shiny = moments(band, PAIRS), moments(band, PAIRS, before=6)
     parts = separate_polarised(dull, shiny, GREY, pixel_count=20, device=device)
     found = fit_highlights(parts, GREY, TO_CAMERA, gain=2.0, pixel_count=20, device=device)

@@ -86,7 +86,7 @@ def test_a_typed_circle():
 
 
 def test_the_view_of_a_ball_is_the_sphere():
-    camera, geometry = SCENES["perspective"]
+    camera = PERSPECTIVE
     ball = ball_from_circle(camera, 100, 80, 50, radius_m=0.1)
     view = view_ball(ball, camera)
     inside = view.inside
@@ -133,5 +133,5 @@ def test_masks_that_show_no_ball():
         ball_from_mask(ORTHOGRAPHIC, rng.random((HEIGHT, WIDTH)) > 0.999)
     half = empty.copy()
     half[80:] = 1
-    with pytest.raises(CalibrationError, match="line|not round"):
+    with pytest.raises(CalibrationError, match=r"line|not round"):
         ball_from_mask(ORTHOGRAPHIC, half)

@@ -37,7 +37,8 @@ def test_the_stated_uncertainty_is_that_of_many_trials():
     error = []
     for _ in range(2000):
         shaken = exact + np.radians(sigma) * rng.normal(size=(2, 3))
-        error.append(nearest_point(points, shaken / np.linalg.norm(shaken, axis=1, keepdims=True), np.full(2, sigma)).position - position)
+        shaken /= np.linalg.norm(shaken, axis=1, keepdims=True)
+        error.append(nearest_point(points, shaken, np.full(2, sigma)).position - position)
     assert np.sqrt((np.array(error) ** 2).sum(axis=1).mean()) == pytest.approx(found.uncertainty, rel=0.05)
 
 
@@ -54,7 +55,8 @@ def test_lights_near_two_rendered_balls(projection, camera):
     for position in (np.array([0.1, 0.5, z + 0.6]), np.array([-0.6, 0.1, z + 0.5])):
         points, directions, sigmas = [], [], []
         for centre in centres:
-            image, mask = render(mirror_of_near(position, degrees=2), centre=centre, radius=radius, width=width, height=height, **camera)
+            image, mask = render(mirror_of_near(position, degrees=2), centre=centre, radius=radius, width=width, height=height,
+                                 **camera)
             ball = ball_from_mask(model, mask, radius_m=radius, z_m=z)
             view = view_ball(ball, model)
             spot = find_spot(box(image, view), None, ball, view)

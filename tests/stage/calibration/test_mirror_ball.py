@@ -120,7 +120,7 @@ def test_flags_of_an_unsure_light():
 
 
 def test_no_light():
-    ball, view, geometry = exact("orthographic")
+    ball, view, _ = exact("orthographic")
     rng = np.random.default_rng(4)
     h, w = view.inside.shape
     for image in (np.zeros((h, w, 3)), np.full((h, w, 3), 0.3), 0.1 + 0.01 * rng.standard_normal((h, w, 3))):

@@ -1,4 +1,4 @@
-"""Brightness of lights from the object's own images: exact Lambertian data, shadows, highlights, noise, and what cannot be told."""
+"""Brightness of lights from the object's own images: exact data, shadows, highlights, noise, and what cannot be told."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from tests.stage.calibration.balls import spread, unit
 
 
 def scene(lights, least_z, *, pixels=1500, seed=0):
-    """Directions, irradiance [lights, 3] over a factor of six, and readings [lights, pixels, 3] of a coloured Lambertian surface."""
+    """Directions, irradiance [lights, 3] over a factor of six, readings [lights, pixels, 3] of a coloured surface, normals."""
     rng = np.random.default_rng(seed)
     directions, normals = spread(lights, least_z), spread(pixels, 0.25)
     albedo = rng.uniform(0.1, 0.9, (pixels, 3))
@@ -38,12 +38,13 @@ def test_noise_is_averaged_and_stated():
     found = fit_intensities(np.maximum(noisy, 0), np.ones(readings.shape[:2], bool), directions)
     error = relative_error(found, irradiance)
     assert error.max() < 0.005
-    assert 0.3 < np.sqrt((error**2).mean()) / found.uncertainty.mean() < 5  # the lights' errors are not independent of the shape's
+    # the stated error leaves out that of the shape, which the lights share
+    assert 0.3 < np.sqrt((error**2).mean()) / found.uncertainty.mean() < 5
 
 
 def test_highlights_and_saturation_take_no_part():
     directions, irradiance, readings, normals = scene(20, 0.3)
-    half = directions + [0, 0, 1]
+    half = directions + unit(0, 0, 1)
     half /= np.linalg.norm(half, axis=1, keepdims=True)
     shiny = readings + 0.3 * irradiance[:, None] * np.maximum(half @ normals.T, 0)[..., None] ** 80
     limit = np.quantile(shiny, 0.97)

@@ -1,0 +1,284 @@
+"""The general solver on surfaces rendered by an independent float64 model, and its parts against that model."""
+
+import numpy as np
+import pytest
+import warp as wp
+from tests.kernels.scenes import GREY, bits, cap, store
+from tests.reference import microfacet as twin
+
+from kernels import packs
+from kernels.errors import ArrayError
+from kernels.microfacet import diffuse, ggx, schlick
+from kernels.photometric.diffuse_shape import choose_diffuse
+from kernels.photometric.hypotheses import Diffuse, SearchOptions, rings, search_normals
+from kernels.photometric.material import fit_material
+from kernels.photometric.readings import grey_factors, pad_lights
+from kernels.photometric.samples import gather, to_host
+from kernels.photometric.svbrdf import average_normals, solve_svbrdf
+
+LIGHTS = cap(48, 70.0)
+VIEW = np.array([0.0, 0.0, 1.0])
+COLOUR = np.array([0.6, 0.35, 0.2])
+
+
+def tilted(count: int, largest_degrees: float = 50.0) -> np.ndarray:
+    """[count, 3] normals, evenly over a cap."""
+    return cap(count, largest_degrees)
+
+
+def render(normal: np.ndarray, *, albedo=COLOUR, alpha=0.16, f0=0.04, rough=None, slope=0.0, lights=LIGHTS) -> np.ndarray:
+    """[3, light, pixel] float64 radiance under unit irradiance."""
+    n, light = normal[None], lights[:, None]
+    shine = twin.specular(n, light, VIEW, alpha, f0) if f0 is not None else 0.0
+    matt = twin.diffuse(n, light, VIEW, rough, slope)
+    return np.stack([channel * matt + shine for channel in albedo])
+
+
+def sample(radiance: np.ndarray, device: str, *, lights=LIGHTS, view=None, saturated=None):
+    """Everything as samples."""
+    count, pixels = radiance.shape[1:]
+    padded = pad_lights(lights, np.ones((count, 3)))
+    band = packs.upload(store(radiance), None if saturated is None else bits(saturated), device=device)
+    toward = np.tile(VIEW, (pixels, 1)) if view is None else view
+    return gather(band, np.arange(pixels), toward, padded, grey_factors(padded, GREY), count), band
+
+
+def degrees(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), (a * b).sum(-1)))
+
+
+def test_model_agrees_with_the_papers(device):
+    """The Warp functions against the float64 twin, over random directions and widths; tolerance: float32 rounding of 1 - a²."""
+    rng = np.random.default_rng(3)
+    normal = np.array([0.0, 0.0, 1.0])
+    light, view = (twin.unit(rng.normal(size=(500, 3)) * [1, 1, 0.4] + [0, 0, 0.8]) for _ in range(2))
+    light[:, 2], view[:, 2] = np.abs(light[:, 2]) + 0.02, np.abs(view[:, 2]) + 0.02
+    light, view = twin.unit(light), twin.unit(view)
+    half = twin.unit(light + view)
+    alpha, rough, slope = rng.uniform(0.05, 1, 500), rng.uniform(0, 1, 500), rng.uniform(-0.3, 0.2, 500)
+    rise = (1 - (half * view).sum(-1)) ** 5
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def evaluate(nl: wp.array(dtype=float), nv: wp.array(dtype=float), nh: wp.array(dtype=float), hv: wp.array(dtype=float),
+                 a: wp.array(dtype=float), r: wp.array(dtype=float), s: wp.array(dtype=float), out: wp.array2d(dtype=float)):
+        i = wp.tid()
+        out[0, i] = ggx(nl[i], nv[i], nh[i], a[i])
+        out[1, i] = diffuse(nl[i], nv[i], hv[i] * hv[i], r[i], s[i])
+        out[2, i] = schlick(hv[i])
+        out[3, i] = diffuse(nl[i], nv[i], hv[i] * hv[i], -1.0, 0.0)
+
+    inputs = [light[:, 2], view[:, 2], half[:, 2], (half * view).sum(-1), alpha, rough, slope]
+    out = wp.zeros((4, 500), dtype=float, device=device)
+    wp.launch(evaluate, dim=500, inputs=[wp.array(v, dtype=float, device=device) for v in inputs], outputs=[out], device=device)
+    got = out.numpy()
+    lobe = np.array([twin.specular(normal, li, vi, ai, 1.0) for li, vi, ai in zip(light, view, alpha, strict=True)])
+    np.testing.assert_allclose(got[0], lobe, rtol=2e-3)
+    burley = [twin.diffuse(normal, li, vi, r, s) for li, vi, r, s in zip(light, view, rough, slope, strict=True)]
+    np.testing.assert_allclose(got[1] / np.pi, burley, rtol=1e-5)
+    np.testing.assert_allclose(got[2], rise, atol=1e-6)
+    np.testing.assert_allclose(got[3], light[:, 2], rtol=1e-6)
+
+
+@pytest.mark.parametrize("alpha", [0.1, 0.3, 0.8])
+def test_distribution_is_normalised(alpha):
+    """∫ D n·h dω = 1 over the hemisphere: the twin itself, by the midpoint rule (tolerance: its step)."""
+    angle = (np.arange(20000) + 0.5) / 20000 * np.pi / 2
+    total = (twin.distribution(np.cos(angle), alpha) * np.cos(angle) * np.sin(angle)).sum() * 2 * np.pi * np.pi / 2 / 20000
+    assert total == pytest.approx(1, abs=1e-4)
+
+
+def test_gathered_readings(device):
+    """Gathered grey and colour readings are radiance / irradiance; saturated ones are marked, padded lanes repeat the last pixel."""
+    normal = tilted(37)
+    radiance = render(normal)
+    saturated = np.zeros(radiance.shape[1:], dtype=bool)
+    saturated[3, 5] = True
+    samples, _ = sample(radiance, device, saturated=saturated)
+    count = len(LIGHTS)
+    flat = [a.numpy().reshape(-1, samples.lanes) for a in (samples.grey, samples.colour)]
+    at = np.array([[p * samples.pack_stride + light * samples.light_stride for p in range(samples.packs)] for light in range(count)])
+    grey = flat[0][at].reshape(count, -1)[:, :37]
+    level = to_host(samples, samples.level)
+    expected = np.einsum("c,clp->lp", GREY, store(radiance)[:, :count].astype(np.float64))
+    keep = ~saturated
+    np.testing.assert_allclose((grey * level)[keep], expected[keep], rtol=1e-5)  # float32
+    assert grey[3, 5] < 0
+    red = flat[1].reshape(3, -1, samples.lanes)[0][at].reshape(count, -1)[:, :37]
+    np.testing.assert_allclose(red[keep], store(radiance)[0, :count].astype(np.float64)[keep], rtol=1e-5)
+    assert red[3, 5] < 0
+    assert (level > 0).all()
+
+
+def test_gather_refuses(device):
+    samples, band = sample(render(tilted(4)), device)
+    lights = pad_lights(LIGHTS, np.ones((48, 3)))
+    factors = grey_factors(lights, GREY)
+    for pixels in (np.array([], dtype=int), np.array([-1]), np.array([band.pixel_count])):
+        with pytest.raises(ArrayError, match="pixels must be"):
+            gather(band, pixels, np.tile(VIEW, (len(pixels), 1)), lights, factors, 48)
+    with pytest.raises(ArrayError, match="view is"):
+        gather(band, np.arange(3), np.tile(VIEW, (2, 1)), lights, factors, 48)
+    with pytest.raises(ArrayError, match="start is"):
+        search_normals(samples, np.tile(VIEW, (3, 1)), shape=Diffuse())
+
+
+def test_rings_lie_at_their_angles():
+    offsets = rings((2.0, 5.0), 12)
+    assert offsets[0].tolist() == [0, 1, 1, 0]
+    np.testing.assert_allclose(np.hypot(offsets[:, 0], offsets[:, 1]), 1, atol=1e-6)
+    angles = np.degrees(np.arctan2(offsets[:, 0], offsets[:, 1]))
+    assert sorted({round(float(a), 3) for a in angles}) == [0.0, 2.0, 5.0]
+
+
+@pytest.mark.parametrize(("alpha", "f0"), [(0.1, 0.04), (0.25, 0.04), (0.5, 0.08), (0.25, None)])
+def test_normals_of_a_glossy_dielectric(device, alpha, f0):
+    """Closed-form pixels: the normal is found to the last ring of 0.2°, for lobes between the mixture's widths too.
+
+    A start 12° off is far from the answer and well inside the first rings.
+    """
+    normal = tilted(150)
+    samples, _ = sample(render(normal, alpha=alpha, f0=f0), device)
+    start = twin.unit(normal + 0.21 * np.array([0.6, -0.8, 0.0]))
+    found = search_normals(samples, start, shape=Diffuse())
+    error = degrees(found.normal, normal)
+    assert np.median(error) < 0.25
+    assert error.max() < 1.0  # lobes between two widths are a mixture of both, not quite of their shape
+
+
+def test_normals_of_a_metal(device):
+    """No diffuse light at all: the lobe alone says where the normal is."""
+    normal = tilted(100, 40.0)
+    samples, _ = sample(render(normal, albedo=np.zeros(3), alpha=0.25, f0=0.7), device)
+    found = search_normals(samples, twin.unit(normal + [0.2, 0.1, 0]), shape=Diffuse())
+    assert np.median(degrees(found.normal, normal)) < 0.4
+
+
+def test_cast_shadows_hardly_matter(device):
+    """A third of the lights, at random, are blocked at each pixel: what a shadow costs is the same for every candidate."""
+    normal = tilted(150)
+    radiance = render(normal, alpha=0.25)
+    radiance = radiance * (np.random.default_rng(5).random(radiance.shape[1:]) > 0.33)
+    samples, _ = sample(radiance, device)
+    found = search_normals(samples, twin.unit(normal + [0.1, 0.1, 0]), shape=Diffuse())
+    assert np.median(degrees(found.normal, normal)) < 0.3
+
+
+def test_saturated_readings_take_no_part(device):
+    """Readings cut off by the sensor and marked as such change nothing, whatever they say."""
+    normal = tilted(64)
+    radiance = render(normal, alpha=0.12, f0=0.3)
+    saturated = radiance[1] > np.quantile(radiance[1], 0.95, axis=0)
+    spoiled = np.where(saturated, 0.7 * radiance, radiance)
+    start = twin.unit(normal + [0.05, 0.05, 0])
+    clean = search_normals(sample(radiance, device, saturated=saturated)[0], start, shape=Diffuse())
+    cut = search_normals(sample(spoiled, device, saturated=saturated)[0], start, shape=Diffuse())
+    np.testing.assert_array_equal(clean.normal, cut.normal)
+
+
+def test_perspective_views(device):
+    """Each pixel has a view of its own; the highlight moves with it."""
+    rng = np.random.default_rng(8)
+    normal = tilted(80, 30.0)
+    view = twin.unit(np.array([0, 0, 1.0]) + rng.uniform(-0.3, 0.3, (80, 3)) * [1, 1, 0])
+    radiance = np.stack([c * twin.diffuse(normal[None], LIGHTS[:, None], view[None])
+                         + twin.specular(normal[None], LIGHTS[:, None], view[None], 0.15, 0.3) for c in COLOUR])
+    found = search_normals(sample(radiance, device, view=view)[0], twin.unit(normal + [0.1, 0, 0]), shape=Diffuse())
+    assert np.median(degrees(found.normal, normal)) < 0.3
+    wrong = search_normals(sample(radiance, device)[0], twin.unit(normal + [0.1, 0, 0]), shape=Diffuse())
+    assert np.median(degrees(wrong.normal, normal)) > 0.5  # it matters
+
+
+@pytest.mark.parametrize(("rough", "slope"), [(None, 0.0), (0.5, 0.0), (0.1, -0.2)])
+def test_the_diffuse_shape_is_recovered(device, rough, slope):
+    """The object as a whole says which diffuse lobe it has; normals gain by it. Half a degree: the shapes tried are 0.075 in
+    roughness and 0.05 in slope apart."""
+    normal = tilted(200, 65.0)
+    samples, _ = sample(render(normal, alpha=0.25, rough=rough, slope=slope), device)
+    shape, tried = choose_diffuse(samples, twin.unit(normal + [0.03, 0.02, 0]))
+    assert tried[:, 2].min() == tried[(tried[:, 0] == shape.rough) & (tried[:, 1] == shape.slope), 2][0]
+    chosen = degrees(search_normals(samples, normal, shape=shape).normal, normal)
+    assert np.median(chosen) < 0.5
+    if rough is None:
+        assert shape == Diffuse()
+    else:
+        lambert = degrees(search_normals(samples, normal, shape=Diffuse()).normal, normal)
+        assert np.median(chosen) < 0.5 * np.median(lambert)
+
+
+@pytest.mark.parametrize(("roughness", "f0"), [(0.3, 0.04), (0.5, 0.06), (0.7, 0.04)])
+def test_material_of_a_dielectric(device, roughness, f0):
+    """Known normals: albedo, F0 and roughness come back; tolerance: the roughness resolution of 0.01 and half rounding."""
+    normal = tilted(64, 45.0)
+    samples, _ = sample(render(normal, alpha=roughness**2, f0=f0), device)
+    material = fit_material(samples, normal, shape=Diffuse())
+    np.testing.assert_allclose(np.median(material.roughness), roughness, atol=0.012)
+    np.testing.assert_allclose(np.median(material.diffuse_albedo, axis=0), COLOUR, rtol=0.01)
+    np.testing.assert_allclose(np.median(material.specular), f0, rtol=0.06)
+
+
+def test_material_of_a_metal(device):
+    normal = tilted(64, 40.0)
+    gold = np.array([0.9, 0.7, 0.3])
+    shine = np.stack([twin.specular(normal[None], LIGHTS[:, None], VIEW, 0.25, f) for f in gold])
+    material = fit_material(sample(shine, device)[0], normal, shape=Diffuse())
+    np.testing.assert_allclose(np.median(material.specular, axis=0), gold, rtol=0.02)
+    np.testing.assert_allclose(np.median(material.roughness), 0.5, atol=0.012)
+    assert np.median(material.diffuse_albedo) < 0.01
+
+
+def test_material_of_a_lambertian_surface(device):
+    """No highlight: F0 near zero. Schlick's rise stays, as in every renderer, so a trace of it may be taken from the albedo."""
+    normal = tilted(64, 45.0)
+    material = fit_material(sample(render(normal, f0=None), device)[0], normal, shape=Diffuse())
+    np.testing.assert_allclose(np.median(material.diffuse_albedo, axis=0), COLOUR, rtol=0.03)
+    assert np.median(material.specular) < 0.02
+
+
+def test_whole_solve_scales_and_never_gives_nan(device):
+    """Doubling the light doubles the albedo and leaves normal, F0's share and roughness; dark and odd pixels stay finite."""
+    normal = tilted(40)
+    radiance = render(normal, alpha=0.2)
+    radiance[:, :, 7] = 0.0
+    radiance[:, :, 8] *= np.arange(48)[:, None].T.reshape(-1) == 3  # a single lit reading
+    start = twin.unit(normal + [0.05, 0, 0])
+    once = solve_svbrdf(sample(radiance, device)[0], start, shape=Diffuse())
+    for values in once:
+        assert np.isfinite(values).all()
+    good = np.setdiff1d(np.arange(40), [7, 8])
+    assert np.median(degrees(once.normal, normal)[good]) < 0.3
+    assert (once.confidence >= 0).all() and (once.confidence <= 1).all()
+    half = solve_svbrdf(sample(0.5 * radiance, device)[0], start, shape=Diffuse())
+    np.testing.assert_allclose(half.normal[good], once.normal[good], atol=2e-3)
+    np.testing.assert_allclose(np.median(half.diffuse_albedo[good] / once.diffuse_albedo[good]), 0.5, rtol=0.02)
+
+
+def test_confidence_falls_with_noise(device):
+    normal = tilted(100)
+    radiance = render(normal, alpha=0.25)
+    rng = np.random.default_rng(2)
+    means = []
+    for noise in (0.0, 0.05, 0.2):
+        noisy = np.maximum(radiance * (1 + noise * rng.normal(size=radiance.shape)), 0)
+        means.append(solve_svbrdf(sample(noisy, device)[0], normal, shape=Diffuse()).confidence.mean())
+    assert means[0] > means[1] > means[2]
+
+
+def test_average_of_normals():
+    """Equal costs give the mean direction; a shape that costs far more has no say."""
+    a, b = np.array([[0.0, 0.0, 1.0]]), twin.unit(np.array([[0.1, 0.0, 1.0]]))
+    mean, spread = average_normals(np.stack([a, b]), np.array([[0.1], [0.1]]))
+    np.testing.assert_allclose(mean, twin.unit(a + b), atol=1e-6)
+    assert spread[0] == pytest.approx(np.degrees(np.arctan(0.1)) / 2, rel=1e-2)
+    alone, none = average_normals(np.stack([a, b]), np.array([[0.1], [10.0]]))
+    np.testing.assert_allclose(alone, a, atol=1e-6)
+    assert none[0] < 0.05
+
+
+def test_more_rounds_are_an_option(device):
+    """Options reach the kernel: one round of re-weighting is worse on shadows than five."""
+    normal = tilted(100)
+    radiance = render(normal, alpha=0.25) * (np.random.default_rng(5).random((48, 100)) > 0.3)
+    samples, _ = sample(radiance, device)
+    few, many = (degrees(search_normals(samples, normal, shape=Diffuse(), options=SearchOptions(reweightings=r)).normal, normal)
+                 for r in (1, 5))
+    assert few.mean() > many.mean()

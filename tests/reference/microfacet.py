@@ -1,0 +1,44 @@
+"""The reflectance model in float64, from the papers: GGX (Walter 2007, equation 33), Smith's height-correlated masking from its Λ
+(Heitz 2014, equations 72 and 99), Schlick 1994, Burley 2012 section 5.3. Imports nothing of ours."""
+
+import numpy as np
+
+
+def unit(v):
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def distribution(cosine, alpha):
+    """GGX's D of the angle between normal and half vector."""
+    tangent2 = 1 / cosine**2 - 1
+    return 1 / (np.pi * alpha**2 * cosine**4 * (1 + tangent2 / alpha**2) ** 2)
+
+
+def smith_lambda(cosine, alpha):
+    """Λ of GGX for a direction at this cosine from the normal."""
+    tangent2 = 1 / cosine**2 - 1
+    return (np.sqrt(1 + alpha**2 * tangent2) - 1) / 2
+
+
+def specular(normal, light, view, alpha, f0):
+    """BRDF · n·l of the GGX lobe; 0 for lights below the horizon. Broadcasts over leading axes."""
+    half = unit(light + view)
+    nl, nv = (normal * light).sum(-1), (normal * view).sum(-1)
+    nh, hv = (normal * half).sum(-1), (half * view).sum(-1)
+    lit = nl > 1e-9
+    safe = np.where(lit, nl, 1.0)
+    masking = 1 / (1 + smith_lambda(safe, alpha) + smith_lambda(nv, alpha))
+    fresnel = f0 + (1 - f0) * (1 - hv) ** 5
+    return np.where(lit, distribution(np.maximum(nh, 1e-6), alpha) * masking * fresnel / (4 * nv), 0.0)
+
+
+def diffuse(normal, light, view, rough=None, slope=0.0):
+    """BRDF · n·l of the diffuse lobe of albedo one: Lambert's, or Burley's of this roughness, times 1 + slope (1 - n·l)."""
+    half = unit(light + view)
+    nl = np.maximum((normal * light).sum(-1), 0)
+    nv, hv = (normal * view).sum(-1), (half * view).sum(-1)
+    lobe = nl / np.pi * (1 + slope * (1 - nl))
+    if rough is not None:
+        grazing = 0.5 + 2 * rough * hv**2
+        lobe = lobe * (1 + (grazing - 1) * (1 - nl) ** 5) * (1 + (grazing - 1) * (1 - nv) ** 5)
+    return lobe
