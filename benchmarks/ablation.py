@@ -17,7 +17,7 @@ from kernels.photometric.robust import solve_robust
 from kernels.photometric.samples import Samples, gather
 from kernels.photometric.svbrdf import solve_svbrdf
 from kernels.status import Status
-from service.pipelines.normals import SHAPE_PIXELS
+from service.pipelines.material import SHAPE_PIXELS
 from stage.capture import Capture
 from stage.colour import GREY_WEIGHTS
 from stage.importers import diligent

@@ -19,6 +19,7 @@ import numpy as np
 from benchmarks.ablation import ablation_table
 from benchmarks.accuracy import SolveError, compare, diligent_errors, read_truth, relight_error, sample_errors
 from benchmarks.large import large_rows, measure
+from benchmarks.search_speed import search_rows
 from service.methods import Method
 from service.pipelines.bench import bench
 from service.pipelines.solve import solve
@@ -45,16 +46,16 @@ def row(name: str, error: SolveError) -> str:
 
 def lambert(_: argparse.Namespace) -> list[str]:
     """The path-traced Lambertian sample."""
-    return ["`samples/lambert`: a bumpy ball, 32 distant lights of unequal colour and strength, direct light with cast shadows, path "
-            "traced.", "", HEAD, *(row(f"`{method}`", sample_errors("lambert", method)) for method in DISTANT)]
+    return ["`samples/lambert`: a bumpy ball, 32 distant lights of unequal colour and strength, direct light with cast shadows, "
+            "path traced.", "", HEAD, *(row(f"`{method}`", sample_errors("lambert", method)) for method in DISTANT)]
 
 
 def real(given: argparse.Namespace) -> list[str] | None:
     """DiLiGenT."""
     if given.data is None:
         return None
-    lines = ["DiLiGenT objects, 96 real lights; the cat at every second pixel. `lambert` leaves out readings of zero; with them NumPy's "
-             "`lstsq` gives 4.17 and 8.46.", "", HEAD]
+    lines = ["DiLiGenT objects, 96 real lights; the cat at every second pixel. `lambert` leaves out readings of zero; with them "
+             "NumPy's `lstsq` gives 4.17 and 8.46.", "", HEAD]
     for name in ("ball", "cat"):
         lines += [row(f"{name}, `{method}`", diligent_errors(given.data / f"diligent_{name}", method)) for method in DISTANT]
     return lines
@@ -64,8 +65,8 @@ def glossy(given: argparse.Namespace) -> list[str] | None:
     """Path-traced dielectric and metal."""
     if given.glossy is None:
         return None
-    lines = ["`samples/make_glossy.py`: Mitsuba's `principled`, roughness 0.3 to 0.75, 64 lights, full interreflection. Of the metal, "
-             "albedo is F0; roughness error is absolute.", "",
+    lines = ["`samples/make_glossy.py`: Mitsuba's `principled`, roughness 0.3 to 0.75, 64 lights, full interreflection. Of the "
+             "metal, albedo is F0; roughness error is absolute.", "",
              "| object | mean ° | median ° | albedo or F0, median | roughness, median |", "|---|---|---|---|---|"]
     for name in ("glossy", "glossy_metal"):
         folder = given.glossy / name
@@ -92,13 +93,13 @@ def ablation(given: argparse.Namespace) -> list[str] | None:
 def relighting(_: argparse.Namespace) -> list[str]:
     """The owl under its sky."""
     error, energy = relight_error("reference_environment.exr")
-    return ["`samples/owl` under `environment.exr` (a sun of 3° and a sky), linear combination of 96 captured lights against the path "
-            f"tracer: relative RMSE {error:.3f}, total energy {energy:.3f} of the truth."]
+    return ["`samples/owl` under `environment.exr` (a sun of 3° and a sky), linear combination of 96 captured lights against the "
+            f"path tracer: relative RMSE {error:.3f}, total energy {energy:.3f} of the truth."]
 
 
 def speed(_: argparse.Namespace) -> list[str]:
-    """The table of `relit bench`."""
-    return bench(None, 9)
+    """The table of `relit bench`, and the general solver against NumPy."""
+    return [*bench(None, 9), "", *search_rows()]
 
 
 def demo(_: argparse.Namespace) -> list[str]:

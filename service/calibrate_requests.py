@@ -30,6 +30,8 @@ class LightsRequest(BaseModel):
     """Another capture under the same lights in the same order, whose manifest is written; None: the capture itself."""
     out: Path | None = None
     """Where the manifest is written; None: over the target's capture.json."""
+    drop_failed: bool = False
+    """Leave out frames whose light cannot be measured, in place of refusing the capture."""
 
 
 class BallRequest(LightsRequest):
@@ -37,8 +39,6 @@ class BallRequest(LightsRequest):
 
     circles: tuple[Circle, ...] = ()
     masks: tuple[Path, ...] = ()
-    drop_failed: bool = False
-    """Leave out frames whose light cannot be measured, in place of refusing the capture."""
 
 
 class MirrorBallRequest(BallRequest):
@@ -73,7 +73,7 @@ class GreyBallRequest(BallRequest):
 class IntensityRequest(LightsRequest):
     """Brightness of each light from images of the object itself."""
 
-    pixels: Annotated[int, Field(ge=100, le=100_000)] = 4000
+    pixels: Annotated[int, Field(ge=100, le=100_000)] = 2000
     """Of the mask, drawn at random, that take part."""
 
 

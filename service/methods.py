@@ -12,5 +12,7 @@ class Method(StrEnum):
     """Shadows and highlights rejected per pixel."""
     GRADIENT = "gradient"
     """Diffuse and specular normals from spherical gradient frames."""
+    REFERENCE = "reference"
+    """From a ball of the object's material, photographed under the same lights."""
     SVBRDF = "svbrdf"
     """Normal, diffuse albedo, specular and roughness; the default where there are lights enough."""

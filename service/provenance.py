@@ -9,7 +9,7 @@ from pydantic import BaseModel
 
 from service import __version__
 
-REPORTED = ("relit", "warp-lang", "numpy", "OpenEXR", "OpenImageIO", "usd-core")
+REPORTED = ("relit", "warp-lang", "numpy", "OpenEXR", "OpenImageIO", "opencv-python-headless", "usd-core")
 """Distributions whose versions a report names."""
 
 
@@ -28,12 +28,14 @@ def metadata(request: BaseModel, *, capture: str, inputs: str, method: str | Non
     """String attributes for result files. Nothing in them changes between two runs on the same inputs.
 
     Args:
-        request: what was asked; paths and device are left out, so that results do not depend on where they were made.
+        request: what was asked; paths and device are left out, so that results do not depend on where they were made, and so is
+            what was not asked for.
         capture: its name.
         inputs: content hash of the images.
         method: the one that was used, where the request left the choice open.
     """
     options = request.model_dump(mode="json", exclude={"capture", "out", "maps", "environment", "cache", "device"})
+    options = {name: value for name, value in options.items() if value is not None and value is not False}
     if method is not None:
         options["method"] = str(method)
     return {"relit:version": __version__, "relit:capture": capture, "relit:inputs": inputs,

@@ -18,7 +18,21 @@ class Request(BaseModel):
     """Folder for the stack cache; None: `.relit` in the capture's folder."""
 
 
-class SolveRequest(Request):
+class StackRequest(Request):
+    """Base of requests on the images of a capture."""
+
+    align: bool = False
+    """Warp the frames of a moving subject to the time of one tracking frame."""
+    align_to: str | None = None
+    """Image of that tracking frame, and so `align`; None: the middle one."""
+
+    @property
+    def aligned(self) -> bool:
+        """Whether frames are warped."""
+        return self.align or self.align_to is not None
+
+
+class SolveRequest(StackRequest):
     """Normals, albedo and height of a capture."""
 
     capture: Path
@@ -26,9 +40,11 @@ class SolveRequest(Request):
     """Folder for maps.exr and report.json."""
     method: Method | None = None
     """None: gradient where there are gradient frames; else svbrdf where there are lights enough, else robust."""
+    reference_ball: Path | None = None
+    """Capture of a ball of the object's material under the same lights, for the method reference."""
 
 
-class RelightRequest(Request):
+class RelightRequest(StackRequest):
     """Frames of a capture under a lat-long environment."""
 
     capture: Path

@@ -5,7 +5,7 @@ import json
 import math
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -19,15 +19,19 @@ from stage.files import replacing, write_text
 from stage.fingerprint import Fingerprints
 from stage.light import OffLight
 from stage.manifest import Frame
+from stage.motion.align import VERSION, Alignment, Warp
+from stage.motion.tracking import Tracking
 from stage.stack import CHANNELS, LIGHT_PAD, PIXEL_PAD, Stack
 
 LAYOUT = 1
 """Raised when the layout or the arithmetic of the cache changes, so that older caches are rebuilt."""
 CACHE_FOLDER = ".relit"
+ALIGNED = "aligned-"
+"""Keys of stacks whose frames were warped to one time begin with it: one such stack is kept, and one as recorded."""
 DECODE_BYTES = 1 << 30
 """What the images being decoded at one time may take together."""
-BYTES_PER_PIXEL = 40
-"""Of one image while it is corrected: half and float RGB, masks and the planes to write."""
+BYTES_PER_PIXEL, ALIGNED_BYTES_PER_PIXEL = 40, 160
+"""Of one image while it is corrected: half and float RGB, masks and the planes to write; and while it is warped."""
 TOP_EXPONENT = 15
 """The brightest value of a light is stored in [2^14, 2^15): below half's largest, 65504, with 29 stops of normal values."""
 
@@ -35,17 +39,19 @@ Progress = Callable[[int, int], None]
 """Called with (done, total)."""
 
 
-def open_stack(capture: Capture, *, cache: Path | None = None, progress: Progress | None = None) -> Stack:
+def open_stack(capture: Capture, *, cache: Path | None = None, tracking: Tracking | None = None,
+               progress: Progress | None = None) -> Stack:
     """The stack of a capture's light frames, from the cache or built now.
 
     Args:
         capture: an opened capture.
         cache: folder for the cache; None: `.relit` in the capture's folder.
+        tracking: warp every frame to the time of the reference of these tracking frames; None: leave them as recorded.
         progress: called after every decoded frame when the stack is built.
 
     Raises:
-        ManifestError: the capture has no frame that a light lit.
-        ImageError: an image is unreadable or holds impossible values; names the file.
+        ManifestError: the capture has no frame that a light lit, or one lies too far outside the tracking frames.
+        ImageError: an image is unreadable or holds impossible values, or a tracking frame is dark; names the file.
         StorageError: the cache cannot be written (no space, read-only folder); nothing is left behind.
     """
     frames = capture.sources()
@@ -53,42 +59,49 @@ def open_stack(capture: Capture, *, cache: Path | None = None, progress: Progres
         raise ManifestError(f"{capture.folder}: frames: none is lit by a distant, point, extended or gradient light")
     folder = cache if cache is not None else capture.folder / CACHE_FOLDER
     fingerprints = Fingerprints(capture.folder, folder / "files.json")
-    key = _key(capture, frames, fingerprints)
+    key = _key(capture, frames, tracking, fingerprints)
     found = stacks.find(folder, key)
     if found is not None:
         return found
+    alignment = None if tracking is None else Alignment(capture, tracking, frames)
     hint = "" if cache is not None else " (--cache names another folder for it)"
     with storage(f"make the stack cache{hint} in", folder):
         folder.mkdir(parents=True, exist_ok=True)
-    built = _build(capture, frames, folder, key, progress)
+    built = _build(capture, frames, alignment, folder, key, progress)
     fingerprints.remember()
     _drop_others(folder, key)
     return built
 
 
-def _key(capture: Capture, frames: list[Frame], fingerprints: Fingerprints) -> str:
+def _key(capture: Capture, frames: list[Frame], tracking: Tracking | None, fingerprints: Fingerprints) -> str:
     """A hash of all that the stored values depend on."""
     manifest = capture.manifest
     off = [frame for frame, _ in capture.lit_by(OffLight)]
     corrections = [name for name in (manifest.dark, manifest.flat) if name is not None]
-    if manifest.flat is not None and manifest.mask is not None:
-        corrections.append(manifest.mask)  # the flat is scaled over the mask
-    images = [frame.image for frame in frames + off]
+    if manifest.mask is not None and (manifest.flat is not None or tracking is not None):
+        corrections.append(manifest.mask)  # the flat and the tracking frames are scaled over the mask
+    read = frames + off + ([] if tracking is None else [*tracking.frames])
+    images = [frame.image for frame in read]
     inputs = {
         "layout": LAYOUT,
         "resolution": manifest.camera.resolution,
         "color_space": manifest.color_space,
         "saturation": manifest.saturation,
-        "exposures": [frame.exposure_s for frame in frames + off],
+        "exposures": [frame.exposure_s for frame in read],
         "images": images,
         "light_count": len(frames),
         "corrections": [manifest.dark, manifest.flat],
         "content": fingerprints.of([*images, *corrections]),
     }
-    return hashlib.blake2b(json.dumps(inputs, sort_keys=True).encode(), digest_size=8).hexdigest()
+    if tracking is not None:
+        time_of = {frame.image: time for time, frame in enumerate(manifest.frames)}
+        inputs["align"] = [VERSION, tracking.times, tracking.reference, [time_of[frame.image] for frame in frames]]
+    digest = hashlib.blake2b(json.dumps(inputs, sort_keys=True).encode(), digest_size=8).hexdigest()
+    return digest if tracking is None else ALIGNED + digest
 
 
-def _build(capture: Capture, frames: list[Frame], folder: Path, key: str, progress: Progress | None) -> Stack:
+def _build(capture: Capture, frames: list[Frame], alignment: Alignment | None, folder: Path, key: str,
+           progress: Progress | None) -> Stack:
     pixel_count = capture.camera.width * capture.camera.height
     lights, pixels = stacks.padded(len(frames), LIGHT_PAD), stacks.padded(pixel_count, PIXEL_PAD)
     scale = np.zeros(lights, dtype=np.float32)
@@ -105,9 +118,11 @@ def _build(capture: Capture, frames: list[Frame], folder: Path, key: str, progre
         with storage("make the stack cache", values):
             _reserve(file.fileno(), start + 2 * CHANNELS * lights * pixels)
 
-        def take(light: int) -> None:
+        def take(light: int, warp: Warp | None) -> None:
             nonlocal done
             radiance = correction.apply(frames[light])
+            if warp is not None:
+                radiance = warp(light, radiance)
             planes, scale[light] = _to_half(radiance)
             for channel in range(CHANNELS):
                 plane = np.ascontiguousarray(planes[..., channel])
@@ -119,17 +134,22 @@ def _build(capture: Capture, frames: list[Frame], folder: Path, key: str, progre
                 if progress is not None:
                     progress(done, len(frames))
 
-        workers = max(1, min(os.cpu_count() or 1, DECODE_BYTES // (BYTES_PER_PIXEL * pixel_count)))
+        batches: Iterable[tuple[Sequence[int], Warp | None]] = [(range(len(frames)), None)]
+        if alignment is not None:
+            batches = alignment.batches(correction)
+        bytes_per_pixel = BYTES_PER_PIXEL if alignment is None else ALIGNED_BYTES_PER_PIXEL
+        workers = max(1, min(os.cpu_count() or 1, DECODE_BYTES // (bytes_per_pixel * pixel_count)))
         with ThreadPoolExecutor(workers, thread_name_prefix="relit-ingest") as pool:
-            jobs = [pool.submit(take, light) for light in range(len(frames))]
             try:
-                for job in jobs:
-                    job.result()
+                for batch, warp in batches:
+                    for job in [pool.submit(take, light, warp) for light in batch]:
+                        job.result()
             except BaseException:
                 pool.shutdown(cancel_futures=True)
                 raise
     names = tuple(frame.image for frame in frames)
-    index = {"frames": names, "scale": [float(s) for s in scale], "pixel_count": pixel_count}
+    motion = None if alignment is None else alignment.statistics()
+    index = {"frames": names, "scale": [float(s) for s in scale], "pixel_count": pixel_count, "motion": motion}
     try:
         if saturated.any():
             with replacing(stacks.saturated_path(folder, key)) as temporary:
@@ -138,7 +158,7 @@ def _build(capture: Capture, frames: list[Frame], folder: Path, key: str, progre
     except BaseException:
         _remove(folder, key)
         raise
-    return Stack(folder, key, names, scale, pixel_count)
+    return Stack(folder, key, names, scale, pixel_count, motion)
 
 
 def _to_half(radiance: Radiance) -> tuple[np.ndarray, float]:
@@ -167,10 +187,10 @@ def _reserve(descriptor: int, size: int) -> None:
 
 
 def _drop_others(folder: Path, key: str) -> None:
-    """Remove the stacks of earlier inputs."""
+    """Remove the stacks of earlier inputs, aligned ones or unaligned ones as this one is."""
     for index in folder.glob("stack-*.json"):
         old = index.stem.removeprefix("stack-")
-        if old != key:
+        if old != key and old.startswith(ALIGNED) == key.startswith(ALIGNED):
             _remove(folder, old)
 
 

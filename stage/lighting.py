@@ -1,23 +1,16 @@
-"""The distant lights of a capture as arrays, and whether they can determine a normal."""
-
-from typing import NamedTuple
+"""The lights of a capture as arrays, and whether they can determine a normal."""
 
 import numpy as np
 
 from stage.capture import SOURCES, Capture
 from stage.errors import ManifestError
-from stage.light import DistantLight, GradientLight
+from stage.extended_lights import ExtendedLights, extended_lights
+from stage.light import DistantLight, ExtendedLight, GradientLight, PointLight
 from stage.manifest import FILE_NAME
+from stage.point_lights import DistantLights, PlacedLights, place_lights
 
 MIN_SPREAD = 1e-3
 """Least ratio of the smallest to the largest singular value of the light directions: about 0.1° out of one plane."""
-
-
-class DistantLights(NamedTuple):
-    """One row a frame, in manifest order, as in the stack."""
-
-    direction: np.ndarray  # [lights, 3] float64, unit, from the surface to the light, camera frame
-    irradiance: np.ndarray  # [lights, 3] float64, relative
 
 
 def distant_lights(capture: Capture) -> DistantLights:
@@ -37,29 +30,49 @@ def distant_lights(capture: Capture) -> DistantLights:
     return DistantLights(np.array([light.direction for light in lights]), np.array([light.irradiance for light in lights]))
 
 
-def check_solvable(capture: Capture) -> DistantLights:
+def check_solvable(capture: Capture) -> DistantLights | PlacedLights | ExtendedLights:
     """Refuse a capture from which no normal can be solved.
 
     Returns:
-        Its distant lights.
+        Its lights: ExtendedLights where some are extended, PlacedLights where some are near, otherwise distant ones.
 
     Raises:
-        ManifestError: fewer than three lights, lights in one plane, an image of one pixel, a channel without light.
+        ManifestError: fewer than three lights, lights in one plane (near ones as seen from the object's centre), near lights
+            where none can be, an image of one pixel, a channel without light.
     """
     where = capture.folder / FILE_NAME
-    lights = distant_lights(capture)
+    if capture.lit_by(ExtendedLight):
+        check_surface(capture)
+        return extended_lights(capture)
+    near = bool(capture.lit_by(PointLight))
+    lights = place_lights(capture) if near else distant_lights(capture)
     count = len(lights.direction)
     if count < 3:
-        raise ManifestError(f"{where}: frames: {count} lit by a distant light: a normal needs three or more")
+        raise ManifestError(f"{where}: frames: {count} lit by a {'distant or point' if near else 'distant'} light: "
+                            "a normal needs three or more")
     spread = np.linalg.svd(lights.direction, compute_uv=False)
     if spread[2] < MIN_SPREAD * spread[0]:
-        raise ManifestError(f"{where}: frames[].light.direction: all {count} lights lie in one plane through the object: "
-                            "a normal needs lights out of it")
-    unlit = np.flatnonzero(~(lights.irradiance > 0).any(axis=0))
+        raise ManifestError(f"{where}: frames[].light.{'position_m' if near else 'direction'}: all {count} lights lie in one "
+                            "plane through the object: a normal needs lights out of it")
+    strength = lights.strength if isinstance(lights, PlacedLights) else lights.irradiance
+    unlit = np.flatnonzero(~(strength > 0).any(axis=0))
     if len(unlit):
-        raise ManifestError(f"{where}: frames[].light.irradiance: channel {'RGB'[unlit[0]]} is 0 for every light")
+        raise ManifestError(f"{where}: frames[].light.{'intensity' if near else 'irradiance'}: channel {'RGB'[unlit[0]]} is 0 "
+                            "for every light")
     check_surface(capture)
     return lights
+
+
+def lights_from_centre(capture: Capture) -> DistantLights:
+    """Every light as a distant one: near lights as the centre of the object sees them.
+
+    Raises:
+        ManifestError: as distant_lights, but point lights are taken too; near lights where none can be.
+    """
+    if not capture.lit_by(PointLight):
+        return distant_lights(capture)
+    placed = place_lights(capture)
+    return DistantLights(placed.direction, placed.irradiance)
 
 
 def check_surface(capture: Capture) -> None:

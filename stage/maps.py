@@ -17,6 +17,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], type[np.floating[Any]]]] = {
     "diffuse_albedo": (_RGB, np.float16),
     "specular": (_RGB, np.float16),
     "roughness": (("Y",), np.float16),
+    "regime": (("Y",), np.float16),
     "specular_normal": (_XYZ, np.float32),
     "height": (("Z",), np.float32),
     "confidence": (("Y",), np.float16),
@@ -35,6 +36,7 @@ class SurfaceMaps:
     diffuse_albedo: np.ndarray | None = None  # [rows, cols, 3] scene-linear, 0…1
     specular: np.ndarray | None = None  # [rows, cols, 3] F0, scene-linear, 0…1
     roughness: np.ndarray | None = None  # [rows, cols] 0…1, alpha = roughness²
+    regime: np.ndarray | None = None  # [rows, cols] 1 Lambertian, 2 glossy, 3 mirror, 4 mixture of diffuse and specular
     specular_normal: np.ndarray | None = None  # [rows, cols, 3] float32, unit, of the highlight; 0 where none was found
     height: np.ndarray | None = None  # [rows, cols] float32, camera-frame z; metres, or pixels without a scale
     confidence: np.ndarray | None = None  # [rows, cols] 0…1

@@ -2,14 +2,15 @@
 
 Layout of `stack-<key>.npy`: [channel, light padded to a multiple of 8, pixel padded to a multiple of 64] half. Each light has
 a power-of-two scale of its own, so that half covers it from its brightest value down 29 stops: radiance = stored · scale[light].
-Beside it `stack-<key>.saturated.npy` [light / 8, pixel] uint8 (bit l % 8, least significant first) where readings saturate, and
-`stack-<key>.json`. A padded light or pixel is 0.
+Beside it `stack-<key>.saturated.npy` [light / 8, pixel] uint8 (bit l % 8, least significant first) where there is no reading
+(it saturates, or alignment has none) and `stack-<key>.json`. A padded light or pixel is 0.
 """
 
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -39,6 +40,8 @@ class Stack:
     """Image name of each light, in manifest order."""
     scale: np.ndarray  # [lights padded] float32, radiance of a stored 1.0; 0 for padding
     pixel_count: int
+    motion: dict[str, Any] | None = None
+    """Of an aligned stack, how the subject moved, as the report says it."""
 
     @property
     def light_count(self) -> int:
@@ -95,8 +98,7 @@ class Stack:
             [3, lights padded, n] float16 and [lights padded / 8, n] uint8, copies.
         """
         values = self._map(values_path(self.folder, self.key), self.shape)[:, :, pixels]
-        bits = [self.saturated(position, position + 1)[:, 0] for position in pixels]
-        return np.ascontiguousarray(values), np.stack(bits, axis=1)
+        return np.ascontiguousarray(values), np.ascontiguousarray(self.saturated(0, self.shape[2])[:, pixels])
 
     def _map(self, path: Path, shape: tuple[int, ...]) -> np.ndarray:
         with storage("read", path):
@@ -128,7 +130,8 @@ def find(folder: Path, key: str) -> Stack | None:
     """The finished stack of this key, or None."""
     try:
         index = json.loads(index_path(folder, key).read_text(encoding="utf-8"))
-        found = Stack(folder, key, tuple(index["frames"]), np.array(index["scale"], dtype=np.float32), int(index["pixel_count"]))
+        found = Stack(folder, key, tuple(index["frames"]), np.array(index["scale"], dtype=np.float32), int(index["pixel_count"]),
+                      index.get("motion"))
     except (OSError, ValueError, KeyError, TypeError):  # a cache, and a damaged one: built again
         return None
     if not values_path(folder, key).exists():

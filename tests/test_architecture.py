@@ -66,7 +66,7 @@ def test_the_imports_are_read():
 
 
 @pytest.mark.parametrize(("floor", "allowed"), [
-    ("stage", {"stage", "numpy", "pydantic", "OpenEXR", "OpenImageIO"}),
+    ("stage", {"stage", "numpy", "pydantic", "OpenEXR", "OpenImageIO", "cv2"}),
     ("kernels", {"kernels", "numpy", "warp"}),
 ])
 def test_a_floor_knows_only_its_own_libraries(floor, allowed):
@@ -77,7 +77,7 @@ def test_a_floor_knows_only_its_own_libraries(floor, allowed):
 
 @pytest.mark.parametrize(("library", "home"), [
     ("pxr", "service.usd"), ("typer", "service.cli"), ("rich", "service.cli"),
-    ("fastapi", "service.api"), ("dbos", "service.jobs"),
+    ("fastapi", "service.api"), ("dbos", "service.jobs"), ("cv2", "stage.motion"),
 ])
 def test_a_library_lives_in_one_place(library, home):
     assert {i.importer for i in IMPORTS if top(i.target) == library and not under(i.importer, home)} == set()
@@ -145,7 +145,7 @@ def test_no_cycles():
 
 
 def test_the_command_line_starts_without_heavy_libraries():
-    heavy = "warp", "pxr", "OpenEXR", "OpenImageIO", "numpy", "pydantic"
+    heavy = "warp", "pxr", "OpenEXR", "OpenImageIO", "numpy", "pydantic", "cv2"
     code = f"import sys, service.cli.main; print([name for name in {heavy!r} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=HOME, timeout=60, check=True)
     assert done.stdout.strip() == "[]"

@@ -10,10 +10,11 @@ from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.packs import Band, as_packs, pack_type, scalars
 from kernels.photometric.lambert import NormalFit
+from kernels.photometric.near import Near, falloff_or_none, toward_or_none
 from kernels.photometric.readings import Lights, Readings
 
 
-def fit_albedo(band: Band, weights: Readings, fit: NormalFit, lights: Lights) -> wp.array:
+def fit_albedo(band: Band, weights: Readings, fit: NormalFit, lights: Lights, near: Near | None = None) -> wp.array:
     """Weighted least squares of radiance = ρ/π · E · n·l in each channel.
 
     Args:
@@ -21,6 +22,7 @@ def fit_albedo(band: Band, weights: Readings, fit: NormalFit, lights: Lights) ->
         weights: what the normal solver left in its readings: the weight of each light, 0…1.
         fit: the normals.
         lights: direction, irradiance and scale of each light.
+        near: directions and falloff per pixel, in place of the lights' directions, where some light is near.
 
     Returns:
         [3, pixels padded] float32 albedo ρ, scene-linear; 0 where there is no normal.
@@ -39,21 +41,24 @@ def fit_albedo(band: Band, weights: Readings, fit: NormalFit, lights: Lights) ->
     # E in stored units: radiance / scale = ρ/π · (E / scale) · n·l
     stored = np.divide(lights.irradiance, lights.scale[:, None], out=np.zeros_like(lights.irradiance),
                        where=lights.scale[:, None] > 0)
-    devices.launch(_albedo_kernel(devices.pack_width(device)), band.packs,
-                   [band.values, weights.values, weights.pack_stride, weights.light_stride, as_packs(fit.normal, device),
+    devices.launch(_albedo_kernel(devices.pack_width(device), near is not None), band.packs,
+                   [band.values, weights.values, toward_or_none(near, device), falloff_or_none(near, device),
+                    weights.pack_stride, weights.light_stride, as_packs(fit.normal, device),
                     wp.array(lights.direction, dtype=wp.vec3, device=device), wp.array(stored, dtype=wp.vec3, device=device)],
                    [as_packs(albedo, device)], device=device)
     return albedo
 
 
 @cache
-def _albedo_kernel(pack: int) -> Any:
+def _albedo_kernel(pack: int, near: bool = False) -> Any:
     half_pack, float_pack = pack_type(pack, wp.float16), pack_type(pack, wp.float32)
 
     @wp.kernel(enable_backward=False, module="unique")
     def albedo_kernel(first: int,
                       values: wp.array2d(dtype=half_pack),  # [3 · L, P] stored radiance
                       weights: wp.array(dtype=float_pack),  # [P · L]
+                      toward: wp.array2d(dtype=float_pack),  # [3, P · L] in place of directions, if near
+                      falloff: wp.array(dtype=float_pack),  # [P · L] irradiance here / irradiance of the light, if near
                       pack_stride: int,
                       light_stride: int,
                       normal: wp.array2d(dtype=float_pack),  # [3, P]
@@ -68,10 +73,19 @@ def _albedo_kernel(pack: int) -> Any:
         lights = directions.shape[0]
         for light in range(lights):
             red, green, blue = values[light, p], values[lights + light, p], values[2 * lights + light, p]
-            weight = weights[p * pack_stride + light * light_stride]
-            lx, ly, lz = directions[light][0], directions[light][1], directions[light][2]
+            at = p * pack_stride + light * light_stride
+            weight = weights[at]
+            if wp.static(near):
+                tx = toward[0, at]
+                ty = toward[1, at]
+                tz = toward[2, at]
+                part = falloff[at]
+            else:
+                lx, ly, lz = directions[light][0], directions[light][1], directions[light][2]
             er, eg, eb = irradiance[light][0], irradiance[light][1], irradiance[light][2]
             for k in range(pack):
+                if wp.static(near):
+                    lx, ly, lz = part[k] * tx[k], part[k] * ty[k], part[k] * tz[k]
                 cosine = wp.max(nx[k] * lx + ny[k] * ly + nz[k] * lz, 0.0)
                 r = er * weight[k] * cosine
                 g = eg * weight[k] * cosine

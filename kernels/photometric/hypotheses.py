@@ -1,9 +1,11 @@
-"""Normals by hypothesis and test: each candidate normal is judged by how well a non-negative mixture of lobes explains the readings.
+"""Normals by hypothesis and test: each candidate normal is judged by how well a non-negative mixture of lobes explains the
+readings.
 
-For a candidate the readings are expected to be Σ x_k f_k(l), x ≥ 0, with f_0 a diffuse lobe and the others GGX lobes of fixed widths.
-The mixture is fitted by re-weighted non-negative least squares with Cauchy weights relative to the noise σ = s0 + s1 · reading, and the candidate's cost is
-Σ log(1 + r²/σ²) over the lights. A light that reads far below its prediction is in cast shadow, which costs a fixed sum: any normal
-may be shadowed, none may be brighter than its lobes. Candidates are rings about the best normal so far, coarse to fine.
+For a candidate the readings are expected to be Σ x_k f_k(l), x ≥ 0, with f_0 a diffuse lobe and the others GGX lobes of fixed
+widths. The mixture is fitted by re-weighted non-negative least squares with Cauchy weights relative to the noise σ = s0 + s1 ·
+reading, and the candidate's cost is Σ log(1 + r²/σ²) over the lights. A light that reads far below its prediction is in cast
+shadow, which costs a fixed sum: any normal may be shadowed, none may be brighter than its lobes. Candidates are rings about the
+best normal so far, coarse to fine.
 
 Source: hypothesised normals after Hui and Sankaranarayanan, "Shape and spatially-varying reflectance estimation from virtual
 exemplars", TPAMI 2017; here with analytic lobes in place of measured materials, and robust.
@@ -19,17 +21,11 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
-from kernels.microfacet import diffuse, ggx, schlick
 from kernels.packs import pack_type
+from kernels.photometric.lobes import Lobes, direction_lobes
 from kernels.photometric.samples import Samples, per_pixel, to_host
+from kernels.photometric.tabulated_lobes import tabulated_lobes
 
-LOBES = (0.08, 0.15, 0.25, 0.4, 0.6)
-"""Widths α of the GGX lobes of the mixture: roughness 0.28 to 0.77, a factor of 1.5 to 2 apart, as wide as the lobes are."""
-MIXTURE = 1 + len(LOBES)
-MIXTURE_F0 = 0.04
-"""Reflectance at normal incidence whose Fresnel rise the lobes have; readings at grazing half vectors hardly tell it."""
-GEOMETRY = 2
-"""Scratch beside the lobes for each light: 1 / |l + v| and (1 - h·v)⁵."""
 SHADOW_TRUST = 0.1
 """Weight that a reading of zero, or far below its prediction, keeps in the fit: it bounds the radiance and hardly measures it."""
 LEAST_NZ = 0.02
@@ -76,6 +72,7 @@ class Search(NamedTuple):
     normal: np.ndarray  # [n, 3] float32, unit
     cost: np.ndarray  # [n] float32, per light
     curvature: np.ndarray  # [n] float32, mean rise of the cost over the last ring, per light
+    weights: np.ndarray  # [n, lobes] float32, of the mixture, for readings relative to the pixel's level
 
 
 def rings(degrees: tuple[float, ...], last_count: int) -> np.ndarray:
@@ -95,7 +92,7 @@ def rings(degrees: tuple[float, ...], last_count: int) -> np.ndarray:
 
 def search_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse,
                    options: SearchOptions | None = None, wide: tuple[tuple[float, ...], int] = WIDE,
-                   fine: tuple[tuple[tuple[float, ...], int], ...] = FINE) -> Search:
+                   fine: tuple[tuple[tuple[float, ...], int], ...] = FINE, table: wp.array | None = None) -> Search:
     """Search the normals of sampled pixels.
 
     Args:
@@ -104,6 +101,8 @@ def search_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse,
         shape: of the diffuse lobe.
         options: how candidates are judged.
         wide, fine: the rings.
+        table: [cells, lights, lobes] of response_table.search_table or a reference_table, in place of the samples' directions;
+            its diffuse lobe is what it is, whatever the shape.
 
     Returns:
         The best candidates. Waits for the device.
@@ -114,12 +113,17 @@ def search_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse,
     options = options or SearchOptions()
     if start.shape != (samples.pixel_count, 3):
         raise ArrayError(f"start is {start.shape}: give one normal for each of the {samples.pixel_count} pixels")
+    if table is not None and table.shape[1] != samples.light_count:
+        raise ArrayError(f"table has {table.shape[1]} lights, the samples {samples.light_count}: tabulate those of the samples")
     device, lanes, packs, lights = samples.device, samples.lanes, samples.packs, samples.light_count
     lane_type = pack_type(lanes, wp.float32)
     normal = per_pixel(samples, start)
     cost = wp.empty(packs, dtype=lane_type, device=device)
     curvature = wp.empty(packs, dtype=lane_type, device=device)
-    held = MIXTURE + GEOMETRY
+    lobes = direction_lobes(lanes) if table is None else tabulated_lobes(lanes, table.shape[2])
+    held = lobes.held
+    weights = wp.empty((lobes.count, packs), dtype=lane_type, device=device)
+    table = wp.empty((0, 0, 0), dtype=wp.float32, device=device) if table is None else table
     scratch = wp.empty(packs * lights * held, dtype=lane_type, device=device)
     strides = (lights * held, 1) if device == "cpu" else (1, packs)
     noise = wp.vec2(options.noise_floor, options.noise_slope)
@@ -127,23 +131,25 @@ def search_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse,
     form = wp.vec2(shape.rough, shape.slope)
     for degrees, count in (wide, *fine):
         offsets = wp.array(rings(degrees, count), dtype=wp.vec4, device=device)
-        devices.launch(_search_kernel(lanes, options.reweightings, options.sweeps), packs,
-                       [samples.grey, samples.toward, samples.view, offsets, noise, shadow, form, lights, samples.pack_stride,
-                        samples.light_stride, *strides], [scratch, normal, cost, curvature], device=device)
-    return Search(to_host(samples, normal), to_host(samples, cost), to_host(samples, curvature))
+        devices.launch(_search_kernel(lanes, lobes, options.reweightings, options.sweeps), packs,
+                       [samples.grey, samples.toward, table, samples.view, offsets, noise, shadow, form, lights,
+                        samples.pack_stride, samples.light_stride, *strides],
+                       [scratch, normal, cost, curvature, weights], device=device)
+    return Search(to_host(samples, normal), to_host(samples, cost), to_host(samples, curvature), to_host(samples, weights))
 
 
 @cache
-def _search_kernel(lanes: int, reweightings: int, sweeps: int) -> Any:
+def _search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> Any:
     lane_type = pack_type(lanes, wp.float32)
-    coefficients = wp.types.matrix(shape=(MIXTURE, lanes), dtype=wp.float32)
-    gram = wp.types.matrix(shape=(MIXTURE * (MIXTURE + 1) // 2, lanes), dtype=wp.float32)
-    widths = wp.types.vector(length=len(LOBES), dtype=wp.float32)
+    mixture, held, relaxation, prepare, fill = lobes
+    coefficients = wp.types.matrix(shape=(mixture, lanes), dtype=wp.float32)
+    gram = wp.types.matrix(shape=(mixture * (mixture + 1) // 2, lanes), dtype=wp.float32)
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
     def search_kernel(first: int,
                       grey: wp.array(dtype=lane_type),  # [P · L] readings / level
                       toward: wp.array2d(dtype=lane_type),  # [3, P · L]
+                      table: wp.array3d(dtype=float),  # [cells, L, lobes]
                       view: wp.array2d(dtype=lane_type),  # [3, P]
                       offsets: wp.array(dtype=wp.vec4),  # [candidates]
                       noise: wp.vec2,  # s0, s1
@@ -155,30 +161,21 @@ def _search_kernel(lanes: int, reweightings: int, sweeps: int) -> Any:
                       scratch_pack: int,
                       scratch_step: int,
                       # outputs
-                      scratch: wp.array(dtype=lane_type),  # [P · L · (lobes + 2)]
+                      scratch: wp.array(dtype=lane_type),  # [P · L · held]
                       normal: wp.array2d(dtype=lane_type),  # [3, P] in: start, out: best
                       cost: wp.array(dtype=lane_type),  # [P]
-                      curvature: wp.array(dtype=lane_type)):  # [P]
+                      curvature: wp.array(dtype=lane_type),  # [P]
+                      weights: wp.array2d(dtype=lane_type)):  # [lobes, P]
         p = first + wp.tid()
-        alphas = widths(wp.static(LOBES[0]), wp.static(LOBES[1]), wp.static(LOBES[2]), wp.static(LOBES[3]), wp.static(LOBES[4]))
         vx, vy, vz = view[0, p], view[1, p], view[2, p]
+        start = p * pack_stride
         base = p * scratch_pack
-        # what depends on light and view alone
-        for light in range(light_count):
-            at = base + light * wp.static(MIXTURE + GEOMETRY) * scratch_step
-            element = p * pack_stride + light * light_stride
-            wx, wy, wz = toward[0, element], toward[1, element], toward[2, element]
-            inverse, rise = lane_type(), lane_type()
-            for k in range(lanes):
-                lv = wx[k] * vx[k] + wy[k] * vy[k] + wz[k] * vz[k]
-                inverse[k] = 1.0 / wp.sqrt(wp.max(2.0 + 2.0 * lv, 1.0e-6))
-                rise[k] = schlick(wp.sqrt(wp.max(0.5 + 0.5 * lv, 0.0)))
-            scratch[at + wp.static(MIXTURE) * scratch_step] = inverse
-            scratch[at + wp.static(MIXTURE + 1) * scratch_step] = rise
+        prepare(toward, vx, vy, vz, start, light_count, light_stride, base, scratch_step, scratch)
         # tangent frame about the start
         cx, cy, cz = normal[0, p], normal[1, p], normal[2, p]
         tx, ty, tz, ux, uy, uz = lane_type(), lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
         best, bx, by, bz, centre, ring = lane_type(), lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
+        found = coefficients()
         for k in range(lanes):
             n = wp.vec3(cx[k], cy[k], cz[k])
             up = wp.where(wp.abs(n[2]) < 0.9, wp.vec3(0.0, 0.0, 1.0), wp.vec3(1.0, 0.0, 0.0))
@@ -194,7 +191,7 @@ def _search_kernel(lanes: int, reweightings: int, sweeps: int) -> Any:
 
         for candidate in range(offsets.shape[0]):
             o = offsets[candidate]
-            nx, ny, nz, nv = lane_type(), lane_type(), lane_type(), lane_type()
+            nx, ny, nz = lane_type(), lane_type(), lane_type()
             for k in range(lanes):
                 x = o[1] * cx[k] + o[0] * (o[2] * tx[k] + o[3] * ux[k])
                 y = o[1] * cy[k] + o[0] * (o[2] * ty[k] + o[3] * uy[k])
@@ -208,27 +205,7 @@ def _search_kernel(lanes: int, reweightings: int, sweeps: int) -> Any:
                 nx[k] = x * scale
                 ny[k] = y * scale
                 nz[k] = z * scale
-                nv[k] = nx[k] * vx[k] + ny[k] * vy[k] + nz[k] * vz[k]
-            # the lobes at this candidate
-            for light in range(light_count):
-                reading_at = p * pack_stride + light * light_stride
-                lx, ly, lz = toward[0, reading_at], toward[1, reading_at], toward[2, reading_at]
-                at = base + light * wp.static(MIXTURE + GEOMETRY) * scratch_step
-                inverse = scratch[at + wp.static(MIXTURE) * scratch_step]
-                rise = scratch[at + wp.static(MIXTURE + 1) * scratch_step]
-                nl, nh, fresnel, lobe = lane_type(), lane_type(), lane_type(), lane_type()
-                for k in range(lanes):
-                    cosine = nx[k] * lx[k] + ny[k] * ly[k] + nz[k] * lz[k]
-                    nl[k] = wp.max(cosine, 0.0)
-                    nh[k] = (cosine + nv[k]) * inverse[k]
-                    fresnel[k] = wp.static(0.1 / MIXTURE_F0) * (MIXTURE_F0 + (1.0 - MIXTURE_F0) * rise[k])
-                    lobe[k] = diffuse(nl[k], nv[k], 0.25 / (inverse[k] * inverse[k]), form[0], form[1])
-                scratch[at] = lobe
-                for a in range(wp.static(len(LOBES))):
-                    width = alphas[a]
-                    for k in range(lanes):
-                        lobe[k] = fresnel[k] * ggx(nl[k], nv[k], nh[k], width)
-                    scratch[at + (1 + a) * scratch_step] = lobe
+            fill(toward, table, form, nx, ny, nz, vx, vy, vz, start, light_count, light_stride, base, scratch_step, scratch)
             # the robust non-negative mixture
             x_best = coefficients()
             total = lane_type()
@@ -237,10 +214,10 @@ def _search_kernel(lanes: int, reweightings: int, sweeps: int) -> Any:
                 r = coefficients()
                 total = lane_type()
                 for light in range(light_count):
-                    at = base + light * wp.static(MIXTURE + GEOMETRY) * scratch_step
-                    reading = grey[p * pack_stride + light * light_stride]
+                    at = base + light * held * scratch_step
+                    reading = grey[start + light * light_stride]
                     predicted, w = lane_type(), lane_type()
-                    for a in range(wp.static(MIXTURE)):
+                    for a in range(mixture):
                         f = scratch[at + a * scratch_step]
                         for k in range(lanes):
                             predicted[k] += f[k] * x_best[a, k]
@@ -258,7 +235,7 @@ def _search_kernel(lanes: int, reweightings: int, sweeps: int) -> Any:
                         for k in range(lanes):
                             total[k] += wp.log(1.0 + predicted[k])
                     if turn < reweightings:
-                        for a in range(wp.static(MIXTURE)):
+                        for a in range(mixture):
                             f = scratch[at + a * scratch_step]
                             wf = lane_type()
                             for k in range(lanes):
@@ -270,17 +247,20 @@ def _search_kernel(lanes: int, reweightings: int, sweeps: int) -> Any:
                                     g[a * (a + 1) / 2 + b, k] += wf[k] * h[k]
                 if turn < reweightings:
                     for _ in range(sweeps):
-                        for a in range(wp.static(MIXTURE)):
+                        for a in range(mixture):
                             for k in range(lanes):
                                 rest = r[a, k]
-                                for b in range(wp.static(MIXTURE)):
+                                for b in range(mixture):
                                     high = wp.max(a, b)
                                     rest -= g[high * (high + 1) / 2 + wp.min(a, b), k] * x_best[b, k]
-                                x_best[a, k] = wp.max(x_best[a, k] + rest / (g[a * (a + 1) / 2 + a, k] + 1.0e-8), 0.0)
+                                move = relaxation * rest / (g[a * (a + 1) / 2 + a, k] + 1.0e-8)
+                                x_best[a, k] = wp.max(x_best[a, k] + move, 0.0)
             for k in range(lanes):
                 ring[k] += wp.where(candidate > 0, total[k], 0.0)
                 centre[k] = wp.where(candidate == 0, total[k], centre[k])
                 better = total[k] < best[k]
+                for a in range(mixture):
+                    found[a, k] = wp.where(better, x_best[a, k], found[a, k])
                 best[k] = wp.where(better, total[k], best[k])
                 bx[k] = wp.where(better, nx[k], bx[k])
                 by[k] = wp.where(better, ny[k], by[k])
@@ -294,5 +274,9 @@ def _search_kernel(lanes: int, reweightings: int, sweeps: int) -> Any:
             bend[k] = (ring[k] / wp.max(float(offsets.shape[0] - 1), 1.0) - best[k]) / float(light_count)
         cost[p] = share
         curvature[p] = bend
+        for a in range(mixture):
+            for k in range(lanes):
+                share[k] = found[a, k]
+            weights[a, p] = share
 
     return search_kernel

@@ -10,6 +10,7 @@ from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.packs import Band, as_packs, pack_type, scalars
 from kernels.photometric.least_squares import confidence_of, fit_pixel, symmetric
+from kernels.photometric.near import Near, toward_or_none
 from kernels.photometric.readings import Readings
 from kernels.status import OK
 
@@ -23,13 +24,14 @@ class NormalFit(NamedTuple):
     status: wp.array  # [pixels] int32, kernels.status.Status
 
 
-def solve_lambert(band: Band, readings: Readings, directions: np.ndarray) -> NormalFit:
+def solve_lambert(band: Band, readings: Readings, directions: np.ndarray, near: Near | None = None) -> NormalFit:
     """Least squares on every light with a reading above zero.
 
     Args:
         band: the stack on the device.
         readings: its grey readings; on return each holds the weight that the light had in the fit: 1 or 0.
         directions: [lights, 3] unit, from the surface to the light; padding is ignored.
+        near: directions and falloff per pixel, in place of `directions`, where some light is near.
 
     Returns:
         Normals on the device; not synchronised on CUDA.
@@ -40,10 +42,10 @@ def solve_lambert(band: Band, readings: Readings, directions: np.ndarray) -> Nor
     Source:
         Woodham, "Photometric method for determining surface orientation from multiple images", Optical Engineering 1980.
     """
-    return run_normal_kernel(_lambert_kernel, band, readings, directions)
+    return run_normal_kernel(_lambert_kernel, band, readings, directions, near)
 
 
-def run_normal_kernel(make: Any, band: Band, readings: Readings, directions: np.ndarray) -> NormalFit:
+def run_normal_kernel(make: Any, band: Band, readings: Readings, directions: np.ndarray, near: Near | None) -> NormalFit:
     """Launch a kernel that turns readings into normals; shared by the solvers that differ in the kernel alone."""
     if directions.shape != (band.light_count, 3):
         raise ArrayError(f"directions are {directions.shape}, the band has {band.light_count} lights: give a row for each")
@@ -52,19 +54,20 @@ def run_normal_kernel(make: Any, band: Band, readings: Readings, directions: np.
                     scalars(band.pixel_count, None, wp.float32, band.device),
                     scalars(band.pixel_count, None, wp.int32, band.device))
     lights = wp.array(np.ascontiguousarray(directions, dtype=np.float32), dtype=wp.vec3, device=band.device)
-    devices.launch(make(devices.pack_width(band.device)), band.packs,
-                   [lights, readings.pack_stride, readings.light_stride],
+    devices.launch(make(devices.pack_width(band.device), near is not None), band.packs,
+                   [lights, toward_or_none(near, band.device), readings.pack_stride, readings.light_stride],
                    [readings.values, *(as_packs(array, band.device) for array in fit)], device=band.device)
     return fit
 
 
 @cache
-def _lambert_kernel(pack: int) -> Any:
+def _lambert_kernel(pack: int, near: bool = False) -> Any:
     float_pack, int_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32)
 
     @wp.kernel(enable_backward=False, module="unique")
     def lambert_kernel(first: int,
                        lights: wp.array(dtype=wp.vec3),  # [L]
+                       toward: wp.array2d(dtype=float_pack),  # [3, P · L] in place of lights, if near
                        pack_stride: int,
                        light_stride: int,
                        # outputs
@@ -80,8 +83,15 @@ def _lambert_kernel(pack: int) -> Any:
             at = p * pack_stride + light * light_stride
             y = readings[at]
             weight = float_pack()
-            lx, ly, lz = lights[light][0], lights[light][1], lights[light][2]
+            if wp.static(near):
+                tx = toward[0, at]
+                ty = toward[1, at]
+                tz = toward[2, at]
+            else:
+                lx, ly, lz = lights[light][0], lights[light][1], lights[light][2]
             for k in range(pack):
+                if wp.static(near):
+                    lx, ly, lz = tx[k], ty[k], tz[k]
                 w = wp.where(y[k] > 0.0, 1.0, 0.0)
                 weight[k] = w
                 count[k] += w

@@ -1,8 +1,8 @@
 """Material of pixels with known normals: diffuse albedo, F0 and roughness of the contract's BRDF, by a search over roughness.
 
-For each roughness the readings of a channel are linear in albedo ρ and F0: y = ρ f_d + F0 (1 - s) f_s + s f_s, with f_d the diffuse
-lobe, f_s the GGX lobe without Fresnel and s Schlick's rise; both are fitted by re-weighted non-negative least squares, three channels
-on their own. The roughness of least cost is taken from a grid and halved steps about its best.
+For each roughness the readings of a channel are linear in albedo ρ and F0: y = ρ f_d + F0 (1 - s) f_s + s f_s, with f_d the
+diffuse lobe, f_s the GGX lobe without Fresnel and s Schlick's rise; both are fitted by re-weighted non-negative least squares,
+three channels on their own. The roughness of least cost is taken from a grid and halved steps about its best.
 """
 
 import math
@@ -13,10 +13,13 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
-from kernels.microfacet import INVERSE_PI, diffuse, ggx, schlick
+from kernels.errors import ArrayError
 from kernels.packs import pack_type
 from kernels.photometric.hypotheses import SHADOW_TRUST, Diffuse, SearchOptions
+from kernels.photometric.lobes import Reflectance, direction_reflectance
+from kernels.photometric.response_table import COLUMNS
 from kernels.photometric.samples import Samples, per_pixel, to_host
+from kernels.photometric.tabulated_lobes import tabulated_reflectance
 
 ROUGHNESS_FIRST, ROUGHNESS_STEP, ROUGHNESS_COUNT = 0.1, 0.075, 13
 """Grid of roughness, 0.1 to 1; below 0.1 a lobe is narrower than lights of any rig are apart."""
@@ -32,10 +35,11 @@ class Material(NamedTuple):
     diffuse_albedo: np.ndarray  # [n, 3] float32
     specular: np.ndarray  # [n, 3] float32, F0, 0…1
     roughness: np.ndarray  # [n] float32
+    cost: np.ndarray  # [n] float32, per light, as of the search
 
 
 def fit_material(samples: Samples, normal: np.ndarray, *, shape: Diffuse,
-                 options: SearchOptions | None = None) -> Material:
+                 options: SearchOptions | None = None, table: wp.array | None = None) -> Material:
     """Fit the material of sampled pixels.
 
     Args:
@@ -43,34 +47,49 @@ def fit_material(samples: Samples, normal: np.ndarray, *, shape: Diffuse,
         normal: [n, 3] unit normals.
         shape: of the diffuse lobe.
         options: noise and shadows, as in the search.
+        table: of response_table, for lights that are not of one direction each; its diffuse lobe is Lambert's whatever the shape.
 
     Returns:
-        The materials. The albedo is that of the Lambertian lobe closest to the fitted diffuse lobe under the capture's lights, so that
-        an asset renders as fitted. Waits for the device.
+        The materials. The albedo is that of the Lambertian lobe closest to the fitted diffuse lobe under the capture's lights, so
+        that an asset renders as fitted. With a table a surface without any specular lobe is a candidate too, because lights
+        behind the rim tell it from one of F0 = 0, whose Fresnel rise shines there; it has F0 = 0 and roughness 1.
+        Waits for the device.
+
+    Raises:
+        ArrayError: a table of other lights.
     """
     options = options or SearchOptions()
+    if table is not None and table.shape[1:] != (samples.light_count, COLUMNS):
+        raise ArrayError(f"table is {table.shape}, the samples have {samples.light_count} lights: give their response table")
     device, lanes, packs = samples.device, samples.lanes, samples.packs
     lane_type = pack_type(lanes, wp.float32)
-    fitted = wp.empty((7, packs), dtype=lane_type, device=device)
-    devices.launch(_material_kernel(lanes), packs,
-                   [samples.colour, samples.toward, samples.level, samples.view, per_pixel(samples, normal),
+    reflectance = direction_reflectance(lanes) if table is None else tabulated_reflectance(lanes)
+    fitted = wp.empty((8, packs), dtype=lane_type, device=device)
+    responses = wp.empty((0, 0, 0), dtype=wp.float32, device=device) if table is None else table
+    devices.launch(_material_kernel(lanes, reflectance, table is not None), packs,
+                   [samples.colour, samples.toward, responses, samples.level, samples.view, per_pixel(samples, normal),
                     wp.vec2(options.noise_floor, options.noise_slope),
                     wp.vec2(math.expm1(options.shadow_cost), options.shadow_depth),
-                    wp.vec2(shape.rough, shape.slope), samples.light_count, samples.pack_stride, samples.light_stride], [fitted], device=device)
+                    wp.vec2(shape.rough, shape.slope), samples.light_count, samples.pack_stride, samples.light_stride],
+                   [fitted], device=device)
     values = to_host(samples, fitted)
-    return Material(values[:, :3], values[:, 3:6], values[:, 6])
+    return Material(values[:, :3], values[:, 3:6], np.where(values[:, 6] > 0, values[:, 6], 1).astype(np.float32),
+                    values[:, 7] / samples.light_count)
 
 
 @cache
-def _material_kernel(lanes: int) -> Any:
+def _material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
+    respond, lambertian = reflectance
     lane_type = pack_type(lanes, wp.float32)
     channels = wp.types.matrix(shape=(3, lanes), dtype=wp.float32)
-    trials = ROUGHNESS_COUNT + 2 * HALVINGS
+    bare_trials = int(bare)
+    trials = bare_trials + ROUGHNESS_COUNT + 2 * HALVINGS
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
     def material_kernel(first: int,
                         colour: wp.array2d(dtype=lane_type),  # [3, P · L] radiance / irradiance
                         toward: wp.array2d(dtype=lane_type),  # [3, P · L]
+                        table: wp.array3d(dtype=float),  # [cells, L, columns]
                         level: wp.array(dtype=lane_type),  # [P]
                         view: wp.array2d(dtype=lane_type),  # [3, P]
                         normal: wp.array2d(dtype=lane_type),  # [3, P]
@@ -81,27 +100,27 @@ def _material_kernel(lanes: int) -> Any:
                         pack_stride: int,
                         light_stride: int,
                         # outputs
-                        fitted: wp.array2d(dtype=lane_type)):  # [7, P] albedo, F0, roughness
+                        fitted: wp.array2d(dtype=lane_type)):  # [8, P] albedo, F0, roughness, cost
         p = first + wp.tid()
         vx, vy, vz = view[0, p], view[1, p], view[2, p]
         nx, ny, nz = normal[0, p], normal[1, p], normal[2, p]
         bright = level[p]
-        best_cost, best_rough, nv = lane_type(), lane_type(), lane_type()
+        best_cost, best_rough = lane_type(), lane_type()
         best_rho, best_f0 = channels(), channels()
         for k in range(lanes):
             best_cost[k] = 1.0e30
-            nv[k] = wp.max(nx[k] * vx[k] + ny[k] * vy[k] + nz[k] * vz[k], 1.0e-3)
         step = float(ROUGHNESS_STEP)
         for trial in range(trials):
-            # the grid, then two trials a halving on either side of the best
-            late = trial - ROUGHNESS_COUNT
+            # no lobe at all where that is a candidate, the grid, then two trials a halving on either side of the best
+            grid = trial - bare_trials
+            late = grid - ROUGHNESS_COUNT
             if late >= 0 and late % 2 == 0:
                 step = step * 0.5
             rough = lane_type()
             for k in range(lanes):
                 side = wp.where(late % 2 == 0, step, -step)
                 around = wp.clamp(best_rough[k] + side, wp.static(0.5 * ROUGHNESS_FIRST), 1.0)
-                rough[k] = wp.where(late < 0, ROUGHNESS_FIRST + ROUGHNESS_STEP * float(trial), around)
+                rough[k] = wp.where(late < 0, wp.where(grid < 0, 0.0, ROUGHNESS_FIRST + ROUGHNESS_STEP * float(grid)), around)
             rho, f0 = channels(), channels()
             cost = lane_type()
             for turn in range(wp.static(REWEIGHTINGS + 1)):
@@ -109,19 +128,7 @@ def _material_kernel(lanes: int) -> Any:
                 cost = lane_type()
                 for light in range(light_count):
                     at = p * pack_stride + light * light_stride
-                    lx, ly, lz = toward[0, at], toward[1, at], toward[2, at]
-                    fd, fs, fixed = lane_type(), lane_type(), lane_type()
-                    for k in range(lanes):
-                        lv = lx[k] * vx[k] + ly[k] * vy[k] + lz[k] * vz[k]
-                        hv2 = wp.max(0.5 + 0.5 * lv, 2.5e-7)
-                        cosine = nx[k] * lx[k] + ny[k] * ly[k] + nz[k] * lz[k]
-                        nl = wp.max(cosine, 0.0)
-                        nh = (cosine + nv[k]) * 0.5 / wp.sqrt(hv2)
-                        rise = schlick(wp.sqrt(hv2))
-                        lobe = ggx(nl, nv[k], nh, rough[k] * rough[k])
-                        fd[k] = INVERSE_PI * diffuse(nl, nv[k], hv2, form[0], form[1])
-                        fs[k] = (1.0 - rise) * lobe
-                        fixed[k] = rise * lobe
+                    fd, fs, fixed = respond(toward, table, form, nx, ny, nz, vx, vy, vz, rough, at, light)
                     # one weight a light for all channels: a shadow is one in each of them
                     off2, shining, expected, w = lane_type(), lane_type(), lane_type(), lane_type()
                     for c in range(3):
@@ -176,24 +183,16 @@ def _material_kernel(lanes: int) -> Any:
                 for c in range(3):
                     best_rho[c, k] = wp.where(better, rho[c, k], best_rho[c, k])
                     best_f0[c, k] = wp.where(better, f0[c, k], best_f0[c, k])
-        # the Lambertian lobe closest to the diffuse one under these lights
-        above, below = lane_type(), lane_type()
-        for light in range(light_count):
-            at = p * pack_stride + light * light_stride
-            wx, wy, wz = toward[0, at], toward[1, at], toward[2, at]
-            for k in range(lanes):
-                lv = wx[k] * vx[k] + wy[k] * vy[k] + wz[k] * vz[k]
-                nl = wp.max(nx[k] * wx[k] + ny[k] * wy[k] + nz[k] * wz[k], 0.0)
-                above[k] += nl * diffuse(nl, nv[k], wp.max(0.5 + 0.5 * lv, 0.0), form[0], form[1])
-                below[k] += nl * nl
+        closest = lambertian(toward, form, nx, ny, nz, vx, vy, vz, p * pack_stride, light_count, light_stride)
         for c in range(3):
             out = lane_type()
             for k in range(lanes):
-                out[k] = best_rho[c, k] * above[k] / wp.max(below[k], 1.0e-20)
+                out[k] = best_rho[c, k] * closest[k]
             fitted[c, p] = out
             for k in range(lanes):
                 out[k] = best_f0[c, k]
             fitted[3 + c, p] = out
         fitted[6, p] = best_rough
+        fitted[7, p] = best_cost
 
     return material_kernel

@@ -63,13 +63,11 @@ def pad_lights(direction: np.ndarray, irradiance: np.ndarray, scale: np.ndarray 
     return Lights(np.pad(direction, extra), np.pad(irradiance, extra), padded_scale)
 
 
-def grey_factors(lights: Lights, grey_weights: tuple[float, float, float]) -> np.ndarray:
-    """What each stored channel is multiplied by to give the grey reading.
-
-    Only channels that every light reaches are used, so that readings of differently coloured lights compare.
+def channel_weights(lights: Lights, grey_weights: tuple[float, float, float]) -> np.ndarray:
+    """The grey weights of the channels that every light reaches, summing to 1: readings of differently coloured lights compare.
 
     Returns:
-        [lights, 3] float32; 0 for padding.
+        [3] float64.
 
     Raises:
         ArrayError: no channel is lit by every light.
@@ -79,9 +77,22 @@ def grey_factors(lights: Lights, grey_weights: tuple[float, float, float]) -> np
     if not common.any():
         raise ArrayError("no channel is lit by every light: grey readings of red, green and blue lights do not compare")
     weights = np.where(common, grey_weights, 0)
-    weights = weights / weights.sum()
+    return weights / weights.sum()
+
+
+def grey_factors(lights: Lights, grey_weights: tuple[float, float, float]) -> np.ndarray:
+    """What each stored channel is multiplied by to give the grey reading, with channel_weights.
+
+    Returns:
+        [lights, 3] float32; 0 for padding.
+
+    Raises:
+        ArrayError: no channel is lit by every light.
+    """
+    weights = channel_weights(lights, grey_weights)
+    real = lights.irradiance.any(axis=1)
     factors = np.zeros_like(lights.irradiance)
-    factors[real] = np.divide(weights, lights.irradiance[real], out=np.zeros_like(factors[real]), where=common)
+    factors[real] = np.divide(weights, lights.irradiance[real], out=np.zeros_like(factors[real]), where=weights > 0)
     return factors * lights.scale[:, None]
 
 

@@ -18,6 +18,7 @@ import warp as wp
 from kernels.packs import Band, pack_type
 from kernels.photometric.lambert import NormalFit, run_normal_kernel
 from kernels.photometric.least_squares import confidence_of, fit_pixel, symmetric
+from kernels.photometric.near import Near
 from kernels.photometric.readings import Readings
 from kernels.status import OK
 
@@ -43,13 +44,14 @@ BISECTIONS = 18
 """Steps in all; the others halve the difference, and find the value to 10⁻⁴ of itself, under the rounding of half values."""
 
 
-def solve_robust(band: Band, readings: Readings, directions: np.ndarray) -> NormalFit:
+def solve_robust(band: Band, readings: Readings, directions: np.ndarray, near: Near | None = None) -> NormalFit:
     """Normals from the lights that, at each pixel, are neither shadow nor highlight.
 
     Args:
         band: the stack on the device.
         readings: its grey readings; on return each holds the weight, 0…1, that the light had in the fit.
         directions: [lights, 3] unit, from the surface to the light; padding is ignored.
+        near: directions and falloff per pixel, in place of `directions`, where some light is near.
 
     Returns:
         Normals on the device; not synchronised on CUDA.
@@ -57,7 +59,7 @@ def solve_robust(band: Band, readings: Readings, directions: np.ndarray) -> Norm
     Raises:
         ArrayError: directions do not match the band.
     """
-    return run_normal_kernel(_robust_kernel, band, readings, directions)
+    return run_normal_kernel(_robust_kernel, band, readings, directions, near)
 
 
 @wp.func
@@ -67,12 +69,13 @@ def _between(low: float, high: float, step: int) -> float:
 
 
 @cache
-def _robust_kernel(pack: int) -> Any:
+def _robust_kernel(pack: int, near: bool = False) -> Any:
     float_pack, int_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32)
 
     @wp.kernel(enable_backward=False, module="unique")
     def robust_kernel(first: int,
                       lights: wp.array(dtype=wp.vec3),  # [L]
+                      toward: wp.array2d(dtype=float_pack),  # [3, P · L] in place of lights, if near
                       pack_stride: int,
                       light_stride: int,
                       # outputs
@@ -158,9 +161,17 @@ def _robust_kernel(pack: int) -> Any:
             xx, xy, xz, yy, yz, zz = float_pack(), float_pack(), float_pack(), float_pack(), float_pack(), float_pack()
             rx, ry, rz, squares, count = float_pack(), float_pack(), float_pack(), float_pack(), float_pack()
             for light in range(light_count):
-                y = readings[start + light * light_stride]
-                lx, ly, lz = lights[light][0], lights[light][1], lights[light][2]
+                at = start + light * light_stride
+                y = readings[at]
+                if wp.static(near):
+                    tx = toward[0, at]
+                    ty = toward[1, at]
+                    tz = toward[2, at]
+                else:
+                    lx, ly, lz = lights[light][0], lights[light][1], lights[light][2]
                 for k in range(pack):
+                    if wp.static(near):
+                        lx, ly, lz = tx[k], ty[k], tz[k]
                     off = (y[k] - (bx[k] * lx + by[k] * ly + bz[k] * lz)) / reach[k]
                     kept = wp.where(y[k] > dark_low[k], 1.0, 0.0) * wp.where(y[k] <= bright_high[k], 1.0, 0.0)
                     w = kept / (1.0 + off * off)
@@ -191,8 +202,15 @@ def _robust_kernel(pack: int) -> Any:
             at = start + light * light_stride
             y = readings[at]
             weight = float_pack()
-            lx, ly, lz = lights[light][0], lights[light][1], lights[light][2]
+            if wp.static(near):
+                tx = toward[0, at]
+                ty = toward[1, at]
+                tz = toward[2, at]
+            else:
+                lx, ly, lz = lights[light][0], lights[light][1], lights[light][2]
             for k in range(pack):
+                if wp.static(near):
+                    lx, ly, lz = tx[k], ty[k], tz[k]
                 off = (y[k] - (bx[k] * lx + by[k] * ly + bz[k] * lz)) / reach[k]
                 kept = wp.where(y[k] > dark_low[k], 1.0, 0.0) * wp.where(y[k] <= bright_high[k], 1.0, 0.0)
                 weight[k] = kept / (1.0 + off * off)

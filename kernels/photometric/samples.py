@@ -9,6 +9,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.packs import Band, pack_type
+from kernels.photometric.near import NearField, falloff, near_direction
 from kernels.photometric.readings import LARGEST, Lights
 
 LANES_CUDA = 1
@@ -42,7 +43,8 @@ def lanes_of(device: str) -> int:
     return devices.pack_width(device) if device == "cpu" else LANES_CUDA
 
 
-def gather(band: Band, pixels: np.ndarray, view: np.ndarray, lights: Lights, factors: np.ndarray, light_count: int) -> Samples:
+def gather(band: Band, pixels: np.ndarray, view: np.ndarray, lights: Lights, factors: np.ndarray, light_count: int,
+           field: NearField | None = None) -> Samples:
     """Gather the readings of some pixels of a band.
 
     Args:
@@ -52,17 +54,21 @@ def gather(band: Band, pixels: np.ndarray, view: np.ndarray, lights: Lights, fac
         lights: irradiance and scale of each light.
         factors: [lights, 3], of readings.grey_factors.
         light_count: lights without padding.
+        field: places of the lights and the points of these pixels, in place of the lights' directions, where some light is near.
 
     Returns:
         The samples on the device.
 
     Raises:
-        ArrayError: no pixel, or positions outside the band.
+        ArrayError: no pixel, positions outside the band, or a view or points for other pixels.
     """
     if len(pixels) == 0 or pixels.min() < 0 or pixels.max() >= band.pixel_count:
         raise ArrayError(f"pixels must be one or more positions from 0 to {band.pixel_count - 1}")
     if view.shape != (len(pixels), 3):
         raise ArrayError(f"view is {view.shape}, expected {(len(pixels), 3)}")
+    if field is not None and (field.points.shape != (3, len(pixels)) or len(field.places.place) != len(lights.direction)):
+        raise ArrayError(f"points are {field.points.shape} under {len(field.places.place)} padded lights, expected "
+                         f"{(3, len(pixels))} under {len(lights.direction)}")
     device, lanes = band.device, lanes_of(band.device)
     packs = -(-len(pixels) // lanes)
     last = len(pixels) - 1
@@ -81,10 +87,16 @@ def gather(band: Band, pixels: np.ndarray, view: np.ndarray, lights: Lights, fac
     per_channel = np.divide(lights.scale[:, None], lights.irradiance, out=np.zeros_like(lights.irradiance),
                             where=lights.irradiance > 0)
     where = wp.array(pixels[order].astype(np.int32), dtype=wp.int32, device=device)
-    devices.launch(_gather_kernel(lanes), packs,
+    if field is None:
+        near = (wp.empty(0, dtype=wp.vec4, device=device),) * 2 + (wp.empty((3, 0), dtype=float, device=device),)
+    else:
+        near = (wp.array(field.places.place, dtype=wp.vec4, device=device),
+                wp.array(field.places.lobe, dtype=wp.vec4, device=device),
+                wp.array(np.ascontiguousarray(field.points[:, order], dtype=np.float32), dtype=float, device=device))
+    devices.launch(_gather_kernel(lanes, field is not None), packs,
                    [flat, bits, where, wp.array(factors, dtype=wp.vec3, device=device),
                     wp.array(per_channel.astype(np.float32), dtype=wp.vec3, device=device),
-                    wp.array(lights.direction, dtype=wp.vec3, device=device), light_count, pack_stride, light_stride],
+                    wp.array(lights.direction, dtype=wp.vec3, device=device), *near, light_count, pack_stride, light_stride],
                    [grey, colour, toward, level], device=device)
     planes = np.ascontiguousarray(view[order].astype(np.float32).T).reshape(3, packs, lanes)
     return Samples(grey, colour, level, toward, wp.array(planes, dtype=lane_type, device=device), len(pixels), packs, light_count, lanes,
@@ -107,7 +119,7 @@ def to_host(samples: Samples, packs: wp.array) -> np.ndarray:
 
 
 @cache
-def _gather_kernel(lanes: int) -> Any:
+def _gather_kernel(lanes: int, near: bool = False) -> Any:
     lane_type = pack_type(lanes, wp.float32)
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
@@ -118,6 +130,9 @@ def _gather_kernel(lanes: int) -> Any:
                       grey_factors: wp.array(dtype=wp.vec3),  # [L padded]
                       channel_factors: wp.array(dtype=wp.vec3),  # [L padded]
                       directions: wp.array(dtype=wp.vec3),  # [L padded]
+                      places: wp.array(dtype=wp.vec4),  # [L padded], if near in place of directions
+                      lobes: wp.array(dtype=wp.vec4),  # [L padded], if near
+                      points: wp.array2d(dtype=float),  # [3, P · lanes], if near
                       light_count: int,
                       pack_stride: int,
                       light_stride: int,
@@ -132,20 +147,42 @@ def _gather_kernel(lanes: int) -> Any:
         for light in range(light_count):
             at = p * pack_stride + light * light_stride
             f, g, way = grey_factors[light], channel_factors[light], directions[light]
-            for c in range(3):
-                same = lane_type()
+            inverse = lane_type()  # 1 / falloff
+            if wp.static(near):
+                place = places[light]
+                tx, ty, tz = lane_type(), lane_type(), lane_type()
                 for k in range(lanes):
-                    same[k] = way[c]
-                toward[c, at] = same
+                    m = p * lanes + k
+                    near_way = near_direction(place, points[0, m], points[1, m], points[2, m])
+                    tx[k] = near_way[0]
+                    ty[k] = near_way[1]
+                    tz[k] = near_way[2]
+                    fall = falloff(place, lobes[light], points[0, m], points[1, m], points[2, m])
+                    inverse[k] = wp.where(fall > 0.0, 1.0 / wp.max(fall, 1.0e-30), 0.0)
+                toward[0, at] = tx
+                toward[1, at] = ty
+                toward[2, at] = tz
+            else:
+                for c in range(3):
+                    same = lane_type()
+                    for k in range(lanes):
+                        same[k] = way[c]
+                    toward[c, at] = same
             y, red, green, blue = lane_type(), lane_type(), lane_type(), lane_type()
             for k in range(lanes):
                 n = pixels[p * lanes + k]
                 r = float(values[light, n])
                 gr = float(values[padded + light, n])
                 b = float(values[2 * padded + light, n])
+                if wp.static(near):
+                    r = r * inverse[k]
+                    gr = gr * inverse[k]
+                    b = b * inverse[k]
                 sound = wp.where((int(saturated[light / 8, n]) >> (light % 8)) & 1 == 0, 1, 0)
                 value = f[0] * r + f[1] * gr + f[2] * b
                 sound = wp.where(value < LARGEST, sound, 0)  # 0 also for NaN
+                if wp.static(near):
+                    sound = wp.where(inverse[k] > 0.0, sound, 0)
                 y[k] = wp.where(sound == 1, wp.max(value, 0.0), -1.0)
                 red[k] = wp.where(sound == 1, wp.max(g[0] * r, 0.0), -1.0)
                 green[k] = wp.where(sound == 1, wp.max(g[1] * gr, 0.0), -1.0)

@@ -117,7 +117,8 @@ def grey_ball(
 
 def intensity(
     capture: CaptureArgument,
-    pixels: Annotated[int, typer.Option("--pixels", help="Of the mask, drawn at random, that take part.")] = 4000,
+    pixels: Annotated[int, typer.Option("--pixels", help="Of the mask, drawn at random, that take part.")] = 2000,
+    drop_failed: DropOption = False,
     apply_to: ApplyOption = None,
     out: OutOption = None,
 ) -> None:
@@ -126,8 +127,9 @@ def intensity(
     from service.cli.bar import Bar
     from service.pipelines.calibrate_object import intensity as run
 
+    request = IntensityRequest(capture=capture, pixels=pixels, drop_failed=drop_failed, apply_to=apply_to, out=out)
     with Bar() as bar:
-        result = run(IntensityRequest(capture=capture, pixels=pixels, apply_to=apply_to, out=out), bar)
+        result = run(request, bar)
     _show(result)
 
 

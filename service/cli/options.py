@@ -8,5 +8,10 @@ import typer
 CaptureArgument = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder with a capture.json.", show_default=False)]
 DeviceOption = Annotated[str | None, typer.Option("--device", help="cpu, cuda:0, …; without it the first CUDA device or the CPU.",
                                                   show_default=False)]
+AlignOption = Annotated[bool, typer.Option(
+    "--align", help="The subject moves: warp every frame to the time of the middle tracking frame (light type full). "
+                    "The mask belongs to that time.")]
+AlignToOption = Annotated[str | None, typer.Option(
+    "--align-to", metavar="IMAGE", help="Align, to the time of this tracking frame.", show_default=False)]
 CacheOption = Annotated[Path | None, typer.Option("--cache", help="Folder for the image stack; without it .relit in the capture.",
                                                   show_default=False)]

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli.options import CacheOption, CaptureArgument, DeviceOption
+from service.cli.options import AlignOption, AlignToOption, CacheOption, CaptureArgument, DeviceOption
 from service.methods import Method
 
 
@@ -22,8 +22,14 @@ def solve(
     method: Annotated[Method | None, typer.Option(
         "--method", show_default=False,
         help="lambert: least squares on every light; robust: without shadows and highlights; "
-             "svbrdf: with specular and roughness; gradient: from spherical gradient frames. "
+             "svbrdf: with specular and roughness; gradient: from spherical gradient frames; "
+             "reference: from a ball of the same material. "
              "Without it what the capture's frames allow.")] = None,
+    reference_ball: Annotated[Path | None, typer.Option(
+        "--reference-ball", metavar="CAPTURE", show_default=False,
+        help="A ball of the object's material under the same lights, for --method reference.")] = None,
+    align: AlignOption = False,
+    align_to: AlignToOption = None,
     device: DeviceOption = None,
     cache: CacheOption = None,
 ) -> None:
@@ -33,7 +39,8 @@ def solve(
     from service.requests import SolveRequest
 
     with Bar() as bar:
-        result = run(SolveRequest(capture=capture, out=out, method=method, device=device, cache=cache), bar)
+        result = run(SolveRequest(capture=capture, out=out, method=method, reference_ball=reference_ball, align=align,
+                                  align_to=align_to, device=device, cache=cache), bar)
     print(f"maps     {result.maps_path}")
     print(f"report   {result.report_path}")
     print(f"pixels   {', '.join(f'{count} {name}' for name, count in result.counts.items() if count)}")
@@ -46,6 +53,8 @@ def relight(
     frames: Annotated[str, typer.Option("--frames", help="A number, or first-last.")] = "1",
     spin_degrees: Annotated[float, typer.Option(
         "--spin-degrees", help="Turn of the environment about +y over the range, +z towards +x; frame one is unturned.")] = 0.0,
+    align: AlignOption = False,
+    align_to: AlignToOption = None,
     device: DeviceOption = None,
     cache: CacheOption = None,
 ) -> None:
@@ -55,11 +64,13 @@ def relight(
     from service.requests import RelightRequest
 
     request = RelightRequest(capture=capture, environment=environment, out=out, frames=frames, spin_degrees=spin_degrees,
-                             device=device, cache=cache)
+                             align=align, align_to=align_to, device=device, cache=cache)
     with Bar() as bar:
         result = run(request, bar)
     last = f" … {result.frames[-1].name}" if len(result.frames) > 1 else ""
     print(f"frames   {result.frames[0]}{last}")
+    if result.near_lights:
+        print(f"lights   {result.near_lights} near lights are taken as distant, as the object's centre sees them")
     if result.clipped:
         print(f"clipped  {result.clipped} pixels are brighter than half can hold and stand at its largest value")
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from service.calibrate_requests import IntensityRequest
-from service.pipelines.calibration_results import Calibration, Measured, digits, finish, open_captures, triple
+from service.pipelines.calibration_results import Calibration, Measured, digits, finish, kept, open_captures, triple
 from service.progress import Progress, Timings
 from stage.calibration.apply import with_brightness
 from stage.calibration.semi_calibrated import check_directions, fit_intensities
@@ -12,8 +12,8 @@ from stage.errors import CalibrationError, ManifestError
 from stage.light import DistantLight
 from stage.manifest import FILE_NAME
 
-BEHIND_Z = -0.35
-"""Flagged: a light more than 110° from the view axis, which the object shows at grazing angles only."""
+BEHIND_Z = -0.2
+"""Flagged: a light more than 101° from the view axis, which the object shows at grazing angles only."""
 
 
 def intensity(request: IntensityRequest, progress: Progress | None = None) -> Calibration:
@@ -51,13 +51,17 @@ def intensity(request: IntensityRequest, progress: Progress | None = None) -> Ca
         found = fit_intensities(readings, usable, directions)
     except CalibrationError as error:
         raise CalibrationError(f"{source.folder}: {error}") from error
-    results = []
+    results: list[Measured | CalibrationError] = []
     for lit, rgb, residual, sigma in zip(captures.lit, found.irradiance, found.residual, found.uncertainty, strict=True):
         assert isinstance(lit.light, DistantLight)
+        if np.isnan(rgb).any():
+            results.append(CalibrationError("too few pixels of the object are lit by this light to tell its brightness"))
+            continue
         flags = ["behind: seen at grazing angles only"] if lit.light.direction[2] < BEHIND_Z else []
         entry = {"irradiance": digits(rgb), "uncertainty": digits(sigma), "residual": digits(residual), "flags": flags}
         row = (triple(rgb), f"{100 * sigma.max():.2g} %", f"{residual.max():.3f}")
         results.append(Measured(with_brightness(lit.light, rgb), entry, row, float(sigma.max())))
     timings.close()
-    return finish("intensity", request, captures, results, headings=("irradiance", "sure to", "residual"),
+    measured = kept(captures, results, drop_failed=request.drop_failed)
+    return finish("intensity", request, captures, measured, headings=("irradiance", "sure to", "residual"),
                   summary={"pixels": found.pixels})

@@ -10,7 +10,7 @@ from kernels.photometric.highlight import fit_highlights, specular_normals
 from kernels.photometric.moments import Moments, fit_moments
 from kernels.photometric.separation import separate_by_colour, separate_polarised
 from kernels.status import Status
-from service.pipelines.normals import Solution
+from service.pipelines.solution import Solution
 from service.progress import Timings
 from stage.camera import Camera
 from stage.colour import GREY_WEIGHTS

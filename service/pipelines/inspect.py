@@ -18,6 +18,7 @@ from stage.gradients import gradient_frames, has_gradients
 from stage.light import DistantLight
 from stage.lighting import check_solvable
 from stage.manifest import Frame
+from stage.point_lights import PlacedLights
 
 
 class Inspection(NamedTuple):
@@ -51,12 +52,13 @@ def inspect(path: Path, progress: Progress | None = None) -> Inspection:
             timings.advance(len(levels))
     timings.close()
     faults = [level.fault for level in levels if level.fault is not None]
+    lights: object = None
     if capture.sources():
         try:
             if has_gradients(capture):
                 gradient_frames(capture)
             else:
-                check_solvable(capture)
+                lights = check_solvable(capture)
         except StageError as error:
             faults.append(str(error))
     facts = list(_facts(capture))
@@ -70,6 +72,8 @@ def inspect(path: Path, progress: Progress | None = None) -> Inspection:
         facts.append(("mask", f"{int(mask.sum())} of {mask.size} pixels"))
     except StageError as error:
         faults.append(str(error))
+    if isinstance(lights, PlacedLights):
+        facts.append(("near lights", _near(lights)))
     if not faults:
         try:
             Correction.of(capture)
@@ -96,6 +100,13 @@ def _facts(capture: Capture) -> Iterator[tuple[str, str]]:
         behind = int((directions[:, 2] < 0).sum())
         widest = np.degrees(np.arccos(np.clip(directions[:, 2].min(), -1, 1)))
         yield "lights", f"{len(directions)} distant, up to {widest:.0f} degrees from the view axis, {behind} behind the object"
+
+
+def _near(lights: PlacedLights) -> str:
+    """How many there are, and how far away."""
+    near = lights.place[:, 3] == 1
+    distance = np.linalg.norm(lights.place[near, :3] - lights.centre, axis=1)
+    return f"{int(near.sum())}, {distance.min():.3g} to {distance.max():.3g} m from the object's centre"
 
 
 def _kind(frame: Frame) -> str:

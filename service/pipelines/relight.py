@@ -24,7 +24,9 @@ from stage.colour import convert, linear_space
 from stage.errors import ImageError
 from stage.frames import rotation_about_y
 from stage.ingest import open_stack
-from stage.lighting import distant_lights
+from stage.light import PointLight
+from stage.lighting import lights_from_centre
+from stage.motion.tracking import tracking_frames
 from stage.stack import Stack
 
 CHUNK_BYTES = 512 << 20
@@ -41,6 +43,8 @@ class RelightResult(NamedTuple):
     frames: tuple[Path, ...]
     clipped: int
     """Pixels above the largest half value, stored as that value."""
+    near_lights: int
+    """Point lights that were taken as distant ones, as the object's centre sees them."""
 
 
 def relight(request: RelightRequest, progress: Progress | None = None) -> RelightResult:
@@ -61,7 +65,9 @@ def relight(request: RelightRequest, progress: Progress | None = None) -> Religh
     paths = [frame_path(request.out, number) for number in numbers]
     timings.stage("open", 1)
     capture = Capture.open(request.capture)
-    lights = distant_lights(capture)
+    lights = lights_from_centre(capture)
+    near = len(capture.lit_by(PointLight))
+    tracking = tracking_frames(capture, to=request.align_to) if request.aligned else None
     space = linear_space(capture.manifest.color_space)
     environment = read_environment(request.environment, space)
     inputs = {request.environment.resolve(), *(capture.file(name).resolve() for _, name in capture.files())}
@@ -69,7 +75,7 @@ def relight(request: RelightRequest, progress: Progress | None = None) -> Religh
         if path.resolve() in inputs:
             raise RequestError(f"--out {request.out}: {path} is an input: choose another folder or name")
     timings.stage("ingest", len(capture.sources()))
-    stack = open_stack(capture, cache=request.cache, progress=lambda done, _: timings.advance(done))
+    stack = open_stack(capture, cache=request.cache, tracking=tracking, progress=lambda done, _: timings.advance(done))
     timings.stage("weights", len(numbers))
     turns = [request.spin_degrees * i / len(numbers) for i in range(len(numbers))]
     weights = np.zeros((len(numbers), 3, stack.shape[1]), dtype=np.float32)
@@ -79,6 +85,8 @@ def relight(request: RelightRequest, progress: Progress | None = None) -> Religh
         timings.advance(index + 1)
     timings.stage("frames", len(numbers))
     provenance = metadata(request, capture=capture.name, inputs=stack.key)
+    if near:
+        provenance["relit:lights"] = f"{near} near lights taken as distant, as the object's centre sees them"
     clipped = written = 0
     for chunk, frames in _combine_chunks(stack, weights, device):
         clipped += int((frames > HALF_MAX).any(axis=1).sum())
@@ -95,7 +103,7 @@ def relight(request: RelightRequest, progress: Progress | None = None) -> Religh
                 written += 1
                 timings.advance(written)
     timings.close()
-    return RelightResult(tuple(paths), clipped)
+    return RelightResult(tuple(paths), clipped, near)
 
 
 def frame_numbers(text: str) -> list[int]:

@@ -8,27 +8,36 @@ import numpy as np
 from kernels import device as devices
 from kernels.photometric.readings import pad_lights
 from kernels.status import Status
-from kernels.surface.integrate import Integration, IntegrationOptions, integrate_normals
+from kernels.surface.integrate import Integration
+from service.errors import RequestError
 from service.methods import Method
 from service.pipelines.gradient import solve_gradients
+from service.pipelines.height import integrate, mark_not_facing
+from service.pipelines.near import solve_near
 from service.pipelines.normals import solve_normals
+from service.pipelines.reference import solve_by_reference
+from service.pipelines.sampling import solve_extended
 from service.progress import Progress, Timings
 from service.provenance import metadata, report
 from service.requests import SolveRequest
 from stage.capture import Capture
 from stage.colour import linear_space
+from stage.errors import ManifestError
+from stage.extended_lights import ExtendedLights
 from stage.files import write_text
 from stage.gradients import GradientFrames, gradient_frames, has_gradients
 from stage.ingest import open_stack
+from stage.light import ExtendedLight
 from stage.lighting import check_solvable
+from stage.manifest import FILE_NAME
 from stage.maps import SurfaceMaps
+from stage.motion.tracking import tracking_frames
+from stage.point_lights import DistantLights, PlacedLights
+from stage.reference_ball import ReferenceBall, reference_ball
 
 SVBRDF_LIGHTS = 12
 """From this many lights on the general solver is the default: it fits six lobes and a direction to each pixel, and was better than
 robust on every object tried with eight to 96 lights (docs/figures.md)."""
-INTEGRATION = IntegrationOptions(discontinuities=True, max_reweightings=0)
-"""The surface may break where slopes around a pixel contradict each other: objects hide parts of themselves. The bilateral rounds
-that may follow gain little more on real objects and can settle on a wrong break where normals are noisy (docs/figures.md)."""
 MAPS_FILE, REPORT_FILE = "maps.exr", "report.json"
 
 
@@ -58,32 +67,53 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
     timings.stage("open", 1)
     capture = Capture.open(request.capture)
     method = request.method or _default_method(capture)
-    lights = gradient_frames(capture) if method is Method.GRADIENT else check_solvable(capture)
+    if (method is Method.REFERENCE) != (request.reference_ball is not None):
+        raise RequestError("--method reference and --reference-ball CAPTURE go together: give both or neither")
+    lights: GradientFrames | ReferenceBall | DistantLights | PlacedLights | ExtendedLights
+    if method is Method.GRADIENT:
+        lights = gradient_frames(capture)
+    elif request.reference_ball is not None:
+        lights = reference_ball(capture, Capture.open(request.reference_ball))
+    else:
+        lights = check_solvable(capture)
+    if isinstance(lights, ExtendedLights) and method is not Method.SVBRDF:
+        raise ManifestError(f"{capture.folder / FILE_NAME}: frames[].light: some are extended: --method svbrdf solves these, "
+                            f"{method} needs lights of one direction each")
     mask = capture.mask()
+    tracking = tracking_frames(capture, to=request.align_to) if request.aligned else None
     timings.stage("ingest", len(capture.sources()))
-    stack = open_stack(capture, cache=request.cache, progress=lambda done, _: timings.advance(done))
-    if isinstance(lights, GradientFrames):
-        solution = solve_gradients(lights, stack, capture.camera, mask, device, timings)
+    stack = open_stack(capture, cache=request.cache, tracking=tracking, progress=lambda done, _: timings.advance(done))
+    camera, integration, height = capture.camera, None, None
+    if isinstance(lights, PlacedLights):
+        solution, height, integration = solve_near(method, stack, lights, camera, mask, device, timings)
+    elif isinstance(lights, ExtendedLights):
+        solution = solve_extended(stack, lights, camera, mask, device, timings)
+    elif isinstance(lights, ReferenceBall):
+        solution = solve_by_reference(stack, lights, camera, mask, request.cache, device, timings)
+    elif isinstance(lights, GradientFrames):
+        solution = solve_gradients(lights, stack, camera, mask, device, timings)
     else:
         padded = pad_lights(lights.direction, lights.irradiance, stack.scale)
-        solution = solve_normals(method, stack, padded, capture.camera, mask, device, timings)
+        solution = solve_normals(method, stack, padded, camera, mask, device, timings)
     rows, cols = mask.shape
     status = solution.status.reshape(rows, cols)
     normal = np.moveaxis(solution.normal.reshape(3, rows, cols), 0, -1)
-    _mark_not_facing(capture, normal, status)
+    mark_not_facing(camera, solution)
     solved = status == Status.OK
-    timings.stage("height", 100)
-    integration = _integrate(capture, solution.normal.reshape(3, rows, cols), solved, device, timings)
+    if integration is None:
+        timings.stage("height", 100)
+        integration = integrate(camera, solution.normal, solved, device, lambda part: timings.advance(round(100 * part)))
     maps = SurfaceMaps(
-        camera=capture.camera,
+        camera=camera,
         mask=solved,
         normal=normal,
-        diffuse_albedo=np.moveaxis(solution.albedo.reshape(3, rows, cols), 0, -1),
+        diffuse_albedo=None if method is Method.REFERENCE else np.moveaxis(solution.albedo.reshape(3, rows, cols), 0, -1),
         specular=None if solution.specular is None else np.moveaxis(solution.specular.reshape(3, rows, cols), 0, -1),
         roughness=None if solution.roughness is None else solution.roughness.reshape(rows, cols),
+        regime=None if solution.regime is None else solution.regime.reshape(rows, cols),
         specular_normal=None if solution.specular_normal is None else np.moveaxis(
             solution.specular_normal.reshape(3, rows, cols), 0, -1),
-        height=None if integration is None else integration.height.numpy(),
+        height=integration.height.numpy() if height is None and integration is not None else height,
         confidence=solution.confidence.reshape(rows, cols),
         color_space=linear_space(capture.manifest.color_space),
         provenance=metadata(request, method=method, capture=capture.name, inputs=stack.key),
@@ -96,7 +126,8 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
         inputs={"capture": str(request.capture), "name": capture.name, "content": stack.key, "frames": len(stack.frames),
                 "resolution": list(capture.camera.resolution), "color_space": capture.manifest.color_space},
         method=str(method),
-        options=request.model_dump(mode="json", include={"method"}),
+        options=request.model_dump(mode="json", include={"method", *(("reference_ball",) if request.reference_ball else ()),
+                                                         *(("align", "align_to") if request.aligned else ())}),
         found=solution.facts or {},
         device=devices.describe(device),
         timings_s=timings.close(),
@@ -104,6 +135,7 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
         residual=_residual_statistics(solution.residual.reshape(rows, cols)[solved]),
         albedo_above_one=int((maps.diffuse_albedo[solved] > 1).any(axis=-1).sum()) if maps.diffuse_albedo is not None else 0,
         height=_height_report(integration, capture),
+        **({} if stack.motion is None else {"motion": stack.motion}),
     ))
     return SolveResult(maps, maps_path, report_path, counts)
 
@@ -111,31 +143,9 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
 def _default_method(capture: Capture) -> Method:
     if has_gradients(capture):
         return Method.GRADIENT
+    if capture.lit_by(ExtendedLight):
+        return Method.SVBRDF
     return Method.SVBRDF if len(capture.sources()) >= SVBRDF_LIGHTS else Method.ROBUST
-
-
-def _mark_not_facing(capture: Capture, normal: np.ndarray, status: np.ndarray) -> None:
-    """A visible surface faces its line of sight: pixels whose normal does not are not solved."""
-    toward = normal[..., 2]
-    if capture.camera.projection == "perspective":
-        x, y = capture.camera.plane_coordinates()
-        toward = normal[..., 2] - normal[..., 0] * x - normal[..., 1] * y
-    status[(status == Status.OK) & (toward <= 0)] = Status.NOT_FACING
-
-
-def _integrate(capture: Capture, normal: np.ndarray, solved: np.ndarray, device: str, timings: Timings) -> Integration | None:
-    """Height of the solved pixels; None when there is none."""
-    if not solved.any():
-        return None
-    camera = capture.camera
-    perspective = camera.projection == "perspective"
-    mean_z = camera.surface_z_m or 0.0
-    if perspective and camera.surface_z_m is None:
-        assert camera.focal_px is not None
-        mean_z = -sum(camera.focal_px) / 2  # at this distance one pixel spans one unit
-    x, y = camera.plane_coordinates()
-    return integrate_normals(normal, solved, x.astype(np.float32), y.astype(np.float32), perspective=perspective, mean_z=mean_z,
-                             options=INTEGRATION, device=device, progress=lambda part: timings.advance(round(100 * part)))
 
 
 def _residual_statistics(residual: np.ndarray) -> dict[str, float]:

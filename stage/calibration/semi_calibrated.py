@@ -24,21 +24,30 @@ WEIGHT_SCALE = 2.385
 BRIGHT_END = 0.9
 """Quantile of a pixel's readings that stands for its brightest one."""
 ROUNDS = 60
-LINEAR_ROUNDS = range(10, 25)
+LINEAR_ROUNDS = range(6, 12)
 """Of the rounds, those that solve the eigenvalue problem."""
-CONVERGED = 1e-7
+CONVERGED = 1e-4
+"""Largest relative change of any light in a round: a hundredth of what real surfaces leave in doubt."""
 TINY = 1e-200
 """Below any reading: against division by zero."""
 
 
 class Intensities(NamedTuple):
-    """Brightness of each light."""
+    """Brightness of each light; NaN for a light that too few pixels show, because it is behind the object or dark."""
 
-    irradiance: np.ndarray  # [lights, 3] float64, mean 1 over the lights in every channel
+    irradiance: np.ndarray  # [lights, 3] float64, mean 1 over the lights that are told in every channel
     residual: np.ndarray  # [lights, 3] float64, weighted root mean square of the residual over |b|
     uncertainty: np.ndarray  # [lights, 3] float64, standard error relative to the value, from that residual
     pixels: int
     """Pixels that took part."""
+
+
+class _UnlitError(Exception):
+    """Lights that too few pixels show."""
+
+    def __init__(self, lights: np.ndarray) -> None:
+        super().__init__(lights)
+        self.lights = lights
 
 
 def fit_intensities(readings: np.ndarray, usable: np.ndarray, directions: np.ndarray) -> Intensities:
@@ -53,9 +62,19 @@ def fit_intensities(readings: np.ndarray, usable: np.ndarray, directions: np.nda
         CalibrationError: too few lights or pixels, or directions that do not determine the brightness.
     """
     check_directions(directions)
-    fits = [_fit_channel(readings[..., channel].astype(np.float64), usable, directions, "RGB"[channel]) for channel in range(3)]
-    irradiance, residual, uncertainty = (np.stack([fit[part] for fit in fits], axis=-1) for part in range(3))
-    return Intensities(irradiance, residual, uncertainty, min(fit[3] for fit in fits))
+    told = np.arange(len(directions))
+    while True:
+        try:
+            fits = [_fit_channel(readings[told, :, channel].astype(np.float64), usable[told], directions[told], "RGB"[channel])
+                    for channel in range(3)]
+            break
+        except _UnlitError as unlit:
+            told = np.delete(told, unlit.lights)
+            check_directions(directions[told])
+    result = [np.full((len(directions), 3), np.nan) for _ in range(3)]
+    for part, values in enumerate(result):
+        values[told] = np.stack([fit[part] for fit in fits], axis=-1)
+    return Intensities(result[0], result[1], result[2], min(fit[3] for fit in fits))
 
 
 def check_directions(directions: np.ndarray) -> None:
@@ -92,29 +111,24 @@ def _fit_channel(reading: np.ndarray, usable: np.ndarray, directions: np.ndarray
                                f"{MIN_PIXELS} are needed")
     reading, lit = reading[:, enough], lit[:, enough]
     reading = reading / np.where(lit, reading, 0).max(axis=0)  # every pixel counts alike, however dark its albedo
-    e = np.ones(len(directions))
+    e, weight = np.ones(len(directions)), lit.astype(np.float64)
     for step in range(ROUNDS):
-        weight = _weights(reading, lit, e, directions)
-        _check_lit(weight, name)
+        weight = _weights(reading, lit, e, directions, weight)
+        unlit = (weight > 0).sum(axis=1) < MIN_PIXELS
+        if unlit.any():
+            raise _UnlitError(np.flatnonzero(unlit))
         before = e
         # the first rounds only alternate: they are slow to converge, but highlights cannot make them negative
         e = _linear(reading, weight, directions, e) if step in LINEAR_ROUNDS else e
         b = _normals(reading / e[:, None], weight * e[:, None] ** 2, directions)
         e = _scale(reading, directions @ b, weight)
         e /= e.mean()
-        if step > LINEAR_ROUNDS.stop and np.abs(e / before - 1).max() < CONVERGED:
+        if step >= LINEAR_ROUNDS.stop and np.abs(e / before - 1).max() < CONVERGED:
             break
     error = np.where(weight > 0, (reading / e[:, None] - directions @ b) / np.maximum(np.linalg.norm(b, axis=0), TINY), 0)
     total = weight.sum(axis=1)
     residual = np.sqrt((weight * error**2).sum(axis=1) / total)
     return e, residual, residual / np.sqrt(total), count
-
-
-def _check_lit(weight: np.ndarray, name: str) -> None:
-    few = (weight > 0).sum(axis=1)
-    if few.min() < MIN_PIXELS:
-        raise CalibrationError(f"channel {name}: {int(few.min())} pixels are lit, unsaturated and like a Lambertian "
-                               f"surface under light {int(np.argmin(few)) + 1} of {len(few)}: {MIN_PIXELS} are needed")
 
 
 def _linear(reading: np.ndarray, weight: np.ndarray, directions: np.ndarray, e: np.ndarray) -> np.ndarray:
@@ -132,19 +146,17 @@ def _linear(reading: np.ndarray, weight: np.ndarray, directions: np.ndarray, e: 
     return len(q) / q / (1 / q).sum() if (q > 0).all() else e
 
 
-def _weights(reading: np.ndarray, lit: np.ndarray, e: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Cauchy weights of the residual over |b|; zero in shadow, as readings and as the model say."""
+def _weights(reading: np.ndarray, lit: np.ndarray, e: np.ndarray, directions: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Cauchy weights of the residual over |b|, from the weights before; zero in shadow, as readings and as the model say."""
     scaled = reading / e[:, None]
     top = np.quantile(np.where(lit, scaled, 0), BRIGHT_END, axis=0)
     bright = lit & (scaled > SHADOW * top)
-    weight = bright.astype(np.float64)
-    for _ in range(3):
-        b = _normals(scaled, weight, directions)
-        model, length = directions @ b, np.maximum(np.linalg.norm(b, axis=0), TINY)
-        relative = (scaled - model) / length
-        chosen = bright & (model > SHADOW * length)
-        spread = 1.4826 * np.median(np.abs(relative[chosen])) if chosen.any() else 1.0
-        weight = chosen / (1 + (np.where(chosen, relative, 0) / (WEIGHT_SCALE * spread + 1e-9)) ** 2)
+    b = _normals(scaled, weight * bright, directions)
+    model, length = directions @ b, np.maximum(np.linalg.norm(b, axis=0), TINY)
+    chosen = bright & (model > SHADOW * length)
+    relative = np.where(chosen, scaled - model, 0) / length
+    spread = 1.4826 * np.median(np.abs(relative[chosen])) if chosen.any() else 1.0
+    weight = chosen / (1 + (relative / (WEIGHT_SCALE * spread + 1e-9)) ** 2)
     weight[:, (weight > 0.1).sum(axis=0) < MIN_LIGHTS] = 0  # three readings fit any brightness
     return weight
 

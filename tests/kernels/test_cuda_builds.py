@@ -1,13 +1,14 @@
 """The kernels as CUDA runs them go through the compiler that Warp brings along, on machines without a GPU too."""
 
 import re
+from functools import partial
 
 import pytest
 import warp as wp
 
 from kernels import device as devices
 from kernels.device import PACK_CUDA
-from kernels.photometric import albedo, gradient, highlight, lambert, moments, readings, robust, separation
+from kernels.photometric import albedo, gradient, highlight, lambert, moments, near, readings, robust, separation
 from kernels.relight import batch, combine, environment
 
 devices.names()
@@ -17,7 +18,9 @@ OLDEST = min(wp.get_cuda_supported_archs(), default=None)
 @pytest.mark.skipif(OLDEST is None, reason="this build of Warp has no CUDA compiler")
 @pytest.mark.parametrize("make", [readings._grey_kernel, lambert._lambert_kernel, robust._robust_kernel, albedo._albedo_kernel,
                                   moments._moments_kernel, separation._difference_kernel, separation._colour_kernel,
-                                  gradient._diffuse_kernel, highlight._specular_kernel,
+                                  gradient._diffuse_kernel, highlight._specular_kernel, near._near_kernel,
+                                  *(partial(module, near=True) for module in
+                                    (lambert._lambert_kernel, robust._robust_kernel, albedo._albedo_kernel)),
                                   combine.register_kernel, batch.register_kernel, environment._nearest_kernel])
 def test_kernel_compiles_for_cuda_and_keeps_its_packs_in_registers(make, tmp_path):
     wp.compile_aot_module(make(PACK_CUDA).module, arch=OLDEST, module_dir=tmp_path, use_ptx=True)

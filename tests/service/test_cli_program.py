@@ -12,7 +12,7 @@ import service
 from stage.capture import Capture
 from tests.captures import edit_manifest, make_scene, write_capture, write_exr, write_image
 
-COMMANDS = ["demo", "import", "info", "solve", "relight", "export", "doctor", "bench"]
+COMMANDS = ["demo", "import", "info", "calibrate", "solve", "relight", "export", "doctor", "bench"]
 ROOT = Path(service.__file__).parents[1]
 
 

@@ -20,7 +20,7 @@ CAMERA = Camera(projection="perspective", resolution=(COLS, ROWS), focal_px=(9.0
 def make_maps(**changes) -> SurfaceMaps:
     three, one = (lambda: RNG.random((ROWS, COLS, 3)).astype(np.float32)), (lambda: RNG.random((ROWS, COLS)).astype(np.float32))
     layers = {"normal": three(), "diffuse_albedo": three(), "specular": three(), "roughness": one(), "height": one() - 1,
-              "confidence": one(), "specular_normal": three()}
+              "confidence": one(), "specular_normal": three(), "regime": one()}
     return SurfaceMaps(**{"camera": CAMERA, "mask": MASK, "provenance": {"relit:capture": "owl"}, **layers, **changes})
 
 
@@ -42,7 +42,8 @@ def test_the_channels_are_those_of_the_contract(tmp_path):
     with OpenEXR.File(str(tmp_path / "maps.exr"), separate_channels=True) as file:
         types = {name: channel.pixels.dtype.name for name, channel in file.channels().items()}
         header = dict(file.header())
-    half = [f"{layer}.{c}" for layer in ("diffuse_albedo", "specular") for c in "RGB"] + ["roughness.Y", "confidence.Y", "mask.Y"]
+    half = [f"{layer}.{c}" for layer in ("diffuse_albedo", "specular") for c in "RGB"]
+    half += [f"{layer}.Y" for layer in ("roughness", "regime", "confidence", "mask")]
     floats = [f"{layer}.{c}" for layer in ("normal", "specular_normal") for c in "XYZ"] + ["height.Z"]
     assert types == {**dict.fromkeys(half, "float16"), **dict.fromkeys(floats, "float32")}
     assert header["colorInteropID"] == "lin_rec709_scene" and "chromaticities" in header and "relit:camera" in header

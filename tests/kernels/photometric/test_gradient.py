@@ -177,6 +177,21 @@ def test_a_perspective_mirror_shows_its_normal(device):
     assert angle_degrees(specular(band, parts, 2.0, view.T.astype(np.float32)), normal).max() < 0.1  # half rounding
 
 
+def test_a_rough_lobe_seen_in_perspective(device):
+    """The lobe is fitted about each pixel's own line of sight, whatever its plane of incidence."""
+    normal = cap(20, 40)
+    view = -np.random.default_rng(2).normal([0, 0, -4], 0.8, (20, 3))
+    view /= np.linalg.norm(view, axis=1, keepdims=True)
+    lobe = np.array([[reference.ggx(n, v, axis, sign, alpha=0.16, f0=0.3, nodes=60, turns=90)
+                      for n, v in zip(normal, view, strict=True)] for axis, sign in PAIRS])
+    cross = np.full((3, 6, 20), 2.0**-6)
+    band = upload(np.concatenate([cross, cross + lobe], axis=1), device)
+    parts = separate_polarised(moments(band, PAIRS), moments(band, PAIRS, before=6), GREY, pixel_count=20, device=device)
+    found = fit_highlights(parts, GREY, view.T.astype(np.float32), gain=2.0, pixel_count=20, device=device)
+    assert angle_degrees(found.normal.numpy()[:, :20].T, normal).max() < 0.2  # half rounding, and the steps of the table
+    assert np.allclose(found.f0.numpy()[:, :20], 0.3, rtol=0.01) and np.allclose(found.roughness.numpy()[:20], 0.4, atol=0.01)
+
+
 def test_colour_tells_them_apart_on_a_dielectric(device):
     """Without separation the highlight tilts the normal towards the mirror direction; the chromatic part does not know it."""
     normal = cap(40, 60)

@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 import warp as wp
-from tests.kernels.scenes import GREY, bits, cap, store
-from tests.reference import microfacet as twin
 
 from kernels import packs
 from kernels.errors import ArrayError
@@ -15,6 +13,9 @@ from kernels.photometric.material import fit_material
 from kernels.photometric.readings import grey_factors, pad_lights
 from kernels.photometric.samples import gather, to_host
 from kernels.photometric.svbrdf import average_normals, solve_svbrdf
+from tests.kernels.scenes import GREY, bits, cap, store
+from tests.reference import hypotheses
+from tests.reference import microfacet as twin
 
 LIGHTS = cap(48, 70.0)
 VIEW = np.array([0.0, 0.0, 1.0])
@@ -282,3 +283,29 @@ def test_more_rounds_are_an_option(device):
     few, many = (degrees(search_normals(samples, normal, shape=Diffuse(), options=SearchOptions(reweightings=r)).normal, normal)
                  for r in (1, 5))
     assert few.mean() > many.mean()
+
+
+@pytest.mark.parametrize(("rough", "slope"), [(None, 0.0), (0.4, -0.1)])
+def test_cost_agrees_with_the_twin(device, rough, slope):
+    """One candidate, judged by the kernel and by NumPy in float64, on noisy, shadowed, partly saturated readings of wrong normals.
+
+    Tolerance: float32 sums through five rounds of re-weighting; a reading at the very edge of being a shadow may fall either way.
+    """
+    rng = np.random.default_rng(4)
+    normal = tilted(120)
+    radiance = render(normal, alpha=0.2, f0=0.1, rough=rough, slope=slope)
+    radiance = radiance * rng.lognormal(0, 0.05, radiance.shape[1:]) * (rng.random(radiance.shape[1:]) > 0.1)
+    saturated = rng.random(radiance.shape[1:]) < 0.02
+    samples, _ = sample(radiance, device, saturated=saturated)
+    candidate = twin.unit(normal + rng.normal(0, 0.1, normal.shape)).astype(np.float32)
+    shape = Diffuse(rough=-1.0 if rough is None else rough, slope=slope)
+    found = search_normals(samples, candidate, shape=shape, wide=((), 1), fine=())
+    np.testing.assert_allclose(found.normal, candidate, atol=1e-6)
+    grey = samples.grey.numpy().reshape(-1, samples.lanes)
+    at = np.array([[p * samples.pack_stride + light * samples.light_stride for p in range(samples.packs)] for light in range(48)])
+    readings = grey[at].reshape(48, -1)[:, :120].T.astype(np.float64)
+    assert (readings < 0).sum() == saturated.sum()
+    expected = hypotheses.cost(readings, candidate.astype(np.float64), LIGHTS, np.tile(VIEW, (120, 1)), rough=rough, slope=slope)
+    close = np.abs(found.cost - expected) < 1e-3 * (expected + 0.01)
+    assert close.mean() > 0.97
+    assert np.median(expected) > 0.02  # the data is not trivial

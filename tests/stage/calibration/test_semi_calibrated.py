@@ -76,7 +76,14 @@ def test_too_little_to_go_by():
     usable = np.ones(readings.shape[:2], bool)
     with pytest.raises(CalibrationError, match="channel R: 0 pixels are lit"):
         fit_intensities(0 * readings, usable, directions)
-    dark = readings.copy()
-    dark[2] = 0
-    with pytest.raises(CalibrationError, match="under light 3 of 8"):
-        fit_intensities(dark, usable, directions)
+
+
+def test_a_light_that_nothing_shows_is_left_out_of_the_others():
+    directions, irradiance, readings, _ = scene(8, 0.8)
+    readings[2] = 0
+    found = fit_intensities(readings, np.ones(readings.shape[:2], bool), directions)
+    assert np.isnan(found.irradiance[2]).all()
+    others = np.delete(irradiance, 2, axis=0)
+    np.testing.assert_allclose(np.delete(found.irradiance, 2, axis=0), others / others.mean(axis=0), rtol=1e-6)
+    with pytest.raises(CalibrationError, match="under 4 or more lights"):
+        fit_intensities(readings[2:6], np.ones((4, readings.shape[1]), bool), directions[2:6])

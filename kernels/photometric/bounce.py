@@ -1,0 +1,85 @@
+"""Light that reached a pixel by way of its surroundings is taken off its readings."""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from kernels.errors import ArrayError
+from kernels.packs import pack_type
+from kernels.photometric.samples import Samples, per_pixel
+
+
+def subtract_bounce(samples: Samples, arriving: np.ndarray, corners: np.ndarray, shares: np.ndarray, albedo: np.ndarray,
+                    grey_weights: np.ndarray) -> None:
+    """Subtract albedo · arriving light from the readings; a reading does not fall below zero.
+
+    Args:
+        samples: changed in place.
+        arriving: [patches, 3, lights] float32: what a surface of albedo 1 at each patch sends on, per irradiance of the light.
+        corners: [n, 4] int, the patches about each pixel.
+        shares: [n, 4] float32, their interpolation weights.
+        albedo: [n, 3] diffuse albedo of each pixel.
+        grey_weights: [3], of the grey readings.
+
+    Raises:
+        ArrayError: shapes that do not fit, or corners outside the patches.
+    """
+    patches, _, lights = arriving.shape
+    count = samples.pixel_count
+    if corners.shape != (count, 4) or shares.shape != (count, 4) or albedo.shape != (count, 3) or lights != samples.light_count:
+        raise ArrayError(f"corners are {corners.shape}, shares {shares.shape}, albedo {albedo.shape}, arriving light "
+                         f"{arriving.shape}: expected {count} pixels and {samples.light_count} lights")
+    if corners.min() < 0 or corners.max() >= patches:
+        raise ArrayError(f"corners must be from 0 to {patches - 1}")
+    device = samples.device
+    devices.launch(_bounce_kernel(samples.lanes), samples.packs,
+                   [wp.array(np.ascontiguousarray(arriving, dtype=np.float32), dtype=wp.float32, device=device),
+                    per_pixel(samples, corners), per_pixel(samples, shares), per_pixel(samples, albedo), samples.level,
+                    wp.vec3(*(float(w) for w in grey_weights)), samples.light_count, samples.pack_stride, samples.light_stride],
+                   [samples.grey, samples.colour], device=device)
+
+
+@cache
+def _bounce_kernel(lanes: int) -> Any:
+    lane_type = pack_type(lanes, wp.float32)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
+    def bounce_kernel(first: int,
+                      arriving: wp.array3d(dtype=float),  # [patches, 3, L]
+                      corners: wp.array2d(dtype=lane_type),  # [4, P] patch numbers, exact in float32
+                      shares: wp.array2d(dtype=lane_type),  # [4, P]
+                      albedo: wp.array2d(dtype=lane_type),  # [3, P]
+                      level: wp.array(dtype=lane_type),  # [P]
+                      weights: wp.vec3,
+                      light_count: int,
+                      pack_stride: int,
+                      light_stride: int,
+                      # outputs
+                      grey: wp.array(dtype=lane_type),  # [P · L]
+                      colour: wp.array2d(dtype=lane_type)):  # [3, P · L]
+        p = first + wp.tid()
+        bright = level[p]
+        for light in range(light_count):
+            at = p * pack_stride + light * light_stride
+            taken = lane_type()
+            for c in range(3):
+                y, rho = colour[c, at], albedo[c, p]
+                for k in range(lanes):
+                    light_in = 0.0
+                    for corner in range(4):
+                        patch = int(corners[corner, p][k])
+                        light_in += shares[corner, p][k] * arriving[patch, c, light]
+                    bounced = rho[k] * light_in
+                    taken[k] += weights[c] * bounced
+                    y[k] = wp.where(y[k] > 0.0, wp.max(y[k] - bounced, 0.0), y[k])
+                colour[c, at] = y
+            relative = grey[at]
+            for k in range(lanes):
+                left = wp.max(relative[k] - taken[k] / bright[k], 0.0)
+                relative[k] = wp.where(relative[k] > 0.0, left, relative[k])
+            grey[at] = relative
+
+    return bounce_kernel

@@ -1,0 +1,145 @@
+"""What the search and the material fit expect a light to read: parts that their kernels close over, here for lights of one
+direction.
+
+`tabulated_lobes` has the same parts for lights of any extent, looked up in a table, so that one kernel body serves both.
+"""
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import warp as wp
+
+from kernels.microfacet import INVERSE_PI, diffuse, ggx, schlick
+from kernels.packs import pack_type
+
+LOBES = (0.08, 0.15, 0.25, 0.4, 0.6)
+"""Widths α of the GGX lobes of the mixture: roughness 0.28 to 0.77, a factor of 1.5 to 2 apart, as wide as the lobes are."""
+MIXTURE = 1 + len(LOBES)
+MIXTURE_F0 = 0.04
+"""Reflectance at normal incidence whose Fresnel rise the lobes have; readings at grazing half vectors hardly tell it."""
+LOBE_SCALE = 0.1 / MIXTURE_F0
+"""Of the GGX lobes beside the diffuse one, so that their weights are of one order."""
+GEOMETRY = 2
+"""Scratch beside the lobes for each light: 1 / |l + v| and (1 - h·v)⁵."""
+
+
+class Lobes(NamedTuple):
+    """Expected readings as the search takes them: Warp functions that write them to scratch, [light][held values]."""
+
+    count: int
+    """Lobes of the mixture, the diffuse one first."""
+    held: int
+    """Values of a light in scratch: its lobes, and what `prepare` keeps there."""
+    relaxation: float
+    """Of the non-negative solve: above one where lobes are much alike."""
+    prepare: Any
+    """Writes what depends on light and view alone."""
+    fill: Any
+    """Writes the lobes of every light at a candidate normal. Reads `toward` or `table`, and leaves the other alone."""
+
+
+class Reflectance(NamedTuple):
+    """Expected readings as the material fit takes them: Warp functions."""
+
+    respond: Any
+    """Diffuse response to albedo one, specular response to F0, and what of it does not depend on F0."""
+    lambertian: Any
+    """Albedo of the closest Lambertian lobe, for a fitted albedo of one."""
+
+
+@cache
+def direction_lobes(lanes: int) -> Lobes:
+    """The mixture under lights of one direction each."""
+    lane_type = pack_type(lanes, wp.float32)
+    widths = wp.types.vector(length=len(LOBES), dtype=wp.float32)
+
+    @wp.func
+    def prepare(toward: wp.array2d(dtype=lane_type), vx: lane_type, vy: lane_type, vz: lane_type, start: int, light_count: int,
+                light_stride: int, base: int, step: int, scratch: wp.array(dtype=lane_type)):
+        for light in range(light_count):
+            at = base + light * wp.static(MIXTURE + GEOMETRY) * step
+            element = start + light * light_stride
+            wx, wy, wz = toward[0, element], toward[1, element], toward[2, element]
+            inverse, rise = lane_type(), lane_type()
+            for k in range(lanes):
+                lv = wx[k] * vx[k] + wy[k] * vy[k] + wz[k] * vz[k]
+                inverse[k] = 1.0 / wp.sqrt(wp.max(2.0 + 2.0 * lv, 1.0e-6))
+                rise[k] = schlick(wp.sqrt(wp.max(0.5 + 0.5 * lv, 0.0)))
+            scratch[at + wp.static(MIXTURE) * step] = inverse
+            scratch[at + wp.static(MIXTURE + 1) * step] = rise
+
+    @wp.func
+    def fill(toward: wp.array2d(dtype=lane_type), table: wp.array3d(dtype=float), form: wp.vec2,
+             nx: lane_type, ny: lane_type, nz: lane_type, vx: lane_type, vy: lane_type, vz: lane_type, start: int,
+             light_count: int, light_stride: int, base: int, step: int, scratch: wp.array(dtype=lane_type)):
+        alphas = widths(wp.static(LOBES[0]), wp.static(LOBES[1]), wp.static(LOBES[2]), wp.static(LOBES[3]), wp.static(LOBES[4]))
+        nv = lane_type()
+        for k in range(lanes):
+            nv[k] = nx[k] * vx[k] + ny[k] * vy[k] + nz[k] * vz[k]
+        for light in range(light_count):
+            element = start + light * light_stride
+            lx, ly, lz = toward[0, element], toward[1, element], toward[2, element]
+            at = base + light * wp.static(MIXTURE + GEOMETRY) * step
+            inverse = scratch[at + wp.static(MIXTURE) * step]
+            rise = scratch[at + wp.static(MIXTURE + 1) * step]
+            nl, nh, fresnel, lobe = lane_type(), lane_type(), lane_type(), lane_type()
+            for k in range(lanes):
+                cosine = nx[k] * lx[k] + ny[k] * ly[k] + nz[k] * lz[k]
+                nl[k] = wp.max(cosine, 0.0)
+                nh[k] = (cosine + nv[k]) * inverse[k]
+                fresnel[k] = LOBE_SCALE * (MIXTURE_F0 + (1.0 - MIXTURE_F0) * rise[k])
+                lobe[k] = diffuse(nl[k], nv[k], 0.25 / (inverse[k] * inverse[k]), form[0], form[1])
+            scratch[at] = lobe
+            for a in range(wp.static(len(LOBES))):
+                width = alphas[a]
+                for k in range(lanes):
+                    lobe[k] = fresnel[k] * ggx(nl[k], nv[k], nh[k], width)
+                scratch[at + (1 + a) * step] = lobe
+
+    return Lobes(MIXTURE, MIXTURE + GEOMETRY, 1.0, prepare, fill)
+
+
+@cache
+def direction_reflectance(lanes: int) -> Reflectance:
+    """The contract's BRDF under lights of one direction each."""
+    lane_type = pack_type(lanes, wp.float32)
+
+    @wp.func
+    def respond(toward: wp.array2d(dtype=lane_type), table: wp.array3d(dtype=float), form: wp.vec2,
+                nx: lane_type, ny: lane_type, nz: lane_type, vx: lane_type, vy: lane_type, vz: lane_type, rough: lane_type,
+                element: int, light: int):
+        lx, ly, lz = toward[0, element], toward[1, element], toward[2, element]
+        fd, fs, fixed = lane_type(), lane_type(), lane_type()
+        for k in range(lanes):
+            nv = wp.max(nx[k] * vx[k] + ny[k] * vy[k] + nz[k] * vz[k], 1.0e-3)
+            lv = lx[k] * vx[k] + ly[k] * vy[k] + lz[k] * vz[k]
+            hv2 = wp.max(0.5 + 0.5 * lv, 2.5e-7)
+            cosine = nx[k] * lx[k] + ny[k] * ly[k] + nz[k] * lz[k]
+            nl = wp.max(cosine, 0.0)
+            nh = (cosine + nv) * 0.5 / wp.sqrt(hv2)
+            rise = schlick(wp.sqrt(hv2))
+            lobe = ggx(nl, nv, nh, rough[k] * rough[k])
+            fd[k] = INVERSE_PI * diffuse(nl, nv, hv2, form[0], form[1])
+            fs[k] = (1.0 - rise) * lobe
+            fixed[k] = rise * lobe
+        return fd, fs, fixed
+
+    @wp.func
+    def lambertian(toward: wp.array2d(dtype=lane_type), form: wp.vec2,
+                   nx: lane_type, ny: lane_type, nz: lane_type, vx: lane_type, vy: lane_type, vz: lane_type, start: int,
+                   light_count: int, light_stride: int):
+        above, below, share = lane_type(), lane_type(), lane_type()
+        for light in range(light_count):
+            at = start + light * light_stride
+            wx, wy, wz = toward[0, at], toward[1, at], toward[2, at]
+            for k in range(lanes):
+                nv = wp.max(nx[k] * vx[k] + ny[k] * vy[k] + nz[k] * vz[k], 1.0e-3)
+                lv = wx[k] * vx[k] + wy[k] * vy[k] + wz[k] * vz[k]
+                nl = wp.max(nx[k] * wx[k] + ny[k] * wy[k] + nz[k] * wz[k], 0.0)
+                above[k] += nl * diffuse(nl, nv, wp.max(0.5 + 0.5 * lv, 0.0), form[0], form[1])
+                below[k] += nl * nl
+        for k in range(lanes):
+            share[k] = above[k] / wp.max(below[k], 1.0e-20)
+        return share
+
+    return Reflectance(respond, lambertian)

@@ -1,0 +1,69 @@
+"""Normals from a table measured on a ball of the same material: what the lights make a normal read, whatever its reflectance.
+
+The search of `hypotheses` with one lobe, the ball's, at every candidate normal; its weight is how bright the pixel is beside the
+ball, so albedo may vary and the kind of reflectance may not.
+
+Source: Woodham, "Photometric method for determining surface orientation from multiple images", Optical Engineering 1980
+(lookup table from a calibration sphere); Hertzmann and Seitz, "Example-based photometric stereo", TPAMI 2005.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from kernels.errors import ArrayError
+from kernels.photometric.hypotheses import Diffuse, search_normals
+from kernels.photometric.response_table import GRID
+from kernels.photometric.samples import Samples
+from kernels.photometric.sampling import AROUND, AROUND_OPTIONS, FINE, HEMISPHERE, HEMISPHERE_OPTIONS, OPTIONS, RING_DEGREES
+
+
+class ReferenceFit(NamedTuple):
+    """What was found for each sampled pixel, on the host."""
+
+    normal: np.ndarray  # [n, 3] float32, unit
+    confidence: np.ndarray  # [n] float32: 1 / (1 + standard error of the normal / 1°)
+    residual: np.ndarray  # [n] float32: root of the mean cost per light, in units of the noise
+
+
+def reference_table(readings: np.ndarray, device: str) -> wp.array:
+    """A table of what the ball reads at each of response_table.nodes.
+
+    Args:
+        readings: [GRID², lights] not negative.
+        device: where.
+
+    Returns:
+        [GRID², lights, 1] float32 on the device.
+
+    Raises:
+        ArrayError: readings at other nodes, or none above zero.
+    """
+    if readings.ndim != 2 or len(readings) != GRID * GRID:
+        raise ArrayError(f"readings are {readings.shape}: give one row for each of the {GRID * GRID} nodes")
+    if not (readings >= 0).all() or not readings.any():
+        raise ArrayError("readings of the ball must not be negative, and some must be above zero")
+    return wp.array(readings[..., None].astype(np.float32), dtype=wp.float32, device=device)
+
+
+def solve_reference(samples: Samples, table: wp.array, view: np.ndarray) -> ReferenceFit:
+    """Solve sampled pixels.
+
+    Args:
+        samples: their readings, in the units of the ball's.
+        table: of the same lights.
+        view: [n, 3] unit directions to the viewer.
+
+    Returns:
+        The fit. Waits for the device.
+
+    Raises:
+        ArrayError: shapes that do not fit.
+    """
+    normal = view
+    for rings, options in ((HEMISPHERE, HEMISPHERE_OPTIONS), (AROUND, AROUND_OPTIONS), (FINE, OPTIONS)):
+        found = search_normals(samples, normal, shape=Diffuse(), options=options, wide=rings[0], fine=rings[1:], table=table)
+        normal = found.normal
+    variance = 2 * found.cost * RING_DEGREES**2 / (samples.light_count * np.maximum(found.curvature, 1e-12))
+    return ReferenceFit(normal, (1 / (1 + np.sqrt(variance))).astype(np.float32), np.sqrt(found.cost))

@@ -1,0 +1,87 @@
+"""Readings in cast shadow, as the height says, are taken out of the samples: what is known to be shadow need not be guessed."""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from kernels.errors import ArrayError
+from kernels.packs import pack_type
+from kernels.photometric.near import Places
+from kernels.photometric.samples import Samples
+from kernels.surface.shadows import NO_REACH, Projection, in_shadow_within, unproject
+
+
+def exclude_shadows(samples: Samples, pixels: np.ndarray, height: wp.array, mask: wp.array, projection: Projection,
+                    places: Places | None = None) -> None:
+    """Mark readings whose light is hidden by the surface as no readings.
+
+    Args:
+        samples: changed in place.
+        pixels: [n] their row-major positions in the image.
+        height: [rows, cols] float32, camera-frame z.
+        mask: [rows, cols] uint8, where there is surface.
+        projection: of the camera; the unit is that of height.
+        places: of the lights, where some light is near.
+
+    Raises:
+        ArrayError: positions outside the image.
+    """
+    rows, cols = mask.shape
+    if len(pixels) != samples.pixel_count or pixels.min() < 0 or pixels.max() >= rows * cols:
+        raise ArrayError(f"pixels must be {samples.pixel_count} positions from 0 to {rows * cols - 1}")
+    order = np.minimum(np.arange(samples.packs * samples.lanes), samples.pixel_count - 1)
+    where = wp.array(pixels[order].astype(np.int32), dtype=wp.int32, device=samples.device)
+    place = np.zeros((samples.light_count, 4), dtype=np.float32) if places is None else places.place
+    devices.launch(_exclude_kernel(samples.lanes), samples.packs,
+                   [samples.toward, wp.array(place, dtype=wp.vec4, device=samples.device), where, height, mask,
+                    projection.perspective, projection.scale, projection.centre,
+                    samples.light_count, samples.pack_stride, samples.light_stride], [samples.grey, samples.colour],
+                   device=samples.device)
+
+
+@cache
+def _exclude_kernel(lanes: int) -> Any:
+    lane_type = pack_type(lanes, wp.float32)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
+    def exclude_kernel(first: int,
+                       toward: wp.array2d(dtype=lane_type),  # [3, P · L]
+                       places: wp.array(dtype=wp.vec4),  # [L or padded] position and 1, or anything and 0
+                       pixels: wp.array(dtype=wp.int32),  # [P · lanes]
+                       height: wp.array2d(dtype=float),
+                       mask: wp.array2d(dtype=wp.uint8),
+                       perspective: bool,
+                       scale: wp.vec2,
+                       centre: wp.vec2,
+                       light_count: int,
+                       pack_stride: int,
+                       light_stride: int,
+                       # outputs
+                       grey: wp.array(dtype=lane_type),
+                       colour: wp.array2d(dtype=lane_type)):
+        p = first + wp.tid()
+        cols = mask.shape[1]
+        for light in range(light_count):
+            at = p * pack_stride + light * light_stride
+            place = places[light]
+            lx, ly, lz = toward[0, at], toward[1, at], toward[2, at]
+            y, red, green, blue = grey[at], colour[0, at], colour[1, at], colour[2, at]
+            for k in range(lanes):
+                n = pixels[p * lanes + k]
+                row, col = n / cols, n % cols
+                start = unproject(float(col) + 0.5, float(row) + 0.5, height[row, col], perspective, scale, centre)
+                reach = wp.where(place[3] > 0.0, wp.length(wp.vec3(place[0], place[1], place[2]) - start), NO_REACH)
+                if in_shadow_within(height, mask, row, col, wp.vec3(lx[k], ly[k], lz[k]), reach, perspective, scale, centre):
+                    y[k] = -1.0
+                    red[k] = -1.0
+                    green[k] = -1.0
+                    blue[k] = -1.0
+            grey[at] = y
+            colour[0, at] = red
+            colour[1, at] = green
+            colour[2, at] = blue
+
+    return exclude_kernel

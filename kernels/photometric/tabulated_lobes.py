@@ -1,0 +1,131 @@
+"""The lobes of the search and of the material fit looked up in a response table: for lights of any extent.
+
+The table is for the view z. A pixel that is seen from elsewhere, v, looks the diffuse lobe up at its normal and the others at
+the normal that reflects z to where its own reflects v: exact for a mirror, and to first order in the angle between v and z for
+any lobe.
+"""
+
+import math
+from functools import cache
+
+import warp as wp
+
+from kernels.packs import pack_type
+from kernels.photometric.lobes import Lobes, Reflectance
+from kernels.photometric.response_table import (
+    GRID,
+    LEAST_NZ,
+    MIRROR_ALPHA,
+    NARROWEST,
+    WIDTH_COUNT,
+    WIDTH_RATIO,
+    grid_position,
+)
+
+RELAXATION = 1.6
+"""Of the non-negative solve: lobes integrated over wide lights are much alike, and plain sweeps would crawl."""
+LOG_MIRROR, LOG_NARROWEST, LOG_RATIO = math.log(MIRROR_ALPHA), math.log(NARROWEST), math.log(WIDTH_RATIO)
+
+
+@wp.func
+def reflecting_normal(n: wp.vec3, v: wp.vec3) -> wp.vec3:
+    """The normal that reflects the table's view to where n reflects v."""
+    r = 2.0 * wp.dot(n, v) * n - v
+    return wp.normalize(wp.vec3(r[0], r[1], wp.max(r[2] + 1.0, LEAST_NZ)))
+
+
+@wp.func
+def look_up(table: wp.array3d(dtype=float), place: wp.vec2, light: int, column: int) -> float:
+    """One column at a place among the nodes, bilinear."""
+    i = wp.clamp(int(place[0]), 0, wp.static(GRID - 2))
+    j = wp.clamp(int(place[1]), 0, wp.static(GRID - 2))
+    a = place[0] - float(i)
+    b = place[1] - float(j)
+    cell = i * GRID + j
+    low = (1.0 - b) * table[cell, light, column] + b * table[cell + 1, light, column]
+    high = (1.0 - b) * table[cell + GRID, light, column] + b * table[cell + wp.static(GRID + 1), light, column]
+    return (1.0 - a) * low + a * high
+
+
+@wp.func
+def width_position(roughness: float) -> float:
+    """Where a roughness lies among the widths of the table: 0 the mirror, 1 the narrowest GGX lobe; linear in log α between."""
+    width = 2.0 * wp.log(wp.max(roughness, 1.0e-3))
+    above = 1.0 + (width - LOG_NARROWEST) / LOG_RATIO
+    below = (width - LOG_MIRROR) / wp.static(LOG_NARROWEST - LOG_MIRROR)
+    return wp.clamp(wp.where(above >= 1.0, above, below), 0.0, float(WIDTH_COUNT))
+
+
+@cache
+def tabulated_lobes(lanes: int, count: int) -> Lobes:
+    """The mixture of a search table of `count` lobes."""
+    lane_type = pack_type(lanes, wp.float32)
+    pairs = wp.types.matrix(shape=(4, lanes), dtype=wp.float32)
+
+    @wp.func
+    def prepare(toward: wp.array2d(dtype=lane_type), vx: lane_type, vy: lane_type, vz: lane_type, start: int, light_count: int,
+                light_stride: int, base: int, step: int, scratch: wp.array(dtype=lane_type)):
+        pass
+
+    @wp.func
+    def fill(toward: wp.array2d(dtype=lane_type), table: wp.array3d(dtype=float), form: wp.vec2,
+             nx: lane_type, ny: lane_type, nz: lane_type, vx: lane_type, vy: lane_type, vz: lane_type, start: int,
+             light_count: int, light_stride: int, base: int, step: int, scratch: wp.array(dtype=lane_type)):
+        places = pairs()
+        for k in range(lanes):
+            n = wp.vec3(nx[k], ny[k], nz[k])
+            plain = grid_position(n)
+            turned = grid_position(reflecting_normal(n, wp.vec3(vx[k], vy[k], vz[k])))
+            places[0, k] = plain[0]
+            places[1, k] = plain[1]
+            places[2, k] = turned[0]
+            places[3, k] = turned[1]
+        for light in range(light_count):
+            at = base + light * count * step
+            lobe = lane_type()
+            for k in range(lanes):
+                lobe[k] = look_up(table, wp.vec2(places[0, k], places[1, k]), light, 0)
+            scratch[at] = lobe
+            for a in range(1, count):
+                for k in range(lanes):
+                    lobe[k] = look_up(table, wp.vec2(places[2, k], places[3, k]), light, a)
+                scratch[at + a * step] = lobe
+
+    return Lobes(count, count, RELAXATION, prepare, fill)
+
+
+@cache
+def tabulated_reflectance(lanes: int) -> Reflectance:
+    """The contract's BRDF from a response table; a roughness of 0 stands for no specular lobe at all."""
+    lane_type = pack_type(lanes, wp.float32)
+
+    @wp.func
+    def respond(toward: wp.array2d(dtype=lane_type), table: wp.array3d(dtype=float), form: wp.vec2,
+                nx: lane_type, ny: lane_type, nz: lane_type, vx: lane_type, vy: lane_type, vz: lane_type, rough: lane_type,
+                element: int, light: int):
+        fd, fs, fixed = lane_type(), lane_type(), lane_type()
+        for k in range(lanes):
+            n = wp.vec3(nx[k], ny[k], nz[k])
+            place = grid_position(reflecting_normal(n, wp.vec3(vx[k], vy[k], vz[k])))
+            width = width_position(rough[k])
+            narrow = wp.min(int(width), wp.static(WIDTH_COUNT - 1))
+            part = width - float(narrow)
+            column = 1 + 2 * narrow
+            shines = wp.where(rough[k] > 0.0, 1.0, 0.0)
+            fd[k] = look_up(table, grid_position(n), light, 0)
+            fs[k] = shines * ((1.0 - part) * look_up(table, place, light, column)
+                              + part * look_up(table, place, light, column + 2))
+            fixed[k] = shines * ((1.0 - part) * look_up(table, place, light, column + 1)
+                                 + part * look_up(table, place, light, column + 3))
+        return fd, fs, fixed
+
+    @wp.func
+    def lambertian(toward: wp.array2d(dtype=lane_type), form: wp.vec2,
+                   nx: lane_type, ny: lane_type, nz: lane_type, vx: lane_type, vy: lane_type, vz: lane_type, start: int,
+                   light_count: int, light_stride: int):
+        one = lane_type()
+        for k in range(lanes):
+            one[k] = 1.0
+        return one
+
+    return Reflectance(respond, lambertian)

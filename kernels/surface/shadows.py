@@ -1,0 +1,83 @@
+"""Cast shadows on a height field: the way from a surface point to a light is marched over the picture, pixel by pixel.
+
+A point is in shadow when the surface stands above the way by more than a margin: a part of a pixel, and a slope that a
+height integrated from normals may be wrong by. Only what the camera sees can throw a shadow here.
+"""
+
+from typing import NamedTuple
+
+import warp as wp
+
+MARGIN_PIXELS = 0.3
+"""How far, in pixels, the surface must stand above the way."""
+MARGIN_SLOPE = 0.02
+"""And how far more for each unit of the way: heights drift by about a degree."""
+FIRST_STEP = 1.5
+"""In pixels: the point's own neighbours say nothing about cast shadows."""
+
+NO_REACH = 1.0e30
+"""The reach of a distant light."""
+
+
+class Projection(NamedTuple):
+    """How camera-frame points fall on the picture, without lens distortion."""
+
+    perspective: bool
+    scale: wp.vec2  # perspective: focal lengths in pixels; orthographic: pixels per unit
+    centre: wp.vec2  # principal point in pixels
+
+
+@wp.func
+def project(point: wp.vec3, perspective: bool, scale: wp.vec2, centre: wp.vec2) -> wp.vec2:
+    """Continuous image coordinates of a camera-frame point."""
+    far = wp.where(perspective, wp.max(-point[2], 1.0e-9), 1.0)
+    return wp.vec2(centre[0] + scale[0] * point[0] / far, centre[1] - scale[1] * point[1] / far)
+
+
+@wp.func
+def unproject(u: float, v: float, z: float, perspective: bool, scale: wp.vec2, centre: wp.vec2) -> wp.vec3:
+    """The camera-frame point of height z at continuous image coordinates."""
+    far = wp.where(perspective, -z, 1.0)
+    return wp.vec3((u - centre[0]) / scale[0] * far, (centre[1] - v) / scale[1] * far, z)
+
+
+@wp.func
+def in_cast_shadow(height: wp.array2d(dtype=float), mask: wp.array2d(dtype=wp.uint8), row: int, col: int, toward: wp.vec3,
+                   perspective: bool, scale: wp.vec2, centre: wp.vec2) -> bool:
+    """Whether the surface at this pixel is hidden from a distant light in this direction."""
+    return in_shadow_within(height, mask, row, col, toward, NO_REACH, perspective, scale, centre)
+
+
+@wp.func
+def in_shadow_within(height: wp.array2d(dtype=float), mask: wp.array2d(dtype=wp.uint8), row: int, col: int, toward: wp.vec3,
+                     reach: float, perspective: bool, scale: wp.vec2, centre: wp.vec2) -> bool:
+    """Whether the surface stands in this direction from this pixel before `reach`: what lies behind a light hides nothing."""
+    z = height[row, col]
+    start = unproject(float(col) + 0.5, float(row) + 0.5, z, perspective, scale, centre)
+    pixel = wp.where(perspective, -z, 1.0) / (0.5 * (scale[0] + scale[1]))  # what a pixel spans here
+    across = wp.sqrt(toward[0] * toward[0] + toward[1] * toward[1])
+    if across < 1.0e-4:
+        return False  # along the line of sight
+    stride = pixel / across
+    travelled = FIRST_STEP * stride
+    hidden = False
+    rows, cols = mask.shape[0], mask.shape[1]
+    for _ in range(rows + cols):
+        if travelled >= reach:
+            break
+        point = start + travelled * toward
+        at = project(point, perspective, scale, centre)
+        u, v = at[0] - 0.5, at[1] - 0.5
+        c, r = int(wp.floor(u)), int(wp.floor(v))
+        if c < 0 or r < 0 or c >= cols - 1 or r >= rows - 1:
+            break
+        if int(mask[r, c]) + int(mask[r, c + 1]) + int(mask[r + 1, c]) + int(mask[r + 1, c + 1]) == 4:
+            fu, fv = u - float(c), v - float(r)
+            upper = height[r, c] * (1.0 - fu) + height[r, c + 1] * fu
+            lower = height[r + 1, c] * (1.0 - fu) + height[r + 1, c + 1] * fu
+            above = upper * (1.0 - fv) + lower * fv - point[2]
+            if above > MARGIN_PIXELS * pixel + MARGIN_SLOPE * travelled * across:
+                hidden = True
+                break
+        travelled += stride
+    return hidden

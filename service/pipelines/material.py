@@ -1,0 +1,188 @@
+"""The general solver over an image: a first search, the height it gives, the shadows and the light that this height throws on itself,
+and the final solve."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from kernels import packs
+from kernels.photometric.bounce import subtract_bounce
+from kernels.photometric.diffuse_shape import choose_diffuse
+from kernels.photometric.hypotheses import Diffuse, search_normals
+from kernels.photometric.lobes import GEOMETRY, MIXTURE
+from kernels.photometric.material import fit_material
+from kernels.photometric.near import NearField, see_near
+from kernels.photometric.readings import Lights, channel_weights, grey_factors, grey_readings
+from kernels.photometric.robust import solve_robust
+from kernels.photometric.samples import Samples, gather
+from kernels.photometric.shadowing import exclude_shadows
+from kernels.photometric.svbrdf import solve_svbrdf
+from kernels.status import Status
+from kernels.surface.shadows import Projection
+from service.pipelines.height import integrate
+from service.pipelines.interreflection import arriving_light
+from service.pipelines.solution import NEAR_BYTES, READING_BYTES, Solution
+from service.progress import Timings
+from stage.camera import Camera
+from stage.colour import GREY_WEIGHTS
+from stage.stack import Stack
+
+SAMPLE_BYTES = 4 * (4 + 3 + MIXTURE + GEOMETRY)
+"""Per light and pixel: grey and colour readings, direction, lobes."""
+BATCH_BYTES = 256 << 20
+"""Of samples that are solved at one time."""
+SHAPE_PIXELS = 384
+"""Pixels, spread over the object, from which the shape of the diffuse lobe is chosen."""
+
+
+LARGEST_ALBEDO = 0.98
+"""What a surface can send on; a fitted albedo may be larger where the scale of the lights is not absolute."""
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What the height of the first search is used for; both by default, either alone to see what it buys."""
+
+    shadows: bool = True
+    """Cast shadows are taken out."""
+    bounce: bool = True
+    """Light that the object throws on itself is taken off."""
+
+
+ALL = Parts()
+
+
+class _Batch(NamedTuple):
+    where: np.ndarray  # [n] positions in the image
+    samples: Samples
+
+
+def solve_material(stack: Stack, lights: Lights, camera: Camera, mask: np.ndarray, device: str, timings: Timings,
+                   field: NearField | None = None, parts: Parts = ALL) -> Solution:
+    """Solve every pixel of the mask: normal, diffuse albedo, F0 and roughness.
+
+    Args:
+        stack: the images.
+        lights: of the stack, padded.
+        camera: of the capture.
+        mask: [rows, cols] bool.
+        device: where.
+        timings: told of every stage.
+        field: where the lights are, and the point of each pixel, where some light is near; then light that the object throws on
+            itself is not taken off.
+        parts: what the height is used for.
+    """
+    factors, view = grey_factors(lights, GREY_WEIGHTS), view_directions(camera)
+    result = Solution.empty(stack.pixel_count)
+    result.specular = np.zeros((3, stack.pixel_count), np.float16)
+    result.roughness = np.zeros(stack.pixel_count, np.float16)
+    timings.stage("start", stack.shape[2])
+    _start(result, stack, lights, factors, mask.reshape(-1), device, timings, field)
+    solvable = np.flatnonzero(result.status == Status.OK)
+    timings.stage("shape", 1)
+    shape, tried = _shape(result, stack, lights, factors, view, solvable, device, field)
+    result.facts = {"diffuse_roughness": None if shape.rough < 0 else shape.rough, "diffuse_slope": shape.slope,
+                    "shapes_tried": len(tried)}
+
+    def batches(stage: str) -> Iterator[_Batch]:
+        timings.stage(stage, len(solvable))
+        done = 0
+        for batch in _batches(stack, lights, factors, view, solvable, device, field):
+            yield batch
+            done += len(batch.where)
+            timings.advance(done)
+
+    for where, samples in batches("search"):
+        normal = search_normals(samples, result.normal[:, where].T, shape=shape).normal
+        result.normal[:, where] = normal.T
+        result.albedo[:, where] = fit_material(samples, normal, shape=shape).diffuse_albedo.T
+    timings.stage("surface", 100)
+    solved = (result.status == Status.OK).reshape(mask.shape)
+    surface = integrate(camera, result.normal, solved, device, lambda part: timings.advance(round(100 * part)))
+    inside = wp.array(solved.astype(np.uint8), dtype=wp.uint8, device=device)
+    arriving = None
+    if parts.bounce and field is None and surface is not None:
+        arriving = arriving_light(stack, lights, camera, projection_of(camera), result.normal, surface.height, solved, device)
+    for where, samples in batches("normals"):
+        assert surface is not None  # there are pixels
+        if parts.shadows:
+            exclude_shadows(samples, where, surface.height, inside, projection_of(camera), None if field is None else field.places)
+        if arriving is not None:
+            corners, shares = arriving.at(*np.divmod(where, camera.width))
+            albedo = np.minimum(result.albedo[:, where].T.astype(np.float32), LARGEST_ALBEDO)
+            subtract_bounce(samples, arriving.light, corners, shares, albedo, channel_weights(lights, GREY_WEIGHTS))
+        found = solve_svbrdf(samples, result.normal[:, where].T, shape=shape)
+        result.normal[:, where] = found.normal.T
+        result.albedo[:, where] = found.diffuse_albedo.T
+        result.specular[:, where] = found.specular.T
+        result.roughness[where] = found.roughness
+        result.confidence[where] = found.confidence
+        result.residual[where] = found.residual
+    return result
+
+
+def view_directions(camera: Camera) -> Callable[[np.ndarray], np.ndarray]:
+    """A function from pixel positions (row-major, [n]) to unit directions to the viewer [n, 3] float32."""
+    if camera.projection == "orthographic":
+        return lambda positions: np.tile(np.array([0, 0, 1], dtype=np.float32), (len(positions), 1))
+    x, y = (plane.reshape(-1) for plane in camera.plane_coordinates())
+
+    def towards(positions: np.ndarray) -> np.ndarray:
+        rays = np.stack([-x[positions], -y[positions], np.ones(len(positions))], axis=1)
+        return (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
+
+    return towards
+
+
+def projection_of(camera: Camera) -> Projection:
+    """How camera-frame points fall on the picture; lens distortion, which moves shadows by its own few pixels, is left out."""
+    centre = camera.principal_px or (camera.width / 2, camera.height / 2)
+    if camera.projection == "perspective":
+        assert camera.focal_px is not None
+        return Projection(True, wp.vec2(*camera.focal_px), wp.vec2(*centre))
+    per_unit = 1.0 / (camera.pixel_size_m or 1.0)
+    return Projection(False, wp.vec2(per_unit, per_unit), wp.vec2(*centre))
+
+
+def _start(result: Solution, stack: Stack, lights: Lights, factors: np.ndarray, inside: np.ndarray, device: str,
+           timings: Timings, field: NearField | None) -> None:
+    """Normals and status to begin from: those of `robust`."""
+    for start, stop in stack.bands((READING_BYTES if field is None else NEAR_BYTES) * stack.shape[1]):
+        here = slice(start, min(stop, stack.pixel_count))
+        if inside[here].any():
+            band = packs.upload(stack.band(start, stop), stack.saturated(start, stop), device=device)
+            readings = grey_readings(band, factors)
+            near = None if field is None else see_near(band, readings, field.at(np.arange(start, stop)))
+            result.place(here, inside[here], solve_robust(band, readings, lights.direction, near))
+        timings.advance(stop)
+
+
+def _shape(result: Solution, stack: Stack, lights: Lights, factors: np.ndarray, view: Callable[[np.ndarray], np.ndarray],
+           solvable: np.ndarray, device: str, field: NearField | None) -> tuple[Diffuse, np.ndarray]:
+    """The diffuse shape, from pixels at even steps through the object."""
+    if not len(solvable):
+        return Diffuse(), np.zeros((0, 3))
+    chosen = solvable[np.unique(np.linspace(0, len(solvable) - 1, min(SHAPE_PIXELS, len(solvable))).astype(int))]
+    band = packs.upload(*stack.pick(chosen), device=device)
+    samples = gather(band, np.arange(len(chosen)), view(chosen), lights, factors, stack.light_count,
+                     None if field is None else field.at(chosen))
+    return choose_diffuse(samples, result.normal[:, chosen].T)
+
+
+def _batches(stack: Stack, lights: Lights, factors: np.ndarray, view: Callable[[np.ndarray], np.ndarray], solvable: np.ndarray,
+             device: str, field: NearField | None) -> Iterator[_Batch]:
+    """The samples of the solvable pixels, as many at a time as memory allows."""
+    size = max(1, BATCH_BYTES // (SAMPLE_BYTES * stack.light_count))
+    for start, stop in stack.bands(READING_BYTES * stack.shape[1]):
+        local = solvable[(solvable >= start) & (solvable < stop)] - start
+        if not len(local):
+            continue
+        band = packs.upload(stack.band(start, stop), stack.saturated(start, stop), device=device)
+        for first in range(0, len(local), size):
+            part = local[first : first + size]
+            where = start + part
+            yield _Batch(where, gather(band, part, view(where), lights, factors, stack.light_count,
+                                       None if field is None else field.at(where)))

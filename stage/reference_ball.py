@@ -1,0 +1,73 @@
+"""A ball of the object's material, photographed in the same rig: where each normal lies in its images."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from stage.calibration.ball import Ball
+from stage.calibration.outline import ball_from_mask
+from stage.capture import Capture
+from stage.errors import ManifestError
+from stage.light import PointLight
+from stage.lighting import check_surface
+from stage.manifest import FILE_NAME
+
+RIM_PX = 1.5
+"""How far inside the outline readings are taken: a pixel on it is part background."""
+LEAST_RADIUS_PX = 8.0
+"""A smaller ball has normals more than 7° apart."""
+LEAST_LIGHTS = 3
+
+
+class ReferenceBall(NamedTuple):
+    """The ball, checked against the capture that it is to solve."""
+
+    capture: Capture
+    ball: Ball
+
+    def pixel_of(self, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where normals [n, 3] are seen: continuous column and row, the centre of pixel (0, 0) at (0, 0); the rim's RIM_PX
+        inside it."""
+        camera = self.capture.camera
+        across = normal[:, :2] / np.maximum(np.linalg.norm(normal[:, :2], axis=1, keepdims=True), 1e-12)
+        radius = np.minimum(np.linalg.norm(normal[:, :2], axis=1), 1 - RIM_PX / self.ball.radius_px)
+        x, y = (self.ball.centre[:2] + self.ball.radius * across * radius[:, None]).T
+        per_unit = 1 / (camera.pixel_size_m or 1.0)
+        centre_u, centre_v = camera.principal_px or (camera.width / 2, camera.height / 2)
+        return centre_u + x * per_unit - 0.5, centre_v - y * per_unit - 0.5
+
+
+def reference_ball(capture: Capture, reference: Capture) -> ReferenceBall:
+    """Check a reference ball against the capture.
+
+    Raises:
+        ManifestError: an image of one pixel; other lights than the capture's, or in another order; near lights; a perspective
+            camera; no mask.
+        CalibrationError: the mask shows no ball.
+    """
+    where = reference.folder / FILE_NAME
+    check_surface(capture)
+    ours, theirs = capture.sources(), reference.sources()
+    if len(ours) != len(theirs):
+        raise ManifestError(f"{where}: frames: {len(theirs)} are lit, the capture has {len(ours)}: "
+                            "photograph the ball under the same lights")
+    if len(ours) < LEAST_LIGHTS:
+        raise ManifestError(f"{capture.folder / FILE_NAME}: frames: {len(ours)} are lit: a normal needs three or more")
+    for index, (mine, given) in enumerate(zip(ours, theirs, strict=True)):
+        if mine.light != given.light:
+            raise ManifestError(f"{where}: frames: the light of {given.image} is not that of {mine.image} of the capture (lit "
+                                f"frame {index}): the same lights must follow in the same order")
+        if isinstance(mine.light, PointLight):
+            raise ManifestError(f"{where}: frames: the light of {given.image} is point: a near light does not fall "
+                                "on ball and object alike")
+    for one in (capture, reference):
+        if one.camera.projection != "orthographic":
+            raise ManifestError(f"{one.folder / FILE_NAME}: camera.projection: is perspective: a reference ball serves "
+                                "an orthographic camera, which sees equal normals under equal angles")
+    if reference.manifest.mask is None:
+        raise ManifestError(f"{where}: mask: is missing: it says where the ball is")
+    ball = ball_from_mask(reference.camera, reference.mask().astype(np.float64))
+    if ball.radius_px < LEAST_RADIUS_PX:
+        raise ManifestError(f"{where}: mask: the ball has a radius of {ball.radius_px:.1f} pixels: "
+                            f"it needs {LEAST_RADIUS_PX:g} or more")
+    return ReferenceBall(reference, ball)

@@ -1,0 +1,119 @@
+"""Cast shadows on height fields with a closed form."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from kernels.errors import ArrayError
+from kernels.photometric.shadowing import exclude_shadows
+from kernels.surface.shadows import MARGIN_PIXELS, MARGIN_SLOPE, Projection, in_cast_shadow
+from tests.kernels.photometric.test_svbrdf import LIGHTS, render, sample, tilted
+
+STEP_AT, STEP_HEIGHT = 40, 10.0
+
+
+@wp.kernel(enable_backward=False)
+def shadow_kernel(height: wp.array2d(dtype=float), mask: wp.array2d(dtype=wp.uint8), toward: wp.vec3, perspective: bool,
+                  scale: wp.vec2, centre: wp.vec2, out: wp.array2d(dtype=wp.uint8)):
+    r, c = wp.tid()
+    if in_cast_shadow(height, mask, r, c, toward, perspective, scale, centre):
+        out[r, c] = wp.uint8(1)
+
+
+def shadows(height: np.ndarray, mask: np.ndarray, toward, projection: Projection, device: str) -> np.ndarray:
+    out = wp.zeros(height.shape, dtype=wp.uint8, device=device)
+    wp.launch(shadow_kernel, dim=height.shape,
+              inputs=[wp.array(height, dtype=float, device=device), wp.array(mask.astype(np.uint8), dtype=wp.uint8, device=device),
+                      wp.vec3(*(np.array(toward) / np.linalg.norm(toward))), *projection], outputs=[out], device=device)
+    return out.numpy().astype(bool)
+
+
+def orthographic(per_unit: float, side: int) -> Projection:
+    return Projection(False, wp.vec2(per_unit, per_unit), wp.vec2(side / 2, side / 2))
+
+
+@pytest.mark.parametrize("elevation", [20.0, 35.0, 60.0])
+@pytest.mark.parametrize("unit", [1.0, 0.001])
+def test_a_step_throws_a_shadow_of_its_length(device, elevation, unit):
+    """A step of height h lit from its side at elevation e: h / tan e of the floor is dark, whatever the unit.
+
+    Tolerance: one pixel of sampling, half a pixel of the interpolated wall, and what the margins shorten it by.
+    """
+    side = 64
+    height = np.zeros((side, side), np.float32)
+    height[:, STEP_AT:] = STEP_HEIGHT * unit  # the wall faces left; light from the right
+    tangent = np.tan(np.radians(elevation))
+    dark = shadows(height, np.ones_like(height), (1.0, 0.0, tangent), orthographic(1 / unit, side), device)
+    length = dark[side // 2, :STEP_AT].sum()
+    expected = STEP_HEIGHT / tangent
+    shortened = (MARGIN_PIXELS + MARGIN_SLOPE * expected) / tangent
+    assert expected - shortened - 1.6 <= length <= expected + 0.6
+    assert not dark[:, STEP_AT:].any()  # the top of the step is free
+    lit_from_left = shadows(height, np.ones_like(height), (-1.0, 0.0, tangent), orthographic(1 / unit, side), device)
+    assert not lit_from_left.any()
+
+
+def test_up_is_up(device):
+    """Rows count down and y up: light from +y is thrown over by what lies higher in the picture."""
+    height = np.zeros((40, 40), np.float32)
+    height[:10] = 8.0
+    dark = shadows(height, np.ones_like(height), (0.0, 1.0, 1.0), orthographic(1.0, 40), device)
+    assert dark[11:15, 20].all() and not dark[25:, 20].any() and not dark[:10].any()
+
+
+def test_a_convex_ball_shadows_nothing(device):
+    """On a ball no lit point is hidden; only points that face away from the light may be called so."""
+    v, u = np.mgrid[0:60, 0:60] + 0.5 - 30.0
+    inside = u**2 + v**2 < 27.0**2
+    height = np.where(inside, np.sqrt(np.maximum(27.0**2 - u**2 - v**2, 0)), 0).astype(np.float32)
+    normal = np.stack([u, -v, height], axis=-1) / 27.0
+    toward = np.array([0.8, 0.3, 0.52])
+    dark = shadows(height, inside, toward, orthographic(1.0, 60), device)
+    lit = normal @ (toward / np.linalg.norm(toward)) > 0.05
+    assert not dark[inside & lit].any()
+
+
+def test_perspective_agrees_with_the_same_scene_seen_from_far(device):
+    """A step on a plane at distance d with focal length d: as d grows the picture is the orthographic one."""
+    side, far = 64, 2000.0
+    height = np.full((side, side), -far, np.float32)
+    height[:, STEP_AT:] += STEP_HEIGHT
+    toward = (1.0, 0.1, 0.7)
+    flat = shadows(height + far, np.ones_like(height), toward, orthographic(1.0, side), device)
+    seen = shadows(height, np.ones_like(height), toward, Projection(True, wp.vec2(far, far), wp.vec2(side / 2, side / 2)), device)
+    assert (flat != seen).mean() < 0.02  # a pixel along the shadow's edge
+    assert seen[:, :STEP_AT].sum() > 200
+
+
+def test_nothing_outside_the_mask_throws_a_shadow(device):
+    height = np.zeros((40, 40), np.float32)
+    height[:, 25:] = 50.0
+    mask = np.zeros((40, 40), bool)
+    mask[:, :24] = True
+    assert not shadows(height, mask, (1.0, 0.0, 0.3), orthographic(1.0, 40), device).any()
+    assert not shadows(height, mask, (0.0, 0.0, 1.0), orthographic(1.0, 40), device).any()
+
+
+def test_shadowed_readings_leave_the_samples(device):
+    """What lies behind a wall loses exactly the lights that the wall hides; the others keep their readings."""
+    samples, _ = sample(render(tilted(16)), device)
+    before = samples.grey.numpy().copy()
+    height = np.zeros((16, 16), np.float32)
+    height[:, 8:] = 100.0
+    mask = wp.array(np.ones((16, 16), np.uint8), dtype=wp.uint8, device=device)
+    pixels = np.arange(16) * 16 + 4  # column 4 of every row
+    exclude_shadows(samples, pixels, wp.array(height, dtype=float, device=device), mask, orthographic(1.0, 16))
+    after = samples.grey.numpy()
+    colour = samples.colour.numpy()
+    flat = [values.reshape(-1, samples.lanes) for values in (before, after)]
+    row = 8  # in the middle: the way to any light from the right crosses the wall before it leaves the picture
+    for light, direction in enumerate(LIGHTS):
+        at = (row // samples.lanes) * samples.pack_stride + light * samples.light_stride
+        was, now = flat[0][at, row % samples.lanes], flat[1][at, row % samples.lanes]
+        if direction[0] > 0.5 and abs(direction[1]) < 0.5:
+            assert now < 0
+            assert (colour.reshape(3, -1, samples.lanes)[:, at, row % samples.lanes] < 0).all()
+        if direction[0] < -0.1:
+            assert now == was
+    with pytest.raises(ArrayError, match="pixels must be"):
+        exclude_shadows(samples, np.arange(3), wp.array(height, dtype=float, device=device), mask, orthographic(1.0, 16))

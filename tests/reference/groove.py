@@ -1,0 +1,31 @@
+"""A V-groove of two planes at right angles, along y, seen from +z, with all bounces of light: radiosity in float64. Imports nothing of ours."""
+
+import numpy as np
+
+
+class Groove:
+    """side x side pixels of unit size; x from left to right, both faces rise at 45 degrees from the middle."""
+
+    def __init__(self, side: int):
+        self.side = side
+        v, u = np.mgrid[0:side, 0:side]
+        x, y = u + 0.5 - side / 2, side / 2 - (v + 0.5)
+        self.points = np.stack([x, y, np.abs(x)], axis=-1).reshape(-1, 3)
+        s = np.sqrt(0.5)
+        self.normals = np.stack([-np.sign(x) * s, np.zeros_like(x), np.full_like(x, s)], axis=-1).reshape(-1, 3)
+        self.areas = np.full(side * side, 1 / s)
+
+    def factors(self) -> np.ndarray:
+        """[n, n] form factors; the two faces see each other wholly, each face not itself."""
+        way = self.points[None] - self.points[:, None]
+        squared = (way**2).sum(-1) + np.eye(len(way))
+        here = np.maximum((way * self.normals[:, None]).sum(-1), 0)
+        there = np.maximum(-(way * self.normals[None]).sum(-1), 0)
+        return here * there / squared * self.areas[None] / (np.pi * squared + self.areas[None])
+
+    def radiance(self, lights: np.ndarray, albedo: float) -> tuple[np.ndarray, np.ndarray]:
+        """[light, pixel] radiance with all bounces, and the direct part, for unit irradiance. The faces throw no shadows on each
+        other for lights within 45 degrees of +z."""
+        direct = albedo / np.pi * np.maximum(lights @ self.normals.T, 0)
+        whole = np.linalg.solve(np.eye(self.side**2) - albedo * self.factors(), direct.T).T
+        return whole, direct

@@ -1,0 +1,134 @@
+"""relit solve --method reference: a ball of the same, unknown material under the same lights, which need not be known either."""
+
+import json
+
+import numpy as np
+import pytest
+
+from stage import exr
+from stage.maps import SurfaceMaps
+from tests.captures import angles_degrees, edit_frame, edit_manifest, write_exr, write_image, write_manifest
+
+LIGHTS, SIDE = 24, 40
+RNG = np.random.default_rng(5)
+
+
+def directions() -> np.ndarray:
+    i = np.arange(LIGHTS) + 0.5
+    z = 1 - 0.75 * i / LIGHTS
+    turn = np.pi * (1 + 5**0.5) * i
+    return np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], axis=1)
+
+
+DIRECTIONS = directions()
+STRENGTH = RNG.uniform(0.5, 2.0, (LIGHTS, 3))
+
+
+def velvet(normal: np.ndarray) -> np.ndarray:
+    """[n, lights] of no textbook's material: flat, brighter at the rim, with a wide highlight off the mirror direction."""
+    cosine = np.maximum(normal @ DIRECTIONS.T, 0)
+    half = DIRECTIONS + [0.0, 0.0, 0.8]
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    rim = (1 - normal[:, 2:]) ** 2
+    return cosine**0.6 * (0.3 + 0.5 * rim) + 0.6 * np.maximum(normal @ half.T, 0) ** 40 * (cosine > 0)
+
+
+def surface(side: int, stretch: float) -> tuple[np.ndarray, np.ndarray]:
+    """Normals [side, side, 3] and mask of an ellipsoid z = stretch · √(1 - x² - y²)."""
+    centre = ((np.arange(side) + 0.5) / side * 2 - 1) * 1.06
+    x, y = np.meshgrid(centre, -centre)
+    mask = x**2 + y**2 < 1
+    z = np.sqrt(np.where(mask, 1 - x**2 - y**2, 1))
+    normal = np.stack([stretch * x, stretch * y, z], axis=-1)
+    return normal / np.linalg.norm(normal, axis=-1, keepdims=True), mask
+
+
+def write(folder, normal, mask, albedo, **changes):
+    radiance = velvet(normal[mask])[..., None] * STRENGTH * albedo
+    frames = []
+    for index, direction in enumerate(DIRECTIONS):
+        image = np.zeros((*mask.shape, 3))
+        image[mask] = radiance[:, index]
+        write_exr(folder / f"{index:03d}.exr", image)
+        frames.append({"image": f"{index:03d}.exr", "light": {"type": "distant", "direction": direction.tolist(),
+                                                             "irradiance": [1.0, 1.0, 1.0]}})
+    write_image(folder / "mask.png", (mask * 255).astype(np.uint8))
+    rows, cols = mask.shape
+    write_manifest(folder, {"schema": "relit.capture/1", "name": "velvet", "mask": "mask.png", "frames": frames,
+                            "camera": {"projection": "orthographic", "resolution": [cols, rows]}, **changes})
+    return folder
+
+
+@pytest.fixture
+def captures(tmp_path):
+    """The object, whose albedo varies, and the ball."""
+    normal, mask = surface(SIDE, 0.6)
+    albedo = RNG.uniform(0.3, 0.9, (mask.sum(), 1, 1))
+    write(tmp_path / "object", normal, mask, albedo)
+    write(tmp_path / "ball", *surface(140, 1.0), 0.5)
+    return tmp_path
+
+
+def solve(relit, folder, *arguments):
+    return relit("solve", folder / "object", "--out", folder / "out", *arguments)
+
+
+def test_normals_of_a_material_without_a_model(relit, captures):
+    outcome = solve(relit, captures, "--method", "reference", "--reference-ball", captures / "ball",
+                    "--cache", captures / "cache")
+    assert (outcome.code, outcome.err) == (0, "")
+    maps = SurfaceMaps.read(captures / "out" / "maps.exr")
+    normal, mask = surface(SIDE, 0.6)
+    error = angles_degrees(maps.normal, normal)[mask]
+    assert np.array_equal(maps.mask, mask) and error.mean() < 0.3  # the pixels of the ball are 0.9 degrees apart
+    assert error[normal[mask][:, 2] > 0.3].max() < 2  # its last pixel inside the rim is at 78 degrees
+    solve(relit, captures, "--method", "svbrdf")
+    by_model = angles_degrees(SurfaceMaps.read(captures / "out" / "maps.exr").normal, normal)[mask]
+    assert by_model.mean() > 5 * error.mean()
+
+
+def test_what_is_not_estimated_is_absent(relit, captures):
+    solve(relit, captures, "--method", "reference", "--reference-ball", captures / "ball")
+    channels, _ = exr.read(captures / "out" / "maps.exr")
+    assert {name.partition(".")[0] for name in channels} == {"normal", "height", "confidence", "mask"}
+    report = json.loads((captures / "out" / "report.json").read_text())
+    assert report["found"]["reference"]["radius_px"] == pytest.approx(70 / 1.06, abs=0.5)
+    assert report["options"]["reference_ball"] == str(captures / "ball")
+
+
+@pytest.mark.parametrize("arguments", [("--method", "reference"), ("--reference-ball", "ball")])
+def test_method_and_ball_go_together(relit, captures, arguments):
+    outcome = solve(relit, captures, *(captures / a if a == "ball" else a for a in arguments))
+    assert outcome.code == 2 and "--method reference and --reference-ball CAPTURE go together" in outcome.err
+
+
+def refused(relit, captures) -> str:
+    outcome = solve(relit, captures, "--method", "reference", "--reference-ball", captures / "ball")
+    assert outcome.code == 2 and not (captures / "out").exists()
+    return " ".join(outcome.err.split())
+
+
+def test_other_lights_are_refused(relit, captures):
+    edit_frame(captures / "ball", 3, light={"type": "distant", "direction": [0, 0, 1], "irradiance": [1, 1, 1]})
+    assert "the light of 003.exr is not that of 003.exr of the capture" in refused(relit, captures)
+
+
+def test_another_number_of_lights_is_refused(relit, captures):
+    edit_frame(captures / "ball", 3, light={"type": "off"})
+    assert "23 are lit, the capture has 24" in refused(relit, captures)
+
+
+def test_a_ball_without_a_mask_is_refused(relit, captures):
+    edit_manifest(captures / "ball", mask=None)
+    assert "mask: is missing: it says where the ball is" in refused(relit, captures)
+
+
+def test_a_mask_that_is_no_ball_is_refused(relit, captures):
+    write_image(captures / "ball" / "mask.png", np.pad(np.full((90, 10), 255, np.uint8), ((25, 25), (65, 65))))
+    assert "ball" in refused(relit, captures)
+
+
+def test_a_perspective_camera_is_refused(relit, captures):
+    edit_manifest(captures / "ball", camera={"projection": "perspective", "resolution": [140, 140], "focal_px": [300, 300],
+                                             "principal_px": [70, 70]})
+    assert "camera.projection: is perspective" in refused(relit, captures)

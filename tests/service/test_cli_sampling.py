@@ -1,0 +1,103 @@
+"""relit solve on captures under diffused sources: from images on disk to maps.exr, with a known truth."""
+
+import json
+
+import numpy as np
+import pytest
+
+from stage import exr
+from stage.maps import SurfaceMaps
+from tests.captures import angles_degrees
+from tests.reference import sampling as twin
+from tests.sampling_captures import COLOUR, SHARPNESS, VIEW, ball, light, write_sampling
+
+SIDE, LIGHTS = 16, 20
+CENTRES = twin.lattice(LIGHTS)
+BALL = ball(SIDE)
+NORMALS = BALL.normal[BALL.mask]
+PAINTED = NORMALS[:, 0] < 0
+PAINT, METAL, ALPHA = np.array([0.6, 0.3, 0.15]), 0.8, 0.1
+
+
+@pytest.fixture(scope="module")
+def half_painted() -> np.ndarray:
+    """[n, lights, 3]: paint on the left, metal on the right."""
+    paint = twin.lambert(NORMALS, CENTRES, SHARPNESS)[..., None] * PAINT
+    metal = twin.ggx(NORMALS, VIEW, CENTRES, SHARPNESS, alpha=ALPHA, f0=METAL)[..., None]
+    return np.where(PAINTED[:, None, None], paint, metal) * COLOUR
+
+
+def solve(relit, folder, *arguments):
+    outcome = relit("solve", folder, "--out", folder / "out", *arguments)
+    assert (outcome.code, outcome.err) == (0, "")
+    return SurfaceMaps.read(folder / "out" / "maps.exr"), json.loads((folder / "out" / "report.json").read_text())
+
+
+def test_half_painted_half_metallic(relit, tmp_path, half_painted):
+    maps, report = solve(relit, write_sampling(tmp_path, BALL, half_painted, CENTRES))
+    assert np.array_equal(maps.mask, BALL.mask) and report["method"] == "svbrdf"
+    assert angles_degrees(maps.normal, BALL.normal)[BALL.mask].mean() < 0.3
+    regime = maps.regime[BALL.mask]
+    assert (regime == np.where(PAINTED, 1, 2)).mean() > 0.99
+    albedo, specular, roughness = (layer[BALL.mask] for layer in (maps.diffuse_albedo, maps.specular, maps.roughness))
+    assert np.allclose(np.median(albedo[PAINTED], axis=0), PAINT, rtol=0.02)
+    assert np.median(specular[~PAINTED]) == pytest.approx(METAL, abs=0.02)
+    assert np.median(roughness[~PAINTED]) == pytest.approx(ALPHA**0.5, abs=0.03)
+    channels, _ = exr.read(tmp_path / "out" / "maps.exr")
+    layers = {name.partition(".")[0] for name in channels}
+    assert layers == {"normal", "diffuse_albedo", "specular", "roughness", "regime", "height", "confidence", "mask"}
+    assert all(np.isfinite(plane).all() for plane in channels.values())
+    found = report["found"]
+    assert sum(found["regimes"].values()) == BALL.mask.sum() and found["views"] == 1 and found["light_samples"] > 1000
+
+
+def test_a_mirror_with_a_distant_light_among_the_sources(relit, tmp_path):
+    """The distant light shows in a few pixels alone; all others have to bear a reading of zero."""
+    radiance = twin.mirror(NORMALS, VIEW, CENTRES, SHARPNESS, f0=0.9)[..., None] * COLOUR
+    dark = np.zeros((len(NORMALS), 1, 3))
+    lights = [light(centre) for centre in CENTRES]
+    lights.append({"type": "distant", "direction": [0.0, 0.6, 0.8], "irradiance": [1.0, 1.0, 1.0]})
+    write_sampling(tmp_path, BALL, np.concatenate([radiance, dark], axis=1), CENTRES, lights=lights)
+    maps, _ = solve(relit, tmp_path, "--method", "svbrdf")
+    error = angles_degrees(maps.normal, BALL.normal)[BALL.mask]
+    assert np.percentile(error, 95) < 0.5
+    assert (maps.regime[BALL.mask] == 3).mean() > 0.95
+
+
+def test_a_perspective_view_is_solved_in_parts(relit, tmp_path):
+    """A ball, half paint and half mirror, 20 degrees wide: its pixels see it from different sides."""
+    focal = SIDE / (2 * np.tan(np.radians(10)))
+    offset = (np.arange(SIDE) + 0.5 - SIDE / 2) / focal
+    x, y = np.meshgrid(offset, -offset)
+    view = np.stack([-x, -y, np.ones_like(x)], axis=-1)
+    view = (view / np.linalg.norm(view, axis=-1, keepdims=True))[BALL.mask]
+    radiance = np.where(PAINTED[:, None], 0.5 * twin.lambert(NORMALS, CENTRES, SHARPNESS),
+                        twin.mirror(NORMALS, view, CENTRES, SHARPNESS, f0=0.9))[..., None] * COLOUR
+    facing = (NORMALS * view).sum(axis=1) > 0.25
+    camera = {"projection": "perspective", "resolution": [SIDE, SIDE], "focal_px": [focal, focal],
+              "principal_px": [SIDE / 2, SIDE / 2]}
+    maps, report = solve(relit, write_sampling(tmp_path, BALL, radiance, CENTRES, camera=camera))
+    error = angles_degrees(maps.normal, BALL.normal)[BALL.mask]
+    assert error[facing].mean() < 0.2 and error[facing].max() < 1
+    assert report["found"]["views"] == 9
+    assert (maps.regime[BALL.mask] == np.where(PAINTED, 1, 3))[facing].mean() > 0.99
+
+
+@pytest.mark.parametrize("method", ["lambert", "robust"])
+def test_methods_for_one_direction_refuse(relit, tmp_path, half_painted, method):
+    write_sampling(tmp_path, BALL, half_painted, CENTRES)
+    outcome = relit("solve", tmp_path, "--out", tmp_path / "out", "--method", method)
+    assert outcome.code == 2 and "some are extended: --method svbrdf solves these" in outcome.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_info_counts_them_and_finds_no_fault(relit, tmp_path, half_painted):
+    outcome = relit("info", write_sampling(tmp_path, BALL, half_painted, CENTRES))
+    assert outcome.code == 0 and f"{LIGHTS} extended light" in outcome.out
+
+
+def test_dark_pixels_have_a_status(relit, tmp_path, half_painted):
+    radiance = half_painted.copy()
+    radiance[:5] = 0
+    maps, report = solve(relit, write_sampling(tmp_path, BALL, radiance, CENTRES))
+    assert report["pixels"]["dark"] == 5 and maps.mask.sum() == BALL.mask.sum() - 5
