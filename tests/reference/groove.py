@@ -1,4 +1,7 @@
-"""A V-groove of two planes at right angles, along y, seen from +z, with all bounces of light: radiosity in float64. Imports nothing of ours."""
+"""A V-groove of two planes at right angles, along y, seen from +z, with all bounces of light: radiosity in float64.
+
+Imports nothing of ours.
+"""
 
 import numpy as np
 
