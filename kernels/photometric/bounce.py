@@ -68,7 +68,7 @@ def _bounce_kernel(lanes: int) -> Any:
             for c in range(3):
                 y, rho = colour[c, at], albedo[c, p]
                 for k in range(lanes):
-                    light_in = 0.0
+                    light_in = float(0.0)  # a literal could not change inside the loop
                     for corner in range(4):
                         patch = int(corners[corner, p][k])
                         light_in += shares[corner, p][k] * arriving[patch, c, light]

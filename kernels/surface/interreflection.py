@@ -54,7 +54,7 @@ def form_factors(points: np.ndarray, normals: np.ndarray, areas: np.ndarray, hei
 @wp.func
 def _hidden(a: wp.vec3, b: wp.vec3, height: wp.array2d(dtype=float), mask: wp.array2d(dtype=wp.uint8), perspective: bool,
             scale: wp.vec2, centre: wp.vec2) -> bool:
-    between = False
+    between = bool(False)  # a literal could not change inside the loop
     for step in range(SIGHT_STEPS):
         point = a + (b - a) * ((float(step) + 1.5) / float(SIGHT_STEPS + 2))
         at = project(point, perspective, scale, centre)
@@ -82,7 +82,7 @@ def _factor_kernel(first: int,
     for j in range(points.shape[0]):
         way = points[j] - points[i]
         far = wp.length(way)
-        value = 0.0
+        value = float(0.0)  # likewise
         if j != i and far > 0.0:
             here = wp.max(wp.dot(normals[i], way) / far, 0.0)
             there = wp.max(-wp.dot(normals[j], way) / far, 0.0)

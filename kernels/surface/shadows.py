@@ -60,7 +60,7 @@ def in_shadow_within(height: wp.array2d(dtype=float), mask: wp.array2d(dtype=wp.
         return False  # along the line of sight
     stride = pixel / across
     travelled = FIRST_STEP * stride
-    hidden = False
+    hidden = bool(False)  # a literal could not change inside the loop
     rows, cols = mask.shape[0], mask.shape[1]
     for _ in range(rows + cols):
         if travelled >= reach:

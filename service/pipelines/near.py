@@ -30,7 +30,7 @@ SETTLED_PERCENT = 99.5
 ROUNDS = 20
 """At most; five to seven are usual with lights at 1.3 object radii, twelve with a rim seen edge on, three at three radii."""
 STALLED = 4
-"""They end too when so many rounds in a row did not move the surface less than one before: noise then decides who is in shadow."""
+"""They end too when so many rounds in a row moved the surface no less than one before: noise then decides what is shadow."""
 MATERIAL_ROUNDS = 3
 """At most, of the general solver, on a surface that is nearly settled: a round leaves about a tenth of the change before it."""
 
