@@ -146,7 +146,7 @@ def _table_kernel(lanes: int) -> Any:
             lx, ly, lz, solid = places[place][0], places[place][1], places[place][2], places[place][3]
             begin, end = begins[place], begins[place + 1]
             nl, nh, mirror, bare, risen = lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
-            lit, seen = float(0.0), float(0.0)  # noqa: UP018 - Warp variables
+            lit, seen = float(0.0), float(0.0)  # variables of a Warp loop
             inverse = 1.0 / wp.sqrt(wp.max(2.0 + 2.0 * lz, 1.0e-6))
             vh = wp.sqrt(wp.max(0.5 + 0.5 * lz, 1.0e-4))
             rise = schlick(vh)

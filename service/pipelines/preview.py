@@ -30,26 +30,30 @@ def write_preview(path: Path, maps: SurfaceMaps, captured: np.ndarray, frames: S
         path: the PNG.
         maps: solved maps.
         captured: [rows, cols, 3] scene-linear, one captured image.
-        frames: relit EXR frames; eight of them, evenly chosen, are shown.
+        frames: relit EXR frames; two rows of them, evenly chosen, are shown.
 
     Raises:
         StorageError: the picture cannot be written.
     """
     mask = maps.mask
-    shown = [frames[i] for i in np.linspace(0, len(frames), min(8, len(frames)), endpoint=False).astype(int)]
-    relit = [_read_rgb(frame) for frame in shown]
-    exposure = _exposure(np.stack(relit), mask)
     top = [("captured, one light", _display(captured * _exposure(captured[None], mask), maps.color_space))]
     if maps.normal is not None:
         top.append(("normals", np.where(mask[..., None], 0.5 + 0.5 * maps.normal, BACKGROUND)))
     if maps.diffuse_albedo is not None:
         albedo = convert(np.clip(maps.diffuse_albedo, 0, 1).astype(np.float32), maps.color_space, "srgb_rec709_scene")
         top.append(("diffuse albedo", np.where(mask[..., None], albedo, BACKGROUND)))
+    if maps.roughness is not None:
+        grey = np.repeat(maps.roughness.astype(np.float32)[..., None], 3, axis=-1)
+        top.append(("roughness", np.where(mask[..., None], grey, BACKGROUND)))
     if maps.height is not None:
         top.append(("height", _relief(maps.height, mask)))
+    count = min(2 * len(top), len(frames))
+    shown = [frames[i] for i in np.linspace(0, len(frames), count, endpoint=False).astype(int)]
+    relit = [_read_rgb(frame) for frame in shown]
+    exposure = _exposure(np.stack(relit), mask)
     bottom = [(f"relit, {frame.stem}", _display(pixels * exposure, maps.color_space))
               for frame, pixels in zip(shown, relit, strict=True)]
-    rows = [[(title, _fit(image)) for title, image in row] for row in (top, bottom[:4], bottom[4:]) if row]
+    rows = [[(title, _fit(image)) for title, image in row] for row in (top, bottom[: len(top)], bottom[len(top) :]) if row]
     _write(path, _sheet(rows))
 
 
