@@ -4,6 +4,7 @@ On the CPU a Warp launch runs its threads one after another on one core and rele
 cut into blocks that a thread pool runs side by side. On CUDA a launch is one launch.
 """
 
+import itertools
 import os
 import sys
 import tempfile
@@ -23,8 +24,9 @@ PACK_CPU = 32
 """Pixels per thread on the CPU: wide enough for the compiler to fill SIMD registers (docs/figures.md)."""
 PACK_CUDA = 4
 """Pixels per thread on CUDA: one 8-byte load of half values per thread, coalesced over a warp."""
-BLOCKS_PER_WORKER = 4
-"""CPU blocks per thread, so that a slow block does not leave the other cores idle."""
+UNEVEN_BLOCKS = 4
+"""CPU blocks per core where some take longer than others. Where all take the same, one a core: starting a block takes a tenth of a
+millisecond of the interpreter, during which the other cores wait."""
 
 CPU_BLOCK = 1
 """The block size that Warp launches CPU kernels with; loading ahead with another would compile the module twice."""
@@ -80,7 +82,8 @@ def worker_count() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def launch(kernel: Any, count: int, inputs: Sequence[Any], outputs: Sequence[Any], *, device: str) -> None:
+def launch(kernel: Any, count: int, inputs: Sequence[Any], outputs: Sequence[Any], *, device: str,
+           uneven: bool = False) -> None:
     """Run `count` independent threads of a kernel.
 
     Args:
@@ -90,6 +93,7 @@ def launch(kernel: Any, count: int, inputs: Sequence[Any], outputs: Sequence[Any
         inputs: the kernel's inputs after `first`.
         outputs: its outputs.
         device: where to run.
+        uneven: whether some threads work much longer than others; on the CPU the work is then cut finer.
 
     Raises:
         ArrayError: more threads than a launch can have.
@@ -107,17 +111,16 @@ def launch(kernel: Any, count: int, inputs: Sequence[Any], outputs: Sequence[Any
         wp.launch(kernel, dim=count, inputs=[0, *inputs], outputs=list(outputs), device=device, block_dim=CUDA_BLOCK)
         return
     workers = worker_count()
-    blocks = min(count, workers * BLOCKS_PER_WORKER) if workers > 1 else 1
+    blocks = min(count, workers * (UNEVEN_BLOCKS if uneven else 1)) if workers > 1 else 1
     edges = [count * b // blocks for b in range(blocks + 1)]
 
-    def run(block: int) -> None:
-        first, last = edges[block], edges[block + 1]
-        wp.launch(kernel, dim=last - first, inputs=[first, *inputs], outputs=list(outputs), device="cpu")
-
+    # recorded here, so that the pool's threads need the interpreter for a moment only
+    commands = [wp.launch(kernel, dim=last - first, inputs=[first, *inputs], outputs=list(outputs), device="cpu", record_cmd=True)
+                for first, last in itertools.pairwise(edges)]
     if blocks == 1:
-        run(0)
+        commands[0].launch()
     else:
-        list(_pool(workers).map(run, range(blocks)))
+        list(_pool(workers).map(lambda command: command.launch(), commands))
 
 
 @cache
@@ -140,4 +143,12 @@ def _start() -> None:
 
 @cache
 def _pool(workers: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(workers, thread_name_prefix="relit-kernel")
+    """One thread a core, each kept on its own where the system allows: two woken on one core would take turns for milliseconds."""
+    cores = iter(sorted(os.sched_getaffinity(0))) if hasattr(os, "sched_setaffinity") else iter(())
+
+    def settle() -> None:
+        core = next(cores, None)
+        if core is not None:
+            os.sched_setaffinity(0, {core})
+
+    return ThreadPoolExecutor(workers, thread_name_prefix="relit-kernel", initializer=settle)

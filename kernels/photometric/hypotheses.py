@@ -62,7 +62,7 @@ class SearchOptions:
 
 WIDE = ((5.0, 10.0, 16.0, 24.0, 34.0, 46.0), 30)
 """First rings, degrees from the start, and how many candidates the last one has."""
-FINE = (((2.5, 5.0), 10), ((0.9, 1.8), 8), ((0.4,), 6), ((0.2,), 6))
+FINE = (((2.5, 5.0), 10), ((0.9, 1.8), 8), ((0.4,), 6), ((0.2,), 6), ((0.06,), 6))
 """The rings that follow, each about the best so far."""
 
 
@@ -131,10 +131,11 @@ def search_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse,
     form = wp.vec2(shape.rough, shape.slope)
     for degrees, count in (wide, *fine):
         offsets = wp.array(rings(degrees, count), dtype=wp.vec4, device=device)
+        radius = math.sin(math.radians(degrees[0])) if len(degrees) == 1 else 0.0
         devices.launch(_search_kernel(lanes, lobes, options.reweightings, options.sweeps), packs,
-                       [samples.grey, samples.toward, table, samples.view, offsets, noise, shadow, form, lights,
+                       [samples.grey, samples.toward, table, samples.view, offsets, radius, noise, shadow, form, lights,
                         samples.pack_stride, samples.light_stride, *strides],
-                       [scratch, normal, cost, curvature, weights], device=device)
+                       [scratch, normal, cost, curvature, weights], device=device, uneven=True)
     return Search(to_host(samples, normal), to_host(samples, cost), to_host(samples, curvature), to_host(samples, weights))
 
 
@@ -152,6 +153,7 @@ def _search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> 
                       table: wp.array3d(dtype=float),  # [cells, L, lobes]
                       view: wp.array2d(dtype=lane_type),  # [3, P]
                       offsets: wp.array(dtype=wp.vec4),  # [candidates]
+                      radius: float,  # sine of the only ring's angle, 0 where there are several
                       noise: wp.vec2,  # s0, s1
                       shadow: wp.vec2,  # r²/σ² of equal cost, depth
                       form: wp.vec2,  # diffuse roughness, slope
@@ -174,7 +176,8 @@ def _search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> 
         # tangent frame about the start
         cx, cy, cz = normal[0, p], normal[1, p], normal[2, p]
         tx, ty, tz, ux, uy, uz = lane_type(), lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
-        best, bx, by, bz, centre, ring = lane_type(), lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
+        best, bx, by, bz = lane_type(), lane_type(), lane_type(), lane_type()
+        centre, ring, slope_x, slope_y = lane_type(), lane_type(), lane_type(), lane_type()
         found = coefficients()
         for k in range(lanes):
             n = wp.vec3(cx[k], cy[k], cz[k])
@@ -256,7 +259,10 @@ def _search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> 
                                 move = relaxation * rest / (g[a * (a + 1) / 2 + a, k] + 1.0e-8)
                                 x_best[a, k] = wp.max(x_best[a, k] + move, 0.0)
             for k in range(lanes):
-                ring[k] += wp.where(candidate > 0, total[k], 0.0)
+                around = wp.where(candidate > 0, total[k], 0.0)
+                ring[k] += around
+                slope_x[k] += around * o[2]
+                slope_y[k] += around * o[3]
                 centre[k] = wp.where(candidate == 0, total[k], centre[k])
                 better = total[k] < best[k]
                 for a in range(mixture):
@@ -265,13 +271,27 @@ def _search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> 
                 bx[k] = wp.where(better, nx[k], bx[k])
                 by[k] = wp.where(better, ny[k], by[k])
                 bz[k] = wp.where(better, nz[k], bz[k])
+        share, bend = lane_type(), lane_type()
+        for k in range(lanes):
+            members = wp.max(float(offsets.shape[0] - 1), 1.0)
+            rise = ring[k] / members - centre[k]
+            # Newton's step on the paraboloid through centre and ring, in radii; never beyond the ring
+            move_x = -slope_x[k] / (members * wp.max(rise, 1.0e-12))
+            move_y = -slope_y[k] / (members * wp.max(rise, 1.0e-12))
+            far = wp.max(wp.sqrt(move_x * move_x + move_y * move_y), 1.0)
+            x = cx[k] + radius * (move_x * tx[k] + move_y * ux[k]) / far
+            y = cy[k] + radius * (move_x * ty[k] + move_y * uy[k]) / far
+            z = cz[k] + radius * (move_x * tz[k] + move_y * uz[k]) / far
+            scale = 1.0 / wp.sqrt(x * x + y * y + z * z)
+            stepped = wp.where(radius > 0.0, 1, 0) * wp.where(rise > 0.0, 1, 0)
+            bx[k] = wp.where(stepped == 1, x * scale, bx[k])
+            by[k] = wp.where(stepped == 1, y * scale, by[k])
+            bz[k] = wp.where(stepped == 1, z * scale, bz[k])
+            share[k] = best[k] / float(light_count)
+            bend[k] = (ring[k] / members - best[k]) / float(light_count)
         normal[0, p] = bx
         normal[1, p] = by
         normal[2, p] = bz
-        share, bend = lane_type(), lane_type()
-        for k in range(lanes):
-            share[k] = best[k] / float(light_count)
-            bend[k] = (ring[k] / wp.max(float(offsets.shape[0] - 1), 1.0) - best[k]) / float(light_count)
         cost[p] = share
         curvature[p] = bend
         for a in range(mixture):
