@@ -17,7 +17,8 @@ from kernels.photometric.robust import solve_robust
 from kernels.photometric.samples import Samples, gather
 from kernels.photometric.svbrdf import solve_svbrdf
 from kernels.status import Status
-from service.pipelines.material import SHAPE_PIXELS
+from service.pipelines.material import SHAPE_PIXELS, Parts, solve_material
+from service.progress import Timings
 from stage.capture import Capture
 from stage.colour import GREY_WEIGHTS
 from stage.importers import diligent
@@ -41,6 +42,8 @@ class Case:
     samples: Samples
     shape: Diffuse
     """The shared diffuse shape, chosen on SHAPE_PIXELS of them."""
+    whole: Callable[[Parts], np.ndarray]
+    """Solves the whole image; [n, 3] of its normals."""
 
 
 def load_case(name: str, capture: Capture, truth: np.ndarray, cache: Path) -> Case:
@@ -69,7 +72,12 @@ def load_case(name: str, capture: Capture, truth: np.ndarray, cache: Path) -> Ca
     samples = _gather(band, solved, lights, factors, stack.light_count)
     few = solved[np.unique(np.linspace(0, len(solved) - 1, min(SHAPE_PIXELS, len(solved))).astype(int))]
     shape, _ = choose_diffuse(_gather(band, few, lights, factors, stack.light_count), robust[0][few])
-    return Case(name, truth.reshape(-1, 3)[chosen[solved]], lambert[0][solved], robust[0][solved], samples, shape)
+
+    def whole(parts: Parts) -> np.ndarray:
+        solution = solve_material(stack, lights, capture.camera, capture.mask(), "cpu", Timings(), parts=parts)
+        return solution.normal[:, chosen[solved]].T
+
+    return Case(name, truth.reshape(-1, 3)[chosen[solved]], lambert[0][solved], robust[0][solved], samples, shape, whole)
 
 
 def _gather(band: packs.Band, pixels: np.ndarray, lights: Lights, factors: np.ndarray, count: int) -> Samples:
@@ -84,7 +92,9 @@ VARIANTS: dict[str, Callable[[Case], np.ndarray]] = {
         lambda case: search_normals(case.samples, case.robust, shape=Diffuse(), options=NO_SHADOW).normal,
     "+ cast shadow as a hypothesis of its own": lambda case: search_normals(case.samples, case.robust, shape=Diffuse()).normal,
     "+ diffuse shape shared by the object": lambda case: search_normals(case.samples, case.robust, shape=case.shape).normal,
-    "+ averaged over nearby shapes (`svbrdf`)": lambda case: solve_svbrdf(case.samples, case.robust, shape=case.shape).normal,
+    "+ averaged over nearby shapes": lambda case: solve_svbrdf(case.samples, case.robust, shape=case.shape).normal,
+    "+ cast shadows of the height taken out": lambda case: case.whole(Parts(bounce=False)),
+    "+ light that the object throws on itself taken off (`svbrdf`)": lambda case: case.whole(Parts()),
 }
 
 

@@ -53,8 +53,20 @@ def write_preview(path: Path, maps: SurfaceMaps, captured: np.ndarray, frames: S
     exposure = _exposure(np.stack(relit), mask)
     bottom = [(f"relit, {frame.stem}", _display(pixels * exposure, maps.color_space))
               for frame, pixels in zip(shown, relit, strict=True)]
-    rows = [[(title, _fit(image)) for title, image in row] for row in (top, bottom[: len(top)], bottom[len(top) :]) if row]
-    _write(path, _sheet(rows))
+    write_sheet(path, [row for row in (top, bottom[: len(top)], bottom[len(top) :]) if row])
+
+
+def write_sheet(path: Path, rows: Sequence[Sequence[tuple[str, np.ndarray]]]) -> None:
+    """Write pictures with titles, row by row, as one PNG.
+
+    Args:
+        path: the PNG.
+        rows: (title, [rows, cols, 3] display values 0…1) of each picture.
+
+    Raises:
+        StorageError: the picture cannot be written.
+    """
+    _write(path, _sheet([[(title, _fit(image)) for title, image in row] for row in rows]))
 
 
 def _read_rgb(path: Path) -> np.ndarray:
