@@ -4,7 +4,7 @@ from enum import IntEnum
 
 
 class Status(IntEnum):
-    """Why a pixel has, or has not, a result. Only OK pixels carry values; an unwritten pixel is never OK."""
+    """Why a pixel has, or has not, a result. Only the codes of SOLVED carry values; an unwritten pixel is never among them."""
 
     UNSOLVED = 0
     """Never reached by a solver (outside the mask)."""
@@ -18,6 +18,18 @@ class Status(IntEnum):
     """The usable lights lie close to one plane, or the readings are the same from every side: the normal is not determined."""
     NOT_FACING = 5
     """The best normal points away from the camera."""
+    SATURATED = 6
+    """Too few usable lights, and it was saturation that took the others."""
+    SHADOWED = 7
+    """Too few usable lights: the others are in shadow."""
+    AMBIGUOUS = 8
+    """Solved, but the readings leave the normal open by more than five degrees (standard error)."""
+    NOT_CONVERGED = 9
+    """Solved, but normals and depth under near lights still moved each other in the last round."""
+
+
+SOLVED = (Status.OK, Status.AMBIGUOUS, Status.NOT_CONVERGED)
+"""Codes of pixels that carry values."""
 
 
 UNSOLVED = int(Status.UNSOLVED)

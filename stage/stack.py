@@ -97,8 +97,25 @@ class Stack:
         Returns:
             [3, lights padded, n] float16 and [lights padded / 8, n] uint8, copies.
         """
-        values = self._map(values_path(self.folder, self.key), self.shape)[:, :, pixels]
-        return np.ascontiguousarray(values), np.ascontiguousarray(self.saturated(0, self.shape[2])[:, pixels])
+        channels, lights, _ = self.shape
+        values = np.empty((channels, lights, len(pixels)), dtype=np.float16)
+        for channel, light in np.ndindex(channels, lights):  # a map each: scattered reads leave a page or more in the process
+            values[channel, light] = self._map(values_path(self.folder, self.key), self.shape)[channel, light, pixels]
+        return values, self.pick_saturated(pixels)
+
+    def pick_saturated(self, pixels: np.ndarray) -> np.ndarray:
+        """The saturation bits of single pixels.
+
+        Args:
+            pixels: [n] positions, row-major.
+
+        Returns:
+            [lights padded / 8, n] uint8, a copy.
+        """
+        rows = self.shape[1] // 8
+        if not saturated_path(self.folder, self.key).exists():
+            return np.zeros((rows, len(pixels)), dtype=np.uint8)
+        return np.stack([self.saturated(0, self.shape[2])[row, pixels] for row in range(rows)])
 
     def _map(self, path: Path, shape: tuple[int, ...]) -> np.ndarray:
         with storage("read", path):

@@ -44,6 +44,10 @@ def solve(
     print(f"maps     {result.maps_path}")
     print(f"report   {result.report_path}")
     print(f"pixels   {', '.join(f'{count} {name}' for name, count in result.counts.items() if count)}")
+    if result.suspects:
+        worst = ", ".join(f"{suspect.image} by {100 * suspect.misfit:.0f} %" for suspect in result.suspects[:5])
+        more = f" and {len(result.suspects) - 5} more" if len(result.suspects) > 5 else ""
+        print(f"suspect  lights that disagree with the others: {worst}{more}; check their direction and irradiance")
 
 
 def relight(

@@ -63,7 +63,7 @@ def solve_near(method: Method, stack: Stack, lights: PlacedLights, camera: Camer
     places = pad_places(lights.place, lights.lobe)
     height = np.full(mask.shape, mean_height(camera), dtype=np.float32)
     rounds: dict[str, int] = {}
-    change, settled = np.inf, False
+    change, settled, restless = np.inf, False, np.zeros(mask.size, dtype=bool)
     for turn in (Method.ROBUST, Method.SVBRDF) if method is Method.SVBRDF else (method,):
         least, idle = np.inf, 0
         for number in range(1, (MATERIAL_ROUNDS if turn is Method.SVBRDF else ROUNDS) + 1):
@@ -80,10 +80,13 @@ def solve_near(method: Method, stack: Stack, lights: PlacedLights, camera: Camer
                                   perspective=camera.projection == "perspective")
             relief = max(float(np.ptp(found[solved])), 1e-12)
             change = float(np.percentile(np.abs(found - height)[solved], SETTLED_PERCENT)) / relief
+            restless = (solved & (np.abs(found - height) > SETTLED * relief)).reshape(-1)
             height = found
             settled = change < SETTLED
             least, idle = (change, 0) if change < least else (least, idle + 1)
             if settled or idle == STALLED:
                 break
+    if not settled:
+        solution.status[restless & (solution.status == Status.OK)] = Status.NOT_CONVERGED
     solution.facts = {**solution.facts, "near": {"rounds": rounds, "last_change_of_relief": round(change, 6), "settled": settled}}
     return NearSolution(solution, np.where(solved, height, 0).astype(np.float32), integration)

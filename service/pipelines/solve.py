@@ -7,10 +7,12 @@ import numpy as np
 
 from kernels import device as devices
 from kernels.photometric.readings import pad_lights
-from kernels.status import Status
+from kernels.status import SOLVED, Status
 from kernels.surface.integrate import Integration
 from service.errors import RequestError
 from service.methods import Method
+from service.pipelines.causes import name_causes
+from service.pipelines.consistency import Suspect, suspect_lights
 from service.pipelines.gradient import solve_gradients
 from service.pipelines.height import integrate, mark_not_facing
 from service.pipelines.near import solve_near
@@ -49,6 +51,8 @@ class SolveResult(NamedTuple):
     report_path: Path
     counts: dict[str, int]
     """Pixels of the mask per status."""
+    suspects: tuple[Suspect, ...]
+    """Distant lights that disagree with the others."""
 
 
 def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResult:
@@ -84,6 +88,7 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
     timings.stage("ingest", len(capture.sources()))
     stack = open_stack(capture, cache=request.cache, tracking=tracking, progress=lambda done, _: timings.advance(done))
     camera, integration, height = capture.camera, None, None
+    suspects: list[Suspect] = []
     if isinstance(lights, PlacedLights):
         solution, height, integration = solve_near(method, stack, lights, camera, mask, device, timings)
     elif isinstance(lights, ExtendedLights):
@@ -95,11 +100,13 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
     else:
         padded = pad_lights(lights.direction, lights.irradiance, stack.scale)
         solution = solve_normals(method, stack, padded, camera, mask, device, timings)
+        suspects = suspect_lights(solution, stack, padded)
     rows, cols = mask.shape
     status = solution.status.reshape(rows, cols)
     normal = np.moveaxis(solution.normal.reshape(3, rows, cols), 0, -1)
     mark_not_facing(camera, solution)
-    solved = status == Status.OK
+    name_causes(solution, stack)
+    solved = np.isin(status, SOLVED)
     if integration is None:
         timings.stage("height", 100)
         integration = integrate(camera, solution.normal, solved, device, lambda part: timings.advance(round(100 * part)))
@@ -129,6 +136,7 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
         options=request.model_dump(mode="json", include={"method", *(("reference_ball",) if request.reference_ball else ()),
                                                          *(("align", "align_to") if request.aligned else ())}),
         found=solution.facts or {},
+        suspect_lights=[suspect._asdict() for suspect in suspects],
         device=devices.describe(device),
         timings_s=timings.close(),
         pixels={"mask": int(mask.sum()), **counts},
@@ -137,7 +145,7 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
         height=_height_report(integration, capture),
         **({} if stack.motion is None else {"motion": stack.motion}),
     ))
-    return SolveResult(maps, maps_path, report_path, counts)
+    return SolveResult(maps, maps_path, report_path, counts, tuple(suspects))
 
 
 def _default_method(capture: Capture) -> Method:
