@@ -4,12 +4,12 @@ import json
 
 import numpy as np
 import pytest
-from tests import captures
 
 from kernels.status import Status
 from service.methods import Method
 from service.pipelines.solve import solve
 from service.requests import SolveRequest
+from tests import captures
 
 
 def solved(folder, out, method=Method.ROBUST):
