@@ -107,7 +107,7 @@ def test_every_device_and_a_rim_that_few_lamps_reach(relit, tmp_path, device):
     lights = lamps(ORTHOGRAPHIC, 9, RADII, widest=45)
     maps, report = solve(relit, near_scenes.write(tmp_path, ORTHOGRAPHIC, lights), "lambert", device)
     lit = sum(near_scenes.render(ORTHOGRAPHIC, lamp)[..., 1] > 0 for lamp in lights) * ORTHOGRAPHIC.mask
-    assert 0 < report["pixels"]["too_few_lights"] == ((lit < 3) & (lit > 0)).sum()
+    assert 0 < report["pixels"]["shadowed"] == ((lit < 3) & (lit > 0)).sum()
     assert abs(height_error(maps, ORTHOGRAPHIC)).mean() < 0.02  # the depth of the unlit rim, a ninth of the mask, is guessed
 
 
