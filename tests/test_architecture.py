@@ -107,7 +107,7 @@ def test_the_command_line_knows_kernels_and_warp_lightly():
     """relit doctor runs a kernel, which is a check of the installation and no pipeline; it may, when it is called."""
     knowing = {i for i in IMPORTS if under(i.importer, "service.cli") and top(i.target) in ("kernels", "warp")}
     assert all(i.lazy for i in knowing)
-    assert {i.importer for i in knowing} <= {"service.cli.doctor"}
+    assert {i.importer for i in knowing} <= {"service.cli.doctor", "service.cli.options"}
 
 
 def test_the_roof_outside_pipelines_knows_no_warp():

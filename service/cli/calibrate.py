@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.cli.options import CaptureArgument
+from service.cli.options import CaptureArgument, HostOption
 
 if TYPE_CHECKING:
     from service.calibrate_requests import Circle
@@ -45,6 +45,7 @@ def mirror_ball(
     drop_failed: DropOption = False,
     apply_to: ApplyOption = None,
     out: OutOption = None,
+    device: HostOption = None,
 ) -> None:
     """Directions of far lights from one mirror ball."""
     from service.calibrate_requests import MirrorBallRequest
@@ -71,6 +72,7 @@ def light_positions(
     drop_failed: DropOption = False,
     apply_to: ApplyOption = None,
     out: OutOption = None,
+    device: HostOption = None,
 ) -> None:
     """Positions of near lights from two or more mirror balls."""
     from service.calibrate_requests import LightPositionsRequest
@@ -101,6 +103,7 @@ def grey_ball(
     drop_failed: DropOption = False,
     apply_to: ApplyOption = None,
     out: OutOption = None,
+    device: HostOption = None,
 ) -> None:
     """Brightness of each light from one grey ball."""
     from service.calibrate_requests import GreyBallRequest
@@ -121,6 +124,7 @@ def intensity(
     drop_failed: DropOption = False,
     apply_to: ApplyOption = None,
     out: OutOption = None,
+    device: HostOption = None,
 ) -> None:
     """Brightness of lights of known direction from images of the object itself."""
     from service.calibrate_requests import IntensityRequest
@@ -133,7 +137,7 @@ def intensity(
     _show(result)
 
 
-def dark(capture: CaptureArgument, images: ImagesArgument) -> None:
+def dark(capture: CaptureArgument, images: ImagesArgument, device: HostOption = None) -> None:
     """The capture's dark.exr: mean of images with the lens covered."""
     from service.calibrate_requests import DarkRequest
     from service.cli.bar import Bar
@@ -152,6 +156,7 @@ def flat_field(
     dark: Annotated[list[Path] | None, typer.Option(
         "--dark", help="A dark image at the card's exposure; may be repeated. Without it the capture's dark.",
         show_default=False)] = None,
+    device: HostOption = None,
 ) -> None:
     """The capture's flat.exr: mean of images of an evenly lit white card."""
     from service.calibrate_requests import FlatFieldRequest
@@ -168,6 +173,7 @@ def flat_field(
 def saturation(
     capture: CaptureArgument,
     write: Annotated[bool, typer.Option("--write", help="Set it in the manifest.")] = False,
+    device: HostOption = None,
 ) -> None:
     """Where the readings of the frames pile up at the top of the histogram."""
     from service.calibrate_requests import SaturationRequest

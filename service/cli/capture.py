@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli.options import CaptureArgument
+from service.cli.options import CaptureArgument, HostOption
 
 
 class Format(StrEnum):
@@ -26,6 +26,7 @@ def import_(
     format: Annotated[Format, typer.Argument(metavar="FORMAT", help="diligent, or lp (RTI).", show_default=False)],
     source: Annotated[Path, typer.Argument(metavar="SRC", help="Folder of the data, or the .lp file.", show_default=False)],
     destination: Annotated[Path, typer.Argument(metavar="DST", help="Folder for the capture; may be SRC.", show_default=False)],
+    device: HostOption = None,
 ) -> None:
     """Write a capture.json for data laid out another way."""
     from stage.importers import diligent, lp
@@ -34,7 +35,7 @@ def import_(
     print(f"capture  {module.import_folder(source, destination)}")
 
 
-def info(capture: CaptureArgument) -> None:
+def info(capture: CaptureArgument, device: HostOption = None) -> None:
     """Say what a capture holds, and what is wrong with it."""
     from service.cli.bar import Bar
     from service.pipelines.inspect import inspect

@@ -1,8 +1,12 @@
 """relit doctor: is this installation sound?"""
 
+from typing import Annotated
+
 import typer
 
 ROOTS = ("stage", "kernels", "service")
+
+DoctorDevice = Annotated[str | None, typer.Option("--device", help="Check this device; without it all.", show_default=False)]
 
 
 def register(app: typer.Typer) -> None:
@@ -10,7 +14,7 @@ def register(app: typer.Typer) -> None:
     app.command("doctor")(doctor)
 
 
-def doctor() -> None:
+def doctor(only: DoctorDevice = None) -> None:
     """Check this installation: versions, shadowed packages, devices, a kernel, a writable kernel cache."""
     import importlib.util
     import tempfile
@@ -37,7 +41,7 @@ def doctor() -> None:
         from kernels import device, packs
         from kernels.relight.combine import combine
 
-        for name in device.names():
+        for name in [device.resolve(only)] if only else device.names():
             band = packs.upload(np.ones((3, 8, 64), dtype=np.float16), device=name)
             sound = bool((combine(band, np.full((3, 8), 0.25, dtype=np.float32)).numpy() == 2.0).all())
             print(f"{'device':<12} {device.describe(name)}: {'works' if sound else 'gives wrong sums'}")

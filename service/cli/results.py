@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli.options import AlignOption, AlignToOption, CacheOption, CaptureArgument, DeviceOption
+from service.cli.options import AlignOption, AlignToOption, CacheOption, CaptureArgument, DeviceOption, HostOption
 from service.methods import Method
 
 
@@ -84,6 +84,7 @@ def export(
     out: Annotated[Path, typer.Option("--out", help="The asset: .usdz, .usda or .usdc.", show_default=False)],
     name: Annotated[str | None, typer.Option("--name", help="Of the asset; without it the capture's.",
                                              show_default=False)] = None,
+    device: HostOption = None,
 ) -> None:
     """A USD asset with the estimated material."""
     from service.cli.bar import Bar

@@ -34,6 +34,19 @@ def test_help_of_each_command(relit, command):
     assert f"relit {command}" in outcome.out and "--help" in outcome.out
 
 
+@pytest.mark.parametrize("command", [
+    ["demo", "--out", "OUT"], ["import", "lp", "CAPTURE", "OUT"], ["info", "CAPTURE"], ["solve", "CAPTURE", "--out", "OUT"],
+    ["relight", "CAPTURE", "--environment", "CAPTURE/000.exr", "--out", "OUT/f.####.exr"], ["export", "CAPTURE", "--out", "OUT/a.usdz"],
+    ["calibrate", "mirror-ball", "CAPTURE", "--ball", "8,8,4"], ["calibrate", "intensity", "CAPTURE"], ["doctor"], ["bench"],
+], ids=lambda command: " ".join(command[:2]))
+def test_every_command_takes_a_device_and_refuses_one_that_is_not_there(relit, tmp_path, command):
+    capture = write_capture(tmp_path / "capture")
+    words = [word.replace("CAPTURE", str(capture)).replace("OUT", str(tmp_path / "out")) for word in command]
+    outcome = relit(*words, "--device", "cuda:99")
+    assert outcome.code == 2 and "cuda:99" in outcome.err and outcome.err.count("\n") == 1
+    assert not (tmp_path / "out").exists() or not any((tmp_path / "out").iterdir())
+
+
 def test_doctor_finds_this_installation_sound(relit):
     outcome = relit("doctor")
     assert outcome.code == 0, outcome.out
