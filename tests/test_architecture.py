@@ -104,7 +104,8 @@ def test_stage_and_kernels_meet_in_pipelines_alone():
 
 
 def test_the_command_line_knows_kernels_and_warp_lightly():
-    """relit doctor runs a kernel, which is a check of the installation and no pipeline; it may, when it is called."""
+    """relit doctor runs a kernel, which is a check of the installation and no pipeline, and --device asks which devices there are; they
+    may, when they are called."""
     knowing = {i for i in IMPORTS if under(i.importer, "service.cli") and top(i.target) in ("kernels", "warp")}
     assert all(i.lazy for i in knowing)
     assert {i.importer for i in knowing} <= {"service.cli.doctor", "service.cli.options"}
