@@ -11,6 +11,7 @@ from stage import exr
 from stage.camera import Camera
 from stage.errors import ResultError
 
+MAPS_FILE = "maps.exr"
 _RGB, _XYZ = ("R", "G", "B"), ("X", "Y", "Z")
 LAYERS: dict[str, tuple[tuple[str, ...], type[np.floating[Any]]]] = {
     "normal": (_XYZ, np.float32),

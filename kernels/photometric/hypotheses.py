@@ -74,6 +74,15 @@ class Search(NamedTuple):
     curvature: np.ndarray  # [n] float32, mean rise of the cost over the last ring, per light
     weights: np.ndarray  # [n, lobes] float32, of the mixture, for readings relative to the pixel's level
 
+    def variance(self, light_count: int, ring_degrees: float) -> np.ndarray:
+        """Variance of the normals, degrees², by least squares: 2 · cost · ring² / (lights · rise), cost and rise per light.
+
+        Args:
+            light_count: of the samples.
+            ring_degrees: angle of the last ring.
+        """
+        return 2 * self.cost * ring_degrees**2 / (light_count * np.maximum(self.curvature, 1e-12))
+
 
 def rings(degrees: tuple[float, ...], last_count: int) -> np.ndarray:
     """Offsets of candidates from a centre: the centre, then rings.

@@ -65,5 +65,5 @@ def solve_reference(samples: Samples, table: wp.array, view: np.ndarray) -> Refe
     for rings, options in ((HEMISPHERE, HEMISPHERE_OPTIONS), (AROUND, AROUND_OPTIONS), (FINE, OPTIONS)):
         found = search_normals(samples, normal, shape=Diffuse(), options=options, wide=rings[0], fine=rings[1:], table=table)
         normal = found.normal
-    variance = 2 * found.cost * RING_DEGREES**2 / (samples.light_count * np.maximum(found.curvature, 1e-12))
+    variance = found.variance(samples.light_count, RING_DEGREES)
     return ReferenceFit(normal, (1 / (1 + np.sqrt(variance))).astype(np.float32), np.sqrt(found.cost))

@@ -111,8 +111,7 @@ def solve_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, *
     metallic = materials[1].cost < materials[0].cost
     found, material = Search(*_choose(metallic, *searches)), Material(*_choose(metallic, *materials))
     facing = (found.normal * view).sum(axis=1)
-    # least squares: variance of the normal = 2 · cost · ring² / (lights · rise), cost and rise per light
-    variance = 2 * found.cost * RING_DEGREES**2 / (samples.light_count * np.maximum(found.curvature, 1e-12))
+    variance = found.variance(samples.light_count, RING_DEGREES)
     return SamplingFit(found.normal, material.diffuse_albedo, material.specular, material.roughness,
                        regimes(found.weights, np.where(metallic, METAL, DIELECTRIC), facing, material),
                        (1 / (1 + np.sqrt(variance))).astype(np.float32), np.sqrt(found.cost))

@@ -61,9 +61,7 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse,
         costs.append(other.cost)
     normal, spread = average_normals(np.stack(normals), np.stack(costs))
     material = fit_material(samples, normal, shape=shape, options=options)
-    # least squares: variance of the normal = 2 · cost · ring² / (lights · rise), cost and rise per light
-    rise = np.maximum(found.curvature, 1e-12)
-    variance = 2 * found.cost * RING_DEGREES**2 / (samples.light_count * rise) + spread**2
+    variance = found.variance(samples.light_count, RING_DEGREES) + spread**2
     return SvbrdfFit(normal, material.diffuse_albedo, material.specular, material.roughness,
                      (1 / (1 + np.sqrt(variance))).astype(np.float32), np.sqrt(found.cost))
 

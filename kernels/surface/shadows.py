@@ -42,13 +42,6 @@ def unproject(u: float, v: float, z: float, perspective: bool, scale: wp.vec2, c
 
 
 @wp.func
-def in_cast_shadow(height: wp.array2d(dtype=float), mask: wp.array2d(dtype=wp.uint8), row: int, col: int, toward: wp.vec3,
-                   perspective: bool, scale: wp.vec2, centre: wp.vec2) -> bool:
-    """Whether the surface at this pixel is hidden from a distant light in this direction."""
-    return in_shadow_within(height, mask, row, col, toward, NO_REACH, perspective, scale, centre)
-
-
-@wp.func
 def in_shadow_within(height: wp.array2d(dtype=float), mask: wp.array2d(dtype=wp.uint8), row: int, col: int, toward: wp.vec3,
                      reach: float, perspective: bool, scale: wp.vec2, centre: wp.vec2) -> bool:
     """Whether the surface stands in this direction from this pixel before `reach`: what lies behind a light hides nothing."""

@@ -7,9 +7,7 @@ from service.progress import Progress, Timings
 from service.requests import ExportRequest
 from service.usd.asset import write_asset
 from stage.errors import ResultError
-from stage.maps import SurfaceMaps
-
-MAPS_FILE = "maps.exr"
+from stage.maps import MAPS_FILE, SurfaceMaps
 
 
 def export(request: ExportRequest, progress: Progress | None = None) -> Path:

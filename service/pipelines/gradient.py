@@ -10,6 +10,7 @@ from kernels.photometric.highlight import fit_highlights, specular_normals
 from kernels.photometric.moments import Moments, fit_moments
 from kernels.photometric.separation import separate_by_colour, separate_polarised
 from kernels.status import Status
+from service.pipelines.batches import view_directions
 from service.pipelines.solution import Solution
 from service.progress import Timings
 from stage.camera import Camera
@@ -91,10 +92,8 @@ def view_vectors(camera: Camera, padded: int) -> np.ndarray:
     """Unit vectors from the surface to the camera: [3, padded] float32, 0 in the padding, or [3, 1] when all are the same."""
     if camera.projection == "orthographic":
         return np.array([[0.0], [0.0], [1.0]], dtype=np.float32)
-    x, y = camera.plane_coordinates()
-    toward = np.stack([-x.reshape(-1), -y.reshape(-1), np.ones(x.size)])
-    toward /= np.linalg.norm(toward, axis=0)
-    return np.pad(toward.astype(np.float32), ((0, 0), (0, padded - x.size)))
+    toward = view_directions(camera)(np.arange(camera.width * camera.height)).T
+    return np.pad(toward, ((0, 0), (0, padded - toward.shape[1])))
 
 
 def _facts(frames: GradientFrames, result: Solution, length: np.ndarray, separated: np.ndarray,

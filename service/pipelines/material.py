@@ -1,9 +1,8 @@
 """The general solver over an image: a first search, the height it gives, the shadows and the light that this height throws on itself,
 and the final solve."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -17,11 +16,12 @@ from kernels.photometric.material import fit_material
 from kernels.photometric.near import NearField, see_near
 from kernels.photometric.readings import Lights, channel_weights, grey_factors, grey_readings
 from kernels.photometric.robust import solve_robust
-from kernels.photometric.samples import Samples, gather
+from kernels.photometric.samples import gather
 from kernels.photometric.shadowing import exclude_shadows
 from kernels.photometric.svbrdf import solve_svbrdf
 from kernels.status import Status
 from kernels.surface.shadows import Projection
+from service.pipelines.batches import Batch, View, pixel_batches, view_directions
 from service.pipelines.height import integrate
 from service.pipelines.interreflection import arriving_light
 from service.pipelines.solution import NEAR_BYTES, READING_BYTES, Solution
@@ -30,10 +30,6 @@ from stage.camera import Camera
 from stage.colour import GREY_WEIGHTS
 from stage.stack import Stack
 
-SAMPLE_BYTES = 4 * (4 + 3 + MIXTURE + GEOMETRY)
-"""Per light and pixel: grey and colour readings, direction, lobes."""
-BATCH_BYTES = 256 << 20
-"""Of samples that are solved at one time."""
 SHAPE_PIXELS = 384
 """Pixels, spread over the object, from which the shape of the diffuse lobe is chosen."""
 
@@ -53,11 +49,6 @@ class Parts:
 
 
 ALL = Parts()
-
-
-class _Batch(NamedTuple):
-    where: np.ndarray  # [n] positions in the image
-    samples: Samples
 
 
 def solve_material(stack: Stack, lights: Lights, camera: Camera, mask: np.ndarray, device: str, timings: Timings,
@@ -87,29 +78,31 @@ def solve_material(stack: Stack, lights: Lights, camera: Camera, mask: np.ndarra
     result.facts = {"diffuse_roughness": None if shape.rough < 0 else shape.rough, "diffuse_slope": shape.slope,
                     "shapes_tried": len(tried)}
 
-    def batches(stage: str) -> Iterator[_Batch]:
+    def batches(stage: str) -> Iterator[Batch]:
         timings.stage(stage, len(solvable))
         done = 0
-        for batch in _batches(stack, lights, factors, view, solvable, device, field):
+        for batch in pixel_batches(stack, lights, factors, view, solvable, device, lobes=MIXTURE + GEOMETRY, field=field):
             yield batch
             done += len(batch.where)
             timings.advance(done)
 
+    bounce = parts.bounce and field is None
     for where, samples in batches("search"):
         normal = search_normals(samples, result.normal[:, where].T, shape=shape).normal
         result.normal[:, where] = normal.T
-        result.albedo[:, where] = fit_material(samples, normal, shape=shape).diffuse_albedo.T
+        if bounce:
+            result.albedo[:, where] = fit_material(samples, normal, shape=shape).diffuse_albedo.T
     timings.stage("surface", 100)
     solved = (result.status == Status.OK).reshape(mask.shape)
     surface = integrate(camera, result.normal, solved, device, lambda part: timings.advance(round(100 * part)))
     inside = wp.array(solved.astype(np.uint8), dtype=wp.uint8, device=device)
-    arriving = None
-    if parts.bounce and field is None and surface is not None:
-        arriving = arriving_light(stack, lights, camera, projection_of(camera), result.normal, surface.height, solved, device)
+    projection, arriving = projection_of(camera), None
+    if bounce and surface is not None:
+        arriving = arriving_light(stack, lights, camera, projection, result.normal, surface.height, solved, device)
     for where, samples in batches("normals"):
         assert surface is not None  # there are pixels
         if parts.shadows:
-            exclude_shadows(samples, where, surface.height, inside, projection_of(camera), None if field is None else field.places)
+            exclude_shadows(samples, where, surface.height, inside, projection, None if field is None else field.places)
         if arriving is not None:
             corners, shares = arriving.at(*np.divmod(where, camera.width))
             albedo = np.minimum(result.albedo[:, where].T.astype(np.float32), LARGEST_ALBEDO)
@@ -122,19 +115,6 @@ def solve_material(stack: Stack, lights: Lights, camera: Camera, mask: np.ndarra
         result.confidence[where] = found.confidence
         result.residual[where] = found.residual
     return result
-
-
-def view_directions(camera: Camera) -> Callable[[np.ndarray], np.ndarray]:
-    """A function from pixel positions (row-major, [n]) to unit directions to the viewer [n, 3] float32."""
-    if camera.projection == "orthographic":
-        return lambda positions: np.tile(np.array([0, 0, 1], dtype=np.float32), (len(positions), 1))
-    x, y = (plane.reshape(-1) for plane in camera.plane_coordinates())
-
-    def towards(positions: np.ndarray) -> np.ndarray:
-        rays = np.stack([-x[positions], -y[positions], np.ones(len(positions))], axis=1)
-        return (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
-
-    return towards
 
 
 def projection_of(camera: Camera) -> Projection:
@@ -160,7 +140,7 @@ def _start(result: Solution, stack: Stack, lights: Lights, factors: np.ndarray, 
         timings.advance(stop)
 
 
-def _shape(result: Solution, stack: Stack, lights: Lights, factors: np.ndarray, view: Callable[[np.ndarray], np.ndarray],
+def _shape(result: Solution, stack: Stack, lights: Lights, factors: np.ndarray, view: View,
            solvable: np.ndarray, device: str, field: NearField | None) -> tuple[Diffuse, np.ndarray]:
     """The diffuse shape, from pixels at even steps through the object."""
     if not len(solvable):
@@ -170,19 +150,3 @@ def _shape(result: Solution, stack: Stack, lights: Lights, factors: np.ndarray, 
     samples = gather(band, np.arange(len(chosen)), view(chosen), lights, factors, stack.light_count,
                      None if field is None else field.at(chosen))
     return choose_diffuse(samples, result.normal[:, chosen].T)
-
-
-def _batches(stack: Stack, lights: Lights, factors: np.ndarray, view: Callable[[np.ndarray], np.ndarray], solvable: np.ndarray,
-             device: str, field: NearField | None) -> Iterator[_Batch]:
-    """The samples of the solvable pixels, as many at a time as memory allows."""
-    size = max(1, BATCH_BYTES // (SAMPLE_BYTES * stack.light_count))
-    for start, stop in stack.bands(READING_BYTES * stack.shape[1]):
-        local = solvable[(solvable >= start) & (solvable < stop)] - start
-        if not len(local):
-            continue
-        band = packs.upload(stack.band(start, stop), stack.saturated(start, stop), device=device)
-        for first in range(0, len(local), size):
-            part = local[first : first + size]
-            where = start + part
-            yield _Batch(where, gather(band, part, view(where), lights, factors, stack.light_count,
-                                       None if field is None else field.at(where)))

@@ -4,15 +4,13 @@ from pathlib import Path
 
 import numpy as np
 
-from kernels import packs
 from kernels.photometric.readings import grey_factors, pad_lights
 from kernels.photometric.reference_table import reference_table, solve_reference
-from kernels.photometric.response_table import nodes
-from kernels.photometric.samples import gather
+from kernels.photometric.response_table import SEARCH_LOBES, nodes
 from kernels.status import Status
-from service.pipelines.material import view_directions
-from service.pipelines.sampling import BATCH_BYTES, SAMPLE_BYTES, readable
-from service.pipelines.solution import READING_BYTES, Solution
+from service.pipelines.batches import pixel_batches, view_directions
+from service.pipelines.sampling import readable
+from service.pipelines.solution import Solution
 from service.progress import Timings
 from stage.camera import Camera
 from stage.colour import GREY_WEIGHTS
@@ -51,25 +49,16 @@ def solve_by_reference(stack: Stack, ball: ReferenceBall, camera: Camera, mask: 
     result.facts = {"reference": {"capture": str(ball.capture.folder), "content": theirs.key,
                                   "radius_px": round(ball.ball.radius_px, 2),
                                   "outline_error_px": round(ball.ball.outline_error_px, 4)}}
-    batch = max(1, BATCH_BYTES // (SAMPLE_BYTES * count))
     timings.stage("normals", len(inside))
-    for start, stop in stack.bands(READING_BYTES * stack.shape[1]):
-        local = inside[(inside >= start) & (inside < stop)] - start
-        if not len(local):
-            continue
-        band = packs.upload(stack.band(start, stop), stack.saturated(start, stop), device=device)
-        for first in range(0, len(local), batch):
-            part = local[first : first + batch]
-            where = start + part
-            samples = gather(band, part, view(where), padded, factors, count)
-            found = solve_reference(samples, table, view(where))
-            status = readable(samples)
-            ok = status == Status.OK
-            result.status[where] = status
-            result.normal[:, where[ok]] = found.normal.T[:, ok]
-            result.confidence[where[ok]] = found.confidence[ok]
-            result.residual[where[ok]] = found.residual[ok]
-            timings.advance(int(np.searchsorted(inside, where[-1])) + 1)
+    for where, samples in pixel_batches(stack, padded, factors, view, inside, device, lobes=SEARCH_LOBES):
+        found = solve_reference(samples, table, view(where))
+        status = readable(samples)
+        ok = status == Status.OK
+        result.status[where] = status
+        result.normal[:, where[ok]] = found.normal.T[:, ok]
+        result.confidence[where[ok]] = found.confidence[ok]
+        result.residual[where[ok]] = found.residual[ok]
+        timings.advance(int(np.searchsorted(inside, where[-1])) + 1)
     return result
 
 

@@ -5,24 +5,19 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from kernels import packs
 from kernels.photometric.readings import grey_factors, pad_lights
 from kernels.photometric.response_table import SEARCH_LOBES, response_table
-from kernels.photometric.samples import Samples, gather
+from kernels.photometric.samples import Samples
 from kernels.photometric.sampling import Regime, sampling_tables, solve_sampling
 from kernels.status import Status
-from service.pipelines.material import view_directions
-from service.pipelines.solution import READING_BYTES, Solution
+from service.pipelines.batches import pixel_batches, view_directions
+from service.pipelines.solution import Solution
 from service.progress import Timings
 from stage.camera import Camera
 from stage.colour import GREY_WEIGHTS
 from stage.extended_lights import ExtendedLights
 from stage.stack import Stack
 
-SAMPLE_BYTES = 4 * (4 + 3 + SEARCH_LOBES)
-"""Per light and pixel: grey and colour readings, direction, lobes."""
-BATCH_BYTES = 256 << 20
-"""Of samples that are solved at one time."""
 PART_DEGREES = 8.0
 """Width of a part of a perspective view that shares a table: at its edge, 4° from its middle, the normal of a metal of roughness
 0.5 or 0.7 is off by another 0.3°, that of anything else by less than 0.1°."""
@@ -48,7 +43,6 @@ def solve_extended(stack: Stack, lights: ExtendedLights, camera: Camera, mask: n
     result = Solution.empty(stack.pixel_count)
     result.specular, result.roughness = np.zeros((3, stack.pixel_count), np.float16), np.zeros(stack.pixel_count, np.float16)
     result.regime = np.zeros(stack.pixel_count, np.uint8)
-    batch = max(1, BATCH_BYTES // (SAMPLE_BYTES * count))
     timings.stage("normals", int(mask.sum()))
     parts = done = 0
     for inside in view_parts(camera, mask):
@@ -56,30 +50,25 @@ def solve_extended(stack: Stack, lights: ExtendedLights, camera: Camera, mask: n
         turn = turn_to_z(view(inside).mean(axis=0, dtype=np.float64))
         tables = sampling_tables(response_table(lights.direction @ turn.T, lights.solid_angle, lights.light, lights.share,
                                                 light_count=count, device=device))
-        for start, stop in stack.bands(READING_BYTES * stack.shape[1]):
-            local = inside[(inside >= start) & (inside < stop)] - start
-            if not len(local):
-                continue
-            band = packs.upload(stack.band(start, stop), stack.saturated(start, stop), device=device)
-            for first in range(0, len(local), batch):
-                part = local[first : first + batch]
-                where = start + part
-                seen = (view(where) @ turn.T).astype(np.float32)
-                samples = gather(band, part, seen, padded, factors, count)
-                found = solve_sampling(samples, tables, seen)
-                status = readable(samples)
-                ok = status == Status.OK
-                kept = where[ok]
-                result.status[where] = status
-                result.normal[:, kept] = (found.normal @ turn).T[:, ok]
-                result.albedo[:, kept] = found.diffuse_albedo.T[:, ok]
-                result.specular[:, kept] = found.specular.T[:, ok]
-                result.roughness[kept] = found.roughness[ok]
-                result.regime[kept] = found.regime[ok]
-                result.confidence[kept] = found.confidence[ok]
-                result.residual[kept] = found.residual[ok]
-                done += len(part)
-                timings.advance(done)
+
+        def seen(positions: np.ndarray, turn: np.ndarray = turn) -> np.ndarray:
+            return (view(positions) @ turn.T).astype(np.float32)
+
+        for where, samples in pixel_batches(stack, padded, factors, seen, inside, device, lobes=SEARCH_LOBES):
+            found = solve_sampling(samples, tables, seen(where))
+            status = readable(samples)
+            ok = status == Status.OK
+            kept = where[ok]
+            result.status[where] = status
+            result.normal[:, kept] = (found.normal @ turn).T[:, ok]
+            result.albedo[:, kept] = found.diffuse_albedo.T[:, ok]
+            result.specular[:, kept] = found.specular.T[:, ok]
+            result.roughness[kept] = found.roughness[ok]
+            result.regime[kept] = found.regime[ok]
+            result.confidence[kept] = found.confidence[ok]
+            result.residual[kept] = found.residual[ok]
+            done += len(where)
+            timings.advance(done)
     codes = np.bincount(result.regime[mask.reshape(-1)], minlength=len(Regime))
     result.facts = {"light_samples": len(lights.share), "views": parts,
                     "regimes": {regime.name.lower(): int(codes[regime]) for regime in Regime if regime is not Regime.UNSOLVED}}

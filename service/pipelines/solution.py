@@ -17,7 +17,7 @@ NEAR_BYTES = READING_BYTES + 16
 
 @dataclass
 class Solution:
-    """What was found at every pixel of the image; only pixels with status OK have values."""
+    """What was found at every pixel of the image; only pixels with a status of kernels.status.SOLVED have values."""
 
     normal: np.ndarray  # [3, pixels] float32
     albedo: np.ndarray  # [3, pixels] float16

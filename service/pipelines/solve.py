@@ -32,7 +32,7 @@ from stage.ingest import open_stack
 from stage.light import ExtendedLight
 from stage.lighting import check_solvable
 from stage.manifest import FILE_NAME
-from stage.maps import SurfaceMaps
+from stage.maps import MAPS_FILE, SurfaceMaps
 from stage.motion.tracking import tracking_frames
 from stage.point_lights import DistantLights, PlacedLights
 from stage.reference_ball import ReferenceBall, reference_ball
@@ -40,7 +40,7 @@ from stage.reference_ball import ReferenceBall, reference_ball
 SVBRDF_LIGHTS = 12
 """From this many lights on the general solver is the default: it fits six lobes and a direction to each pixel, and was better than
 robust on every object tried with eight to 96 lights (docs/figures.md)."""
-MAPS_FILE, REPORT_FILE = "maps.exr", "report.json"
+REPORT_FILE = "report.json"
 
 
 class SolveResult(NamedTuple):
@@ -103,25 +103,29 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
         suspects = suspect_lights(solution, stack, padded)
     rows, cols = mask.shape
     status = solution.status.reshape(rows, cols)
-    normal = np.moveaxis(solution.normal.reshape(3, rows, cols), 0, -1)
     mark_not_facing(camera, solution)
     name_causes(solution, stack)
     solved = np.isin(status, SOLVED)
     if integration is None:
         timings.stage("height", 100)
         integration = integrate(camera, solution.normal, solved, device, lambda part: timings.advance(round(100 * part)))
+
+    def image(planes: np.ndarray | None) -> np.ndarray | None:
+        if planes is None:
+            return None
+        return planes.reshape(rows, cols) if planes.ndim == 1 else np.moveaxis(planes.reshape(-1, rows, cols), 0, -1)
+
     maps = SurfaceMaps(
         camera=camera,
         mask=solved,
-        normal=normal,
-        diffuse_albedo=None if method is Method.REFERENCE else np.moveaxis(solution.albedo.reshape(3, rows, cols), 0, -1),
-        specular=None if solution.specular is None else np.moveaxis(solution.specular.reshape(3, rows, cols), 0, -1),
-        roughness=None if solution.roughness is None else solution.roughness.reshape(rows, cols),
-        regime=None if solution.regime is None else solution.regime.reshape(rows, cols),
-        specular_normal=None if solution.specular_normal is None else np.moveaxis(
-            solution.specular_normal.reshape(3, rows, cols), 0, -1),
+        normal=image(solution.normal),
+        diffuse_albedo=None if method is Method.REFERENCE else image(solution.albedo),
+        specular=image(solution.specular),
+        roughness=image(solution.roughness),
+        regime=image(solution.regime),
+        specular_normal=image(solution.specular_normal),
         height=integration.height.numpy() if height is None and integration is not None else height,
-        confidence=solution.confidence.reshape(rows, cols),
+        confidence=image(solution.confidence),
         color_space=linear_space(capture.manifest.color_space),
         provenance=metadata(request, method=method, capture=capture.name, inputs=stack.key),
     )
@@ -135,7 +139,7 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
         method=str(method),
         options=request.model_dump(mode="json", include={"method", *(("reference_ball",) if request.reference_ball else ()),
                                                          *(("align", "align_to") if request.aligned else ())}),
-        found=solution.facts or {},
+        found=solution.facts,
         suspect_lights=[suspect._asdict() for suspect in suspects],
         device=devices.describe(device),
         timings_s=timings.close(),

@@ -6,7 +6,7 @@ import warp as wp
 
 from kernels.errors import ArrayError
 from kernels.photometric.shadowing import exclude_shadows
-from kernels.surface.shadows import MARGIN_PIXELS, MARGIN_SLOPE, Projection, in_cast_shadow
+from kernels.surface.shadows import MARGIN_PIXELS, MARGIN_SLOPE, NO_REACH, Projection, in_shadow_within
 from tests.kernels.photometric.test_svbrdf import LIGHTS, render, sample, tilted
 
 STEP_AT, STEP_HEIGHT = 40, 10.0
@@ -16,7 +16,7 @@ STEP_AT, STEP_HEIGHT = 40, 10.0
 def shadow_kernel(height: wp.array2d(dtype=float), mask: wp.array2d(dtype=wp.uint8), toward: wp.vec3, perspective: bool,
                   scale: wp.vec2, centre: wp.vec2, out: wp.array2d(dtype=wp.uint8)):
     r, c = wp.tid()
-    if in_cast_shadow(height, mask, r, c, toward, perspective, scale, centre):
+    if in_shadow_within(height, mask, r, c, toward, NO_REACH, perspective, scale, centre):
         out[r, c] = wp.uint8(1)
 
 
