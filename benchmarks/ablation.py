@@ -15,9 +15,9 @@ from kernels.photometric.lambert import NormalFit, solve_lambert
 from kernels.photometric.readings import Lights, grey_factors, grey_readings, pad_lights
 from kernels.photometric.robust import solve_robust
 from kernels.photometric.samples import Samples, gather
-from kernels.photometric.svbrdf import solve_svbrdf
+from kernels.photometric.svbrdf import average_normals, solve_svbrdf
 from kernels.status import Status
-from service.pipelines.material import SHAPE_PIXELS, Parts, solve_material
+from service.pipelines.material import SPREAD_PIXELS, Parts, solve_material
 from service.progress import Timings
 from stage.capture import Capture
 from stage.colour import GREY_WEIGHTS
@@ -40,8 +40,10 @@ class Case:
     lambert: np.ndarray  # [n, 3]
     robust: np.ndarray  # [n, 3]
     samples: Samples
+    channels: tuple[Samples, ...]
+    """The same pixels with the readings of one channel as their grey."""
     shape: Diffuse
-    """The shared diffuse shape, chosen on SHAPE_PIXELS of them."""
+    """The shared diffuse shape, chosen on SPREAD_PIXELS of them."""
     whole: Callable[[Parts], np.ndarray]
     """Solves the whole image; [n, 3] of its normals."""
 
@@ -70,19 +72,25 @@ def load_case(name: str, capture: Capture, truth: np.ndarray, cache: Path) -> Ca
     lambert, robust = normals(solve_lambert), normals(solve_robust)
     solved = np.flatnonzero(lambert[1] & robust[1])
     samples = _gather(band, solved, lights, factors, stack.light_count)
-    few = solved[np.unique(np.linspace(0, len(solved) - 1, min(SHAPE_PIXELS, len(solved))).astype(int))]
+    channels = tuple(_gather(band, solved, lights, grey_factors(lights, one), stack.light_count) for one in np.eye(3))
+    few = solved[np.unique(np.linspace(0, len(solved) - 1, min(SPREAD_PIXELS, len(solved))).astype(int))]
     shape, _ = choose_diffuse(_gather(band, few, lights, factors, stack.light_count), robust[0][few])
 
     def whole(parts: Parts) -> np.ndarray:
         solution = solve_material(stack, lights, capture.camera, capture.mask(), "cpu", Timings(), parts=parts)
         return solution.normal[:, chosen[solved]].T
 
-    return Case(name, truth.reshape(-1, 3)[chosen[solved]], lambert[0][solved], robust[0][solved], samples, shape, whole)
+    return Case(name, truth.reshape(-1, 3)[chosen[solved]], lambert[0][solved], robust[0][solved], samples, channels, shape, whole)
 
 
 def _gather(band: packs.Band, pixels: np.ndarray, lights: Lights, factors: np.ndarray, count: int) -> Samples:
     view = np.tile(np.array([0, 0, 1], dtype=np.float32), (len(pixels), 1))
     return gather(band, pixels, view, lights, factors, count)
+
+
+def _channels_apart(case: Case) -> np.ndarray:
+    found = [search_normals(samples, case.robust, shape=case.shape) for samples in case.channels]
+    return average_normals(np.stack([search.normal for search in found]), np.stack([search.cost for search in found]))[0]
 
 
 VARIANTS: dict[str, Callable[[Case], np.ndarray]] = {
@@ -92,9 +100,10 @@ VARIANTS: dict[str, Callable[[Case], np.ndarray]] = {
         lambda case: search_normals(case.samples, case.robust, shape=Diffuse(), options=NO_SHADOW).normal,
     "+ cast shadow as a hypothesis of its own": lambda case: search_normals(case.samples, case.robust, shape=Diffuse()).normal,
     "+ diffuse shape shared by the object": lambda case: search_normals(case.samples, case.robust, shape=case.shape).normal,
+    "· the same with the three channels searched apart and averaged by cost (left out)": _channels_apart,
     "+ averaged over nearby shapes": lambda case: solve_svbrdf(case.samples, case.robust, shape=case.shape).normal,
     "+ cast shadows of the height taken out": lambda case: case.whole(Parts(bounce=False)),
-    "+ light that the object throws on itself taken off (`svbrdf`)": lambda case: case.whole(Parts()),
+    "+ light that the object throws on itself taken off, materials shared (`svbrdf`)": lambda case: case.whole(Parts()),
 }
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from benchmarks.ablation import ablation_table
 from benchmarks.accuracy import SolveError, compare, diligent_errors, read_truth, relight_error, sample_errors
 from benchmarks.large import large_rows, measure
+from benchmarks.materials import material_table
 from benchmarks.search_speed import search_rows
 from service.methods import Method
 from service.pipelines.bench import bench
@@ -85,6 +86,11 @@ def glossy(given: argparse.Namespace) -> list[str] | None:
     return lines
 
 
+def materials(given: argparse.Namespace) -> list[str] | None:
+    """Materials shared between pixels, or not."""
+    return None if given.glossy is None else material_table(given.glossy)
+
+
 def ablation(given: argparse.Namespace) -> list[str] | None:
     """Parts of the general solver, one at a time."""
     return ablation_table(given.data, given.glossy)
@@ -125,6 +131,7 @@ SECTIONS: dict[str, tuple[str, Section]] = {
     "lambert": ("Lambertian surface with cast shadows", lambert),
     "real": ("Real objects", real),
     "glossy": ("Glossy and metallic objects", glossy),
+    "materials": ("What sharing materials buys", materials),
     "ablation": ("What each part of `svbrdf` buys", ablation),
     "relighting": ("Relighting", relighting),
     "speed": ("Speed", speed),

@@ -33,8 +33,8 @@ class SvbrdfFit(NamedTuple):
     residual: np.ndarray  # [n] float32: root of the mean cost per light, in units of the noise
 
 
-def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse,
-                 options: SearchOptions | None = None) -> SvbrdfFit:
+def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, options: SearchOptions | None = None,
+                 shared: np.ndarray | None = None) -> SvbrdfFit:
     """Solve sampled pixels.
 
     Args:
@@ -42,6 +42,7 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse,
         start: [n, 3] unit normals to begin from, within some 50° of the truth.
         shape: of the diffuse lobe, from diffuse_shape.choose_diffuse.
         options: how candidates are judged.
+        shared: [materials, 4] of shared_materials.choose_materials; None: every pixel has a material of its own.
 
     Returns:
         The fit. Waits for the device.
@@ -60,7 +61,7 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse,
         normals.append(other.normal)
         costs.append(other.cost)
     normal, spread = average_normals(np.stack(normals), np.stack(costs))
-    material = fit_material(samples, normal, shape=shape, options=options)
+    material = fit_material(samples, normal, shape=shape, options=options, shared=shared)
     variance = found.variance(samples.light_count, RING_DEGREES) + spread**2
     return SvbrdfFit(normal, material.diffuse_albedo, material.specular, material.roughness,
                      (1 / (1 + np.sqrt(variance))).astype(np.float32), np.sqrt(found.cost))

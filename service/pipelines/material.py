@@ -1,5 +1,5 @@
 """The general solver over an image: a first search, the height it gives, the shadows and the light that this height throws on itself,
-and the final solve."""
+the materials that pixels share, and the final solve."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,8 +16,9 @@ from kernels.photometric.material import fit_material
 from kernels.photometric.near import NearField, see_near
 from kernels.photometric.readings import Lights, channel_weights, grey_factors, grey_readings
 from kernels.photometric.robust import solve_robust
-from kernels.photometric.samples import gather
+from kernels.photometric.samples import Samples, gather
 from kernels.photometric.shadowing import exclude_shadows
+from kernels.photometric.shared_materials import choose_materials
 from kernels.photometric.svbrdf import solve_svbrdf
 from kernels.status import Status
 from kernels.surface.shadows import Projection
@@ -30,9 +31,8 @@ from stage.camera import Camera
 from stage.colour import GREY_WEIGHTS
 from stage.stack import Stack
 
-SHAPE_PIXELS = 384
-"""Pixels, spread over the object, from which the shape of the diffuse lobe is chosen."""
-
+SPREAD_PIXELS = 384
+"""Pixels, spread over the object, from which the shape of the diffuse lobe and the shared materials are chosen."""
 
 LARGEST_ALBEDO = 0.98
 """What a surface can send on; a fitted albedo may be larger where the scale of the lights is not absolute."""
@@ -40,12 +40,14 @@ LARGEST_ALBEDO = 0.98
 
 @dataclass(frozen=True)
 class Parts:
-    """What the height of the first search is used for; both by default, either alone to see what it buys."""
+    """Parts of the solver that can be left out, to see what each buys."""
 
     shadows: bool = True
     """Cast shadows are taken out."""
     bounce: bool = True
     """Light that the object throws on itself is taken off."""
+    sharing: bool = True
+    """Pixels share materials."""
 
 
 ALL = Parts()
@@ -64,7 +66,7 @@ def solve_material(stack: Stack, lights: Lights, camera: Camera, mask: np.ndarra
         timings: told of every stage.
         field: where the lights are, and the point of each pixel, where some light is near; then light that the object throws on
             itself is not taken off.
-        parts: what the height is used for.
+        parts: what is left out.
     """
     factors, view = grey_factors(lights, GREY_WEIGHTS), view_directions(camera)
     result = Solution.empty(stack.pixel_count)
@@ -74,9 +76,12 @@ def solve_material(stack: Stack, lights: Lights, camera: Camera, mask: np.ndarra
     _start(result, stack, lights, factors, mask.reshape(-1), device, timings, field)
     solvable = np.flatnonzero(result.status == Status.OK)
     timings.stage("shape", 1)
-    shape, tried = _shape(result, stack, lights, factors, view, solvable, device, field)
-    result.facts = {"diffuse_roughness": None if shape.rough < 0 else shape.rough, "diffuse_slope": shape.slope,
-                    "shapes_tried": len(tried)}
+    shape = Diffuse()
+    if len(solvable):
+        few, samples = _spread(stack, lights, factors, view, solvable, device, field)
+        shape, tried = choose_diffuse(samples, result.normal[:, few].T)
+        result.facts = {"diffuse_roughness": None if shape.rough < 0 else shape.rough, "diffuse_slope": shape.slope,
+                        "shapes_tried": len(tried)}
 
     def batches(stage: str) -> Iterator[Batch]:
         timings.stage(stage, len(solvable))
@@ -99,7 +104,9 @@ def solve_material(stack: Stack, lights: Lights, camera: Camera, mask: np.ndarra
     projection, arriving = projection_of(camera), None
     if bounce and surface is not None:
         arriving = arriving_light(stack, lights, camera, projection, result.normal, surface.height, solved, device)
-    for where, samples in batches("normals"):
+
+    def clean(where: np.ndarray, samples: Samples) -> None:
+        """Take out of the readings what the height tells."""
         assert surface is not None  # there are pixels
         if parts.shadows:
             exclude_shadows(samples, where, surface.height, inside, projection, None if field is None else field.places)
@@ -107,7 +114,17 @@ def solve_material(stack: Stack, lights: Lights, camera: Camera, mask: np.ndarra
             corners, shares = arriving.at(*np.divmod(where, camera.width))
             albedo = np.minimum(result.albedo[:, where].T.astype(np.float32), LARGEST_ALBEDO)
             subtract_bounce(samples, arriving.light, corners, shares, albedo, channel_weights(lights, GREY_WEIGHTS))
-        found = solve_svbrdf(samples, result.normal[:, where].T, shape=shape)
+
+    materials = None
+    if parts.sharing and len(solvable):
+        few, samples = _spread(stack, lights, factors, view, solvable, device, field)
+        clean(few, samples)
+        materials = choose_materials(samples, result.normal[:, few].T, shape=shape)
+        result.facts["shared_materials"] = [{"specular": material[:3].tolist(), "roughness": float(material[3])}
+                                            for material in materials.round(4).astype(float)]
+    for where, samples in batches("normals"):
+        clean(where, samples)
+        found = solve_svbrdf(samples, result.normal[:, where].T, shape=shape, shared=materials)
         result.normal[:, where] = found.normal.T
         result.albedo[:, where] = found.diffuse_albedo.T
         result.specular[:, where] = found.specular.T
@@ -140,13 +157,10 @@ def _start(result: Solution, stack: Stack, lights: Lights, factors: np.ndarray, 
         timings.advance(stop)
 
 
-def _shape(result: Solution, stack: Stack, lights: Lights, factors: np.ndarray, view: View,
-           solvable: np.ndarray, device: str, field: NearField | None) -> tuple[Diffuse, np.ndarray]:
-    """The diffuse shape, from pixels at even steps through the object."""
-    if not len(solvable):
-        return Diffuse(), np.zeros((0, 3))
-    chosen = solvable[np.unique(np.linspace(0, len(solvable) - 1, min(SHAPE_PIXELS, len(solvable))).astype(int))]
+def _spread(stack: Stack, lights: Lights, factors: np.ndarray, view: View, solvable: np.ndarray, device: str,
+            field: NearField | None) -> tuple[np.ndarray, Samples]:
+    """Some pixels at even steps through the object, from which is chosen what all share: positions and readings."""
+    chosen = solvable[np.unique(np.linspace(0, len(solvable) - 1, min(SPREAD_PIXELS, len(solvable))).astype(int))]
     band = packs.upload(*stack.pick(chosen), device=device)
-    samples = gather(band, np.arange(len(chosen)), view(chosen), lights, factors, stack.light_count,
-                     None if field is None else field.at(chosen))
-    return choose_diffuse(samples, result.normal[:, chosen].T)
+    return chosen, gather(band, np.arange(len(chosen)), view(chosen), lights, factors, stack.light_count,
+                          None if field is None else field.at(chosen))

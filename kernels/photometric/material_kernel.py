@@ -1,0 +1,176 @@
+"""The kernel of the material fit: albedo, F0 and roughness of each pixel of a pack, by re-weighted non-negative least squares at each
+roughness that is tried, and the best of them."""
+
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from kernels.packs import pack_type
+from kernels.photometric.hypotheses import SHADOW_TRUST
+from kernels.photometric.lobes import Reflectance
+
+ROUGHNESS_FIRST, ROUGHNESS_STEP, ROUGHNESS_COUNT = 0.1, 0.075, 13
+"""Grid of roughness, 0.1 to 1; below 0.1 a lobe is narrower than lights of any rig are apart."""
+HALVINGS = 3
+"""Of the step about the best: to a resolution of 0.01."""
+REWEIGHTINGS = 4
+"""Rounds of the robust fit at each roughness."""
+COMMON_ROUNDS = 3
+"""Turns in which it settles which channels have albedo above 0, where the three share one F0."""
+
+
+TINTED = wp.constant(0)
+"""Of the specular lobe are free: F0 of each channel, and roughness. Metals."""
+NEUTRAL = wp.constant(1)
+"""One F0, and roughness: dielectrics, whose highlights have the colour of the light."""
+GIVEN = wp.constant(2)
+"""Nothing: F0 and roughness are given, and albedo alone is fitted."""
+
+
+@cache
+def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
+    """The kernel for one width of packs and one kind of light.
+
+    Args:
+        lanes: pixels of a pack.
+        reflectance: expected readings.
+        bare: whether a surface without any specular lobe is a candidate of its own.
+    """
+    respond, lambertian = reflectance
+    lane_type = pack_type(lanes, wp.float32)
+    channels = wp.types.matrix(shape=(3, lanes), dtype=wp.float32)
+    bare_trials = int(bare)
+    searched = bare_trials + ROUGHNESS_COUNT + 2 * HALVINGS
+
+    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
+    def fit_kernel(first: int,
+                   colour: wp.array2d(dtype=lane_type),  # [3, P · L] radiance / irradiance
+                   toward: wp.array2d(dtype=lane_type),  # [3, P · L]
+                   table: wp.array3d(dtype=float),  # [cells, L, columns]
+                   level: wp.array(dtype=lane_type),  # [P]
+                   view: wp.array2d(dtype=lane_type),  # [3, P]
+                   normal: wp.array2d(dtype=lane_type),  # [3, P]
+                   noise: wp.vec2,  # s0, s1
+                   shadow: wp.vec2,  # r²/σ² of equal cost, depth
+                   form: wp.vec2,  # diffuse roughness, slope
+                   freedom: int,
+                   known: wp.vec4,  # F0 and roughness, where they are given
+                   light_count: int,
+                   pack_stride: int,
+                   light_stride: int,
+                   # outputs
+                   fitted: wp.array2d(dtype=lane_type)):  # [8, P] albedo, F0, roughness, cost
+        p = first + wp.tid()
+        vx, vy, vz = view[0, p], view[1, p], view[2, p]
+        nx, ny, nz = normal[0, p], normal[1, p], normal[2, p]
+        bright = level[p]
+        best_cost, best_rough = lane_type(), lane_type()
+        best_rho, best_f0 = channels(), channels()
+        for k in range(lanes):
+            best_cost[k] = 1.0e30
+        step = float(ROUGHNESS_STEP)
+        trials = wp.where(freedom == GIVEN, 1, searched)
+        for trial in range(trials):
+            # no lobe at all where that is a candidate, the grid, then two trials a halving on either side of the best
+            grid = trial - bare_trials
+            late = grid - ROUGHNESS_COUNT
+            if late >= 0 and late % 2 == 0:
+                step = step * 0.5
+            rough = lane_type()
+            for k in range(lanes):
+                side = wp.where(late % 2 == 0, step, -step)
+                around = wp.clamp(best_rough[k] + side, wp.static(0.5 * ROUGHNESS_FIRST), 1.0)
+                tried = wp.where(late < 0, wp.where(grid < 0, 0.0, ROUGHNESS_FIRST + ROUGHNESS_STEP * float(grid)), around)
+                rough[k] = wp.where(freedom == GIVEN, known[3], tried)
+            rho, f0 = channels(), channels()
+            cost = lane_type()
+            for turn in range(wp.static(REWEIGHTINGS + 1)):
+                dd, ds, ss, rd, rs = channels(), channels(), channels(), channels(), channels()
+                cost = lane_type()
+                for light in range(light_count):
+                    at = p * pack_stride + light * light_stride
+                    fd, fs, fixed = respond(toward, table, form, nx, ny, nz, vx, vy, vz, rough, at, light)
+                    # one weight a light for all channels: a shadow is one in each of them
+                    off2, shining, expected, w = lane_type(), lane_type(), lane_type(), lane_type()
+                    for c in range(3):
+                        y = colour[c, at]
+                        for k in range(lanes):
+                            predicted = rho[c, k] * fd[k] + f0[c, k] * fs[k] + fixed[k]
+                            sigma = wp.max(noise[0] * bright[k] + noise[1] * wp.max(y[k], 0.0), 1.0e-20)
+                            off = (y[k] - predicted) / sigma
+                            off2[k] += wp.where(turn == 0, 0.0, off * off / 3.0)
+                            shining[k] += y[k]
+                            expected[k] += predicted
+                    for k in range(lanes):
+                        dark = wp.where(shining[k] < shadow[1] * expected[k], 1, 0) * wp.where(off2[k] > shadow[0], 1, 0)
+                        given = wp.where(shining[k] >= 0.0, 1.0, 0.0)
+                        cost[k] += given * wp.log(1.0 + wp.where(dark == 1, shadow[0], off2[k]))
+                        sigma = wp.max(noise[0] * bright[k] + noise[1] * wp.max(shining[k], 0.0) / 3.0, 1.0e-20)
+                        relative = bright[k] / sigma
+                        trust = wp.where(shining[k] > 0.0, wp.where(dark == 1, SHADOW_TRUST, 1.0), SHADOW_TRUST)
+                        w[k] = given * trust * relative * relative / (1.0 + off2[k])
+                    for c in range(3):
+                        y = colour[c, at]
+                        for k in range(lanes):
+                            left = y[k] - fixed[k]
+                            dd[c, k] += w[k] * fd[k] * fd[k]
+                            ds[c, k] += w[k] * fd[k] * fs[k]
+                            ss[c, k] += w[k] * fs[k] * fs[k]
+                            rd[c, k] += w[k] * fd[k] * left
+                            rs[c, k] += w[k] * fs[k] * left
+                if turn < wp.static(REWEIGHTINGS) and freedom == TINTED:
+                    for c in range(3):
+                        for k in range(lanes):
+                            # two non-negative unknowns: the free solution, or the better one alone
+                            bottom = dd[c, k] * ss[c, k] - ds[c, k] * ds[c, k]
+                            safe = bottom > 1.0e-6 * dd[c, k] * ss[c, k]
+                            a = (ss[c, k] * rd[c, k] - ds[c, k] * rs[c, k]) / wp.where(safe, bottom, 1.0)
+                            b = (dd[c, k] * rs[c, k] - ds[c, k] * rd[c, k]) / wp.where(safe, bottom, 1.0)
+                            only_a = wp.max(rd[c, k], 0.0) / wp.max(dd[c, k], 1.0e-20)
+                            only_b = wp.clamp(wp.max(rs[c, k], 0.0) / wp.max(ss[c, k], 1.0e-20), 0.0, 1.0)
+                            gain_a = only_a * (2.0 * rd[c, k] - only_a * dd[c, k])
+                            gain_b = only_b * (2.0 * rs[c, k] - only_b * ss[c, k])
+                            both = wp.where(safe, 1, 0) * wp.where(a >= 0.0, 1, 0) * wp.where(b >= 0.0, 1, 0)
+                            full = wp.where(b > 1.0, 1, 0)  # F0 at its bound: the albedo takes what is left
+                            rest = wp.max(rd[c, k] - ds[c, k], 0.0) / wp.max(dd[c, k], 1.0e-20)
+                            alone_a = wp.where(gain_a >= gain_b, only_a, 0.0)
+                            alone_b = wp.where(gain_a >= gain_b, 0.0, only_b)
+                            rho[c, k] = wp.where(both == 1, wp.where(full == 1, rest, a), alone_a)
+                            f0[c, k] = wp.where(both == 1, wp.min(b, 1.0), alone_b)
+                if turn < wp.static(REWEIGHTINGS) and freedom != TINTED:
+                    for k in range(lanes):
+                        common = float(0.0)
+                        for _ in range(wp.where(freedom == NEUTRAL, COMMON_ROUNDS, 0)):
+                            # a channel with albedo above 0 leaves to F0 what its diffuse lobe cannot explain, others leave all
+                            top, bottom, whole = float(0.0), float(0.0), float(0.0)
+                            for c in range(3):
+                                shared = wp.where(rd[c, k] > common * ds[c, k], ds[c, k] / wp.max(dd[c, k], 1.0e-20), 0.0)
+                                top += rs[c, k] - shared * rd[c, k]
+                                bottom += ss[c, k] - shared * ds[c, k]
+                                whole += ss[c, k]
+                            common = wp.where(bottom > 1.0e-6 * whole, wp.clamp(top / wp.max(bottom, 1.0e-20), 0.0, 1.0), 0.0)
+                        for c in range(3):
+                            shine = wp.where(freedom == NEUTRAL, common, known[c])
+                            f0[c, k] = shine
+                            rho[c, k] = wp.max(rd[c, k] - shine * ds[c, k], 0.0) / wp.max(dd[c, k], 1.0e-20)
+            for k in range(lanes):
+                better = cost[k] < best_cost[k]
+                best_cost[k] = wp.where(better, cost[k], best_cost[k])
+                best_rough[k] = wp.where(better, rough[k], best_rough[k])
+                for c in range(3):
+                    best_rho[c, k] = wp.where(better, rho[c, k], best_rho[c, k])
+                    best_f0[c, k] = wp.where(better, f0[c, k], best_f0[c, k])
+        closest = lambertian(toward, form, nx, ny, nz, vx, vy, vz, p * pack_stride, light_count, light_stride)
+        for c in range(3):
+            out = lane_type()
+            for k in range(lanes):
+                out[k] = best_rho[c, k] * closest[k]
+            fitted[c, p] = out
+            for k in range(lanes):
+                out[k] = best_f0[c, k]
+            fitted[3 + c, p] = out
+        fitted[6, p] = best_rough
+        fitted[7, p] = best_cost
+
+    return fit_kernel
