@@ -101,7 +101,8 @@ VARIANTS: dict[str, Callable[[Case], np.ndarray]] = {
     "+ cast shadow as a hypothesis of its own": lambda case: search_normals(case.samples, case.robust, shape=Diffuse()).normal,
     "+ diffuse shape shared by the object": lambda case: search_normals(case.samples, case.robust, shape=case.shape).normal,
     "· the same with the three channels searched apart and averaged by cost (left out)": _channels_apart,
-    "+ averaged over nearby shapes": lambda case: solve_svbrdf(case.samples, case.robust, shape=case.shape).normal,
+    "+ averaged over nearby shapes": lambda case: solve_svbrdf(case.samples, case.robust, shape=case.shape, single_lobe=False).normal,
+    "+ a single lobe fitted jointly with the normal": lambda case: solve_svbrdf(case.samples, case.robust, shape=case.shape).normal,
     "+ cast shadows of the height taken out": lambda case: case.whole(Parts(bounce=False)),
     "+ light that the object throws on itself taken off, materials shared (`svbrdf`)": lambda case: case.whole(Parts()),
 }

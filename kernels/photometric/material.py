@@ -77,6 +77,15 @@ def fit_material(samples: Samples, normal: np.ndarray, *, shape: Diffuse, option
     return _where(blend.cost <= SHARED_RISE * own.cost + COST_FLOOR, blend, own)
 
 
+def fit_tinted(samples: Samples, normal: np.ndarray, *, shape: Diffuse, options: SearchOptions | None = None) -> Material:
+    """Fit the material of sampled pixels with an F0 of each channel's own: the freest fit, where cost alone is asked for.
+
+    Args:
+        samples, normal, shape, options: as for fit_material.
+    """
+    return _fit(samples, normal, shape, options or SearchOptions(), None, TINTED)
+
+
 def fit_given(samples: Samples, normal: np.ndarray, material: np.ndarray, *, shape: Diffuse,
               options: SearchOptions | None = None) -> Material:
     """Fit the albedo of sampled pixels to a specular lobe that is given.

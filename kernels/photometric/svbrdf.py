@@ -1,7 +1,7 @@
 """The general solver: normal, diffuse albedo, F0 and roughness of each pixel, without learning.
 
-Normals come from the hypothesis search under the diffuse shape that the object shares, averaged over shapes close to it, each weighted
-by how well it explains the pixel; the material then follows for the normal found.
+Normals come from the hypothesis search under the diffuse shape that the object shares and under shapes close to it, and from the joint
+fit of a single lobe; they are averaged, each weighted by how well it explains the pixel. The material then follows for the normal found.
 """
 
 from typing import NamedTuple
@@ -9,7 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels.photometric.hypotheses import FINE, Diffuse, SearchOptions, search_normals
-from kernels.photometric.material import fit_material
+from kernels.photometric.material import fit_material, fit_tinted
+from kernels.photometric.refine import refine
 from kernels.photometric.samples import Samples
 
 NEIGHBOURS = ((-0.15, 0.0), (0.15, 0.0), (0.0, -0.1), (0.0, 0.1))
@@ -17,7 +18,9 @@ NEIGHBOURS = ((-0.15, 0.0), (0.15, 0.0), (0.0, -0.1), (0.0, 0.1))
 NEAR = (((0.7, 1.5, 2.5), 10), (((0.4,), 6),))
 """Rings that follow a changed shape from the normal of the shared one."""
 TEMPERATURE = 0.4
-"""A shape whose cost is this fraction above the best has 1/e of its weight: costs a third apart cannot be told from misfit."""
+"""A model whose cost is this fraction above the best has 1/e of its weight: costs a third apart cannot be told from misfit."""
+SINGLE_LOBE_CHARGE = 1.5
+"""Factor on the cost of the single lobe: it must explain a pixel clearly better than the mixture, as it does on metals, to replace it."""
 RING_DEGREES = FINE[-1][0][-1]
 """Radius of the last ring of the search, whose rise in cost gives the standard error."""
 
@@ -34,7 +37,7 @@ class SvbrdfFit(NamedTuple):
 
 
 def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, options: SearchOptions | None = None,
-                 shared: np.ndarray | None = None) -> SvbrdfFit:
+                 shared: np.ndarray | None = None, single_lobe: bool = True) -> SvbrdfFit:
     """Solve sampled pixels.
 
     Args:
@@ -43,6 +46,7 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, options
         shape: of the diffuse lobe, from diffuse_shape.choose_diffuse.
         options: how candidates are judged.
         shared: [materials, 4] of shared_materials.choose_materials; None: every pixel has a material of its own.
+        single_lobe: False leaves the joint fit of one lobe out, to see what it buys.
 
     Returns:
         The fit. Waits for the device.
@@ -60,6 +64,11 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, options
         other = search_normals(samples, found.normal, shape=nearby, options=options, wide=wide, fine=fine)
         normals.append(other.normal)
         costs.append(other.cost)
+    if single_lobe:
+        single = refine(samples, found.normal, fit_tinted(samples, found.normal, shape=shape, options=options).roughness, shape=shape,
+                        options=options)
+        normals.append(single.normal)
+        costs.append(SINGLE_LOBE_CHARGE * single.cost)
     normal, spread = average_normals(np.stack(normals), np.stack(costs))
     material = fit_material(samples, normal, shape=shape, options=options, shared=shared)
     variance = found.variance(samples.light_count, RING_DEGREES) + spread**2
@@ -68,11 +77,11 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, options
 
 
 def average_normals(normals: np.ndarray, costs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean of a pixel's normals under several shapes, each weighted by exp(-(cost - best) / (temperature · best)).
+    """Mean of a pixel's normals under several models, each weighted by exp(-(cost - best) / (temperature · best)).
 
     Args:
-        normals: [shapes, n, 3] unit.
-        costs: [shapes, n].
+        normals: [models, n, 3] unit.
+        costs: [models, n].
 
     Returns:
         [n, 3] unit normals, and [n] their weighted RMS spread in degrees.

@@ -1,0 +1,281 @@
+"""Joint refinement of normal, roughness, albedo and F0 by Levenberg-Marquardt, on readings that one GGX lobe explains.
+
+The search's mixture of fixed lobes is safe on surfaces of any kind, and as coarse as its lobes: on a surface whose one lobe is that of
+the contract's BRDF, a metal above all, that lobe with the roughness of the pixel is sharper. So the whole model is fitted from
+where the search ended: two tilts of the normal and the roughness by Gauss-Newton steps on the readings re-weighted as in the search,
+with the six linear unknowns, albedo and F0 of three channels, eliminated from every step (variable projection).
+
+Source: Levenberg-Marquardt with eliminated linear parameters after Golub and Pereyra, "Separable nonlinear least squares", Inverse
+Problems 2003; Cauchy weights as in hypotheses.
+"""
+
+import math
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from kernels.packs import pack_type
+from kernels.photometric.hypotheses import LEAST_NZ, SHADOW_TRUST, Diffuse, SearchOptions
+from kernels.photometric.lobes import Reflectance, direction_reflectance
+from kernels.photometric.samples import Samples, per_pixel, to_host
+
+LINEAR_TURNS = 4
+"""Rounds of the robust linear fit before the first step."""
+STEPS = 12
+"""Steps, those that are taken back included."""
+TILT, BEND = 0.002, 0.01
+"""Differences of normal, radians, and of roughness, from which derivatives are taken."""
+LONGEST_TILT, LONGEST_BEND = 0.05, 0.1
+"""Of one step."""
+DAMPING, DAMPING_UP, DAMPING_DOWN = 0.01, 8.0, 0.3
+LEAST_ROUGHNESS = 0.05
+
+
+class Refinement(NamedTuple):
+    """What was fitted for each sampled pixel."""
+
+    normal: np.ndarray  # [n, 3] float32, unit
+    roughness: np.ndarray  # [n] float32
+    cost: np.ndarray  # [n] float32, per light, as of the material fit
+
+
+def refine(samples: Samples, normal: np.ndarray, roughness: np.ndarray, *, shape: Diffuse,
+           options: SearchOptions | None = None) -> Refinement:
+    """Refine sampled pixels under lights of one direction each.
+
+    Args:
+        samples: their readings.
+        normal: [n, 3] unit normals, within a few degrees of the truth.
+        roughness: [n] of the material fit at these normals.
+        shape: of the diffuse lobe.
+        options: noise and shadows, as in the search.
+
+    Returns:
+        The best fit met on the way, never of higher cost than the first. Waits for the device.
+    """
+    options = options or SearchOptions()
+    device, lanes, packs = samples.device, samples.lanes, samples.packs
+    refined = wp.empty((5, packs), dtype=pack_type(lanes, wp.float32), device=device)
+    start = np.concatenate([normal, roughness[:, None]], axis=1)
+    devices.launch(_refine_kernel(lanes, direction_reflectance(lanes)), packs,
+                   [samples.colour, samples.toward, wp.empty((0, 0, 0), dtype=wp.float32, device=device), samples.level, samples.view,
+                    per_pixel(samples, start), wp.vec2(options.noise_floor, options.noise_slope),
+                    wp.vec2(math.expm1(options.shadow_cost), options.shadow_depth), wp.vec2(shape.rough, shape.slope),
+                    samples.light_count, samples.pack_stride, samples.light_stride], [refined], device=device)
+    values = to_host(samples, refined)
+    return Refinement(values[:, :3], values[:, 3], values[:, 4] / samples.light_count)
+
+
+@wp.func
+def active(dd: float, ds: float, ss: float, rd: float, rs: float):
+    """Which of two non-negative unknowns, albedo and F0, are above 0 in the least-squares fit: 1.0 or 0.0 of each."""
+    bottom = dd * ss - ds * ds
+    safe = bottom > 1.0e-6 * dd * ss
+    both = safe and ss * rd >= ds * rs and dd * rs >= ds * rd
+    gain_d = wp.max(rd, 0.0) * wp.max(rd, 0.0) * ss
+    gain_s = wp.max(rs, 0.0) * wp.max(rs, 0.0) * dd
+    first = wp.where(gain_d >= gain_s, 1.0, 0.0)
+    return wp.where(both, 1.0, first), wp.where(both, 1.0, 1.0 - first)
+
+
+@wp.func
+def solve_symmetric(m00: float, m01: float, m02: float, m11: float, m12: float, m22: float, b: wp.vec3):
+    """Solution of a symmetric positive definite 3 × 3 system; 0 where it is not one."""
+    c00, c01, c02 = m11 * m22 - m12 * m12, m02 * m12 - m01 * m22, m01 * m12 - m02 * m11
+    bottom = m00 * c00 + m01 * c01 + m02 * c02
+    c11, c12, c22 = m00 * m22 - m02 * m02, m01 * m02 - m00 * m12, m00 * m11 - m01 * m01
+    x = wp.vec3(c00 * b[0] + c01 * b[1] + c02 * b[2], c01 * b[0] + c11 * b[1] + c12 * b[2], c02 * b[0] + c12 * b[1] + c22 * b[2])
+    sound = m00 > 0.0 and m11 > 0.0 and m22 > 0.0 and bottom > 1.0e-6 * m00 * m11 * m22
+    return wp.where(sound, x / wp.max(bottom, 1.0e-30), wp.vec3())
+
+
+@cache
+def _refine_kernel(lanes: int, reflectance: Reflectance) -> Any:
+    respond, _ = reflectance
+    lane_type = pack_type(lanes, wp.float32)
+    channels = wp.types.matrix(shape=(3, lanes), dtype=wp.float32)
+    triples = wp.types.matrix(shape=(9, lanes), dtype=wp.float32)  # [3 · channel + unknown]
+    squares = wp.types.matrix(shape=(6, lanes), dtype=wp.float32)  # 00 01 02 11 12 22
+
+    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
+    def refine_kernel(first: int,
+                      colour: wp.array2d(dtype=lane_type),  # [3, P · L] radiance / irradiance
+                      toward: wp.array2d(dtype=lane_type),  # [3, P · L]
+                      table: wp.array3d(dtype=float),  # of no use to lights of one direction
+                      level: wp.array(dtype=lane_type),  # [P]
+                      view: wp.array2d(dtype=lane_type),  # [3, P]
+                      start: wp.array2d(dtype=lane_type),  # [4, P] normal, roughness
+                      noise: wp.vec2,  # s0, s1
+                      shadow: wp.vec2,  # r²/σ² of equal cost, depth
+                      form: wp.vec2,  # diffuse roughness, slope
+                      light_count: int,
+                      pack_stride: int,
+                      light_stride: int,
+                      # outputs
+                      refined: wp.array2d(dtype=lane_type)):  # [5, P] normal, roughness, cost
+        p = first + wp.tid()
+        vx, vy, vz = view[0, p], view[1, p], view[2, p]
+        nx, ny, nz, rough = start[0, p], start[1, p], start[2, p], start[3, p]
+        bright = level[p]
+        best, damping, again = lane_type(), lane_type(), lane_type()
+        best_x, best_y, best_z, best_rough = lane_type(), lane_type(), lane_type(), lane_type()
+        rho, f0, best_rho, best_f0 = channels(), channels(), channels(), channels()
+        for k in range(lanes):
+            best[k] = 1.0e30
+            damping[k] = DAMPING
+        for turn in range(wp.static(LINEAR_TURNS + STEPS + 1)):
+            # tangents, and the normals and roughness from which derivatives are taken
+            ax, ay, az, bx, by, bz = lane_type(), lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
+            px, py, pz, qx, qy, qz = lane_type(), lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
+            wider = lane_type()
+            for k in range(lanes):
+                n = wp.vec3(nx[k], ny[k], nz[k])
+                up = wp.where(wp.abs(n[2]) < 0.9, wp.vec3(0.0, 0.0, 1.0), wp.vec3(1.0, 0.0, 0.0))
+                a = wp.normalize(wp.cross(up, n))
+                b = wp.cross(n, a)
+                plus, aside = wp.normalize(n + TILT * a), wp.normalize(n + TILT * b)
+                ax[k] = a[0]
+                ay[k] = a[1]
+                az[k] = a[2]
+                bx[k] = b[0]
+                by[k] = b[1]
+                bz[k] = b[2]
+                px[k] = plus[0]
+                py[k] = plus[1]
+                pz[k] = plus[2]
+                qx[k] = aside[0]
+                qy[k] = aside[1]
+                qz[k] = aside[2]
+                wider[k] = rough[k] + BEND
+            cost = lane_type()
+            dd, ds, ss, rd, rs = channels(), channels(), channels(), channels(), channels()
+            jd, js, jy = triples(), triples(), triples()
+            jj = squares()
+            for light in range(light_count):
+                at = p * pack_stride + light * light_stride
+                fd, fs, fixed = respond(toward, table, form, nx, ny, nz, vx, vy, vz, rough, at, light)
+                fd0, fs0, fixed0 = respond(toward, table, form, px, py, pz, vx, vy, vz, rough, at, light)
+                fd1, fs1, fixed1 = respond(toward, table, form, qx, qy, qz, vx, vy, vz, rough, at, light)
+                fd2, fs2, fixed2 = respond(toward, table, form, nx, ny, nz, vx, vy, vz, wider, at, light)
+                off2, shining, expected, w = lane_type(), lane_type(), lane_type(), lane_type()
+                for c in range(3):
+                    y = colour[c, at]
+                    for k in range(lanes):
+                        predicted = rho[c, k] * fd[k] + f0[c, k] * fs[k] + fixed[k]
+                        sigma = wp.max(noise[0] * bright[k] + noise[1] * wp.max(y[k], 0.0), 1.0e-20)
+                        off = (y[k] - predicted) / sigma
+                        off2[k] += wp.where(turn == 0, 0.0, off * off / 3.0)
+                        shining[k] += y[k]
+                        expected[k] += predicted
+                for k in range(lanes):
+                    dark = wp.where(shining[k] < shadow[1] * expected[k], 1, 0) * wp.where(off2[k] > shadow[0], 1, 0)
+                    given = wp.where(shining[k] >= 0.0, 1.0, 0.0)
+                    cost[k] += given * wp.log(1.0 + wp.where(dark == 1, shadow[0], off2[k]))
+                    sigma = wp.max(noise[0] * bright[k] + noise[1] * wp.max(shining[k], 0.0) / 3.0, 1.0e-20)
+                    relative = bright[k] / sigma
+                    trust = wp.where(shining[k] > 0.0, wp.where(dark == 1, SHADOW_TRUST, 1.0), SHADOW_TRUST)
+                    w[k] = given * trust * relative * relative / (1.0 + off2[k])
+                for c in range(3):
+                    y = colour[c, at]
+                    for k in range(lanes):
+                        left = y[k] - fixed[k]
+                        wd, ws = w[k] * fd[k], w[k] * fs[k]
+                        dd[c, k] += wd * fd[k]
+                        ds[c, k] += wd * fs[k]
+                        ss[c, k] += ws * fs[k]
+                        rd[c, k] += wd * left
+                        rs[c, k] += ws * left
+                        j0 = (rho[c, k] * (fd0[k] - fd[k]) + f0[c, k] * (fs0[k] - fs[k]) + fixed0[k] - fixed[k]) / TILT
+                        j1 = (rho[c, k] * (fd1[k] - fd[k]) + f0[c, k] * (fs1[k] - fs[k]) + fixed1[k] - fixed[k]) / TILT
+                        j2 = (rho[c, k] * (fd2[k] - fd[k]) + f0[c, k] * (fs2[k] - fs[k]) + fixed2[k] - fixed[k]) / BEND
+                        jd[3 * c, k] += j0 * wd
+                        jd[3 * c + 1, k] += j1 * wd
+                        jd[3 * c + 2, k] += j2 * wd
+                        js[3 * c, k] += j0 * ws
+                        js[3 * c + 1, k] += j1 * ws
+                        js[3 * c + 2, k] += j2 * ws
+                        jy[3 * c, k] += j0 * w[k] * left
+                        jy[3 * c + 1, k] += j1 * w[k] * left
+                        jy[3 * c + 2, k] += j2 * w[k] * left
+                        jj[0, k] += w[k] * j0 * j0
+                        jj[1, k] += w[k] * j0 * j1
+                        jj[2, k] += w[k] * j0 * j2
+                        jj[3, k] += w[k] * j1 * j1
+                        jj[4, k] += w[k] * j1 * j2
+                        jj[5, k] += w[k] * j2 * j2
+            for k in range(lanes):
+                if turn >= LINEAR_TURNS and cost[k] >= best[k] and again[k] == 0.0:
+                    # the step cost more: back to the best, and a shorter one from there in the next turn
+                    again[k] = 1.0
+                    damping[k] = damping[k] * DAMPING_UP
+                    nx[k] = best_x[k]
+                    ny[k] = best_y[k]
+                    nz[k] = best_z[k]
+                    rough[k] = best_rough[k]
+                    for c in range(3):
+                        rho[c, k] = best_rho[c, k]
+                        f0[c, k] = best_f0[c, k]
+                else:
+                    if turn >= LINEAR_TURNS:
+                        damping[k] = wp.where(again[k] == 0.0, wp.max(damping[k] * DAMPING_DOWN, 1.0e-6), damping[k])
+                        again[k] = 0.0
+                        best[k] = cost[k]
+                        best_x[k] = nx[k]
+                        best_y[k] = ny[k]
+                        best_z[k] = nz[k]
+                        best_rough[k] = rough[k]
+                        for c in range(3):
+                            best_rho[c, k] = rho[c, k]
+                            best_f0[c, k] = f0[c, k]
+                    # normal equations of the step, albedo and then F0 of each channel eliminated
+                    m00, m01, m02 = jj[0, k], jj[1, k], jj[2, k]
+                    m11, m12, m22 = jj[3, k], jj[4, k], jj[5, k]
+                    right = wp.vec3()
+                    for c in range(3):
+                        d_on, s_on = active(dd[c, k], ds[c, k], ss[c, k], rd[c, k], rs[c, k])
+                        e = wp.vec3(jd[3 * c, k], jd[3 * c + 1, k], jd[3 * c + 2, k]) * d_on
+                        inverse = d_on / wp.max(dd[c, k], 1.0e-20)
+                        h = wp.vec3(js[3 * c, k], js[3 * c + 1, k], js[3 * c + 2, k]) - (inverse * ds[c, k]) * e
+                        below = ss[c, k] - inverse * ds[c, k] * ds[c, k]
+                        further = s_on / wp.max(below, 1.0e-20)
+                        m00 -= inverse * e[0] * e[0] + further * h[0] * h[0]
+                        m01 -= inverse * e[0] * e[1] + further * h[0] * h[1]
+                        m02 -= inverse * e[0] * e[2] + further * h[0] * h[2]
+                        m11 -= inverse * e[1] * e[1] + further * h[1] * h[1]
+                        m12 -= inverse * e[1] * e[2] + further * h[1] * h[2]
+                        m22 -= inverse * e[2] * e[2] + further * h[2] * h[2]
+                        right += wp.vec3(jy[3 * c, k], jy[3 * c + 1, k], jy[3 * c + 2, k])
+                        right -= (inverse * rd[c, k]) * e + (further * (rs[c, k] - inverse * ds[c, k] * rd[c, k])) * h
+                    heavier = 1.0 + damping[k]
+                    move = solve_symmetric(heavier * m00, m01, m02, heavier * m11, m12, heavier * m22, right)
+                    move = wp.where(turn < LINEAR_TURNS, wp.vec3(), move)
+                    length = wp.sqrt(move[0] * move[0] + move[1] * move[1])
+                    bend = wp.max(wp.abs(move[2]), 1.0e-20)
+                    move = move * wp.min(1.0, wp.min(LONGEST_TILT / wp.max(length, 1.0e-20), LONGEST_BEND / bend))
+                    for c in range(3):
+                        d_on, s_on = active(dd[c, k], ds[c, k], ss[c, k], rd[c, k], rs[c, k])
+                        d_rest = rd[c, k] - (jd[3 * c, k] * move[0] + jd[3 * c + 1, k] * move[1] + jd[3 * c + 2, k] * move[2])
+                        s_rest = rs[c, k] - (js[3 * c, k] * move[0] + js[3 * c + 1, k] * move[1] + js[3 * c + 2, k] * move[2])
+                        inverse = d_on / wp.max(dd[c, k], 1.0e-20)
+                        below = wp.max(ss[c, k] - inverse * ds[c, k] * ds[c, k], 1.0e-20)
+                        shine = wp.clamp(s_on * (s_rest - inverse * ds[c, k] * d_rest) / below, 0.0, 1.0)
+                        f0[c, k] = shine
+                        rho[c, k] = wp.max(inverse * (d_rest - ds[c, k] * shine), 0.0)
+                    n = wp.vec3(nx[k] + move[0] * ax[k] + move[1] * bx[k], ny[k] + move[0] * ay[k] + move[1] * by[k],
+                                nz[k] + move[0] * az[k] + move[1] * bz[k])
+                    v = wp.vec3(vx[k], vy[k], vz[k])
+                    n = wp.normalize(n + wp.max(LEAST_NZ - wp.dot(n, v), 0.0) * v)
+                    nx[k] = n[0]
+                    ny[k] = n[1]
+                    nz[k] = n[2]
+                    rough[k] = wp.clamp(rough[k] + move[2], LEAST_ROUGHNESS, 1.0)
+        refined[0, p] = best_x
+        refined[1, p] = best_y
+        refined[2, p] = best_z
+        refined[3, p] = best_rough
+        refined[4, p] = best
+
+    return refine_kernel
