@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from kernels.errors import KernelError
 from service.usd.errors import AssetError
 from stage.errors import StageError
-from stage.manifest import describe
+from stage.records import describe
 
 
 class RequestError(ValueError):

@@ -1,6 +1,8 @@
 """How a pipeline says where it is; the doors decide how to show it."""
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Protocol
 
 
@@ -22,6 +24,8 @@ class Timings:
         self._inner = inner
         self._started: tuple[str, float] | None = None
         self.seconds: dict[str, float] = {}
+        self.parts: dict[str, float] = {}
+        """Seconds of named parts of stages."""
 
     def stage(self, name: str, total: int) -> None:
         """Begin a stage."""
@@ -34,6 +38,15 @@ class Timings:
         """Pass on."""
         if self._inner is not None:
             self._inner.advance(done)
+
+    @contextmanager
+    def part(self, name: str) -> Iterator[None]:
+        """Time a part of the current stage that comes again and again: it has seconds of its own, but no line on the terminal."""
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.parts[name] = round(self.parts.get(name, 0.0) + time.perf_counter() - began, 6)
 
     def close(self) -> dict[str, float]:
         """End the last stage.

@@ -12,6 +12,9 @@ from service import __version__
 REPORTED = ("relit", "warp-lang", "numpy", "OpenEXR", "OpenImageIO", "opencv-python-headless", "usd-core")
 """Distributions whose versions a report names."""
 
+UNRECORDED = {"capture", "out", "maps", "environment", "keys", "sheet", "report", "cache", "device", "overwrite"}
+"""Of a request: paths, and how it was carried out."""
+
 
 def versions() -> dict[str, str]:
     """Versions of this program and of what its results depend on."""
@@ -34,7 +37,7 @@ def metadata(request: BaseModel, *, capture: str, inputs: str, method: str | Non
         inputs: content hash of the images.
         method: the one that was used, where the request left the choice open.
     """
-    options = request.model_dump(mode="json", exclude={"capture", "out", "maps", "environment", "cache", "device"})
+    options = request.model_dump(mode="json", exclude=UNRECORDED)
     options = {name: value for name, value in options.items() if value is not None and value is not False}
     if method is not None:
         options["method"] = str(method)

@@ -1,10 +1,18 @@
 """What can be asked of Relit: one frozen model a job, the same object for the command line, the API and the workflow."""
 
 from pathlib import Path
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
-from service.methods import Method
+from service.methods import BasisKind, FrameCompression, FrameSpace, Layer, LightWeights, Method
+
+MAX_STOPS = 32.0
+"""Of exposure either way: more than half has from its smallest value to its largest."""
+
+
+def _split(given: Any) -> Any:
+    return tuple(part.strip() for part in given.split(",")) if isinstance(given, str) else given
 
 
 class Request(BaseModel):
@@ -45,16 +53,55 @@ class SolveRequest(StackRequest):
 
 
 class RelightRequest(StackRequest):
-    """Frames of a capture under a lat-long environment."""
+    """Frames of a capture, or of a sequence of captures, under lat-long environments and animated lights."""
 
     capture: Path
-    environment: Path
+    """A folder with a capture.json; or with such folders, one a time step: in order of name, each gives one frame."""
     out: str
     """Path of the frames with #### for the number."""
-    frames: str = "1"
-    """A number, or first-last."""
+    environment: Path | None = None
+    """A lat-long map; with #### in its name one a frame."""
+    keys: Path | None = None
+    """Light keys (schema relit.keys/1): animation of lights, environment, captured images and exposure."""
+    frames: str | None = None
+    """A number, or first-last; None: 1, or 1 to the number of time steps."""
+    weights: LightWeights | None = None
+    """How light from between the captured lights is shared out over them; None: cells, with maps smooth."""
+    exposure: float = Field(default=0.0, ge=-MAX_STOPS, le=MAX_STOPS, allow_inf_nan=False)
+    """Stops: every frame is multiplied by 2 to this power."""
+    maps: Path | None = None
+    """Folder of the solved maps (of a sequence: of a folder a time step, named as its capture): frames are guided by a model of them."""
+    aov: Annotated[tuple[Layer, ...], BeforeValidator(_split)] = (Layer.BEAUTY,)
+    """Layers of a frame; as text, names with commas between."""
+    color_space: FrameSpace | None = None
+    """None: the capture's own scene-linear space."""
+    compression: FrameCompression = FrameCompression.ZIP
+    overwrite: bool = False
+    """Make frames anew that an equal request has made already."""
+    sheet: Path | None = None
+    """A PNG that shows the frames for review."""
+    report: Path | None = None
+    """A JSON file that says what was made, and where the time went."""
     spin_degrees: float = Field(default=0.0, allow_inf_nan=False)
     """How far the environment turns about +y over the whole range; the first frame is unturned, and a full turn closes."""
+
+    @property
+    def weighting(self) -> LightWeights:
+        """The weights that are used."""
+        return self.weights or (LightWeights.CELLS if self.maps is None else LightWeights.SMOOTH)
+
+
+class BasisRequest(StackRequest):
+    """A capture reduced to a few coefficient images, for a browser or for viewers of relightable images."""
+
+    capture: Path
+    out: Path
+    """.exr (svd), .ptm (ptm, lrgb-ptm) or .rti (hsh)."""
+    kind: BasisKind | None = None
+    """None: the first kind with the suffix of `out`."""
+    count: int | None = Field(default=None, ge=1)
+    """Coefficients in each channel. svd: 1 to the number of lights, None: 16 or that number; hsh: 4, 9 or 16, None: 9 from 18
+    lights on, else 4; ptm: six in any case."""
 
 
 class ExportRequest(BaseModel):

@@ -76,6 +76,19 @@ def convert(pixels: np.ndarray, source: str, target: str) -> np.ndarray:
     return converted[..., :1] if grey else converted
 
 
+def rgb_matrix(source: str, target: str) -> np.ndarray:
+    """The matrix between two scene-linear spaces.
+
+    Returns:
+        [3, 3] float32, column vectors: target = matrix @ source.
+
+    Raises:
+        ValueError: OpenColorIO does not know one of the names.
+    """
+    primaries = np.eye(3, dtype=np.float32)[None]  # one row of three pixels: red, green and blue
+    return np.ascontiguousarray(convert(primaries, source, target)[0].T)
+
+
 def pixels_of(buffer: oiio.ImageBuf) -> np.ndarray:
     """The pixels of an OpenImageIO buffer, [rows, cols, channels] float32.
 

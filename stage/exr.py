@@ -24,6 +24,10 @@ class Compression:
     DWAA = OpenEXR.DWAA_COMPRESSION
 
 
+DWA_LEVEL = 45.0
+"""How lossy DWAA is: the library's own default, written into the file so that it is known; 0 loses least."""
+
+
 class Header(NamedTuple):
     """What an EXR says about itself before any pixel is read."""
 
@@ -90,13 +94,15 @@ def write(path: str | Path, channels: Mapping[str, np.ndarray], *, color_space: 
         color_space: a scene-linear colour space by its interchange name; kept as `colorInteropID`, with the
             `chromaticities` that readers without that attribute understand.
         metadata: further string attributes.
-        compression: one of Compression.
+        compression: one of Compression. DWAA is lossy in the channels whose name ends in R, G, B or Y, of every layer.
 
     Raises:
         StorageError: the file cannot be written; nothing is left behind.
     """
     header: dict[str, Any] = {"compression": compression, "type": OpenEXR.scanlineimage, "colorInteropID": color_space,
                               **metadata}
+    if compression == Compression.DWAA:
+        header["dwaCompressionLevel"] = DWA_LEVEL
     chromaticities = OpenEXR.colorInteropIDToChromaticities(color_space)
     if chromaticities is not None:
         header["chromaticities"] = chromaticities

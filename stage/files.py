@@ -2,11 +2,14 @@
 
 import os
 import tempfile
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from stage.errors import storage
+
+_umask_lock = threading.Lock()
 
 
 @contextmanager
@@ -44,6 +47,7 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def _umask() -> int:
-    current = os.umask(0)
-    os.umask(current)
+    with _umask_lock:  # reading sets it to 0 for a moment, which another thread must not take for the umask
+        current = os.umask(0)
+        os.umask(current)
     return current

@@ -38,7 +38,7 @@ class Fingerprints:
                 stat = path.stat()
                 known = self._known.get(name)
                 if known is None or known[:2] != [stat.st_size, stat.st_mtime_ns]:
-                    self._known[name] = [stat.st_size, stat.st_mtime_ns, _digest(path)]
+                    self._known[name] = [stat.st_size, stat.st_mtime_ns, digest(path)]
             result[name] = str(self._known[name][2])
         return result
 
@@ -47,9 +47,14 @@ class Fingerprints:
         write_text(self._memory, json.dumps(self._known))
 
 
-def _digest(path: Path) -> str:
-    digest = hashlib.blake2b(digest_size=16)
-    with open(path, "rb") as stream:
+def digest(path: str | Path) -> str:
+    """Content hash of one file.
+
+    Raises:
+        StorageError: it cannot be read.
+    """
+    content = hashlib.blake2b(digest_size=16)
+    with storage("read", path), open(path, "rb") as stream:
         while block := stream.read(BLOCK):
-            digest.update(block)
-    return digest.hexdigest()
+            content.update(block)
+    return content.hexdigest()

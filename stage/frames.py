@@ -46,6 +46,23 @@ def rotation_about_y(degrees: float) -> np.ndarray:
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
 
 
+def rotation_about(axis: tuple[float, float, float], degrees: float) -> np.ndarray:
+    """Rotation about any axis through the origin, by the right-hand rule: about +y as rotation_about_y.
+
+    Args:
+        axis: unit vector.
+
+    Returns:
+        [3, 3] float64, column vectors: turned = rotation @ direction.
+
+    Source: Rodrigues' formula.
+    """
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return c * np.eye(3) + s * cross + (1 - c) * np.outer(axis, axis)
+
+
 def latlong_directions(width: int, height: int) -> np.ndarray:
     """Direction from the object to each texel centre of a lat-long map.
 

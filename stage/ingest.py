@@ -7,6 +7,7 @@ import os
 import threading
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -39,38 +40,73 @@ Progress = Callable[[int, int], None]
 """Called with (done, total)."""
 
 
+@dataclass(frozen=True)
+class Ingest:
+    """The images of a capture, hashed but not decoded: what its stack depends on is known before the stack is there."""
+
+    capture: Capture
+    frames: list[Frame]
+    tracking: Tracking | None
+    folder: Path
+    """Of the cache."""
+    hint: str
+    """For messages: the option that names another folder."""
+    fingerprints: Fingerprints
+    key: str
+    """Of the stack: a hash of all that the stored values depend on."""
+
+    @classmethod
+    def of(cls, capture: Capture, *, cache: Path | None = None, tracking: Tracking | None = None) -> "Ingest":
+        """Hash the images of a capture's light frames.
+
+        Args:
+            capture: an opened capture.
+            cache: folder for the cache; None: `.relit` in the capture's folder.
+            tracking: warp every frame to the time of the reference of these tracking frames; None: leave them as recorded.
+
+        Raises:
+            ManifestError: the capture has no frame that a light lit.
+            StorageError: an image cannot be read.
+        """
+        frames = capture.sources()
+        if not frames:
+            raise ManifestError(f"{capture.folder}: frames: none is lit by a distant, point, extended or gradient light")
+        folder = cache if cache is not None else capture.folder / CACHE_FOLDER
+        fingerprints = Fingerprints(capture.folder, folder / "files.json")
+        hint = "" if cache is not None else " (--cache names another folder for it)"
+        return cls(capture, frames, tracking, folder, hint, fingerprints, _key(capture, frames, tracking, fingerprints))
+
+    def stack(self, progress: Progress | None = None) -> Stack:
+        """The stack, from the cache or built now.
+
+        Args:
+            progress: called after every decoded frame when the stack is built.
+
+        Raises:
+            ManifestError: a frame lies too far outside the tracking frames.
+            ImageError: an image is unreadable or holds impossible values, or a tracking frame is dark; names the file.
+            StorageError: the cache cannot be written (no space, read-only folder); nothing is left behind.
+        """
+        found = stacks.find(self.folder, self.key)
+        if found is not None:
+            return found
+        alignment = None if self.tracking is None else Alignment(self.capture, self.tracking, self.frames)
+        with storage(f"make the stack cache{self.hint} in", self.folder):
+            self.folder.mkdir(parents=True, exist_ok=True)
+        built = _build(self.capture, self.frames, alignment, self.folder, self.key, progress)
+        self.fingerprints.remember()
+        _drop_others(self.folder, self.key)
+        return built
+
+
 def open_stack(capture: Capture, *, cache: Path | None = None, tracking: Tracking | None = None,
                progress: Progress | None = None) -> Stack:
-    """The stack of a capture's light frames, from the cache or built now.
-
-    Args:
-        capture: an opened capture.
-        cache: folder for the cache; None: `.relit` in the capture's folder.
-        tracking: warp every frame to the time of the reference of these tracking frames; None: leave them as recorded.
-        progress: called after every decoded frame when the stack is built.
+    """The stack of a capture's light frames: `Ingest.of` and `Ingest.stack` in one.
 
     Raises:
-        ManifestError: the capture has no frame that a light lit, or one lies too far outside the tracking frames.
-        ImageError: an image is unreadable or holds impossible values, or a tracking frame is dark; names the file.
-        StorageError: the cache cannot be written (no space, read-only folder); nothing is left behind.
+        ManifestError, ImageError, StorageError: as these two say.
     """
-    frames = capture.sources()
-    if not frames:
-        raise ManifestError(f"{capture.folder}: frames: none is lit by a distant, point, extended or gradient light")
-    folder = cache if cache is not None else capture.folder / CACHE_FOLDER
-    fingerprints = Fingerprints(capture.folder, folder / "files.json")
-    key = _key(capture, frames, tracking, fingerprints)
-    found = stacks.find(folder, key)
-    if found is not None:
-        return found
-    alignment = None if tracking is None else Alignment(capture, tracking, frames)
-    hint = "" if cache is not None else " (--cache names another folder for it)"
-    with storage(f"make the stack cache{hint} in", folder):
-        folder.mkdir(parents=True, exist_ok=True)
-    built = _build(capture, frames, alignment, folder, key, progress)
-    fingerprints.remember()
-    _drop_others(folder, key)
-    return built
+    return Ingest.of(capture, cache=cache, tracking=tracking).stack(progress)
 
 
 def _key(capture: Capture, frames: list[Frame], tracking: Tracking | None, fingerprints: Fingerprints) -> str:

@@ -1,17 +1,18 @@
 """The `relit` program: its commands, and one place that turns errors into a sentence and an exit code."""
 
 import os
+import signal
 import sys
 from typing import Annotated
 
 import typer
 from typer.exceptions import TyperException
 
-from service.cli import calibrate, capture, demo, doctor, measure, results
+from service.cli import basis, calibrate, capture, demo, doctor, measure, relight, results
 
 app = typer.Typer(name="relit", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
                   help="Light-stage captures to normals, albedo, USD assets and relit frames.")
-for module in (demo, capture, calibrate, results, doctor, measure):
+for module in (demo, capture, calibrate, results, relight, basis, doctor, measure):
     module.register(app)
 
 BAD_INPUT, INTERRUPTED = 2, 130
@@ -28,6 +29,7 @@ def _root(version: Annotated[bool, typer.Option("--version", help="Print the ver
 
 def main() -> None:
     """Run the program; exit 2 with one sentence on bad input, 130 when interrupted."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # whoever ends us gets the same tidy end as one who types Ctrl-C
     try:
         code = app(standalone_mode=False)  # so that wrong options, too, are one sentence
         if code == INTERRUPTED:  # what typer makes of KeyboardInterrupt

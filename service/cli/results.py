@@ -1,4 +1,4 @@
-"""relit solve, relit relight, relit export: results out."""
+"""relit solve, relit export: results out."""
 
 from pathlib import Path
 from typing import Annotated
@@ -12,7 +12,6 @@ from service.methods import Method
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     app.command("solve")(solve)
-    app.command("relight")(relight)
     app.command("export")(export)
 
 
@@ -48,35 +47,6 @@ def solve(
         worst = ", ".join(f"{suspect.image} by {100 * suspect.misfit:.0f} %" for suspect in result.suspects[:5])
         more = f" and {len(result.suspects) - 5} more" if len(result.suspects) > 5 else ""
         print(f"suspect  lights that disagree with the others: {worst}{more}; check their direction and irradiance")
-
-
-def relight(
-    capture: CaptureArgument,
-    environment: Annotated[Path, typer.Option("--environment", help="Lat-long .exr or .hdr.", show_default=False)],
-    out: Annotated[str, typer.Option("--out", help="Path of the frames, #### for the number.", show_default=False)],
-    frames: Annotated[str, typer.Option("--frames", help="A number, or first-last.")] = "1",
-    spin_degrees: Annotated[float, typer.Option(
-        "--spin-degrees", help="Turn of the environment about +y over the range, +z towards +x; frame one is unturned.")] = 0.0,
-    align: AlignOption = False,
-    align_to: AlignToOption = None,
-    device: DeviceOption = None,
-    cache: CacheOption = None,
-) -> None:
-    """Frames of a capture under an HDR environment."""
-    from service.cli.bar import Bar
-    from service.pipelines.relight import relight as run
-    from service.requests import RelightRequest
-
-    request = RelightRequest(capture=capture, environment=environment, out=out, frames=frames, spin_degrees=spin_degrees,
-                             align=align, align_to=align_to, device=device, cache=cache)
-    with Bar() as bar:
-        result = run(request, bar)
-    last = f" … {result.frames[-1].name}" if len(result.frames) > 1 else ""
-    print(f"frames   {result.frames[0]}{last}")
-    if result.near_lights:
-        print(f"lights   {result.near_lights} near lights are taken as distant, as the object's centre sees them")
-    if result.clipped:
-        print(f"clipped  {result.clipped} pixels are brighter than half can hold and stand at its largest value")
 
 
 def export(

@@ -36,7 +36,7 @@ def write_preview(path: Path, maps: SurfaceMaps, captured: np.ndarray, frames: S
         StorageError: the picture cannot be written.
     """
     mask = maps.mask
-    top = [("captured, one light", _display(captured * _exposure(captured[None], mask), maps.color_space))]
+    top = [("captured, one light", display(captured * _exposure(captured[None], mask), maps.color_space))]
     if maps.normal is not None:
         top.append(("normals", np.where(mask[..., None], 0.5 + 0.5 * maps.normal, BACKGROUND)))
     if maps.diffuse_albedo is not None:
@@ -49,29 +49,38 @@ def write_preview(path: Path, maps: SurfaceMaps, captured: np.ndarray, frames: S
         top.append(("height", _relief(maps.height, mask)))
     count = min(2 * len(top), len(frames))
     shown = [frames[i] for i in np.linspace(0, len(frames), count, endpoint=False).astype(int)]
-    relit = [_read_rgb(frame) for frame in shown]
+    relit = [read_frame(frame)[0] for frame in shown]
     exposure = _exposure(np.stack(relit), mask)
-    bottom = [(f"relit, {frame.stem}", _display(pixels * exposure, maps.color_space))
+    bottom = [(f"relit, {frame.stem}", display(pixels * exposure, maps.color_space))
               for frame, pixels in zip(shown, relit, strict=True)]
     write_sheet(path, [row for row in (top, bottom[: len(top)], bottom[len(top) :]) if row])
 
 
-def write_sheet(path: Path, rows: Sequence[Sequence[tuple[str, np.ndarray]]]) -> None:
+def write_sheet(path: Path, rows: Sequence[Sequence[tuple[str, np.ndarray]]], *, height: int = TILE) -> None:
     """Write pictures with titles, row by row, as one PNG.
 
     Args:
         path: the PNG.
         rows: (title, [rows, cols, 3] display values 0…1) of each picture.
+        height: that each picture is scaled to, pixels.
 
     Raises:
         StorageError: the picture cannot be written.
     """
-    _write(path, _sheet([[(title, _fit(image)) for title, image in row] for row in rows]))
+    _write(path, _sheet([[(title, fit(image, height)) for title, image in row] for row in rows], height))
 
 
-def _read_rgb(path: Path) -> np.ndarray:
-    channels, _ = exr.read(path)
-    return np.stack([channels[c] for c in "RGB"], axis=-1).astype(np.float32)
+def read_frame(path: Path) -> tuple[np.ndarray, str]:
+    """A relit frame.
+
+    Returns:
+        [rows, cols, 3] float32 radiance, and its colour space.
+
+    Raises:
+        ImageError, StorageError: it cannot be read.
+    """
+    channels, metadata = exr.read(path)
+    return np.stack([channels[c] for c in "RGB"], axis=-1).astype(np.float32), exr.color_space_of(metadata)
 
 
 def _exposure(images: np.ndarray, mask: np.ndarray) -> float:
@@ -79,8 +88,16 @@ def _exposure(images: np.ndarray, mask: np.ndarray) -> float:
     return EXPOSURE_TARGET / level if level > 0 else 1.0
 
 
-def _display(pixels: np.ndarray, space: str) -> np.ndarray:
-    """Scene-linear to display values through OpenColorIO's ACES view."""
+def display(pixels: np.ndarray, space: str) -> np.ndarray:
+    """Scene-linear to display values through OpenColorIO's ACES view.
+
+    Args:
+        pixels: [rows, cols, 3] radiance.
+        space: its scene-linear colour space.
+
+    Returns:
+        [rows, cols, 3] float32, 0…1; black becomes the background of a sheet.
+    """
     source = oiio.ImageBuf(np.ascontiguousarray(pixels, dtype=np.float32))
     shown = oiio.ImageBufAlgo.ociodisplay(source, DISPLAY, VIEW, space, colorconfig=CONFIG)
     if shown.has_error:
@@ -95,19 +112,19 @@ def _relief(height: np.ndarray, mask: np.ndarray) -> np.ndarray:
     return np.where(mask[..., None], np.repeat((0.12 + 0.83 * grey)[..., None], 3, axis=-1), BACKGROUND)
 
 
-def _fit(image: np.ndarray) -> np.ndarray:
-    """Scale to the tile height."""
+def fit(image: np.ndarray, height: int = TILE, *, kernel: str = "") -> np.ndarray:
+    """Scale [rows, cols, 3] to a height; kernel: OpenImageIO's name of a filter, without it a sharp one that may ring."""
     rows, cols = image.shape[:2]
-    if rows == TILE:
+    if rows == height:
         return image
-    width = max(1, round(cols * TILE / rows))
+    width = max(1, round(cols * height / rows))
     source = oiio.ImageBuf(np.ascontiguousarray(image, dtype=np.float32))
-    return pixels_of(oiio.ImageBufAlgo.resize(source, roi=oiio.ROI(0, width, 0, TILE, 0, 1, 0, 3)))
+    return pixels_of(oiio.ImageBufAlgo.resize(source, kernel, roi=oiio.ROI(0, width, 0, height, 0, 1, 0, 3)))
 
 
-def _sheet(rows: list[list[tuple[str, np.ndarray]]]) -> oiio.ImageBuf:
+def _sheet(rows: list[list[tuple[str, np.ndarray]]], tile: int) -> oiio.ImageBuf:
     width = max(sum(image.shape[1] + GAP for _, image in row) - GAP for row in rows) + 2 * MARGIN
-    height = len(rows) * (TILE + TITLE + GAP) - GAP + 2 * MARGIN
+    height = len(rows) * (tile + TITLE + GAP) - GAP + 2 * MARGIN
     canvas = np.empty((height, width, 3), dtype=np.float32)
     canvas[:] = BACKGROUND
     titles = []
@@ -115,10 +132,10 @@ def _sheet(rows: list[list[tuple[str, np.ndarray]]]) -> oiio.ImageBuf:
     for row in rows:
         x = MARGIN
         for title, image in row:
-            canvas[y + TITLE : y + TITLE + TILE, x : x + image.shape[1]] = image
+            canvas[y + TITLE : y + TITLE + tile, x : x + image.shape[1]] = image
             titles.append((x, y + TITLE - 8, title))
             x += image.shape[1] + GAP
-        y += TITLE + TILE + GAP
+        y += TITLE + tile + GAP
     sheet = oiio.ImageBuf(canvas)
     for x, y, title in titles:
         oiio.ImageBufAlgo.render_text(sheet, x, y, title, 15, "", INK)

@@ -12,7 +12,8 @@ from pydantic import ValidationError
 from stage import images
 from stage.errors import ManifestError, storage
 from stage.files import replacing
-from stage.manifest import FILE_NAME, Manifest, describe, write_manifest
+from stage.manifest import FILE_NAME, Manifest, write_manifest
+from stage.records import describe
 
 
 def read_table(path: Path, columns: int) -> np.ndarray:

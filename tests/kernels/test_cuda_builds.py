@@ -9,7 +9,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import PACK_CUDA
 from kernels.photometric import albedo, gradient, highlight, lambert, moments, near, readings, robust, separation
-from kernels.relight import batch, combine, environment
+from kernels.relight import basis, batch, cells, combine, display, guide, near_sum, occlusion, residual, shading, smooth
 
 devices.names()
 OLDEST = min(wp.get_cuda_supported_archs(), default=None)
@@ -21,7 +21,11 @@ OLDEST = min(wp.get_cuda_supported_archs(), default=None)
                                   gradient._diffuse_kernel, highlight._specular_kernel, near._near_kernel,
                                   *(partial(module, near=True) for module in
                                     (lambert._lambert_kernel, robust._robust_kernel, albedo._albedo_kernel)),
-                                  combine.register_kernel, batch.register_kernel, environment._nearest_kernel])
+                                  combine.register_kernel, batch.register_kernel, cells._nearest_kernel,
+                                  basis.gram_kernel, display.encode_kernel, residual.residual_kernel, shading._shade_kernel,
+                                  guide._trust_kernel, near_sum._sum_kernel, occlusion._see_kernel,
+                                  lambda pack: smooth._walk_kernel(),
+                                  lambda pack: near_sum._weights_kernel()])
 def test_kernel_compiles_for_cuda_and_keeps_its_packs_in_registers(make, tmp_path):
     wp.compile_aot_module(make(PACK_CUDA).module, arch=OLDEST, module_dir=tmp_path, use_ptx=True)
     ptx, = (path.read_text(encoding="latin-1") for path in tmp_path.glob("*.ptx"))

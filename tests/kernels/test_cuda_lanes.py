@@ -4,8 +4,9 @@ import pytest
 import warp as wp
 
 from kernels import device as devices
-from kernels.photometric import hypotheses, material, response_table
+from kernels.photometric import hypotheses, refine, response_table
 from kernels.photometric.lobes import direction_lobes, direction_reflectance
+from kernels.photometric.material_kernel import material_kernel
 from kernels.photometric.samples import LANES_CUDA
 from kernels.photometric.tabulated_lobes import tabulated_lobes, tabulated_reflectance
 
@@ -16,8 +17,9 @@ KERNELS = {
     "search, table": lambda: hypotheses._search_kernel(
         LANES_CUDA, tabulated_lobes(LANES_CUDA, response_table.SEARCH_LOBES), 5, 30),
     "search, one measured lobe": lambda: hypotheses._search_kernel(LANES_CUDA, tabulated_lobes(LANES_CUDA, 1), 5, 30),
-    "material, directions": lambda: material._material_kernel(LANES_CUDA, direction_reflectance(LANES_CUDA), False),
-    "material, table": lambda: material._material_kernel(LANES_CUDA, tabulated_reflectance(LANES_CUDA), True),
+    "material, directions": lambda: material_kernel(LANES_CUDA, direction_reflectance(LANES_CUDA), False),
+    "material, table": lambda: material_kernel(LANES_CUDA, tabulated_reflectance(LANES_CUDA), True),
+    "refinement": lambda: refine._refine_kernel(LANES_CUDA, direction_reflectance(LANES_CUDA)),
     "table": lambda: response_table._table_kernel(LANES_CUDA),
 }
 

@@ -1,5 +1,7 @@
 """Slow float64 twins of the relighting kernels; they import nothing of ours."""
 
+import itertools
+
 import numpy as np
 
 
@@ -7,6 +9,14 @@ def rotation_about_y(degrees):
     """Turns about +y, positive from +z towards +x; turned = rotation @ direction."""
     t = np.radians(degrees)
     return np.array([[np.cos(t), 0, np.sin(t)], [0, 1, 0], [-np.sin(t), 0, np.cos(t)]])
+
+
+def rotation_about(axis, degrees):
+    """Right-handed turn about any axis, after Rodrigues; turned = rotation @ direction."""
+    x, y, z = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    t = np.radians(degrees)
+    return np.eye(3) + np.sin(t) * cross + (1 - np.cos(t)) * cross @ cross
 
 
 def weighted_sum(stack, weights):
@@ -27,19 +37,52 @@ def texel_solid_angles(rows, cols):
     return np.repeat((np.sin(v) * (np.pi / rows) * (2 * np.pi / cols))[:, None], cols, axis=1)
 
 
+def samples(environment, rotation, *, down, across):
+    """For each row of texels cut into down x across samples: directions [n, 3] turned by the rotation, solid angles [n] by which a
+    texel keeps its contract one, radiance [n, 3]."""
+    rows, cols, _ = environment.shape
+    fine = texel_solid_angles(rows * down, cols * across).reshape(rows, down, cols * across)
+    wanted = texel_solid_angles(rows, cols)
+    turned = (texel_directions(rows * down, cols * across) @ rotation.T).reshape(rows, -1, 3)
+    for row in range(rows):
+        solid_angle = fine[row] * np.repeat(wanted[row] / (fine[row, :, 0].sum() * across), across)
+        radiance = np.repeat(environment[row], across, axis=0)
+        yield turned[row], solid_angle.reshape(-1), np.tile(radiance, (down, 1))
+
+
 def cell_energy(environment, directions, rotation, *, down, across):
     """Energy [light, 3] and solid angle [light] of each light's cell: each texel is cut into down x across samples, and each
-    sample, turned by the rotation, goes to the light with the largest cosine. A texel keeps its contract solid angle."""
-    rows, cols, _ = environment.shape
-    turned = texel_directions(rows * down, cols * across) @ rotation.T
-    nearest = np.argmax(turned @ directions.T, axis=-1)
-    fine = texel_solid_angles(rows * down, cols * across)
-    by_texel = fine.reshape(rows, down, cols, across).sum(axis=(1, 3))
-    wanted = texel_solid_angles(rows, cols)
-    fine = fine * np.kron(wanted / by_texel, np.ones((down, across)))
+    sample, turned by the rotation, goes whole to the light with the largest cosine."""
     energy, solid_angle = np.zeros((len(directions), 3)), np.zeros(len(directions))
-    for light in range(len(directions)):
-        share = np.where(nearest == light, fine, 0).reshape(rows, down, cols, across).sum(axis=(1, 3))
-        solid_angle[light] = share.sum()
-        energy[light] = (share[..., None] * environment).sum(axis=(0, 1))
+    for turned, weight, radiance in samples(environment, rotation, down=down, across=across):
+        nearest = np.argmax(turned @ directions.T, axis=-1)
+        np.add.at(solid_angle, nearest, weight)
+        np.add.at(energy, nearest, weight[:, None] * radiance)
+    return energy, solid_angle
+
+
+def delaunay_triangles(directions):
+    """[face, 3]: every three lights whose plane has all others beneath it, by trying all; none four on one circle."""
+    triples = np.array(list(itertools.combinations(range(len(directions)), 3)))
+    a, b, c = (directions[triples[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    above = normal @ directions.T - (normal * a).sum(axis=1)[:, None]
+    np.put_along_axis(above, triples, 0, axis=1)
+    return triples[(above <= 0).all(axis=1) | (above >= 0).all(axis=1)]
+
+
+def smooth_energy(environment, directions, rotation, *, down, across):
+    """Energy [light, 3] and ∫ share dω [light] where each sample is the positive combination of a Delaunay triangle's corners, and is
+    shared by them as its coefficients are, scaled to sum one. The lights lie all around: the centre is inside their hull."""
+    triangles = delaunay_triangles(directions)
+    inverse = np.linalg.inv(directions[triangles].swapaxes(1, 2))
+    energy, solid_angle = np.zeros((len(directions), 3)), np.zeros(len(directions))
+    for turned, weight, radiance in samples(environment, rotation, down=down, across=across):
+        coefficients = np.einsum("fkx,nx->nfk", inverse, turned)
+        face = np.argmax(coefficients.min(axis=2), axis=1)
+        share = np.take_along_axis(coefficients, face[:, None, None], axis=1)[:, 0]
+        assert share.min() > -1e-12
+        share *= (weight / share.sum(axis=1))[:, None]
+        np.add.at(solid_angle, triangles[face], share)
+        np.add.at(energy, triangles[face], share[..., None] * radiance[:, None])
     return energy, solid_angle

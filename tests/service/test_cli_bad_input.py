@@ -146,7 +146,26 @@ BAD_RELIGHT = {
     "more frames than a disk": ({}, {"frames": "1-99999999999"}, "--frames 1-99999999999: asks for 99999999999 frames"),
     "endless spin": ({}, {"spin-degrees": "inf"}, "spin_degrees: is Infinity"),
     "no spin": ({}, {"spin-degrees": "nan"}, "spin_degrees: is NaN"),
-    "a file for a folder": ({}, {"out": "file/a.##.exr"}, "cannot write"),
+    "a file for a folder": ({}, {"out": "file/a.##.exr"}, "cannot write file/a.01.exr: not a directory"),
+    "two numbers in the environment": ({}, {"environment": "sky.#.##.exr"}, "sky.#.##.exr: the file name of a sequence has one run of #"),
+    "an environment of a sequence": ({}, {"environment": "sky.##.exr"}, "frame 1 has no map: sky.01.exr is not there"),
+    "over its environment": ({}, {"environment": "env/a.##.exr", "out": "env/a.##.exr"}, "frame 1 has no map: env/a.01.exr"),
+    "no keys": ({}, {"keys": "none.json"}, "cannot read none.json: no such file"),
+    "far too bright": ({}, {"exposure": "99"}, "exposure: is 99.0: input should be less than or equal to 32"),
+    "not a number of stops": ({}, {"exposure": "nan"}, "exposure: is NaN"),
+    "a layer without maps": ({}, {"aov": "beauty,normal"}, "--aov normal needs --maps DIR"),
+    "confidence without maps": ({}, {"aov": "confidence"}, "--aov confidence needs --maps DIR"),
+    "an unknown layer": ({}, {"aov": "beauty,depth"}, 'aov[1]: is "depth": input should be \'beauty\', \'diffuse\''),
+    "maps for nothing": ({}, {"maps": "cap"}, "cap/maps.exr is not there: run `relit solve` first"),
+    "no maps there": ({}, {"maps": "cap", "aov": "normal"}, "cap/maps.exr is not there: run `relit solve` first"),
+    "another colour space": ({}, {"color-space": "srgb_texture"}, "'srgb_texture' is not one of 'lin_rec709_scene', 'lin_ap1_scene'"),
+    "another compression": ({}, {"compression": "jpeg"}, "'jpeg' is not one of 'zip', 'piz', 'dwaa'"),
+    "other weights": ({}, {"weights": "even"}, "'even' is not one of 'cells', 'smooth'"),
+    "smooth weights in one plane": ({"plane": True}, {"weights": "smooth"}, "smooth weighting needs lights that are not all in one plane"),
+    "a sheet of another kind": ({}, {"sheet": "s.jpg"}, "--sheet s.jpg: a contact sheet is a PNG"),
+    "a sheet over the mask": ({}, {"sheet": "cap/mask.png"}, "--sheet cap/mask.png: cap/mask.png is an input"),
+    "a report over the manifest": ({}, {"report": "cap/capture.json"}, "--report cap/capture.json: cap/capture.json is an input"),
+    "a report below a file": ({}, {"report": "file/r.json"}, "cannot write file/r.json: not a directory"),
 }
 
 
@@ -156,6 +175,8 @@ def test_bad_relights(relit, tmp_path, monkeypatch, fault):
     write_capture(tmp_path / "cap", SCENE)
     (tmp_path / "file").write_text("")
     images, options, words = BAD_RELIGHT[fault]
+    if "plane" in images:
+        coplanar(tmp_path / "cap")
     write_exr(tmp_path / "sky.exr", images.get("sky", np.ones((4, 8, 3))))
     before = {name: (tmp_path / name).read_bytes() for name in files_in(tmp_path)}
     given = {"environment": "sky.exr", "out": "out/a.##.exr", "frames": "1-2", **options}
@@ -229,6 +250,17 @@ def test_what_may_not_be_read_or_written(open_folder, command, locked, mode, wor
     assert done.stderr.startswith("relit: cannot ") and done.stderr.count("\n") == 1
     assert words in done.stderr
     assert files_in(open_folder) == before
+
+
+def test_frames_into_a_locked_folder_are_refused_before_any_work(open_folder):
+    cap, out = write_capture(open_folder / "cap", SCENE), open_folder / "out"
+    sky = write_exr(open_folder / "sky.exr", np.ones((4, 8, 3)))
+    out.mkdir(mode=0o555)
+    arguments = ["relight", cap, "--environment", sky, "--out", out / "a.##.exr", "--cache", open_folder / "cache"]
+    done = subprocess.run([sys.executable, "-c", AS_NOBODY, *map(str, arguments)], capture_output=True, text=True,
+                          timeout=60, cwd=Path(service.__file__).parents[1])
+    assert (done.returncode, done.stderr) == (2, f"relit: cannot write {out}/a.01.exr: permission denied\n")
+    assert not (open_folder / "cache").exists() and files_in(out) == set()
 
 
 @pytest.mark.parametrize("command", ["solve", "info"])

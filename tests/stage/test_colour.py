@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stage.colour import convert, is_linear, linear_space, linearise
+from stage.colour import convert, is_linear, linear_space, linearise, rgb_matrix
 
 AP1_TO_REC709 = np.array([[1.70505, -0.62179, -0.08326], [-0.13026, 1.14080, -0.01055], [-0.02400, -0.12897, 1.15297]])
 """ACEScg to linear Rec.709 with Bradford adaptation, five digits, as ACES and its CTL publish it."""
@@ -68,3 +68,11 @@ def test_the_working_space_keeps_the_primaries():
 def test_an_unknown_space_is_an_error():
     with pytest.raises(ValueError, match="no_such_space"):
         convert(np.zeros((1, 1, 3), dtype=np.float32), "no_such_space", "lin_rec709_scene")
+
+
+def test_the_matrix_is_the_conversion():
+    assert np.allclose(rgb_matrix("lin_ap1_scene", "lin_rec709_scene"), AP1_TO_REC709, atol=1e-5)
+    colours = np.random.default_rng(0).random((2, 5, 3)).astype(np.float32)
+    converted = convert(colours, "lin_rec709_scene", "lin_ap1_scene")
+    assert np.allclose(colours @ rgb_matrix("lin_rec709_scene", "lin_ap1_scene").T, converted, atol=1e-6)
+    assert np.array_equal(rgb_matrix("lin_ap1_scene", "lin_ap1_scene"), np.eye(3))

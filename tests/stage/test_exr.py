@@ -49,6 +49,16 @@ def test_dwa_is_close_and_smaller(tmp_path):
     back, _ = exr.read(tmp_path / "a.exr")
     assert np.abs(back["Y"].astype(np.float32) - smooth["Y"]).max() < 0.02  # lossy by its nature
     assert (tmp_path / "a.exr").stat().st_size < smooth["Y"].nbytes
+    assert exr.read_header(tmp_path / "a.exr").metadata["dwaCompressionLevel"] == exr.DWA_LEVEL
+
+
+def test_dwa_keeps_the_channels_that_it_does_not_know(tmp_path):
+    ramp = np.linspace(0, 1, 64 * 64, dtype=np.float32).reshape(64, 64).astype(np.float16)
+    normal = {f"normal.{name}": ramp for name in "XYZ"}
+    exr.write(tmp_path / "a.exr", normal, color_space="lin_rec709_scene", metadata={}, compression=exr.Compression.DWAA)
+    back, _ = exr.read(tmp_path / "a.exr")
+    same = {name: np.array_equal(back[name], plane) for name, plane in normal.items()}
+    assert same == {"normal.X": True, "normal.Y": False, "normal.Z": True}  # Y is luminance to it
 
 
 COMPRESSIONS = ["NO", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB"]

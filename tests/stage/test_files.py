@@ -2,6 +2,7 @@
 
 import os
 import stat
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -51,3 +52,15 @@ def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path):
 def test_text_is_utf8(tmp_path):
     write_text(tmp_path / "a.txt", "ρ")
     assert (tmp_path / "a.txt").read_bytes() == "ρ".encode()
+
+
+def test_threads_that_write_together_leave_the_umask_alone(tmp_path):
+    before = os.umask(0o027)
+    try:
+        with ThreadPoolExecutor(8) as pool:
+            list(pool.map(lambda number: write_text(tmp_path / f"{number}.txt", "x"), range(200)))
+        after = os.umask(0o027)
+    finally:
+        os.umask(before)
+    assert after == 0o027
+    assert {stat.S_IMODE(path.stat().st_mode) for path in tmp_path.iterdir()} == {0o640}

@@ -5,7 +5,7 @@ import os
 import pytest
 
 from stage.errors import StorageError
-from stage.fingerprint import Fingerprints
+from stage.fingerprint import Fingerprints, digest
 
 
 def test_the_hash_follows_the_content_not_the_name_or_the_time(tmp_path):
@@ -42,3 +42,10 @@ def test_a_damaged_memory_is_only_a_slower_start(tmp_path, memory):
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(StorageError, match=r"cannot read .*gone\.exr: no such file"):
         Fingerprints(tmp_path, tmp_path / "memory.json").of(["gone.exr"])
+
+
+def test_the_hash_of_one_file(tmp_path):
+    (tmp_path / "a").write_bytes(b"content")
+    assert digest(tmp_path / "a") == Fingerprints(tmp_path, tmp_path / "memory.json").of(["a"])["a"]
+    with pytest.raises(StorageError, match=r"cannot read .*gone: no such file"):
+        digest(tmp_path / "gone")

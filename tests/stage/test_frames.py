@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stage.frames import latlong_directions, latlong_solid_angles, pixel_centres, rigid_fault, rotation_about_y
+from stage.frames import latlong_directions, latlong_solid_angles, pixel_centres, rigid_fault, rotation_about, rotation_about_y
 
 
 def test_pixel_centre_of_row_r_column_c_is_half_past():
@@ -69,3 +69,14 @@ def test_rigid_transforms_pass():
 ])
 def test_what_is_not_rigid_is_named(matrix, words):
     assert words in rigid_fault(matrix)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 30.0, 90.0, -200.0])
+def test_any_axis_turns_by_the_right_hand(degrees):
+    assert np.allclose(rotation_about((0.0, 1.0, 0.0), degrees), rotation_about_y(degrees))
+    axis = np.array([0.48, -0.6, 0.64])
+    turned = rotation_about((0.48, -0.6, 0.64), degrees)
+    assert np.allclose(turned @ turned.T, np.eye(3)) and np.allclose(turned @ axis, axis)
+    across = np.array([0.8, 0.0, -0.6])
+    expected = np.cos(np.radians(degrees)) * across + np.sin(np.radians(degrees)) * np.cross(axis, across)
+    assert np.allclose(turned @ across, expected)

@@ -15,7 +15,7 @@ from stage import ingest, stack
 from stage.capture import Capture
 from stage.correction import Radiance
 from stage.errors import ImageError, ManifestError, StorageError
-from stage.ingest import open_stack
+from stage.ingest import Ingest, open_stack
 from tests.captures import edit_frame, edit_manifest, files_in, make_scene, write_capture, write_exr
 
 SCENE = make_scene(size=9, lights=5)
@@ -323,3 +323,11 @@ def test_no_space_is_one_sentence_and_leaves_nothing(tmp_path):
     assert done.stdout.startswith(f"cannot make the stack cache {tmp_path}/.relit/stack-") and done.stdout.count("\n") == 1
     assert done.stdout.strip().endswith("file too large")
     assert cache_files(tmp_path) == set()
+
+
+def test_the_key_is_known_before_anything_is_built(tmp_path):
+    write_capture(tmp_path)
+    before = files_in(tmp_path)
+    hashed = Ingest.of(Capture.open(tmp_path))
+    assert files_in(tmp_path) == before
+    assert hashed.stack().key == hashed.key == open_stack(Capture.open(tmp_path)).key

@@ -6,7 +6,8 @@ import pytest
 from pydantic import ValidationError
 
 from stage.errors import ManifestError, StorageError
-from stage.manifest import Manifest, describe, read_manifest, write_manifest
+from stage.manifest import Manifest, read_manifest, write_manifest
+from stage.records import describe
 
 IDENTITY = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 EXAMPLE = {

@@ -1,0 +1,89 @@
+"""Far disc lights, small suns and large ones, shared out over the captured lights by samples of the disc.
+
+The samples lie in NumPy: a few hundred directions are too few for a launch.
+"""
+
+import math
+
+import numpy as np
+
+from kernels.errors import ArrayError
+from kernels.relight.environment import Weighting
+from kernels.relight.latlong import first_of_equals
+from kernels.relight.triangulation import triangulate
+
+SAMPLE_PITCH_DEGREES = 1.0
+MIN_SAMPLES = 256
+"""Of a disc however small, so that it passes from one light to the next in steps of 0.4 % of it."""
+
+
+def integrate_discs(middles: np.ndarray, angles_degrees: np.ndarray, directions: np.ndarray, *, weighting: Weighting) -> np.ndarray:
+    """Share discs of even radiance out over the lights.
+
+    Args:
+        middles: [discs, 3] unit vectors to the middle of each disc.
+        angles_degrees: [discs] diameter of each as seen from the object, 0…180.
+        directions: [lights, 3] unit vectors from the object to the lights (without padding).
+        weighting: how, as for a map.
+
+    Returns:
+        [discs, lights] float64: ∫ w L dω, for discs that give a surface facing them an irradiance of 1.
+
+    Raises:
+        ArrayError: shapes that do not fit; for smooth weighting also as integrate_smooth.
+
+    Convention:
+        A facing surface gets ∫ L cosθ dω = 1, so that the sum over the lights, ∫ L dω, is 2 / (1 + cos(angle / 2)): 1 for a small
+        disc, 2 for half the sphere.
+    """
+    middles, directions = np.asarray(middles, dtype=np.float64), np.asarray(directions, dtype=np.float64)
+    if directions.ndim != 2 or directions.shape[1] != 3 or len(directions) == 0:
+        raise ArrayError(f"directions are {directions.shape}: give [lights, 3], one light or more")
+    if middles.ndim != 2 or middles.shape[1] != 3 or np.shape(angles_degrees) != (len(middles),):
+        raise ArrayError(f"middles are {middles.shape}, angles {np.shape(angles_degrees)}: give [discs, 3] and [discs]")
+    kept = first_of_equals(directions)
+    energy = np.zeros((len(middles), len(directions)))
+    triangles = triangulate(directions[kept]) if weighting is Weighting.SMOOTH and len(middles) else None
+    for disc, (middle, angle) in enumerate(zip(middles, angles_degrees, strict=True)):
+        samples = disc_samples(middle, float(angle))
+        if triangles is None:
+            shares = np.bincount((samples @ directions[kept].T).argmax(axis=1), minlength=len(kept)).astype(np.float64)
+        else:
+            shares = _vertex_shares(samples, triangles.vertex, triangles.corner) @ triangles.share
+        energy[disc, kept] = shares * (2 / (1 + math.cos(math.radians(angle / 2))) / len(samples))
+    return energy
+
+
+def disc_samples(middle: np.ndarray, angle_degrees: float) -> np.ndarray:
+    """Directions spread evenly over a disc on the sphere, each standing for the same solid angle.
+
+    Args:
+        middle: [3] unit vector.
+        angle_degrees: diameter, 0…180.
+
+    Returns:
+        [samples, 3] float64 unit vectors.
+
+    Source: Vogel, "A better way to construct the sunflower head", Mathematical Biosciences 44, 1979, with even steps of the cosine.
+    """
+    low = 2 * math.sin(math.radians(angle_degrees / 4)) ** 2  # 1 - cosine of the rim: without the rounding near 1
+    count = max(MIN_SAMPLES, math.ceil(2 * math.pi * low / math.radians(SAMPLE_PITCH_DEGREES) ** 2))
+    place = np.arange(count) + 0.5
+    fall = place / count * low
+    across = np.sqrt(fall * (2 - fall))
+    turn = place * math.pi * (3 - math.sqrt(5))
+    z = np.asarray(middle, dtype=np.float64)
+    x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
+    x /= np.linalg.norm(x)
+    return (across * np.cos(turn))[:, None] * x + (across * np.sin(turn))[:, None] * np.cross(z, x) + (1 - fall)[:, None] * z
+
+
+def _vertex_shares(samples: np.ndarray, vertex: np.ndarray, corner: np.ndarray) -> np.ndarray:
+    """[vertices] the sum of the samples' barycentric coordinates in the triangles that they lie in."""
+    corners = vertex[corner]  # [faces, 3, 3]
+    plane = np.cross(np.roll(corners, -1, axis=1), np.roll(corners, -2, axis=1))  # through the centre and the edge opposite
+    depth = np.einsum("sx,fkx->fks", samples, plane / np.linalg.norm(plane, axis=2, keepdims=True))
+    face = depth.min(axis=1).argmax(axis=0)
+    share = np.maximum(np.einsum("sx,skx->sk", samples, plane[face]), 0)
+    share /= share.sum(axis=1, keepdims=True)
+    return np.bincount(corner[face].reshape(-1), weights=share.reshape(-1), minlength=len(vertex))

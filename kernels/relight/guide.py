@@ -1,0 +1,140 @@
+"""How far a model of the surface may correct the captured images, pixel by pixel.
+
+Between the lights a picture is predicted from those around: Σ s_k I_k. The model says by how much that is wrong, M - Σ s_k M_k; how much
+of it to believe is what the captured lights tell when each is left out and predicted from its neighbours: β is the least-squares factor
+between what was missing and what the model says was missing, 0 to 1. A model that explains nothing gets 0, and the plain sum stays.
+
+Source: the model as a control variate with regression coefficient, Glasserman, "Monte Carlo Methods in Financial Engineering",
+section 4.1; here over lights in place of samples.
+"""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from kernels.errors import ArrayError
+from kernels.microfacet import INVERSE_PI
+from kernels.packs import Band, as_packs, pack_type
+from kernels.relight.shading import Surface, lobes
+
+LEAST_ALPHA = 0.3
+"""Width α of the narrowest lobe, of the angle between neighbouring lights: α is about half a lobe's width at half its height, and between
+two lights the half vector moves by half of what they are apart (docs/figures.md)."""
+
+
+def seen_lobes(specular: np.ndarray, roughness: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Make lobes as wide as the captured lights can tell.
+
+    A lobe much narrower than the lights are apart is not seen but from afar, where it is as strong as F0 · α²: the same in a wider
+    and fainter lobe, which is what this gives.
+
+    Args:
+        specular: […, 3] F0.
+        roughness: […].
+        direction: [lights, 3] unit vectors to the captured lights.
+
+    Returns:
+        F0 and roughness, float32.
+    """
+    cosine = direction @ direction.T - 2 * np.eye(len(direction))
+    spacing = float(np.median(np.arccos(np.clip(cosine.max(axis=1), -1, 1))))
+    alpha = np.asarray(roughness, dtype=np.float32) ** 2
+    wider = np.maximum(alpha, np.float32(LEAST_ALPHA * spacing))
+    return specular * ((alpha / wider) ** 2)[..., None], np.where(alpha > 0, np.sqrt(wider), 0)
+
+
+def trust_model(band: Band, surface: Surface, visible: wp.array, direction: np.ndarray, irradiance: np.ndarray, scale: np.ndarray,
+                neighbours: np.ndarray, shares: np.ndarray) -> wp.array:
+    """Fit β.
+
+    Args:
+        band: captured images of the same pixels as the surface.
+        surface: solved maps.
+        visible: [lights, P] uint8 packs of occlusion.see_lights.
+        direction: [lights, 3] unit vectors to the captured lights.
+        irradiance: [lights, 3] of each.
+        scale: [lights padded] radiance of a stored 1.0.
+        neighbours, shares: [lights, 3] of around.left_out.
+
+    Returns:
+        [pixels padded] float32 on the device, 0…1.
+
+    Raises:
+        ArrayError: shapes that do not fit.
+    """
+    band.require_channels(3)
+    count, device = len(direction), surface.device
+    if band.packs != surface.packs or visible.shape[1] != surface.packs or min(visible.shape[0], band.light_count) < count:
+        raise ArrayError(f"band has {band.packs} packs of {band.light_count} lights, the surface {surface.packs}, visibility is "
+                         f"{visible.shape}, directions are {count}: give the same pixels and lights")
+    if np.shape(neighbours) != (count, 3) or np.shape(shares) != (count, 3):
+        raise ArrayError(f"neighbours are {np.shape(neighbours)}, shares {np.shape(shares)}: give {(count, 3)} of both")
+    pack = devices.pack_width(device)
+    factor = np.divide(scale[:count, None], irradiance, out=np.zeros((count, 3)), where=irradiance > 0)
+    place = np.concatenate([direction, np.zeros((count, 1))], axis=1)
+    trust = wp.empty(surface.packs * pack, dtype=wp.float32, device=device)
+    devices.launch(_trust_kernel(pack), surface.packs,
+                   [band.values, band.light_count, surface.values, visible,
+                    wp.array(place.astype(np.float32), dtype=wp.vec4, device=device),
+                    wp.array(factor.astype(np.float32), dtype=wp.vec3, device=device),
+                    wp.array(np.ascontiguousarray(neighbours), dtype=wp.vec3i, device=device),
+                    wp.array(np.ascontiguousarray(shares), dtype=wp.vec3, device=device)], [as_packs(trust, device)], device=device)
+    return trust
+
+
+@cache
+def _trust_kernel(pack: int) -> Any:
+    lane_type, half_pack, byte_pack = (pack_type(pack, dtype) for dtype in (wp.float32, wp.float16, wp.uint8))
+    evaluate = lobes(pack)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
+    def trust_kernel(first: int,
+                     captured: wp.array2d(dtype=half_pack),  # [3 · lights padded, P]
+                     padded: int,  # lights
+                     values: wp.array2d(dtype=lane_type),  # [16, P]
+                     visible: wp.array2d(dtype=byte_pack),  # [lights, P]
+                     places: wp.array(dtype=wp.vec4),  # [lights]
+                     factors: wp.array(dtype=wp.vec3),  # [lights] stored → radiance / irradiance
+                     neighbours: wp.array(dtype=wp.vec3i),  # [lights]
+                     shares: wp.array(dtype=wp.vec3),  # [lights]
+                     # outputs
+                     trust: wp.array(dtype=lane_type)):  # [P]
+        p = first + wp.tid()
+        albedo_r, albedo_g, albedo_b = values[3, p], values[4, p], values[5, p]
+        f0_r, f0_g, f0_b = values[6, p], values[7, p], values[8, p]
+        top, bottom = lane_type(), lane_type()
+        for light in range(places.shape[0]):
+            parts = shares[light]
+            if parts[0] + parts[1] + parts[2] > 0.0:
+                near = neighbours[light]
+                missing_r, missing_g, missing_b = lane_type(), lane_type(), lane_type()
+                told_r, told_g, told_b = lane_type(), lane_type(), lane_type()
+                for corner in range(4):
+                    at = wp.where(corner == 0, light, wp.where(corner == 1, near[0], wp.where(corner == 2, near[1], near[2])))
+                    weight = wp.where(corner == 0, 1.0, -wp.where(corner == 1, parts[0], wp.where(corner == 2, parts[1], parts[2])))
+                    facing, shine, rise, _ = evaluate(values, p, places[at], wp.vec4())
+                    lit = visible[at, p]
+                    factor = factors[at] * weight
+                    red, green, blue = captured[at, p], captured[padded + at, p], captured[2 * padded + at, p]
+                    for k in range(pack):
+                        seen = weight * float(lit[k]) * wp.static(1.0 / 255.0)
+                        matt = seen * INVERSE_PI * facing[k]
+                        mirror, edge = seen * shine[k] * (1.0 - rise[k]), seen * shine[k] * rise[k]
+                        missing_r[k] += factor[0] * float(red[k])
+                        missing_g[k] += factor[1] * float(green[k])
+                        missing_b[k] += factor[2] * float(blue[k])
+                        told_r[k] += albedo_r[k] * matt + f0_r[k] * mirror + edge
+                        told_g[k] += albedo_g[k] * matt + f0_g[k] * mirror + edge
+                        told_b[k] += albedo_b[k] * matt + f0_b[k] * mirror + edge
+                for k in range(pack):
+                    top[k] += missing_r[k] * told_r[k] + missing_g[k] * told_g[k] + missing_b[k] * told_b[k]
+                    bottom[k] += told_r[k] * told_r[k] + told_g[k] * told_g[k] + told_b[k] * told_b[k]
+        out = lane_type()
+        for k in range(pack):
+            out[k] = wp.where(bottom[k] > 0.0, wp.clamp(top[k] / wp.max(bottom[k], 1.0e-30), 0.0, 1.0), 0.0)
+        trust[p] = out
+
+    return trust_kernel

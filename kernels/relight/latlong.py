@@ -1,0 +1,138 @@
+"""A lat-long map cut into samples, and their energy summed over lights.
+
+Samples lie at most half a degree apart, so that a coarse map is cut finer than its texels. Nothing is resampled when the map turns:
+the lights are turned the other way instead. Sums are taken on the host in float64, so that the parts of a sample, whichever lights
+they go to, are the whole of it.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from kernels.errors import ArrayError
+from kernels.relight.turns import shared_turns
+
+SAMPLE_PITCH_DEGREES = 0.5
+"""A sample is small enough to be flat: the areas of its parts are off by 3e-5 of it."""
+UNIT_TOLERANCE = 1e-3
+"""How far a light direction's length may be from one; within it, directions are normalised."""
+EQUAL_RADIANS = 1e-4
+"""Lights closer than this, 0.006 degrees, stand in one place; the first of them gets its energy."""
+BAND_SAMPLES = 1 << 19
+"""Samples that are summed at one time: bounds the memory of a large map, and the sums find them in the cache."""
+
+
+class LightEnergy(NamedTuple):
+    """What an environment sends to each light."""
+
+    energy: np.ndarray  # [frames, lights, 3] float64: ∫ w L dω, W/m² of the map's unit; w is the light's part of each direction
+    solid_angle: np.ndarray  # [frames, lights] float64 steradians: ∫ w dω
+
+
+class SampleGrid(NamedTuple):
+    """Rows of samples of a lat-long map; all are equally large in polar angle and azimuth."""
+
+    polar: np.ndarray  # [rows] radians from +y to the middle of each row
+    azimuth: np.ndarray  # [cols] radians from the left edge, -z, over +x
+    half_polar: float
+    """Radians from the middle of a sample to its upper edge."""
+    half_azimuth: float
+    solid_angle: np.ndarray  # [rows] steradians of one sample
+    texel_row: np.ndarray  # [rows] row of the map
+    across: int
+    """Samples of a texel side by side."""
+
+    def bands(self) -> Iterator["SampleGrid"]:
+        """The same grid, some rows at a time."""
+        size = max(1, BAND_SAMPLES // len(self.azimuth))
+        for start in range(0, len(self.polar), size):
+            rows = slice(start, start + size)
+            yield self._replace(polar=self.polar[rows], solid_angle=self.solid_angle[rows], texel_row=self.texel_row[rows])
+
+
+class Part(NamedTuple):
+    """Parts of samples that go to lights."""
+
+    sample: np.ndarray | slice  # [n] index into the samples of a band, row by row
+    light: np.ndarray  # [n]
+    share: np.ndarray  # [n] float64 of the sample
+
+
+def cut(rows: int, cols: int) -> SampleGrid:
+    """Cut the texels of a lat-long map of this size into samples.
+
+    A texel keeps the solid angle of the contract, sin(πv) · (π/H) · (2π/W), and its rows of samples have it by their sines.
+    """
+    across = max(1, math.ceil(360.0 / SAMPLE_PITCH_DEGREES / cols))
+    down = max(1, math.ceil(180.0 / SAMPLE_PITCH_DEGREES / rows))
+    half_polar, half_azimuth = np.pi / (2 * rows * down), np.pi / (cols * across)
+    polar = half_polar * (2 * np.arange(rows * down) + 1)
+    azimuth = half_azimuth * (2 * np.arange(cols * across) + 1)
+    texel = np.sin(np.pi * (np.arange(rows) + 0.5) / rows) * (np.pi / rows) * (2 * np.pi / cols)
+    sines = np.sin(polar).reshape(rows, down)
+    solid_angle = sines / sines.sum(axis=1, keepdims=True) / across * texel[:, None]
+    return SampleGrid(polar, azimuth, half_polar, half_azimuth, solid_angle.reshape(-1), np.repeat(np.arange(rows), down), across)
+
+
+def check(environment: np.ndarray, directions: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Refuse what cannot be integrated.
+
+    Returns:
+        Directions, normalised, and rotations, in float64.
+
+    Raises:
+        ArrayError: shapes that do not fit, directions that are not unit vectors, or radiance that is negative or not finite
+            (counted).
+    """
+    directions, rotations = np.asarray(directions, dtype=np.float64), np.asarray(rotations, dtype=np.float64)
+    if directions.ndim != 2 or directions.shape[1] != 3 or len(directions) == 0:
+        raise ArrayError(f"directions are {directions.shape}: give [lights, 3], one light or more")
+    if rotations.ndim != 3 or rotations.shape[1:] != (3, 3):
+        raise ArrayError(f"rotations are {rotations.shape}: give [frames, 3, 3]")
+    length = np.linalg.norm(directions, axis=1)
+    if not (np.abs(length - 1) < UNIT_TOLERANCE).all():
+        raise ArrayError(f"direction of light {int(np.argmax(np.abs(length - 1)))} is not a unit vector")
+    if environment.ndim != 3 or environment.shape[2] != 3 or min(environment.shape[:2]) < 1:
+        raise ArrayError(f"environment is {environment.shape}: give [rows, cols, 3]")
+    for name, bad in (("not finite", ~np.isfinite(environment)), ("negative", environment < 0)):
+        if bad.any():
+            raise ArrayError(f"environment has {int(bad.any(axis=2).sum())} texels that are {name}")
+    return directions / length[:, None], rotations
+
+
+def first_of_equals(directions: np.ndarray) -> np.ndarray:
+    """Ascending indices of the lights that do not stand where an earlier one does."""
+    close = directions @ directions.T > 1 - EQUAL_RADIANS**2 / 2
+    return np.flatnonzero(~np.tril(close, -1).any(axis=1))
+
+
+def gather(environment: np.ndarray, rotations: np.ndarray, lights: int,
+           split: Callable[[np.ndarray, SampleGrid], Iterable[Part]]) -> LightEnergy:
+    """Sum the energy of the samples of a map over lights.
+
+    Args:
+        environment: [rows, cols, 3] scene-linear radiance.
+        rotations: [frames, 3, 3] of the map.
+        lights: how many there are.
+        split: (rotation, band) → which parts of the band's samples go where; the shares of a sample add up to one.
+
+    Returns:
+        Energy and solid angle of each light; both sum to those of the whole map.
+    """
+    energy, areas = np.zeros((len(rotations), lights, 3)), np.zeros((len(rotations), lights))
+    for band in cut(*environment.shape[:2]).bands():
+        solid_angle = np.repeat(band.solid_angle, len(band.azimuth))
+        amounts = [np.repeat(environment[band.texel_row, :, channel].astype(np.float64), band.across, axis=1)
+                   * band.solid_angle[:, None] for channel in range(3)]
+        for turn in shared_turns(rotations, len(band.azimuth)):
+            parts = list(split(turn.rotation, band))
+            for part in parts:
+                areas[list(turn.frames)] += np.bincount(part.light, weights=solid_angle[part.sample] * part.share, minlength=lights)
+            for frame, columns in zip(turn.frames, turn.columns, strict=True):
+                for channel, amount in enumerate(amounts):
+                    moved = np.roll(amount, -columns, axis=1).reshape(-1)
+                    for part in parts:
+                        energy[frame, :, channel] += np.bincount(part.light, weights=moved[part.sample] * part.share, minlength=lights)
+    return LightEnergy(energy, areas)

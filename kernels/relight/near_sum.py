@@ -1,0 +1,191 @@
+"""Captured images summed for light that is near: every pixel sees a near light in a direction and strength of its own, and takes the
+captured lights around that direction, as smooth weighting does.
+
+The same sum is taken of a model of the surface under the captured lights, so that the model can say what the sum of images misses.
+"""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from kernels.errors import ArrayError
+from kernels.microfacet import INVERSE_PI
+from kernels.packs import Band, as_packs, pack_type
+from kernels.relight.latlong import first_of_equals
+from kernels.relight.shading import Surface, lobes
+from kernels.relight.smooth import BESIDE_RADIANS
+from kernels.relight.sources import Sources
+from kernels.relight.triangulation import triangulate
+
+LEAST_PART = 1e-3
+"""Of the energy of an imaginary light: lights far from a hole that would get less get none, the others have it."""
+
+
+def sum_near(band: Band, surface: Surface, visible: wp.array, sources: Sources, direction: np.ndarray, irradiance: np.ndarray,
+             scale: np.ndarray) -> wp.array:
+    """Sum images, and the model's images, for near and far samples of light.
+
+    Args:
+        band: captured images of the same pixels as the surface.
+        surface: solved maps.
+        visible: [lights, P] uint8 packs of occlusion.see_lights for the captured lights.
+        sources: the wanted light, some tens of samples; what hides it is not looked at, the images show it.
+        direction, irradiance: [lights, 3] of the captured lights, four or more not in one plane.
+        scale: [lights padded] radiance of a stored 1.0.
+
+    Returns:
+        [6, pixels padded] float32 radiance on the device: of the images, and of the model.
+
+    Raises:
+        ArrayError: shapes that do not fit, a captured light without irradiance, fewer than four lights, or all in one plane.
+    """
+    band.require_channels(3)
+    count, device = len(direction), surface.device
+    if band.packs != surface.packs or visible.shape[1] != surface.packs or min(visible.shape[0], band.light_count) < count:
+        raise ArrayError(f"band has {band.packs} packs of {band.light_count} lights, the surface {surface.packs}, visibility is "
+                         f"{visible.shape}, directions are {count}: give the same pixels and lights")
+    if not (irradiance > 0).all():
+        light, channel = np.argwhere(~(irradiance > 0))[0]
+        raise ArrayError(f"irradiance of light {light} is 0 in channel {'RGB'[channel]}: its image says nothing about light from there")
+    kept = first_of_equals(direction)
+    triangles = triangulate(direction[kept])
+    vertex, owner = np.nonzero(triangles.share > LEAST_PART)
+    start = np.searchsorted(vertex, np.arange(len(triangles.vertex) + 1))
+    part = triangles.share[vertex, owner] / np.add.reduceat(triangles.share[vertex, owner], start[:-1])[vertex]
+    corners = triangles.vertex[triangles.corner]
+    plane = np.cross(np.roll(corners, -1, axis=1), np.roll(corners, -2, axis=1))  # through the centre and the edge opposite
+    length = np.linalg.norm(plane, axis=2, keepdims=True)
+    pack = devices.pack_width(device)
+    factor = (scale[:count, None] / irradiance).astype(np.float32)
+    place = np.concatenate([direction, np.zeros((count, 1))], axis=1).astype(np.float32)
+    weights = wp.zeros((3 * count, surface.packs * pack), dtype=wp.float32, device=device)
+    out = wp.empty((6, surface.packs * pack), dtype=wp.float32, device=device)
+
+    def upload(values: np.ndarray, dtype: Any) -> wp.array:
+        return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
+
+    position = wp.array(np.ascontiguousarray(surface.values.numpy()[12:15].reshape(3, -1)), dtype=wp.float32, device=device)
+    devices.launch(_weights_kernel(), surface.packs * pack,
+                   [position, upload(sources.place, wp.vec4), upload(sources.energy, wp.vec3), upload(sources.axis, wp.vec4),
+                    upload((plane / length).reshape(-1, 3).astype(np.float32), wp.vec3),
+                    upload(length.reshape(-1).astype(np.float32), wp.float32),
+                    upload(triangles.neighbour.reshape(-1).astype(np.int32), wp.int32),
+                    upload(triangles.corner.reshape(-1).astype(np.int32), wp.int32), upload(start.astype(np.int32), wp.int32),
+                    upload(kept[owner].astype(np.int32), wp.int32), upload(part.astype(np.float32), wp.float32), count], [weights],
+                   device=device)
+    devices.launch(_sum_kernel(pack), surface.packs,
+                   [band.values, band.light_count, surface.values, visible, upload(place, wp.vec4), upload(factor, wp.vec3),
+                    as_packs(weights, device)], [as_packs(out, device)], device=device)
+    return out
+
+
+@cache
+def _weights_kernel() -> Any:
+    @wp.kernel(enable_backward=False, module="unique")
+    def weights_kernel(first: int,
+                       position: wp.array2d(dtype=float),  # [3, pixels padded]
+                       place: wp.array(dtype=wp.vec4),  # [N]
+                       energy: wp.array(dtype=wp.vec3),  # [N]
+                       axis: wp.array(dtype=wp.vec4),  # [N]
+                       inward: wp.array(dtype=wp.vec3),  # [3 · faces] unit normals of the planes of the edges opposite to the corners
+                       length: wp.array(dtype=float),  # [3 · faces] what a corner's coordinate is weighted by
+                       neighbour: wp.array(dtype=int),  # [3 · faces] face beyond that edge
+                       corner: wp.array(dtype=int),  # [3 · faces] vertex at the corner
+                       start: wp.array(dtype=int),  # [vertices + 1] where the lights of a vertex begin; a light's own is the only one
+                       owner: wp.array(dtype=int),  # lights of the vertices
+                       part: wp.array(dtype=float),  # of a vertex's energy, that they get
+                       count: int,  # lights
+                       # outputs
+                       weights: wp.array2d(dtype=float)):  # [3 · lights, pixels padded], 0
+        pixel = first + wp.tid()
+        point = wp.vec3(position[0, pixel], position[1, pixel], position[2, pixel])
+        here = wp.int32(0)
+        for n in range(place.shape[0]):
+            source, lobe = place[n], axis[n]
+            toward = wp.vec3(source[0], source[1], source[2]) - source[3] * point
+            away2 = wp.max(wp.dot(toward, toward), 1.0e-20)
+            toward = toward / wp.sqrt(away2)
+            arriving = wp.where(source[3] > 0.0, 1.0 / away2, 1.0)
+            if lobe[3] > 0.0:
+                ahead = wp.max(-(toward[0] * lobe[0] + toward[1] * lobe[1] + toward[2] * lobe[2]), 0.0)
+                arriving = arriving * wp.pow(ahead, lobe[3])
+            a, b, c = float(0.0), float(0.0), float(0.0)
+            for _ in range(inward.shape[0]):  # across the edge that it lies beyond, as in smooth weighting
+                a = wp.dot(toward, inward[3 * here])
+                b = wp.dot(toward, inward[3 * here + 1])
+                c = wp.dot(toward, inward[3 * here + 2])
+                least = wp.min(a, wp.min(b, c))
+                if least >= -BESIDE_RADIANS:
+                    break
+                if least == a:
+                    here = neighbour[3 * here]
+                elif least == b:
+                    here = neighbour[3 * here + 1]
+                else:
+                    here = neighbour[3 * here + 2]
+            a = wp.max(a, 0.0) * length[3 * here]
+            b = wp.max(b, 0.0) * length[3 * here + 1]
+            c = wp.max(c, 0.0) * length[3 * here + 2]
+            given = energy[n] * (arriving / wp.max(a + b + c, 1.0e-20))
+            for side in range(3):
+                share = wp.where(side == 0, a, wp.where(side == 1, b, c))
+                vertex = corner[3 * here + side]
+                for i in range(start[vertex], start[vertex + 1]):
+                    light = owner[i]
+                    amount = given * (share * part[i])
+                    weights[light, pixel] = weights[light, pixel] + amount[0]
+                    weights[count + light, pixel] = weights[count + light, pixel] + amount[1]
+                    weights[2 * count + light, pixel] = weights[2 * count + light, pixel] + amount[2]
+
+    return weights_kernel
+
+
+@cache
+def _sum_kernel(pack: int) -> Any:
+    lane_type, half_pack, byte_pack = (pack_type(pack, dtype) for dtype in (wp.float32, wp.float16, wp.uint8))
+    evaluate = lobes(pack)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
+    def sum_kernel(first: int,
+                   captured: wp.array2d(dtype=half_pack),  # [3 · lights padded, P]
+                   padded: int,  # lights
+                   values: wp.array2d(dtype=lane_type),  # [16, P]
+                   visible: wp.array2d(dtype=byte_pack),  # [lights, P]
+                   lights: wp.array(dtype=wp.vec4),  # [lights]
+                   factors: wp.array(dtype=wp.vec3),  # [lights] stored → radiance / irradiance
+                   weights: wp.array2d(dtype=lane_type),  # [3 · lights, P]
+                   # outputs
+                   out: wp.array2d(dtype=lane_type)):  # [6, P]
+        p = first + wp.tid()
+        count = lights.shape[0]
+        albedo_r, albedo_g, albedo_b = values[3, p], values[4, p], values[5, p]
+        f0_r, f0_g, f0_b = values[6, p], values[7, p], values[8, p]
+        image_r, image_g, image_b = lane_type(), lane_type(), lane_type()
+        model_r, model_g, model_b = lane_type(), lane_type(), lane_type()
+        for light in range(count):
+            facing, shine, rise, _ = evaluate(values, p, lights[light], wp.vec4())
+            lit = visible[light, p]
+            factor = factors[light]
+            red, green, blue = captured[light, p], captured[padded + light, p], captured[2 * padded + light, p]
+            wr, wg, wb = weights[light, p], weights[count + light, p], weights[2 * count + light, p]
+            for k in range(pack):
+                seen = float(lit[k]) * wp.static(1.0 / 255.0)
+                matt = seen * INVERSE_PI * facing[k]
+                mirror, edge = seen * shine[k] * (1.0 - rise[k]), seen * shine[k] * rise[k]
+                image_r[k] += wr[k] * factor[0] * float(red[k])
+                image_g[k] += wg[k] * factor[1] * float(green[k])
+                image_b[k] += wb[k] * factor[2] * float(blue[k])
+                model_r[k] += wr[k] * (albedo_r[k] * matt + f0_r[k] * mirror + edge)
+                model_g[k] += wg[k] * (albedo_g[k] * matt + f0_g[k] * mirror + edge)
+                model_b[k] += wb[k] * (albedo_b[k] * matt + f0_b[k] * mirror + edge)
+        out[0, p] = image_r
+        out[1, p] = image_g
+        out[2, p] = image_b
+        out[3, p] = model_r
+        out[4, p] = model_g
+        out[5, p] = model_b
+
+    return sum_kernel

@@ -1,0 +1,81 @@
+"""Which pixels see which lights, over the solved height."""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from kernels.errors import ArrayError
+from kernels.packs import pack_type
+from kernels.surface.shadows import NO_REACH, Projection, in_shadow_within, unproject
+
+
+def see_lights(place: np.ndarray, pixels: np.ndarray, height: wp.array, mask: wp.array, projection: Projection, *,
+               device: str) -> wp.array:
+    """March from every pixel to every light.
+
+    Args:
+        place: [n, 4] unit direction and 0, or position and 1, as of sources.Sources.
+        pixels: [m] row-major positions in the image.
+        height: [rows, cols] float32, camera-frame z.
+        mask: [rows, cols] uint8, where there is surface.
+        projection: of the camera; the unit is that of height.
+        device: where.
+
+    Returns:
+        [n, P] uint8 packs: 255 where the light is seen, 0 where the surface hides it. The last pack is filled up with the last
+        pixel. Attached shadow is not looked at.
+
+    Raises:
+        ArrayError: positions outside the image, or none.
+    """
+    if not len(pixels) or pixels.min() < 0 or pixels.max() >= mask.shape[0] * mask.shape[1]:
+        raise ArrayError(f"pixels must be positions from 0 to {mask.shape[0] * mask.shape[1] - 1}, one or more")
+    pack = devices.pack_width(device)
+    packs = -(-len(pixels) // pack)
+    where = pixels[np.minimum(np.arange(packs * pack), len(pixels) - 1)].astype(np.int32)
+    visible = wp.empty((len(place), packs), dtype=pack_type(pack, wp.uint8), device=device)
+    devices.launch(_see_kernel(pack), len(place) * packs,
+                   [wp.array(np.ascontiguousarray(place, dtype=np.float32), dtype=wp.vec4, device=device),
+                    wp.array(where, dtype=wp.int32, device=device), height, mask, projection.perspective, projection.scale,
+                    projection.centre], [visible], device=device, uneven=True)
+    return visible
+
+
+@cache
+def _see_kernel(pack: int) -> Any:
+    byte_pack = pack_type(pack, wp.uint8)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
+    def see_kernel(first: int,
+                   places: wp.array(dtype=wp.vec4),  # [N]
+                   pixels: wp.array(dtype=wp.int32),  # [P · pack]
+                   height: wp.array2d(dtype=float),
+                   mask: wp.array2d(dtype=wp.uint8),
+                   perspective: bool,
+                   scale: wp.vec2,
+                   centre: wp.vec2,
+                   # outputs
+                   visible: wp.array2d(dtype=byte_pack)):  # [N, P]
+        thread = first + wp.tid()
+        packs = visible.shape[1]
+        light = thread / packs
+        p = thread % packs
+        place = places[light]
+        out = byte_pack()
+        for k in range(pack):
+            n = pixels[p * pack + k]
+            row, col = n / mask.shape[1], n % mask.shape[1]
+            toward = wp.vec3(place[0], place[1], place[2])
+            reach = float(NO_REACH)
+            if place[3] > 0.0:
+                toward = toward - unproject(float(col) + 0.5, float(row) + 0.5, height[row, col], perspective, scale, centre)
+                reach = wp.length(toward)
+                toward = toward / wp.max(reach, 1.0e-20)
+            hidden = in_shadow_within(height, mask, row, col, toward, reach, perspective, scale, centre)
+            out[k] = wp.where(hidden, wp.uint8(0), wp.uint8(255))
+        visible[light, p] = out
+
+    return see_kernel

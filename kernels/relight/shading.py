@@ -1,0 +1,229 @@
+"""Solved surfaces under samples of light: the contract's BRDF, diffuse and specular apart.
+
+Radiance = Σ over the samples of V · E · (ρ/π + D V F) · n·l, with E the energy of a far sample or intensity · cos^μ / distance² of a
+near one, and V the visibility that the caller gives by rows.
+"""
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from kernels.errors import ArrayError
+from kernels.microfacet import INVERSE_PI, ggx, schlick
+from kernels.packs import as_packs, pack_type
+from kernels.relight.sources import Sources
+
+LEAST_ROUGHNESS = 0.05
+"""Below it a lobe is narrower than any sample of a light."""
+LEAST_FACING = 0.02
+"""Of n·v: normals of pixels at the rim may look away from the viewer by a little."""
+PLANES = 16
+"""Values of a pixel: normal, albedo, F0, view, position (3 each), roughness."""
+
+
+class Surface(NamedTuple):
+    """Pixels of solved maps on a device."""
+
+    values: wp.array  # [16, P] float packs
+    pixel_count: int
+    device: str
+
+    @property
+    def packs(self) -> int:
+        """How many packs cover the pixels; the last is filled up with copies of the last pixel."""
+        return int(self.values.shape[1])
+
+
+class SourcesOnDevice(NamedTuple):
+    """Samples of light, uploaded."""
+
+    place: wp.array
+    energy: wp.array
+    axis: wp.array
+    occluder: wp.array
+    share: wp.array
+
+
+def upload_surface(normal: np.ndarray, diffuse_albedo: np.ndarray, specular: np.ndarray, roughness: np.ndarray, view: np.ndarray,
+                   position: np.ndarray, *, device: str) -> Surface:
+    """Put pixels on the device.
+
+    Args:
+        normal, diffuse_albedo, specular, view, position: [n, 3]; unit normals and directions to the viewer, F0, places in the
+            camera frame.
+        roughness: [n] 0…1; 0: no specular lobe, whatever F0.
+        device: where.
+
+    Raises:
+        ArrayError: no pixels, or shapes that do not fit.
+    """
+    count = len(normal)
+    given = (normal, diffuse_albedo, specular, view, position, roughness)
+    planes = [np.asarray(plane, dtype=np.float32).reshape(max(count, 1), -1) for plane in given]
+    widths = [plane.shape[1] for plane in planes]
+    if count == 0 or widths != [3, 3, 3, 3, 3, 1]:
+        raise ArrayError(f"surface has {count} pixels with {widths} values: give [3, 3, 3, 3, 3, 1] of one pixel or more")
+    pack = devices.pack_width(device)
+    padded = -(-count // pack) * pack
+    values = np.concatenate(planes, axis=1).T[:, np.minimum(np.arange(padded), count - 1)]
+    packed = np.ascontiguousarray(values.reshape(PLANES, -1, pack))
+    return Surface(wp.array(packed, dtype=pack_type(pack, wp.float32), device=device), count, device)
+
+
+def upload_sources(sources: Sources, device: str) -> SourcesOnDevice:
+    """Put samples on the device."""
+    return SourcesOnDevice(*(wp.array(np.ascontiguousarray(values), dtype=dtype, device=device) for values, dtype in
+                             zip(sources, (wp.vec4, wp.vec3, wp.vec4, wp.vec3i, wp.vec3), strict=True)))
+
+
+def shade(surface: Surface, sources: Sources, visible: wp.array | None = None) -> wp.array:
+    """Light a surface.
+
+    Args:
+        surface: the pixels.
+        sources: the samples.
+        visible: [rows, P] uint8 packs, 255 where a pixel sees the occluder of that row; None: nothing is hidden.
+
+    Returns:
+        [6, pixels padded] float32 radiance on the device, diffuse RGB and specular RGB; not synchronised on CUDA.
+
+    Raises:
+        ArrayError: samples that ask for rows of visibility that are not there, or visibility of other pixels.
+    """
+    rows = 0 if visible is None else visible.shape[0]
+    if sources.count and sources.occluder.max() >= rows:
+        raise ArrayError(f"sources ask for row {sources.occluder.max()} of visibility, there are {rows}")
+    if visible is not None and visible.shape[1] != surface.packs:
+        raise ArrayError(f"visibility has {visible.shape[1]} packs, the surface {surface.packs}: give the same pixels")
+    pack = devices.pack_width(surface.device)
+    if visible is None:
+        visible = wp.empty((0, surface.packs), dtype=pack_type(pack, wp.uint8), device=surface.device)
+    out = wp.empty((6, surface.packs * pack), dtype=wp.float32, device=surface.device)
+    devices.launch(_shade_kernel(pack), surface.packs, [surface.values, *upload_sources(sources, surface.device), visible],
+                   [as_packs(out, surface.device)], device=surface.device)
+    return out
+
+
+@cache
+def lobes(pack: int) -> Any:
+    """Warp function: what every pixel of a pack makes of a sample at one place."""
+    lane_type = pack_type(pack, wp.float32)
+
+    @wp.func
+    def evaluate(values: wp.array2d(dtype=lane_type), p: int, place: wp.vec4, axis: wp.vec4):
+        """n·l, D V n·l, Schlick's rise, and what of the energy arrives."""
+        facing, shine, rise, arriving = lane_type(), lane_type(), lane_type(), lane_type()
+        nx, ny, nz = values[0, p], values[1, p], values[2, p]
+        vx, vy, vz = values[9, p], values[10, p], values[11, p]
+        rough = values[15, p]
+        tx, ty, tz = lane_type(), lane_type(), lane_type()
+        if place[3] > 0.0:
+            px, py, pz = values[12, p], values[13, p], values[14, p]
+            for k in range(pack):
+                lx = place[0] - px[k]
+                ly = place[1] - py[k]
+                lz = place[2] - pz[k]
+                inverse = 1.0 / wp.sqrt(wp.max(lx * lx + ly * ly + lz * lz, 1.0e-20))
+                tx[k] = lx * inverse
+                ty[k] = ly * inverse
+                tz[k] = lz * inverse
+                arriving[k] = inverse * inverse
+            if axis[3] > 0.0:
+                for k in range(pack):
+                    ahead = wp.max(-(tx[k] * axis[0] + ty[k] * axis[1] + tz[k] * axis[2]), 0.0)
+                    if axis[3] != 1.0:
+                        ahead = wp.pow(ahead, axis[3])
+                    arriving[k] = arriving[k] * ahead
+        else:
+            for k in range(pack):
+                tx[k] = place[0]
+                ty[k] = place[1]
+                tz[k] = place[2]
+                arriving[k] = 1.0
+        for k in range(pack):
+            nl = nx[k] * tx[k] + ny[k] * ty[k] + nz[k] * tz[k]
+            hx, hy, hz = tx[k] + vx[k], ty[k] + vy[k], tz[k] + vz[k]
+            half = 1.0 / wp.sqrt(wp.max(hx * hx + hy * hy + hz * hz, 1.0e-12))
+            nh = wp.min((nx[k] * hx + ny[k] * hy + nz[k] * hz) * half, 1.0)
+            hv = (hx * vx[k] + hy * vy[k] + hz * vz[k]) * half
+            nv = wp.max(nx[k] * vx[k] + ny[k] * vy[k] + nz[k] * vz[k], LEAST_FACING)
+            clipped = wp.max(rough[k], LEAST_ROUGHNESS)
+            facing[k] = wp.max(nl, 0.0)
+            shine[k] = wp.where(rough[k] > 0.0, ggx(nl, nv, nh, clipped * clipped), 0.0)
+            rise[k] = schlick(hv)
+        return facing, shine, rise, arriving
+
+    return evaluate
+
+
+@cache
+def _shade_kernel(pack: int) -> Any:
+    lane_type, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.uint8)
+    evaluate = lobes(pack)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
+    def shade_kernel(first: int,
+                     values: wp.array2d(dtype=lane_type),  # [16, P]
+                     place: wp.array(dtype=wp.vec4),  # [N]
+                     energy: wp.array(dtype=wp.vec3),  # [N]
+                     axis: wp.array(dtype=wp.vec4),  # [N]
+                     occluder: wp.array(dtype=wp.vec3i),  # [N]
+                     share: wp.array(dtype=wp.vec3),  # [N]
+                     visible: wp.array2d(dtype=byte_pack),  # [rows, P]
+                     # outputs
+                     out: wp.array2d(dtype=lane_type)):  # [6, P]
+        p = first + wp.tid()
+        # of each channel: n·l, D V n·l, and that times Schlick's rise
+        matt_r, matt_g, matt_b = lane_type(), lane_type(), lane_type()
+        shine_r, shine_g, shine_b = lane_type(), lane_type(), lane_type()
+        rise_r, rise_g, rise_b = lane_type(), lane_type(), lane_type()
+        for n in range(place.shape[0]):
+            facing, shine, rise, lit = evaluate(values, p, place[n], axis[n])
+            rows = occluder[n]
+            if rows[0] >= 0 or rows[1] >= 0 or rows[2] >= 0:
+                parts = share[n]
+                whole = lane_type()
+                for corner in range(3):
+                    if rows[corner] >= 0:
+                        v = visible[rows[corner], p]
+                        part = parts[corner] * wp.static(1.0 / 255.0)
+                        for k in range(pack):
+                            whole[k] += part * float(v[k])
+                    else:
+                        for k in range(pack):
+                            whole[k] += parts[corner]
+                for k in range(pack):
+                    lit[k] = lit[k] * whole[k]
+            e = energy[n]
+            er, eg, eb = e[0], e[1], e[2]
+            for k in range(pack):
+                matt = lit[k] * facing[k]
+                lobe = lit[k] * shine[k]
+                raised = lobe * rise[k]
+                matt_r[k] += er * matt
+                matt_g[k] += eg * matt
+                matt_b[k] += eb * matt
+                shine_r[k] += er * lobe
+                shine_g[k] += eg * lobe
+                shine_b[k] += eb * lobe
+                rise_r[k] += er * raised
+                rise_g[k] += eg * raised
+                rise_b[k] += eb * raised
+        for k in range(pack):
+            matt_r[k] = values[3, p][k] * INVERSE_PI * matt_r[k]
+            matt_g[k] = values[4, p][k] * INVERSE_PI * matt_g[k]
+            matt_b[k] = values[5, p][k] * INVERSE_PI * matt_b[k]
+            shine_r[k] = values[6, p][k] * shine_r[k] + (1.0 - values[6, p][k]) * rise_r[k]
+            shine_g[k] = values[7, p][k] * shine_g[k] + (1.0 - values[7, p][k]) * rise_g[k]
+            shine_b[k] = values[8, p][k] * shine_b[k] + (1.0 - values[8, p][k]) * rise_b[k]
+        out[0, p] = matt_r
+        out[1, p] = matt_g
+        out[2, p] = matt_b
+        out[3, p] = shine_r
+        out[4, p] = shine_g
+        out[5, p] = shine_b
+
+    return shade_kernel

@@ -1,0 +1,134 @@
+"""Smooth weighting: each sample of a lat-long map is shared by the three lights around it.
+
+The triangles are the spherical Delaunay triangles of the lights. A ray from the centre meets its triangle's plane in a point, and the
+shares are that point's barycentric coordinates: never negative, one in sum, the whole at a light, and the same from both sides of an
+edge. A sun that moves fades from light to light and never jumps, where cell weighting keeps it whole on one.
+
+Source: barycentric weights of a direction as in vector base amplitude panning, Pulkki, JAES 1997, here with sum one.
+"""
+
+from collections.abc import Iterator
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from kernels.relight.latlong import LightEnergy, Part, SampleGrid, check, first_of_equals, gather
+from kernels.relight.triangulation import Triangulation, triangulate
+
+RUN = 64
+"""Neighbouring samples of one thread: it seeks the first one's triangle over the whole sphere, the others' from the one before."""
+BESIDE_RADIANS = 1e-6
+"""A direction this far beyond an edge counts as on it: float32 does not tell more. Seeking cannot go in circles then."""
+
+
+class Located(NamedTuple):
+    """The triangle of each sample of a grid."""
+
+    face: np.ndarray  # [samples] int32
+    share: np.ndarray  # [samples, 3] float64 of each of its corners; sums to one
+
+
+def integrate_smooth(environment: np.ndarray, directions: np.ndarray, rotations: np.ndarray, *, device: str) -> LightEnergy:
+    """Share a lat-long map out over the lights, each direction to the three around it, for several rotations of the map.
+
+    Args:
+        environment: [rows, cols, 3] scene-linear radiance; top row +y, image centre +z, a quarter from the left +x.
+        directions: [lights, 3] unit vectors from the object to the lights (without padding).
+        rotations: [frames, 3, 3]: the environment is turned by these, turned = rotation @ direction.
+        device: where the triangles are found; sums are taken on the host in float64.
+
+    Returns:
+        Energy of each light, and the integral of its share over the sphere; both sum to those of the whole map. Of lights in one
+        place the first gets all. Where lights are missing, energy goes to those around the hole (kernels.relight.triangulation).
+
+    Raises:
+        ArrayError: shapes that do not fit, directions that are not unit vectors, radiance that is negative or not finite (counted),
+            fewer than four lights in different places, or all of them in one plane.
+    """
+    directions, rotations = check(environment, directions, rotations)
+    kept = first_of_equals(directions)
+    triangles = triangulate(directions[kept])
+
+    def split(rotation: np.ndarray, band: SampleGrid) -> Iterator[Part]:
+        face, share = locate(band, triangles, rotation, device=device)
+        for k in range(3):
+            yield Part(slice(None), triangles.corner[face, k], share[:, k])
+
+    sums = gather(environment, rotations, len(triangles.vertex), split)
+    energy = np.zeros((len(rotations), len(directions), 3))
+    solid_angle = np.zeros((len(rotations), len(directions)))
+    energy[:, kept] = np.einsum("fvc,vl->flc", sums.energy, triangles.share)
+    solid_angle[:, kept] = sums.solid_angle @ triangles.share
+    return LightEnergy(energy, solid_angle)
+
+
+def locate(grid: SampleGrid, triangles: Triangulation, rotation: np.ndarray, *, device: str) -> Located:
+    """Find the triangle that each sample of a grid lies in when the grid is turned, and where in it.
+
+    Args:
+        grid: of a lat-long map.
+        triangles: that cover the sphere.
+        rotation: [3, 3].
+        device: where; the call waits for it.
+    """
+    vertex = triangles.vertex[triangles.corner]  # [faces, 3, 3]
+    # the plane through the centre and the edge opposite to a corner; its length is what the corner's coordinate is weighted by
+    plane = np.cross(np.roll(vertex, -1, axis=1), np.roll(vertex, -2, axis=1))
+    length = np.linalg.norm(plane, axis=2)
+    inward = ((plane / length[..., None]) @ rotation).reshape(-1, 3).astype(np.float32)
+    rows, cols = len(grid.polar), len(grid.azimuth)
+    runs = -(-cols // RUN)
+    on_rows = np.stack([np.sin(grid.polar), np.cos(grid.polar)], axis=1).astype(np.float32)
+    on_columns = np.stack([np.sin(grid.azimuth), -np.cos(grid.azimuth)], axis=1).astype(np.float32)
+    face = wp.empty((rows, cols), dtype=wp.int32, device=device)
+    depth = wp.empty((rows, cols), dtype=wp.vec3, device=device)
+    inputs = [wp.array(on_rows, dtype=wp.vec2, device=device), wp.array(on_columns, dtype=wp.vec2, device=device),
+              wp.array(inward, dtype=wp.vec3, device=device),
+              wp.array(triangles.neighbour.reshape(-1).astype(np.int32), dtype=wp.int32, device=device), runs]
+    devices.launch(_walk_kernel(), rows * runs, inputs, [face, depth], device=device)
+    found = face.numpy().reshape(-1)
+    share = np.maximum(depth.numpy().reshape(-1, 3), 0) * length[found]
+    return Located(found, share / share.sum(axis=1, keepdims=True))
+
+
+@cache
+def _walk_kernel() -> Any:
+    @wp.kernel(enable_backward=False, module="unique")
+    def walk_kernel(first: int,
+                    polar: wp.array(dtype=wp.vec2),  # [rows] sine and cosine of the angle from +y
+                    equator: wp.array(dtype=wp.vec2),  # [cols] x and z of a direction on the equator
+                    inward: wp.array(dtype=wp.vec3),  # [3 · faces] unit normals of the planes of the edges opposite to the corners
+                    neighbour: wp.array(dtype=int),  # [3 · faces] face beyond that edge
+                    runs: int,  # of one row
+                    # outputs
+                    face: wp.array2d(dtype=int),  # [rows, cols]
+                    depth: wp.array2d(dtype=wp.vec3)):  # [rows, cols] sine of the angle from each edge
+        thread = first + wp.tid()
+        row = thread / runs
+        begin = (thread % runs) * RUN
+        here = wp.int32(0)
+        for col in range(begin, wp.min(begin + RUN, equator.shape[0])):
+            direction = wp.vec3(polar[row][0] * equator[col][0], polar[row][1], polar[row][0] * equator[col][1])
+            a, b, c = float(0.0), float(0.0), float(0.0)
+            # across the edge that the direction lies beyond, again and again: on a convex hull every step leads to a face whose
+            # plane the ray meets nearer to the centre, so that none comes twice
+            for _ in range(inward.shape[0]):
+                a = wp.dot(direction, inward[3 * here])
+                b = wp.dot(direction, inward[3 * here + 1])
+                c = wp.dot(direction, inward[3 * here + 2])
+                least = wp.min(a, wp.min(b, c))
+                if least >= -BESIDE_RADIANS:
+                    break
+                if least == a:
+                    here = neighbour[3 * here]
+                elif least == b:
+                    here = neighbour[3 * here + 1]
+                else:
+                    here = neighbour[3 * here + 2]
+            face[row, col] = here
+            depth[row, col] = wp.vec3(a, b, c)
+
+    return walk_kernel

@@ -1,0 +1,123 @@
+"""Light as samples: far ones by direction, near ones by place, all in one form that the shading kernel takes.
+
+A far sample is what an environment or a disc sends from about one direction; a near one is a point light or a patch of an area light.
+Area lights become patches of equal area, each shining by the cosine to its normal.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from kernels.errors import ArrayError
+
+SPHERE_SAMPLES = 512
+"""Half of them face away from any point: 256 serve it."""
+RECTANGLE_SAMPLES = 256
+FEW = 64
+"""Samples of a light for sums in which the error of having few is in both terms of a difference."""
+NEVER = -1
+"""Row of an occluder that is none."""
+
+
+class Sources(NamedTuple):
+    """Samples of light."""
+
+    place: np.ndarray  # [n, 4] float32: unit direction to the light and 0, or its position in the camera frame and 1
+    energy: np.ndarray  # [n, 3] float32: irradiance on a surface that faces it, or intensity per steradian; may be negative
+    axis: np.ndarray  # [n, 4] float32: unit direction it shines along and exponent of the cosine about it; exponent 0: evenly
+    occluder: np.ndarray  # [n, 3] int32 rows of visibility; NEVER: nothing hides it
+    share: np.ndarray  # [n, 3] float32 of those rows
+
+    @property
+    def count(self) -> int:
+        """How many samples."""
+        return len(self.place)
+
+
+def far(direction: np.ndarray, irradiance: np.ndarray) -> Sources:
+    """Far lights.
+
+    Args:
+        direction: [n, 3] unit vectors to them.
+        irradiance: [n, 3] on a surface that faces each.
+    """
+    return _sources(np.concatenate([direction, np.zeros((len(direction), 1))], axis=1), irradiance)
+
+
+def point(position: np.ndarray, intensity: np.ndarray, axis: np.ndarray | None = None, exponent: float = 0.0) -> Sources:
+    """One point light: irradiance = intensity · cos^exponent / distance².
+
+    Args:
+        position: [3] in the unit of the surface, camera frame.
+        intensity: [3].
+        axis: [3] unit direction it shines along; None: evenly.
+        exponent: of the cosine about the axis.
+    """
+    lobe = None if axis is None else np.append(axis, exponent)[None]
+    return _sources(np.append(position, 1.0)[None], np.asarray(intensity)[None], lobe)
+
+
+def sphere(centre: np.ndarray, radius: float, radiance: np.ndarray, count: int = SPHERE_SAMPLES) -> Sources:
+    """A sphere of even radiance.
+
+    Args:
+        centre: [3], camera frame.
+        radius: in the same unit, above 0.
+        radiance: [3].
+        count: of samples.
+
+    Raises:
+        ArrayError: no radius.
+    """
+    if not radius > 0:
+        raise ArrayError(f"radius of a sphere light is {radius}: it must be above 0")
+    height = 1 - 2 * (np.arange(count) + 0.5) / count
+    turn = math.pi * (3 - math.sqrt(5)) * np.arange(count)
+    ring = np.sqrt(1 - height**2)
+    normal = np.stack([ring * np.cos(turn), ring * np.sin(turn), height], axis=1)
+    area = 4 * math.pi * radius**2 / count
+    return _patches(np.asarray(centre) + radius * normal, normal, np.asarray(radiance, dtype=np.float64) * area)
+
+
+def rectangle(centre: np.ndarray, edge_u: np.ndarray, edge_v: np.ndarray, radiance: np.ndarray,
+              count: int = RECTANGLE_SAMPLES) -> Sources:
+    """A rectangle of even radiance that shines to one side, against edge_u × edge_v, as a UsdLux RectLight of width u and height v does.
+
+    Args:
+        centre: [3], camera frame.
+        edge_u, edge_v: [3] its whole edges, at a right angle.
+        radiance: [3].
+        count: of samples, about.
+
+    Raises:
+        ArrayError: an edge of no length, or edges that are not at a right angle.
+    """
+    edge_u, edge_v = np.asarray(edge_u, dtype=np.float64), np.asarray(edge_v, dtype=np.float64)
+    lengths = np.linalg.norm(edge_u), np.linalg.norm(edge_v)
+    if min(lengths) <= 0 or abs(edge_u @ edge_v) > 1e-3 * lengths[0] * lengths[1]:
+        raise ArrayError(f"edges of a rectangle light are {edge_u.tolist()} and {edge_v.tolist()}: give two at a right angle")
+    across = max(1, round(math.sqrt(count * lengths[0] / lengths[1])))
+    down = max(1, round(count / across))
+    u, v = np.meshgrid((np.arange(across) + 0.5) / across - 0.5, (np.arange(down) + 0.5) / down - 0.5)
+    places = np.asarray(centre) + u.reshape(-1, 1) * edge_u + v.reshape(-1, 1) * edge_v
+    normal = np.cross(edge_v, edge_u)
+    area = lengths[0] * lengths[1] / len(places)
+    return _patches(places, np.tile(normal / np.linalg.norm(normal), (len(places), 1)), np.asarray(radiance, dtype=np.float64) * area)
+
+
+def join(parts: list[Sources]) -> Sources:
+    """All samples of some sources, in order."""
+    return Sources(*(np.concatenate(planes) for planes in zip(*parts, strict=True)))
+
+
+def _patches(places: np.ndarray, normal: np.ndarray, intensity: np.ndarray) -> Sources:
+    return _sources(np.concatenate([places, np.ones((len(places), 1))], axis=1), np.tile(intensity, (len(places), 1)),
+                    np.concatenate([normal, np.ones((len(places), 1))], axis=1))
+
+
+def _sources(place: np.ndarray, energy: np.ndarray, axis: np.ndarray | None = None) -> Sources:
+    count = len(place)
+    return Sources(place.astype(np.float32), np.asarray(energy, dtype=np.float32),
+                   np.zeros((count, 4), np.float32) if axis is None else np.asarray(axis, dtype=np.float32),
+                   np.full((count, 3), NEVER, np.int32), np.tile(np.float32([1, 0, 0]), (count, 1)))

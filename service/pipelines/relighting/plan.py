@@ -1,0 +1,82 @@
+"""A request → what will be made, checked as far as that is cheap: before an image of the capture is read or anything is written."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from service.pipelines.relighting.environments import Environments
+from service.pipelines.relighting.frames import check_folders, frame_numbers, frame_path, refuse_inputs
+from service.pipelines.relighting.keys import LightKeys
+from service.pipelines.relighting.layers import check_layers, maps_file
+from service.pipelines.relighting.schedule import FrameLighting, schedule
+from service.pipelines.relighting.sequence import capture_files, time_steps
+from service.pipelines.relighting.sheet import check_sheet
+from service.requests import RelightRequest
+
+
+class PlannedFrame(NamedTuple):
+    """One frame."""
+
+    path: Path
+    lighting: FrameLighting
+
+
+class Plan(NamedTuple):
+    """What will be made."""
+
+    folders: tuple[Path, ...]
+    """One capture, or one a time step."""
+    frames: tuple[PlannedFrame, ...]
+    environments: Environments | None
+    keys: LightKeys | None
+
+    @property
+    def is_sequence(self) -> bool:
+        """Whether there are several captures, which give one frame each."""
+        return len(self.folders) > 1
+
+    def steps(self) -> Iterator[tuple[Path, tuple[PlannedFrame, ...]]]:
+        """Each capture and its frames."""
+        if not self.is_sequence:
+            yield self.folders[0], self.frames
+            return
+        for folder, frame in zip(self.folders, self.frames, strict=True):
+            yield folder, (frame,)
+
+
+def make_plan(request: RelightRequest) -> Plan:
+    """Check a request and lay out its frames.
+
+    Raises:
+        RequestError: a bad frame range, a pattern without ####, options that do not fit, or an output that would replace an input.
+        StageError: a map, the light keys or a manifest is wrong; names file and field.
+        StorageError: a folder cannot be written to.
+    """
+    folders = time_steps(request.capture)
+    numbers = frame_numbers(request.frames, len(folders))
+    paths = [frame_path(request.out, number) for number in numbers]
+    outputs = [(f"--out {request.out}", path) for path in paths]
+    check_layers(request.aov, request.maps)
+    if request.sheet is not None:
+        check_sheet(request.sheet)
+        outputs.append((f"--sheet {request.sheet}", request.sheet))
+    if request.report is not None:
+        outputs.append((f"--report {request.report}", request.report))
+    keys = LightKeys.read(request.keys) if request.keys is not None else None
+    environments = Environments(request.environment) if request.environment is not None else None
+    lighting = schedule(request, numbers, keys, environments)
+    if environments is not None:
+        environments.check(numbers)
+
+    def inputs() -> Iterator[Path]:
+        yield from ([] if request.keys is None else [request.keys])
+        yield from {frame.sky.path for frame in lighting if frame.sky is not None}
+        for folder in folders:
+            yield from capture_files(folder)
+            if request.maps is not None:
+                yield maps_file(request.maps, folder, len(folders))
+
+    refuse_inputs(outputs, inputs())
+    check_folders(path for _, path in outputs)
+    return Plan(tuple(folders), tuple(PlannedFrame(path, frame) for path, frame in zip(paths, lighting, strict=True)),
+                environments, keys)

@@ -1,0 +1,110 @@
+"""JSON files with a schema: read strictly, and every fault said as one sentence that names file and field."""
+
+import json
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from stage.errors import ManifestError, storage
+
+Record = TypeVar("Record", bound=BaseModel)
+
+
+def read_record(path: str | Path, model: type[Record], schema: str) -> Record:
+    """Read and check a JSON file.
+
+    Args:
+        path: the file.
+        model: what it must hold.
+        schema: what its key `schema` must say.
+
+    Raises:
+        StorageError: it cannot be read.
+        ManifestError: not JSON, another schema, or a field is wrong; the message names file and field.
+    """
+    with storage("read", path):
+        text = Path(path).read_bytes()
+    try:
+        data = json.loads(text, object_pairs_hook=_unique_keys, parse_constant=_refuse_constant)
+    except UnicodeDecodeError as error:
+        raise ManifestError(f"{path}: is not UTF-8 text") from error
+    except json.JSONDecodeError as error:
+        raise ManifestError(f"{path}: is not JSON: {error.msg} at line {error.lineno}, column {error.colno}") from error
+    except RecursionError as error:
+        raise ManifestError(f"{path}: is nested too deeply") from error
+    except ValueError as error:
+        raise ManifestError(f"{path}: {error}") from error
+    if not isinstance(data, dict):
+        raise ManifestError(f"{path}: must hold one JSON object")
+    if "schema" not in data:
+        raise ManifestError(f"{path}: schema: is missing: this program reads {schema}")
+    if data["schema"] != schema:
+        raise ManifestError(f"{path}: schema: is {json.dumps(data['schema'])}, this program reads {schema}")
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        raise ManifestError(f"{path}: {describe(error)}") from error
+
+
+def describe(error: ValidationError) -> str:
+    """The first fault of a pydantic error as `field: what is wrong`, with a count of the others."""
+    places = {fault["loc"][:n] for fault in error.errors() for n in range(len(fault["loc"]))}
+    faults = [fault for fault in error.errors() if fault["loc"] not in places]  # not of a list what is said of its entries
+    fault = faults[0]
+    where = _field(fault["loc"])
+    match fault["type"]:
+        case "extra_forbidden":
+            text = "is not a known key"
+        case "missing":
+            text = "is missing"
+        case "value_error":
+            text = str(fault["ctx"]["error"])
+        case "union_tag_invalid":
+            text = f"{fault['ctx']['discriminator'].strip(chr(39))} is {json.dumps(fault['ctx']['tag'])}, " \
+                   f"must be one of {fault['ctx']['expected_tags']}"
+        case "too_short":
+            text = f"has {fault['ctx']['actual_length']} entries, needs {fault['ctx']['min_length']} or more"
+        case "too_long":
+            text = f"has {fault['ctx']['actual_length']} entries, must have {fault['ctx']['max_length']}"
+        case "tuple_type":
+            text = f"is {_short(fault['input'])}: must be a list"
+        case "model_type" | "model_attributes_type":
+            text = f"is {_short(fault['input'])}: must be an object"
+        case "union_tag_not_found":
+            text = f"lacks the key {fault['ctx']['discriminator'].strip(chr(39))}"
+        case _:
+            text = f"is {_short(fault['input'])}: {fault['msg'][0].lower()}{fault['msg'][1:]}"
+    more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
+    return f"{where}: {text}{more}" if where else f"{text}{more}"
+
+
+def _field(location: tuple[int | str, ...]) -> str:
+    """`frames[3].light.direction` from pydantic's location, which also names union members after their key."""
+    text = ""
+    previous: int | str = ""
+    for part in location:
+        if isinstance(part, int):
+            text += f"[{part}]"
+        elif previous not in ("light", "pattern", "laser", "tof"):
+            text += f".{part}" if text else part
+        previous = part
+    return text
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value, default=str)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    result: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in result:
+            raise ValueError(f"key {key} is given twice in one object")
+        result[key] = value
+    return result
+
+
+def _refuse_constant(name: str) -> float:
+    raise ValueError(f"{name} is not a JSON number")
