@@ -6,6 +6,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from service.methods import BasisKind, FrameCompression, FrameSpace, Layer, LightWeights, Method
+from service.near_lights import GivenPoint, GivenRectangle, GivenSphere
 
 MAX_STOPS = 32.0
 """Of exposure either way: more than half has from its smallest value to its largest."""
@@ -89,6 +90,31 @@ class RelightRequest(StackRequest):
     def weighting(self) -> LightWeights:
         """The weights that are used."""
         return self.weights or (LightWeights.CELLS if self.maps is None else LightWeights.SMOOTH)
+
+
+class ShadeRequest(Request):
+    """One picture of solved maps under near lights, area lights and an environment."""
+
+    maps: Path
+    """A folder with maps.exr, or the file."""
+    out: Path
+    """.exr."""
+    light: tuple[GivenPoint, ...] = ()
+    sphere: tuple[GivenSphere, ...] = ()
+    rectangle: tuple[GivenRectangle, ...] = ()
+    environment: Path | None = None
+    """A lat-long map."""
+    turn_degrees: float = Field(default=0.0, allow_inf_nan=False)
+    """Of the environment about +y, +z towards +x."""
+    capture: Path | None = None
+    """The capture of the maps: its images give what a model of the maps cannot, interreflection and scattering."""
+    exposure: float = Field(default=0.0, ge=-MAX_STOPS, le=MAX_STOPS, allow_inf_nan=False)
+    """Stops: the picture is multiplied by 2 to this power."""
+    aov: Annotated[tuple[Layer, ...], BeforeValidator(_split)] = (Layer.BEAUTY,)
+    """Layers of the picture; as text, names with commas between."""
+    color_space: FrameSpace | None = None
+    """None: that of the maps."""
+    compression: FrameCompression = FrameCompression.ZIP
 
 
 class BasisRequest(StackRequest):

@@ -84,3 +84,16 @@ def latlong_solid_angles(width: int, height: int) -> np.ndarray:
     """
     v = (np.arange(height) + 0.5) / height
     return np.sin(np.pi * v) * (np.pi / height) * (2 * np.pi / width)
+
+
+def fibonacci_sphere(count: int) -> np.ndarray:
+    """Directions spread evenly over the sphere.
+
+    Returns:
+        [count, 3] float64 unit vectors.
+
+    Source: Swinbank and Purser, "Fibonacci grids", Quarterly Journal of the Royal Meteorological Society 132, 2006.
+    """
+    z = 1 - (2 * np.arange(count) + 1) / count
+    ring, azimuth = np.sqrt(1 - z * z), np.pi * (1 + 5**0.5) * np.arange(count)
+    return np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z], axis=1)

@@ -15,7 +15,9 @@ import warp as wp
 from kernels import packs
 from kernels.relight.around import left_out
 from kernels.relight.guide import seen_lobes, trust_model
+from kernels.relight.near_sum import sum_near
 from kernels.relight.shading import shade
+from service.pipelines.near_light import NearLight, near_lights
 from service.pipelines.relighting.environments import Environments
 from service.pipelines.relighting.model_light import LightModel
 from service.pipelines.relighting.schedule import FrameLighting
@@ -97,6 +99,31 @@ class Guide:
                     shine[index][:, batch.pixels] = np.clip(whole, 0, np.maximum(guided, 0))
             done += count
         return shine
+
+    def add_near(self, frame: np.ndarray, shine: np.ndarray, lights: Sequence[NearLight]) -> None:
+        """Add near lights to a frame: every pixel's own sum of the captured images, and what the model says that misses.
+
+        Args:
+            frame: [3, pixels] float32, changed in place.
+            shine: [3, pixels] float32, its specular part, changed in place.
+            lights: in the camera frame.
+        """
+        near = near_lights(lights, len(self._place))
+        if not near.fine.count:
+            return
+        done = 0
+        for batch in self._model.batches():
+            count = len(batch.pixels)
+            visible = self._visible(batch, near.marched)
+            wanted = shade(batch.surface, near.fine, visible).numpy()[:, :count]
+            band = packs.upload(*self._stack.pick(batch.pixels), device=self._model.device)
+            summed = sum_near(band, batch.surface, visible, near.coarse, self._lights.direction, self._lights.irradiance,
+                              self._stack.scale).numpy()[:, :count]
+            missing = wanted[:3] + wanted[3:] - summed[3:]
+            added = np.maximum(summed[:3] + self.trust[done : done + count] * missing, 0)
+            frame[:, batch.pixels] += added
+            shine[:, batch.pixels] += np.clip(wanted[3:], 0, added)
+            done += count
 
     def _energy(self, lighting: FrameLighting, weights: np.ndarray) -> np.ndarray:
         """[lights, 3] that map and discs give each captured light: what its weight stands for beside `captured` of the frame."""

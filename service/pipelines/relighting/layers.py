@@ -53,12 +53,13 @@ def read_maps(path: Path, capture: Capture) -> SurfaceMaps:
     return maps
 
 
-def still_layers(layers: Collection[Layer], capture: Capture, maps: SurfaceMaps | None, where: Path | None) -> dict[str, np.ndarray]:
+def still_layers(layers: Collection[Layer], capture: Capture | None, maps: SurfaceMaps | None, where: Path | None) -> dict[str, np.ndarray]:
     """The layers that every frame of a capture shares.
 
     Args:
         layers: which.
-        maps: solved maps; None: the mask is the capture's.
+        capture: whose mask is taken where there are no maps.
+        maps: solved maps.
         where: the file of the maps, for messages.
 
     Returns:
@@ -72,7 +73,7 @@ def still_layers(layers: Collection[Layer], capture: Capture, maps: SurfaceMaps 
     for layer, suffixes in SUFFIXES.items():
         if layer not in layers:
             continue
-        values = capture.mask() if maps is None else getattr(maps, layer)
+        values = getattr(maps, layer) if maps is not None else capture.mask() if capture is not None else None
         if values is None:
             raise ResultError(f"{where}: has no layer {layer}, which --aov {layer} needs")
         planes = values[..., None] if values.ndim == 2 else values

@@ -6,6 +6,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.packs import pack_type
 from kernels.relight import shading
+from tests.kernels.scenes import store
 from tests.reference.shading import Pixels
 
 FLOAT = 2.0**-24
@@ -49,3 +50,12 @@ def pack_bytes(rows: np.ndarray, device: str) -> wp.array:
     pack = devices.pack_width(device)
     padded = np.pad(rows, ((0, 0), (0, -rows.shape[1] % pack)), constant_values=7)
     return wp.array(padded.reshape(len(rows), -1, pack), dtype=pack_type(pack, wp.uint8), device=device)
+
+
+def stored(readings: np.ndarray, irradiance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A stack of readings [lights, 3, P]: half values and what a stored 1.0 is worth, unequal among the lights; and what it then holds."""
+    count = len(readings)
+    scale = np.ones(-(-count // 8) * 8, np.float32)
+    scale[:count] = 2.0 ** (np.arange(count) % 5 - 2)
+    stack = store(np.einsum("lcp,lc,l->clp", readings, irradiance, 1 / scale[:count]))
+    return stack, scale, np.einsum("clp,lc,l->lcp", stack[:, :count].astype(float), 1 / irradiance, scale[:count])

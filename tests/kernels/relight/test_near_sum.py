@@ -11,7 +11,7 @@ from kernels.relight.environment import Weighting
 from kernels.relight.near_sum import sum_near
 from kernels.relight.triangulation import triangulate
 from tests.kernels.relight.lights import AXES, CUBE, icosahedron, ring, scattered, turn
-from tests.kernels.relight.surfaces import FLOAT, LOBE, pack_bytes, scattered_pixels, upload
+from tests.kernels.relight.surfaces import FLOAT, LOBE, pack_bytes, scattered_pixels, stored, upload
 from tests.kernels.scenes import HALF_ROUNDING, cap, colours, store
 from tests.reference import shading as reference
 
@@ -27,15 +27,6 @@ NEAR = {
     "far": sources.far(scattered(30, 3), np.random.default_rng(3).random((30, 3))),
 }
 ALL = sources.join(list(NEAR.values()))
-
-
-def stored(readings, irradiance):
-    """A stack of readings [lights, 3, P]: half values and what a stored 1.0 is worth, unequal among the lights; and what it then holds."""
-    count = len(readings)
-    scale = np.ones(-(-count // 8) * 8, np.float32)
-    scale[:count] = 2.0 ** (np.arange(count) % 5 - 2)
-    stack = store(np.einsum("lcp,lc,l->clp", readings, irradiance, 1 / scale[:count]))
-    return stack, scale, np.einsum("clp,lc,l->lcp", stack[:, :count].astype(float), 1 / irradiance, scale[:count])
 
 
 def summed(pixels, readings, given, lights, device, *, visible=None, irradiance=None):
