@@ -26,6 +26,16 @@ class Status(IntEnum):
     """Solved, but the readings leave the normal open by more than five degrees (standard error)."""
     NOT_CONVERGED = 9
     """Solved, but normals and depth under near lights still moved each other in the last round."""
+    LOW_MODULATION = 10
+    """Depth: the projected or emitted signal is too weak to be decoded."""
+    OUT_OF_RANGE = 11
+    """Depth: decoded, but to a place that the device cannot have lit, or outside the measured range."""
+    UNDECIDED = 12
+    """Depth: the readings fit several places about equally well."""
+    FLYING = 13
+    """Depth: a mixture of two surfaces, taken out by a filter that was asked for."""
+    MULTIPATH = 14
+    """Depth: frequencies or codes disagree: light came over several ways."""
 
 
 SOLVED = (Status.OK, Status.AMBIGUOUS, Status.NOT_CONVERGED)

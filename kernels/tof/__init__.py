@@ -1,0 +1,1 @@
+"""Time of flight: correlation images and histograms in, ranges and their uncertainty out."""
