@@ -7,9 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from service.methods import Method
-from service.pipelines.relight import relight
 from service.pipelines.solve import solve
-from service.requests import RelightRequest, SolveRequest
+from service.requests import SolveRequest
 from stage import exr
 from stage.capture import Capture
 from stage.importers import diligent
@@ -79,27 +78,3 @@ def diligent_errors(source: Path, method: Method) -> SolveError:
         maps = solve(SolveRequest(capture=capture, out=Path(folder), method=method)).maps
         truth = {"normal": np.load(source / "normal_gt.npz")["normal"]}
         return compare(maps, truth, Capture.open(capture).mask())
-
-
-def relight_error(reference: str) -> tuple[float, float]:
-    """The owl relit under its environment, against the path tracer.
-
-    Args:
-        reference: file of the path-traced picture.
-
-    Returns:
-        Relative RMSE over the mask, and the ratio of the total energies.
-    """
-    capture = SAMPLES / "owl"
-    mask = Capture.open(capture).mask()
-    with tempfile.TemporaryDirectory() as folder:
-        result = relight(RelightRequest(capture=capture, environment=capture / "environment.exr", cache=Path(folder),
-                                        out=str(Path(folder) / "frame.####.exr")))
-        ours = _rgb(result.frames[0])[mask]
-    truth = _rgb(capture / reference)[mask]
-    return float(np.sqrt(np.mean((ours - truth) ** 2) / np.mean(truth**2))), float(ours.sum() / truth.sum())
-
-
-def _rgb(path: Path) -> np.ndarray:
-    channels, _ = exr.read(path)
-    return np.stack([channels[c] for c in "RGB"], axis=-1).astype(np.float64)

@@ -17,9 +17,10 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.ablation import ablation_table
-from benchmarks.accuracy import SolveError, compare, diligent_errors, read_truth, relight_error, sample_errors
+from benchmarks.accuracy import SolveError, compare, diligent_errors, read_truth, sample_errors
 from benchmarks.large import large_rows, measure
 from benchmarks.materials import material_table
+from benchmarks.relighting import relighting_table
 from benchmarks.search_speed import search_rows
 from service.methods import Method
 from service.pipelines.bench import bench
@@ -96,11 +97,9 @@ def ablation(given: argparse.Namespace) -> list[str] | None:
     return ablation_table(given.data, given.glossy)
 
 
-def relighting(_: argparse.Namespace) -> list[str]:
-    """The owl under its sky."""
-    error, energy = relight_error("reference_environment.exr")
-    return ["`samples/owl` under `environment.exr` (a sun of 3° and a sky), linear combination of 96 captured lights against the "
-            f"path tracer: relative RMSE {error:.3f}, total energy {energy:.3f} of the truth."]
+def relighting(given: argparse.Namespace) -> list[str]:
+    """Relit and shaded pictures against the path tracer."""
+    return relighting_table(given.relighting)
 
 
 def speed(_: argparse.Namespace) -> list[str]:
@@ -152,6 +151,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--data", type=Path, help="folder with diligent_ball and diligent_cat")
     parser.add_argument("--glossy", type=Path, help="folder with glossy and glossy_metal of samples/make_glossy.py")
+    parser.add_argument("--relighting", type=Path, help="folder with glossy and owl of samples/make_relight_checks.py")
     parser.add_argument("--large", type=Path, help="folder where some 12 GiB may be written and are removed again")
     parser.add_argument("--only", nargs="+", choices=SECTIONS, help="sections to measure (default: all)")
     given = parser.parse_args()
