@@ -1,0 +1,98 @@
+"""A glossy dome under lights all around it, rendered with the float64 twin of the contract's model, and its true maps: what model-guided
+relighting and shading are judged on. The dome is convex, so that nothing throws a shadow but attached ones."""
+
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from stage.camera import Camera
+from stage.maps import MAPS_FILE, SurfaceMaps
+from tests.captures import write_exr, write_image
+from tests.reference import microfacet
+
+VIEW = np.array([0.0, 0.0, 1.0])
+PIXEL_M = 0.001
+ALBEDO = np.array([0.5, 0.35, 0.2])
+ROUGHNESS, F0 = 0.55, 0.05
+
+
+class Dome(NamedTuple):
+    """The surface."""
+
+    normal: np.ndarray  # [rows, cols, 3]
+    height: np.ndarray  # [rows, cols] metres, mean 0 over the mask
+    mask: np.ndarray  # [rows, cols] bool
+
+    @property
+    def places(self) -> np.ndarray:
+        """[rows, cols, 3] metres, camera frame."""
+        size = len(self.mask)
+        across = (np.arange(size) + 0.5 - size / 2) * PIXEL_M
+        x, y = np.meshgrid(across, -across)
+        return np.stack([x, y, self.height], axis=-1)
+
+
+def dome(size: int = 24) -> Dome:
+    """A spherical cap of 50 degrees."""
+    radius = size / 2 / np.sin(np.radians(50.0))
+    across = np.arange(size) + 0.5 - size / 2
+    x, y = np.meshgrid(across, -across)
+    mask = x**2 + y**2 < (size / 2 - 1) ** 2
+    z = np.sqrt(np.maximum(radius**2 - x**2 - y**2, 1e-9))
+    normal = np.where(mask[..., None], np.stack([x, y, z], axis=-1) / radius, VIEW)
+    height = np.where(mask, z - z[mask].mean(), 0) * PIXEL_M
+    return Dome(normal / np.linalg.norm(normal, axis=-1, keepdims=True), height, mask)
+
+
+def reflect(normal: np.ndarray, toward: np.ndarray, roughness: float = ROUGHNESS) -> np.ndarray:
+    """[…, 3] radiance under unit irradiance from unit directions; broadcasts."""
+    shine = microfacet.specular(normal, toward, VIEW, roughness**2, F0)
+    return ALBEDO * microfacet.diffuse(normal, toward, VIEW)[..., None] + shine[..., None]
+
+
+def sphere_directions(count: int) -> np.ndarray:
+    """[count, 3] unit directions, evenly over the sphere."""
+    y = 1 - (2 * np.arange(count) + 1) / count
+    turn = np.pi * (1 + 5**0.5) * np.arange(count)
+    ring = np.sqrt(1 - y**2)
+    return np.stack([ring * np.sin(turn), y, ring * np.cos(turn)], axis=-1)
+
+
+def write_dome(folder: Path, surface: Dome, *, lights: int = 48, irradiance: float = 2.0) -> np.ndarray:
+    """Write the capture; returns the directions of its lights."""
+    folder.mkdir(parents=True)
+    directions = sphere_directions(lights)
+    frames = []
+    for index, direction in enumerate(directions):
+        image = reflect(surface.normal, direction) * irradiance * surface.mask[..., None]
+        write_exr(folder / f"{index:03d}.exr", image)
+        frames.append({"image": f"{index:03d}.exr",
+                       "light": {"type": "distant", "direction": direction.tolist(), "irradiance": [irradiance] * 3}})
+    write_image(folder / "mask.png", (surface.mask * 255).astype(np.uint8))
+    size = len(surface.mask)
+    manifest = {"schema": "relit.capture/1", "name": "dome", "color_space": "lin_rec709_scene", "mask": "mask.png", "frames": frames,
+                "camera": {"projection": "orthographic", "resolution": [size, size], "pixel_size_m": PIXEL_M}}
+    (folder / "capture.json").write_text(json.dumps(manifest))
+    return directions
+
+
+def write_maps(folder: Path, surface: Dome, **changes: np.ndarray | str | None) -> Path:
+    """Write the true maps, or changed ones."""
+    folder.mkdir(parents=True)
+    size = len(surface.mask)
+    full = np.ones((size, size, 3), np.float32)
+    camera = Camera(projection="orthographic", resolution=(size, size), pixel_size_m=PIXEL_M)
+    layers = {"normal": surface.normal.astype(np.float32), "diffuse_albedo": ALBEDO * full, "specular": F0 * full,
+              "roughness": ROUGHNESS * full[..., 0], "height": surface.height.astype(np.float32), "confidence": full[..., 0], **changes}
+    SurfaceMaps(camera=camera, mask=surface.mask, **layers).write(folder / MAPS_FILE)
+    return folder
+
+
+def lat_long(rows: int) -> tuple[np.ndarray, np.ndarray]:
+    """[rows, 2 rows, 3] directions and [rows, 1] solid angles of texels, as of the contract."""
+    v, u = (np.arange(rows) + 0.5) / rows * np.pi, (np.arange(2 * rows) + 0.5) / (2 * rows) * 2 * np.pi
+    sine = np.sin(v)[:, None]
+    directions = np.stack([np.sin(u) * sine, np.cos(v)[:, None] * np.ones(2 * rows), -np.cos(u) * sine], axis=-1)
+    return directions, sine * np.pi / rows * np.pi / rows

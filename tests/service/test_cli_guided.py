@@ -1,0 +1,97 @@
+"""relit relight --maps: guided by a model, nearer to the truth than the plain sum, and never away from it."""
+
+import numpy as np
+import pytest
+
+from stage import exr
+from tests.captures import write_exr
+from tests.glossy_captures import dome, lat_long, reflect, write_dome, write_maps
+
+SURFACE = dome()
+MIDDLE = np.array([0.35, 0.45, 0.82]) / np.linalg.norm([0.35, 0.45, 0.82])
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """Capture, maps, an environment with a small sun that is no captured light, and the dome under it by the twin."""
+    folder = tmp_path_factory.mktemp("guided")
+    write_dome(folder / "cap", SURFACE)
+    write_maps(folder / "maps", SURFACE)
+    directions, solid_angle = lat_long(48)
+    sky = np.where((directions @ MIDDLE > np.cos(np.radians(4.0)))[..., None], [60.0, 50.0, 40.0], 0.1)
+    write_exr(folder / "sky.exr", sky)
+    sky = sky.astype(np.float32).astype(np.float64)  # as the file has it
+    truth = np.zeros((*SURFACE.mask.shape, 3))
+    for row in range(len(sky)):
+        lit = reflect(SURFACE.normal[:, :, None], directions[row])  # [rows, cols, texels, 3]
+        truth += np.einsum("rctk,tk->rck", lit, sky[row] * solid_angle[row])
+    return folder, truth * SURFACE.mask[..., None]
+
+
+def rgb(path, layer=""):
+    channels, _ = exr.read(path)
+    return np.stack([channels[layer + c].astype(np.float64) for c in "RGB"], axis=-1)
+
+
+def rmse(ours, truth):
+    inside = SURFACE.mask
+    return np.sqrt(((ours - truth)[inside] ** 2).mean() / (truth[inside] ** 2).mean())
+
+
+def relight(relit, folder, out, *options):
+    outcome = relit("relight", folder / "cap", "--environment", folder / "sky.exr", "--out", out / "f.#.exr", *options)
+    assert (outcome.code, outcome.err) == (0, "")
+    return rgb(out / "f.1.exr")
+
+
+def test_true_maps_make_up_for_what_lies_between_lights(relit, scene, tmp_path):
+    """Plain weights are off by the spread of the sun over 30° between lights; what guided ones leave is the widening of the
+    lobe to what such lights can tell, and 1024 samples of the map."""
+    folder, truth = scene
+    plain = rmse(relight(relit, folder, tmp_path / "a", "--weights", "smooth"), truth)
+    cells = rmse(relight(relit, folder, tmp_path / "b"), truth)
+    guided = rmse(relight(relit, folder, tmp_path / "c", "--maps", folder / "maps"), truth)
+    assert guided < 0.5 * min(plain, cells)
+
+
+@pytest.mark.parametrize("wrong", ["normals", "gloss"])
+def test_wrong_maps_do_no_harm(relit, scene, tmp_path, wrong):
+    """Normals turned away, or a bright narrow lobe that no light saw: β and the widest lobe keep the result near the plain sum's."""
+    folder, truth = scene
+    if wrong == "normals":
+        turned = SURFACE.normal[:, :, [1, 0, 2]] * (-1, 1, 1)
+        maps = write_maps(tmp_path / "maps", SURFACE, normal=turned.astype(np.float32))
+    else:
+        shape = SURFACE.mask.shape
+        maps = write_maps(tmp_path / "maps", SURFACE, specular=np.full((*shape, 3), 0.9), roughness=np.full(shape, 0.12))
+    plain = rmse(relight(relit, folder, tmp_path / "a", "--weights", "smooth"), truth)
+    guided = rmse(relight(relit, folder, tmp_path / "b", "--maps", maps), truth)
+    assert guided < 1.1 * plain
+
+
+def test_diffuse_and_specular_add_up_to_the_beauty(relit, scene, tmp_path):
+    """To the rounding of three half values; and the specular layer is that of the twin, widened as guided lobes are."""
+    folder, truth = scene
+    beauty = relight(relit, folder, tmp_path, "--maps", folder / "maps", "--aov", "diffuse,specular,normal,mask,confidence")
+    diffuse, specular = (rgb(tmp_path / "f.1.exr", layer) for layer in ("diffuse.", "specular."))
+    np.testing.assert_allclose(diffuse + specular, beauty, rtol=2e-3, atol=1e-6)
+    assert (specular >= 0).all() and (specular <= beauty * 1.001).all() and specular[SURFACE.mask].min() > 0
+    assert specular[SURFACE.mask].mean() < 0.5 * truth[SURFACE.mask].mean()
+
+
+def test_guided_frames_are_known_again(relit, scene, tmp_path):
+    folder, _ = scene
+    relight(relit, folder, tmp_path, "--maps", folder / "maps")
+    again = "relight", folder / "cap", "--environment", folder / "sky.exr", "--out", tmp_path / "f.#.exr"
+    assert "skipped  1 of 1" in relit(*again, "--maps", folder / "maps").out
+    assert "skipped" not in relit(*again, "--weights", "smooth").out
+
+
+def test_bad_maps_are_a_sentence(relit, scene, tmp_path):
+    folder, _ = scene
+    for name, changes, words in (("height", {"height": None}, "has no layer height"),
+                                 ("space", {"color_space": "lin_ap1_scene"}, "solve it again")):
+        maps = write_maps(tmp_path / name, SURFACE, **changes)
+        outcome = relit("relight", folder / "cap", "--environment", folder / "sky.exr", "--out", tmp_path / "f.#.exr", "--maps", maps)
+        assert outcome.code == 2 and outcome.err.count("\n") == 1 and words in outcome.err and str(maps) in outcome.err
+        assert not (tmp_path / "f.1.exr").exists()
