@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import service
 from service.errors import RequestError
+from service.methods import LightWeights
 from service.pipelines.export import export
 from service.pipelines.preview import write_preview
 from service.pipelines.relight import relight
@@ -56,7 +57,8 @@ def demo(out: Path, *, device: str | None = None, progress: Progress | None = No
     solved = solve(SolveRequest(capture=sample, out=out, device=device, cache=cache), progress)
     asset = export(ExportRequest(maps=out, out=out / "asset.usdz"), progress)
     relit = relight(RelightRequest(capture=sample, environment=sample / "environment.exr", out=str(out / "frame.####.exr"),
-                                   frames=FRAMES, spin_degrees=360.0, device=device, cache=cache), progress)
+                                   frames=FRAMES, spin_degrees=360.0, weights=LightWeights.SMOOTH, device=device,
+                                   cache=cache), progress)
     timings = Timings(progress)
     timings.stage("preview", 1)
     preview = out / "preview.png"
