@@ -22,6 +22,7 @@ from benchmarks.large import large_rows, measure
 from benchmarks.materials import material_table
 from benchmarks.relighting import relighting_table
 from benchmarks.search_speed import search_rows
+from benchmarks.spin import spin_table
 from service.methods import Method
 from service.pipelines.bench import bench
 from service.pipelines.solve import solve
@@ -102,6 +103,11 @@ def relighting(given: argparse.Namespace) -> list[str]:
     return relighting_table(given.relighting)
 
 
+def spin(_: argparse.Namespace) -> list[str]:
+    """Where the time of a frame range goes."""
+    return spin_table()
+
+
 def speed(_: argparse.Namespace) -> list[str]:
     """The table of `relit bench`, and the general solver against NumPy."""
     return [*bench(None, 9), "", *search_rows()]
@@ -133,6 +139,7 @@ SECTIONS: dict[str, tuple[str, Section]] = {
     "materials": ("What sharing materials buys", materials),
     "ablation": ("What each part of `svbrdf` buys", ablation),
     "relighting": ("Relighting", relighting),
+    "spin": ("A spin of 240 frames", spin),
     "speed": ("Speed", speed),
     "demo": ("The demo", demo),
     "memory": ("Memory", memory),

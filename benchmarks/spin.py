@@ -1,0 +1,42 @@
+"""A turn of the environment in 240 frames of the shipped sample: where the time goes, from captured files to relit ones."""
+
+import json
+import tempfile
+import time
+from pathlib import Path
+
+from benchmarks.accuracy import SAMPLES
+from service.methods import FrameCompression, LightWeights, Method
+from service.pipelines.relight import relight
+from service.pipelines.solve import solve
+from service.requests import RelightRequest, SolveRequest
+
+FRAMES = 240
+PARTS = ("ingest", "guide", "weights", "product", "waiting for files")
+
+
+def spin_table() -> list[str]:
+    """Lines of Markdown."""
+    lines = [f"`samples/owl`, {FRAMES} frames, 320 × 320, 96 lights, from EXR to half EXR; seconds. Files are written on threads beside "
+             "the rest; `waiting` is what of that is left.", "",
+             "| | decode and stack | guide | weights | product | waiting | whole | MB |", "|---|---|---|---|---|---|---|---|"]
+    sample = SAMPLES / "owl"
+    with tempfile.TemporaryDirectory() as folder:
+        work = Path(folder)
+        solve(SolveRequest(capture=sample, out=work / "maps", method=Method.SVBRDF, cache=work / "solve"))
+        relight(RelightRequest(capture=sample, environment=sample / "environment.exr", out=str(work / "warm.#.exr"), cache=work / "solve",
+                               maps=work / "maps"))
+        for title, weights, compression, maps in (("cells, zip", LightWeights.CELLS, FrameCompression.ZIP, None),
+                                                  ("smooth, zip", LightWeights.SMOOTH, FrameCompression.ZIP, None),
+                                                  ("smooth, dwaa", LightWeights.SMOOTH, FrameCompression.DWAA, None),
+                                                  ("guided, zip", None, FrameCompression.ZIP, work / "maps")):
+            out, cache = work / title.replace(", ", "-"), work / f"cache-{title}"
+            began = time.perf_counter()
+            result = relight(RelightRequest(
+                capture=sample, environment=sample / "environment.exr", out=str(out / "f.####.exr"), frames=f"1-{FRAMES}",
+                spin_degrees=360, weights=weights, compression=compression, maps=maps, cache=cache, report=out / "report.json"))
+            whole = time.perf_counter() - began
+            parts = json.loads((out / "report.json").read_text())["timings_s"]["of these"]
+            size = sum(path.stat().st_size for path in result.frames) / 1e6
+            lines.append(f"| {title} | " + " | ".join(f"{parts.get(part, 0):.2f}" for part in PARTS) + f" | {whole:.1f} | {size:.0f} |")
+    return lines
