@@ -143,17 +143,21 @@ def lobes(pack: int) -> Any:
                 ty[k] = place[1]
                 tz[k] = place[2]
                 arriving[k] = 1.0
-        for k in range(pack):
-            nl = nx[k] * tx[k] + ny[k] * ty[k] + nz[k] * tz[k]
+        for k in range(pack):  # no choices: the compiler makes them of whole packs
+            nl = wp.max(nx[k] * tx[k] + ny[k] * ty[k] + nz[k] * tz[k], 0.0)
             hx, hy, hz = tx[k] + vx[k], ty[k] + vy[k], tz[k] + vz[k]
-            half = 1.0 / wp.sqrt(wp.max(hx * hx + hy * hy + hz * hz, 1.0e-12))
-            nh = wp.min((nx[k] * hx + ny[k] * hy + nz[k] * hz) * half, 1.0)
+            half = 1.0 / wp.sqrt(hx * hx + hy * hy + hz * hz + 1.0e-12)
+            nh = (nx[k] * hx + ny[k] * hy + nz[k] * hz) * half
             hv = (hx * vx[k] + hy * vy[k] + hz * vz[k]) * half
             nv = wp.max(nx[k] * vx[k] + ny[k] * vy[k] + nz[k] * vz[k], LEAST_FACING)
-            clipped = wp.max(rough[k], LEAST_ROUGHNESS)
-            facing[k] = wp.max(nl, 0.0)
-            shine[k] = wp.where(rough[k] > 0.0, ggx(nl, nv, nh, clipped * clipped), 0.0)
-            rise[k] = schlick(hv)
+            a = wp.max(rough[k], LEAST_ROUGHNESS)
+            a2 = a * a * a * a
+            spread = nh * nh * (a2 - 1.0) + 1.0
+            masking = nl * wp.sqrt(nv * nv * (1.0 - a2) + a2) + nv * wp.sqrt(nl * nl * (1.0 - a2) + a2)
+            facing[k] = nl
+            shine[k] = wp.min(rough[k] * 1.0e6, 1.0) * 0.5 * INVERSE_PI * a2 * nl / (spread * spread * masking)
+            u = wp.max(1.0 - hv, 0.0)
+            rise[k] = u * u * u * u * u
         return facing, shine, rise, arriving
 
     return evaluate

@@ -74,11 +74,11 @@ def test_far_light_throws_a_shadow_of_its_slope(tangent, pixel, device):
     assert not dark[0, :, BLOCK[1].stop :].any() and not dark[1, :, : BLOCK[1].start].any() and dark[1].any()
 
 
-@pytest.mark.parametrize("over", [5.0, 15.0, 40.0])
+@pytest.mark.parametrize("x, over", [(12.0, 5.0), (12.0, 15.0), (30.0, 25.0), (70.0, 70.0)])
 @pytest.mark.parametrize("pixel", [1.0, 0.001])
-def test_near_light_throws_a_shadow_from_its_place(over, pixel, device):
+def test_near_light_throws_a_shadow_from_its_place(x, over, pixel, device):
     """From x over z across the block's upper edge down to the floor: as far again beyond the edge as h / (z - h) of the way to it."""
-    x, z = 12.0, HEIGHT + over  # over the block's middle column, 4 from its edge
+    z = HEIGHT + over
     see, _ = seen([[x * pixel, 0, z * pixel, 1.0]], ALL, block(pixel=pixel), flat(pixel), device)
     least, most = bounds(lambda edge, top: EDGE - edge + (x - edge) * top / (z - top))
     assert least <= dark_left(see[0]) <= most
@@ -109,6 +109,21 @@ def test_perspective_near_light(device):
 
     least, most = bounds(length)
     assert least <= dark_left(see[0]) <= most
+
+
+@pytest.mark.parametrize("perspective", [False, True])
+def test_a_mirrored_scene_has_a_mirrored_shadow(perspective, device):
+    """Left for right and top for bottom: pixels look from their centres. But for rounding where way and surface just meet."""
+    base = -60.0 if perspective else 0.0
+    projection = Projection(True, wp.vec2(60, 60), wp.vec2(SIDE / 2, SIDE / 2)) if perspective else flat()
+    height = block(base=base)
+    height[8:14, 10:50] += 6
+    places = np.random.default_rng(0).uniform([-25, -25, base + 8, 1], [25, 25, base + 20, 1], (40, 4))
+    expected = seen(places, ALL, height, projection, device)[0].reshape(-1, SIDE, SIDE)
+    for axis, mirror in ((2, [-1, 1, 1, 1]), (1, [1, -1, 1, 1])):
+        got, _ = seen(places * mirror, ALL, np.flip(height, axis - 1).copy(), projection, device)
+        assert (np.flip(got.reshape(-1, SIDE, SIDE), axis) != expected).sum() <= 4
+    assert 0.02 < np.mean(~expected) < 0.5
 
 
 @pytest.mark.parametrize("perspective", [False, True])

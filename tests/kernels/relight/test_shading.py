@@ -8,6 +8,7 @@ from kernels.relight import shading, sources
 from tests.kernels.relight.lights import scattered, turn
 from tests.kernels.relight.surfaces import FLOAT, LOBE, facing, pack_bytes, radiance, scattered_pixels, upload
 from tests.reference import shading as reference
+from tests.reference.microfacet import distribution, smith_lambda
 
 
 def lights(kind, seed=0):
@@ -93,13 +94,22 @@ def test_a_mirror_direction_peaks_as_the_distribution_says(device):
     np.testing.assert_allclose(got[3:, 0], 2 * np.array([0.04, 0.5, 1]) / (4 * np.pi * 0.5**4), rtol=LOBE)
 
 
-def test_normals_that_look_away_from_the_viewer_stay_finite(device):
+def test_normals_that_look_away_from_the_viewer_count_as_grazing(device):
+    """Smith's masking and 1 / n·v of the least cosine; the rest as it is."""
     pixels = scattered_pixels(40)
     turned = np.cross(pixels.view, [0.0, 1, 0]) - 0.05 * pixels.view
     pixels = pixels._replace(normal=(turned / np.linalg.norm(turned, axis=1, keepdims=True)).astype(np.float32))
-    given = lights("far")._replace(energy=np.ones((20, 3), np.float32))
-    got = radiance(pixels, given, device)
-    assert np.isfinite(got).all() and got.min() >= 0 and got[3:].max() > 0
+    given = sources.far(np.array([[-0.6, 0, 0.8]]), np.ones((1, 3)))
+    got = radiance(pixels, given, device)[3:].T
+    pixels, direction = pixels.double(), given.place[0, :3].astype(float)
+    half = (direction + pixels.view) / np.linalg.norm(direction + pixels.view, axis=1, keepdims=True)
+    nl, nh, hv = pixels.normal @ direction, (pixels.normal * half).sum(axis=1), (pixels.view * half).sum(axis=1)
+    lit, alpha = nl > 0.1, pixels.roughness**2
+    masking = 1 / (1 + smith_lambda(np.where(lit, nl, 1), alpha) + smith_lambda(shading.LEAST_FACING, alpha))
+    fresnel = pixels.f0 + (1 - pixels.f0) * (1 - hv)[:, None] ** 5
+    expected = (distribution(nh, alpha) * masking / (4 * shading.LEAST_FACING))[:, None] * fresnel
+    assert lit.sum() > 10
+    np.testing.assert_allclose(got[lit], expected[lit], rtol=2 * LOBE)
 
 
 def test_behind_its_back_a_narrow_point_sends_nothing(device):
