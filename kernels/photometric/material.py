@@ -4,9 +4,10 @@ For each roughness the readings of a channel are linear in albedo ρ and F0: y =
 diffuse lobe, f_s the GGX lobe without Fresnel and s Schlick's rise; both are fitted by re-weighted non-negative least squares.
 The roughness of least cost is taken from a grid and halved steps about its best.
 
-Highlights of dielectrics have the colour of the light, so the three channels share one F0 unless that costs clearly more, as on
-coloured metals. Pixels that saw no highlight cannot tell F0 from roughness: they take the materials that the object's pixels share
-(`shared_materials`), in the mixture that explains them, wherever that explains them about as well as a material of their own.
+Highlights of dielectrics have the colour of the light, so the three channels share one F0, as low as that of dielectrics is, unless
+that costs clearly more and the surface is a metal, without diffuse reflection. Pixels that saw no highlight cannot tell F0 from
+roughness: they take the materials that the object's pixels share (`shared_materials`), in the mixture that explains them, wherever that
+explains them about as well as a material of their own.
 """
 
 import math
@@ -28,6 +29,11 @@ from kernels.photometric.tabulated_lobes import tabulated_reflectance
 NEUTRAL_RISE = 1.25
 """A shared F0 of the channels may cost this much more than one each: coloured metals rise at least 1.3 fold and mostly several fold,
 dielectrics hardly at all (95 % of their pixels below 1.1)."""
+BRIGHTEST_DIELECTRIC = 0.2
+"""F0 of diamond is 0.17, and no coat is brighter: what shines more is a metal."""
+METAL_DIFFUSE = 0.25
+"""Metals have no diffuse reflection; dirt and light from around may look like this part of their F0. With more of it, a bright lobe
+stands for what the diffuse one misses, at the rim above all."""
 SHARED_RISE = 1.4
 """A material shared with other pixels may cost this much more than one of a pixel's own."""
 COST_FLOOR = 0.005
@@ -69,8 +75,12 @@ def fit_material(samples: Samples, normal: np.ndarray, *, shape: Diffuse, option
     """
     options = options or SearchOptions()
     tinted = _fit(samples, normal, shape, options, table, TINTED)
-    neutral = _fit(samples, normal, shape, options, table, NEUTRAL)
-    own = _where(neutral.cost <= NEUTRAL_RISE * tinted.cost + COST_FLOOR, neutral, tinted)
+    bound = BRIGHTEST_DIELECTRIC if table is None else 1.0  # extended lights show the whole of a lobe: nothing is left to guess
+    neutral = _fit(samples, normal, shape, options, table, NEUTRAL, np.full(4, bound))
+    metal = neutral.cost > NEUTRAL_RISE * tinted.cost + COST_FLOOR
+    if table is None:
+        metal &= tinted.diffuse_albedo.mean(axis=1) < METAL_DIFFUSE * tinted.specular.mean(axis=1)
+    own = _where(metal, tinted, neutral)
     if shared is None or not len(shared):
         return own
     blend = _blend([fit_given(samples, normal, material, shape=shape, options=options) for material in shared])

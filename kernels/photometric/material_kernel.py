@@ -23,7 +23,7 @@ COMMON_ROUNDS = 3
 TINTED = wp.constant(0)
 """Of the specular lobe are free: F0 of each channel, and roughness. Metals."""
 NEUTRAL = wp.constant(1)
-"""One F0, and roughness: dielectrics, whose highlights have the colour of the light."""
+"""One F0 up to a bound, and roughness: dielectrics, whose highlights have the colour of the light."""
 GIVEN = wp.constant(2)
 """Nothing: F0 and roughness are given, and albedo alone is fitted."""
 
@@ -55,7 +55,7 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
                    shadow: wp.vec2,  # r²/σ² of equal cost, depth
                    form: wp.vec2,  # diffuse roughness, slope
                    freedom: int,
-                   known: wp.vec4,  # F0 and roughness, where they are given
+                   known: wp.vec4,  # F0 and roughness, where they are given; else the bound of a common F0, last
                    light_count: int,
                    pack_stride: int,
                    light_stride: int,
@@ -149,7 +149,7 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
                                 top += rs[c, k] - shared * rd[c, k]
                                 bottom += ss[c, k] - shared * ds[c, k]
                                 whole += ss[c, k]
-                            common = wp.where(bottom > 1.0e-6 * whole, wp.clamp(top / wp.max(bottom, 1.0e-20), 0.0, 1.0), 0.0)
+                            common = wp.where(bottom > 1.0e-6 * whole, wp.clamp(top / wp.max(bottom, 1.0e-20), 0.0, known[3]), 0.0)
                         for c in range(3):
                             shine = wp.where(freedom == NEUTRAL, common, known[c])
                             f0[c, k] = shine

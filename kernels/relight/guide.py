@@ -20,6 +20,8 @@ from kernels.microfacet import INVERSE_PI
 from kernels.packs import Band, as_packs, pack_type
 from kernels.relight.shading import Surface, lobes
 
+POOL = 2
+"""Neighbours on each side whose sums count too."""
 LEAST_ALPHA = 0.3
 """Width α of the narrowest lobe, of the angle between neighbouring lights: α is about half a lobe's width at half its height, and between
 two lights the half vector moves by half of what they are apart (docs/figures.md)."""
@@ -46,9 +48,9 @@ def seen_lobes(specular: np.ndarray, roughness: np.ndarray, direction: np.ndarra
     return specular * ((alpha / wider) ** 2)[..., None], np.where(alpha > 0, np.sqrt(wider), 0)
 
 
-def trust_model(band: Band, surface: Surface, visible: wp.array, direction: np.ndarray, irradiance: np.ndarray, scale: np.ndarray,
+def compare_model(band: Band, surface: Surface, visible: wp.array, direction: np.ndarray, irradiance: np.ndarray, scale: np.ndarray,
                 neighbours: np.ndarray, shares: np.ndarray) -> wp.array:
-    """Fit β.
+    """Compare what the model says with what the captured images say.
 
     Args:
         band: captured images of the same pixels as the surface.
@@ -60,7 +62,7 @@ def trust_model(band: Band, surface: Surface, visible: wp.array, direction: np.n
         neighbours, shares: [lights, 3] of around.left_out.
 
     Returns:
-        [pixels padded] float32 on the device, 0…1.
+        [2, pixels padded] float32 on the device: Σ over lights and channels of missing · told, and of told².
 
     Raises:
         ArrayError: shapes that do not fit.
@@ -75,23 +77,45 @@ def trust_model(band: Band, surface: Surface, visible: wp.array, direction: np.n
     pack = devices.pack_width(device)
     factor = np.divide(scale[:count, None], irradiance, out=np.zeros((count, 3)), where=irradiance > 0)
     place = np.concatenate([direction, np.zeros((count, 1))], axis=1)
-    trust = wp.empty(surface.packs * pack, dtype=wp.float32, device=device)
-    devices.launch(_trust_kernel(pack), surface.packs,
+    sums = wp.empty((2, surface.packs * pack), dtype=wp.float32, device=device)
+    devices.launch(_compare_kernel(pack), surface.packs,
                    [band.values, band.light_count, surface.values, visible,
                     wp.array(place.astype(np.float32), dtype=wp.vec4, device=device),
                     wp.array(factor.astype(np.float32), dtype=wp.vec3, device=device),
                     wp.array(np.ascontiguousarray(neighbours), dtype=wp.vec3i, device=device),
-                    wp.array(np.ascontiguousarray(shares), dtype=wp.vec3, device=device)], [as_packs(trust, device)], device=device)
-    return trust
+                    wp.array(np.ascontiguousarray(shares), dtype=wp.vec3, device=device)], [as_packs(sums, device)], device=device)
+    return sums
+
+
+def fit_trust(sums: np.ndarray, pixels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """β from the sums of each pixel and of its neighbours: a pixel's own lights are few, and what is wrong about a model is wrong around.
+
+    Args:
+        sums: [2, n] of compare_model.
+        pixels: [n] row-major positions in the image.
+        shape: (rows, cols) of the image.
+
+    Returns:
+        [n] float32, 0…1; 0 where the model says nothing.
+    """
+    rows, cols = np.divmod(pixels, shape[1])
+    pooled = []
+    for plane in sums:
+        table = np.zeros((shape[0] + 2 * POOL, shape[1] + 2 * POOL))
+        table[rows + POOL, cols + POOL] = plane
+        across = sum(table[:, k : k + shape[1]] for k in range(2 * POOL + 1))  # no running sums: they keep what is bright or no number
+        pooled.append(sum(across[k : k + shape[0]] for k in range(2 * POOL + 1))[rows, cols])
+    top, bottom = pooled
+    return np.clip(np.divide(top, bottom, out=np.zeros(len(pixels)), where=bottom > 1e-12), 0, 1).astype(np.float32)
 
 
 @cache
-def _trust_kernel(pack: int) -> Any:
+def _compare_kernel(pack: int) -> Any:
     lane_type, half_pack, byte_pack = (pack_type(pack, dtype) for dtype in (wp.float32, wp.float16, wp.uint8))
     evaluate = lobes(pack)
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
-    def trust_kernel(first: int,
+    def compare_kernel(first: int,
                      captured: wp.array2d(dtype=half_pack),  # [3 · lights padded, P]
                      padded: int,  # lights
                      values: wp.array2d(dtype=lane_type),  # [16, P]
@@ -101,7 +125,7 @@ def _trust_kernel(pack: int) -> Any:
                      neighbours: wp.array(dtype=wp.vec3i),  # [lights]
                      shares: wp.array(dtype=wp.vec3),  # [lights]
                      # outputs
-                     trust: wp.array(dtype=lane_type)):  # [P]
+                     sums: wp.array2d(dtype=lane_type)):  # [2, P]
         p = first + wp.tid()
         albedo_r, albedo_g, albedo_b = values[3, p], values[4, p], values[5, p]
         f0_r, f0_g, f0_b = values[6, p], values[7, p], values[8, p]
@@ -132,9 +156,7 @@ def _trust_kernel(pack: int) -> Any:
                 for k in range(pack):
                     top[k] += missing_r[k] * told_r[k] + missing_g[k] * told_g[k] + missing_b[k] * told_b[k]
                     bottom[k] += told_r[k] * told_r[k] + told_g[k] * told_g[k] + told_b[k] * told_b[k]
-        out = lane_type()
-        for k in range(pack):
-            out[k] = wp.where(bottom[k] > 0.0, wp.clamp(top[k] / wp.max(bottom[k], 1.0e-30), 0.0, 1.0), 0.0)
-        trust[p] = out
+        sums[0, p] = top
+        sums[1, p] = bottom
 
-    return trust_kernel
+    return compare_kernel

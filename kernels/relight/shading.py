@@ -12,7 +12,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
-from kernels.microfacet import INVERSE_PI, ggx, schlick
+from kernels.microfacet import INVERSE_PI
 from kernels.packs import as_packs, pack_type
 from kernels.relight.sources import Sources
 
@@ -147,7 +147,7 @@ def lobes(pack: int) -> Any:
             nl = wp.max(nx[k] * tx[k] + ny[k] * ty[k] + nz[k] * tz[k], 0.0)
             hx, hy, hz = tx[k] + vx[k], ty[k] + vy[k], tz[k] + vz[k]
             half = 1.0 / wp.sqrt(hx * hx + hy * hy + hz * hz + 1.0e-12)
-            nh = (nx[k] * hx + ny[k] * hy + nz[k] * hz) * half
+            nh = wp.min((nx[k] * hx + ny[k] * hy + nz[k] * hz) * half, 1.0)  # normals rounded to half may be longer: a pole
             hv = (hx * vx[k] + hy * vy[k] + hz * vz[k]) * half
             nv = wp.max(nx[k] * vx[k] + ny[k] * vy[k] + nz[k] * vz[k], LEAST_FACING)
             a = wp.max(rough[k], LEAST_ROUGHNESS)

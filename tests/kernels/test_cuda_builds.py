@@ -10,6 +10,10 @@ from kernels import device as devices
 from kernels.device import PACK_CUDA
 from kernels.photometric import albedo, gradient, highlight, lambert, moments, near, readings, robust, separation
 from kernels.relight import basis, batch, cells, combine, display, guide, near_sum, occlusion, residual, shading, smooth
+from kernels.structured import binary, kary, micro, modulated, phase, ramp
+from kernels.structured import separation as light_parts
+from kernels.structured import unwrap as wraps
+from kernels.tof import bilateral, continuous, flying, pileup, returns, unwrap, wiggling
 
 devices.names()
 OLDEST = min(wp.get_cuda_supported_archs(), default=None)
@@ -23,7 +27,16 @@ OLDEST = min(wp.get_cuda_supported_archs(), default=None)
                                     (lambert._lambert_kernel, robust._robust_kernel, albedo._albedo_kernel)),
                                   combine.register_kernel, batch.register_kernel, cells._nearest_kernel,
                                   basis.gram_kernel, display.encode_kernel, residual.residual_kernel, shading._shade_kernel,
-                                  guide._trust_kernel, near_sum._sum_kernel, occlusion._see_kernel,
+                                  guide._compare_kernel, near_sum._sum_kernel, occlusion._see_kernel,
+                                  continuous.decode_kernel, unwrap.unwrap_kernel, unwrap.vote_kernel, unwrap.decide_kernel,
+                                  wiggling.straighten_kernel, flying.flying_kernel, bilateral.smooth_kernel, bilateral.frame_kernel, pileup.coates_kernel,
+                                  returns.returns_kernel,
+                                  *(partial(binary._stripe_kernel, code=code) for code in ("binary", "gray", "xor")),
+                                  partial(binary._stripe_kernel, inverses=False), partial(binary._stripe_kernel, references=False),
+                                  kary._kary_kernel, partial(kary._kary_kernel, channels=3), ramp._ramp_kernel,
+                                  partial(ramp._ramp_kernel, pair=False), phase._phase_kernel, partial(phase._phase_kernel, ambient=True),
+                                  wraps._joint_kernel, wraps._numbered_kernel, micro._micro_kernel, modulated._modulated_kernel,
+                                  light_parts._extremes_kernel, light_parts._swing_kernel,
                                   lambda pack: smooth._walk_kernel(),
                                   lambda pack: near_sum._weights_kernel()])
 def test_kernel_compiles_for_cuda_and_keeps_its_packs_in_registers(make, tmp_path):

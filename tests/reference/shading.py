@@ -77,8 +77,11 @@ def trust(images, model, neighbours, shares):
     """β [P]: the least-squares factor, held between 0 and 1, of what images [lights, 3, P] of readings miss when each is predicted by its
     neighbours, on what the model's images say is missing; lights without shares are left out. With it both, [lights, 3, P]."""
     def lacking(stack):
-        return np.stack([stack[l] - sum(shares[l][k] * stack[neighbours[l][k]] for k in range(3)) if sum(shares[l]) > 0 else 0 * stack[l]
-                         for l in range(len(stack))])
+        misses = np.zeros(stack.shape)
+        for light, (near, share) in enumerate(zip(neighbours, shares, strict=True)):
+            if sum(share) > 0:
+                misses[light] = stack[light] - sum(float(part) * stack[other] for part, other in zip(share, near, strict=True))
+        return misses
 
     missing, told = lacking(images), lacking(model)
     return np.clip((missing * told).sum(axis=(0, 1)) / (told**2).sum(axis=(0, 1)), 0, 1), missing, told
@@ -97,7 +100,8 @@ def shares_around(lights, direction):
 
 
 def sum_near(images, pixels, sources, lights):
-    """[3, P] of images [lights, 3, P] of readings, each pixel's weighted by its own shares of what arrives; and those weights, [lights, 3, P]."""
+    """[3, P] of images [lights, 3, P] of readings, each pixel's weighted by its own shares of what arrives; and those weights,
+    [lights, 3, P]."""
     position = np.asarray(pixels.position, dtype=np.float64)
     weights = np.zeros(images.shape)
     for place, energy, axis in zip(*(np.asarray(plane, dtype=np.float64) for plane in sources[:3]), strict=True):

@@ -14,7 +14,7 @@ import warp as wp
 
 from kernels import packs
 from kernels.relight.around import left_out
-from kernels.relight.guide import seen_lobes, trust_model
+from kernels.relight.guide import compare_model, fit_trust, seen_lobes
 from kernels.relight.near_sum import sum_near
 from kernels.relight.shading import shade
 from service.pipelines.near_light import NearLight, near_lights
@@ -53,20 +53,20 @@ class Guide:
         self._place = np.concatenate([lights.direction, np.zeros((len(lights.direction), 1))], axis=1)
         self._keep = len(self._place) * len(model.pixels) <= KEPT_BYTES
         self._seen: dict[int, wp.array] = {}
-        self.trust = np.zeros(len(model.pixels), dtype=np.float32)
-        """[n] β of the model's pixels, 0…1."""
         neighbours, shares = left_out(lights.direction)
         if progress is not None:
             progress.stage("guide", len(model.pixels))
-        done = 0
+        sums, done = np.zeros((2, len(model.pixels)), dtype=np.float32), 0
         for batch in model.batches():
             band = packs.upload(*stack.pick(batch.pixels), device=model.device)
-            trust = trust_model(band, batch.surface, self._visible(batch), lights.direction, lights.irradiance, stack.scale, neighbours,
-                                shares)
-            self.trust[done : done + len(batch.pixels)] = trust.numpy()[: len(batch.pixels)]
+            compared = compare_model(band, batch.surface, self._visible(batch), lights.direction, lights.irradiance, stack.scale,
+                                     neighbours, shares)
+            sums[:, done : done + len(batch.pixels)] = compared.numpy()[:, : len(batch.pixels)]
             done += len(batch.pixels)
             if progress is not None:
                 progress.advance(done)
+        self.trust = fit_trust(sums, model.pixels, model.maps.mask.shape)
+        """[n] β of the model's pixels, 0…1."""
 
     def correct(self, frames: np.ndarray, lighting: Sequence[FrameLighting], weights: np.ndarray, *,
                 specular: bool) -> np.ndarray | None:

@@ -12,7 +12,7 @@ from tests.reference.shading import Pixels
 FLOAT = 2.0**-24
 """Largest relative error of one float32 operation."""
 ROUGHEST, SMOOTHEST = 0.9, 0.3
-"""Of scattered pixels. GGX's a² (n·h)² + 1 - (n·h)² is off by some 4 FLOAT and at least a² = 0.3⁴: values are off by twice 4 FLOAT / 0.3⁴."""
+"""Of scattered pixels. GGX's α² (n·h)² + 1 - (n·h)² is off by some 4 FLOAT and at least α² = 0.3⁴: values by twice 4 FLOAT / 0.3⁴."""
 LOBE = 1e-4
 """That, relative."""
 

@@ -13,7 +13,6 @@ from tests.kernels.scenes import cap
 from tests.reference.shading import shares_around
 
 
-
 def geodesic():
     """The corners of an icosahedron and the middles of its edges."""
     corners = icosahedron()

@@ -83,8 +83,8 @@ def test_a_sun_in_a_sky_is_cut_out_of_it():
 
 
 def test_what_is_dim_is_cut_too():
-    """A half of a millionth of the other's radiance counts as 1/8 of all to the other's 9/8. Cuts even out that density times the fourth power
-    of the side: sides are 9^¼ apart and numbers as 1 to 3, 50 of 200; boxes are halved, so that either may be off by a good part."""
+    """A half of a millionth of the other's radiance counts as 1/8 of all to the other's 9/8. Cuts even out that density times the fourth
+    power of the side: sides are 9^¼ apart and numbers as 1 to 3, 50 of 200; boxes are halved, so that either may be off by a good part."""
     environment = np.ones((64, 128, 3))
     environment[:, :64] = 1e-6
     got = sample_environment(environment, 200)
@@ -119,14 +119,15 @@ def test_a_white_map_lights_a_matt_pixel_by_its_albedo(rows, device):
 
 
 def test_samples_light_a_pixel_as_the_map_does(device):
-    """Of every colour and any orientation. Tolerance: as of a white map."""
+    """Of every colour and any orientation. Tolerance: the three colours of a box share one direction, some 0.03 radians from that of each,
+    and errors of so uneven a map's few hundred bright boxes add up as their root: 0.03 / √100, 0.3 %; twice that."""
     environment = noise(48, 96)
     got = sample_environment(environment)
     given = sources.far(got.direction, got.energy)
     directions, amount = texel_directions(48, 96).reshape(-1, 3), (environment * texel_solid_angles(48, 96)[..., None]).reshape(-1, 3)
     for normal in cap(12, 180):
         lit = radiance(facing(1, normal=normal), given, device)[:3, 0]
-        np.testing.assert_allclose(lit, np.maximum(directions @ normal, 0) @ amount / np.pi, rtol=1.5e-3)
+        np.testing.assert_allclose(lit, np.maximum(directions @ normal, 0) @ amount / np.pi, rtol=6e-3)
 
 
 def test_turning_the_map_by_columns_turns_the_samples():

@@ -6,7 +6,7 @@ import pytest
 from kernels import packs
 from kernels.errors import ArrayError
 from kernels.relight.around import left_out
-from kernels.relight.guide import LEAST_ALPHA, seen_lobes, trust_model
+from kernels.relight.guide import LEAST_ALPHA, POOL, compare_model, fit_trust, seen_lobes
 from tests.kernels.relight.lights import AXES, icosahedron
 from tests.kernels.relight.surfaces import LOBE, facing, pack_bytes, scattered_pixels, stored, upload
 from tests.kernels.scenes import HALF_ROUNDING, HALF_STEP, cap, colours, store
@@ -18,25 +18,31 @@ NEIGHBOURS, SHARES = left_out(LIGHTS)
 IRRADIANCE = 3 * colours(24, seed=4)
 
 
-def trusted(pixels, readings, device, *, visible=None, shares=SHARES):
-    """β [P] of trust_model, and the readings that its band holds."""
+def compared(pixels, readings, device, *, visible=None, shares=SHARES):
+    """[2, P] of compare_model, and the readings that its band holds."""
     stack, scale, held = stored(readings, IRRADIANCE)
     visible = np.full((len(LIGHTS), len(pixels.normal)), 255, np.uint8) if visible is None else visible
-    got = trust_model(packs.upload(stack, device=device), upload(pixels, device), pack_bytes(visible, device), LIGHTS, IRRADIANCE, scale,
-                      NEIGHBOURS, shares)
-    return got.numpy()[: len(pixels.normal)], held
+    got = compare_model(packs.upload(stack, device=device), upload(pixels, device), pack_bytes(visible, device), LIGHTS, IRRADIANCE, scale,
+                        NEIGHBOURS, shares)
+    return got.numpy()[:, : len(pixels.normal)], held
+
+
+def trusted(pixels, readings, device, *, visible=None, shares=SHARES):
+    """β [P] of pixels too far apart for one to count for another, and the readings that the band holds."""
+    sums, held = compared(pixels, readings, device, visible=visible, shares=shares)
+    count = len(pixels.normal)
+    return fit_trust(sums, np.arange(count) * (POOL + 1), (1, (POOL + 1) * count)), held
 
 
 def wobble(values, error, told, shares=SHARES):
-    """[P] how far β moves at most when values [lights, 3, P] are off by `error` of themselves: Σ |what is told| · |what is missing moves by| /
-    Σ told²."""
+    """[P] how far β moves at most when values [lights, 3, P] are off by `error` of themselves: Σ |told| · |misses move by| / Σ told²."""
     off = error * np.abs(values)
-    moved = np.stack([off[l] + sum(shares[l][k] * off[NEIGHBOURS[l][k]] for k in range(3)) for l in range(len(off))])
+    moved = off + sum(shares[:, k, None, None] * off[NEIGHBOURS[:, k]] for k in range(3))
     return (np.abs(told) * moved).sum(axis=(0, 1)) / (told**2).sum(axis=(0, 1))
 
 
 def rounded(readings, told, shares=SHARES):
-    """[P] how far half rounding moves β: a part of each reading, and a step below the normal range, of stored values a tenth of a reading."""
+    """[P] how far half rounding moves β: a part of each reading, and below the normal range a step of stored values a tenth of it."""
     return wobble(np.abs(readings) + 10 * HALF_STEP / HALF_ROUNDING, 1.01 * HALF_ROUNDING, told, shares)
 
 
@@ -73,6 +79,63 @@ def test_packs_of_four_are_packs_of_more(monkeypatch):
     assert close(got, held, model)
 
 
+def test_sums_are_the_twins(device):
+    """What neighbours are weighed by. Tolerance: float32 sums, and twice the lobes of the sum of squares."""
+    pixels = scattered_pixels(45)
+    model = reference.readings(pixels, LIGHTS)
+    (top, bottom), held = compared(pixels, 0.2 + 0.5 * model, device)
+    _, missing, told = reference.trust(held, model, NEIGHBOURS, SHARES)
+    allowed = 3 * wobble(model, LOBE, told) * (told**2).sum(axis=(0, 1))
+    assert (np.abs(bottom - (told**2).sum(axis=(0, 1))) <= allowed).all()
+    assert (np.abs(top - (missing * told).sum(axis=(0, 1))) <= allowed).all()
+
+
+def image(shape, seed=0, part=0.7):
+    """Sums [2, n] of scattered pixels of a picture, with model and images that differ."""
+    rng = np.random.default_rng(seed)
+    pixels = np.flatnonzero(rng.random(shape) < part)
+    bottom = rng.gamma(1, 1, len(pixels))
+    return np.stack([bottom * rng.normal(0.5, 0.7, len(pixels)), bottom]).astype(np.float32), pixels
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 40), (40, 1), (7, 3), (30, 41)])
+def test_pixels_pool_their_neighbourhood(shape):
+    """Sums over the pixels that are there, at most POOL rows and columns away, by all pairs."""
+    sums, pixels = image(shape, part=1.0 if max(shape) == 1 else 0.7)
+    rows, cols = np.divmod(pixels, shape[1])
+    near = (np.abs(rows[:, None] - rows) <= POOL) & (np.abs(cols[:, None] - cols) <= POOL)
+    top, bottom = (near @ plane.astype(float) for plane in sums)
+    got = fit_trust(sums, pixels, shape)
+    assert got.dtype == np.float32
+    np.testing.assert_allclose(got, np.clip(top / bottom, 0, 1), atol=1e-6)  # float32
+    assert max(shape) < 40 or ((got > 0).any() and (got < 1).any())
+
+
+def test_pixels_that_are_no_numbers_spoil_only_those_beside_them():
+    sums, pixels = image((30, 41))
+    bad = int(np.argmin(np.abs(pixels - (5 * 41 + 8))))
+    spoilt = sums.copy()
+    spoilt[0, bad] = np.nan
+    near = np.abs(np.array(np.divmod(pixels, 41)) - np.array(np.divmod(pixels[bad], 41))[:, None]).max(axis=0) <= POOL
+    np.testing.assert_array_equal(fit_trust(spoilt, pixels, (30, 41))[~near], fit_trust(sums, pixels, (30, 41))[~near])
+
+
+def test_dim_pixels_have_their_trust_beside_bright_ones():
+    """Twelve decades apart in what is told, six in radiance."""
+    pixels = np.array([3, 30 * 50 + 40])
+    got = fit_trust(np.array([[0.9e6, 0.25e-6], [1e6, 1e-6]], np.float32), pixels, (50, 50))
+    np.testing.assert_allclose(got, [0.9, 0.25], rtol=1e-6)  # float32
+
+
+def test_where_nothing_is_told_nothing_is_trusted():
+    """However much is told elsewhere."""
+    rng = np.random.default_rng(0)
+    bottom = np.zeros((40, 40))
+    bottom[:20] = rng.gamma(1, 1e5, (20, 40))
+    got = fit_trust(np.stack([bottom, bottom]).reshape(2, -1), np.arange(1600), (40, 40)).reshape(40, 40)
+    assert (got[: 20 + POOL] == 1).all() and (got[20 + POOL :] == 0).all()
+
+
 def test_images_that_are_the_model_are_trusted_whole(device):
     pixels = scattered_pixels(45)
     visible = np.random.default_rng(0).choice(np.array([0, 255], np.uint8), (len(LIGHTS), 45))
@@ -86,7 +149,7 @@ def test_images_that_are_the_model_are_trusted_whole(device):
 
 @pytest.mark.parametrize("part", [0.25, 0.5, 0.75])
 def test_images_of_a_smooth_part_and_a_part_of_the_model(part, device):
-    """What is the same under every light is predicted by its neighbours, and so misses nothing; what the model says is missing, is missing in
+    """What is the same under every light is predicted by its neighbours, and so misses nothing; what the model says is missing, is so in
     part."""
     pixels = scattered_pixels(45)
     model = reference.readings(pixels, LIGHTS)
@@ -115,8 +178,8 @@ def test_images_that_the_model_does_not_explain_are_not_guided(device):
 
 
 def test_noise_is_trusted_as_little_as_chance_has_it(device):
-    """β before it is held at none is normal around none, with a spread σ that follows from the shares: then half of the pixels have none, and
-    the mean is σ / √2π."""
+    """β before it is held at none is normal around none, with a spread σ that follows from the shares: then half of the pixels have none,
+    and the mean is σ / √2π."""
     count = 4000
     pixels = type(scattered_pixels(1))(*(np.repeat(plane, count, axis=0) for plane in scattered_pixels(1, seed=3)))
     one = reference.readings(type(pixels)(*(plane[:1] for plane in pixels)), LIGHTS)
@@ -152,7 +215,7 @@ def test_lights_without_shares_say_nothing(device):
     light = int(np.argmax(SHARES.sum(axis=1) * LIGHTS[:, 2]))
     shares = np.where(np.arange(len(LIGHTS))[:, None] == light, SHARES, 0).astype(np.float32)
     readings = 0.2 + 0.5 * model
-    readings[[l for l in range(len(LIGHTS)) if l not in (light, *NEIGHBOURS[light])]] = 7
+    readings[np.setdiff1d(np.arange(len(LIGHTS)), [light, *NEIGHBOURS[light]])] = 7
     got, held = trusted(pixels, readings, device, shares=shares)
     _, _, told = reference.trust(held, model, NEIGHBOURS, shares)
     clear = (told**2).sum(axis=(0, 1)) > 1e-4
@@ -176,8 +239,8 @@ def test_a_black_model_is_not_trusted(black, device):
 
 def call(device, *, pixels=40, band_pixels=40, seen=(24, 40), stack_lights=24, channels=3, neighbours=NEIGHBOURS, shares=SHARES):
     stack = store(np.ones((channels, stack_lights, band_pixels)))
-    return trust_model(packs.upload(stack, device=device), upload(scattered_pixels(pixels), device),
-                       pack_bytes(np.full(seen, 255, np.uint8), device), LIGHTS, IRRADIANCE, np.ones(24, np.float32), neighbours, shares)
+    return compare_model(packs.upload(stack, device=device), upload(scattered_pixels(pixels), device),
+                         pack_bytes(np.full(seen, 255, np.uint8), device), LIGHTS, IRRADIANCE, np.ones(24, np.float32), neighbours, shares)
 
 
 @pytest.mark.parametrize("change, message", [
@@ -216,7 +279,8 @@ def test_narrower_lobes_become_wide_and_look_the_same_from_afar():
         specular, f0, wide = lobes(roughness, cap(60, 180))
         assert wide[0] > 0.25
         far = np.cos(np.radians(75))
-        np.testing.assert_allclose(f0 * distribution(far, wide[0] ** 2), specular * distribution(far, np.float32(roughness) ** 2), rtol=0.02)
+        expected = specular * distribution(far, np.float32(roughness) ** 2)
+        np.testing.assert_allclose(f0 * distribution(far, wide[0] ** 2), expected, rtol=0.02)
         assert (f0 <= specular).all()
 
 

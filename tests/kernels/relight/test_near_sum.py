@@ -34,7 +34,8 @@ def summed(pixels, readings, given, lights, device, *, visible=None, irradiance=
     irradiance = 3 * colours(len(lights), seed=4) if irradiance is None else irradiance
     stack, scale, held = stored(readings, irradiance)
     visible = np.full((len(lights), len(pixels.normal)), 255, np.uint8) if visible is None else visible
-    got = sum_near(packs.upload(stack, device=device), upload(pixels, device), pack_bytes(visible, device), given, lights, irradiance, scale)
+    got = sum_near(packs.upload(stack, device=device), upload(pixels, device), pack_bytes(visible, device), given, lights, irradiance,
+                   scale)
     return got.numpy()[:, : len(pixels.normal)], held
 
 

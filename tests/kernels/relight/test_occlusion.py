@@ -32,6 +32,10 @@ def flat(pixel=1.0):
     return Projection(False, wp.vec2(1 / pixel, 1 / pixel), wp.vec2(SIDE / 2, SIDE / 2))
 
 
+def pinhole(focal):
+    return Projection(True, wp.vec2(focal, focal), wp.vec2(SIDE / 2, SIDE / 2))
+
+
 def seen(place, pixels, height, projection, device, mask=None):
     """[n, m] bool, and the rest of the last pack."""
     mask = np.ones(height.shape, np.uint8) if mask is None else mask.astype(np.uint8)
@@ -91,7 +95,7 @@ def test_perspective(focal, tangent, device):
     """A floor at a depth at which a pixel is a unit wide there; the block's upper edge is nearer and so farther out, and its shadow begins
     where the ray from it meets the floor."""
     depth = focal
-    see, _ = seen([far(1, 0, tangent)], ALL, block(base=-depth), Projection(True, wp.vec2(focal, focal), wp.vec2(SIDE / 2, SIDE / 2)), device)
+    see, _ = seen([far(1, 0, tangent)], ALL, block(base=-depth), pinhole(focal), device)
     # the wall is seen in the picture's column, on a ray that leans
     least, most = bounds(lambda edge, top: EDGE - (edge / focal * (depth - top) - top / tangent))
     assert least <= dark_left(see[0]) <= most
@@ -101,7 +105,7 @@ def test_perspective_near_light(device):
     focal = depth = 120.0
     x, over = 14.0, 10.0
     see, _ = seen([[x, 0, -depth + HEIGHT + over, 1.0]], ALL, block(base=-depth),
-                  Projection(True, wp.vec2(focal, focal), wp.vec2(SIDE / 2, SIDE / 2)), device)
+                  pinhole(focal), device)
 
     def length(edge, top):
         leaning = edge / focal * (depth - top)
@@ -115,7 +119,7 @@ def test_perspective_near_light(device):
 def test_a_mirrored_scene_has_a_mirrored_shadow(perspective, device):
     """Left for right and top for bottom: pixels look from their centres. But for rounding where way and surface just meet."""
     base = -60.0 if perspective else 0.0
-    projection = Projection(True, wp.vec2(60, 60), wp.vec2(SIDE / 2, SIDE / 2)) if perspective else flat()
+    projection = pinhole(60) if perspective else flat()
     height = block(base=base)
     height[8:14, 10:50] += 6
     places = np.random.default_rng(0).uniform([-25, -25, base + 8, 1], [25, 25, base + 20, 1], (40, 4))
@@ -130,7 +134,7 @@ def test_a_mirrored_scene_has_a_mirrored_shadow(perspective, device):
 def test_a_light_before_the_block_is_seen_from_all_of_the_floor_before_it(perspective, device):
     """Low and in line with the block: light from as low behind it is hidden."""
     base = -200.0 if perspective else 0.0
-    projection = Projection(True, wp.vec2(200, 200), wp.vec2(SIDE / 2, SIDE / 2)) if perspective else flat()
+    projection = pinhole(200) if perspective else flat()
     place = [[EDGE - 3.0, 0, base + 1.0, 1.0], [EDGE + 30.0, 0, base + 1.0, 1.0]]
     see, _ = seen(place, ALL, block(base=base), projection, device)
     floor = see.reshape(2, SIDE, SIDE)[:, SIDE // 2 - 2 : SIDE // 2 + 2, : BLOCK[1].start - 5]

@@ -94,6 +94,22 @@ def test_a_mirror_direction_peaks_as_the_distribution_says(device):
     np.testing.assert_allclose(got[3:, 0], 2 * np.array([0.04, 0.5, 1]) / (4 * np.pi * 0.5**4), rtol=LOBE)
 
 
+@pytest.mark.parametrize("roughness", [shading.LEAST_ROUGHNESS, 0.1, 0.2])
+@pytest.mark.parametrize("store", [lambda normal: normal.astype(np.float16), lambda normal: normal * 1.0005], ids=["half", "long"])
+def test_normals_not_quite_unit_make_no_fireflies(roughness, store, device):
+    """Of normals all about the half vector none is brighter than the peak, F0 / (4 π α² h·v), but for n·l / n·v rounded in half twice."""
+    light, rng = np.array([0.6, 0, 0.8]), np.random.default_rng(0)
+    half = (light + [0, 0, 1]) / np.linalg.norm(light + [0, 0, 1])
+    normal = half + rng.normal(0, 0.7 * roughness**2, (20_000, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    pixels = facing(20_000)._replace(normal=store(normal).astype(np.float32), roughness=np.full(20_000, roughness, np.float32),
+                                     f0=np.full((20_000, 3), 0.04, np.float32))
+    got = radiance(pixels, sources.far(light[None], np.ones((1, 3))), device)[3]
+    fresnel = 0.04 + 0.96 * (1 - half[2]) ** 5
+    peak = fresnel / (4 * np.pi * roughness**4 * half[2])
+    assert got.max() == pytest.approx(peak, rel=0.02)
+
+
 def test_normals_that_look_away_from_the_viewer_count_as_grazing(device):
     """Smith's masking and 1 / n·v of the least cosine; the rest as it is."""
     pixels = scattered_pixels(40)
@@ -226,5 +242,5 @@ def test_rows_that_are_not_there_are_refused(rows, device):
 
 def test_visibility_of_other_pixels_is_refused(rows, device):
     surface = upload(scattered_pixels(200), device)
-    with pytest.raises(ArrayError, match="visibility has .* packs, the surface"):
+    with pytest.raises(ArrayError, match=r"visibility has .* packs, the surface"):
         shading.shade(surface, lights("point"), pack_bytes(rows, device))

@@ -123,11 +123,11 @@ def test_few_samples_of_a_far_away_sphere_lie_in_its_direction():
 
 @pytest.mark.parametrize("radius", [0.0, -1.0, np.nan])
 def test_a_sphere_without_a_radius_is_refused(radius):
-    with pytest.raises(ArrayError, match="radius of a sphere light is .*: it must be above 0"):
+    with pytest.raises(ArrayError, match=r"radius of a sphere light is .*: it must be above 0"):
         sources.sphere(np.zeros(3), radius, COLOUR)
 
 
 @pytest.mark.parametrize("u, v", [([0, 0, 0], [0, 1, 0]), ([1, 0, 0], [0, 0, 0]), ([1, 0, 0], [0.1, 1, 0]), ([1, 0, 0], [1, 0, 0])])
 def test_a_rectangle_without_a_right_angle_is_refused(u, v):
-    with pytest.raises(ArrayError, match="edges of a rectangle light are .*: give two at a right angle"):
+    with pytest.raises(ArrayError, match=r"edges of a rectangle light are .*: give two at a right angle"):
         sources.rectangle(np.zeros(3), np.array(u), np.array(v), COLOUR)
