@@ -1,6 +1,6 @@
 """Write docs/figures.md: every figure in it is measured here. A section whose data is not at hand keeps what it said before.
 
-    python -m benchmarks.figures [--data DIR] [--glossy DIR] [--large DIR] [--only NAME ...]
+    python -m benchmarks.figures [--data DIR] [--glossy DIR] [--relighting DIR] [--rig DIR] [--large DIR] [--only NAME ...]
 """
 
 import argparse
@@ -21,6 +21,7 @@ from benchmarks.accuracy import SolveError, compare, diligent_errors, read_truth
 from benchmarks.large import large_rows, measure
 from benchmarks.materials import material_table
 from benchmarks.relighting import relighting_table
+from benchmarks.rig import rig_table
 from benchmarks.search_speed import search_rows
 from benchmarks.spin import spin_table
 from service.methods import Method
@@ -108,6 +109,11 @@ def spin(_: argparse.Namespace) -> list[str]:
     return spin_table()
 
 
+def rig(given: argparse.Namespace) -> list[str] | None:
+    """Depth from projected codes and lasers."""
+    return None if given.rig is None else rig_table(given.rig)
+
+
 def speed(_: argparse.Namespace) -> list[str]:
     """The table of `relit bench`, and the general solver against NumPy."""
     return [*bench(None, 9), "", *search_rows()]
@@ -140,6 +146,7 @@ SECTIONS: dict[str, tuple[str, Section]] = {
     "ablation": ("What each part of `svbrdf` buys", ablation),
     "relighting": ("Relighting", relighting),
     "spin": ("A spin of 240 frames", spin),
+    "rig": ("Depth from projected light", rig),
     "speed": ("Speed", speed),
     "demo": ("The demo", demo),
     "memory": ("Memory", memory),
@@ -159,6 +166,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, help="folder with diligent_ball and diligent_cat")
     parser.add_argument("--glossy", type=Path, help="folder with glossy and glossy_metal of samples/make_glossy.py")
     parser.add_argument("--relighting", type=Path, help="folder with glossy and owl of samples/make_relight_checks.py")
+    parser.add_argument("--rig", type=Path, help="folder with the sets of samples/make_rig.py")
     parser.add_argument("--large", type=Path, help="folder where some 12 GiB may be written and are removed again")
     parser.add_argument("--only", nargs="+", choices=SECTIONS, help="sections to measure (default: all)")
     given = parser.parse_args()

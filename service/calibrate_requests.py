@@ -106,3 +106,35 @@ class SaturationRequest(BaseModel):
     capture: Path
     write: bool = False
     """Set `saturation` in the manifest, in place of only saying it."""
+
+
+class ProcamRequest(BaseModel):
+    """Camera, projector and their pose from a chessboard under projected light, one capture a pose of the board."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    captures: Annotated[tuple[Path, ...], Field(min_length=1)]
+    board: tuple[Annotated[int, Field(ge=3)], Annotated[int, Field(ge=3)]]
+    """Inner corners across and down."""
+    square_m: Above0
+    """Side of a square."""
+    projector: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] | None = None
+    """Width and height of the projector; None: what the captures say."""
+    apply_to: tuple[Path, ...] = ()
+    """Other captures of the same rig, whose manifests are written too."""
+    drop_outliers: bool = False
+    """Leave out views whose error stands out, and fit again."""
+    device: str | None = None
+    cache: Path | None = None
+
+
+class ResponseRequest(BaseModel):
+    """The light of a projector at each level, from images of evenly grey projections."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    capture: Path
+    """Its camera is the one that took the images; its projector gets the response."""
+    images: Annotated[tuple[Path, ...], Field(min_length=3)]
+    levels: tuple[Annotated[float, Field(ge=0, le=1)], ...] = ()
+    """Of each image, 0 to 1; empty: even steps from 0 to 1 in the order of the images."""

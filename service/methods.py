@@ -71,3 +71,23 @@ class BasisKind(StrEnum):
     """Polynomial texture map of the luminance, and one colour a pixel: half the size."""
     HSH = "hsh"
     """Hemispherical harmonics, in an RTI file."""
+
+
+class Ranging(StrEnum):
+    """What a depth is measured with."""
+
+    PATTERN = "pattern"
+    """A projector's patterns: structured light."""
+    LASER = "laser"
+    """Spots and stripes of a laser."""
+    TOF = "tof"
+    """The time that light takes."""
+
+
+class Geometry(StrEnum):
+    """What an asset of a depth is made of."""
+
+    MESH = "mesh"
+    """Faces between neighbouring pixels of one surface."""
+    POINTS = "points"
+    """The measured points."""

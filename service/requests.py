@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
-from service.methods import BasisKind, FrameCompression, FrameSpace, Layer, LightWeights, Method
+from service.methods import BasisKind, FrameCompression, FrameSpace, Geometry, Layer, LightWeights, Method
 from service.near_lights import GivenPoint, GivenRectangle, GivenSphere
 
 MAX_STOPS = 32.0
@@ -131,13 +131,15 @@ class BasisRequest(StackRequest):
 
 
 class ExportRequest(BaseModel):
-    """A USD asset from solved maps."""
+    """A USD asset from solved maps or a depth."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     maps: Path
-    """A folder with maps.exr, or the file."""
+    """A folder with maps.exr or depth.exr, or the file."""
     out: Path
     """.usdz, .usda or .usdc."""
     name: str | None = None
     """Of the asset; None: what the maps say, else the file's stem."""
+    geometry: Geometry | None = None
+    """Of a depth (depth.exr in place of maps.exr); None: mesh."""

@@ -77,11 +77,58 @@ class PhasePattern(Strict):
         return self
 
 
+class XorPattern(Strict):
+    """One bit of the Gray code with bit base_bit laid over it by XOR: no stripe is wide, so that light between surfaces averages out.
+
+    Bits above base_bit are shown as their XOR with it; base_bit and the bits below it, which are as fine, as they are. XOR-02 of
+    Gupta et al. (CVPR 2011) has base bit 0, XOR-04 base bit 1.
+    """
+
+    code: Literal["xor"]
+    axis: Axis
+    bit: Index
+    bits: Count
+    base_bit: Index = 0
+    stripe_px: Positive = 1
+    inverse: bool = False
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        for name in ("bit", "base_bit"):
+            if getattr(self, name) >= self.bits:
+                raise ValueError(f"{name} {getattr(self, name)} does not exist in {self.bits} bits (0 to {self.bits - 1})")
+        return self
+
+
+class ModulatedPattern(Strict):
+    """A phase frame under a fine carrier across it: (1 + cos(2πu/P - 2πi/N))/2 · (1 + cos(2πv/Q - 2πj/M))/2.
+
+    Chen, Seidel and Lensch, "Modulated phase-shifting for 3D scanning", CVPR 2008: what varies with the carrier is direct light.
+    """
+
+    code: Literal["modulated"]
+    axis: Axis
+    period_px: Positive
+    step: Index
+    steps: Annotated[int, Field(ge=3)]
+    carrier_period_px: Positive
+    carrier_step: Index
+    carrier_steps: Annotated[int, Field(ge=3)]
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        for name, count in (("step", self.steps), ("carrier_step", self.carrier_steps)):
+            if getattr(self, name) >= count:
+                raise ValueError(f"{name} {getattr(self, name)} does not exist in {count} steps (0 to {count - 1})")
+        return self
+
+
 class UniformPattern(Strict):
     """Projector black (ambient) or full on."""
 
     code: Literal["black", "white"]
 
 
-Pattern = Annotated[BinaryPattern | KaryPattern | RampPattern | PhasePattern | UniformPattern, Field(discriminator="code")]
+Pattern = Annotated[BinaryPattern | KaryPattern | RampPattern | PhasePattern | XorPattern | ModulatedPattern | UniformPattern,
+                    Field(discriminator="code")]
 """Any of the pattern codes, told apart by `code`."""

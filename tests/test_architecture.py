@@ -77,10 +77,14 @@ def test_a_floor_knows_only_its_own_libraries(floor, allowed):
 
 @pytest.mark.parametrize(("library", "home"), [
     ("pxr", "service.usd"), ("typer", "service.cli"), ("rich", "service.cli"),
-    ("fastapi", "service.api"), ("dbos", "service.jobs"), ("cv2", "stage.motion"),
+    ("fastapi", "service.api"), ("dbos", "service.jobs"),
 ])
 def test_a_library_lives_in_one_place(library, home):
     assert {i.importer for i in IMPORTS if top(i.target) == library and not under(i.importer, home)} == set()
+
+
+def test_opencv_lives_where_motion_is_tracked_and_rigs_are_calibrated():
+    assert {i.importer for i in IMPORTS if top(i.target) == "cv2" and not under(i.importer, "stage.motion", "stage.calibration")} == set()
 
 
 @pytest.mark.parametrize(("package", "forbidden"), [

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from service.cli import calibrate_projector
 from service.cli.options import CaptureArgument, HostOption
 
 if TYPE_CHECKING:
@@ -30,10 +31,11 @@ ImagesArgument = Annotated[list[Path], typer.Argument(metavar="IMAGE...", help="
 def register(app: typer.Typer) -> None:
     """Add the command and its kinds."""
     kinds = typer.Typer(name="calibrate", no_args_is_help=True,
-                        help="Lights, dark frame, flat field and saturation from images; with residuals.")
+                        help="Lights, projector and camera, dark frame, flat field and saturation from images; with residuals.")
     for name, command in (("mirror-ball", mirror_ball), ("light-positions", light_positions), ("grey-ball", grey_ball),
                           ("intensity", intensity), ("dark", dark), ("flat-field", flat_field), ("saturation", saturation)):
         kinds.command(name)(command)
+    calibrate_projector.register(kinds)
     app.add_typer(kinds)
 
 

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from service.cli.options import AlignOption, AlignToOption, CacheOption, CaptureArgument, DeviceOption, HostOption
-from service.methods import Method
+from service.methods import Geometry, Method
 
 
 def register(app: typer.Typer) -> None:
@@ -50,16 +50,18 @@ def solve(
 
 
 def export(
-    maps: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with maps.exr.", show_default=False)],
+    maps: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with maps.exr or depth.exr.", show_default=False)],
     out: Annotated[Path, typer.Option("--out", help="The asset: .usdz, .usda or .usdc.", show_default=False)],
     name: Annotated[str | None, typer.Option("--name", help="Of the asset; without it the capture's.",
                                              show_default=False)] = None,
+    geometry: Annotated[Geometry | None, typer.Option(
+        "--geometry", show_default=False, help="Of a depth: mesh (without it) or points.")] = None,
     device: HostOption = None,
 ) -> None:
-    """A USD asset with the estimated material."""
+    """A USD asset: solved maps with the estimated material, a depth with its colours."""
     from service.cli.bar import Bar
     from service.pipelines.export import export as run
     from service.requests import ExportRequest
 
     with Bar() as bar:
-        print(f"asset    {run(ExportRequest(maps=maps, out=out, name=name), bar)}")
+        print(f"asset    {run(ExportRequest(maps=maps, out=out, name=name, geometry=geometry), bar)}")

@@ -53,14 +53,12 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, progress: Pro
         StorageError: the disk refuses; what was there before is left as it was.
     """
     target = Path(path)
-    suffix = target.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise AssetError(f"{target} cannot be written as a USD asset: its suffix must be .usda, .usdc or .usdz")
+    suffix = known_suffix(target)
     tell = progress or (lambda what, done: None)
 
     tell("mesh", 0.0)
     mesh = height_mesh(maps)
-    with _workshop(target) as workshop:
+    with workshop_beside(target) as workshop:
         folder = workshop / f"{target.stem}_textures"
         folder.mkdir()
         textures = write_textures(maps, mesh, folder, progress=lambda layer, done: tell(
@@ -76,19 +74,31 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, progress: Pro
             tell("package", 0.95)
             package = workshop / f"{target.stem}.usdz"
             pack(package, layer, files)
-            _flush(package)
+            flush(package)
             os.replace(package, target)
             files = []
         else:
-            _flush(layer, *files)
+            flush(layer, *files)
             _install(layer, folder, target)
     installed = tuple(target.parent / file.relative_to(workshop) for file in files)
     return AssetReport(target, installed, len(mesh.points), len(mesh.face_counts), mesh.step,
                        {layer: texture.clipped_pixels for layer, texture in textures.items()})
 
 
+def known_suffix(target: Path) -> str:
+    """The suffix of an asset, in lower case.
+
+    Raises:
+        AssetError: it is none that can be written.
+    """
+    suffix = target.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise AssetError(f"{target} cannot be written as a USD asset: its suffix must be .usda, .usdc or .usdz")
+    return suffix
+
+
 @contextmanager
-def _workshop(target: Path) -> Iterator[Path]:
+def workshop_beside(target: Path) -> Iterator[Path]:
     """A temporary folder beside the target, gone at the end; errors inside become StorageErrors about the target."""
     with storage("write", target):
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -122,7 +132,8 @@ def _install(layer: Path, folder: Path, target: Path) -> None:
                 os.rename(file, place / file.name)
 
 
-def _flush(*files: Path) -> None:
+def flush(*files: Path) -> None:
+    """See files onto the disk, before they get their names."""
     for file in files:
         with open(file, "rb") as written:
             os.fsync(written.fileno())

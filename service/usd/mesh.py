@@ -87,6 +87,28 @@ def height_mesh(maps: SurfaceMaps, *, vertex_budget: int = VERTEX_BUDGET) -> Sur
     return SurfaceMesh(points, _normals(points, quads, triangles), st, quads, triangles, rows, cols, step)
 
 
+def without_faces(mesh: SurfaceMesh, torn: np.ndarray) -> SurfaceMesh:
+    """The mesh without some of its faces and the vertices that only they used.
+
+    Args:
+        torn: [Q + T] bool, quads first.
+
+    Raises:
+        AssetError: no face is left.
+    """
+    quads, triangles = mesh.quads[~torn[:len(mesh.quads)]], mesh.triangles[~torn[len(mesh.quads):]]
+    if len(quads) + len(triangles) == 0:
+        raise AssetError("no neighbouring pixels lie on one surface, so there is no face to export: --geometry points exports them alone")
+    used = np.zeros(len(mesh.points), dtype=bool)
+    used[quads] = True
+    used[triangles] = True
+    renumbered = np.cumsum(used, dtype=np.int32) - np.int32(1)
+    quads, triangles = renumbered[quads], renumbered[triangles]
+    points = mesh.points[used]
+    return SurfaceMesh(points, _normals(points, quads, triangles), mesh.st[used], quads, triangles, mesh.rows[used], mesh.cols[used],
+                       mesh.step)
+
+
 def face_to_vertex(quad_values: np.ndarray, triangle_values: np.ndarray, quads: np.ndarray, triangles: np.ndarray,
                    vertex_count: int) -> np.ndarray:
     """Sum a vector per face onto the corners of each face, and give it length one.

@@ -9,6 +9,7 @@ from service.usd.materials import define_material
 from service.usd.mesh import SurfaceMesh
 from service.usd.rig import define_camera
 from service.usd.textures import Texture
+from stage.camera import Camera
 from stage.maps import SurfaceMaps
 
 UNIT_WITHOUT_SCALE_M = 0.001
@@ -29,45 +30,62 @@ def define_asset(usd_stage: Usd.Stage, maps: SurfaceMaps, mesh: SurfaceMesh, tex
         The asset is in the camera frame; world_from_camera, where the capture gives it, is the root's transform.
     """
     unit_m = 1.0 if maps.camera.metric else UNIT_WITHOUT_SCALE_M
-    UsdGeom.SetStageUpAxis(usd_stage, UsdGeom.Tokens.y)
-    UsdGeom.SetStageMetersPerUnit(usd_stage, unit_m)
-    root = UsdGeom.Xform.Define(usd_stage, Sdf.Path.absoluteRootPath.AppendChild(Tf.MakeValidIdentifier(name)))
-    usd_stage.SetDefaultPrim(root.GetPrim())
-    _describe(usd_stage, root.GetPrim(), maps, name)
-    if maps.camera.world_from_camera is not None:
-        root.AddTransformOp().Set(_matrix(maps.camera.world_from_camera, unit_m))
-
+    root = define_root(usd_stage, maps.camera, {**maps.provenance, "relit:color_space": maps.color_space}, name=name, unit_m=unit_m)
+    if not maps.camera.metric:
+        root.GetPrim().SetCustomDataByKey("relit:scale", SCALE_NOTE)
     path = root.GetPath()
     UsdGeom.Scope.Define(usd_stage, path.AppendChild("Geom"))
-    usd_mesh = _define_mesh(usd_stage, path.AppendPath("Geom/Mesh"), mesh)
+    usd_mesh = define_mesh(usd_stage, path.AppendPath("Geom/Mesh"), mesh)
     UsdGeom.Scope.Define(usd_stage, path.AppendChild("Looks"))
     material = define_material(usd_stage, path.AppendPath("Looks/Material"), textures, texture_folder)
     UsdShade.MaterialBindingAPI.Apply(usd_mesh.GetPrim()).Bind(material)
     define_camera(usd_stage, path.AppendChild("Camera"), maps.camera, mesh.extent)
+    hint_extent(root)
 
+
+def define_root(usd_stage: Usd.Stage, camera: Camera, provenance: Mapping[str, str], *, name: str, unit_m: float) -> UsdGeom.Xform:
+    """Axes, unit, the root prim and what is known about it.
+
+    Args:
+        camera: its world_from_camera becomes the root's transform.
+        provenance: kept in customLayerData, with the camera.
+        name: free text; the root prim is named after it.
+        unit_m: metres of a scene unit.
+    """
+    UsdGeom.SetStageUpAxis(usd_stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(usd_stage, unit_m)
+    root = UsdGeom.Xform.Define(usd_stage, Sdf.Path.absoluteRootPath.AppendChild(Tf.MakeValidIdentifier(name)))
+    usd_stage.SetDefaultPrim(root.GetPrim())
+    _describe(usd_stage, root.GetPrim(), camera, provenance, name)
+    if camera.world_from_camera is not None:
+        root.AddTransformOp().Set(_matrix(camera.world_from_camera, unit_m))
+    return root
+
+
+def hint_extent(root: UsdGeom.Xform) -> None:
+    """The bounding box of everything below the root, for readers that do not load it."""
     model = UsdGeom.ModelAPI.Apply(root.GetPrim())
     model.SetExtentsHint(model.ComputeExtentsHint(UsdGeom.BBoxCache(Usd.TimeCode.Default(), [UsdGeom.Tokens.default_])))
 
 
-def _describe(usd_stage: Usd.Stage, root: Usd.Prim, maps: SurfaceMaps, name: str) -> None:
-    """What the asset is and where it comes from: kind, names, provenance, scale."""
+def _describe(usd_stage: Usd.Stage, root: Usd.Prim, camera: Camera, provenance: Mapping[str, str], name: str) -> None:
+    """What the asset is and where it comes from: kind, names, provenance."""
     model = Usd.ModelAPI(root)
     model.SetKind(Kind.Tokens.component)
     model.SetAssetName(name)
     if root.GetName() != name and name:
         root.SetDisplayName(name)
-    if not maps.camera.metric:
-        root.SetCustomDataByKey("relit:scale", SCALE_NOTE)
-    method = maps.provenance.get("relit:method")
+    method = provenance.get("relit:method")
     usd_stage.GetRootLayer().documentation = (
         f"{name}: a measured surface, exported by Relit{f' (method {method})' if method else ''}. Camera frame: "
         "+x right, +y up, +z towards the viewer. Where it comes from is in customLayerData.")
-    known = {**maps.provenance, "relit:camera": maps.camera.model_dump_json(), "relit:color_space": maps.color_space}
+    known = {**provenance, "relit:camera": camera.model_dump_json()}
     for key, value in sorted(known.items()):
         usd_stage.SetMetadataByDictKey("customLayerData", key, value)
 
 
-def _define_mesh(usd_stage: Usd.Stage, path: Sdf.Path, mesh: SurfaceMesh) -> UsdGeom.Mesh:
+def define_mesh(usd_stage: Usd.Stage, path: Sdf.Path, mesh: SurfaceMesh) -> UsdGeom.Mesh:
+    """The polygons, their normals and texture coordinates."""
     usd_mesh = UsdGeom.Mesh.Define(usd_stage, path)
     usd_mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     usd_mesh.CreateDoubleSidedAttr(True)

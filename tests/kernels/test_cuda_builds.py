@@ -10,7 +10,7 @@ from kernels import device as devices
 from kernels.device import PACK_CUDA
 from kernels.photometric import albedo, gradient, highlight, lambert, moments, near, readings, robust, separation
 from kernels.relight import basis, batch, cells, combine, display, guide, near_sum, occlusion, residual, shading, smooth
-from kernels.structured import binary, kary, micro, modulated, phase, ramp
+from kernels.structured import binary, edges, kary, micro, modulated, phase, ramp, stripe, triangulate
 from kernels.structured import separation as light_parts
 from kernels.structured import unwrap as wraps
 from kernels.tof import bilateral, continuous, flying, pileup, returns, unwrap, wiggling
@@ -36,7 +36,9 @@ OLDEST = min(wp.get_cuda_supported_archs(), default=None)
                                   kary._kary_kernel, partial(kary._kary_kernel, channels=3), ramp._ramp_kernel,
                                   partial(ramp._ramp_kernel, pair=False), phase._phase_kernel, partial(phase._phase_kernel, ambient=True),
                                   wraps._joint_kernel, wraps._numbered_kernel, micro._micro_kernel, modulated._modulated_kernel,
-                                  light_parts._extremes_kernel, light_parts._swing_kernel,
+                                  *(partial(triangulate._kernel, with_u=u, with_v=v) for u, v in ((1, 0), (0, 1), (1, 1))),
+                                  lambda pack: stripe._stripe_kernel, light_parts._extremes_kernel, light_parts._swing_kernel, edges._number_kernel,
+                                  lambda pack: edges._edge_kernel(),
                                   lambda pack: smooth._walk_kernel(),
                                   lambda pack: near_sum._weights_kernel()])
 def test_kernel_compiles_for_cuda_and_keeps_its_packs_in_registers(make, tmp_path):

@@ -1,0 +1,53 @@
+"""Angles, sines and cosines by arithmetic alone, so that a loop over a pack becomes SIMD instructions; libm's is a call a lane."""
+
+import math
+
+import warp as wp
+
+EIGHTH = 0.41421356237
+"""tan(π/8): above, the quotient is turned by π/4 first."""
+QUARTER_TURN = 0.5 * math.pi
+HALF_TURN = math.pi
+TURN = 2.0 * math.pi
+
+
+@wp.func
+def angle_of(x: float, y: float) -> float:
+    """atan2(y, x), 0 to 2π, within 4e-7; 0 for the zero vector.
+
+    Source: Moshier, Cephes Mathematical Library, atanf (odd polynomial of degree nine up to tan π/8).
+    """
+    across, up = wp.abs(x), wp.abs(y)
+    small, large = wp.min(across, up), wp.max(across, up)
+    turned = wp.where(small > EIGHTH * large, 1.0, 0.0)
+    q = (small - turned * large) / (large + turned * small + 1.0e-30)
+    z = q * q
+    angle = ((8.05374449538e-2 * z - 1.38776856032e-1) * z + 1.99777106478e-1) * z - 3.33329491539e-1
+    angle = angle * z * q + q + turned * (0.5 * QUARTER_TURN)
+    steep = wp.where(up > across, 1.0, 0.0)
+    angle = angle + steep * (QUARTER_TURN - 2.0 * angle)
+    left = wp.where(x < 0.0, 1.0, 0.0)
+    angle = angle + left * (HALF_TURN - 2.0 * angle)
+    below = wp.where(y < 0.0, 1.0, 0.0)
+    return angle + below * (TURN - 2.0 * angle)
+
+
+@wp.func
+def sine_quarter(t: float) -> float:
+    """sin 2πt for a quarter of a turn either way, within 1e-7: Taylor's polynomial of degree eleven."""
+    x = TURN * t
+    z = x * x
+    series = ((((-2.5052108e-8 * z + 2.7557319e-6) * z - 1.98412698e-4) * z + 8.33333333e-3) * z - 1.66666667e-1) * z
+    return x + x * series
+
+
+@wp.func
+def cosine_of_turns(t: float) -> float:
+    """cos 2πt, within 2e-7 for small t; the rounding of t itself is added for large."""
+    return sine_quarter(0.25 - wp.abs(t - wp.floor(t + 0.5)))
+
+
+@wp.func
+def sine_of_turns(t: float) -> float:
+    """sin 2πt, as cosine_of_turns."""
+    return cosine_of_turns(t - 0.25)

@@ -1,0 +1,248 @@
+"""Binary, Gray and XOR codes: a threshold per pixel and bit, doubtful bits resolved or refused.
+
+A bit is the sign of d = I - Ī (with inverses) or d = I - (white + black)/2. It is in doubt where |d| is under DOUBT_SIGMAS of its
+own noise or DOUBT_PART of the contrast: at edges, and where stripes are finer than camera or projector resolve. Up to two
+doubtful bits are tried both ways; where all readings lie within MAX_SPREAD + 1 neighbouring stripes (at an edge of a Gray code
+always: there one bit changes) their middle is the result, with the deviation of the whole range; otherwise the pixel is UNDECIDED.
+
+Sources: Posdamer and Altschuler, CGIP 1982 (binary); Inokuchi, Sato and Matsuda, ICPR 1984 (Gray); Gupta, Agrawal,
+Veeraraghavan and Narasimhan, CVPR 2011, section 4 (XOR).
+"""
+
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from kernels.errors import ArrayError
+from kernels.packs import as_packs, pack_type
+from kernels.status import OK, Status
+from kernels.structured.decoded import Decoded
+from kernels.structured.frames import Frames, NoiseModel, check_noise, check_stripes
+
+SHADOW_SIGMAS = 5.0
+"""Contrast (white minus black, or the largest difference of a pair) over its deviation: below, the projector does not reach the pixel."""
+DOUBT_SIGMAS = 3.0
+"""Difference over its deviation below which a bit may be wrong: one pixel in 740 by noise alone at the limit."""
+DOUBT_PART = 0.05
+"""Of the contrast: with less of it a bit is a mixture of both stripes, and blur rather than noise decides."""
+LARGEST = 1.0e15
+"""A contrast above this counts as infinite: it is squared in float32."""
+MAX_SPREAD = 1
+"""Stripes that the readings of a pixel with doubtful bits may lie apart."""
+MAX_BITS = 24
+"""Stripes are counted in float32 at the end, exact up to here."""
+STRIPE_DEVIATION = float(1.0 / np.sqrt(12.0))
+"""Standard deviation of a place evenly distributed over a stripe of width one."""
+
+_SATURATED, _SHADOWED, _UNDECIDED, _OUT_OF_RANGE = (int(s) for s in (Status.SATURATED, Status.SHADOWED, Status.UNDECIDED,
+                                                                    Status.OUT_OF_RANGE))
+
+
+def decode_binary(frames: Frames, bits: Sequence[int], inverses: Sequence[int] | None = None, *, white: int | None = None,
+                  black: int | None = None, extent: float, stripe_px: float = 1.0, noise: NoiseModel) -> Decoded:
+    """Decode a plain binary code.
+
+    Args:
+        frames: linear images of one channel.
+        bits: frame of each bit, bit 0 (the finest) first.
+        inverses: frame of each inverse in the same order, or None; then white and black are needed.
+        white, black: frames of the projector full on and black.
+        extent: projector pixels along the axis.
+        stripe_px: width of the finest stripe.
+        noise: of a reading.
+
+    Returns:
+        Stripe centres on the device; not synchronised on CUDA. SATURATED: a frame that decides a bit is. SHADOWED: the contrast
+        is not above noise. UNDECIDED: doubtful bits leave stripes far apart. OUT_OF_RANGE: a code beyond the projector.
+
+    Raises:
+        ArrayError: a frame is missing, does not exist or is given twice; a value that cannot be.
+    """
+    return _decode(_stripe_kernel, "binary", frames, bits, inverses, white, black, extent, stripe_px, noise, 0)
+
+
+def decode_gray(frames: Frames, bits: Sequence[int], inverses: Sequence[int] | None = None, *, white: int | None = None,
+                black: int | None = None, extent: float, stripe_px: float = 1.0, noise: NoiseModel) -> Decoded:
+    """Decode a Gray code: as decode_binary; at an edge one bit changes, so edges are decoded too."""
+    return _decode(_stripe_kernel, "gray", frames, bits, inverses, white, black, extent, stripe_px, noise, 0)
+
+
+def decode_xor(frames: Frames, bits: Sequence[int], inverses: Sequence[int] | None = None, *, base_bit: int = 0,
+               white: int | None = None, black: int | None = None, extent: float, stripe_px: float = 1.0,
+               noise: NoiseModel) -> Decoded:
+    """Decode an XOR code: as decode_gray, after the bits above base_bit are freed of it.
+
+    Bits are decided before they are combined, so light that other surfaces add to a frame and to its inverse alike, as it does
+    where all stripes are narrow, decides none.
+    """
+    if not 0 <= base_bit < len(bits):
+        raise ArrayError(f"base bit {base_bit} does not exist in {len(bits)} bits (0 to {len(bits) - 1})")
+    return _decode(_stripe_kernel, "xor", frames, bits, inverses, white, black, extent, stripe_px, noise, base_bit)
+
+
+def _decode(make: Any, code: str, frames: Frames, bits: Sequence[int], inverses: Sequence[int] | None, white: int | None,
+            black: int | None, extent: float, stripe_px: float, noise: NoiseModel, base_bit: int) -> Decoded:
+    check_noise(noise)
+    check_stripes(extent, stripe_px)
+    frames.require(*bits, *(inverses or ()), white, black)
+    if not 1 <= len(bits) <= MAX_BITS:
+        raise ArrayError(f"the code has {len(bits)} bits: give 1 to {MAX_BITS}")
+    if 2.0 ** len(bits) * stripe_px < extent:
+        raise ArrayError(f"{len(bits)} bits of {stripe_px:g} px stripes number {2 ** len(bits) * stripe_px:g} px, the projector has "
+                         f"{extent:g}: a bit is missing")
+    if inverses is not None and len(inverses) != len(bits):
+        raise ArrayError(f"there are {len(bits)} bits and {len(inverses)} inverses: give one for each, or none")
+    references = white is not None and black is not None
+    if inverses is None and not references:
+        raise ArrayError("there are neither inverses nor white and black: a bit needs one of the two as its threshold")
+    result = frames.outputs()
+    rows = np.stack([bits, bits if inverses is None else inverses], axis=1).astype(np.int32)
+    used = [*bits, *inverses] if inverses is not None else [*bits, white, black]
+    kernel = make(devices.pack_width(frames.device), code, inverses is not None, references)
+    devices.launch(kernel, frames.packs,
+                   [frames.values, frames.saturated, frames.mask_of(used), wp.array(rows, dtype=wp.int32, device=frames.device),
+                    white if references else 0, black if references else 0, noise.read**2, noise.gain, float(stripe_px), float(extent),
+                    int(base_bit), (1 << len(bits)) - (2 << base_bit)],
+                   [as_packs(array, frames.device) for array in result], device=frames.device)
+    return result
+
+
+@wp.func
+def gray_to_binary(gray: int) -> int:
+    """The number whose reflected binary code this is; up to 32 bits."""
+    code = gray ^ (gray >> 1)
+    code = code ^ (code >> 2)
+    code = code ^ (code >> 4)
+    code = code ^ (code >> 8)
+    return code ^ (code >> 16)
+
+
+@wp.func
+def number_binary(shown: int, base_bit: int, above: int) -> int:
+    """The stripe whose bits are shown."""
+    return shown
+
+
+@wp.func
+def number_gray(shown: int, base_bit: int, above: int) -> int:
+    """The stripe whose Gray code is shown."""
+    return gray_to_binary(shown)
+
+
+@wp.func
+def number_xor(shown: int, base_bit: int, above: int) -> int:
+    """The stripe whose Gray code, its upper bits laid over by one of them, is shown."""
+    return gray_to_binary(shown ^ (above & (-((shown >> base_bit) & 1))))
+
+
+_NUMBERS = {"binary": number_binary, "gray": number_gray, "xor": number_xor}
+
+
+@cache
+def _stripe_kernel(pack: int, code: str = "gray", inverses: bool = True, references: bool = True) -> Any:
+    float_pack, int_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32), pack_type(pack, wp.uint8)
+    number_of = _NUMBERS[code]
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def stripe_kernel(first: int,
+                      values: wp.array2d(dtype=float_pack),  # [F, P]
+                      saturated: wp.array2d(dtype=byte_pack),  # [F / 8, P] bits
+                      masks: wp.array(dtype=int),  # [F / 8] of the frames that decide bits
+                      rows: wp.array2d(dtype=int),  # [bits, 2] frame, inverse
+                      white: int,
+                      black: int,
+                      read_variance: float,
+                      gain: float,
+                      stripe: float,
+                      extent: float,
+                      base_bit: int,
+                      above: int,  # mask of the bits that it lies over
+                      # outputs
+                      coordinate: wp.array(dtype=float_pack),
+                      sigma: wp.array(dtype=float_pack),
+                      amplitude: wp.array(dtype=float_pack),
+                      status: wp.array(dtype=byte_pack)):
+        p = first + wp.tid()
+        cut = int_pack()
+        for group in range(masks.shape[0]):
+            flags = saturated[group, p]
+            mask = masks[group]
+            for k in range(pack):
+                cut[k] = cut[k] | (int(flags[k]) & mask)
+        contrast, spread, middle = float_pack(), float_pack(), float_pack()
+        if wp.static(references):
+            on = values[white, p]
+            off = values[black, p]
+            for k in range(pack):
+                contrast[k] = on[k] - off[k]
+                middle[k] = 0.5 * (on[k] + off[k])
+                spread[k] = 2.0 * read_variance + gain * (wp.max(on[k], 0.0) + wp.max(off[k], 0.0))
+        else:
+            for bit in range(rows.shape[0]):
+                one = values[rows[bit, 0], p]
+                other = values[rows[bit, 1], p]
+                for k in range(pack):
+                    contrast[k] = wp.max(contrast[k], wp.abs(one[k] - other[k]))
+                    spread[k] = 2.0 * read_variance + gain * wp.max(one[k] + other[k], 0.0)
+        noise_part = wp.static(2.0 * DOUBT_SIGMAS**2) * read_variance
+        gain_part = wp.static(DOUBT_SIGMAS**2) * gain
+        small = float_pack()
+        for k in range(pack):
+            part = wp.static(DOUBT_PART) * contrast[k]
+            small[k] = wp.max(part * part, noise_part)
+        shown, doubt = int_pack(), int_pack()
+        for bit in range(rows.shape[0]):
+            flag = 1 << bit
+            one = values[rows[bit, 0], p]
+            if wp.static(inverses):
+                other = values[rows[bit, 1], p]
+                for k in range(pack):
+                    d = one[k] - other[k]
+                    limit = wp.max(noise_part + gain_part * (one[k] + other[k]), small[k])
+                    shown[k] = shown[k] + wp.where(d > 0.0, flag, 0)
+                    doubt[k] = doubt[k] + wp.where(d * d >= limit, 0, flag)
+            else:
+                for k in range(pack):
+                    d = one[k] - middle[k]
+                    variance = read_variance + gain * wp.max(one[k], 0.0) + 0.25 * spread[k]
+                    part = wp.static(0.5 * DOUBT_PART) * contrast[k]
+                    limit = wp.max(wp.static(DOUBT_SIGMAS**2) * variance, part * part)
+                    shown[k] = shown[k] + wp.where(d > 0.0, flag, 0)
+                    doubt[k] = doubt[k] + wp.where(d * d >= limit, 0, flag)
+        u, error, signal, result = float_pack(), float_pack(), float_pack(), byte_pack()
+        for k in range(pack):
+            low = doubt[k] & (-doubt[k])
+            rest = doubt[k] & (doubt[k] - 1)
+            second = rest & (-rest)
+            stripe_read = number_of(shown[k], base_bit, above)
+            stripe_low = number_of(shown[k] ^ low, base_bit, above)
+            stripe_second = number_of(shown[k] ^ second, base_bit, above)
+            stripe_both = number_of(shown[k] ^ low ^ second, base_bit, above)
+            least = wp.min(wp.min(stripe_read, stripe_low), wp.min(stripe_second, stripe_both))
+            most = wp.max(wp.max(stripe_read, stripe_low), wp.max(stripe_second, stripe_both))
+            apart = most - least
+            if cut[k] != 0:
+                result[k] = wp.uint8(_SATURATED)
+            elif not (contrast[k] > 0.0 and contrast[k] < LARGEST and contrast[k] * contrast[k] >= wp.static(SHADOW_SIGMAS**2) * spread[k]):  # NaN too
+                result[k] = wp.uint8(_SHADOWED)
+            elif (rest & (rest - 1)) != 0 or apart > wp.static(MAX_SPREAD):
+                result[k] = wp.uint8(_UNDECIDED)
+            elif float(least) * stripe >= extent:
+                result[k] = wp.uint8(_OUT_OF_RANGE)
+            else:
+                result[k] = wp.uint8(OK)
+                start = float(least) * stripe
+                end = wp.min((float(most) + 1.0) * stripe, extent)
+                u[k] = 0.5 * (start + end)
+                error[k] = wp.static(STRIPE_DEVIATION) * (end - start)
+                signal[k] = 0.5 * contrast[k]
+        coordinate[p] = u
+        sigma[p] = error
+        amplitude[p] = signal
+        status[p] = result
+
+    return stripe_kernel

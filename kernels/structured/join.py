@@ -1,0 +1,32 @@
+"""Wrapped phases that were decoded one by one, as one set of periods that is unwrapped together."""
+
+from collections.abc import Sequence
+
+import warp as wp
+
+from kernels.errors import ArrayError
+from kernels.structured.frames import unwritten
+from kernels.structured.phase import WrappedPhase
+
+
+def join_periods(parts: Sequence[WrappedPhase]) -> WrappedPhase:
+    """All periods of several phases of the same pixels, in the order given.
+
+    Raises:
+        ArrayError: nothing is given, or the pixels differ.
+    """
+    if not parts:
+        raise ArrayError("no phase is given: give one or more")
+    first = parts[0]
+    other = next((part.pixel_count for part in parts if part.pixel_count != first.pixel_count), None)
+    if other is not None:
+        raise ArrayError(f"one phase has {first.pixel_count} pixels, another {other}: decode the same frames")
+    periods = tuple(period for part in parts for period in part.periods_px)
+    joined = []
+    for field in ("phase", "amplitude", "offset", "sigma", "status"):
+        rows = [getattr(part, field)[row] for part in parts for row in range(len(part.periods_px))]
+        plane = unwritten(first.pixel_count, len(periods), rows[0].dtype, first.device)
+        for row, values in enumerate(rows):
+            wp.copy(plane[row], values)
+        joined.append(plane)
+    return WrappedPhase(*joined, periods, first.pixel_count, first.device)

@@ -1,0 +1,238 @@
+"""k-ary codes: each digit the nearest of k grey levels or colours, after black and white of the same pixel.
+
+A reading under the pattern colour c is black + e(c) · (white - black), channel by channel, with e(c) = (X c) / (X 1) for a projector
+and camera whose channels mix by the matrix X: the object's reflectance cancels. Digits are the candidates of least χ². A digit is
+in doubt where the second-best is nearly as near (a mixture at an edge, or noise); up to two doubtful digits are tried both ways,
+and where that changes the stripe by one at most, as it does at every edge of a reflected code, the middle is the result.
+
+Sources: Er (reflected k-ary), The Computer Journal 1984; Horn and Kiryati, "Toward optimal structured light patterns", Image and
+Vision Computing 1999 (grey levels); Caspi, Kiryati and Shamir, "Range imaging with adaptive color structured light", TPAMI 1998
+(crosstalk, equations 1 to 5).
+"""
+
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from kernels.errors import ArrayError
+from kernels.packs import as_packs, pack_type
+from kernels.status import OK, Status
+from kernels.structured.decoded import Decoded
+from kernels.structured.frames import Frames, NoiseModel, check_noise, check_stripes
+
+SHADOW_SIGMAS = 5.0
+"""White minus black over its deviation (all channels together): below, the projector does not reach the pixel."""
+LEVEL_ERROR = 0.02
+"""Of white minus black, by which a level may be off beyond noise: responses, and light from other surfaces."""
+DOUBT_CHI2 = 9.0
+"""χ² between the best and the second-best level that noise alone leaves (three standard deviations)."""
+DOUBT_RATIO = 0.44
+"""χ² of the best over that of the second-best: above, the reading lies more than two fifths of the way to the next level."""
+MAX_SPREAD = 1
+"""Stripes that the readings of a pixel with doubtful digits may lie apart."""
+MAX_STRIPES = 1 << 24
+"""Stripes are counted in float32 at the end, exact up to here."""
+MIN_LEVEL_STEP = 1.0e-3
+"""Between two levels, of white minus black: with less they are the same."""
+STRIPE_DEVIATION = float(1.0 / np.sqrt(12.0))
+"""Standard deviation of a place evenly distributed over a stripe of width one."""
+LARGEST = 1.0e15
+"""A signal above this counts as infinite: it is squared in float32."""
+FAR = 1.0e30
+
+_SATURATED, _SHADOWED, _UNDECIDED, _OUT_OF_RANGE = (int(s) for s in (Status.SATURATED, Status.SHADOWED, Status.UNDECIDED,
+                                                                    Status.OUT_OF_RANGE))
+
+
+def decode_kary(frames: Frames, digits: Sequence[int], *, white: int, black: int, levels: np.ndarray, reflected: bool,
+                extent: float, stripe_px: float = 1.0, crosstalk: np.ndarray | None = None, noise: NoiseModel) -> Decoded:
+    """Decode a base-k code in grey levels or colours.
+
+    Args:
+        frames: linear images: one channel for levels, three for colours.
+        digits: frame of each digit, digit 0 (the finest) first.
+        white, black: frames of the projector full on and black.
+        levels: [k] grey levels or [k, 3] colours of the digit values, 0…1, linear light.
+        reflected: whether the code is the reflected one.
+        extent: projector pixels along the axis.
+        stripe_px: width of the finest stripe.
+        crosstalk: [3, 3] camera channels from projector channels, for colours; None: each channel sees its own.
+        noise: of a reading.
+
+    Returns:
+        Stripe centres on the device; not synchronised on CUDA. SATURATED: a frame of the code is. SHADOWED: white is not above
+        black. UNDECIDED: doubtful digits leave stripes apart. OUT_OF_RANGE: a code beyond the projector.
+
+    Raises:
+        ArrayError: a frame is missing, does not exist or is given twice; levels that are the same; a value that cannot be.
+    """
+    check_noise(noise)
+    check_stripes(extent, stripe_px)
+    expected = expected_levels(levels, crosstalk)
+    base, channels = expected.shape
+    frames.require(*digits, white, black, channels=channels)
+    if not digits or base ** len(digits) * stripe_px < extent:
+        raise ArrayError(f"{len(digits)} digits in base {base} number {base ** len(digits) * stripe_px:g} px of stripes of "
+                         f"{stripe_px:g} px, the projector has {extent:g}: a digit is missing")
+    if base ** len(digits) > MAX_STRIPES:
+        raise ArrayError(f"{len(digits)} digits in base {base} number more than {MAX_STRIPES} stripes: give fewer digits")
+    result = frames.outputs()
+    order = np.array(digits, dtype=np.int32)
+    devices.launch(_kary_kernel(devices.pack_width(frames.device), channels), frames.packs,
+                   [frames.values, frames.saturated, frames.mask_of([*digits, white, black]),
+                    wp.array(order, dtype=wp.int32, device=frames.device), white, black,
+                    wp.array(expected.astype(np.float32), dtype=wp.float32, device=frames.device), 1 if reflected else 0,
+                    noise.read**2, noise.gain, float(stripe_px), float(extent)],
+                   [as_packs(array, frames.device) for array in result], device=frames.device)
+    return result
+
+
+def expected_levels(levels: np.ndarray, crosstalk: np.ndarray | None) -> np.ndarray:
+    """What each digit value reads, as a part of white minus black.
+
+    Returns:
+        [k, channels] float64.
+
+    Raises:
+        ArrayError: shapes that cannot be, or levels that look the same.
+    """
+    given = np.asarray(levels, dtype=np.float64)
+    if given.ndim == 1:
+        given = given[:, None]
+    if given.ndim != 2 or len(given) < 2 or given.shape[1] not in (1, 3) or not np.isfinite(given).all():
+        raise ArrayError(f"levels are {np.shape(levels)}: give [k] grey levels or [k, 3] colours, two or more, finite")
+    if crosstalk is not None:
+        if given.shape[1] != 3 or np.shape(crosstalk) != (3, 3):
+            raise ArrayError(f"crosstalk is {np.shape(crosstalk)} for levels {np.shape(levels)}: give [3, 3], and colours")
+        mixed = np.asarray(crosstalk, dtype=np.float64)
+        if not (mixed.sum(axis=1) > 0).all():
+            raise ArrayError("crosstalk has a camera channel that sees no light of the projector: every row must add up to more than 0")
+        given = given @ mixed.T / mixed.sum(axis=1)
+    for i in range(len(given)):
+        for j in range(i):
+            if np.abs(given[i] - given[j]).max() < MIN_LEVEL_STEP:
+                raise ArrayError(f"digit values {j} and {i} look the same to the camera: give levels that differ")
+    return given
+
+
+@cache
+def _kary_kernel(pack: int, channels: int = 1) -> Any:
+    float_pack, int_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32), pack_type(pack, wp.uint8)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def kary_kernel(first: int,
+                    values: wp.array2d(dtype=float_pack),  # [F · channels, P]
+                    saturated: wp.array2d(dtype=byte_pack),  # [F / 8, P] bits
+                    masks: wp.array(dtype=int),  # [F / 8]
+                    order: wp.array(dtype=int),  # [digits] frames, finest first
+                    white: int,
+                    black: int,
+                    expected: wp.array2d(dtype=float),  # [k, channels]
+                    reflected: int,
+                    read_variance: float,
+                    gain: float,
+                    stripe: float,
+                    extent: float,
+                    # outputs
+                    coordinate: wp.array(dtype=float_pack),
+                    sigma: wp.array(dtype=float_pack),
+                    amplitude: wp.array(dtype=float_pack),
+                    status: wp.array(dtype=byte_pack)):
+        p = first + wp.tid()
+        cut = int_pack()
+        for group in range(masks.shape[0]):
+            flags = saturated[group, p]
+            mask = masks[group]
+            for k in range(pack):
+                cut[k] = cut[k] | (int(flags[k]) & mask)
+        lit, signal = float_pack(), float_pack()
+        for channel in range(channels):
+            on = values[white * channels + channel, p]
+            off = values[black * channels + channel, p]
+            for k in range(pack):
+                contrast = wp.max(on[k] - off[k], 0.0)
+                lit[k] = lit[k] + contrast * contrast / (2.0 * read_variance + gain * (wp.max(on[k], 0.0) + wp.max(off[k], 0.0)))
+                signal[k] = signal[k] + wp.static(0.5 / channels) * contrast
+
+        # the number under every choice of up to two doubtful digits, most significant digit first
+        base = expected.shape[0]
+        doubts = int_pack()
+        code0, code1, code2, code3 = int_pack(), int_pack(), int_pack(), int_pack()
+        sum0, sum1, sum2, sum3 = int_pack(), int_pack(), int_pack(), int_pack()
+        for back in range(order.shape[0]):
+            frame = order[order.shape[0] - 1 - back]
+            best, second, nearest, next_nearest = float_pack(), float_pack(), int_pack(), int_pack()
+            for k in range(pack):
+                best[k] = FAR
+                second[k] = FAR
+            for digit in range(base):
+                cost = float_pack()
+                for channel in range(channels):
+                    on = values[white * channels + channel, p]
+                    off = values[black * channels + channel, p]
+                    reading = values[frame * channels + channel, p]
+                    level = expected[digit, channel]
+                    for k in range(pack):
+                        contrast = wp.max(on[k] - off[k], 0.0)
+                        variance = 3.0 * read_variance + wp.static(LEVEL_ERROR**2) * contrast * contrast + gain * (
+                            wp.max(on[k], 0.0) + wp.max(off[k], 0.0) + wp.max(reading[k], 0.0))
+                        miss = reading[k] - off[k] - level * contrast
+                        cost[k] = cost[k] + miss * miss / variance
+                for k in range(pack):
+                    first_is = wp.where(cost[k] < best[k], 1, 0)
+                    second_is = (1 - first_is) * wp.where(cost[k] < second[k], 1, 0)
+                    next_nearest[k] = first_is * nearest[k] + second_is * digit + (1 - first_is - second_is) * next_nearest[k]
+                    nearest[k] = nearest[k] + first_is * (digit - nearest[k])
+                    second[k] = wp.min(second[k], wp.max(cost[k], best[k]))
+                    best[k] = wp.min(cost[k], best[k])
+            for k in range(pack):
+                sure = wp.where(second[k] - best[k] > DOUBT_CHI2, 1, 0) * wp.where(best[k] < DOUBT_RATIO * second[k], 1, 0)
+                other = next_nearest[k] - nearest[k]
+                one = (1 - sure) * wp.where(doubts[k] == 0, 1, 0)
+                two = (1 - sure) * wp.where(doubts[k] == 1, 1, 0)
+                doubts[k] = doubts[k] + 1 - sure
+                d0 = nearest[k]
+                d1 = nearest[k] + one * other
+                d2 = nearest[k] + two * other
+                d3 = nearest[k] + (one + two) * other
+                number0 = d0 + reflected * (sum0[k] & 1) * (base - 1 - 2 * d0)  # as it is in the plain number
+                sum0[k] = sum0[k] + d0
+                number1 = d1 + reflected * (sum1[k] & 1) * (base - 1 - 2 * d1)
+                sum1[k] = sum1[k] + d1
+                number2 = d2 + reflected * (sum2[k] & 1) * (base - 1 - 2 * d2)
+                sum2[k] = sum2[k] + d2
+                number3 = d3 + reflected * (sum3[k] & 1) * (base - 1 - 2 * d3)
+                sum3[k] = sum3[k] + d3
+                code0[k] = code0[k] * base + number0
+                code1[k] = code1[k] * base + number1
+                code2[k] = code2[k] * base + number2
+                code3[k] = code3[k] * base + number3
+        u, error, result = float_pack(), float_pack(), byte_pack()
+        for k in range(pack):
+            least = wp.min(wp.min(code0[k], code1[k]), wp.min(code2[k], code3[k]))
+            most = wp.max(wp.max(code0[k], code1[k]), wp.max(code2[k], code3[k]))
+            if cut[k] != 0:
+                result[k] = wp.uint8(_SATURATED)
+            elif not (lit[k] >= wp.static(SHADOW_SIGMAS**2) and signal[k] < LARGEST):  # NaN too
+                result[k] = wp.uint8(_SHADOWED)
+            elif doubts[k] > 2 or most - least > wp.static(MAX_SPREAD):
+                result[k] = wp.uint8(_UNDECIDED)
+            elif float(least) * stripe >= extent:
+                result[k] = wp.uint8(_OUT_OF_RANGE)
+            else:
+                result[k] = wp.uint8(OK)
+                start = float(least) * stripe
+                end = wp.min((float(most) + 1.0) * stripe, extent)
+                u[k] = 0.5 * (start + end)
+                error[k] = wp.static(STRIPE_DEVIATION) * (end - start)
+            signal[k] = wp.where(int(result[k]) == OK, signal[k], 0.0)
+        coordinate[p] = u
+        sigma[p] = error
+        amplitude[p] = signal
+        status[p] = result
+
+    return kary_kernel

@@ -1,0 +1,252 @@
+"""Micro phase shifting: three shifts of one short period, one frame of each of several periods close to it.
+
+The reference period gives offset A, amplitude B and a phase; all other frames share A and B, because no period is long enough to
+be bounced about and all are dimmed alike by defocus. Every wrap of the reference predicts their readings, and the one whose
+misfit χ² is least is refined by Gauss-Newton steps on A, B and u over all frames, weighted by their variance.
+
+Source: Gupta and Nayar, "Micro Phase Shifting", CVPR 2012, equations 5 to 10.
+"""
+
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from kernels.errors import ArrayError
+from kernels.packs import as_packs, pack_type
+from kernels.status import OK, Status
+from kernels.structured.angles import TURN, cosine_of_turns, sine_of_turns
+from kernels.structured.decoded import Decoded
+from kernels.structured.frames import Frames, NoiseModel
+from kernels.structured.phase import decode_phase
+
+LEVEL_ERROR = 0.02
+"""Of the amplitude, by which a reading may be off beyond noise: responses, and amplitudes that are not quite alike."""
+UNDECIDED_CHI2 = 9.0
+"""χ² of the second-best wrap that is not enough to rule it out (three standard deviations) …"""
+UNDECIDED_RATIO = 2.0
+"""… beyond so many times that of the best."""
+MULTIPATH_CHI2 = 225.0
+"""χ² of the best wrap beyond which the readings contradict each other."""
+MIN_SEPARATION = 0.05
+"""Of the amplitude, by which the readings at two places must differ, all frames together."""
+BORDER_PX = 0.5
+"""How far outside the projector a place may seem to lie."""
+STEPS = 3
+"""Gauss-Newton steps; the start is off by the noise of three readings, and each step squares the error."""
+FAR = 1.0e30
+
+_SATURATED, _UNDECIDED, _MULTIPATH, _OUT_OF_RANGE = (int(s) for s in (Status.SATURATED, Status.UNDECIDED, Status.MULTIPATH,
+                                                                     Status.OUT_OF_RANGE))
+
+
+def decode_micro(frames: Frames, numbers: Sequence[int], periods_px: Sequence[float], shifts: Sequence[float], *,
+                 black: int | None = None, extent: float, noise: NoiseModel) -> Decoded:
+    """The coordinate from frames of several close periods that share offset and amplitude.
+
+    Args:
+        frames: linear images of one channel.
+        numbers: the phase frames, in any order.
+        periods_px: of each of them; one has three or more frames of different shifts.
+        shifts: of each of them in turns (step / steps).
+        black: frame of the ambient light, or None.
+        extent: projector pixels along the axis.
+        noise: of a reading.
+
+    Returns:
+        The coordinate on the device; not synchronised on CUDA. UNDECIDED: another wrap fits about as well. MULTIPATH: none fits.
+        Else as decode_phase.
+
+    Raises:
+        ArrayError: no period has three shifts, or none has fewer frames than that; two places of the projector look alike.
+    """
+    periods = np.array(periods_px, dtype=np.float64)
+    if not len(numbers) == len(periods) == len(shifts) or not extent > 0:
+        raise ArrayError(f"there are {len(numbers)} frames, {len(periods)} periods, {len(shifts)} shifts and {extent:g} px: give one "
+                         "of each for every frame, and a width above 0")
+    full = [period for period in dict.fromkeys(periods) if len({s % 1.0 for s, p in zip(shifts, periods, strict=True) if p == period}) >= 3]
+    if not full:
+        raise ArrayError("no period has three shifts: micro phase shifting needs one that has, to know offset and amplitude")
+    reference = full[0]
+    member = periods == reference
+    if member.all():
+        raise ArrayError(f"all frames have the period {reference:g} px: give frames of other periods near it")
+    start = decode_phase(frames, [n for n, m in zip(numbers, member, strict=True) if m], periods[member],
+                         np.array(shifts)[member].tolist(), black=black, noise=noise)
+    frames.require(*numbers, black)
+    others, device, pack = np.flatnonzero(~member), frames.device, devices.pack_width(frames.device)
+    ratio = reference / periods[others]
+    wraps = np.arange(-1, int(np.ceil(extent / reference)) + 1)
+    _require_unlike(periods, reference, others, extent)
+    turns = 2 * np.pi * np.outer(wraps, ratio)
+    order = np.concatenate([others, np.flatnonzero(member)])
+    table = np.stack([1 / periods[order], np.array(shifts)[order]], axis=1)
+    result = frames.outputs()
+    scratch = wp.empty((2 * len(others), frames.packs * pack), dtype=wp.float32, device=device)
+    inputs = [as_packs(array, device) for array in (start.phase, start.amplitude, start.offset, start.status)]
+    devices.launch(_micro_kernel(pack), frames.packs,
+                   [frames.values, frames.saturated, frames.mask_of(list(numbers)), *inputs,
+                    wp.array(np.array(numbers, dtype=np.int32)[order], dtype=wp.int32, device=device),
+                    wp.array(table.astype(np.float32), dtype=wp.vec2, device=device),
+                    wp.array(np.stack([np.cos(turns), np.sin(turns)], axis=-1).astype(np.float32), dtype=wp.vec2, device=device),
+                    float(reference), float(member.sum()), float(extent), noise.read**2, noise.gain],
+                   [as_packs(array, device) for array in (scratch, *result)], device=device)
+    return result
+
+
+def _require_unlike(periods: np.ndarray, reference: float, others: np.ndarray, extent: float) -> None:
+    """Refuse periods whose single readings are the same at two places that show one reference phase."""
+    offsets = np.arange(1, int(np.ceil(extent / reference))) * reference
+    at = np.linspace(0, extent, 256, endpoint=False)[:, None, None]
+    here, there = (np.cos(2 * np.pi * (at + offset) / periods[others]) for offset in (0.0, offsets[:, None]))
+    apart = np.where(at[..., 0] + offsets < extent, np.linalg.norm(here - there, axis=-1), np.inf)
+    if offsets.size and apart.min() < MIN_SEPARATION:
+        covered = offsets[int(np.argmin(apart.min(axis=0)))]
+        listed = ", ".join(f"{period:g}" for period in dict.fromkeys(periods))
+        raise ArrayError(f"frames of {listed} px show two places {covered:g} px apart alike, the projector has {extent:g}: "
+                         "add a period, or choose other ones")
+
+
+@cache
+def _micro_kernel(pack: int) -> Any:
+    float_pack, int_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32), pack_type(pack, wp.uint8)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def micro_kernel(first: int,
+                     values: wp.array2d(dtype=float_pack),  # [F, P]
+                     saturated: wp.array2d(dtype=byte_pack),  # [F / 8, P] bits
+                     masks: wp.array(dtype=int),  # [F / 8]
+                     phase: wp.array2d(dtype=float_pack),  # [1, P] of the reference, radians
+                     amplitude: wp.array2d(dtype=float_pack),  # [1, P]
+                     offset: wp.array2d(dtype=float_pack),  # [1, P]
+                     state: wp.array2d(dtype=byte_pack),  # [1, P]
+                     order: wp.array(dtype=int),  # [N] frames, those of the reference last
+                     table: wp.array(dtype=wp.vec2),  # [N] 1 / period, shift in turns
+                     step: wp.array2d(dtype=wp.vec2),  # [wraps, others] cos, sin of what a wrap adds to the angle
+                     period: float,
+                     shifts: float,  # frames of the reference
+                     extent: float,
+                     read_variance: float,
+                     gain: float,
+                     # outputs
+                     turned: wp.array2d(dtype=float_pack),  # [2 · others, P] scratch: B cos, B sin at wrap 0
+                     coordinate: wp.array(dtype=float_pack),
+                     sigma: wp.array(dtype=float_pack),
+                     signal: wp.array(dtype=float_pack),
+                     status: wp.array(dtype=byte_pack)):
+        p = first + wp.tid()
+        cut = int_pack()
+        for group in range(masks.shape[0]):
+            flags = saturated[group, p]
+            mask = masks[group]
+            for k in range(pack):
+                cut[k] = cut[k] | (int(flags[k]) & mask)
+        angle = phase[0, p]
+        swing = amplitude[0, p]
+        mean = offset[0, p]
+        given = state[0, p]
+        others = step.shape[1]
+        for f in range(others):
+            cosine, sine = float_pack(), float_pack()
+            for k in range(pack):
+                t = angle[k] * wp.static(1.0 / TURN) * period * table[f][0] - table[f][1]
+                cosine[k] = swing[k] * cosine_of_turns(t)
+                sine[k] = swing[k] * sine_of_turns(t)
+            turned[2 * f, p] = cosine
+            turned[2 * f + 1, p] = sine
+
+        # every wrap of the reference, and how well the other frames fit there
+        best, second, place, trust, known = float_pack(), float_pack(), float_pack(), float_pack(), float_pack()
+        for k in range(pack):
+            best[k] = FAR
+            second[k] = FAR
+            trust[k] = 1.0 / (2.0 * (read_variance + gain * wp.max(mean[k], 0.0)) + wp.static(LEVEL_ERROR**2) * swing[k] * swing[k])
+            slope_reference = swing[k] * TURN / period
+            known[k] = 0.5 * shifts * slope_reference * slope_reference + 1.0e-20
+        for wrap in range(step.shape[0]):
+            squares, slopes, stiffness = float_pack(), float_pack(), float_pack()
+            for f in range(others):
+                cosine = turned[2 * f, p]
+                sine = turned[2 * f + 1, p]
+                reading = values[order[f], p]
+                c, s = step[wrap, f][0], step[wrap, f][1]
+                w = TURN * table[f][0]
+                for k in range(pack):
+                    miss = reading[k] - mean[k] - cosine[k] * c + sine[k] * s
+                    slope = -w * (sine[k] * c + cosine[k] * s)
+                    squares[k] = squares[k] + miss * miss
+                    slopes[k] = slopes[k] + miss * slope
+                    stiffness[k] = stiffness[k] + slope * slope
+            for k in range(pack):
+                shift = slopes[k] / (stiffness[k] + known[k])
+                u = (angle[k] * wp.static(1.0 / TURN) + float(wrap - 1)) * period + shift
+                outside = wp.where(wp.abs(u - 0.5 * extent) > 0.5 * extent + BORDER_PX, FAR, 0.0)
+                cost = wp.max(squares[k] - slopes[k] * shift, 0.0) * trust[k] + outside
+                better = wp.where(cost < best[k], 1.0, 0.0)
+                second[k] = wp.min(second[k], wp.max(cost, best[k]))
+                best[k] = wp.min(cost, best[k])
+                place[k] = place[k] + better * (u - place[k])
+
+        # A, B and u from all frames, each by its variance
+        information = float_pack()
+        for _step in range(STEPS):
+            aa, ab, au, bb, bu, uu = float_pack(), float_pack(), float_pack(), float_pack(), float_pack(), float_pack()
+            ra, rb, ru = float_pack(), float_pack(), float_pack()
+            for f in range(order.shape[0]):
+                reading = values[order[f], p]
+                frequency, delta = table[f][0], table[f][1]
+                for k in range(pack):
+                    t = place[k] * frequency - delta
+                    c = cosine_of_turns(t)
+                    slope = -swing[k] * TURN * frequency * sine_of_turns(t)
+                    w = 1.0 / (read_variance + gain * wp.max(reading[k], 0.0))
+                    miss = reading[k] - mean[k] - swing[k] * c
+                    aa[k] = aa[k] + w
+                    ab[k] = ab[k] + w * c
+                    au[k] = au[k] + w * slope
+                    bb[k] = bb[k] + w * c * c
+                    bu[k] = bu[k] + w * c * slope
+                    uu[k] = uu[k] + w * slope * slope
+                    ra[k] = ra[k] + w * miss
+                    rb[k] = rb[k] + w * c * miss
+                    ru[k] = ru[k] + w * slope * miss
+            for k in range(pack):
+                # eliminate A, then B
+                bb1 = bb[k] - ab[k] * ab[k] / aa[k]
+                bu1 = bu[k] - ab[k] * au[k] / aa[k]
+                uu1 = uu[k] - au[k] * au[k] / aa[k]
+                rb1 = rb[k] - ab[k] * ra[k] / aa[k]
+                ru1 = ru[k] - au[k] * ra[k] / aa[k]
+                left = uu1 - bu1 * bu1 / bb1
+                du = (ru1 - bu1 * rb1 / bb1) / left
+                db = (rb1 - bu1 * du) / bb1
+                place[k] = place[k] + du
+                swing[k] = swing[k] + db
+                mean[k] = mean[k] + (ra[k] - ab[k] * db - au[k] * du) / aa[k]
+                information[k] = left
+        u_out, error, height, result = float_pack(), float_pack(), float_pack(), byte_pack()
+        for k in range(pack):
+            code = int(given[k])
+            if cut[k] != 0:
+                code = _SATURATED
+            elif code == OK:
+                if best[k] >= FAR:
+                    code = _OUT_OF_RANGE
+                elif not (best[k] < MULTIPATH_CHI2 and information[k] > 0.0):  # NaN too
+                    code = _MULTIPATH
+                elif second[k] < UNDECIDED_CHI2 + UNDECIDED_RATIO * best[k]:
+                    code = _UNDECIDED
+            if code == OK:
+                u_out[k] = place[k]
+                error[k] = 1.0 / wp.sqrt(information[k])
+                height[k] = swing[k]
+            result[k] = wp.uint8(code)
+        coordinate[p] = u_out
+        sigma[p] = error
+        signal[p] = height
+        status[p] = result
+
+    return micro_kernel

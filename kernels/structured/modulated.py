@@ -1,0 +1,152 @@
+"""Modulated phase shifting: the direct light of each phase step, by a fine carrier, and then the phase of that.
+
+Under (1 + cos φ_i)/2 · (1 + cos ψ_j)/2 only direct light follows the carrier ψ. Its carrier phase is the same at every step i, so
+the steps' responses are projected on the direction of their sum: they keep their sign, and noise does not make dark steps bright.
+
+Source: Chen, Seidel and Lensch, "Modulated phase-shifting for 3D scanning", CVPR 2008, section 4.
+"""
+
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from kernels.errors import ArrayError
+from kernels.packs import as_packs, pack_type
+from kernels.status import OK, Status
+from kernels.structured.angles import angle_of
+from kernels.structured.frames import Frames, NoiseModel, check_noise, unwritten
+from kernels.structured.phase import MIN_MODULATION, SIGNAL_SIGMAS, WrappedPhase, weights
+
+_SATURATED, _SHADOWED, _LOW_MODULATION = int(Status.SATURATED), int(Status.SHADOWED), int(Status.LOW_MODULATION)
+
+
+def decode_modulated(frames: Frames, numbers: Sequence[Sequence[int]], *, period_px: float, noise: NoiseModel) -> WrappedPhase:
+    """Wrapped phase of one period, of direct light alone.
+
+    Args:
+        frames: linear images of one channel.
+        numbers: [steps][carrier steps] frames; both even over a turn.
+        period_px: of the phase.
+        noise: of a reading.
+
+    Returns:
+        The phase as decode_phase gives it; amplitude and offset are those of the direct light; ambient light has cancelled.
+        SHADOWED: no direct light. LOW_MODULATION: it does not follow the phase.
+
+    Raises:
+        ArrayError: a frame is missing, does not exist or is given twice; a period that is not above zero.
+    """
+    check_noise(noise)
+    steps, carriers = len(numbers), len(numbers[0]) if numbers else 0
+    if steps < 3 or carriers < 3 or any(len(row) != carriers for row in numbers):
+        raise ArrayError(f"there are {[len(row) for row in numbers]} carrier frames a step: give three or more for each of three or more "
+                         "steps, as many for each")
+    if not period_px > 0:
+        raise ArrayError(f"the period is {period_px:g} px: give more than 0")
+    order = [number for row in numbers for number in row]
+    frames.require(*order)
+    device = frames.device
+    outer, inner = (weights(np.arange(n) / n, period_px).astype(np.float32) for n in (steps, carriers))
+    rows = [unwritten(frames.pixel_count, 1, dtype, device) for dtype in (*[wp.float32] * 4, wp.uint8)]
+    devices.launch(_modulated_kernel(devices.pack_width(device)), frames.packs,
+                   [frames.values, frames.saturated, frames.mask_of(order),
+                    wp.array(np.array(numbers, dtype=np.int32), dtype=wp.int32, device=device),
+                    wp.array(outer, dtype=wp.vec3, device=device), wp.array(inner, dtype=wp.vec3, device=device),
+                    noise.read**2, noise.gain],
+                   [as_packs(row, device) for row in rows], device=device)
+    return WrappedPhase(*rows, (float(period_px),), frames.pixel_count, device)
+
+
+@cache
+def _modulated_kernel(pack: int) -> Any:
+    float_pack, int_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32), pack_type(pack, wp.uint8)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def modulated_kernel(first: int,
+                         values: wp.array2d(dtype=float_pack),  # [F, P]
+                         saturated: wp.array2d(dtype=byte_pack),  # [F / 8, P] bits
+                         masks: wp.array(dtype=int),  # [F / 8]
+                         order: wp.array2d(dtype=int),  # [steps, carrier steps] frames
+                         outer: wp.array(dtype=wp.vec3),  # [steps] weights for A, C, S
+                         inner: wp.array(dtype=wp.vec3),  # [carrier steps]
+                         read_variance: float,
+                         gain: float,
+                         # outputs
+                         phase: wp.array2d(dtype=float_pack),
+                         amplitude: wp.array2d(dtype=float_pack),
+                         offset: wp.array2d(dtype=float_pack),
+                         sigma: wp.array2d(dtype=float_pack),
+                         status: wp.array2d(dtype=byte_pack)):
+        p = first + wp.tid()
+        cut = int_pack()
+        for group in range(masks.shape[0]):
+            flags = saturated[group, p]
+            mask = masks[group]
+            for k in range(pack):
+                cut[k] = cut[k] | (int(flags[k]) & mask)
+
+        # where the carrier stands at this pixel: the same at every step
+        cosine, sine = float_pack(), float_pack()
+        for step in range(order.shape[0]):
+            for carrier in range(order.shape[1]):
+                reading = values[order[step, carrier], p]
+                c, s = inner[carrier][1], inner[carrier][2]
+                for k in range(pack):
+                    cosine[k] = cosine[k] + c * reading[k]
+                    sine[k] = sine[k] + s * reading[k]
+        for k in range(pack):
+            over = 1.0 / (wp.sqrt(cosine[k] * cosine[k] + sine[k] * sine[k]) + 1.0e-30)
+            cosine[k] = cosine[k] * over
+            sine[k] = sine[k] * over
+
+        mean, along, across = float_pack(), float_pack(), float_pack()
+        vaa, vcc, vss, vcs = float_pack(), float_pack(), float_pack(), float_pack()
+        for step in range(order.shape[0]):
+            direct, variance = float_pack(), float_pack()
+            for carrier in range(order.shape[1]):
+                reading = values[order[step, carrier], p]
+                c, s = inner[carrier][1], inner[carrier][2]
+                for k in range(pack):
+                    w = c * cosine[k] + s * sine[k]
+                    direct[k] = direct[k] + w * reading[k]
+                    variance[k] = variance[k] + w * w * (read_variance + gain * wp.max(reading[k], 0.0))
+            a, c, s = outer[step][0], outer[step][1], outer[step][2]
+            for k in range(pack):
+                y, v = direct[k], variance[k]
+                mean[k] = mean[k] + a * y
+                along[k] = along[k] + c * y
+                across[k] = across[k] + s * y
+                vaa[k] = vaa[k] + a * a * v
+                vcc[k] = vcc[k] + c * c * v
+                vss[k] = vss[k] + s * s * v
+                vcs[k] = vcs[k] + c * s * v
+        angle, swing, error, level, result = float_pack(), float_pack(), float_pack(), float_pack(), byte_pack()
+        for k in range(pack):
+            c2, s2 = along[k] * along[k], across[k] * across[k]
+            twice = 2.0 * along[k] * across[k] * vcs[k]
+            square = c2 + s2
+            over = 1.0 / (square + 1.0e-30)
+            swing_variance = (c2 * vcc[k] + s2 * vss[k] + twice) * over
+            if cut[k] != 0:
+                result[k] = wp.uint8(_SATURATED)
+            elif not (mean[k] > wp.static(SIGNAL_SIGMAS) * wp.sqrt(vaa[k])):  # NaN too
+                result[k] = wp.uint8(_SHADOWED)
+            elif not (square > wp.max(wp.static(SIGNAL_SIGMAS**2) * swing_variance, wp.static(MIN_MODULATION**2) * mean[k] * mean[k])):
+                result[k] = wp.uint8(_LOW_MODULATION)
+            else:
+                result[k] = wp.uint8(OK)
+                angle[k] = angle_of(along[k], across[k])
+                swing[k] = wp.sqrt(square)
+                error[k] = wp.sqrt(wp.max(c2 * vss[k] + s2 * vcc[k] - twice, 0.0)) * over
+                level[k] = mean[k]
+        phase[0, p] = angle
+        amplitude[0, p] = swing
+        offset[0, p] = level
+        sigma[0, p] = error
+        status[0, p] = result
+
+    return modulated_kernel

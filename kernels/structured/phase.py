@@ -1,0 +1,197 @@
+"""Phase shifting: readings I = A + B cos(φ - δ) under three or more shifts δ of each period → φ, B, A by least squares.
+
+Written as A + C cos δ + S sin δ the fit is linear, so each of the three is a fixed weighted sum of the readings whatever the
+shifts; φ = atan2(S, C), B = √(C² + S²). With the variance v of each reading the same sums give
+var φ = (C² V_SS + S² V_CC - 2 C S V_CS) / B⁴ to first order, V_XY = Σ x y v.
+
+Sources: Bruning et al., Applied Optics 1974 (synchronous detection); Greivenkamp, Optical Engineering 1984 (least squares, any
+shifts); Surrel, Applied Optics 1997 (noise).
+"""
+
+from collections.abc import Sequence
+from functools import cache
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from kernels.errors import ArrayError
+from kernels.packs import as_packs, pack_type
+from kernels.status import OK, Status
+from kernels.structured.angles import angle_of
+from kernels.structured.frames import Frames, NoiseModel, check_noise, unwritten
+
+SIGNAL_SIGMAS = 5.0
+"""Light of the projector over its deviation, below which a pixel is SHADOWED; amplitude over its deviation, below which it has
+LOW_MODULATION: the phase would be uncertain by more than 0.2 radians."""
+MIN_MODULATION = 0.02
+"""Amplitude over offset, ambient taken off: below, the pattern is blurred or outshone by its own bounces, and harmonics decide."""
+MIN_SPREAD = 1.0e-3
+"""Smallest singular value of the fit over the root of the frames: 0.7 for even shifts, 0 for two shifts."""
+
+_SATURATED, _SHADOWED, _LOW_MODULATION = int(Status.SATURATED), int(Status.SHADOWED), int(Status.LOW_MODULATION)
+
+
+class WrappedPhase(NamedTuple):
+    """Phases of a band, one row a period; pixels are padded to whole packs. Only entries with status OK have values."""
+
+    phase: wp.array  # [periods, pixels] float32 radians, 0 to 2π: 2π u / period
+    amplitude: wp.array  # [periods, pixels] float32, B
+    offset: wp.array  # [periods, pixels] float32, A, ambient included
+    sigma: wp.array  # [periods, pixels] float32 radians, standard deviation of the phase
+    status: wp.array  # [periods, pixels] uint8
+    periods_px: tuple[float, ...]
+    pixel_count: int
+    device: str
+
+
+def decode_phase(frames: Frames, numbers: Sequence[int], periods_px: Sequence[float], shifts: Sequence[float], *,
+                 black: int | None = None, noise: NoiseModel) -> WrappedPhase:
+    """Wrapped phase of every period.
+
+    Args:
+        frames: linear images of one channel.
+        numbers: the phase frames, in any order.
+        periods_px: of each of them.
+        shifts: δ of each of them in turns (step / steps), any three or more different ones a period.
+        black: frame of the ambient light, or None: then it counts as light of the projector in telling SHADOWED pixels.
+        noise: of a reading.
+
+    Returns:
+        Phases on the device, periods in order of first appearance; not synchronised on CUDA. SATURATED: a frame of the period
+        is. SHADOWED: the mean is not above ambient. LOW_MODULATION: the pattern is not seen in the light that there is.
+
+    Raises:
+        ArrayError: lists of different lengths, a frame that does not exist or is given twice, a period with fewer than three
+            different shifts.
+    """
+    check_noise(noise)
+    frames.require(*numbers, black)
+    if not numbers or not len(numbers) == len(periods_px) == len(shifts):
+        raise ArrayError(f"there are {len(numbers)} frames, {len(periods_px)} periods, {len(shifts)} shifts: give one of each for "
+                         "every frame, and at least three")
+    periods = tuple(dict.fromkeys(float(period) for period in periods_px))
+    table, order, starts = [], [], [0]
+    for period in periods:
+        if not period > 0:
+            raise ArrayError(f"a period is {period:g} px: give more than 0")
+        members = [index for index, other in enumerate(periods_px) if float(other) == period]
+        table.append(weights(np.array([shifts[index] for index in members]), period))
+        order += [numbers[index] for index in members]
+        starts.append(len(order))
+    device, pack = frames.device, devices.pack_width(frames.device)
+    masks = frames.mask_of(*(order[a:b] for a, b in pairwise(starts))).reshape((len(periods), -1))
+    rows = [unwritten(frames.pixel_count, len(periods), dtype, device) for dtype in (*[wp.float32] * 4, wp.uint8)]
+    devices.launch(_phase_kernel(pack, black is not None), frames.packs,
+                   [frames.values, frames.saturated, masks,
+                    wp.array(np.array(order, dtype=np.int32), dtype=wp.int32, device=device),
+                    wp.array(np.array(starts, dtype=np.int32), dtype=wp.int32, device=device),
+                    wp.array(np.concatenate(table).astype(np.float32), dtype=wp.vec3, device=device),
+                    black or 0, noise.read**2, noise.gain],
+                   [as_packs(row, device) for row in rows], device=device)
+    return WrappedPhase(*rows, periods, frames.pixel_count, device)
+
+
+def weights(shifts: np.ndarray, period_px: float) -> np.ndarray:
+    """What each reading is multiplied by to give A, C and S: rows of the pseudo-inverse.
+
+    Args:
+        shifts: [frames] turns.
+        period_px: for the message.
+
+    Returns:
+        [frames, 3].
+
+    Raises:
+        ArrayError: the shifts do not determine three unknowns.
+    """
+    design = np.stack([np.ones_like(shifts), np.cos(2 * np.pi * shifts), np.sin(2 * np.pi * shifts)], axis=1)
+    if len(shifts) < 3 or np.linalg.svd(design, compute_uv=False)[-1] < MIN_SPREAD * np.sqrt(len(shifts)):
+        given = ", ".join(f"{shift:.3g}" for shift in shifts)
+        raise ArrayError(f"the period of {period_px:g} px has shifts of {given} turns: give three or more different ones")
+    return np.linalg.pinv(design).T
+
+
+@cache
+def _phase_kernel(pack: int, ambient: bool = False) -> Any:
+    float_pack, int_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32), pack_type(pack, wp.uint8)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def phase_kernel(first: int,
+                     values: wp.array2d(dtype=float_pack),  # [F, P]
+                     saturated: wp.array2d(dtype=byte_pack),  # [F / 8, P] bits
+                     masks: wp.array2d(dtype=int),  # [periods, F / 8]
+                     order: wp.array(dtype=int),  # [N] frames, those of a period together
+                     starts: wp.array(dtype=int),  # [periods + 1] places in order
+                     table: wp.array(dtype=wp.vec3),  # [N] weights for A, C, S
+                     black: int,
+                     read_variance: float,
+                     gain: float,
+                     # outputs
+                     phase: wp.array2d(dtype=float_pack),
+                     amplitude: wp.array2d(dtype=float_pack),
+                     offset: wp.array2d(dtype=float_pack),
+                     sigma: wp.array2d(dtype=float_pack),
+                     status: wp.array2d(dtype=byte_pack)):
+        p = first + wp.tid()
+        dark = float_pack()
+        if wp.static(ambient):
+            dark = values[black, p]
+        for period in range(masks.shape[0]):
+            cut = int_pack()
+            for group in range(masks.shape[1]):
+                flags = saturated[group, p]
+                mask = masks[period, group]
+                for k in range(pack):
+                    cut[k] = cut[k] | (int(flags[k]) & mask)
+            mean, along, across = float_pack(), float_pack(), float_pack()
+            vaa, vcc, vss, vcs = float_pack(), float_pack(), float_pack(), float_pack()
+            for n in range(starts[period], starts[period + 1]):
+                reading = values[order[n], p]
+                a, c, s = table[n][0], table[n][1], table[n][2]
+                aa, cc, ss, cs = a * a, c * c, s * s, c * s
+                for k in range(pack):
+                    y = reading[k]
+                    v = read_variance + gain * wp.max(y, 0.0)
+                    mean[k] = mean[k] + a * y
+                    along[k] = along[k] + c * y
+                    across[k] = across[k] + s * y
+                    vaa[k] = vaa[k] + aa * v
+                    vcc[k] = vcc[k] + cc * v
+                    vss[k] = vss[k] + ss * v
+                    vcs[k] = vcs[k] + cs * v
+            angle, swing, error, result = float_pack(), float_pack(), float_pack(), byte_pack()
+            for k in range(pack):
+                c2, s2 = along[k] * along[k], across[k] * across[k]
+                twice = 2.0 * along[k] * across[k] * vcs[k]
+                square = c2 + s2
+                over = 1.0 / (square + 1.0e-30)
+                light = mean[k] - dark[k]
+                light_variance = vaa[k] + wp.static(1.0 if ambient else 0.0) * (read_variance + gain * wp.max(dark[k], 0.0))
+                angle[k] = angle_of(along[k], across[k])
+                swing[k] = wp.sqrt(square)
+                error[k] = wp.sqrt(wp.max(c2 * vss[k] + s2 * vcc[k] - twice, 0.0)) * over
+                swing_variance = (c2 * vcc[k] + s2 * vss[k] + twice) * over
+                lit = wp.where(light > wp.static(SIGNAL_SIGMAS) * wp.sqrt(light_variance), 1, 0)
+                clear = wp.where(square > wp.static(SIGNAL_SIGMAS**2) * swing_variance, 1, 0)
+                strong = wp.where(square > wp.static(MIN_MODULATION**2) * light * light, 1, 0)
+                whole = wp.where(cut[k] == 0, 1, 0)
+                seen = lit * clear * strong
+                code = OK * seen + (1 - seen) * (lit * _LOW_MODULATION + (1 - lit) * _SHADOWED)
+                code = whole * code + (1 - whole) * _SATURATED
+                result[k] = wp.uint8(code)
+            for k in range(pack):
+                if int(result[k]) != OK:  # seldom, and keeps NaN out of the results
+                    angle[k] = 0.0
+                    swing[k] = 0.0
+                    error[k] = 0.0
+                    mean[k] = 0.0
+            phase[period, p] = angle
+            amplitude[period, p] = swing
+            offset[period, p] = mean
+            sigma[period, p] = error
+            status[period, p] = result
+
+    return phase_kernel

@@ -1,0 +1,148 @@
+"""Point-based range finding: where a laser spot is in the image, and where its ray meets the line of sight.
+
+The pixels that hang together with the peak give a first centre and the width; a second, weaker spot (a reflection) and noise elsewhere
+take no part. The centre is then where the centroid under a Gaussian of that width is the Gaussian's middle: it has no cut edges, which
+would pull it by hundredths of a pixel. One spot a frame is little work, so this is NumPy on the host.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from kernels.status import Status
+
+LEVEL = 0.15
+"""Part of the peak above which a pixel counts to the first centre and the width."""
+MIN_WINDOW_PX = 1.5
+"""Least standard deviation of the Gaussian: a narrower one is not sampled well by whole pixels."""
+STEPS = 10
+"""Newton steps; a Gaussian spot takes one, a saturated one about four."""
+LEAST_GAIN = 0.1
+"""Floor of 1 - variance under the window / variance of the window, the slope of Newton's step: 0.5 for a Gaussian spot."""
+NOISE_FACTOR = 8.0
+"""How many standard deviations of the noise a spot must stand out: among 10⁷ pixels the largest of noise alone reaches 5.3."""
+REACH_PX = 64
+"""Half the side of the window in which a spot lies: a larger blot is no spot."""
+PARALLEL = 1e-6
+"""Squared sine of the least angle between two rays that meet in a point: 0.06 degrees."""
+
+
+class Spot(NamedTuple):
+    """One laser spot."""
+
+    u: float  # continuous image coordinates of its centroid
+    v: float
+    sigma_px: float  # standard deviation of the centroid in either direction, from the noise of the image
+    amplitude: float  # peak, in the unit of the image
+    status: int  # kernels.status.Status: OK, or LOW_MODULATION and the rest is 0
+
+
+class Meeting(NamedTuple):
+    """Where two rays come closest."""
+
+    point: np.ndarray  # [n, 3] midway between the two
+    gap: np.ndarray  # [n] metres between the rays: the residual
+    along_a: np.ndarray  # [n] metres along the first ray, negative behind its origin
+    along_b: np.ndarray  # [n] the same of the second
+    angle: np.ndarray  # [n] radians between the rays
+
+
+def find_spot(signal: np.ndarray) -> Spot:
+    """Sub-pixel centroid of the brightest spot.
+
+    Args:
+        signal: [rows, cols] float32, the frame less its background; what is not to be looked at is NaN.
+
+    Source:
+        The mean shift of Comaniciu and Meer, TPAMI 2002, equation 20, divided by its slope.
+
+    Returns:
+        The spot; LOW_MODULATION when none stands out of the noise.
+    """
+    none = Spot(0.0, 0.0, 0.0, 0.0, int(Status.LOW_MODULATION))
+    valid = np.isfinite(signal)
+    if not valid.any():
+        return none
+    values = np.where(valid, signal, 0)
+    sample = values[valid][:: max(1, valid.sum() // 100_000)]
+    middle = float(np.median(sample))
+    noise = max(1.4826 * float(np.median(np.abs(sample - middle))), 1e-7 * float(np.abs(values).max()))
+    values = np.where(valid, signal - middle, 0)
+    row, col = np.unravel_index(int(np.argmax(_blurred(values))), values.shape)
+    if values[row, col] <= 0 or _blurred(values[max(row - 1, 0):row + 2, max(col - 1, 0):col + 2]).max() < NOISE_FACTOR * noise / 3:
+        return none
+    top, left = max(row - REACH_PX, 0), max(col - REACH_PX, 0)
+    window = values[top:row + REACH_PX + 1, left:col + REACH_PX + 1]
+    near = window[max(row - top - 1, 0):row - top + 2, max(col - left - 1, 0):col - left + 2]
+    peak = float(near.max())
+    if peak < NOISE_FACTOR * noise:
+        return none
+    # two noises above nothing at the least, so that the spot does not run out into the noise
+    floor = max(LEVEL * peak, 2 * noise)
+    inside = _hanging_together(window > floor, row - top, col - left)
+    weight = np.where(inside, window - floor, 0).astype(np.float64)
+    total = weight.sum()
+    if total <= 0:
+        return none
+    rows, cols = np.indices(window.shape)
+    centre = np.array([(rows * weight).sum(), (cols * weight).sum()]) / total
+    square = ((rows - centre[0]) ** 2 * weight).sum() + ((cols - centre[1]) ** 2 * weight).sum()
+    width = max(float(np.sqrt(square / total / 2)), MIN_WINDOW_PX)
+    error = 0.0
+    for _ in range(STEPS):
+        off = np.stack([rows - centre[0], cols - centre[1]])
+        gauss = np.exp(-0.5 * (off**2).sum(axis=0) / width**2)
+        under = gauss * window
+        mass = under.sum()
+        if mass <= 0:
+            return none
+        shift = (off * under).sum(axis=(1, 2)) / mass
+        gain = np.maximum(1 - ((off**2 * under).sum(axis=(1, 2)) / mass - shift**2) / width**2, LEAST_GAIN)
+        centre = centre + np.clip(shift / gain, -width, width)
+        error = float(noise * np.sqrt(((gauss * off) ** 2).sum() / 2) / (mass * gain.min()))
+    return Spot(float(left + centre[1] + 0.5), float(top + centre[0] + 0.5), error, peak, int(Status.OK))
+
+
+def nearest_points(origins_a: np.ndarray, directions_a: np.ndarray, origins_b: np.ndarray, directions_b: np.ndarray) -> Meeting:
+    """The points with the least sum of squared distances to two rays each.
+
+    Args:
+        origins_a: [n, 3] or [3], metres. directions_a: [n, 3], of any length. The same of b.
+
+    Returns:
+        The midpoints; NaN where the rays are parallel.
+
+    Source:
+        Sunday, "Practical Geometry Algorithms", 2021, distance between lines: the 2×2 normal equations in closed form.
+    """
+    a, b = (rays / np.linalg.norm(rays, axis=-1, keepdims=True) for rays in (directions_a, directions_b))
+    between = np.broadcast_to(np.asarray(origins_b, float) - origins_a, a.shape)
+    cosine = (a * b).sum(axis=-1)
+    sine2 = (np.cross(a, b) ** 2).sum(axis=-1)
+    safe = np.where(sine2 > PARALLEL, sine2, np.nan)
+    on_a, on_b = (between * a).sum(axis=-1), (between * b).sum(axis=-1)
+    along_a, along_b = (on_a - cosine * on_b) / safe, (cosine * on_a - on_b) / safe
+    first, second = origins_a + along_a[..., None] * a, origins_b + along_b[..., None] * b
+    angle = np.arcsin(np.sqrt(np.minimum(sine2, 1)))
+    return Meeting((first + second) / 2, np.linalg.norm(first - second, axis=-1), along_a, along_b, angle)
+
+
+def _blurred(values: np.ndarray) -> np.ndarray:
+    """Mean of 3×3 pixels, zeros outside: a hot pixel stands back behind a spot."""
+    padded = np.pad(values, 1)
+    rows = padded[:-2] + padded[1:-1] + padded[2:]
+    return np.asarray((rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]) / 9)
+
+
+def _hanging_together(above: np.ndarray, row: int, col: int) -> np.ndarray:
+    """The part of a mask that hangs together with a place and its neighbours, over corners too."""
+    inside = np.zeros_like(above)
+    inside[max(row - 1, 0):row + 2, max(col - 1, 0):col + 2] = True
+    inside &= above
+    while True:
+        padded = np.pad(inside, 1)
+        rows = padded[:-2] | padded[1:-1] | padded[2:]
+        grown = (rows[:, :-2] | rows[:, 1:-1] | rows[:, 2:]) & above
+        if (grown == inside).all():
+            return inside
+        inside = grown

@@ -1,0 +1,160 @@
+"""Flying pixels: a pixel that sees the edge of one surface before another measures a range between the two. Found and taken out, no
+other pixel touched: nothing is smoothed, and smoothing is a filter of its own."""
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from kernels.errors import ArrayError
+from kernels.status import Status
+
+SIGMAS = 4.0
+"""Standard deviations by which a range must depart from what both sides predict."""
+RELATIVE = 0.01
+"""Part of the range by which it must depart at least: curved surfaces depart from their tangents too."""
+STEPS = 1.5
+"""By which it must depart, in steps from pixel to pixel of that side: a surface that curves away at its rim bends by less than a step."""
+STEEPEST = 10.0
+"""Departures by which neighbours on one surface may differ: a slope of a tenth of the range a pixel."""
+ASIDE = 0.9
+"""Part of a pixel's own departure below which a step across the line counts as the slope of that side; one as far off may fly too."""
+LEAST_SUPPORT = 2
+"""Of the eight neighbours on the same surface: a wire one pixel wide has two; of fewer neighbours one in three."""
+
+_OK, _FLYING = int(Status.OK), int(Status.FLYING)
+
+wp.set_module_options({"enable_backward": False})
+
+
+def mark_flying(ranges: wp.array, sigma: wp.array, status: wp.array, rows: int, cols: int, *, least_m: float = 0.02) -> wp.array:
+    """Find flying pixels.
+
+    A pixel is flying where, along a row, a column or a diagonal, the straight lines through the two pixels on either side (next to it,
+    or one further away: edges blur over two pixels) predict ranges that lie apart, and it lies between them, on neither; or where fewer
+    than LEAST_SUPPORT neighbours are as far away as it is.
+
+    Args:
+        ranges, sigma: [rows · cols] float32 metres, padded or not.
+        status: [rows · cols] int32; only pixels that are OK are looked at and count as neighbours.
+        rows, cols: of the image.
+        least_m: smallest departure that counts, metres.
+
+    Returns:
+        [rows · cols] int32 status with FLYING in it, on the device.
+
+    Raises:
+        ArrayError: sizes do not match, or `least_m` is not above zero.
+    """
+    require_image(ranges, sigma, status, rows=rows, cols=cols)
+    if not (np.isfinite(least_m) and least_m > 0):
+        raise ArrayError(f"the least departure is {least_m} m: give one above zero")
+    marked = wp.zeros_like(status)
+    devices.launch(_flying_kernel, rows * cols, [ranges, sigma, status, rows, cols, float(least_m)], [marked], device=str(ranges.device))
+    return marked
+
+
+def require_image(*arrays: wp.array, rows: int, cols: int) -> None:
+    """Refuse arrays that are not one image.
+
+    Raises:
+        ArrayError: one has another size.
+    """
+    for array in arrays:
+        if len(array.shape) != 1 or not 0 < rows * cols <= array.shape[0]:
+            raise ArrayError(f"an array is {array.shape}, the image is {rows} x {cols}: give [rows · cols], padded or not")
+
+
+def flying_kernel(pack: int) -> Any:
+    """For tests that compile it; single pixels whatever the pack."""
+    return _flying_kernel
+
+
+@wp.func
+def seen(status: wp.array(dtype=wp.int32), r: int, c: int, rows: int, cols: int):
+    """Whether there is a measured pixel."""
+    inside = False
+    if r >= 0 and c >= 0 and r < rows and c < cols:
+        inside = status[r * cols + c] == _OK
+    return inside
+
+
+@wp.func
+def step_aside(ranges: wp.array(dtype=wp.float32), status: wp.array(dtype=wp.int32), r: int, c: int, dr: int, dc: int, rows: int,
+               cols: int, most: float):
+    """Largest step from a pixel to its neighbours across the direction (dr, dc), of those below `most`."""
+    here = ranges[r * cols + c]
+    largest = float(0.0)
+    for side in range(2):
+        sign = 1 - 2 * side
+        if seen(status, r - sign * dc, c + sign * dr, rows, cols):
+            step = wp.abs(ranges[(r - sign * dc) * cols + c + sign * dr] - here)
+            if step < most:
+                largest = wp.max(largest, step)
+    return largest
+
+
+@wp.kernel(module="unique")
+def _flying_kernel(first: int,
+                   ranges: wp.array(dtype=wp.float32),
+                   sigma: wp.array(dtype=wp.float32),
+                   status: wp.array(dtype=wp.int32),
+                   rows: int,
+                   cols: int,
+                   least: float,
+                   # outputs
+                   marked: wp.array(dtype=wp.int32)):
+    p = first + wp.tid()
+    code = status[p]
+    if code == _OK:
+        r = p // cols
+        c = p - r * cols
+        d = ranges[p]
+        s2 = sigma[p] * sigma[p]
+        floor_m = wp.max(least, RELATIVE * d)
+        flying = bool(False)
+        for direction in range(4):  # right, down, down right, down left
+            dr = wp.where(direction == 0, 0, 1)
+            dc = wp.where(direction == 1, 0, wp.where(direction == 3, -1, 1))
+            for reach in range(1, 3):
+                r1 = r - reach * dr
+                c1 = c - reach * dc
+                r2 = r + reach * dr
+                c2 = c + reach * dc
+                if (seen(status, r1, c1, rows, cols) and seen(status, r1 - dr, c1 - dc, rows, cols)
+                        and seen(status, r2, c2, rows, cols) and seen(status, r2 + dr, c2 + dc, rows, cols)):
+                    i1 = r1 * cols + c1
+                    j1 = i1 - dr * cols - dc
+                    i2 = r2 * cols + c2
+                    j2 = i2 + dr * cols + dc
+                    ahead = float(reach)
+                    one = ranges[i1] + ahead * (ranges[i1] - ranges[j1])
+                    other = ranges[i2] + ahead * (ranges[i2] - ranges[j2])
+                    grow = (1.0 + ahead) * (1.0 + ahead)
+                    v1 = s2 + grow * sigma[i1] * sigma[i1] + ahead * ahead * sigma[j1] * sigma[j1]
+                    v2 = s2 + grow * sigma[i2] * sigma[i2] + ahead * ahead * sigma[j2] * sigma[j2]
+                    rise1 = wp.max(wp.abs(ranges[i1] - ranges[j1]),
+                                   step_aside(ranges, status, r1, c1, dr, dc, rows, cols, ASIDE * wp.abs(d - ranges[i1])))
+                    rise2 = wp.max(wp.abs(ranges[i2] - ranges[j2]),
+                                   step_aside(ranges, status, r2, c2, dr, dc, rows, cols, ASIDE * wp.abs(d - ranges[i2])))
+                    away1 = wp.max(wp.max(SIGMAS * wp.sqrt(v1), floor_m), STEPS * ahead * rise1)
+                    away2 = wp.max(wp.max(SIGMAS * wp.sqrt(v2), floor_m), STEPS * ahead * rise2)
+                    if (wp.abs(d - one) > away1 and wp.abs(d - other) > away2 and (d - one) * (d - other) < 0.0
+                            and (d - ranges[i1]) * (d - ranges[i2]) < 0.0):
+                        flying = True
+        if not flying:
+            support = wp.int32(0)
+            present = wp.int32(0)
+            for i in range(-1, 2):
+                for j in range(-1, 2):
+                    if (i != 0 or j != 0) and seen(status, r + i, c + j, rows, cols):
+                        q = (r + i) * cols + c + j
+                        present += 1
+                        near = STEEPEST * wp.max(SIGMAS * wp.sqrt(s2 + sigma[q] * sigma[q]), floor_m)
+                        if wp.abs(ranges[q] - d) < near:
+                            support += 1
+            flying = support < wp.min(LEAST_SUPPORT, present // 3)
+        if flying:
+            code = int(_FLYING)
+    marked[p] = code

@@ -1,0 +1,81 @@
+"""What a set of modulation frequencies can tell: radians a metre, and the range after which all phases repeat together."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from kernels.errors import ArrayError
+
+SPEED_OF_LIGHT = 299_792_458.0
+"""Metres a second, in vacuum (SI, exact)."""
+REPEAT_TURNS = 0.02
+"""Phases that differ by less than this part of a turn are the same again: nearer than noise of 0.1 rad tells apart."""
+MOST_TURNS = 1000
+"""Of the lowest frequency within which a repeat is looked for: 7.5 km at 20 MHz."""
+
+
+def radians_per_metre(modulation_hz: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Phase that a metre of range adds: 4πf/c, light goes there and back.
+
+    Args:
+        modulation_hz: [F] frequencies.
+
+    Returns:
+        [F] float64.
+
+    Raises:
+        ArrayError: no frequency, or one is not above zero.
+    """
+    hz = np.asarray(modulation_hz, dtype=np.float64).reshape(-1)
+    if hz.size == 0 or not np.all(np.isfinite(hz) & (hz > 0)):
+        raise ArrayError(f"modulation frequencies are {list(map(float, hz))}: give one or more above zero")
+    return 4 * np.pi * hz / SPEED_OF_LIGHT
+
+
+def common_range_m(modulation_hz: Sequence[float] | np.ndarray) -> float:
+    """The shortest range after which every phase is back where it was, within REPEAT_TURNS.
+
+    For whole multiples of one frequency g it is c / (2g): 14.99 m for 20, 30 and 80 MHz.
+
+    Args:
+        modulation_hz: [F] frequencies; equal ones count once.
+
+    Returns:
+        Metres; MOST_TURNS turns of the lowest frequency where they repeat later than that.
+
+    Raises:
+        ArrayError: no frequency, or one is not above zero.
+    """
+    turns_per_metre = np.unique(radians_per_metre(modulation_hz)) / (2 * np.pi)
+    turns = np.arange(1, MOST_TURNS + 1)
+    others = turns[:, None] * (turns_per_metre / turns_per_metre[0])
+    repeats = np.all(np.abs(others - np.round(others)) < REPEAT_TURNS, axis=1)
+    first = int(np.argmax(repeats)) if repeats.any() else MOST_TURNS - 1
+    return float(turns[first] / turns_per_metre[0])
+
+
+def require_span(modulation_hz: Sequence[float] | np.ndarray, nearest_m: float, farthest_m: float) -> None:
+    """Refuse a span that the frequencies cannot tell apart.
+
+    Raises:
+        ArrayError: the span is empty, or longer than the common range; the message says both.
+    """
+    if not 0 <= nearest_m < farthest_m:
+        raise ArrayError(f"ranges from {nearest_m:g} to {farthest_m:g} m are no span: give 0 <= nearest < farthest")
+    common = common_range_m(modulation_hz)
+    if farthest_m - nearest_m > common * (1 + 1e-6):
+        names = ", ".join(f"{hz / 1e6:g}" for hz in np.unique(modulation_hz))
+        raise ArrayError(f"phases at {names} MHz repeat after {common:.4g} m, {farthest_m - nearest_m:.4g} m were asked for: "
+                         "ask for less, or measure at one more frequency")
+
+
+def require_ascending(times: Sequence[float] | np.ndarray, what: str) -> None:
+    """Refuse times that do not grow.
+
+    Raises:
+        ArrayError: naming the first that does not.
+    """
+    for index, (before, after) in enumerate(pairwise(times)):
+        if not after > before:
+            raise ArrayError(f"{what} are out of order: number {index + 1} ({after:g} s) is not after number {index} ({before:g} s)")

@@ -1,0 +1,100 @@
+"""Pile-up: a detector that counts only the first photon after each pulse favours early bins. Coates's correction undoes it."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from kernels.errors import ArrayError
+
+wp.set_module_options({"enable_backward": False})
+
+EXHAUSTED = 1e-3
+"""Part of the pulses that must be left for a bin to be used: with fewer the correction is division by chance."""
+
+
+class Exposed(NamedTuple):
+    """Counts, and the part of all pulses for which the detector was still awake; [bin, pixel] on the device."""
+
+    counts: wp.array  # float32: expected photons of the pulses that were left
+    awake: wp.array  # float32, 0…1
+
+
+def place(counts: np.ndarray, device: str) -> wp.array:
+    """Histograms on the device as [bin, pixel] float32, laid out so that the threads of the device read them in order.
+
+    Args:
+        counts: [pixel, bin], not negative.
+
+    Raises:
+        ArrayError: wrong shape, negative or not finite counts, or not one count in all of them.
+    """
+    if counts.ndim != 2 or counts.shape[1] < 3:
+        raise ArrayError(f"histograms are {counts.shape}: give [pixel, bin] with three bins or more")
+    values = np.ascontiguousarray(counts, dtype=np.float32)
+    if not np.isfinite(values).all() or values.min(initial=0.0) < 0:
+        raise ArrayError("histograms hold counts that are negative or not finite: give photons")
+    if not values.any():
+        raise ArrayError("every histogram is empty: no photon was counted")
+    if device == "cpu":  # a thread is one pixel after another: its bins stay together
+        return wp.array(values, dtype=wp.float32, device=device).transpose()
+    return wp.array(np.ascontiguousarray(values.T), dtype=wp.float32, device=device)
+
+
+def correct_pileup(counts: wp.array, *, pulses: int) -> Exposed:
+    """Undo pile-up.
+
+    Of `pulses`, those without a photon in bins before i are left at bin i; of these the counted part q had at least one photon in the
+    bin, so that the expected number is -ln(1 - q) a pulse.
+
+    Args:
+        counts: [bin, pixel] float32 first photons, on the device.
+        pulses: laser pulses of each histogram.
+
+    Returns:
+        Expected photons of the pulses that were left, and their part of all: a Poisson variable of mean awake · flux, whatever was lost.
+        Bins with fewer than EXHAUSTED of the pulses left count as blind.
+
+    Raises:
+        ArrayError: pulses is not above zero.
+
+    Source:
+        Coates, "The correction for photon `pile-up' in the measurement of radiative lifetimes", J. Phys. E 1968, equation 4.
+    """
+    if pulses < 1:
+        raise ArrayError(f"pulses is {pulses}: pile-up is corrected with the number of laser pulses, one or more")
+    corrected, awake = wp.zeros_like(counts), wp.zeros_like(counts)
+    devices.launch(_coates_kernel, counts.shape[1], [counts, float(pulses)], [corrected, awake], device=str(counts.device))
+    return Exposed(corrected, awake)
+
+
+def unhurried(counts: wp.array) -> Exposed:
+    """Counts of a detector that is always awake."""
+    return Exposed(counts, wp.full(counts.shape, 1.0, dtype=wp.float32, device=counts.device))
+
+
+def coates_kernel(pack: int) -> Any:
+    """For tests that compile it; single pixels whatever the pack."""
+    return _coates_kernel
+
+
+@wp.kernel(module="unique")
+def _coates_kernel(first: int,
+                   counts: wp.array2d(dtype=wp.float32),  # [bin, pixel]
+                   pulses: float,
+                   # outputs
+                   corrected: wp.array2d(dtype=wp.float32),
+                   awake: wp.array2d(dtype=wp.float32)):
+    p = first + wp.tid()
+    left = float(pulses)
+    for i in range(counts.shape[0]):
+        n = counts[i, p]
+        if left > EXHAUSTED * pulses and n < left:
+            q = n / left
+            rate = -wp.log(1.0 - q)
+            if q < 1.0e-3:  # the logarithm of nearly one loses its digits
+                rate = q + 0.5 * q * q
+            corrected[i, p] = left * rate
+            awake[i, p] = left / pulses
+        left = wp.max(left - n, 0.0)

@@ -1,0 +1,49 @@
+"""What every way of measuring depth gives back."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from kernels.status import SOLVED, Status
+
+HALF_SURE = 1e-3
+"""Standard deviation of the depth, as a part of it, at which confidence is one half."""
+
+
+@dataclass
+class DepthSolution:
+    """Depth at every pixel of the image; only pixels with a status of kernels.status.SOLVED have values."""
+
+    method: str
+    """Of the report: what was decoded."""
+    depth: np.ndarray  # [rows, cols] float32 metres
+    status: np.ndarray  # [rows, cols] uint8
+    sigma: np.ndarray | None = None  # [rows, cols] float32 metres
+    range_m: np.ndarray | None = None  # [rows, cols] float32 metres along the ray
+    projector_u: np.ndarray | None = None  # [rows, cols] float32 projector pixels
+    projector_v: np.ndarray | None = None  # [rows, cols] float32 projector pixels
+    amplitude: np.ndarray | None = None  # [rows, cols] float32, in the unit of the images
+    confidence: np.ndarray | None = None  # [rows, cols] 0…1; None: from sigma
+    colour: np.ndarray | None = None  # [rows, cols, 3] float32 linear, of the scene under even light; None: the amplitude's grey
+    points: np.ndarray | None = None  # [n, 3] float32: measured places between pixel centres, in place of a point a pixel
+    pixels: np.ndarray | None = None  # [n, 2] int: row and column of each of these, for its colour
+    facts: dict[str, Any] = field(default_factory=dict)
+    """For the report."""
+
+    @property
+    def solved(self) -> np.ndarray:
+        """[rows, cols] bool: where there is a depth."""
+        return np.isin(self.status, SOLVED)
+
+    def sureness(self) -> np.ndarray | None:
+        """[rows, cols] 0…1: the method's own, or 1 / (1 + σ / (depth / 1000)) from the standard deviation."""
+        if self.confidence is not None or self.sigma is None:
+            return self.confidence
+        relative = self.sigma / np.maximum(self.depth * HALF_SURE, 1e-12)
+        return np.where(self.solved, 1 / (1 + relative), 0).astype(np.float32)
+
+    def counts(self, mask: np.ndarray) -> dict[str, int]:
+        """Pixels of the mask per status, by name."""
+        numbers = np.bincount(self.status[mask], minlength=max(Status) + 1)
+        return {status.name.lower(): int(numbers[status]) for status in Status}

@@ -1,0 +1,100 @@
+"""Stripe centres between pixels → a depth at pixel centres.
+
+A stripe's centre lies up to half a pixel beside the centre of its pixel. On a sloping surface that is another depth, by more than the
+centre is uncertain; so the sample is carried to the pixel's centre along the slope to its neighbours in the same line, of other
+stripes. The inverse depth is what is linear across a plane, so it is that which is carried.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from kernels.status import Status
+from stage.camera import Camera
+from stage.depth_normals import same_surface
+
+SLOPE_PX = 32.0
+"""How far away a neighbour may be to say the slope."""
+JOIN_PX = 2.0
+"""Pixels between two samples that are no farther apart than this are filled."""
+
+
+class Samples(NamedTuple):
+    """Stripe centres of several frames; `line` is a row and `place` a u, or a column and a v."""
+
+    line: np.ndarray  # [n] int
+    place: np.ndarray  # [n] float, continuous image coordinate along the line
+    depth: np.ndarray  # [n] float64 metres
+    sigma: np.ndarray  # [n] float metres
+    amplitude: np.ndarray  # [n] float32
+    status: np.ndarray  # [n] uint8, kernels.status.Status
+
+    @classmethod
+    def joined(cls, parts: Sequence["Samples"]) -> "Samples":
+        """All of them."""
+        return cls(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
+
+class StripeMap(NamedTuple):
+    """Depth at pixel centres, and the samples themselves."""
+
+    depth: np.ndarray  # [rows, cols] float32 metres
+    sigma: np.ndarray  # [rows, cols] float32 metres
+    amplitude: np.ndarray  # [rows, cols] float32
+    solved: np.ndarray  # [rows, cols] bool
+    points: np.ndarray  # [n, 3] float64 camera frame, of every sample
+    pixels: np.ndarray  # [n, 2] int, row and column of the pixel that holds it
+
+
+def stripe_map(samples: Samples, shape: tuple[int, ...], camera: Camera, *, along: str) -> StripeMap:
+    """Bring samples to pixel centres.
+
+    Args:
+        samples: those with status OK are used.
+        shape: lines, and pixels of a line.
+        camera: perspective.
+        along: "row": lines are rows; "column": lines are columns.
+    """
+    ok = samples.status == Status.OK
+    order = np.lexsort((samples.place[ok], samples.line[ok]))
+    line, place, depth, sigma, amplitude = (values[ok][order] for values in samples[:5])
+    place, inverse = place.astype(np.float64), 1 / depth.astype(np.float64)
+    gap = np.diff(place)
+    linked = (np.diff(line) == 0) & (gap <= SLOPE_PX) & (gap > 0) & same_surface(depth[:-1], depth[1:], np.maximum(gap, 1.0), camera)
+    slope_after = np.where(linked, np.diff(inverse) / np.where(gap > 0, gap, 1), np.nan)
+    before, after = np.append(np.nan, slope_after), np.append(slope_after, np.nan)
+    slope = _least(before, after)
+
+    out = np.zeros(shape, np.float32)
+    spread, bright, solved = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, bool)
+    # between close neighbours first; then the samples' own pixels, the surest last
+    near = np.flatnonzero(linked & (gap <= JOIN_PX))
+    first = np.ceil(place[near] - 0.5).astype(int)
+    for step in range(int(JOIN_PX) + 1):
+        cell = first + step
+        inside = (cell + 0.5 <= place[near + 1]) & (cell < shape[1])
+        at, here = near[inside], cell[inside]
+        part = (here + 0.5 - place[at]) / gap[at]
+        out[line[at], here] = 1 / (inverse[at] + part * (inverse[at + 1] - inverse[at]))
+        spread[line[at], here] = np.maximum(sigma[at], sigma[at + 1])
+        bright[line[at], here] = np.maximum(amplitude[at], amplitude[at + 1])
+        solved[line[at], here] = True
+    cell = np.clip(place.astype(int), 0, shape[1] - 1)
+    carried = inverse + slope * (cell + 0.5 - place)
+    at = np.argsort(-sigma, kind="stable")
+    at = at[~solved[line[at], cell[at]]]
+    out[line[at], cell[at]], spread[line[at], cell[at]] = 1 / carried[at], sigma[at]
+    bright[line[at], cell[at]], solved[line[at], cell[at]] = amplitude[at], True
+    u, v = (place, line + 0.5) if along == "row" else (line + 0.5, place)
+    x, y = camera.plane_at(u, v)
+    points = np.stack([x * depth, y * depth, -depth], axis=-1)
+    if along == "row":
+        return StripeMap(out, spread, bright, solved, points, np.stack([line, cell], axis=-1))
+    return StripeMap(out.T, spread.T, bright.T, solved.T, points, np.stack([cell, line], axis=-1))
+
+
+def _least(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """The slope to carry a sample along: the gentler of the two, 0 where they disagree in sign or neither is known."""
+    b, a = np.where(np.isnan(before), after, before), np.where(np.isnan(after), before, after)
+    return np.nan_to_num(np.where(a * b > 0, np.sign(a) * np.minimum(np.abs(a), np.abs(b)), 0.0))

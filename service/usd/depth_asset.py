@@ -1,0 +1,138 @@
+"""A measured depth as USD: a mesh between neighbouring pixels of one surface, or points; with the colours of the scene."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+
+from service.usd.asset import flush, known_suffix, workshop_beside
+from service.usd.errors import AssetError
+from service.usd.mesh import SurfaceMesh, height_mesh, without_faces
+from service.usd.package import pack
+from service.usd.rig import define_camera
+from service.usd.scene import define_mesh, define_root, hint_extent
+from stage.colour import convert
+from stage.depth_maps import DepthMaps
+from stage.depth_normals import same_surface
+from stage.maps import SurfaceMaps
+from stage.ply import PointCloud
+
+POINT_WIDTH = 1.5
+"""Of a point, in pixels' footprints: neighbours just overlap, corner to corner."""
+GREY = 0.5
+"""Linear colour of points whose colour is not known."""
+
+
+def write_depth_points(maps: DepthMaps, cloud: PointCloud | None, path: str | Path, *, name: str) -> None:
+    """Write the measured points.
+
+    Args:
+        maps: a depth; its points are taken where there is no cloud.
+        cloud: what points.ply holds, or None.
+        path: .usda, .usdc or .usdz.
+        name: free text; the root prim is named after it.
+
+    Raises:
+        AssetError: another suffix, or no point.
+        StorageError: the disk refuses; what was there before is left as it was.
+    """
+    points = cloud.points if cloud is not None else maps.camera.points(-maps.depth)[maps.mask]
+    if len(points) == 0:
+        raise AssetError("the depth has no point, so there is nothing to export")
+    focal = min(maps.camera.focal_px) if maps.camera.focal_px is not None else None
+    widths = POINT_WIDTH * (np.abs(points[:, 2]) / focal if focal else np.full(len(points), maps.camera.pixel_size_m or 1.0))
+    colours = _linear(cloud.colours) if cloud is not None else np.full((1, 3), GREY, np.float32)
+
+    def fill(usd_stage: Usd.Stage, parent: Sdf.Path) -> np.ndarray:
+        prim = UsdGeom.Points.Define(usd_stage, parent.AppendChild("Points"))
+        prim.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(points)))
+        prim.CreateWidthsAttr(Vt.FloatArray.FromNumpy(widths.astype(np.float32)))
+        prim.SetWidthsInterpolation(UsdGeom.Tokens.vertex)
+        prim.CreateExtentAttr(UsdGeom.Points.ComputeExtent(prim.GetPointsAttr().Get(), prim.GetWidthsAttr().Get()))
+        if cloud is not None and cloud.normals is not None:
+            prim.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(cloud.normals)))
+            prim.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+        _colour(prim, colours)
+        return np.array(prim.GetExtentAttr().Get())
+
+    _write(maps, Path(path), name, fill)
+
+
+def write_depth_mesh(maps: DepthMaps, cloud: PointCloud | None, path: str | Path, *, name: str) -> None:
+    """Write a mesh that is not bridged where the depth breaks.
+
+    Args:
+        maps: a depth.
+        cloud: what points.ply holds, for the colours of its pixels, or None.
+        path: .usda, .usdc or .usdz.
+        name: free text; the root prim is named after it.
+
+    Raises:
+        AssetError: another suffix, or no face.
+        StorageError: the disk refuses; what was there before is left as it was.
+    """
+    known_suffix(Path(path))
+    mesh = depth_mesh(maps)
+    colours = np.full((1, 3), GREY, np.float32)
+    if cloud is not None and len(cloud.colours) == np.count_nonzero(maps.mask):  # a point a pixel, row by row
+        of_pixel = np.zeros((*maps.mask.shape, 3), np.uint8)
+        of_pixel[maps.mask] = cloud.colours
+        colours = _linear(of_pixel[mesh.rows, mesh.cols])
+
+    def fill(usd_stage: Usd.Stage, parent: Sdf.Path) -> np.ndarray:
+        _colour(define_mesh(usd_stage, parent.AppendChild("Mesh"), mesh), colours)
+        return mesh.extent
+
+    _write(maps, Path(path), name, fill)
+
+
+def depth_mesh(maps: DepthMaps) -> SurfaceMesh:
+    """Faces between neighbouring pixels; none over a step that is steeper than 80 degrees.
+
+    Raises:
+        AssetError: there is no face.
+    """
+    mesh = height_mesh(SurfaceMaps(camera=maps.camera, mask=maps.mask, height=-maps.depth))
+    depth = -mesh.points[:, 2].astype(np.float64)
+    torn = [_torn(depth[faces], mesh, maps) for faces in (mesh.quads, mesh.triangles)]
+    return without_faces(mesh, np.concatenate(torn))
+
+
+def _torn(corners: np.ndarray, mesh: SurfaceMesh, maps: DepthMaps) -> np.ndarray:
+    """[faces] bool: whether nearest and farthest corner cannot lie on one surface; a diagonal apart at the most."""
+    if len(corners) == 0:
+        return np.zeros(0, dtype=bool)
+    return ~same_surface(corners.min(axis=1), corners.max(axis=1), mesh.step * float(np.sqrt(2)), maps.camera)
+
+
+def _write(maps: DepthMaps, target: Path, name: str, fill: Callable[[Usd.Stage, Sdf.Path], np.ndarray]) -> None:
+    """The asset around what `fill` puts under /Name/Geom; it gives the extent of that."""
+    suffix = known_suffix(target)
+    with workshop_beside(target) as workshop:
+        layer = workshop / f"{target.stem}{'.usdc' if suffix == '.usdz' else suffix}"
+        usd_stage = Usd.Stage.CreateNew(str(layer))
+        root = define_root(usd_stage, maps.camera, maps.provenance, name=name, unit_m=1.0)
+        UsdGeom.Scope.Define(usd_stage, root.GetPath().AppendChild("Geom"))
+        extent = fill(usd_stage, root.GetPath().AppendChild("Geom"))
+        define_camera(usd_stage, root.GetPath().AppendChild("Camera"), maps.camera, extent)
+        hint_extent(root)
+        usd_stage.Save()
+        del usd_stage
+        if suffix == ".usdz":
+            package = workshop / f"{target.stem}.usdz"
+            pack(package, layer, [])
+            layer = package
+        flush(layer)
+        os.replace(layer, target)
+
+
+def _linear(colours: np.ndarray) -> np.ndarray:
+    """[n, 3] float32 linear of uint8 sRGB: USD's display colours are linear."""
+    return convert((colours.astype(np.float32) / 255)[None], "srgb_texture", "lin_rec709_scene")[0]
+
+
+def _colour(prim: UsdGeom.Gprim, colours: np.ndarray) -> None:
+    primvar = prim.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant if len(colours) == 1 else UsdGeom.Tokens.vertex)
+    primvar.Set(Vt.Vec3fArray([Gf.Vec3f(*map(float, colours[0]))]) if len(colours) == 1 else Vt.Vec3fArray.FromNumpy(colours))

@@ -1,0 +1,111 @@
+"""Matrices from OpenCV calibration files: YAML, XML and JSON as cv2.FileStorage writes them, and JSON with plain lists."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from stage.camera import Distortion
+from stage.errors import ManifestError, storage
+
+SUFFIXES = (".yml", ".yaml", ".xml", ".json")
+COEFFICIENTS = 5
+"""Of Brown-Conrady: k1 k2 p1 p2 k3. OpenCV's further ones (rational, thin prism, tilt) have no place in a capture."""
+
+
+def read_matrices(path: Path) -> dict[str, np.ndarray]:
+    """Every matrix or number of a file, by its name.
+
+    Returns:
+        Name → float64 array of one or two dimensions.
+
+    Raises:
+        ManifestError: another suffix, or the file cannot be parsed.
+        StorageError: it cannot be read.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        raise ManifestError(f"{path}: is no OpenCV calibration: its suffix must be one of {', '.join(SUFFIXES)}")
+    with storage("read", path):
+        text = path.read_text(encoding="utf-8", errors="replace")
+    if path.suffix.lower() == ".json":
+        return _from_json(path, text)
+    try:
+        file = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        root = file.root()
+        found = {}
+        for name in root.keys():  # noqa: SIM118 - a FileNode, not a mapping
+            node = root.getNode(name)
+            if node.isMap():
+                found[name] = np.asarray(node.mat(), dtype=np.float64)
+            elif node.isReal() or node.isInt():
+                found[name] = np.array([node.real()])
+            elif node.isSeq():
+                values = [node.at(i).real() for i in range(node.size()) if node.at(i).isReal() or node.at(i).isInt()]
+                if len(values) == node.size():
+                    found[name] = np.array(values, dtype=np.float64)
+        file.release()
+    except (cv2.error, SystemError, ValueError, TypeError) as error:
+        raise ManifestError(f"{path}: cannot be read as an OpenCV file") from error
+    return found
+
+
+def _from_json(path: Path, text: str) -> dict[str, np.ndarray]:
+    try:
+        data = json.loads(text)
+    except ValueError as error:
+        raise ManifestError(f"{path}: is not JSON") from error
+    if not isinstance(data, dict):
+        raise ManifestError(f"{path}: must hold one JSON object")
+    found = {}
+    for name, value in data.items():
+        array = _matrix(value)
+        if array is not None:
+            found[name] = array
+    return found
+
+
+def _matrix(value: Any) -> np.ndarray | None:
+    """A JSON value as an array, or None when it is something else."""
+    try:
+        if isinstance(value, dict):
+            return np.array(value["data"], dtype=np.float64).reshape(int(value["rows"]), int(value["cols"]))
+        return np.atleast_1d(np.array(value, dtype=np.float64))
+    except (KeyError, ValueError, TypeError):
+        return None
+
+
+def pick(matrices: Mapping[str, np.ndarray], names: tuple[str, ...], path: Path, what: str, *,
+         shape: tuple[int, ...] | None = None) -> np.ndarray:
+    """The first of several names that a file may use.
+
+    Args:
+        names: in order of preference.
+        what: for the message.
+        shape: that it must have; None: any.
+
+    Raises:
+        ManifestError: none is there, it has another shape, or holds a value that is not finite.
+    """
+    name = next((name for name in names if name in matrices), None)
+    if name is None:
+        raise ManifestError(f"{path}: holds no {what}: give it as one of {', '.join(names)}")
+    found = matrices[name]
+    if not np.isfinite(found).all() or (shape is not None and found.size != int(np.prod(shape))):
+        raise ManifestError(f"{path}: {name}: must be {' x '.join(map(str, shape or ('finite',)))} numbers")
+    return found.reshape(shape) if shape is not None else found
+
+
+def lens(coefficients: np.ndarray, path: Path, what: str) -> Distortion:
+    """OpenCV's distortion vector k1 k2 p1 p2 [k3 …].
+
+    Raises:
+        ManifestError: it has fewer than four, or a coefficient beyond k3 that is not zero.
+    """
+    values = np.asarray(coefficients, dtype=np.float64).ravel()
+    if len(values) < 4 or not np.isfinite(values).all() or np.any(values[COEFFICIENTS:]):
+        raise ManifestError(f"{path}: the distortion of the {what} must be k1 k2 p1 p2 and, if any, k3; other models are not known")
+    k1, k2, p1, p2, k3 = (float(value) for value in np.append(values, 0.0)[:COEFFICIENTS])
+    return Distortion(model="brown_conrady", k=(k1, k2, k3), p=(p1, p2))

@@ -1,0 +1,88 @@
+"""The projector's light at each level, from images of evenly grey projections.
+
+A camera pixel reads ambient + s · g(level): its own ambient and scale s, and one response g for all. Relative to the darkest and the
+brightest image every pixel says g directly; the median over the pixels that see the projector well is not disturbed by the others.
+The curve is then made to rise (least squares under that condition) and put on even levels.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from stage.errors import CalibrationError
+
+EVEN_LEVELS = 256
+"""Of the result: as many as an eight-bit projector has."""
+LEAST_PART = 0.2
+"""Of the largest difference between brightest and darkest: pixels below it see too little of the projector."""
+LEAST_STEP = 1e-6
+"""By which the curve rises from level to level at the least, so that it can be inverted."""
+MOST_PIXELS = 200_000
+"""That take part."""
+
+
+class Response(NamedTuple):
+    """A projector's response."""
+
+    values: np.ndarray  # [256] float64 at even levels, 0 to 1, rising
+    gamma: float
+    """Exponent of the power law that is nearest."""
+    spread: float
+    """Median absolute deviation of the pixels from the curve, of full scale: how well one curve fits all."""
+
+
+def fit_response(levels: Sequence[float], images: np.ndarray, *, usable: np.ndarray | None = None) -> Response:
+    """Fit the curve.
+
+    Args:
+        levels: of each image, 0 to 1, no two alike; the darkest and the brightest must be 0 and 1.
+        images: [levels, pixels] float32 linear readings.
+        usable: [pixels] bool: not saturated in any; None: all.
+
+    Raises:
+        CalibrationError: levels that cannot be, or the images do not get brighter with the level.
+    """
+    order = np.argsort(levels)
+    x = np.asarray(levels, dtype=np.float64)[order]
+    if len(x) < 3 or len(np.unique(x)) < len(x) or x[0] != 0 or x[-1] != 1:
+        listed = ", ".join(f"{level:g}" for level in levels)
+        raise CalibrationError(f"the levels are {listed}: give three or more different ones, with 0 and 1")
+    dark, bright = images[order[0]].astype(np.float64), images[order[-1]].astype(np.float64)
+    swing = bright - dark
+    good = swing > LEAST_PART * max(float(np.percentile(swing, 99.5)), 0.0)
+    good &= swing > 0
+    if usable is not None:
+        good &= usable
+    count = int(np.count_nonzero(good))
+    if count < 10:
+        raise CalibrationError(f"only {count} pixels get brighter with the level and do not saturate: check the images and their order")
+    kept = np.flatnonzero(good)[:: max(1, count // MOST_PIXELS)]
+    ratio = (images[order][:, kept] - dark[kept]) / swing[kept]
+    curve = np.median(ratio, axis=1)
+    if (np.diff(curve) < -0.02).any():
+        worst = int(np.argmin(np.diff(curve)))
+        raise CalibrationError(f"the light falls from level {x[worst]:g} to {x[worst + 1]:g}: check the order of the images")
+    rising = _rising(curve)
+    inner = (x > 0) & (x < 1) & (rising > 0)
+    gamma = float(np.median(np.log(rising[inner]) / np.log(x[inner]))) if inner.any() else 1.0
+    # between measured levels along the nearest power law, which bends as responses do, then corrected to pass through all of them
+    even = np.linspace(0, 1, EVEN_LEVELS)
+    values = even**gamma + np.interp(even, x, rising - x**gamma)
+    values = np.maximum.accumulate(values + LEAST_STEP * np.arange(EVEN_LEVELS))
+    values = (values + LEAST_STEP * np.arange(EVEN_LEVELS)) - values[0]
+    spread = float(np.median(np.abs(ratio - curve[:, None])))
+    return Response(values / values[-1], gamma, spread)
+
+
+def _rising(values: np.ndarray) -> np.ndarray:
+    """The nearest sequence that does not fall: pool adjacent violators (Ayer et al. 1955)."""
+    blocks: list[list[float]] = []
+    for value in values:
+        blocks.append([float(value), 1.0])
+        while len(blocks) > 1 and blocks[-2][0] > blocks[-1][0]:
+            mean, weight = blocks.pop()
+            before = blocks[-1]
+            before[0] = (before[0] * before[1] + mean * weight) / (before[1] + weight)
+            before[1] += weight
+    return np.concatenate([np.full(int(weight), mean) for mean, weight in blocks])

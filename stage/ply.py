@@ -1,0 +1,87 @@
+"""Point clouds as PLY: binary little-endian, float32 x y z, uchar red green blue, and normals and intensity where there are any."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from stage.errors import ResultError, storage
+from stage.files import replacing
+
+POINTS_FILE = "points.ply"
+PLACE, NORMAL, COLOUR, INTENSITY = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue"), ("intensity",)
+MAX_HEADER = 1 << 16
+"""Bytes in which a header must end."""
+
+
+class PointCloud(NamedTuple):
+    """Points of one capture."""
+
+    points: np.ndarray  # [n, 3] float32 metres, camera frame
+    colours: np.ndarray  # [n, 3] uint8, display-encoded (sRGB)
+    normals: np.ndarray | None = None  # [n, 3] float32, unit, towards the camera; 0 where the neighbours do not say
+    intensity: np.ndarray | None = None  # [n] float32, of a scan: in the unit of its shots
+
+
+def write_ply(cloud: PointCloud, path: str | Path, *, comments: tuple[str, ...] = ()) -> None:
+    """Write a point cloud, whole or not at all.
+
+    Args:
+        cloud: normals are written where there are any, between place and colour; intensity after it.
+        path: of the file.
+        comments: one line each.
+
+    Raises:
+        StorageError: it cannot be written.
+
+    Source:
+        Turk, "The PLY Polygon File Format", 1994.
+    """
+    kind = _type(cloud.normals is not None, cloud.intensity is not None)
+    values = np.empty(len(cloud.points), dtype=kind)
+    intensity = None if cloud.intensity is None else cloud.intensity[:, None]
+    for names, columns in ((PLACE, cloud.points), (NORMAL, cloud.normals), (COLOUR, cloud.colours), (INTENSITY, intensity)):
+        if columns is not None:
+            for column, name in enumerate(names):
+                values[name] = columns[:, column]
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {' '.join(text.split())}" for text in comments),
+             f"element vertex {len(values)}",
+             *(f"property {'uchar' if kind[name] == np.uint8 else 'float'} {name}" for name in kind.names or ()), "end_header"]
+    with replacing(path) as temporary, open(temporary, "wb") as stream:
+        stream.write(("\n".join(lines) + "\n").encode("ascii", "replace"))
+        values.tofile(stream)
+
+
+def read_ply(path: str | Path) -> PointCloud:
+    """Read a point cloud that Relit wrote.
+
+    Raises:
+        ResultError: another layout, or truncated.
+        StorageError: it cannot be read.
+    """
+    with storage("read", path), open(path, "rb") as stream:
+        start = stream.read(MAX_HEADER)
+        end = start.find(b"end_header\n")
+        lines = start[:max(end, 0)].decode("ascii", "replace").splitlines()
+        counts = [line.split()[-1] for line in lines if line.startswith("element vertex ")]
+        names = tuple(line.split()[-1] for line in lines if line.startswith("property "))
+        with_normals, with_intensity = NORMAL[0] in names, INTENSITY[0] in names
+        kind = _type(with_normals, with_intensity)
+        if lines[:2] != ["ply", "format binary_little_endian 1.0"] or len(counts) != 1 or names != kind.names:
+            raise ResultError(f"{path}: is not a point cloud as relit writes it")
+        stream.seek(end + len(b"end_header\n"))
+        values = np.fromfile(stream, dtype=kind, count=int(counts[0]))
+    if len(values) != int(counts[0]):
+        raise ResultError(f"{path}: is truncated: it holds {len(values)} of {counts[0]} points")
+
+    def columns(names: tuple[str, ...]) -> np.ndarray:
+        return np.stack([values[name] for name in names], axis=-1)
+
+    return PointCloud(columns(PLACE), columns(COLOUR), columns(NORMAL) if with_normals else None,
+                      values[INTENSITY[0]] if with_intensity else None)
+
+
+def _type(with_normals: bool, with_intensity: bool) -> np.dtype:
+    floats = (*PLACE, *(NORMAL if with_normals else ()))
+    last = INTENSITY if with_intensity else ()
+    return np.dtype([*((name, "<f4") for name in floats), *((name, "u1") for name in COLOUR), *((name, "<f4") for name in last)])

@@ -1,0 +1,184 @@
+"""What is known about a time-of-flight camera, schema relit.tof/1: noise, wiggling, offset, drift, pulse; and the fits that make it."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from stage.errors import CalibrationError
+from stage.files import write_text
+from stage.model import NotNegative, Positive, Strict
+from stage.records import read_record
+from stage.tof.light_time import SPEED_OF_LIGHT
+
+SCHEMA = "relit.tof/1"
+HARMONICS = 12
+"""Highest harmonic of the wiggling that is fitted: four phases fold the third and fifth of the light into the fourth, the seventh and
+ninth into the eighth, and their products with each other into the twelfth; a third harmonic of 8 % leaves 1.5 mrad beyond."""
+SWEEP_PART = 0.5
+"""Of a turn that a sweep must cover in a frequency: a table from less is extrapolated over most of it."""
+
+
+class Harmonics(Strict):
+    """Wiggling of one frequency: measured phase less true phase is Σ cos[h]·cos hφ + sin[h]·sin hφ, φ the measured phase."""
+
+    modulation_hz: Positive
+    cos: Annotated[tuple[float, ...], Field(min_length=1)]
+    """Radians, h from 0: the first is a constant offset."""
+    sin: Annotated[tuple[float, ...], Field(min_length=1)]
+    """Radians, as many; the first has no effect."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if len(self.cos) != len(self.sin):
+            raise ValueError(f"cos has {len(self.cos)} terms, sin {len(self.sin)}: give as many")
+        return self
+
+
+class Temperature(Strict):
+    """Drift of the range with temperature."""
+
+    reference_c: float
+    metres_per_c: float
+
+
+class PulseShape(Strict):
+    """Samples of the pulse as the detector records it; time 0 is that of a return at no distance."""
+
+    time_s: Annotated[tuple[float, ...], Field(min_length=3)]
+    power: Annotated[tuple[NotNegative, ...], Field(min_length=3)]
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if len(self.time_s) != len(self.power):
+            raise ValueError(f"time_s has {len(self.time_s)} entries, power {len(self.power)}: give as many")
+        for index in range(1, len(self.time_s)):
+            if not self.time_s[index] > self.time_s[index - 1]:
+                raise ValueError(f"time_s is out of order: entry {index} is not after entry {index - 1}")
+        return self
+
+
+class TofCalibration(Strict):
+    """Everything is optional: what is not given is estimated from the capture (noise, pulse) or left out."""
+
+    schema_: Literal["relit.tof/1"] = Field(alias="schema", default="relit.tof/1")
+    electrons_per_unit: Positive | None = None
+    """Photoelectrons of a recorded value of one."""
+    read_noise_electrons: NotNegative | None = None
+    harmonics: tuple[Harmonics, ...] = ()
+    scale: Positive = 1.0
+    offset_m: float = 0.0
+    """True range = scale · measured - offset_m - temperature drift."""
+    temperature: Temperature | None = None
+    pulse_sigma_s: Positive | None = None
+    """Standard deviation of a Gaussian pulse, the detector's jitter included."""
+    pulse: PulseShape | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.electrons_per_unit is None) != (self.read_noise_electrons is None):
+            raise ValueError("electrons_per_unit and read_noise_electrons go together: give both or neither")
+        if self.pulse is not None and self.pulse_sigma_s is not None:
+            raise ValueError("pulse and pulse_sigma_s exclude each other")
+        given = [harmonics.modulation_hz for harmonics in self.harmonics]
+        if len(set(given)) != len(given):
+            raise ValueError("harmonics: a frequency is given twice")
+        return self
+
+    def of_frequency(self, modulation_hz: float) -> Harmonics | None:
+        """The wiggling at a frequency, where it is known (to a part in 10⁶)."""
+        return next((h for h in self.harmonics if abs(h.modulation_hz - modulation_hz) <= 1e-6 * modulation_hz), None)
+
+    def correct(self, range_m: np.ndarray, temperature_c: float | None = None) -> np.ndarray:
+        """Scale, offset and drift taken out of measured ranges, metres.
+
+        Raises:
+            CalibrationError: a temperature is given and the calibration has no drift, or the other way round.
+        """
+        if (temperature_c is None) != (self.temperature is None):
+            what = "no temperature drift, and a temperature was given" if self.temperature is None else "a temperature drift"
+            raise CalibrationError(f"the time-of-flight calibration has {what}: give both or neither")
+        drift = 0.0
+        if self.temperature is not None and temperature_c is not None:
+            drift = self.temperature.metres_per_c * (temperature_c - self.temperature.reference_c)
+        return self.scale * range_m - self.offset_m - drift
+
+
+def read_calibration(path: str | Path) -> TofCalibration:
+    """Read a calibration.
+
+    Raises:
+        ManifestError: a field is wrong; names file and field.
+        StorageError: it cannot be read.
+    """
+    return read_record(path, TofCalibration, SCHEMA)
+
+
+def write_calibration(calibration: TofCalibration, path: str | Path) -> None:
+    """Write a calibration, whole or not at all.
+
+    Raises:
+        StorageError: it cannot be written.
+    """
+    data = {"schema": SCHEMA, **calibration.model_dump(mode="json", exclude_defaults=True, exclude={"schema_"})}
+    write_text(path, json.dumps(data, indent=2) + "\n")
+
+
+def fit_harmonics(phase_rad: np.ndarray, range_m: np.ndarray, modulation_hz: float, *, highest: int = HARMONICS) -> Harmonics:
+    """The wiggling table of a frequency from a sweep over known ranges.
+
+    Args:
+        phase_rad: [n] measured phases.
+        range_m: [n] true ranges along the ray.
+        modulation_hz: of the sweep.
+        highest: harmonic.
+
+    Raises:
+        CalibrationError: too few readings, or they leave too much of the turn unmeasured.
+
+    Source:
+        Lindner, Kolb, "Lateral and depth calibration of PMD-distance sensors", ISVC 2006.
+    """
+    unknowns = 2 * highest + 1
+    if phase_rad.shape != range_m.shape or phase_rad.ndim != 1 or len(phase_rad) < 2 * unknowns:
+        raise CalibrationError(f"the sweep has {phase_rad.size} phases and {range_m.size} ranges: harmonics up to {highest} need "
+                               f"{2 * unknowns} of each")
+    covered = len(np.unique(np.floor(np.mod(phase_rad, 2 * np.pi) / (2 * np.pi) * 32))) / 32
+    if covered < SWEEP_PART:
+        raise CalibrationError(f"the sweep covers {100 * covered:.0f} % of a turn at {modulation_hz / 1e6:g} MHz: "
+                               f"go over {100 * SWEEP_PART:.0f} % or more, {SPEED_OF_LIGHT / (2 * modulation_hz):.3g} m are a whole one")
+    error = phase_rad - 4 * np.pi * modulation_hz / SPEED_OF_LIGHT * range_m
+    centre = np.angle(np.exp(1j * error).mean())  # so that an offset near half a turn does not break in two
+    error = centre + np.angle(np.exp(1j * (error - centre)))
+    angle = phase_rad[:, None] * np.arange(highest + 1)
+    matrix = np.concatenate([np.cos(angle), np.sin(angle[:, 1:])], axis=1)
+    found = np.linalg.lstsq(matrix, error, rcond=1e-6)[0]
+    return Harmonics(modulation_hz=modulation_hz, cos=tuple(found[: highest + 1].tolist()), sin=(0.0, *found[highest + 1 :].tolist()))
+
+
+def fit_line(measured_m: np.ndarray, true_m: np.ndarray) -> tuple[float, float]:
+    """(scale, offset_m) of `TofCalibration` from known ranges, by least squares.
+
+    Raises:
+        CalibrationError: fewer than two different ranges.
+    """
+    if measured_m.shape != true_m.shape or measured_m.ndim != 1 or np.unique(true_m).size < 2 or np.ptp(measured_m) == 0:
+        raise CalibrationError(f"{measured_m.size} measured and {true_m.size} true ranges give no line: "
+                               "give as many, at two different ranges or more")
+    scale, level = np.polyfit(measured_m, true_m, 1)
+    return float(scale), float(-level)
+
+
+def fit_temperature(error_m: np.ndarray, temperature_c: np.ndarray) -> tuple[Temperature, float]:
+    """Drift, and the offset at its reference temperature (the mean one), from the errors at several temperatures.
+
+    Raises:
+        CalibrationError: fewer than two different temperatures.
+    """
+    if error_m.shape != temperature_c.shape or np.unique(temperature_c).size < 2:
+        raise CalibrationError("drift needs errors at two different temperatures or more: give one error a temperature")
+    reference = float(temperature_c.mean())
+    slope, level = np.polyfit(temperature_c - reference, error_m, 1)
+    return Temperature(reference_c=reference, metres_per_c=float(slope)), float(level)

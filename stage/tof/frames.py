@@ -1,0 +1,158 @@
+"""Raw time-of-flight frames of a capture as arrays: correlation images, or photon histograms."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from stage import images
+from stage.capture import Capture
+from stage.errors import ImageError, ManifestError, storage
+from stage.manifest import FILE_NAME, Frame
+from stage.ranging import ContinuousWave, Pulsed
+
+SAME_TIME = 1e-6
+"""Relative: bins that differ by less are the same bins."""
+
+Kind = TypeVar("Kind", ContinuousWave, Pulsed)
+
+
+@dataclass(frozen=True)
+class CorrelationImages:
+    """Correlation images I(δ) = P + Q·cos(φ - δ), in manifest order."""
+
+    images: np.ndarray  # [image, rows · cols] float32, recorded values
+    modulation_hz: np.ndarray  # [image] float64
+    reference_phase_rad: np.ndarray  # [image] float64
+    scale: np.ndarray  # [image] float64: what a recorded value is multiplied by, so that all have the mean exposure
+
+
+@dataclass(frozen=True)
+class Histograms:
+    """Photon histograms."""
+
+    counts: np.ndarray  # [rows · cols, bins] float32
+    bin_s: float
+    start_s: float
+    """Time of flight at which the first bin begins."""
+    pulses: int | None
+    first_photon_only: bool
+
+
+def has_tof(capture: Capture) -> bool:
+    """Whether the capture has time-of-flight frames."""
+    return any(frame.tof is not None for frame in capture.manifest.frames)
+
+
+def is_pulsed(capture: Capture) -> bool:
+    """Whether its time-of-flight frames are histograms.
+
+    Raises:
+        ManifestError: there are none, or frames of both kinds.
+    """
+    kinds = {type(frame.tof) for frame in capture.manifest.frames if frame.tof is not None}
+    if len(kinds) != 1:
+        what = "holds cw and pulsed frames: give one kind" if kinds else "holds no tof frame"
+        raise ManifestError(f"{capture.folder / FILE_NAME}: frames[].tof: {what}")
+    return Pulsed in kinds
+
+
+def read_correlations(capture: Capture) -> CorrelationImages:
+    """Read every correlation image.
+
+    Raises:
+        ManifestError: there is none.
+        ImageError: a file is unreadable or has another size than the camera; names the file.
+    """
+    frames = _frames(capture, ContinuousWave)
+    if not frames:
+        raise ManifestError(f"{capture.folder / FILE_NAME}: frames[].tof: none is cw")
+    values = np.stack([_plane(capture, frame).reshape(-1) for frame, _ in frames])
+    exposures = np.array([frame.exposure_s or 1.0 for frame, _ in frames])
+    return CorrelationImages(values, np.array([tof.modulation_hz for _, tof in frames]),
+                             np.array([tof.reference_phase_rad for _, tof in frames]), exposures.mean() / exposures)
+
+
+def read_histograms(capture: Capture) -> Histograms:
+    """Read the histograms; several frames with the same bins are added up.
+
+    Raises:
+        ManifestError: there is none, frames have different bins, or first_photon_only stands without pulses.
+        ImageError: a file is unreadable, has another size than the camera, or holds what no detector counts; names the file.
+    """
+    frames = _frames(capture, Pulsed)
+    manifest = capture.folder / FILE_NAME
+    if not frames:
+        raise ManifestError(f"{manifest}: frames[].tof: none is pulsed")
+    first = frames[0][1]
+    for frame, tof in frames:
+        if (abs(tof.bin_s - first.bin_s) > SAME_TIME * first.bin_s or abs(tof.start_s - first.start_s) > SAME_TIME * first.bin_s
+                or tof.first_photon_only != first.first_photon_only):
+            raise ManifestError(f"{manifest}: frames[].tof: the bins of {frame.image} are others than those of {frames[0][0].image}: "
+                                "give one capture for each")
+        if tof.first_photon_only and tof.pulses is None:
+            raise ManifestError(f"{manifest}: frames[].tof.pulses: is missing for {frame.image}: pile-up of a detector that counts first "
+                                "photons only is corrected with it")
+    total: np.ndarray | None = None
+    for frame, _ in frames:
+        counts = _histogram(capture, frame)
+        if total is not None and counts.shape != total.shape:
+            raise ImageError(f"{capture.file(frame.image)}: has {counts.shape[1]} bins, {frames[0][0].image} has {total.shape[1]}")
+        total = counts if total is None else total + counts
+    assert total is not None
+    given = [tof.pulses for _, tof in frames if tof.pulses is not None]
+    return Histograms(total, first.bin_s, first.start_s, sum(given) if len(given) == len(frames) else None, first.first_photon_only)
+
+
+def _frames(capture: Capture, kind: type[Kind]) -> list[tuple[Frame, Kind]]:
+    return [(frame, frame.tof) for frame in capture.manifest.frames if isinstance(frame.tof, kind)]
+
+
+def _plane(capture: Capture, frame: Frame) -> np.ndarray:
+    """[rows, cols] float32 of one correlation image: a .npy, or the first channel of an image."""
+    path = capture.file(frame.image)
+    if path.suffix.lower() != ".npy":
+        images.check_resolution(path, capture.camera.resolution)
+        return images.read_pixels(path)[..., 0].astype(np.float32)
+    values = read_array(path)
+    expected = (capture.camera.height, capture.camera.width)
+    if values.shape != expected:
+        raise ImageError(f"{path}: is {values.shape}, the camera's image is {expected} (rows, cols)")
+    return values.astype(np.float32)
+
+
+def _histogram(capture: Capture, frame: Frame) -> np.ndarray:
+    """[rows · cols, bins] float32."""
+    path = capture.file(frame.image)
+    if path.suffix.lower() != ".npy":
+        raise ImageError(f"{path}: is no histogram: give a .npy of (rows, cols, bins)")
+    values = read_array(path)
+    expected = (capture.camera.height, capture.camera.width)
+    if values.ndim != 3 or values.shape[:2] != expected:
+        raise ImageError(f"{path}: is {values.shape}, expected {expected} and bins (rows, cols, bins)")
+    if values.shape[2] < 3:
+        raise ImageError(f"{path}: has {values.shape[2]} bins: a return needs three or more")
+    counts = values.reshape(-1, values.shape[2]).astype(np.float32)
+    if not np.isfinite(counts).all() or counts.min() < 0:
+        raise ImageError(f"{path}: holds counts that are negative or not finite: give photons")
+    if not counts.any():
+        raise ImageError(f"{path}: every histogram is empty: no photon was counted")
+    return counts
+
+
+def read_array(path: Path) -> np.ndarray:
+    """Read a .npy of numbers.
+
+    Raises:
+        ImageError: not a .npy, truncated, or not of numbers; names the file.
+        StorageError: it cannot be read.
+    """
+    with storage("read", path):
+        try:
+            values = np.load(path, allow_pickle=False)
+        except (ValueError, EOFError) as error:
+            raise ImageError(f"{path}: is not a whole .npy array") from error
+    if not isinstance(values, np.ndarray) or not (np.issubdtype(values.dtype, np.floating) or np.issubdtype(values.dtype, np.integer)):
+        raise ImageError(f"{path}: is not an array of real numbers")
+    return values

@@ -1,0 +1,127 @@
+"""A scan: laser shots in known directions from a platform that may move; schema relit.scan/1."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from stage.errors import ImageError, ManifestError, storage
+from stage.model import Count, Positive, Strict, Text, Transform
+from stage.records import read_record
+from stage.tof.frames import read_array
+from stage.tof.track import Pose, Track, poses_at
+
+FILE_NAME = "scan.json"
+SCHEMA = "relit.scan/1"
+IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+COLUMNS = "time_s, azimuth_rad, elevation_rad"
+
+
+class Waveforms(Strict):
+    """A photon histogram of each shot, in place of its range."""
+
+    file: Text
+    """A .npy of (shots, bins)."""
+    bin_s: Positive
+    start_s: float = 0.0
+    pulses: Count | None = None
+    first_photon_only: bool = False
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.first_photon_only and self.pulses is None:
+            raise ValueError("pulses is missing: pile-up of a detector that counts first photons only is corrected with it")
+        return self
+
+
+class Scan(Strict):
+    """What scan.json says."""
+
+    schema_: Literal["relit.scan/1"] = Field(alias="schema")
+    name: Text
+    shots: Text
+    """A .npy of (shots, 5): time_s, azimuth_rad, elevation_rad, range_m, intensity; with waveforms (shots, 3), the first three."""
+    waveforms: Waveforms | None = None
+    platform_from_scanner: Transform = IDENTITY
+    track: Track = Field(default=(Pose(time_s=0.0, world_from_platform=IDENTITY),))
+    """Without it the platform stands still at the origin of the world."""
+
+
+@dataclass(frozen=True)
+class Shots:
+    """The shots of a scan folder."""
+
+    scan: Scan
+    folder: Path
+    time_s: np.ndarray  # [n] float64
+    azimuth_rad: np.ndarray  # [n] float64, to the right of straight ahead
+    elevation_rad: np.ndarray  # [n] float64, above the horizon
+    range_m: np.ndarray | None  # [n] float64; not above zero or not finite: nothing came back
+    intensity: np.ndarray | None  # [n] float64
+    waveforms: np.ndarray | None  # [n, bins] float32
+
+
+def read_scan(path: str | Path) -> Shots:
+    """Read a scan folder.
+
+    Args:
+        path: the folder, or its scan.json.
+
+    Raises:
+        ManifestError: scan.json is missing or wrong; names the field.
+        ImageError: an array is unreadable or of the wrong shape; names the file.
+        StorageError: a file cannot be read.
+    """
+    given = Path(path)
+    folder = given.parent if given.name == FILE_NAME else given
+    with storage("read", folder):
+        if not (folder / FILE_NAME).is_file():
+            raise ManifestError(f"{folder}: holds no {FILE_NAME}")
+    scan = read_record(folder / FILE_NAME, Scan, SCHEMA)
+    for name in (scan.shots, *(() if scan.waveforms is None else (scan.waveforms.file,))):
+        if Path(name).is_absolute() or ".." in Path(name).parts:
+            raise ManifestError(f"{folder / FILE_NAME}: {name} leads out of the scan's folder")
+    shots = read_array(folder / scan.shots)
+    columns = 5 if scan.waveforms is None else 3
+    if shots.ndim != 2 or shots.shape[1] != columns or len(shots) == 0:
+        names = COLUMNS + (", range_m, intensity" if columns == 5 else "")
+        raise ImageError(f"{folder / scan.shots}: is {shots.shape}, expected (shots, {columns}): {names}")
+    values = shots.astype(np.float64).T
+    if not np.isfinite(values[:3]).all():
+        raise ImageError(f"{folder / scan.shots}: has times or angles that are not finite")
+    if scan.waveforms is None:
+        return Shots(scan, folder, values[0], values[1], values[2], values[3], values[4], None)
+    waveforms = read_array(folder / scan.waveforms.file)
+    if waveforms.ndim != 2 or len(waveforms) != len(shots) or waveforms.shape[1] < 3:
+        raise ImageError(f"{folder / scan.waveforms.file}: is {waveforms.shape}, expected ({len(shots)}, bins), three bins or more")
+    return Shots(scan, folder, values[0], values[1], values[2], None, None, waveforms.astype(np.float32))
+
+
+def directions(azimuth_rad: np.ndarray, elevation_rad: np.ndarray) -> np.ndarray:
+    """Unit directions in the scanner's frame: a camera's, so that azimuth 0 looks along -z, +x is a quarter turn to the right, +y is up.
+
+    Returns:
+        [n, 3] float64.
+    """
+    flat = np.cos(elevation_rad)
+    return np.stack([np.sin(azimuth_rad) * flat, np.sin(elevation_rad), -np.cos(azimuth_rad) * flat], axis=-1)
+
+
+def place_points(shots: Shots, index: np.ndarray, range_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Ranges of shots as points of the world, each from where the platform was at the time of its shot.
+
+    Args:
+        shots: of the scan.
+        index: [m] shot of each range; a shot may have several.
+        range_m: [m] metres.
+
+    Returns:
+        Points [m, 3] float64 metres, world, and covered [m] bool: False where the track does not reach to the time of the shot.
+    """
+    rotation, place, covered = poses_at(shots.scan.track, shots.time_s[index])
+    mount = np.array(shots.scan.platform_from_scanner, dtype=np.float64)
+    local = directions(shots.azimuth_rad[index], shots.elevation_rad[index]) * range_m[:, None]
+    on_platform = local @ mount[:3, :3].T + mount[:3, 3]
+    return np.einsum("nij,nj->ni", rotation, on_platform) + place, covered

@@ -1,0 +1,171 @@
+"""Simulated raw time-of-flight frames: for tests, and to plan a capture before there is a camera.
+
+Forward model, at each pixel with range d, albedo ρ and cos θ between the surface normal and the ray:
+
+    signal       A = signal_electrons · ρ · cos θ / d²                         electrons (photons), one a return
+    correlation  I(δ) = ambient · ρ + Σ_returns A·(1 + contrast · w(φ - δ)),   φ = 4πf·d/c
+                 w(ψ) = cos ψ + Σ_h harmonics[h]·cos(hψ), h from 2              wiggling: the light is no pure cosine
+    histogram    λ_i = background + Σ_returns A·(C(t_{i+1} - τ) - C(t_i - τ)),  τ = 2d/c, C the cumulative Gaussian of pulse_sigma_s
+    pile-up      of `pulses`, those still without a photon at bin i: m_i; counted there: binomial(m_i, 1 - exp(-λ_i / pulses))
+
+A second return lies `second_m` behind the first with `second_part` of its signal: light that went round a corner, or a pane of glass.
+Shot noise is Poisson, read noise normal; counts above `full_well` are cut to it. Without a random generator every mean is exact.
+"""
+
+from dataclasses import dataclass
+from math import erf
+from pathlib import Path
+
+import numpy as np
+
+from stage.camera import Camera
+from stage.errors import CalibrationError
+from stage.files import replacing
+from stage.manifest import FILE_NAME, SCHEMA, Frame, Manifest, write_manifest
+from stage.ranging import ContinuousWave, Pulsed
+from stage.tof.light_time import SPEED_OF_LIGHT
+
+
+@dataclass(frozen=True, kw_only=True)
+class TofScene:
+    """What is in front of the camera."""
+
+    range_m: np.ndarray  # [rows, cols] along the ray, above zero
+    albedo: np.ndarray  # [rows, cols] 0…1
+    cosine: np.ndarray  # [rows, cols] 0…1, between normal and ray
+    second_m: float = 1.0
+    second_part: float = 0.0
+    """Of the first return's signal; 0: one return only."""
+
+    def __post_init__(self) -> None:
+        """Refuse scenes that cannot be."""
+        if not self.range_m.shape == self.albedo.shape == self.cosine.shape or self.range_m.ndim != 2:
+            raise CalibrationError(f"range {self.range_m.shape}, albedo {self.albedo.shape} and cosine {self.cosine.shape} "
+                                   "must be one image: give [rows, cols] each")
+        if not (np.isfinite(self.range_m).all() and self.range_m.min() > 0):
+            raise CalibrationError("the scene has ranges that are not above zero")
+        if self.second_part < 0 or self.second_m <= 0:
+            raise CalibrationError("the second return must lie behind the first, with no negative part of its signal")
+
+    def returns(self, signal: float) -> list[tuple[np.ndarray, np.ndarray]]:
+        """(range, signal) of each return."""
+        first = signal * self.albedo * self.cosine / self.range_m**2
+        both = [(self.range_m, first), (self.range_m + self.second_m, self.second_part * first)]
+        return both if self.second_part > 0 else both[:1]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CorrelationCamera:
+    """A continuous-wave camera."""
+
+    modulation_hz: tuple[float, ...] = (20e6, 30e6, 80e6)
+    phases: int = 4
+    """Evenly spaced reference phases of each frequency."""
+    signal_electrons: float = 1e5
+    """Of a white surface facing the camera at one metre, one image."""
+    contrast: float = 1.0
+    ambient_electrons: float = 0.0
+    """Of a white surface."""
+    read_noise_electrons: float = 5.0
+    harmonics: tuple[float, ...] = ()
+    """Of the correlation function, from the second on, over the first."""
+    full_well: float | None = None
+
+    def settings(self) -> list[tuple[float, float]]:
+        """(frequency, reference phase) of each image."""
+        return [(hz, 2 * np.pi * step / self.phases) for hz in self.modulation_hz for step in range(self.phases)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class HistogramCamera:
+    """A pulsed camera that counts photons."""
+
+    bins: int = 64
+    bin_s: float = 1.5e-9
+    start_s: float = 0.0
+    pulse_sigma_s: float = 1.2e-9
+    signal_photons: float = 4000.0
+    """Of a white surface facing the camera at one metre, all pulses together."""
+    background: float = 0.5
+    """Photons a bin, all pulses together."""
+    pulses: int | None = None
+    """With a number the detector counts only the first photon after each pulse."""
+
+
+def correlation_images(scene: TofScene, camera: CorrelationCamera, random: np.random.Generator | None = None) -> np.ndarray:
+    """[image, rows, cols] float64 electrons, in the order of `camera.settings()`; without `random` the means."""
+    images = []
+    for hz, delta in camera.settings():
+        mean = camera.ambient_electrons * scene.albedo
+        for range_m, signal in scene.returns(camera.signal_electrons):
+            angle = 4 * np.pi * hz / SPEED_OF_LIGHT * range_m - delta
+            wave = np.cos(angle) + sum(part * np.cos((index + 2) * angle) for index, part in enumerate(camera.harmonics))
+            mean = mean + signal * (1 + camera.contrast * wave)
+        mean = np.maximum(mean, 0)
+        recorded = mean
+        if random is not None:
+            recorded = random.poisson(mean) + random.normal(0.0, camera.read_noise_electrons, mean.shape)
+        images.append(recorded if camera.full_well is None else np.minimum(recorded, camera.full_well))
+    return np.stack(images)
+
+
+def histograms(scene: TofScene, camera: HistogramCamera, random: np.random.Generator | None = None) -> np.ndarray:
+    """[rows, cols, bins] float64 photons; without `random` the means."""
+    edges = camera.start_s + camera.bin_s * np.arange(camera.bins + 1)
+    mean = np.full((*scene.range_m.shape, camera.bins), camera.background, dtype=np.float64)
+    cumulative = np.vectorize(erf, otypes=[np.float64])
+    for range_m, signal in scene.returns(camera.signal_photons):
+        delay = 2 * range_m[..., None] / SPEED_OF_LIGHT
+        mean += signal[..., None] * np.diff(0.5 * cumulative((edges - delay) / (camera.pulse_sigma_s * 2**0.5)), axis=-1)
+    if camera.pulses is None:
+        return mean if random is None else random.poisson(mean).astype(np.float64)
+    seen = -np.expm1(-mean / camera.pulses)
+    counts = np.empty_like(mean)
+    left = np.full(scene.range_m.shape, float(camera.pulses))
+    for index in range(camera.bins):
+        counts[..., index] = left * seen[..., index] if random is None else random.binomial(left.astype(np.int64), seen[..., index])
+        left = left - counts[..., index]
+    return counts
+
+
+def write_correlations(folder: str | Path, name: str, images: np.ndarray, camera: Camera, sensor: CorrelationCamera) -> Path:
+    """Write images of `correlation_images` as a capture folder.
+
+    Returns:
+        The capture.json.
+
+    Raises:
+        StorageError: it cannot be written.
+    """
+    frames = []
+    for index, (image, (hz, delta)) in enumerate(zip(images, sensor.settings(), strict=True)):
+        frames.append(Frame(image=f"{index:03d}.npy", tof=ContinuousWave(type="cw", modulation_hz=hz, reference_phase_rad=delta)))
+        _save(Path(folder) / frames[-1].image, image)
+    return _manifest(folder, name, camera, frames, sensor.full_well)
+
+
+def write_histograms(folder: str | Path, name: str, counts: np.ndarray, camera: Camera, sensor: HistogramCamera) -> Path:
+    """Write counts of `histograms` as a capture folder.
+
+    Returns:
+        The capture.json.
+
+    Raises:
+        StorageError: it cannot be written.
+    """
+    _save(Path(folder) / "histograms.npy", counts)
+    tof = Pulsed(type="pulsed", bin_s=sensor.bin_s, start_s=sensor.start_s, pulses=sensor.pulses,
+                 first_photon_only=sensor.pulses is not None)
+    return _manifest(folder, name, camera, [Frame(image="histograms.npy", tof=tof)], None)
+
+
+def _save(path: Path, values: np.ndarray) -> None:
+    with replacing(path) as temporary, open(temporary, "wb") as stream:
+        np.save(stream, values.astype(np.float32))
+
+
+def _manifest(folder: str | Path, name: str, camera: Camera, frames: list[Frame], saturation: float | None) -> Path:
+    path = Path(folder) / FILE_NAME
+    write_manifest(Manifest.model_validate({"schema": SCHEMA, "name": name, "camera": camera, "saturation": saturation,
+                                            "frames": tuple(frames)}), path)
+    return path

@@ -1,0 +1,142 @@
+"""Synthetic captures for depth with a known truth: a sphere before a tilted plane under a projector or a laser, its images computed from
+exact geometry in float64 and written with OpenImageIO, OpenEXR and json alone."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tests.captures import write_exr, write_image, write_manifest
+from tests.reference import projector as reference
+
+CAMERA = reference.Device(96, 72, 140.0, (-0.12, 0.03, 0.0), (0.001, -0.0015))
+PROJECTOR = reference.Device(128, 96, 150.0, (-0.15, 0.04, -0.01), (0.002, -0.001))
+POSE = reference.look_at((0.3, 0.08, 0.02), (0.0, 0.0, -1.4))
+PLANE, NORMAL = (0.0, 0.0, -1.5), (0.25, -0.15, 1.0)
+CENTRE, RADIUS = (0.05, 0.0, -1.35), 0.22
+AMBIENT = 0.05
+
+
+class Scene(NamedTuple):
+    """What the camera sees."""
+
+    depth: np.ndarray  # [rows, cols] float64 metres
+    points: np.ndarray  # [rows, cols, 3] float64
+    uv: np.ndarray  # [rows, cols, 2] float64 projector coordinates
+    albedo: np.ndarray  # [rows, cols, 3]
+
+
+def make_scene(*, sphere: bool = True, camera: reference.Device = CAMERA, pose: np.ndarray = POSE) -> Scene:
+    """The scene; without the sphere the plane alone. Nothing shades anything: what lies in the projector's shadow is lit too."""
+    rays = reference.pixel_rays(camera)
+    depth = reference.plane_depth(rays, PLANE, NORMAL)
+    if sphere:
+        depth = np.fmin(depth, reference.sphere_depth(rays, CENTRE, RADIUS))
+    points = rays * depth[..., None]
+    u = np.arange(camera.width) / camera.width
+    albedo = np.stack([0.5 + 0.3 * u, np.full_like(u, 0.5), 0.8 - 0.3 * u], axis=-1) * np.ones((camera.height, 1, 1))
+    return Scene(depth, points, reference.seen_by(PROJECTOR, pose, points), albedo)
+
+
+def entry_of(device: reference.Device) -> dict[str, Any]:
+    return {"resolution": [device.width, device.height], "focal_px": [device.focal] * 2, "principal_px": device.principal.tolist(),
+            "distortion": {"model": "brown_conrady", "k": list(device.k), "p": list(device.p)}}
+
+
+def manifest(frames: list[dict[str, Any]], pose: np.ndarray | None = POSE, *, camera: reference.Device = CAMERA,
+             **changes: Any) -> dict[str, Any]:
+    data = {"schema": "relit.capture/1", "name": "scene", "camera": {"projection": "perspective", **entry_of(camera)},
+            "frames": frames, **changes}
+    if pose is not None:
+        data.setdefault("projector", {**entry_of(PROJECTOR), "camera_from_projector": pose.tolist()})
+    return {key: value for key, value in data.items() if value is not None}
+
+
+def shown(pattern: dict[str, Any], uv: np.ndarray) -> np.ndarray:
+    """[rows, cols] level, 0…1, that a manifest entry shows at projector coordinates; written from the contract, not from our code."""
+    if pattern["code"] in ("black", "white"):
+        return np.full(uv.shape[:-1], float(pattern["code"] == "white"))
+    u = uv[..., 0 if pattern["axis"] == "column" else 1]
+    size = PROJECTOR.width if pattern["axis"] == "column" else PROJECTOR.height
+    match pattern["code"]:
+        case "binary" | "gray":
+            code = np.floor(u / pattern.get("stripe_px", 1)).astype(int)
+            code = code ^ code >> 1 if pattern["code"] == "gray" else code
+            bit = (code >> pattern["bit"] & 1).astype(float)
+            return 1 - bit if pattern.get("inverse") else bit
+        case "ramp":
+            return u / size if pattern["direction"] == "up" else 1 - u / size
+        case "kary":
+            code = np.floor(u / pattern["stripe_px"]).astype(int)
+            values = np.array(pattern.get("levels") or pattern["colors"], dtype=float)
+            return values[np.clip(code, 0, None) // pattern["base"] ** pattern["digit"] % pattern["base"]]
+        case "xor":
+            code = np.floor(u / pattern.get("stripe_px", 1)).astype(int)
+            code = code ^ code >> 1
+            base = pattern["base_bit"]
+            bit = code >> pattern["bit"] & 1
+            bit = bit ^ (code >> base & 1) if pattern["bit"] > base else bit
+            return 1.0 - bit if pattern.get("inverse") else bit.astype(float)
+        case "modulated":
+            across = uv[..., 1 if pattern["axis"] == "column" else 0]
+            wave = (1 + np.cos(2 * np.pi * (u / pattern["period_px"] - pattern["step"] / pattern["steps"]))) / 2
+            return wave * (1 + np.cos(2 * np.pi * (across / pattern["carrier_period_px"] - pattern["carrier_step"] / pattern["carrier_steps"]))) / 2
+        case "phase":
+            return (1 + np.cos(2 * np.pi * (u / pattern["period_px"] - pattern["step"] / pattern["steps"]))) / 2
+    raise ValueError(pattern["code"])
+
+
+def gray_patterns(axis: str, *, stripe: int = 1, inverse: bool = True) -> list[dict[str, Any]]:
+    size = PROJECTOR.width if axis == "column" else PROJECTOR.height
+    bits = int(np.ceil(np.log2(size / stripe)))
+    return [{"code": "gray", "axis": axis, "bit": bit, "bits": bits, "stripe_px": stripe, "inverse": turned}
+            for bit in reversed(range(bits)) for turned in ((False, True) if inverse else (False,))]
+
+
+def phase_patterns(axis: str, period: float, steps: int = 4) -> list[dict[str, Any]]:
+    return [{"code": "phase", "axis": axis, "period_px": period, "step": step, "steps": steps} for step in range(steps)]
+
+
+BLACK_WHITE = [{"code": "black"}, {"code": "white"}]
+
+
+def write_patterns(folder: Path, scene: Scene, patterns: list[dict[str, Any]], *, suffix: str = "png", noise: float = 0.0,
+                   level: float = 0.8, gamma: float = 1.0, **changes: Any) -> Path:
+    """A capture of these patterns: 16-bit PNG, or float EXR, with ambient light and noise."""
+    rng = np.random.default_rng(7)
+    frames = []
+    for number, pattern in enumerate(patterns):
+        light = shown(pattern, scene.uv) ** gamma
+        image = scene.albedo * (level * (light if light.ndim == 3 else light[..., None]) + AMBIENT)
+        image = np.clip(image + rng.normal(0, noise, image.shape[:2])[..., None], 0, 1) if noise else image
+        name = f"{number:02d}.{suffix}"
+        if suffix == "png":
+            write_image(folder / name, np.rint(image * 65535).astype(np.uint16))
+        else:
+            write_exr(folder / name, image)
+        frames.append({"image": name, "pattern": pattern})
+    write_manifest(folder, manifest(frames, **changes))
+    return folder
+
+
+def write_lasers(folder: Path, scene: Scene, lasers: list[dict[str, Any]], *, width: float, noise: float = 0.0, ambient: bool = True,
+                 **changes: Any) -> Path:
+    """A capture of laser frames, the profile a Gaussian of `width` metres about the plane or ray."""
+    rng = np.random.default_rng(3)
+    frames = []
+    points = scene.points
+    for number, laser in enumerate([*lasers, *([None] if ambient else [])]):
+        glow = np.zeros(points.shape[:2])
+        if laser is not None and laser["type"] == "plane":
+            normal = np.array(laser["normal"]) / np.linalg.norm(laser["normal"])
+            glow = np.exp(-(((points - laser["point_m"]) @ normal) ** 2) / (2 * width**2))
+        elif laser is not None:
+            direction = np.array(laser["direction"]) / np.linalg.norm(laser["direction"])
+            off = points - laser["origin_m"]
+            glow = np.exp(-((np.cross(off, direction) ** 2).sum(axis=-1)) / (2 * width**2))
+        image = AMBIENT * scene.albedo + 0.5 * glow[..., None] * scene.albedo[:, :, :1] * (1.0, 0.05, 0.02)
+        image = np.maximum(image + rng.normal(0, noise, image.shape), 0) if noise else image
+        write_exr(folder / f"{number:03d}.exr", image)
+        frames.append({"image": f"{number:03d}.exr", **({"laser": laser} if laser is not None else {"light": {"type": "off"}})})
+    write_manifest(folder, manifest(frames, None, **changes))
+    return folder

@@ -1,0 +1,133 @@
+"""k-ary codes in grey levels and colours: encode, look at, decode; crosstalk; mixtures; bad input."""
+
+import numpy as np
+import pytest
+
+from kernels.errors import ArrayError
+from kernels.status import Status
+from kernels.structured.frames import NoiseModel, saturated_bits, upload
+from kernels.structured.kary import decode_kary, expected_levels
+from stage.patterns.collect import collect
+from stage.patterns.stripes import kary_patterns, palette
+from tests.reference import structured as reference
+from tests.structured_scenes import NOISE, frames_of, places, result, view
+
+WIDTH = 1280
+CROSSTALK = np.array([[0.8, 0.25, 0.02], [0.15, 0.9, 0.2], [0.05, 0.3, 0.7]])
+
+
+def decode(stack, patterns, device, *, crosstalk=None, noise=NOISE, saturated=None, extent=WIDTH):
+    found = collect(patterns)
+    code = found.codes[0]
+    decoded = decode_kary(frames_of(stack, device, saturated), code.frames, white=found.white, black=found.black,
+                          levels=np.array(code.levels if code.colors is None else code.colors), reflected=code.reflected, extent=extent,
+                          stripe_px=code.stripe_px, crosstalk=crosstalk, noise=noise)
+    return result(decoded, stack.shape[-1])
+
+
+@pytest.mark.parametrize("pixels", [1, 33, 4097])
+@pytest.mark.parametrize("base, options", [(2, {}), (3, {}), (3, {"reflected": False}), (4, {"stripe_px": 2}), (5, {}),
+                                           (3, {"levels": (0.9, 0.1, 0.5)}), (3, {"colors": palette(3)}), (6, {"colors": palette(6)}),
+                                           (8, {"colors": palette(8), "reflected": False})])
+def test_every_place_is_in_its_stripe(base, options, pixels, device):
+    patterns = kary_patterns(WIDTH, "column", base=base, **options)
+    u = places(pixels, WIDTH)
+    colour = "colors" in options
+    albedo = np.random.default_rng(2).uniform(0.2, 1, (pixels, 3) if colour else pixels)
+    stack = view(patterns, u, WIDTH, albedo=albedo, crosstalk=CROSSTALK if colour else None)
+    coordinate, sigma, amplitude, status = decode(stack, patterns, device, crosstalk=CROSSTALK if colour else None)
+    stripe = options.get("stripe_px", 1)
+    assert (status == Status.OK).all()
+    np.testing.assert_allclose(coordinate, (np.floor(u / stripe) + 0.5) * stripe, atol=1e-4)  # float32 at a thousand
+    np.testing.assert_allclose(sigma, stripe / np.sqrt(12), rtol=1e-4)
+    expected = (albedo * CROSSTALK.sum(axis=1)).mean(axis=1) / 2 if colour else albedo / 2
+    np.testing.assert_allclose(amplitude, expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize("colour", [False, True])
+@pytest.mark.parametrize("reflected", [False, True])
+def test_digits_are_those_of_the_twin_on_noise(colour, reflected, device):
+    patterns = kary_patterns(243, "column", base=3, reflected=reflected, colors=palette(3) if colour else None)
+    u, noise = places(800, 243), NoiseModel(0.01, 1e-3)
+    stack = view(patterns, u, 243, noise=noise, blur=0.3, crosstalk=CROSSTALK if colour else None)
+    coordinate, sigma, _, status = decode(stack, patterns, device, extent=243, noise=noise, crosstalk=CROSSTALK if colour else None)
+    shaped = stack if colour else stack[:, None]
+    found = collect(patterns)
+    code = found.codes[0]
+    expected = expected_levels(np.array(code.colors if colour else code.levels), CROSSTALK if colour else None)
+    digits = reference.kary_digits(shaped[list(code.frames)], shaped[found.white], shaped[found.black], expected)
+    number = reference.kary_number(digits, 3, reflected)
+    certain = (status == Status.OK) & (sigma < 0.3)
+    assert certain.mean() > 0.6
+    np.testing.assert_allclose(coordinate[certain], number[certain] + 0.5, atol=1e-4)
+
+
+def test_reflected_ternary_stays_within_one_column(device):
+    patterns = kary_patterns(WIDTH, "column", base=3)
+    u = places(50000, WIDTH)
+    coordinate, _, _, status = decode(view(patterns, u, WIDTH, noise=NOISE, blur=0.6), patterns, device)
+    ok = status == Status.OK
+    assert ok.mean() > 0.97
+    assert (np.abs(coordinate - u)[ok] <= 1).mean() >= 0.997
+
+
+def test_reflected_is_right_at_edges_where_plain_is_refused_or_wrong(device):
+    u = np.arange(1, 700, dtype=float)  # half on either side
+    good = {}
+    for reflected in (True, False):
+        patterns = kary_patterns(WIDTH, "column", base=3, reflected=reflected)
+        coordinate, _, _, status = decode(view(patterns, u, WIDTH, blur=1.0, noise=NOISE), patterns, device)
+        good[reflected] = ((status == Status.OK) & (np.abs(coordinate - u) <= 1)).mean()
+    assert good[True] > 0.98 and good[False] < 0.75
+
+
+def test_crosstalk_that_is_not_said_is_refused_or_wrong(device):
+    patterns = kary_patterns(WIDTH, "column", base=8, colors=palette(8))
+    u = places(3000, WIDTH)
+    heavy = np.array([[0.6, 0.5, 0.1], [0.3, 0.8, 0.4], [0.1, 0.5, 0.6]])
+    stack = view(patterns, u, WIDTH, crosstalk=heavy, noise=NOISE)
+    coordinate, _, _, status = decode(stack, patterns, device, crosstalk=heavy)
+    assert ((status == Status.OK) & (np.abs(coordinate - u) <= 0.51)).mean() > 0.99
+    *_, ignored = decode(stack, patterns, device)
+    assert (ignored == Status.OK).mean() < 0.5
+
+
+def test_statuses(device):
+    patterns = kary_patterns(WIDTH, "column", base=3)
+    u = np.full(4, 300.3)
+    stack = view(patterns, u, WIDTH)
+    stack[:, 1] = 0.05
+    stack[:3, 2] = 0.05 + 0.7 * 0.25  # half way between two levels, in three digits
+    cut = np.zeros(stack.shape, dtype=bool)
+    cut[-1, 3] = True
+    *_, status = decode(stack, patterns, device, saturated=saturated_bits(cut))
+    assert [Status(s).name for s in status] == ["OK", "SHADOWED", "UNDECIDED", "SATURATED"]
+    *_, status = decode(view(patterns, u, WIDTH), patterns, device, extent=300)
+    assert (status == Status.OUT_OF_RANGE).all()
+
+
+def test_nothing_is_nan_whatever_the_input(device):
+    patterns = kary_patterns(WIDTH, "column", base=3)
+    stack = np.random.default_rng(7).choice([np.nan, np.inf, -np.inf, -1, 0, 1e-7, 1, 65504], size=(len(patterns), 2000))
+    for array in decode(stack, patterns, device):
+        assert np.isfinite(array).all()
+
+
+LEVELS = np.array([0, 0.5, 1])
+
+
+@pytest.mark.parametrize("call, words", [
+    (lambda f: decode_kary(f, [0, 1], white=2, black=3, levels=LEVELS, reflected=True, extent=27, noise=NOISE),
+     "2 digits in base 3 number 9 px of stripes of 1 px, the projector has 27: a digit is missing"),
+    (lambda f: decode_kary(f, [0, 1, 1], white=2, black=3, levels=LEVELS, reflected=True, extent=27, noise=NOISE), "frame 1 is given"),
+    (lambda f: decode_kary(f, [0, 1], white=2, black=3, levels=np.eye(3), reflected=True, extent=9, noise=NOISE),
+     "the frames have 1 channels, this decoder takes 3"),
+    (lambda f: decode_kary(f, [0, 1], white=2, black=3, levels=LEVELS[:1], reflected=True, extent=9, noise=NOISE), r"levels are \(1,\)"),
+    (lambda f: decode_kary(f, [0, 1], white=2, black=3, levels=LEVELS * 0, reflected=True, extent=9, noise=NOISE),
+     "digit values 0 and 1 look the same"),
+    (lambda f: decode_kary(f, [0, 1], white=2, black=3, levels=LEVELS, reflected=True, extent=9, noise=NOISE, crosstalk=np.eye(3)),
+     "crosstalk is"),
+])
+def test_what_cannot_be_decoded_is_one_sentence(call, words, device):
+    with pytest.raises(ArrayError, match=words):
+        call(upload(np.zeros((5, 4), dtype=np.float32), device=device))

@@ -1,0 +1,145 @@
+"""Intensity ratio, and direct and global light."""
+
+import numpy as np
+import pytest
+
+from kernels.errors import ArrayError
+from kernels.status import Status
+from kernels.structured.frames import NoiseModel, saturated_bits, upload
+from kernels.structured.phase import decode_phase
+from kernels.structured.ramp import decode_ramp
+from kernels.structured.separation import separate_extremes, separate_phase
+from stage.patterns.collect import collect
+from stage.patterns.stripes import uniform_patterns
+from stage.patterns.waves import phase_patterns, ramp_patterns
+from tests.reference import structured as reference
+from tests.structured_scenes import NOISE, frames_of, places, result, view
+
+WIDTH = 1280
+PATTERNS = ramp_patterns("column")
+UP, DOWN, WHITE, BLACK = range(4)
+
+
+@pytest.mark.parametrize("pixels", [1, 31, 4097])
+@pytest.mark.parametrize("given", [{"up": UP, "down": DOWN}, {"up": UP, "white": WHITE}, {"down": DOWN, "white": WHITE}])
+def test_ratio_in_closed_form(given, pixels, device):
+    u, albedo = places(pixels, WIDTH), np.random.default_rng(2).uniform(0.2, 1, pixels)
+    stack = view(PATTERNS, u, WIDTH, albedo=albedo)
+    decoded = decode_ramp(frames_of(stack, device), **given, black=BLACK, extent=WIDTH, noise=NOISE)
+    coordinate, _, amplitude, status = result(decoded, pixels)
+    assert (status == Status.OK).all()
+    np.testing.assert_allclose(coordinate, u, atol=2e-3)  # float32 ratios of a width of a thousand
+    np.testing.assert_allclose(amplitude, albedo / 2, rtol=1e-5)
+
+
+def test_the_twin_on_noise(device):
+    u = places(2000, WIDTH)
+    stack = view(PATTERNS, u, WIDTH, noise=NOISE)
+    coordinate, *_, status = result(decode_ramp(frames_of(stack, device), up=UP, down=DOWN, black=BLACK, extent=WIDTH, noise=NOISE), 2000)
+    ok = status == Status.OK
+    np.testing.assert_allclose(coordinate[ok], reference.ratio(stack[UP], stack[DOWN], stack[BLACK], WIDTH)[ok], atol=3e-3)
+
+
+@pytest.mark.parametrize("given", [{"up": UP, "down": DOWN}, {"up": UP, "white": WHITE}, {"down": DOWN, "white": WHITE}])
+@pytest.mark.parametrize("gain", [0.0, 1e-3])
+def test_sigma_is_that_of_the_error(given, gain, device):
+    noise = NoiseModel(0.004, gain)
+    u = places(30000, WIDTH)
+    stack = view(PATTERNS, u, WIDTH, noise=noise)
+    coordinate, sigma, _, status = result(decode_ramp(frames_of(stack, device), **given, black=BLACK, extent=WIDTH, noise=noise), 30000)
+    ok = status == Status.OK
+    assert ok.mean() > 0.999
+    assert ((coordinate - u)[ok] / sigma[ok]).std() == pytest.approx(1, abs=0.1)
+
+
+def test_low_noise_reaches_seven_tenths_of_a_column(device):
+    noise = NoiseModel(0.0005, 0)
+    u = places(20000, WIDTH)
+    stack = view(PATTERNS, u, WIDTH, noise=noise)
+    decoded = decode_ramp(frames_of(stack, device), up=UP, down=DOWN, black=BLACK, extent=WIDTH, noise=noise)
+    coordinate, _, _, status = result(decoded, 20000)
+    assert np.median(np.abs(coordinate - u)[status == Status.OK]) <= 0.7
+
+
+@pytest.mark.parametrize("given", [{"up": UP, "down": DOWN}, {"up": UP, "white": WHITE}, {"down": DOWN, "white": WHITE}])
+def test_a_bent_response_is_undone(given, device):
+    u = places(3000, WIDTH)
+    response = np.linspace(0, 1, 257) ** 2.2
+    x = u / WIDTH
+    stack = np.stack([0.05 + 0.7 * np.interp(level, np.linspace(0, 1, 257), response) for level in (x, 1 - x, x * 0 + 1, x * 0)])
+    frames = frames_of(stack, device)
+    coordinate, *_ = result(decode_ramp(frames, **given, black=BLACK, extent=WIDTH, response=response, noise=NOISE), 3000)
+    bright = x if "up" in given else 1 - x
+    assert np.abs(coordinate - u)[bright > 0.03].max() < 0.1  # float32 where the light is weak
+    straight, *_ = result(decode_ramp(frames, **given, black=BLACK, extent=WIDTH, noise=NOISE), 3000)
+    assert np.median(np.abs(straight - u)) > 20
+
+
+def test_statuses(device):
+    stack = view(PATTERNS, np.full(4, 300.0), WIDTH)
+    stack[:, 1] = 0.05
+    stack[UP, 2] = 0.01  # darker than ambient: no place is
+    stack[DOWN, 2] = 0.7
+    cut = np.zeros(stack.shape, dtype=bool)
+    cut[DOWN, 3] = True
+    decoded = decode_ramp(frames_of(stack, device, saturated_bits(cut)), up=UP, down=DOWN, black=BLACK, extent=WIDTH, noise=NOISE)
+    assert [Status(s).name for s in result(decoded, 4)[3]] == ["OK", "SHADOWED", "OUT_OF_RANGE", "SATURATED"]
+
+
+def test_nothing_is_nan_whatever_the_input(device):
+    stack = np.random.default_rng(7).choice([np.nan, np.inf, -np.inf, -1, 0, 1e-7, 1, 65504], size=(4, 4000))
+    for given in ({"up": UP, "down": DOWN}, {"up": UP, "white": WHITE}):
+        for array in decode_ramp(frames_of(stack, device), **given, black=BLACK, extent=WIDTH, noise=NOISE):
+            assert np.isfinite(array.numpy()).all()
+
+
+@pytest.mark.parametrize("options, words", [
+    ({"up": 0}, "a frame is missing"), ({}, "a frame is missing"), ({"up": 0, "down": 0}, "frame 0 is given for two patterns"),
+    ({"up": 0, "down": 1, "response": np.array([0, 0.5, 0.5, 1])}, "each above the one before"),
+    ({"up": 0, "down": 1, "extent": 0}, "the projector has 0 px"),
+])
+def test_what_cannot_be_decoded_is_one_sentence(options, words, device):
+    with pytest.raises(ArrayError, match=words):
+        decode_ramp(upload(np.zeros((4, 4), dtype=np.float32), device=device), **{"extent": 8, "noise": NOISE, **options})
+
+
+FINE = (*phase_patterns("column", (12.0,), 12), *uniform_patterns())
+
+
+def bounced(leak=0.0, bounce=0.5):
+    """Readings under fine sinusoids, their direct part, and their global part under white."""
+    u = WIDTH / 4 + places(3000, WIDTH / 2)  # away from the border, where the spread pattern is not even
+    stack = view(FINE, u, WIDTH, albedo=0.5, ambient=0.0, bounce=bounce)
+    white = 0.5 * (1 + bounce)
+    return 0.05 + leak * white + (1 - leak) * stack, 0.5, 0.5 * bounce
+
+
+@pytest.mark.parametrize("leak", [0.0, 0.05])
+def test_direct_and_global_light(leak, device):
+    stack, direct, indirect = bounced(leak)
+    stack[-1] = 0.05  # the lamp off
+    found = collect(FINE)
+    code = found.codes[0]
+    frames = frames_of(stack, device)
+    parts = separate_extremes(frames, code.frames, black=found.black, leak=leak)
+    # twelve steps come within a 24th of a turn of the extremes: cos 15° = 0.966 of the amplitude
+    np.testing.assert_allclose(parts.direct.numpy()[:3000], direct, rtol=0.04)
+    np.testing.assert_allclose(parts.indirect.numpy()[:3000], indirect, rtol=0.16)
+    wrapped = decode_phase(frames, code.frames, code.periods_px, code.shifts, black=found.black, noise=NOISE)
+    ambient = upload(np.ascontiguousarray(stack[-1:], dtype=np.float32), device=device)
+    smooth = separate_phase(wrapped, period=0, ambient=ambient.owner[0][0].flatten(), leak=leak)
+    np.testing.assert_allclose(smooth.direct.numpy()[:3000], direct, rtol=2e-3)
+    np.testing.assert_allclose(smooth.indirect.numpy()[:3000], indirect, rtol=1e-2)  # what the spread leaves of the fine pattern
+    assert (smooth.status.numpy()[:3000] == Status.OK).all()
+
+
+def test_separation_refuses(device):
+    frames = upload(np.zeros((14, 4), dtype=np.float32), device=device)
+    with pytest.raises(ArrayError, match="there are 1 frames"):
+        separate_extremes(frames, [0])
+    with pytest.raises(ArrayError, match="the leak is 1"):
+        separate_extremes(frames, [0, 1], leak=1.0)
+    wrapped = decode_phase(frames, range(3), [8.0] * 3, [0, 0.3, 0.6], noise=NOISE)
+    with pytest.raises(ArrayError, match="period 1 does not exist"):
+        separate_phase(wrapped, period=1)
+    assert (separate_phase(wrapped, period=0).status.numpy()[:4] == Status.SHADOWED).all()

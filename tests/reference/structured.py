@@ -1,0 +1,102 @@
+"""Decoders of projected codes in float64 NumPy: slow, plain, and sharing nothing with the kernels."""
+
+import itertools
+
+import numpy as np
+
+
+def gray_number(bits):
+    """Number of a Gray code; bits [n, pixels] bool, bit 0 first."""
+    number = np.zeros(bits.shape[1], dtype=int)
+    parity = np.zeros(bits.shape[1], dtype=int)
+    for bit in reversed(range(len(bits))):
+        parity ^= bits[bit].astype(int)
+        number += parity << bit
+    return number
+
+
+def stripes(direct, inverse, white, black, read, gain, code="gray", base_bit=0, shadow=5.0, doubt=3.0, part=0.05, spread=1):
+    """Least and greatest stripe of each pixel, and a status name; readings [bits, pixels], bit 0 first."""
+    pixels, n = direct.shape[1], len(direct)
+    if white is None:
+        contrast = np.abs(direct - inverse).max(axis=0)
+        variance = 2 * read**2 + gain * np.maximum(direct[-1] + inverse[-1], 0)
+    else:
+        contrast = white - black
+        variance = 2 * read**2 + gain * (np.maximum(white, 0) + np.maximum(black, 0))
+    if inverse is None:
+        difference = direct - (white + black) / 2
+        own = read**2 + gain * np.maximum(direct, 0) + variance / 4
+        small = part * contrast / 2
+    else:
+        difference = direct - inverse
+        own = 2 * read**2 + gain * np.maximum(direct + inverse, 0)
+        small = part * contrast
+    shown = difference > 0
+    doubtful = ~(difference**2 >= np.maximum(doubt**2 * own, small**2))
+    least, most, status = np.zeros(pixels, int), np.zeros(pixels, int), np.full(pixels, "OK", dtype=object)
+    for p in range(pixels):
+        if not (contrast[p] > 0 and contrast[p] ** 2 >= shadow**2 * variance[p]):
+            status[p] = "SHADOWED"
+            continue
+        where = np.flatnonzero(doubtful[:, p])
+        if len(where) > 2:
+            status[p] = "UNDECIDED"
+            continue
+        numbers = []
+        for choice in itertools.product((False, True), repeat=len(where)):
+            bits = shown[:, p].copy()
+            bits[where[np.array(choice, dtype=bool)]] ^= True
+            if code == "xor":
+                bits[base_bit + 1:] ^= bits[base_bit]
+            numbers.append(sum(int(b) << i for i, b in enumerate(bits)) if code == "binary" else int(gray_number(bits[:, None])[0]))
+        least[p], most[p] = min(numbers), max(numbers)
+        if most[p] - least[p] > spread:
+            status[p] = "UNDECIDED"
+    assert n == len(shown)
+    return least, most, status
+
+
+def phase(readings, shifts):
+    """Phase in 0…2π, amplitude, offset of [frames, pixels] at shifts in turns, by numpy's least squares."""
+    angles = 2 * np.pi * np.asarray(shifts)
+    design = np.stack([np.ones_like(angles), np.cos(angles), np.sin(angles)], axis=1)
+    (a, c, s), *_ = np.linalg.lstsq(design, readings, rcond=None)
+    return np.arctan2(s, c) % (2 * np.pi), np.hypot(c, s), a
+
+
+def unwrap(phases, sigmas, periods, extent, step=0.02):
+    """The place of least χ² by exhaustive search on a grid; phases [periods, pixels]."""
+    u = np.arange(0, extent, step)
+    best, place = np.full(phases.shape[1], np.inf), np.zeros(phases.shape[1])
+    expected = 2 * np.pi * u[:, None] / np.asarray(periods)
+    for p in range(phases.shape[1]):
+        miss = np.angle(np.exp(1j * (expected - phases[:, p]))) / sigmas[:, p]
+        cost = (miss**2).sum(axis=1)
+        at = int(np.argmin(cost))
+        best[p], place[p] = cost[at], u[at]
+    return place, best
+
+
+def kary_number(digits, base, reflected):
+    """Stripe number of digits [n, pixels], digit 0 first: found by trying every stripe."""
+    n = len(digits)
+    table = []
+    for number in range(base**n):
+        plain = [number // base**d % base for d in range(n)]
+        shown = [base - 1 - t if reflected and number // base ** (d + 1) % 2 else t for d, t in enumerate(plain)]
+        table.append(shown)
+    table = np.array(table)
+    return np.array([int(np.flatnonzero((table == column).all(axis=1))[0]) for column in digits.T])
+
+
+def kary_digits(readings, white, black, expected):
+    """Nearest level of [digits, channels, pixels], as a part of white minus black."""
+    part = (readings - black) / (white - black)
+    distance = ((part[:, None] - expected[None, :, :, None]) ** 2 * (white - black) ** 2).sum(axis=2)
+    return distance.argmin(axis=1)
+
+
+def ratio(up, down, black, extent):
+    """Place by up / (up + down)."""
+    return extent * (up - black) / (up + down - 2 * black)

@@ -1,0 +1,267 @@
+"""relit depth on projected patterns: from images on disk to depth.exr and points.ply, with a known truth."""
+
+import json
+
+import numpy as np
+import pytest
+
+from stage.depth_maps import DepthMaps
+from stage.ply import read_ply
+from tests.captures import angles_degrees, edit_frame, edit_manifest, files_in, write_image
+from tests.depth_captures import (
+    AMBIENT,
+    BLACK_WHITE,
+    NORMAL,
+    POSE,
+    PROJECTOR,
+    gray_patterns,
+    make_scene,
+    manifest,
+    phase_patterns,
+    write_patterns,
+)
+from tests.reference import projector as reference
+
+SCENE = make_scene()
+LIT = (SCENE.uv > 0).all(axis=-1) & (SCENE.uv < (PROJECTOR.width, PROJECTOR.height)).all(axis=-1)
+COLUMN_PX = 0.065
+"""Metres of depth that a projector column is worth here, at most."""
+
+
+def solve(relit, folder, *arguments):
+    outcome = relit("depth", folder, "--out", folder / "out", *arguments)
+    assert (outcome.code, outcome.err) == (0, "")
+    assert "depth.exr" in outcome.out and "points.ply" in outcome.out
+    return DepthMaps.read(folder / "out" / "depth.exr"), json.loads((folder / "out" / "report.json").read_text())
+
+
+def off(maps: DepthMaps) -> np.ndarray:
+    return np.abs(maps.depth - SCENE.depth)[maps.mask]
+
+
+@pytest.mark.parametrize("suffix", ["png", "exr"])
+def test_gray_code_with_inverses(relit, tmp_path, suffix):
+    write_patterns(tmp_path, SCENE, [*gray_patterns("column"), *BLACK_WHITE], suffix=suffix)
+    maps, report = solve(relit, tmp_path, "--device", "cpu")
+    assert maps.mask[LIT].mean() > 0.97 and not maps.mask[~LIT].any()
+    assert off(maps).max() < COLUMN_PX  # half a stripe, or one where a bit is in doubt
+    assert np.abs(maps.projector_u - SCENE.uv[..., 0])[maps.mask].max() <= 1.0
+    assert maps.projector_v is None and maps.range is None
+    assert report["method"] == "gray with inverses" and report["found"]["codes"] == {"column": "gray with inverses"}
+    assert report["pixels"]["ok"] == maps.mask.sum() == report["points"]
+    assert report["sigma_m"]["median"] == pytest.approx(np.median(maps.sigma[maps.mask]), rel=1e-4)
+    assert files_in(tmp_path / "out") == {"depth.exr", "points.ply", "report.json"}
+
+
+def test_phase_numbered_by_gray(relit, tmp_path):
+    write_patterns(tmp_path, SCENE, [*phase_patterns("column", 16), *gray_patterns("column", stripe=4), *BLACK_WHITE])
+    maps, report = solve(relit, tmp_path)
+    assert report["method"] == "phase numbered by gray"
+    assert maps.mask[LIT].mean() > 0.97
+    assert np.median(off(maps)) < 2e-5 and off(maps).max() < 2e-4  # 16 bits
+
+
+def test_phase_with_noise_is_as_sure_as_it_says(relit, tmp_path):
+    write_patterns(tmp_path, SCENE, [*phase_patterns("column", 16), *gray_patterns("column", stripe=4), *BLACK_WHITE], noise=0.01)
+    maps, _ = solve(relit, tmp_path, "--read-noise", 0.01, "--photon-gain", 0)
+    ratio = (maps.depth - SCENE.depth)[maps.mask] / maps.sigma[maps.mask]
+    assert 0.8 < np.sqrt(np.mean(np.clip(ratio, -5, 5) ** 2)) < 1.2
+
+
+def test_both_axes_of_two_periods(relit, tmp_path):
+    write_patterns(tmp_path, SCENE, [*phase_patterns("column", 16), *phase_patterns("column", 144), *phase_patterns("row", 16),
+                                     *phase_patterns("row", 144), {"code": "black"}])
+    maps, report = solve(relit, tmp_path)
+    assert maps.mask[LIT].mean() > 0.97
+    assert off(maps).max() < 3e-4
+    assert report["found"]["residual_px"]["p95"] < 0.05
+    assert np.abs(maps.projector_v - SCENE.uv[..., 1])[maps.mask].max() < 0.05
+
+
+def kary(base, digits, stripe, **values):
+    return [{"code": "kary", "axis": "column", "base": base, "digit": digit, "digits": digits, "stripe_px": stripe, **values}
+            for digit in range(digits)]
+
+
+def modulated(period):
+    return [{"code": "modulated", "axis": "column", "period_px": period, "step": i, "steps": 3, "carrier_period_px": 6,
+             "carrier_step": j, "carrier_steps": 3} for i in range(3) for j in range(3)]
+
+
+def micro(*periods):
+    return [{"code": "phase", "axis": "column", "period_px": period, "step": 0, "steps": 3} for period in periods]
+
+
+@pytest.mark.parametrize(("patterns", "name", "worst_px"), [
+    ([{**p, "code": "xor", "base_bit": 0} for p in gray_patterns("column")], "xor with inverses", 1.0),
+    ([*modulated(16), *gray_patterns("column", stripe=4)], "modulated phase numbered by gray", 0.02),
+    ([*modulated(16), *modulated(144)], "modulated phase", 0.02),
+    ([*phase_patterns("column", 16, 3), *micro(15.2, 17.1, 18.4, 14.3)], "micro phase", 0.02),
+    (kary(4, 4, 1, levels=[0, 0.33, 0.67, 1]), "kary", 1.0),
+    (kary(3, 4, 2, colors=[[1, 0, 0], [0, 1, 0], [0, 0, 1]]), "kary", 2.0),
+    ([{"code": "ramp", "axis": "column", "direction": "up"}], "ramp", 0.02),
+    ([{"code": "ramp", "axis": "column", "direction": direction} for direction in ("up", "down")], "ramp", 0.02),
+    ([{**p, "code": "binary"} for p in gray_patterns("column", inverse=False)], "binary", 1.0),
+    ([*phase_patterns("column", 16), *kary(4, 3, 4, levels=[0, 0.33, 0.67, 1])], "phase numbered by kary", 0.01),
+])
+def test_every_code(relit, tmp_path, patterns, name, worst_px):
+    write_patterns(tmp_path, SCENE, [*patterns, *BLACK_WHITE])
+    maps, report = solve(relit, tmp_path)
+    assert report["method"] == name
+    assert maps.mask[LIT].mean() > 0.93
+    assert np.abs(maps.projector_u - SCENE.uv[..., 0])[maps.mask].max() <= worst_px
+
+
+def test_the_projectors_response_is_taken_off_a_ramp(relit, tmp_path):
+    write_patterns(tmp_path, SCENE, [{"code": "ramp", "axis": "column", "direction": "up"}, *BLACK_WHITE], gamma=2.2)
+    data = json.loads((tmp_path / "capture.json").read_text())
+    edit_manifest(tmp_path, projector={**data["projector"], "response": (np.linspace(0, 1, 256) ** 2.2).tolist()})
+    maps, _ = solve(relit, tmp_path)
+    assert np.median(np.abs(maps.projector_u - SCENE.uv[..., 0])[maps.mask]) < 0.02
+
+
+@pytest.mark.parametrize(("patterns", "words"), [
+    ([{"code": "ramp", "axis": "column", "direction": "up"}], "column ramp needs its opposite or a white frame"),
+    (kary(4, 4, 1, levels=[0, 0.33, 0.67, 1]), "column kary code needs a white and a black frame"),
+    (gray_patterns("column", inverse=False), "neither inverses nor a white and a black frame"),
+    (phase_patterns("column", 16), "repeat after"),
+])
+def test_missing_references_are_named(relit, tmp_path, patterns, words):
+    write_patterns(tmp_path, SCENE, patterns)
+    fails(relit, tmp_path, words)
+
+
+def test_points_have_place_colour_and_normal(relit, tmp_path):
+    scene = make_scene(sphere=False)
+    write_patterns(tmp_path, scene, [*phase_patterns("column", 16), *gray_patterns("column", stripe=4), *BLACK_WHITE])
+    maps, _ = solve(relit, tmp_path, "--normals")
+    cloud = read_ply(tmp_path / "out" / "points.ply")
+    assert np.abs(cloud.points - scene.points[maps.mask]).max() < 2e-4
+    assert np.median(angles_degrees(cloud.normals, np.array(NORMAL) / np.linalg.norm(NORMAL))) < 1
+    linear = scene.albedo[maps.mask]
+    linear = np.clip(linear / np.percentile(linear.max(axis=-1), 99), 0, 1)
+    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    assert np.abs(cloud.colours - 255 * encoded).max() < 1.5
+    assert read_ply_without_normals(relit, tmp_path)
+
+
+def read_ply_without_normals(relit, folder) -> bool:
+    solve(relit, folder)
+    return read_ply(folder / "out" / "points.ply").normals is None
+
+
+def test_the_mask_and_the_range_of_depths_hold(relit, tmp_path):
+    write_patterns(tmp_path, SCENE, [*gray_patterns("column"), *BLACK_WHITE], mask="mask.png")
+    mask = np.zeros(SCENE.depth.shape, np.uint8)
+    mask[20:50, 20:70] = 255
+    write_image(tmp_path / "mask.png", mask)
+    maps, report = solve(relit, tmp_path, "--far-m", 1.3)
+    assert not maps.mask[mask == 0].any() and maps.depth.max() <= 1.3
+    assert report["pixels"]["out_of_range"] > 0 and report["pixels"]["mask"] == 1500
+
+
+def test_saturated_readings_are_refused(relit, tmp_path):
+    write_patterns(tmp_path, SCENE, [*phase_patterns("column", 16), *phase_patterns("column", 144)], saturation=0.6)
+    maps, report = solve(relit, tmp_path)
+    bright = SCENE.albedo.max(axis=-1) * (AMBIENT + 0.8 * 0.85) > 0.61  # one of four steps is at 0.85 of full on or above
+    assert report["pixels"]["saturated"] > 0 and not maps.mask[bright & LIT].any()
+
+
+def test_bands_change_nothing(relit, tmp_path, monkeypatch):
+    write_patterns(tmp_path, SCENE, [*phase_patterns("column", 16), *gray_patterns("column", stripe=4), *BLACK_WHITE], noise=0.01)
+    whole, _ = solve(relit, tmp_path)
+    monkeypatch.setattr("stage.planes.BAND_BYTES", 100_000)
+    monkeypatch.setattr("stage.planes.MEMORY_BYTES", 0)
+    parts, _ = solve(relit, tmp_path)
+    assert (whole.depth == parts.depth).all() and (whole.status == parts.status).all()
+
+
+def test_two_runs_write_the_same_bytes(relit, tmp_path):
+    write_patterns(tmp_path, SCENE, [*gray_patterns("column"), *BLACK_WHITE])
+    solve(relit, tmp_path)
+    first = [(tmp_path / "out" / name).read_bytes() for name in ("depth.exr", "points.ply")]
+    solve(relit, tmp_path)
+    assert first == [(tmp_path / "out" / name).read_bytes() for name in ("depth.exr", "points.ply")]
+
+
+def millimetres(pose):
+    return np.block([[pose[:3, :3], 1000 * pose[:3, 3:]], [np.array([[0, 0, 0, 1]])]])
+
+
+def turned(pose):
+    away = pose.copy()
+    away[:3, 0] *= -1
+    away[:3, 2] *= -1
+    return away
+
+
+@pytest.mark.parametrize(("change", "words"), [
+    ({"projector": None}, "projector: is missing"),
+    ({"projector": "millimetres"}, "give the translation in metres"),
+    ({"projector": "turned"}, "the projector lights nothing that the camera sees"),
+    ({"projector": "nowhere"}, "without a baseline there is no depth"),
+    ({"camera": {"projection": "orthographic", "resolution": [96, 72]}}, "is orthographic: triangulation needs a perspective camera"),
+    ({"far": 0.5}, "no pixel has a depth .*out_of_range"),
+])
+def test_impossible_devices_are_named(relit, tmp_path, change, words):
+    write_patterns(tmp_path, SCENE, [*gray_patterns("column"), *BLACK_WHITE])
+    data = json.loads((tmp_path / "capture.json").read_text())
+    poses = {"millimetres": millimetres(POSE), "turned": turned(POSE), "nowhere": np.eye(4)}
+    if isinstance(change.get("projector"), str):
+        change = {"projector": {**data["projector"], "camera_from_projector": poses[change["projector"]].tolist()}}
+    arguments = ("--far-m", change["far"]) if "far" in change else ()
+    edit_manifest(tmp_path, **{key: value for key, value in change.items() if key != "far"})
+    fails(relit, tmp_path, words, *arguments)
+
+
+def fails(relit, folder, words, *arguments):
+    import re
+
+    outcome = relit("depth", folder, "--out", folder / "out", *arguments)
+    assert outcome.code == 2 and len(outcome.err.splitlines()) == 1
+    assert re.search(words, outcome.err), outcome.err
+    assert files_in(folder / "out") == set()
+
+
+def test_incomplete_codes_are_named(relit, tmp_path):
+    write_patterns(tmp_path, SCENE, [*gray_patterns("column")[2:], *BLACK_WHITE])
+    fails(relit, tmp_path, "column gray code of 7 bits has no frame of bit 6")
+
+
+def test_two_frames_of_one_pattern_are_named(relit, tmp_path):
+    write_patterns(tmp_path, SCENE, [*gray_patterns("column"), *gray_patterns("column")[:1]])
+    fails(relit, tmp_path, "show one pattern")
+
+
+def test_images_of_another_size_are_named(relit, tmp_path):
+    write_patterns(tmp_path, SCENE, gray_patterns("column"))
+    write_image(tmp_path / "03.png", np.zeros((10, 10), np.uint16))
+    fails(relit, tmp_path, "03.png: is 10x10")
+
+
+def test_black_images_are_said(relit, tmp_path):
+    write_patterns(tmp_path, SCENE, [*gray_patterns("column"), *BLACK_WHITE], level=0.0)
+    fails(relit, tmp_path, "no pixel has a depth .*shadowed.*not seen")
+
+
+def test_columns_from_above_are_said(relit, tmp_path):
+    pose = reference.look_at((0.0, 0.3, 0.0), (0.0, 0.0, -1.4))
+    scene = make_scene(pose=pose)
+    patterns = [*phase_patterns("column", 16), *phase_patterns("column", 144)]
+    write_patterns(tmp_path, scene, patterns)
+    data = json.loads((tmp_path / "capture.json").read_text())
+    edit_manifest(tmp_path, projector={**data["projector"], "camera_from_projector": pose.tolist()})
+    write = manifest([], pose)["projector"]
+    assert write["camera_from_projector"] == pose.tolist()
+    outcome = relit("depth", tmp_path, "--out", tmp_path / "out")
+    report = json.loads((tmp_path / "out" / "report.json").read_text()) if outcome.code == 0 else None
+    assert report is None or report["pixels"]["ill_posed"] > 0
+
+
+def test_frames_of_another_kind(relit, tmp_path):
+    write_patterns(tmp_path, SCENE, BLACK_WHITE)
+    fails(relit, tmp_path, "none has a pattern with a code, a laser or tof")
+    write_patterns(tmp_path, SCENE, [*gray_patterns("column"), *BLACK_WHITE])
+    fails(relit, tmp_path, "none has a laser, which --using asks for", "--using", "laser")
+    edit_frame(tmp_path, 15, pattern=None, laser={"type": "ray", "origin_m": [0.2, 0, 0], "direction": [0, 0, -1]})
+    fails(relit, tmp_path, "there are pattern and laser frames: --using says which")

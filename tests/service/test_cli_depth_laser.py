@@ -1,0 +1,109 @@
+"""relit depth on laser frames: spots, stripes and sweeps of a known scene."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from stage.depth_maps import DepthMaps
+from stage.ply import read_ply
+from tests.captures import edit_frame, files_in
+from tests.depth_captures import CENTRE, NORMAL, PLANE, RADIUS, make_scene, write_lasers
+from tests.reference import projector as reference
+
+CAMERA = reference.Device(300, 220, 1500.0, (-0.1, 0.02, 0.0), (0.001, -0.001))
+"""A narrow view: at 1.4 m a pixel is 0.9 mm, as with an ordinary lens on a sensor of two megapixels."""
+SCENE = make_scene(camera=CAMERA)
+SOURCE = (0.25, 0.05, 0.0)
+
+
+def ray(target):
+    return {"type": "ray", "origin_m": list(SOURCE), "direction": (np.array(target) - SOURCE).tolist()}
+
+
+def plane(x, *, upright=True):
+    """Through the laser and a line at this place of the plane z = -1.4."""
+    towards, along = np.array([x, 0, -1.4] if upright else [0, x, -1.4]) - SOURCE, [0, 1, 0] if upright else [1, 0, 0]
+    return {"type": "plane", "point_m": list(SOURCE), "normal": np.cross(towards, along).tolist()}
+
+
+def solve(relit, folder, *arguments):
+    outcome = relit("depth", folder, "--out", folder / "out", *arguments)
+    assert (outcome.code, outcome.err) == (0, "")
+    return (DepthMaps.read(folder / "out" / "depth.exr"), read_ply(folder / "out" / "points.ply").points,
+            json.loads((folder / "out" / "report.json").read_text()))
+
+
+def off_surface(points):
+    """Metres along the line of sight between points and the scene."""
+    rays = points.astype(float) / -points[:, 2:]
+    with np.errstate(invalid="ignore"):
+        truth = np.fmin(reference.plane_depth(rays, PLANE, NORMAL), reference.sphere_depth(rays, CENTRE, RADIUS))
+    return np.abs(-points[:, 2] - truth)
+
+
+@pytest.mark.parametrize("ambient", [True, False])
+def test_spots(relit, tmp_path, ambient):
+    targets = [(0.01 * i, 0.01 * j, -1.3) for i in range(-4, 5, 2) for j in range(-3, 4, 2)]
+    write_lasers(tmp_path, SCENE, [ray(target) for target in targets], width=1.5e-3, noise=0.004, ambient=ambient, camera=CAMERA)
+    maps, points, report = solve(relit, tmp_path)
+    assert report["method"] == "laser spot" and report["points"] == len(targets) == len(points)
+    assert report["found"]["ambient"] == ("off frames" if ambient else "least value over the laser frames")
+    assert off_surface(points).max() < 1.2e-3 and np.median(off_surface(points)) < 0.3e-3
+    assert np.abs(maps.depth - SCENE.depth)[maps.mask].max() < 2e-3  # a pixel's centre lies beside the spot's
+    assert report["found"]["residual_m"]["median"] < 1e-3
+    rays = reference.pixel_rays(CAMERA)
+    assert np.abs(maps.range[maps.mask] / maps.depth[maps.mask] - np.linalg.norm(rays, axis=-1)[maps.mask]).max() < 1e-6
+
+
+@pytest.mark.parametrize("upright", [True, False])
+def test_a_sweep_of_stripes(relit, tmp_path, upright):
+    write_lasers(tmp_path, SCENE, [plane(x, upright=upright) for x in np.linspace(-0.1, 0.1, 25)], width=1.2e-3, noise=0.005,
+                 camera=CAMERA)
+    if not upright:  # the laser stands beside the camera: lying planes through its height of 5 cm meet it at few degrees
+        maps, points, _ = solve(relit, tmp_path)
+        assert np.median(off_surface(points)) < 1.5e-3
+        return
+    maps, points, report = solve(relit, tmp_path)
+    assert report["method"] == "laser stripe"
+    assert np.median(off_surface(points)) < 0.15e-3
+    assert np.median(np.abs(maps.depth - SCENE.depth)[maps.mask]) < 0.15e-3
+    ratio = (maps.depth - SCENE.depth)[maps.mask] / maps.sigma[maps.mask]
+    assert 0.5 < np.median(np.abs(ratio)) / 0.6745 < 2
+
+
+def test_a_dense_sweep_fills_the_map(relit, tmp_path):
+    scene = make_scene(sphere=False, camera=CAMERA)
+    write_lasers(tmp_path, scene, [plane(x) for x in np.linspace(-0.02, 0.02, 40)], width=1.2e-3, camera=CAMERA)
+    maps, _, _ = solve(relit, tmp_path)
+    cols = np.flatnonzero(maps.mask.mean(axis=0) > 0.99)
+    assert len(cols) > 25 and (np.diff(cols) == 1).all()
+    assert np.abs(maps.depth - scene.depth)[maps.mask].max() < 2e-5
+
+
+def test_spots_and_stripes_together(relit, tmp_path):
+    write_lasers(tmp_path, SCENE, [plane(-0.03), ray((0.05, 0.0, -1.3))], width=1.5e-3, camera=CAMERA)
+    _, points, report = solve(relit, tmp_path)
+    assert report["method"] == "laser spot and stripe"
+    assert off_surface(points).max() < 2e-4 and len(points) > 200
+
+
+@pytest.mark.parametrize(("change", "words"), [
+    ({"type": "plane", "point_m": [0, 0, -1], "normal": [1, 0, 0]}, r"frames\[0\].laser: its plane goes through the camera's centre"),
+    ({"type": "ray", "origin_m": [0, 0, 0], "direction": [0, 0, -1]}, r"frames\[0\].laser.origin_m: is the camera's centre"),
+    ({"type": "plane", "point_m": [250, 0, 0], "normal": [1, 0, -0.2]}, r"median depth comes out as .* m: give lengths in metres"),
+    ({"type": "plane", "point_m": [0.25, 0, 0], "normal": [1, 0, 0.2]}, "no laser frame has a depth .*out_of_range"),
+])
+def test_impossible_lasers_are_named(relit, tmp_path, change, words):
+    write_lasers(tmp_path, SCENE, [plane(-0.03)], width=1.5e-3, camera=CAMERA)
+    edit_frame(tmp_path, 0, laser=change)
+    outcome = relit("depth", tmp_path, "--out", tmp_path / "out")
+    assert outcome.code == 2 and re.search(words, outcome.err), outcome.err
+    assert files_in(tmp_path / "out") == set()
+
+
+def test_dark_frames_are_said(relit, tmp_path):
+    write_lasers(tmp_path, SCENE, [plane(3.0)], width=1.5e-3, camera=CAMERA)
+    outcome = relit("depth", tmp_path, "--out", tmp_path / "out")
+    assert outcome.code == 2 and "no laser frame has a depth (220 low_modulation)" in outcome.err

@@ -1,0 +1,59 @@
+"""Frames are sorted into codes whatever their order, and incomplete codes are named."""
+
+import random
+
+import pytest
+
+from stage.errors import ManifestError
+from stage.pattern import BinaryPattern, PhasePattern
+from stage.patterns import stripes, waves
+from stage.patterns.collect import BinaryCode, KaryCode, ModulatedCode, PhaseCode, RampCode, collect
+
+
+def test_any_order_and_other_frames_between():
+    patterns = [*stripes.binary_patterns(64, "column"), *stripes.xor_patterns(64, "row", base_bit=1, references=False), None,
+                *stripes.kary_patterns(64, "row", base=4)[:-2], *waves.ramp_patterns("row", references=False),
+                *waves.phase_patterns("column", (16, 18), 3), *waves.modulated_patterns("row", 64)]
+    random.Random(0).shuffle(patterns)
+    found = collect(patterns)
+    assert patterns[found.white].code == "white" and patterns[found.black].code == "black"
+    assert {type(code) for code in found.of_axis("column")} == {BinaryCode, PhaseCode}
+    assert {type(code) for code in found.of_axis("row")} == {BinaryCode, KaryCode, RampCode, ModulatedCode}
+    for code in found.codes:
+        match code:
+            case BinaryCode():
+                assert [patterns[f].bit for f in code.frames] == list(range(6)) == [patterns[f].bit for f in code.inverses]
+                assert all(patterns[f].inverse for f in code.inverses) and not any(patterns[f].inverse for f in code.frames)
+                assert code.base_bit == (1 if code.code == "xor" else 0)
+            case KaryCode():
+                assert [patterns[f].digit for f in code.frames] == [0, 1, 2]
+            case RampCode():
+                assert (patterns[code.up].direction, patterns[code.down].direction) == ("up", "down")
+            case PhaseCode():
+                assert len(code.frames) == 6
+                assert all((patterns[f].period_px, patterns[f].step / 3) == (period, shift)
+                           for f, period, shift in zip(code.frames, code.periods_px, code.shifts, strict=True))
+            case ModulatedCode():
+                assert [[(patterns[f].step, patterns[f].carrier_step) for f in row] for row in code.frames] == [
+                    [(step, carrier) for carrier in range(3)] for step in range(4)]
+
+
+def drop(patterns, test):
+    return [pattern for pattern in patterns if not test(pattern)]
+
+
+GRAY = stripes.binary_patterns(64, "column")
+
+
+@pytest.mark.parametrize("patterns, words", [
+    (drop(GRAY, lambda p: getattr(p, "bit", None) == 2 and not p.inverse), "column gray code of 6 bits has no frame of bit 2"),
+    (drop(GRAY, lambda p: getattr(p, "bit", None) == 2 and p.inverse), "has inverses, but none of bit 2"),
+    ([*GRAY, GRAY[3]], r"frames 3 and 14 show one pattern \(column gray bit 4 of 6, inverse\)"),
+    ([*GRAY, BinaryPattern(code="gray", axis="column", bit=0, bits=6, stripe_px=2)], "disagree about stripe_px"),
+    (stripes.kary_patterns(64, "row", base=4)[1:], "row kary code of 3 digits has no frame of digit 2"),
+    (waves.modulated_patterns("row", 64)[:-1], "no frame of step 3, carrier step 2"),
+    ([PhasePattern(code="phase", axis="row", period_px=8, step=0, steps=3)] * 2, "row phase of 8 px, step 0 of 3"),
+])
+def test_incomplete_codes_are_one_sentence(patterns, words):
+    with pytest.raises(ManifestError, match=words):
+        collect(list(patterns))

@@ -1,0 +1,43 @@
+"""A real Gray-code capture beside OpenCV's own decode of it, where it is at hand: RELIT_TEST_DATA, else ../shared/data."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from kernels.status import Status
+from kernels.structured.binary import decode_gray
+from kernels.structured.frames import EIGHT_BIT, upload
+from stage.patterns.collect import collect
+from stage.patterns.stripes import binary_patterns
+
+DATA = Path(os.environ.get("RELIT_TEST_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")) / "graycode_chessboard"
+PROJECTOR = (1024, 768)
+
+pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason=f"no Gray-code capture in {DATA} (RELIT_TEST_DATA)")
+
+
+@pytest.fixture(scope="module")
+def images() -> np.ndarray:
+    """[frames, rows, cols] float32: fractions of full scale, in OpenCV's order."""
+    read = [oiio.ImageBuf(str(DATA / f"graycode_{index:02d}.png")).get_pixels(oiio.FLOAT)[..., 0] for index in range(42)]
+    return np.stack(read).astype(np.float32)
+
+
+@pytest.mark.parametrize("axis, number", [("column", 0), ("row", 1)])
+def test_opencvs_decode_is_ours(axis, number, images, device):
+    patterns = [*binary_patterns(PROJECTOR[0], "column", references=False), *binary_patterns(PROJECTOR[1], "row")]
+    found = collect(patterns)
+    code, = found.of_axis(axis)
+    frames = upload(images.reshape(len(images), -1), device=device)
+    decoded = decode_gray(frames, code.frames, code.inverses, white=found.white, black=found.black, extent=PROJECTOR[number],
+                          noise=EIGHT_BIT)
+    count = images[0].size
+    coordinate, status = decoded.coordinate.numpy()[:count], decoded.status.numpy()[:count]
+    theirs = np.load(DATA / "opencv_projxy.npz")["projxy"][..., number].ravel() + 0.5  # OpenCV counts pixels, we measure from the edge
+    solved = np.isfinite(theirs)
+    both = solved & (status == Status.OK)
+    assert both.sum() >= 0.9 * solved.sum()
+    assert (np.abs(coordinate - theirs)[both] <= 1).mean() >= 0.995
