@@ -154,15 +154,14 @@ def structured_rows(pixels: int = PIXELS) -> list[str]:
     shifts = [step / STEPS for _ in PERIODS for step in range(STEPS)]
     rows = []
     ours = least_seconds(lambda: decode_phase(frames, numbers, periods, shifts, noise=NOISE))
-    rows.append(("16 images, 4 periods: phase, amplitude, offset, uncertainty, status", ours, least_seconds(lambda: numpy_phase(stack, True)),
-                 least_seconds(lambda: numpy_phase(stack, False)), None))
+    whole, bare = (least_seconds(lambda full=full: numpy_phase(stack, full)) for full in (True, False))
+    rows.append(("16 images, 4 periods: phase, amplitude, offset, uncertainty, status", ours, whole, bare, None))
     wrapped = decode_phase(frames, numbers, periods, shifts, noise=NOISE)
     phases = numpy_phase(stack, False)[[row for period in range(len(PERIODS)) for row in (5 * period, 5 * period + 1)]]
     both = least_seconds(lambda: unwrap_jointly(wrapped, extent=WIDTH))
     plain = least_seconds(lambda: numpy_unwrap(phases), 1)
     rows.append(("4 periods unwrapped jointly", both, None, plain, None))
-    rows.append(("the whole phase set", ours + both, rows[0][2] + plain, rows[0][3] + plain, None))
-    del stack, frames, wrapped, phases
+    rows.append(("the whole phase set", ours + both, whole + plain, bare + plain, None))
     stack = gray_frames(pixels)
     frames = upload(stack, device="cpu")
     bits, inverses = list(range(BITS)), list(range(BITS, 2 * BITS))

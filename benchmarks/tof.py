@@ -9,8 +9,9 @@ import warp as wp
 from benchmarks.search_speed import median_seconds
 from kernels.tof.bilateral import GUIDE_RELATIVE, LEAST_STEP, LEAST_VARIANCE, RANGE_SIGMAS, smooth
 from kernels.tof.continuous import Noise, decode
+from kernels.tof.decide import AGREEMENT_RAD, decide
 from kernels.tof.modulation import common_range_m, radians_per_metre
-from kernels.tof.unwrap import AGREEMENT_RAD, FLOOR_RAD, decide, unwrap
+from kernels.tof.unwrap import FLOOR_RAD, unwrap
 from tests.reference import tof as scenes
 
 COLS, ROWS = 512, 424
@@ -22,7 +23,7 @@ def kernels_work(images: np.ndarray, hz: np.ndarray, delta: np.ndarray) -> np.nd
     """Range by the kernels, without the vote, which the other side lacks too."""
     far = common_range_m(hz)
     found = decode(images, hz, delta, noise=Noise(1.0, 5.0), device="cpu")
-    ranges = decide(found, unwrap(found, nearest_m=0.0, farthest_m=far), nearest_m=0.0, farthest_m=far)
+    ranges = decide(found, unwrap(found, nearest_m=0.0, farthest_m=far))
     guide = wp.array(found.amplitude.numpy().mean(axis=0), device="cpu")
     return smooth(ranges.range, ranges.sigma, guide, ranges.status, ROWS, COLS, radius=RADIUS, spatial_px=SPATIAL).range.numpy()
 

@@ -27,6 +27,8 @@ class DepthRequest(Request):
     """Depths above are out of range."""
     max_residual_px: Above0 = 4.0
     """Where column and row are decoded: how far, in projector pixels, they may lie from a place that the line of sight passes."""
+    refine: bool = True
+    """Interpolate a Gray code with inverses between the edges of its stripes."""
     read_noise: Above0 = 0.003
     """Standard deviation of a reading in the dark, quantisation included, as a part of full scale; patterns only."""
     photon_gain: NotNegative = 1e-4

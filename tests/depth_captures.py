@@ -80,7 +80,8 @@ def shown(pattern: dict[str, Any], uv: np.ndarray) -> np.ndarray:
         case "modulated":
             across = uv[..., 1 if pattern["axis"] == "column" else 0]
             wave = (1 + np.cos(2 * np.pi * (u / pattern["period_px"] - pattern["step"] / pattern["steps"]))) / 2
-            return wave * (1 + np.cos(2 * np.pi * (across / pattern["carrier_period_px"] - pattern["carrier_step"] / pattern["carrier_steps"]))) / 2
+            carrier = across / pattern["carrier_period_px"] - pattern["carrier_step"] / pattern["carrier_steps"]
+            return wave * (1 + np.cos(2 * np.pi * carrier)) / 2
         case "phase":
             return (1 + np.cos(2 * np.pi * (u / pattern["period_px"] - pattern["step"] / pattern["steps"]))) / 2
     raise ValueError(pattern["code"])

@@ -9,7 +9,8 @@ import pytest
 
 from kernels.tof.modulation import SPEED_OF_LIGHT
 from kernels.tof.pileup import place, unhurried
-from kernels.tof.returns import estimate_pulse, find_returns
+from kernels.tof.pulse_width import estimate_pulse
+from kernels.tof.returns import find_returns
 from stage.tof.calibration import TofCalibration, fit_line
 
 DATA = Path(os.environ.get("RELIT_TEST_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")) / "tmf8820_distance.json"

@@ -227,7 +227,8 @@ def _stripe_kernel(pack: int, code: str = "gray", inverses: bool = True, referen
             apart = most - least
             if cut[k] != 0:
                 result[k] = wp.uint8(_SATURATED)
-            elif not (contrast[k] > 0.0 and contrast[k] < LARGEST and contrast[k] * contrast[k] >= wp.static(SHADOW_SIGMAS**2) * spread[k]):  # NaN too
+            elif not (contrast[k] > 0.0 and contrast[k] < LARGEST
+                      and contrast[k] * contrast[k] >= wp.static(SHADOW_SIGMAS**2) * spread[k]):  # NaN too
                 result[k] = wp.uint8(_SHADOWED)
             elif (rest & (rest - 1)) != 0 or apart > wp.static(MAX_SPREAD):
                 result[k] = wp.uint8(_UNDECIDED)

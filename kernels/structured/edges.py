@@ -26,7 +26,8 @@ from kernels.structured.frames import Frames, NoiseModel, check_noise, check_str
 REACH = 48
 """Camera pixels that are searched to either side for an edge; a stripe wider than that is not interpolated."""
 EDGE_ERROR = 0.065
-"""Camera pixels, RMS: how far linear interpolation misses an edge where a pixel sees a sharp square of the surface; less under blur."""
+"""Camera pixels, RMS: how far linear interpolation misses an edge where a pixel sees a sharp square of the surface; less under blur.
+Counted as the same at both edges, as it is where stripes are a whole number of pixels wide."""
 
 
 def refine_edges(decoded: Decoded, frames: Frames, bits: Sequence[int], inverses: Sequence[int], *, columns: int, down: bool,
@@ -108,7 +109,7 @@ def find_edge(readings: wp.array2d(dtype=float), rows: wp.array2d(dtype=int), nu
                 variance_b = 2.0 * read_variance + gain * wp.max(next_one + next_other, 0.0)
                 edge.found = 1
                 edge.at = float(away) + t
-                edge.variance = (b * b * variance_a + a * a * variance_b) / (span * span * span * span) + wp.static(EDGE_ERROR**2)
+                edge.variance = (b * b * variance_a + a * a * variance_b) / (span * span * span * span)
                 edge.place = float(wp.max(number[here], number[there])) * stripe
             break
         here = there
@@ -174,7 +175,8 @@ def _edge_kernel() -> Any:
         slope = (high.place - low.place) / length
         share = low.at / length
         u = low.place + slope * low.at
-        deviation = wp.abs(slope) * wp.sqrt((1.0 - share) * (1.0 - share) * low.variance + share * share * high.variance)
+        noise_variance = (1.0 - share) * (1.0 - share) * low.variance + share * share * high.variance
+        deviation = wp.abs(slope) * wp.sqrt(noise_variance + wp.static(EDGE_ERROR**2))
         if u > 0.0 and u < extent and deviation < sigma[p]:  # not NaN, and better than the stripe alone
             coordinate[p] = u
             sigma[p] = deviation

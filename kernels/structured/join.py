@@ -1,10 +1,12 @@
-"""Wrapped phases that were decoded one by one, as one set of periods that is unwrapped together."""
+"""Decoded pixels put together and taken apart: phases decoded one by one as one set of periods, and a part of a band."""
 
 from collections.abc import Sequence
 
 import warp as wp
 
 from kernels.errors import ArrayError
+from kernels.packs import scalars
+from kernels.structured.decoded import Decoded
 from kernels.structured.frames import unwritten
 from kernels.structured.phase import WrappedPhase
 
@@ -30,3 +32,18 @@ def join_periods(parts: Sequence[WrappedPhase]) -> WrappedPhase:
             wp.copy(plane[row], values)
         joined.append(plane)
     return WrappedPhase(*joined, periods, first.pixel_count, first.device)
+
+
+def cropped(decoded: Decoded, first: int, count: int, *, device: str) -> Decoded:
+    """`count` pixels from `first` on, padded to whole packs; a copy.
+
+    Raises:
+        ArrayError: there are not as many.
+    """
+    have = decoded.coordinate.shape[0]
+    if first < 0 or count < 1 or first + count > have:
+        raise ArrayError(f"pixels {first} to {first + count} are asked for, there are {have}")
+    parts = [scalars(count, None, array.dtype, device) for array in decoded]
+    for part, array in zip(parts, decoded, strict=True):
+        wp.copy(part, array, src_offset=first, count=count)
+    return Decoded(*parts)

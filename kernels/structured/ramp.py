@@ -144,7 +144,7 @@ def _ramp_kernel(pack: int, pair: bool = True, ambient: bool = True) -> Any:
             elif not (whole > wp.static(SHADOW_SIGMAS) * wp.sqrt(whole_variance) and whole < LARGEST and q > -1.0 and q < 2.0):  # NaN too
                 result[k] = wp.uint8(_SHADOWED)
             else:
-                cell = int(0)
+                cell = int(0)  # noqa: RUF046 - declares a variable that a Warp loop may change
                 for halving in range(HALVINGS):
                     middle = cell + (wp.static(TABLE) >> (halving + 1))
                     cell = wp.where(table[middle] <= q, middle, cell)

@@ -58,7 +58,7 @@ def smooth(ranges: wp.array, sigma: wp.array, guide: wp.array, status: wp.array,
         ArrayError: sizes do not match, or an option is not above zero.
 
     Source:
-        Petschnigg et al., "Digital photography with flash and no-flash image pairs", SIGGRAPH 2004, equation 4 (joint bilateral); of
+        Petschnigg et al., "Digital photography with flash and no-flash image pairs", SIGGRAPH 2004 (joint bilateral); of
         first order as Elad, IEEE TIP 11(10), 2002; inverse variances make the fit maximum likelihood.
     """
     require_image(ranges, sigma, guide, status, rows=rows, cols=cols)

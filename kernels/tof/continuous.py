@@ -24,7 +24,7 @@ ROUNDING = 2e-7
 
 
 class Noise(NamedTuple):
-    """Variance of a reading: read² + electrons · reading, all in the unit of the images."""
+    """Variance of a reading: read² + shot · reading, of one electron at the least; all in the unit of the images."""
 
     shot: float
     """Of a reading of one unit: one over the electrons that a unit stands for."""
@@ -102,8 +102,8 @@ def decode(images: np.ndarray, modulation_hz: Sequence[float] | np.ndarray, refe
         ArrayError: shapes do not match, or the images cannot give phases (see `weights`).
 
     Source:
-        Lange, "3D time-of-flight distance measurement with custom solid-state image sensors in CMOS/CCD-technology", Siegen 2000,
-        section 2.2 (four phases); here for any phases. The variance is propagated: Var(x) = Σ row² · Var(I).
+        Lange, "3D time-of-flight distance measurement with custom solid-state image sensors in CMOS/CCD-technology", Siegen 2000
+        (four phases); here for any phases. The variance is propagated: Var(x) = Σ row² · Var(I).
     """
     if images.ndim != 2 or images.dtype != np.float32:
         raise ArrayError(f"images are {images.ndim}-dimensional {images.dtype}: give [image, pixel] float32")
@@ -191,7 +191,7 @@ def decode_kernel(pack: int) -> Any:
                 row_p, row_a, row_b = basis[j, 0], basis[j, 1], basis[j, 2]
                 for k in range(pack):
                     blind[k] += wp.where(wp.abs(y[k]) < saturation, 0.0, 1.0)  # NaN is not below it either
-                    variance = read_variance + shot * wp.max(y[k], 0.0) + (ROUNDING * y[k]) * (ROUNDING * y[k])
+                    variance = read_variance + shot * wp.max(y[k], shot) + (ROUNDING * y[k]) * (ROUNDING * y[k])  # an electron at the least
                     level[k] += row_p * y[k]
                     a[k] += row_a * y[k]
                     b[k] += row_b * y[k]

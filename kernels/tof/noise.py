@@ -12,6 +12,10 @@ BINS = 24
 """Of equal numbers of pixels, over the level."""
 LEAST_IN_BIN = 32
 """Readings of a bin; of fewer than three bins no line is drawn, and all noise counts as read noise."""
+LEAST_READ_ELECTRONS = 5.0
+"""Read noise that is assumed where every part of the image is too bright to show it: black pixels must not pass for certain ones."""
+HIDDEN = 4.0
+"""Shot noise of the darkest bin over that read noise, as variances, from which it cannot be seen."""
 CHI_SQUARED_MEDIAN = 0.4549
 """Of one degree of freedom."""
 
@@ -38,7 +42,7 @@ def estimate_noise(images: np.ndarray, modulation_hz: Sequence[float] | np.ndarr
         ArrayError: three images of one frequency on an image without three pixels in a row: the message says what to give instead.
 
     Source:
-        Photon transfer: Janesick, "Photon Transfer", SPIE 2007, chapter 5.
+        Photon transfer: Janesick, "Photon Transfer", SPIE 2007.
     """
     keep = np.isfinite(images).all(axis=0)
     if usable is not None:
@@ -110,4 +114,8 @@ def _fit(level: np.ndarray, squared: np.ndarray) -> Noise:
             shot, base = (sxy / sxx if sxx > 0 else 0.0), 0.0
         model = base + shot * np.maximum(x, 0)
         weight = 1 / np.maximum(model, model.max() * 1e-6 + 1e-30)
-    return Noise(float(max(shot, 0.0)), float(max(base, 0.0)) ** 0.5)
+    shot, base = max(float(shot), 0.0), max(float(base), 0.0)
+    unseen = (LEAST_READ_ELECTRONS * shot) ** 2
+    if shot * float(x.min()) > HIDDEN * unseen:
+        base = max(base, unseen)
+    return Noise(shot, base**0.5)

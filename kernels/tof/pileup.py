@@ -60,7 +60,7 @@ def correct_pileup(counts: wp.array, *, pulses: int) -> Exposed:
         ArrayError: pulses is not above zero.
 
     Source:
-        Coates, "The correction for photon `pile-up' in the measurement of radiative lifetimes", J. Phys. E 1968, equation 4.
+        Coates, "The correction for photon `pile-up' in the measurement of radiative lifetimes", J. Phys. E 1(8), 1968.
     """
     if pulses < 1:
         raise ArrayError(f"pulses is {pulses}: pile-up is corrected with the number of laser pulses, one or more")

@@ -14,7 +14,7 @@ from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.status import Status
 from kernels.tof.pileup import Exposed
-from kernels.tof.pulse import Pulse, gaussian
+from kernels.tof.pulse import Pulse
 
 FALSE_ALARMS = 1e-3
 """Part of the pixels without a return in which one is found."""
@@ -25,12 +25,6 @@ SCORING_STEPS = 8
 BACKGROUND_ROUNDS = 2
 LEAST_OUTSIDE = 4
 """Bins without a return that the background is taken from; with fewer it stays at what the search took it for."""
-WIDTHS = np.geomspace(0.25, 4.0, 13)
-"""Standard deviations of Gaussian pulses that are tried, in bins."""
-WIDTH_PIXELS = 256
-"""The brightest pixels, which decide on the width."""
-WIDTH_RETURNS = 3
-"""A pixel when the width is looked for; each costs likelihood, or narrow pulses could pile up to any shape."""
 
 _OK, _LOW, _SATURATED = int(Status.OK), int(Status.LOW_MODULATION), int(Status.SATURATED)
 
@@ -66,7 +60,7 @@ def find_returns(exposed: Exposed, pulse: Pulse, *, most: int = 1, first_bin: fl
         ArrayError: `most` is not 1 to 4, or the bins leave no place for a return.
 
     Source:
-        Matched filter and Poisson likelihood: Snyder, "Random Point Processes", 1975, chapter 2; Bar-David, "Communication under the
+        Matched filter and Poisson likelihood: Snyder, "Random Point Processes", 1975; Bar-David, "Communication under the
         Poisson regime", IEEE Trans. Information Theory 15(1), 1969. σ from the Fisher information, with the strength unknown.
     """
     bins, pixels = exposed.counts.shape
@@ -83,44 +77,14 @@ def find_returns(exposed: Exposed, pulse: Pulse, *, most: int = 1, first_bin: fl
     devices.launch(_returns_kernel, pixels, [
         exposed.counts, exposed.awake, wp.array(pulse.cumulative.astype(np.float32), dtype=wp.float32, device=device),
         wp.array(pulse.density.astype(np.float32), dtype=wp.float32, device=device), float(pulse.begin), float(1 / pulse.step),
-        float(pulse.end), float(pulse.width), first_bin, last, _threshold(bins)],
+        float(pulse.end), float(pulse.width), first_bin, last, threshold(bins)],
         [*perms, background, likelihood, status], device=device, uneven=True)
     return Returns(*perms, background, likelihood, status)
 
 
-def _threshold(bins: int) -> float:
+def threshold(bins: int) -> float:
     """Evidence that chance reaches in FALSE_ALARMS of the histograms: chi-squared of two degrees of freedom, in any of the bins."""
     return float(2 * np.log(bins / FALSE_ALARMS))
-
-
-def estimate_pulse(exposed: Exposed, counts: np.ndarray) -> Pulse:
-    """The Gaussian pulse under which the brightest histograms are likeliest; waits for the device.
-
-    Args:
-        exposed: of all pixels.
-        counts: [pixel, bin] the same as recorded, to pick the brightest.
-
-    Raises:
-        ArrayError: none of them shows a return.
-    """
-    peak = counts.max(axis=1) - np.median(counts, axis=1)
-    chosen = np.argsort(-peak, kind="stable")[:WIDTH_PIXELS]
-    device = str(exposed.counts.device)
-    some = Exposed(*(wp.array(np.ascontiguousarray(array.numpy()[:, chosen]), dtype=wp.float32, device=device) for array in exposed))
-    totals = []
-    for width in WIDTHS:
-        found = find_returns(some, gaussian(float(width)), most=WIDTH_RETURNS)
-        returns = int((found.photons.numpy() > 0).sum())
-        cost = 0.5 * returns * _threshold(exposed.counts.shape[0])
-        totals.append(float(found.likelihood.numpy().sum(dtype=np.float64)) - cost if returns else -np.inf)
-    best = int(np.argmax(totals))
-    if not np.isfinite(totals[best]):
-        raise ArrayError("no histogram shows a return: the width of the pulse cannot be told from them")
-    place = 0.0
-    if 0 < best < len(WIDTHS) - 1 and np.isfinite(totals[best - 1]) and np.isfinite(totals[best + 1]):
-        before, here, after = totals[best - 1 : best + 2]
-        place = 0.5 * (before - after) / (before - 2 * here + after)  # of the parabola through the three
-    return gaussian(float(WIDTHS[best] * (WIDTHS[1] / WIDTHS[0]) ** place))
 
 
 def returns_kernel(pack: int) -> Any:

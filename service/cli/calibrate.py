@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.cli import calibrate_projector
+from service.cli import calibrate_projector, calibrate_tof
 from service.cli.options import CaptureArgument, HostOption
 
 if TYPE_CHECKING:
@@ -36,6 +36,7 @@ def register(app: typer.Typer) -> None:
                           ("intensity", intensity), ("dark", dark), ("flat-field", flat_field), ("saturation", saturation)):
         kinds.command(name)(command)
     calibrate_projector.register(kinds)
+    calibrate_tof.register(kinds)
     app.add_typer(kinds)
 
 

@@ -26,6 +26,8 @@ def depth(
                                                 show_default=False)] = None,
     max_residual_px: Annotated[float, typer.Option(
         "--max-residual-px", help="Where columns and rows are decoded: projector pixels by which they may contradict each other.")] = 4.0,
+    refine: Annotated[bool, typer.Option(
+        "--refine/--no-refine", help="Interpolate a Gray code with inverses between the edges of its stripes.")] = True,
     read_noise: Annotated[float, typer.Option(
         "--read-noise", help="Noise of a reading in the dark, as a part of full scale.")] = 0.003,
     photon_gain: Annotated[float, typer.Option(
@@ -53,7 +55,7 @@ def depth(
                                      "temperature_c": temperature_c})
     with Bar() as bar:
         result = run(DepthRequest(capture=capture, out=out, using=using, near_m=near_m, far_m=far_m, max_residual_px=max_residual_px,
-                                  read_noise=read_noise, photon_gain=photon_gain, normals=normals, tof=tof,
+                                  refine=refine, read_noise=read_noise, photon_gain=photon_gain, normals=normals, tof=tof,
                                   device=device, cache=cache), bar)
     print(f"depth    {result.depth_path}")
     print(f"points   {result.points_path}")

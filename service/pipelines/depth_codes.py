@@ -8,6 +8,7 @@ import numpy as np
 
 from kernels.structured.binary import decode_binary, decode_gray, decode_xor
 from kernels.structured.decoded import Decoded
+from kernels.structured.edges import REACH, refine_edges
 from kernels.structured.frames import Frames, NoiseModel
 from kernels.structured.join import join_periods
 from kernels.structured.kary import decode_kary
@@ -19,7 +20,6 @@ from kernels.structured.unwrap import unwrap_by_code, unwrap_jointly
 from stage.errors import ManifestError
 from stage.model import Resolution, Rgb
 from stage.patterns.collect import BinaryCode, Code, Collected, KaryCode, ModulatedCode, PhaseCode, RampCode
-
 
 FULL_STEPS = 3
 """Frames of different shifts that a phase of its own needs."""
@@ -39,6 +39,8 @@ class Readings(NamedTuple):
     grey: Frames
     colour: Frames | None
     """The same with three channels, where a code has colours."""
+    columns: int
+    """Pixels of an image row: the band is whole rows."""
 
 
 @dataclass(frozen=True)
@@ -51,17 +53,20 @@ class AxisPlan:
     colour: bool
     """Whether it needs colour frames."""
     decode: Callable[[Readings, NoiseModel], Decoded]
+    halo: int = 0
+    """Rows beyond a band, above and below, that decoding looks at."""
     unused: tuple[str, ...] = ()
     """Codes of the axis that add nothing to this plan."""
 
 
-def plan_axis(collected: Collected, axis: str, projector: PatternDevice) -> AxisPlan | None:
+def plan_axis(collected: Collected, axis: str, projector: PatternDevice, *, refine: bool = False) -> AxisPlan | None:
     """The most precise way to decode an axis from the codes that there are: phases, else stripes, else digits, else a ramp.
 
     Args:
         collected: the codes of a capture.
         axis: column or row.
         projector: its resolution, response and crosstalk.
+        refine: interpolate a Gray code with inverses between the edges of its stripes.
 
     Returns:
         None where the axis has no code.
@@ -86,7 +91,7 @@ def plan_axis(collected: Collected, axis: str, projector: PatternDevice) -> Axis
         return _wave_plan([phase], "phase", _numbering(stripes, phase.periods_px), collected, codes, projector, extent)
     if stripes:
         return _stripe_plan(min(stripes, key=lambda code: (isinstance(code, KaryCode), code.stripe_px)), collected, codes, projector,
-                            extent)
+                            extent, refine)
     for code in ready:
         if isinstance(code, RampCode):
             return _ramp_plan(code, collected, codes, projector, extent)
@@ -131,7 +136,7 @@ def _micro_plan(phase: PhaseCode, collected: Collected, codes: list[Code], exten
     def decode(readings: Readings, noise: NoiseModel) -> Decoded:
         return decode_micro(readings.grey, phase.frames, phase.periods_px, phase.shifts, black=collected.black, extent=extent, noise=noise)
 
-    return AxisPlan(phase.axis, "micro phase", False, decode, _unused(codes, [phase]))
+    return AxisPlan(phase.axis, "micro phase", False, decode, unused=_unused(codes, [phase]))
 
 
 def _wave_plan(waves: Sequence[PhaseCode | ModulatedCode], name: str, numbering: BinaryCode | KaryCode | None, collected: Collected,
@@ -151,15 +156,23 @@ def _wave_plan(waves: Sequence[PhaseCode | ModulatedCode], name: str, numbering:
 
     used: list[Code] = [*waves, *([] if numbering is None else [numbering])]
     name = name if numbering is None else f"{name} numbered by {_name(numbering)}"
-    return AxisPlan(waves[0].axis, name, _coloured(numbering), decode, _unused(codes, used))
+    return AxisPlan(waves[0].axis, name, _coloured(numbering), decode, unused=_unused(codes, used))
 
 
-def _stripe_plan(code: BinaryCode | KaryCode, collected: Collected, codes: list[Code], projector: PatternDevice, extent: int) -> AxisPlan:
+def _stripe_plan(code: BinaryCode | KaryCode, collected: Collected, codes: list[Code], projector: PatternDevice, extent: int,
+                 refine: bool) -> AxisPlan:
+    inverses = code.inverses if isinstance(code, BinaryCode) else None
+    edges = refine and inverses is not None and isinstance(code, BinaryCode) and code.code == "gray"
+
     def decode(readings: Readings, noise: NoiseModel) -> Decoded:
-        return _decode_stripes(code, collected, projector, extent, readings, noise)
+        found = _decode_stripes(code, collected, projector, extent, readings, noise)
+        if not edges or inverses is None:
+            return found
+        return refine_edges(found, readings.grey, code.frames, inverses, columns=readings.columns, down=code.axis == "row",
+                            extent=extent, stripe_px=code.stripe_px, noise=noise)
 
-    name = f"{_name(code)}{' with inverses' if isinstance(code, BinaryCode) and code.inverses else ''}"
-    return AxisPlan(code.axis, name, _coloured(code), decode, _unused(codes, [code]))
+    name = f"{_name(code)}{' with inverses' if inverses else ''}{', edges refined' if edges else ''}"
+    return AxisPlan(code.axis, name, _coloured(code), decode, REACH if edges and code.axis == "row" else 0, _unused(codes, [code]))
 
 
 def _ramp_plan(code: RampCode, collected: Collected, codes: list[Code], projector: PatternDevice, extent: int) -> AxisPlan:
@@ -169,7 +182,7 @@ def _ramp_plan(code: RampCode, collected: Collected, codes: list[Code], projecto
         return decode_ramp(readings.grey, up=code.up, down=code.down, white=collected.white, black=collected.black, extent=extent,
                            response=response, noise=noise)
 
-    return AxisPlan(code.axis, "ramp", False, decode, _unused(codes, [code]))
+    return AxisPlan(code.axis, "ramp", False, decode, unused=_unused(codes, [code]))
 
 
 def _decode_stripes(code: BinaryCode | KaryCode, collected: Collected, projector: PatternDevice, extent: int, readings: Readings,

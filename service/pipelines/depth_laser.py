@@ -24,6 +24,9 @@ MAX_GAP = 0.02
 """Part of its distance by which the laser's ray may miss the line of sight: beyond, the spot is not that ray's."""
 LEAST_FOR_AMBIENT = 3
 """Laser frames from which the least value of each pixel over them is taken for ambient light, where there is no frame of it."""
+LEAST_PART, OF_PERCENTILE = 0.03, 95.0
+"""Of the brightest lines' peak over all frames (their 95th percentile): a line whose peak is lower sees the stripe's light by way of
+other surfaces, as in the laser's shadow or when the stripe has left the image; or a surface thirty times darker."""
 NOISE_SAMPLE = 200_000
 """Pixels from which the noise of a frame is taken."""
 
@@ -75,10 +78,12 @@ def solve_laser(capture: Capture, mask: np.ndarray, device: str, *, near_m: floa
             along = "row" if abs(frame.laser.normal[0]) >= abs(frame.laser.normal[1]) else "column"
             found = _measure_stripe(signal, mask, frame.laser, along, camera, device, near_m, far_m)
             samples[along].append(found)
-            seen.update({Status(code).name.lower(): int(count) for code, count in zip(*np.unique(found.status, return_counts=True),
-                                                                                      strict=True)})
         timings.advance(number + 1)
     kept = {along: Samples.joined(parts) for along, parts in samples.items() if parts}
+    _refuse_faint(kept)
+    for part in kept.values():
+        numbers = np.bincount(part.status)
+        seen.update({Status(code).name.lower(): int(numbers[code]) for code in np.flatnonzero(numbers)})
     if not spots and not any((part.status == Status.OK).any() for part in kept.values()):
         raise ManifestError(f"{capture.folder}: no laser frame has a depth ({_words(seen)}): check that the laser is seen, that "
                             "origin_m, point_m and directions are in metres in the camera frame, and --near-m and --far-m")
@@ -146,6 +151,15 @@ def _measure_stripe(signal: np.ndarray, mask: np.ndarray, laser: LaserPlane, alo
     status[ok & ~near] = Status.OUT_OF_RANGE
     spread = sigma * met.per_pixel / camera.focal_px[0 if along == "row" else 1]
     return Samples(lines, centre, np.nan_to_num(met.depth), np.nan_to_num(spread), amplitude, status)
+
+
+def _refuse_faint(kept: dict[str, Samples]) -> None:
+    """Mark stripes that are too faint beside the others to be the laser's own light."""
+    found = np.concatenate([part.amplitude[part.status == Status.OK] for part in kept.values()]) if kept else np.zeros(0)
+    if len(found):
+        least = LEAST_PART * float(np.percentile(found, OF_PERCENTILE))
+        for part in kept.values():
+            part.status[(part.status == Status.OK) & (part.amplitude < least)] = Status.LOW_MODULATION
 
 
 def _combine(capture: Capture, shape: tuple[int, ...], kept: dict[str, Samples], spots: list[_Spot], brightest: np.ndarray,

@@ -8,6 +8,7 @@ import numpy as np
 from kernels.status import SOLVED, Status
 from kernels.structured.decoded import Decoded
 from kernels.structured.frames import NoiseModel, saturated_bits, upload
+from kernels.structured.join import cropped
 from kernels.structured.triangulate import ProjectorModel, triangulate
 from service.depth_requests import DepthRequest
 from service.pipelines.depth_codes import AxisPlan, PatternDevice, Readings, plan_axis
@@ -48,7 +49,8 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
     """
     projector = check_projector(capture)
     frames = [frame for frame in capture.manifest.frames if frame.pattern is not None]
-    collected, columns, rows = plan_codes(capture, frames, PatternDevice(projector.resolution, projector.response, projector.crosstalk))
+    collected, columns, rows = plan_codes(capture, frames, PatternDevice(projector.resolution, projector.response, projector.crosstalk),
+                                          refine=request.refine)
     plans = (columns, rows)
     colour = any(plan is not None and plan.colour for plan in plans)
     timings.stage("frames", len(frames))
@@ -64,11 +66,14 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
     return solution
 
 
-def plan_codes(capture: Capture, frames: list[Frame], projector: PatternDevice) -> tuple[Collected, AxisPlan | None, AxisPlan | None]:
+def plan_codes(capture: Capture, frames: list[Frame], projector: PatternDevice, *,
+               refine: bool = False) -> tuple[Collected, AxisPlan | None, AxisPlan | None]:
     """The codes of a capture and how each axis is decoded; what is missing is said with the file's name."""
     try:
+        collect([frame.pattern for frame in capture.manifest.frames])  # so that what is wrong is said with the manifest's numbers
         collected = collect([frame.pattern for frame in frames])
-        return collected, plan_axis(collected, "column", projector), plan_axis(collected, "row", projector)
+        columns, rows = (plan_axis(collected, axis, projector, refine=refine) for axis in ("column", "row"))
+        return collected, columns, rows
     except ManifestError as error:
         raise ManifestError(f"{capture.folder / FILE_NAME}: frames: {error}") from error
 
@@ -120,13 +125,20 @@ def decoded_bands(planes: Planes, plans: Sequence[AxisPlan | None], noise: Noise
     Yields:
         A range of rows, and each axis decoded in it; None where an axis has no plan.
     """
+    _, height, _, width = planes.values.shape
+    halo = max((plan.halo for plan in plans if plan is not None), default=0)
     for band in planes.bands(DECODE_BYTES_PER_PIXEL):
-        values = planes.band(band)
-        bits = None if planes.saturated is None else saturated_bits(planes.saturated[:, band].reshape(len(values), -1))
+        around = slice(max(band.start - halo, 0), min(band.stop + halo, height))
+        values = planes.band(around)
+        bits = None if planes.saturated is None else saturated_bits(planes.saturated[:, around].reshape(len(values), -1))
         grey = values[:, 0] if values.shape[1] == 1 else np.tensordot(values, np.array(GREY_WEIGHTS, np.float32), ([1], [0]))
         readings = Readings(upload(np.ascontiguousarray(grey), bits, device=device),
-                            upload(values, bits, device=device) if values.shape[1] > 1 else None)
-        yield band, [None if plan is None else plan.decode(readings, noise) for plan in plans]
+                            upload(values, bits, device=device) if values.shape[1] > 1 else None, width)
+        decoded = [None if plan is None else plan.decode(readings, noise) for plan in plans]
+        if around != band:
+            first, count = (band.start - around.start) * width, (band.stop - band.start) * width
+            decoded = [None if axis is None else cropped(axis, first, count, device=device) for axis in decoded]
+        yield band, decoded
 
 
 def _amplitude(decoded: list[Decoded | None]) -> np.ndarray:

@@ -10,7 +10,8 @@ from kernels.status import SOLVED
 from kernels.tof.modulation import SPEED_OF_LIGHT
 from kernels.tof.pileup import correct_pileup, place, unhurried
 from kernels.tof.pulse import STEPS_PER_SIGMA
-from kernels.tof.returns import estimate_pulse, find_returns
+from kernels.tof.pulse_width import estimate_pulse
+from kernels.tof.returns import find_returns
 from service.errors import RequestError
 from service.progress import Progress, Timings
 from service.provenance import metadata, report

@@ -21,15 +21,16 @@ from stage.tof.calibration import TofCalibration, read_calibration
 from stage.tof.frames import is_pulsed, read_correlations, read_histograms
 
 
-def solve_tof(capture: Capture, options: TofOptions, *, near_m: float | None = None, far_m: float | None = None, device: str,
-              timings: Timings) -> DepthSolution:
+def solve_tof(capture: Capture, options: TofOptions, *, near_m: float | None = None, far_m: float | None = None,
+              calibration: TofCalibration | None = None, device: str, timings: Timings) -> DepthSolution:
     """Solve the time-of-flight frames of a capture.
 
     Args:
         capture: with cw or pulsed frames.
-        options: filters, calibration.
+        options: filters, and the file of a calibration.
         near_m: nearest range; None: 0, pulsed: where the histogram begins.
         far_m: farthest range; None: as far as the frequencies tell apart, or the histogram reaches.
+        calibration: in place of that file.
         device: where to run.
         timings: told of the stages.
 
@@ -43,7 +44,8 @@ def solve_tof(capture: Capture, options: TofOptions, *, near_m: float | None = N
     """
     timings.stage("read", 1)
     pulsed = is_pulsed(capture)
-    calibration = TofCalibration() if options.calibration is None else read_calibration(options.calibration)
+    if calibration is None:
+        calibration = TofCalibration() if options.calibration is None else read_calibration(options.calibration)
     mask = capture.mask()
     limit = capture.manifest.saturation
     if pulsed:

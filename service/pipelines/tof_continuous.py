@@ -3,9 +3,11 @@
 import numpy as np
 
 from kernels.tof.continuous import Correlation, Noise, decode, weights
+from kernels.tof.decide import AGREEMENT_RAD, UNCALIBRATED_RAD, decide
 from kernels.tof.modulation import common_range_m, require_span
 from kernels.tof.noise import estimate_noise
-from kernels.tof.unwrap import decide, unwrap, vote
+from kernels.tof.unwrap import unwrap
+from kernels.tof.vote import vote
 from kernels.tof.wiggling import ENTRIES, sample_harmonics, straighten
 from service.pipelines.tof_measured import Measured
 from service.tof_options import TofOptions
@@ -41,7 +43,9 @@ def solve_correlations(frames: CorrelationImages, options: TofOptions, calibrati
     hypotheses = unwrap(found, nearest_m=nearest, farthest_m=farthest)
     if options.vote:
         hypotheses = vote(hypotheses, rows, cols)
-    ranges = decide(found, hypotheses, nearest_m=nearest, farthest_m=farthest)
+    straight = [hz for hz in found.modulation_hz.tolist() if calibration.of_frequency(hz) is not None]
+    agreement = AGREEMENT_RAD if len(straight) == len(found.modulation_hz) else UNCALIBRATED_RAD
+    ranges = decide(found, hypotheses, agreement_rad=agreement)
     facts = {
         "modulation_hz": found.modulation_hz.tolist(),
         "images": len(frames.images),
@@ -49,7 +53,8 @@ def solve_correlations(frames: CorrelationImages, options: TofOptions, calibrati
         "common_range_m": round(common_range_m(frames.modulation_hz), 4),
         "vote": options.vote,
         "noise": {"electrons_per_unit": 1 / noise.shot if noise.shot > 0 else None, "read_units": noise.read, "from": source},
-        "wiggling": [hz for hz in found.modulation_hz.tolist() if calibration.of_frequency(hz) is not None],
+        "wiggling": straight,
+        "agreement_rad": agreement,
     }
     pixels = rows * cols
     return Measured("time of flight, continuous wave", ranges.range.numpy()[:pixels], ranges.sigma.numpy()[:pixels],

@@ -9,7 +9,8 @@ from kernels.status import SOLVED, Status
 from kernels.tof.modulation import SPEED_OF_LIGHT
 from kernels.tof.pileup import Exposed, correct_pileup, place, unhurried
 from kernels.tof.pulse import STEPS_PER_SIGMA, Pulse, gaussian, measured
-from kernels.tof.returns import Returns, estimate_pulse, find_returns
+from kernels.tof.pulse_width import estimate_pulse
+from kernels.tof.returns import Returns, find_returns
 from service.errors import RequestError
 from service.pipelines.tof_measured import Measured
 from service.tof_methods import WhichReturn

@@ -13,7 +13,7 @@ from kernels.relight import basis, batch, cells, combine, display, guide, near_s
 from kernels.structured import binary, edges, kary, micro, modulated, phase, ramp, stripe, triangulate
 from kernels.structured import separation as light_parts
 from kernels.structured import unwrap as wraps
-from kernels.tof import bilateral, continuous, flying, pileup, returns, unwrap, wiggling
+from kernels.tof import bilateral, continuous, decide, flying, pileup, returns, unwrap, vote, wiggling
 
 devices.names()
 OLDEST = min(wp.get_cuda_supported_archs(), default=None)
@@ -28,16 +28,17 @@ OLDEST = min(wp.get_cuda_supported_archs(), default=None)
                                   combine.register_kernel, batch.register_kernel, cells._nearest_kernel,
                                   basis.gram_kernel, display.encode_kernel, residual.residual_kernel, shading._shade_kernel,
                                   guide._compare_kernel, near_sum._sum_kernel, occlusion._see_kernel,
-                                  continuous.decode_kernel, unwrap.unwrap_kernel, unwrap.vote_kernel, unwrap.decide_kernel,
-                                  wiggling.straighten_kernel, flying.flying_kernel, bilateral.smooth_kernel, bilateral.frame_kernel, pileup.coates_kernel,
-                                  returns.returns_kernel,
+                                  continuous.decode_kernel, unwrap.unwrap_kernel, vote.vote_kernel, decide.decide_kernel,
+                                  wiggling.straighten_kernel, flying.flying_kernel, bilateral.smooth_kernel, bilateral.frame_kernel,
+                                  pileup.coates_kernel, returns.returns_kernel,
                                   *(partial(binary._stripe_kernel, code=code) for code in ("binary", "gray", "xor")),
                                   partial(binary._stripe_kernel, inverses=False), partial(binary._stripe_kernel, references=False),
                                   kary._kary_kernel, partial(kary._kary_kernel, channels=3), ramp._ramp_kernel,
                                   partial(ramp._ramp_kernel, pair=False), phase._phase_kernel, partial(phase._phase_kernel, ambient=True),
                                   wraps._joint_kernel, wraps._numbered_kernel, micro._micro_kernel, modulated._modulated_kernel,
                                   *(partial(triangulate._kernel, with_u=u, with_v=v) for u, v in ((1, 0), (0, 1), (1, 1))),
-                                  lambda pack: stripe._stripe_kernel, light_parts._extremes_kernel, light_parts._swing_kernel, edges._number_kernel,
+                                  lambda pack: stripe._stripe_kernel, light_parts._extremes_kernel, light_parts._swing_kernel,
+                                  edges._number_kernel,
                                   lambda pack: edges._edge_kernel(),
                                   lambda pack: smooth._walk_kernel(),
                                   lambda pack: near_sum._weights_kernel()])

@@ -47,10 +47,19 @@ def test_gray_code_with_inverses(relit, tmp_path, suffix):
     assert off(maps).max() < COLUMN_PX  # half a stripe, or one where a bit is in doubt
     assert np.abs(maps.projector_u - SCENE.uv[..., 0])[maps.mask].max() <= 1.0
     assert maps.projector_v is None and maps.range is None
-    assert report["method"] == "gray with inverses" and report["found"]["codes"] == {"column": "gray with inverses"}
+    assert report["found"]["codes"] == {"column": report["method"]} == {"column": "gray with inverses, edges refined"}
     assert report["pixels"]["ok"] == maps.mask.sum() == report["points"]
     assert report["sigma_m"]["median"] == pytest.approx(np.median(maps.sigma[maps.mask]), rel=1e-4)
     assert files_in(tmp_path / "out") == {"depth.exr", "points.ply", "report.json"}
+
+
+def test_edges_of_wide_stripes_are_refined(relit, tmp_path):
+    write_patterns(tmp_path, SCENE, [*gray_patterns("column", stripe=8), *BLACK_WHITE])
+    refined, _ = solve(relit, tmp_path)
+    centres, report = solve(relit, tmp_path, "--no-refine")
+    assert report["method"] == "gray with inverses"
+    column = [np.median(np.abs(maps.projector_u - SCENE.uv[..., 0])[maps.mask]) for maps in (centres, refined)]
+    assert column[0] > 1.5 and column[1] < 0.3
 
 
 def test_phase_numbered_by_gray(relit, tmp_path):
@@ -167,8 +176,10 @@ def test_saturated_readings_are_refused(relit, tmp_path):
     assert report["pixels"]["saturated"] > 0 and not maps.mask[bright & LIT].any()
 
 
-def test_bands_change_nothing(relit, tmp_path, monkeypatch):
-    write_patterns(tmp_path, SCENE, [*phase_patterns("column", 16), *gray_patterns("column", stripe=4), *BLACK_WHITE], noise=0.01)
+@pytest.mark.parametrize("patterns", [[*phase_patterns("column", 16), *gray_patterns("column", stripe=4)],
+                                      [*gray_patterns("column", stripe=4), *gray_patterns("row", stripe=4)]])
+def test_bands_change_nothing(relit, tmp_path, monkeypatch, patterns):
+    write_patterns(tmp_path, SCENE, [*patterns, *BLACK_WHITE], noise=0.01)
     whole, _ = solve(relit, tmp_path)
     monkeypatch.setattr("stage.planes.BAND_BYTES", 100_000)
     monkeypatch.setattr("stage.planes.MEMORY_BYTES", 0)
@@ -231,6 +242,10 @@ def test_incomplete_codes_are_named(relit, tmp_path):
 def test_two_frames_of_one_pattern_are_named(relit, tmp_path):
     write_patterns(tmp_path, SCENE, [*gray_patterns("column"), *gray_patterns("column")[:1]])
     fails(relit, tmp_path, "show one pattern")
+    data = json.loads((tmp_path / "capture.json").read_text())
+    write_image(tmp_path / "off.png", np.zeros(SCENE.depth.shape, np.uint16))
+    edit_manifest(tmp_path, frames=[{"image": "off.png", "light": {"type": "off"}}, *data["frames"]])
+    fails(relit, tmp_path, r"capture.json: frames: frames 1 and 15 show one pattern \(column gray bit 6 of 7\)")
 
 
 def test_images_of_another_size_are_named(relit, tmp_path):

@@ -8,6 +8,7 @@ import pytest
 
 from stage.tof.calibration import TofCalibration
 from stage.tof.scan import Scan
+from stage.tof.sweep import Sweep
 
 DOCS = (Path(__file__).resolve().parents[2] / "docs" / "time_of_flight.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"```(\w*)\n(.*?)```", DOCS, re.DOTALL)
@@ -23,7 +24,8 @@ def test_the_speed_of_light_is_among_it():
 
 
 def test_the_json_is_read():
-    calibration, scan = (json.loads(code) for kind, code in BLOCKS if kind == "json")
+    calibration, sweep, scan = (json.loads(code) for kind, code in BLOCKS if kind == "json")
+    assert len(Sweep.model_validate(sweep).steps) == 2
     assert TofCalibration.model_validate(calibration).pulse_sigma_s == 1.2e-9
     assert Scan.model_validate(scan).name == "yard"
 

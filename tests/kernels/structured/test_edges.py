@@ -51,7 +51,7 @@ def test_edges_are_finer_than_stripes(per_pixel, stripe, down, device):
     assert error.std() < 0.25 * (plain[0] - u)[refined].std()
     assert np.abs(error).max() < 0.6 * stripe
     z = error / fine[1][refined]
-    assert z.std() == pytest.approx(1, abs=0.2)  # the footprint here is a square; what interpolation misses is no normal deviate
+    assert 0.75 < z.std() < 1.2  # what interpolation misses is the same at both edges or not, as their places among the pixels have it
 
 
 def test_sigma_follows_the_noise(device):

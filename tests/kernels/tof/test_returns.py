@@ -7,7 +7,8 @@ from kernels.errors import ArrayError
 from kernels.status import Status
 from kernels.tof.pileup import correct_pileup, place, unhurried
 from kernels.tof.pulse import from_sweep, gaussian, measured
-from kernels.tof.returns import estimate_pulse, find_returns
+from kernels.tof.pulse_width import estimate_pulse
+from kernels.tof.returns import find_returns
 from tests.reference import tof
 
 BIN_S, SIGMA_S = 1.5e-9, 1.2e-9

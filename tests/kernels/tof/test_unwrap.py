@@ -6,7 +6,9 @@ import pytest
 from kernels.errors import ArrayError
 from kernels.status import Status
 from kernels.tof.continuous import Noise, decode
-from kernels.tof.unwrap import decide, unwrap, vote
+from kernels.tof.decide import decide
+from kernels.tof.unwrap import unwrap
+from kernels.tof.vote import vote
 from tests.reference import tof
 
 FAR = 14.98
@@ -20,7 +22,7 @@ def solve(images, settings, device, *, far=FAR, near=0.0, noise=NOISE, shape=Non
     weighed = unwrap(found, nearest_m=near, farthest_m=far)
     if shape is not None:
         weighed = vote(weighed, *shape)
-    result = decide(found, weighed, nearest_m=near, farthest_m=far)
+    result = decide(found, weighed)
     return {name: getattr(result, name).numpy()[: flat.shape[1]] for name in result._fields}
 
 

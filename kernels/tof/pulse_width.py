@@ -1,0 +1,50 @@
+"""How wide the pulse is, from the histograms themselves: the Gaussian under which the brightest of them are likeliest."""
+
+import numpy as np
+import warp as wp
+
+from kernels.errors import ArrayError
+from kernels.tof.pileup import Exposed
+from kernels.tof.pulse import Pulse, gaussian
+from kernels.tof.returns import find_returns, threshold
+
+WIDTHS = np.geomspace(0.25, 4.0, 13)
+"""Standard deviations of Gaussian pulses that are tried, in bins."""
+WIDTH_PIXELS = 512
+"""The brightest pixels, which decide on the width."""
+WIDTH_WINDOW = 8
+"""Bins in which their photons are counted: the highest bin alone would prefer histograms that are narrow by chance."""
+WIDTH_RETURNS = 3
+"""A pixel when the width is looked for; each costs likelihood, or narrow pulses could pile up to any shape."""
+
+
+def estimate_pulse(exposed: Exposed, counts: np.ndarray) -> Pulse:
+    """The Gaussian pulse under which the brightest histograms are likeliest; waits for the device.
+
+    Args:
+        exposed: of all pixels.
+        counts: [pixel, bin] the same as recorded, to pick the brightest.
+
+    Raises:
+        ArrayError: none of them shows a return.
+    """
+    total = np.cumsum(counts, axis=1, dtype=np.float64)
+    window = min(WIDTH_WINDOW, counts.shape[1] - 1)
+    peak = (total[:, window:] - total[:, :-window]).max(axis=1) - window * np.median(counts, axis=1)
+    chosen = np.argsort(-peak, kind="stable")[:WIDTH_PIXELS]
+    device = str(exposed.counts.device)
+    some = Exposed(*(wp.array(np.ascontiguousarray(array.numpy()[:, chosen]), dtype=wp.float32, device=device) for array in exposed))
+    totals = []
+    for width in WIDTHS:
+        found = find_returns(some, gaussian(float(width)), most=WIDTH_RETURNS)
+        returns = int((found.photons.numpy() > 0).sum())
+        cost = 0.5 * returns * threshold(exposed.counts.shape[0])
+        totals.append(float(found.likelihood.numpy().sum(dtype=np.float64)) - cost if returns else -np.inf)
+    best = int(np.argmax(totals))
+    if not np.isfinite(totals[best]):
+        raise ArrayError("no histogram shows a return: the width of the pulse cannot be told from them")
+    place = 0.0
+    if 0 < best < len(WIDTHS) - 1 and np.isfinite(totals[best - 1]) and np.isfinite(totals[best + 1]):
+        before, here, after = totals[best - 1 : best + 2]
+        place = 0.5 * (before - after) / (before - 2 * here + after)  # of the parabola through the three
+    return gaussian(float(WIDTHS[best] * (WIDTHS[1] / WIDTHS[0]) ** place))

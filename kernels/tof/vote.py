@@ -1,0 +1,109 @@
+"""A vote of the neighbourhood on the wraps that a pixel leaves open."""
+
+from typing import Any
+
+import warp as wp
+
+from kernels import device as devices
+from kernels.errors import ArrayError
+from kernels.tof.unwrap import HYPOTHESES, Hypotheses
+
+VOTE_RADIUS = 2
+"""Pixels: 24 neighbours."""
+VOTE_ROUNDS = 2
+SAME_SURFACE = 0.3
+"""Neighbours within this part of the wrap distance count as the same surface."""
+CERTAIN = 1 - 1e-5
+"""Probability from which a pixel is not asked again: two rounds multiply the odds of another wrap by at most 1 / STRANGER²."""
+STRANGER = 0.02
+"""Prior of a pixel on a surface that none of its neighbours is on: how far they can outvote what it measured itself."""
+
+wp.set_module_options({"enable_backward": False})
+
+
+def vote(weighed: Hypotheses, rows: int, cols: int) -> Hypotheses:
+    """Let neighbours decide between the hypotheses of each pixel; ranges stay what they are, probabilities move.
+
+    The probability of a hypothesis is multiplied by the density that the neighbours' hypotheses, weighed by their probabilities, have at
+    its range, plus a little for a pixel that is on none of their surfaces. Nothing is smoothed.
+
+    Args:
+        weighed: of `unwrap`; rows · cols pixels and padding.
+        rows, cols: of the image.
+
+    Raises:
+        ArrayError: the image has another number of pixels.
+
+    Source:
+        Järemo Lawin, Forssén, Ovrén, "Efficient multi-frequency phase unwrapping using kernel density estimation", ECCV 2016; here
+        as a factor on what the pixel measured itself.
+    """
+    device, pixels = weighed.range.device, weighed.range.shape[1]
+    if not 0 < rows * cols <= pixels:
+        raise ArrayError(f"there are {pixels} pixels, the image is {rows} x {cols}: give the image's own size")
+    before = weighed.probability
+    for _ in range(VOTE_ROUNDS):
+        after = wp.zeros_like(before)
+        devices.launch(_vote_kernel, rows * cols, [weighed.range, before, rows, cols, 1.0 / (SAME_SURFACE * weighed.spacing_m)], [after],
+                       device=str(device))
+        before = after
+    return weighed._replace(probability=before)
+
+
+def vote_kernel(pack: int) -> Any:
+    """For tests that compile it; single pixels whatever the pack."""
+    return _vote_kernel
+
+
+@wp.func
+def nearness(distance: float, inverse: float):
+    """Of two ranges on one surface: 1 at none, 0 from a radius on (biweight)."""
+    u = distance * inverse
+    v = wp.max(1.0 - u * u, 0.0)
+    return v * v
+
+
+@wp.kernel(module="unique")
+def _vote_kernel(first: int,
+                 ranges: wp.array2d(dtype=wp.float32),  # [3, pixel]
+                 before: wp.array2d(dtype=wp.float32),  # [3, pixel]
+                 rows: int,
+                 cols: int,
+                 inverse: float,  # 1/m: of the radius within which ranges are one surface
+                 # outputs
+                 after: wp.array2d(dtype=wp.float32)):  # [3, pixel]
+    p = first + wp.tid()
+    if before[0, p] >= CERTAIN:
+        after[0, p] = before[0, p]
+        after[1, p] = before[1, p]
+        after[2, p] = before[2, p]
+    elif before[0, p] + before[1, p] + before[2, p] > 0.0:
+        r = p // cols
+        c = p - r * cols
+        d0 = ranges[0, p]
+        d1 = ranges[1, p]
+        d2 = ranges[2, p]
+        s0 = float(0.0)
+        s1 = float(0.0)
+        s2 = float(0.0)
+        voters = float(0.0)
+        for i in range(wp.max(r - VOTE_RADIUS, 0), wp.min(r + VOTE_RADIUS + 1, rows)):
+            for j in range(wp.max(c - VOTE_RADIUS, 0), wp.min(c + VOTE_RADIUS + 1, cols)):
+                q = i * cols + j
+                if q != p:
+                    for k in range(HYPOTHESES):
+                        w = before[k, q]
+                        if w > 1.0e-3:
+                            d = ranges[k, q]
+                            voters += w
+                            s0 += w * nearness(d - d0, inverse)
+                            s1 += w * nearness(d - d1, inverse)
+                            s2 += w * nearness(d - d2, inverse)
+        prior = STRANGER * wp.max(voters, 1.0)
+        a0 = before[0, p] * (prior + s0)
+        a1 = before[1, p] * (prior + s1)
+        a2 = before[2, p] * (prior + s2)
+        share = 1.0 / (a0 + a1 + a2)
+        after[0, p] = a0 * share
+        after[1, p] = a1 * share
+        after[2, p] = a2 * share
