@@ -1,10 +1,12 @@
 """The most probable wrap of each pixel, and why where it is not good enough."""
 
+from functools import cache
 from typing import Any, NamedTuple
 
 import warp as wp
 
 from kernels import device as devices
+from kernels.packs import as_packs, pack_type, scalars
 from kernels.status import Status
 from kernels.tof.continuous import Correlation
 from kernels.tof.modulation import radians_per_metre
@@ -23,8 +25,6 @@ DECIDED = 2 / 3
 
 _OK, _UNDECIDED, _MULTIPATH = int(Status.OK), int(Status.UNDECIDED), int(Status.MULTIPATH)
 _LOW, _SATURATED, _OUT = int(Status.LOW_MODULATION), int(Status.SATURATED), int(Status.OUT_OF_RANGE)
-
-wp.set_module_options({"enable_backward": False})
 
 
 class Ranges(NamedTuple):
@@ -51,82 +51,91 @@ def decide(found: Correlation, weighed: Hypotheses, *, agreement_rad: float = AG
         agreement_rad: systematic error of a phase up to which frequencies count as agreeing.
 
     Returns:
-        Ranges, on the device. OUT_OF_RANGE: nothing in the span of `unwrap` fits; LOW_MODULATION: no more amplitude than noise has; SATURATED: no frequency is left; MULTIPATH: frequencies
-        disagree by more than noise and `agreement_rad` explain; UNDECIDED: the wrap is less probable than DECIDED.
+        Ranges, on the device. LOW_MODULATION: no more amplitude than noise has; SATURATED: no frequency is left; OUT_OF_RANGE: nothing
+        in the span of `unwrap` fits; MULTIPATH: frequencies disagree by more than noise and `agreement_rad` explain; UNDECIDED: the
+        wrap is less probable than DECIDED.
     """
-    device, pixels = weighed.range.device, weighed.range.shape[1]
-    count = len(found.modulation_hz)
+    device, pixels = str(weighed.range.device), weighed.range.shape[1]
+    pack, count = devices.pack_width(device), len(found.modulation_hz)
     agree = [float("inf"), *(quantile(freedom, MULTIPATH_Z) for freedom in range(1, count))]
     signal = [float("inf"), *(quantile(2 * used, SIGNAL_Z) for used in range(1, count + 1))]
-    result = Ranges(*(wp.zeros(pixels, dtype=dtype, device=device) for dtype in (wp.float32, wp.float32, wp.float32, wp.int32, wp.int32)))
-    devices.launch(_decide_kernel, pixels, [
-        found.phase, found.sigma, found.evidence, floats(radians_per_metre(found.modulation_hz), device), floats(agree, device),
-        floats(signal, device), weighed.range, weighed.probability, weighed.sigma,
-        float(agreement_rad) ** 2,
-    ], list(result), device=str(device))
+    result = Ranges(*(scalars(pixels, None, dtype, device) for dtype in (wp.float32, wp.float32, wp.float32, wp.int32, wp.int32)))
+    devices.launch(decide_kernel(pack), pixels // pack, [
+        *(as_packs(array, device) for array in (found.phase, found.sigma, found.evidence)),
+        floats(radians_per_metre(found.modulation_hz), device), floats(agree, device), floats(signal, device),
+        *(as_packs(array, device) for array in (weighed.range, weighed.probability, weighed.sigma)), float(agreement_rad) ** 2,
+    ], [as_packs(array, device) for array in result], device=device)
     return result
 
 
+@cache
 def decide_kernel(pack: int) -> Any:
-    """For tests that compile it; single pixels whatever the pack."""
-    return _decide_kernel
+    """The kernel for packs of this many pixels; public for the test that compiles it for CUDA."""
+    float_pack, int_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32)
 
-
-@wp.kernel(module="unique")
-def _decide_kernel(first: int,
-                   phase: wp.array2d(dtype=wp.float32),  # [F, pixel]
-                   sigma: wp.array2d(dtype=wp.float32),  # [F, pixel]
-                   evidence: wp.array2d(dtype=wp.float32),  # [F, pixel]
-                   per_metre: wp.array(dtype=wp.float32),  # [F]
-                   agree: wp.array(dtype=wp.float32),  # [F] largest cost, by frequencies used less one
-                   signal: wp.array(dtype=wp.float32),  # [F + 1] least evidence, by frequencies used
-                   ranges: wp.array2d(dtype=wp.float32),  # [3, pixel]
-                   probability: wp.array2d(dtype=wp.float32),  # [3, pixel]
-                   hypothesis_sigma: wp.array(dtype=wp.float32),
-                   agreement: float,  # radians²
-                   # outputs
-                   chosen: wp.array(dtype=wp.float32),
-                   range_sigma: wp.array(dtype=wp.float32),
-                   confidence: wp.array(dtype=wp.float32),
-                   wraps: wp.array(dtype=wp.int32),
-                   status: wp.array(dtype=wp.int32)):
-    p = first + wp.tid()
-    used = wp.int32(0)
-    sure = float(0.0)
-    blind = wp.int32(0)
-    for f in range(per_metre.shape[0]):
-        if sigma[f, p] > 0.0:
-            used += 1
-            sure += evidence[f, p]
-        elif sigma[f, p] < 0.0:
-            blind += 1
-    best = wp.int32(0)
-    if probability[1, p] > probability[0, p]:
-        best = 1
-    if probability[2, p] > wp.max(probability[0, p], probability[1, p]):
-        best = 2
-    if used == 0:
-        status[p] = wp.where(blind > 0, _SATURATED, _LOW)
-    elif sure < signal[used]:
-        status[p] = _LOW
-    elif probability[best, p] == 0.0:
-        status[p] = _OUT
-    else:
-        d = ranges[best, p]
-        cost = float(0.0)
+    @wp.kernel(enable_backward=False, module="unique")
+    def choice_kernel(first: int,
+                      phase: wp.array2d(dtype=float_pack),  # [F, P]
+                      sigma: wp.array2d(dtype=float_pack),  # [F, P]
+                      evidence: wp.array2d(dtype=float_pack),  # [F, P]
+                      per_metre: wp.array(dtype=wp.float32),  # [F]
+                      agree: wp.array(dtype=wp.float32),  # [F] largest cost, by frequencies used less one
+                      signal: wp.array(dtype=wp.float32),  # [F + 1] least evidence, by frequencies used
+                      ranges: wp.array2d(dtype=float_pack),  # [3, P]
+                      probability: wp.array2d(dtype=float_pack),  # [3, P]
+                      hypothesis_sigma: wp.array(dtype=float_pack),  # [P]
+                      agreement: float,  # radians²
+                      # outputs
+                      chosen: wp.array(dtype=float_pack),  # [P]
+                      range_sigma: wp.array(dtype=float_pack),
+                      confidence: wp.array(dtype=float_pack),
+                      wraps: wp.array(dtype=int_pack),
+                      status: wp.array(dtype=int_pack)):
+        p = first + wp.tid()
+        d, best = float_pack(), float_pack()
+        p0, p1, p2 = probability[0, p], probability[1, p], probability[2, p]
+        d0, d1, d2 = ranges[0, p], ranges[1, p], ranges[2, p]
+        for k in range(pack):
+            best[k] = wp.max(p0[k], wp.max(p1[k], p2[k]))
+            d[k] = wp.where(p0[k] >= best[k], d0[k], wp.where(p1[k] >= best[k], d1[k], d2[k]))
+        used, blind, sure, cost = float_pack(), float_pack(), float_pack(), float_pack()
         for f in range(per_metre.shape[0]):
             s = sigma[f, p]
-            if s > 0.0:
-                turns = (phase[f, p] - per_metre[f] * d) / (2.0 * wp.pi)
-                away = (turns - wp.round(turns)) * (2.0 * wp.pi)
-                cost += away * away / (s * s + agreement)
-        code = int(_OK)
-        if probability[best, p] < DECIDED:
-            code = int(_UNDECIDED)
-        if cost > agree[used - 1]:
-            code = int(_MULTIPATH)
+            angle = phase[f, p]
+            e = evidence[f, p]
+            slope = per_metre[f]
+            for k in range(pack):
+                there = wp.where(s[k] > 0.0, 1.0, 0.0)
+                turns = (angle[k] - slope * d[k]) * (0.5 / wp.pi)
+                away = (turns - wp.floor(turns + 0.5)) * (2.0 * wp.pi)
+                used[k] += there
+                blind[k] += wp.where(s[k] < 0.0, 1.0, 0.0)
+                sure[k] += there * e[k]
+                cost[k] += there * away * away / (s[k] * s[k] + agreement)
+        spread = hypothesis_sigma[p]
+        codes, turned = int_pack(), int_pack()
+        last = per_metre[per_metre.shape[0] - 1] * (0.5 / wp.pi)
+        least, most = float_pack(), float_pack()
+        for n in range(signal.shape[0]):  # limits by frequencies used: no table that each pixel looks up
+            low, high = signal[n], agree[wp.max(n - 1, 0)]
+            for k in range(pack):
+                least[k] = wp.where(used[k] == float(n), low, least[k])
+                most[k] = wp.where(used[k] == float(n), high, most[k])
+        for k in range(pack):
+            code = wp.where(best[k] < DECIDED, _UNDECIDED, _OK)
+            code = wp.where(cost[k] > most[k], _MULTIPATH, code)
+            code = wp.where(best[k] == 0.0, _OUT, code)
+            code = wp.where(sure[k] < least[k], _LOW, code)
+            codes[k] = wp.where(used[k] == 0.0, wp.where(blind[k] > 0.0, _SATURATED, _LOW), code)
+            kept = wp.where(codes[k] == _OK or codes[k] == _UNDECIDED or codes[k] == _MULTIPATH, 1.0, 0.0)
+            d[k] *= kept
+            spread[k] *= kept
+            best[k] *= kept
+            turned[k] = int(wp.floor(d[k] * last))
         chosen[p] = d
-        range_sigma[p] = hypothesis_sigma[p]
-        confidence[p] = probability[best, p]
-        wraps[p] = int(wp.floor(d * per_metre[per_metre.shape[0] - 1] / (2.0 * wp.pi)))
-        status[p] = code
+        range_sigma[p] = spread
+        confidence[p] = best
+        wraps[p] = turned
+        status[p] = codes
+
+    return choice_kernel
