@@ -22,7 +22,7 @@ from stage.manifest import FILE_NAME, Frame
 from stage.patterns.collect import BinaryCode, Collected, collect
 from stage.planes import Planes, frame_planes
 from stage.projector import Projector
-from stage.rig_check import check_projector, device_from_camera
+from stage.rig_check import check_projector, device_from_camera, project
 
 SCALE_PERCENTILE = 99.9
 """Of the brightest frame's pixels: full scale of images that have none of their own (floating point, no saturation given)."""
@@ -86,6 +86,7 @@ def _bands(planes: Planes, mask: np.ndarray, plans: tuple[AxisPlan | None, AxisP
     x, y = capture.camera.plane_coordinates()
     maps = {name: np.zeros(shape, np.float32) for name in ("depth", "sigma", "residual", "amplitude", "u", "v")}
     status = np.zeros(shape, np.uint8)
+    guessed = {name: np.zeros(shape, dtype=bool) for name in "uv"}
     timings.stage("decode", shape[0])
     for band, decoded in decoded_bands(planes, plans, noise, device):
         near_m, far_m, residual = limits
@@ -106,7 +107,13 @@ def _bands(planes: Planes, mask: np.ndarray, plans: tuple[AxisPlan | None, AxisP
         for name, axis in zip("uv", decoded, strict=True):
             if axis is not None:
                 place(name, axis.coordinate.numpy(), solved)
+                sure = np.isin(axis.status.numpy()[:part.size].reshape(part.shape), SOLVED)
+                guessed[name][band] = solved & ~sure
         timings.advance(band.stop)
+    for index, (name, missing) in enumerate(guessed.items()):
+        if missing.any():  # solved from the other axis alone: where the point lies in the projector
+            points = capture.camera.points(-maps["depth"])[missing]
+            maps[name][missing] = project(projector, points)[0][:, index]
     solved = np.isin(status, SOLVED)
     facts = {}
     if columns is not None and rows is not None and solved.any():
