@@ -24,6 +24,8 @@ from benchmarks.relighting import relighting_table
 from benchmarks.rig import rig_table
 from benchmarks.search_speed import search_rows
 from benchmarks.spin import spin_table
+from benchmarks.structured import structured_rows
+from benchmarks.tof import rows as tof_rows
 from service.methods import Method
 from service.pipelines.bench import bench
 from service.pipelines.solve import solve
@@ -119,6 +121,11 @@ def speed(_: argparse.Namespace) -> list[str]:
     return [*bench(None, 9), "", *search_rows()]
 
 
+def depth_speed(_: argparse.Namespace) -> list[str]:
+    """Decoders of projected codes and of time of flight against NumPy."""
+    return ["Projected codes:", "", *structured_rows(), "", "Time of flight:", "", *tof_rows()]
+
+
 def demo(_: argparse.Namespace) -> list[str]:
     """Seconds of `relit demo`, kernels compiled and not."""
     with tempfile.TemporaryDirectory() as folder:
@@ -148,6 +155,7 @@ SECTIONS: dict[str, tuple[str, Section]] = {
     "spin": ("A spin of 240 frames", spin),
     "rig": ("Depth from projected light", rig),
     "speed": ("Speed", speed),
+    "depth_speed": ("Speed of depth", depth_speed),
     "demo": ("The demo", demo),
     "memory": ("Memory", memory),
 }
