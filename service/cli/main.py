@@ -11,7 +11,7 @@ from typer.exceptions import TyperException
 from service.cli import basis, calibrate, capture, demo, depth, doctor, measure, patterns, relight, results, scan, shade, simulate
 
 app = typer.Typer(name="relit", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
-                  help="Light-stage captures to normals, albedo, USD assets and relit frames.")
+                  help="Active-illumination captures to normals, materials, depth, USD assets and relit frames.")
 for module in (demo, capture, calibrate, results, depth, scan, simulate, patterns, relight, shade, basis, doctor, measure):
     module.register(app)
 
