@@ -26,6 +26,7 @@ samples: $(VENV)/installed-dev
 	$(BIN)/python -m pip install --quiet -e '.[samples]'
 	$(BIN)/python samples/make_owl.py
 	$(BIN)/python samples/make_lambert.py
+	$(BIN)/python samples/make_rig.py --sample
 
 # the lock records versions and hashes, and no download address
 lock:

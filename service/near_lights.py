@@ -9,14 +9,18 @@ RIGHT_ANGLE = 1e-3
 """How far the cosine between the edges of a rectangle may be from 0."""
 
 
+BRIGHTEST = 1e15
+"""Of any light: brighter by far than half can show, and safe from overflow."""
+
+
 class _Part(NamedTuple):
     name: str
     numbers: int
 
 
 def _light(value: Vector) -> Vector:
-    if min(value) < 0:
-        raise ValueError("light is 0 or more in every channel")
+    if min(value) < 0 or max(value) > BRIGHTEST:
+        raise ValueError(f"light is 0 or more in every channel, and {BRIGHTEST:g} at the most")
     return value
 
 

@@ -118,9 +118,26 @@ def write(path: str | Path, channels: Mapping[str, np.ndarray], *, color_space: 
             raise StorageError(f"cannot write {path}: the disk took only part of it") from error
 
 
+PRIMARIES = ("lin_rec709_scene", "lin_ap1_scene", "lin_ap0_scene", "lin_rec2020_scene", "lin_p3d65_scene")
+"""Scene-linear spaces that `chromaticities` are compared with."""
+PRIMARIES_TOLERANCE = 2e-3
+"""Of a coordinate: writers round them."""
+
+
 def color_space_of(metadata: Mapping[str, Any], default: str = "lin_rec709_scene") -> str:
-    """The colour space that a header names, else `default`."""
-    return str(metadata.get("colorInteropID", default))
+    """The scene-linear colour space that a header names by `colorInteropID`, or shows by `chromaticities`; else `default`.
+
+    Raises:
+        ValueError: chromaticities of no known space.
+    """
+    if (name := metadata.get("colorInteropID")) is not None:
+        return str(name)
+    if (given := metadata.get("chromaticities")) is None:
+        return default
+    for space in PRIMARIES:
+        if np.allclose(given, OpenEXR.colorInteropIDToChromaticities(space), atol=PRIMARIES_TOLERANCE):
+            return space
+    raise ValueError("has chromaticities of no known colour space: convert it to Rec.709, Rec.2020, P3-D65, ACEScg or ACES2065-1")
 
 
 def _missing_bytes(path: str | Path, header: Header) -> int:

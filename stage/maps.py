@@ -68,7 +68,7 @@ class SurfaceMaps:
         """Read a maps.exr that Relit wrote.
 
         Raises:
-            ResultError: a layer is incomplete, or the camera is not in the metadata.
+            ResultError: a layer is incomplete or not finite, or the camera is not in the metadata.
             ImageError: not a readable EXR.
         """
         channels, metadata = exr.read(path)
@@ -83,6 +83,8 @@ class SurfaceMaps:
             if len(present) < len(names):
                 raise ResultError(f"{path}: layer {name} lacks channel {next(n for n in names if n not in channels)}")
             planes = [channels[n].astype(np.float32) for n in names]
+            if bad := sum(int((~np.isfinite(plane)).sum()) for plane in planes):
+                raise ResultError(f"{path}: layer {name} has {bad} values that are not finite")
             found[name] = planes[0] if len(planes) == 1 else np.stack(planes, axis=-1)
         if "mask" not in found:
             raise ResultError(f"{path}: has no layer mask.Y")

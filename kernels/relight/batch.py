@@ -16,6 +16,9 @@ from kernels.relight.combine import check_weights
 
 BLOCK_BYTES = 16 << 20
 """Of float32 that one BLAS call reads: bounds the scratch memory, and large enough that starting BLAS threads costs nothing."""
+GROUP = 32
+"""Frames of every BLAS call, made up with frames of nothing: with another number BLAS may sum in another order, and a frame in the same
+place shall be the same to the last bit, whichever others there are."""
 REGISTER_FRAMES = 8
 """Frames of one CUDA thread: 8 · 4 pixels are 32 register sums."""
 
@@ -52,18 +55,25 @@ def combine_batch(band: Band, weights: np.ndarray) -> wp.array:
 
 
 def _product(band: Band, weights: np.ndarray, frames: np.ndarray, pack: int) -> None:
-    """frames[f, c] = weights[f, c] @ stack[c], block by block."""
+    """frames[f, c] = weights[f, c] @ stack[c], block by block and GROUP frames at a time."""
+    groups = -(-len(weights) // GROUP)
+    padded = np.zeros((groups * GROUP, *weights.shape[1:]), dtype=np.float32)
+    padded[: len(weights)] = weights
     step = max(1, BLOCK_BYTES // (4 * pack * band.light_count))
     block = wp.empty((band.light_count, step), dtype=pack_type(pack, wp.float32), device="cpu")
     widened = block.numpy().reshape(band.light_count, step * pack)
+    group = np.empty((GROUP, step * pack), dtype=np.float32)
     for channel in range(3):
-        per_frame = np.ascontiguousarray(weights[:, channel])
+        per_frame = np.ascontiguousarray(padded[:, channel])
         for begin in range(0, band.packs, step):
             count = min(step, band.packs - begin)
             devices.launch(_widen_kernel(pack), band.light_count, [band.values, channel * band.light_count, begin, count],
                            [block], device="cpu")
             pixels = slice(begin * pack, (begin + count) * pack)
-            np.matmul(per_frame, widened[:, : count * pack], out=frames[:, channel, pixels])
+            for first in range(0, len(weights), GROUP):
+                last = min(first + GROUP, len(weights))
+                np.matmul(per_frame[first : first + GROUP], widened[:, : count * pack], out=group[:, : count * pack])
+                frames[first:last, channel, pixels] = group[: last - first, : count * pack]
 
 
 @cache

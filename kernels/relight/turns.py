@@ -36,6 +36,9 @@ def shared_turns(rotations: np.ndarray, columns: int) -> Iterator[Turn]:
         turn = np.arctan2(rotation[0, 2], rotation[0, 0]) / (2 * np.pi) * columns
         whole = int(np.floor(turn + EQUAL_COLUMNS))
         groups.setdefault(round((turn - whole) / EQUAL_COLUMNS), []).append((frame, whole))
-    for members in groups.values():
-        first, moved = members[0]
-        yield Turn(rotations[first], tuple(frame for frame, _ in members), tuple(whole - moved for _, whole in members))
+    for part, members in groups.items():
+        # turned by the part of a column, whichever frames there are: weights of a frame do not hang on the frames beside it
+        angle = part * EQUAL_COLUMNS / columns * 2 * np.pi
+        cosine, sine = np.cos(angle), np.sin(angle)
+        rotation = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
+        yield Turn(rotation, tuple(frame for frame, _ in members), tuple(whole for _, whole in members))

@@ -1,6 +1,6 @@
 """Captures and light → frames: the linear combination of the captured images, chunk by chunk, each frame whole or not there."""
 
-from itertools import islice
+from itertools import groupby, islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -82,7 +82,8 @@ def relight(request: RelightRequest, progress: Progress | None = None) -> Religh
     if request.report is not None:
         write_text(request.report, report(
             inputs={"capture": str(request.capture), "captures": captures},
-            options=request.model_dump(mode="json", exclude={"capture", "device", "cache", "report"}),
+            options=request.model_copy(update={"weights": request.weighting}).model_dump(
+                mode="json", exclude={"capture", "device", "cache", "report"}),
             frames={"made": writer.written.frames, "skipped": skipped, "clipped_pixels": writer.written.clipped,
                     "first": str(paths[0]), "last": str(paths[-1])},
             device=devices.describe(device),
@@ -113,7 +114,7 @@ def _relight_step(step: Step, todo: list[tuple[PlannedFrame, str]], request: Rel
     space = str(request.color_space or step.space)
     form = FrameFormat(step.capture.camera.resolution, space, None if space == step.space else rgb_matrix(step.space, space),
                        request.compression, layers, tuple(layer for layer in (Layer.DIFFUSE, Layer.SPECULAR) if layer in request.aov))
-    provenance = metadata(request, capture=step.capture.name, inputs=stack.key)
+    provenance = metadata(request.model_copy(update={"weights": request.weighting}), capture=step.capture.name, inputs=stack.key)
     if step.near_lights:
         provenance["relit:lights"] = f"{step.near_lights} near lights taken as distant, as the object's centre sees them"
     if plan.keys is not None and plan.keys.frames_per_second is not None:
@@ -122,12 +123,13 @@ def _relight_step(step: Step, todo: list[tuple[PlannedFrame, str]], request: Rel
                                  weighting=Weighting(request.weighting), device=device)
     size = chunk_frames(stack)
     wants_shine = Layer.DIFFUSE in request.aov or Layer.SPECULAR in request.aov
-    for begin in range(0, len(todo), size):
-        chunk = todo[begin : begin + size]
+    for _, members in groupby(todo, key=lambda item: item[0].place // size):
+        chunk = list(members)
         with timings.part("weights"):
             weights = np.stack(list(islice(each_weights, len(chunk))))
         with timings.part("product"):
-            frames = linear_frames(stack, weights, device=device)
+            alone = len(plan.frames) == 1 or plan.is_sequence
+            frames = linear_frames(stack, weights, None if alone else [frame.place % size for frame, _ in chunk], device=device)
         shine = None
         if guide is not None:
             with timings.part("guide"):

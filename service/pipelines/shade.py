@@ -19,6 +19,7 @@ from service.pipelines.relighting.guided import make_guide
 from service.pipelines.relighting.layers import read_maps, still_layers
 from service.pipelines.relighting.model_light import LightModel
 from service.pipelines.relighting.schedule import UPRIGHT, FrameLighting, Sky
+from service.pipelines.relighting.sequence import capture_files
 from service.pipelines.relighting.weights import frame_weights
 from service.pipelines.relighting.write import FrameFile, FrameFormat, FrameWriter
 from service.pipelines.surface_model import SurfaceModel
@@ -71,7 +72,8 @@ def shade(request: ShadeRequest, progress: Progress | None = None) -> ShadeResul
     path = request.maps / MAPS_FILE if request.maps.is_dir() else request.maps
     if not path.is_file():
         raise ResultError(f"{path}: is not there: run `relit solve` first")
-    refuse_inputs([(f"--out {request.out}", request.out)], [path, *([request.environment] if request.environment else [])])
+    refuse_inputs([(f"--out {request.out}", request.out)], [path, *([request.environment] if request.environment else []),
+                                                            *(capture_files(request.capture) if request.capture else ())])
     check_folders([request.out])
     environments = Environments(request.environment) if request.environment is not None else None
     sky = None
@@ -131,7 +133,7 @@ def _of_capture(capture: Capture, cache: Path | None, maps: SurfaceMaps, path: P
     timings.stage("shade", 2)
     weights = np.stack(list(frame_weights([lighting], environments, lights, stack, maps.color_space, weighting=Weighting.SMOOTH,
                                           device=device)))
-    frames = linear_frames(stack, weights, device=device)
+    frames = linear_frames(stack, weights, None, device=device)
     shine = guide.correct(frames, [lighting], weights, specular=True)
     assert shine is not None
     timings.advance(1)

@@ -187,8 +187,8 @@ def test_bad_relights(relit, tmp_path, monkeypatch, fault):
 
 
 @pytest.mark.parametrize(("out", "maps", "words"), [
-    ("a.usdz", "none", "none: is not there: run `relit solve` first"),
-    ("a.usdz", "empty", "empty/maps.exr: is not there: run `relit solve` first"),
+    ("a.usdz", "none", "none: is not there: run `relit solve` or `relit depth` first"),
+    ("a.usdz", "empty", "empty/maps.exr: is not there: run `relit solve` or `relit depth` first"),
     ("a.usdz", "sky.exr", "sky.exr: carries no relit:camera attribute"),
     ("a.obj", "solved", "a.obj"),
     ("file/a.usdz", "solved", "cannot write"),

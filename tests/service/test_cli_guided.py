@@ -95,3 +95,33 @@ def test_bad_maps_are_a_sentence(relit, scene, tmp_path):
         outcome = relit("relight", folder / "cap", "--environment", folder / "sky.exr", "--out", tmp_path / "f.#.exr", "--maps", maps)
         assert outcome.code == 2 and outcome.err.count("\n") == 1 and words in outcome.err and str(maps) in outcome.err
         assert not (tmp_path / "f.1.exr").exists()
+
+
+def test_a_finished_range_is_the_undisturbed_one_to_the_last_bit(relit, scene, tmp_path):
+    """Frames of a range that are made later, among others, are the same: plain in both weightings, and guided."""
+    folder, _ = scene
+    for options in ((), ("--weights", "smooth"), ("--maps", folder / "maps")):
+        out = tmp_path / str(len(list(tmp_path.iterdir())))
+        words = ("relight", folder / "cap", "--environment", folder / "sky.exr", "--frames", "1-40", "--spin-degrees", "360", *options)
+        relit(*words, "--out", out / "f.##.exr")
+        whole = {path.name: rgb(path) for path in out.iterdir()}
+        for number in (2, 3, 7, 20, 21, 33, 40):
+            (out / f"f.{number:02d}.exr").unlink()
+        assert "skipped  33 of 40" in relit(*words, "--out", out / "f.##.exr").out
+        assert all(np.array_equal(rgb(out / name), pixels) for name, pixels in whole.items())
+
+
+def test_maps_of_other_images_are_refused(relit, scene, tmp_path):
+    folder, _ = scene
+    maps = write_maps(tmp_path / "maps", SURFACE, provenance={"relit:inputs": "of something else"})
+    outcome = relit("relight", folder / "cap", "--environment", folder / "sky.exr", "--out", tmp_path / "f.#.exr", "--maps", maps)
+    assert outcome.code == 2 and "solved from other images" in outcome.err and str(maps) in outcome.err
+
+
+def test_maps_with_holes_are_refused(relit, scene, tmp_path):
+    folder, _ = scene
+    height = SURFACE.height.astype(np.float32)
+    height[np.argwhere(SURFACE.mask)[0][0], np.argwhere(SURFACE.mask)[0][1]] = np.nan
+    maps = write_maps(tmp_path / "maps", SURFACE, height=height)
+    outcome = relit("relight", folder / "cap", "--environment", folder / "sky.exr", "--out", tmp_path / "f.#.exr", "--maps", maps)
+    assert outcome.code == 2 and "layer height has 1 values that are not finite" in outcome.err

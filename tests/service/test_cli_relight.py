@@ -135,7 +135,7 @@ def test_smooth_weights_keep_the_energy_and_share_it_otherwise(lit, tmp_path):
 def test_layers_of_a_frame(relit, lit, tmp_path):
     write_capture(tmp_path / "other", SCENE)
     assert relit("solve", tmp_path / "other", "--method", "robust", "--out", tmp_path / "maps").code == 0
-    outcome, out = lit("out", "--aov", "beauty,mask,normal, confidence", "--maps", tmp_path / "maps")
+    outcome, out = lit("out", "--aov", "beauty,mask,normal, confidence", "--maps", tmp_path / "maps", capture=tmp_path / "other")
     assert (outcome.code, outcome.err) == (0, "")
     channels, _ = exr.read(out / "a.01.exr")
     assert set(channels) == {"R", "G", "B", "mask.Y", "normal.X", "normal.Y", "normal.Z", "confidence.Y"}

@@ -110,6 +110,7 @@ def test_maps_without_a_scale_are_lit_in_pixels_and_say_so(relit, tmp_path):
     (("--light", "0,0,1,1,-1,1"), "light is 0 or more"),
     (("--light", "0,0,1,1,1,1,0,0,0,2"), "the axis has no direction"),
     (("--light", "0,0,nan,1,1,1"), "finite"),
+    (("--light", "0,0,1,1e40,1,1"), "at the most"),
     (("--sphere", "0,0,1,0,1,1,1"), "greater than 0"),
     (("--rectangle", "0,0,1,1,0,0,1,1,0,1,1,1"), "right angle"),
     (("--environment", "none.exr"), "none.exr"),
@@ -127,3 +128,11 @@ def test_bad_shades(relit, maps, tmp_path, options, words):
 def test_maps_that_are_not_there(relit, tmp_path):
     outcome = relit("shade", tmp_path / "none", "--light", "0,0,1,1,1,1", "--out", tmp_path / "p.exr")
     assert outcome.code == 2 and "run `relit solve` first" in outcome.err
+
+
+def test_captured_images_are_not_replaced(relit, maps, tmp_path):
+    write_dome(tmp_path / "cap", SURFACE, lights=8)
+    before = (tmp_path / "cap" / "003.exr").read_bytes()
+    outcome = relit("shade", maps, "--light", "0,0,1,1,1,1", "--capture", tmp_path / "cap", "--out", tmp_path / "cap" / "003.exr")
+    assert outcome.code == 2 and "is an input" in outcome.err
+    assert (tmp_path / "cap" / "003.exr").read_bytes() == before

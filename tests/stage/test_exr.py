@@ -147,3 +147,17 @@ def test_one_pixel(tmp_path):
     header = exr.read_header(tmp_path / "a.exr")
     assert (header.width, header.height, header.channels) == (1, 1, ("Y",))
     assert files_in(tmp_path) == {"a.exr"}
+
+
+@pytest.mark.parametrize("space", exr.PRIMARIES)
+def test_chromaticities_name_a_space_where_nothing_else_does(tmp_path, space):
+    """Files of programs that write no colorInteropID; what they round to three digits is known all the same."""
+    primaries = tuple(round(value, 3) for value in OpenEXR.colorInteropIDToChromaticities(space))
+    path = write_exr(tmp_path / "a.exr", PIXELS, chromaticities=primaries)
+    assert exr.color_space_of(exr.read_header(path).metadata) == space
+    assert exr.color_space_of({"chromaticities": primaries, "colorInteropID": "lin_ap0_scene"}) == "lin_ap0_scene"
+
+
+def test_chromaticities_of_no_space_are_refused():
+    with pytest.raises(ValueError, match="no known colour space"):
+        exr.color_space_of({"chromaticities": (0.7, 0.3, 0.2, 0.7, 0.15, 0.05, 0.3, 0.3)})

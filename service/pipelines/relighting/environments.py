@@ -83,8 +83,8 @@ def read_environment(path: Path, space: str) -> np.ndarray:
     """
     pixels = images.read_pixels(path).astype(np.float32)
     images.check_radiance(path, pixels)
-    given = exr.color_space_of(exr.read_header(path).metadata) if path.suffix.lower() == ".exr" else "lin_rec709_scene"
     try:
+        given = exr.color_space_of(exr.read_header(path).metadata) if path.suffix.lower() == ".exr" else "lin_rec709_scene"
         converted = convert(pixels, given, space)
     except ValueError as error:
         raise ImageError(f"{path}: {error}") from error

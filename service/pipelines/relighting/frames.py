@@ -67,16 +67,19 @@ def numbered(name: str, number: int) -> str:
 
 
 def refuse_inputs(outputs: Iterable[tuple[str, Path]], inputs: Iterable[Path]) -> None:
-    """Refuse to write over what is read.
+    """Refuse to write over what is read, and one result over another.
 
     Args:
         outputs: (option as it was given, file) of every file that will be written.
         inputs: every file that will be read.
 
     Raises:
-        RequestError: names the first input that would be replaced.
+        RequestError: names the first input or result that would be replaced.
     """
-    written = {path.resolve(): (option, path) for option, path in outputs}
+    written: dict[Path, tuple[str, Path]] = {}
+    for option, path in outputs:
+        if (earlier := written.setdefault(path.resolve(), (option, path))) != (option, path):
+            raise RequestError(f"{option}: {path} is what {earlier[0]} writes too: choose another name")
     for read in inputs:  # which may be many, of a long sequence
         if (found := written.get(read.resolve())) is not None:
             raise RequestError(f"{found[0]}: {found[1]} is an input: choose another folder or name")

@@ -13,6 +13,7 @@ import numpy as np
 import warp as wp
 
 from kernels import packs
+from kernels.errors import ArrayError
 from kernels.relight.around import left_out
 from kernels.relight.guide import compare_model, fit_trust, seen_lobes
 from kernels.relight.near_sum import sum_near
@@ -175,12 +176,19 @@ def make_guide(maps: SurfaceMaps, where: Path, stack: Stack, lights: DistantLigh
         progress: told of every batch.
 
     Raises:
-        ResultError: maps without the layers that a model needs, or of another colour space.
-        ArrayError: fewer than four lights, or all in one plane.
+        ResultError: maps of other images or another colour space, without the layers that a model needs; fewer than four lights,
+            or all in one plane.
     """
+    if maps.provenance.get("relit:inputs", stack.key) != stack.key:
+        raise ResultError(f"{where}: was solved from other images than the capture has: solve it again")
     if maps.color_space != space:
         raise ResultError(f"{where}: is in {maps.color_space}, the capture in {space}: solve it again")
     if maps.specular is not None and maps.roughness is not None:
         specular, roughness = seen_lobes(maps.specular, maps.roughness, lights.direction)
         maps = replace(maps, specular=specular, roughness=roughness)
-    return Guide(SurfaceModel(maps, where, device), stack, lights, LightModel(lights, environments, space), progress)
+    try:
+        light = LightModel(lights, environments, space)
+    except ArrayError as error:
+        raise ResultError(f"{where}: cannot guide this capture: a model helps between four lights or more that are not all in one "
+                          "plane") from error
+    return Guide(SurfaceModel(maps, where, device), stack, lights, light, progress)

@@ -19,6 +19,8 @@ class PlannedFrame(NamedTuple):
 
     path: Path
     lighting: FrameLighting
+    place: int
+    """In the whole range, from 0."""
 
 
 class Plan(NamedTuple):
@@ -78,5 +80,5 @@ def make_plan(request: RelightRequest) -> Plan:
 
     refuse_inputs(outputs, inputs())
     check_folders(path for _, path in outputs)
-    return Plan(tuple(folders), tuple(PlannedFrame(path, frame) for path, frame in zip(paths, lighting, strict=True)),
+    return Plan(tuple(folders), tuple(PlannedFrame(*planned) for planned in zip(paths, lighting, range(len(paths)), strict=True)),
                 environments, keys)
