@@ -37,7 +37,7 @@ class SvbrdfFit(NamedTuple):
 
 
 def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, options: SearchOptions | None = None,
-                 shared: np.ndarray | None = None, single_lobe: bool = True) -> SvbrdfFit:
+                 shared: np.ndarray | None = None, roughness: np.ndarray | None = None, single_lobe: bool = True) -> SvbrdfFit:
     """Solve sampled pixels.
 
     Args:
@@ -46,6 +46,7 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, options
         shape: of the diffuse lobe, from diffuse_shape.choose_diffuse.
         options: how candidates are judged.
         shared: [materials, 4] of shared_materials.choose_materials; None: every pixel has a material of its own.
+        roughness: [n] of an earlier fit, from which the single lobe begins; None: it is fitted first.
         single_lobe: False leaves the joint fit of one lobe out, to see what it buys.
 
     Returns:
@@ -65,8 +66,9 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, options
         normals.append(other.normal)
         costs.append(other.cost)
     if single_lobe:
-        single = refine(samples, found.normal, fit_tinted(samples, found.normal, shape=shape, options=options).roughness, shape=shape,
-                        options=options)
+        if roughness is None:
+            roughness = fit_tinted(samples, found.normal, shape=shape, options=options).roughness
+        single = refine(samples, found.normal, roughness, shape=shape, options=options)
         normals.append(single.normal)
         costs.append(SINGLE_LOBE_CHARGE * single.cost)
     normal, spread = average_normals(np.stack(normals), np.stack(costs))

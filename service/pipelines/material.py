@@ -12,7 +12,7 @@ from kernels.photometric.bounce import subtract_bounce
 from kernels.photometric.diffuse_shape import choose_diffuse
 from kernels.photometric.hypotheses import Diffuse, search_normals
 from kernels.photometric.lobes import GEOMETRY, MIXTURE
-from kernels.photometric.material import fit_material
+from kernels.photometric.material import fit_tinted
 from kernels.photometric.near import NearField, see_near
 from kernels.photometric.readings import Lights, channel_weights, grey_factors, grey_readings
 from kernels.photometric.robust import solve_robust
@@ -96,7 +96,8 @@ def solve_material(stack: Stack, lights: Lights, camera: Camera, mask: np.ndarra
         normal = search_normals(samples, result.normal[:, where].T, shape=shape).normal
         result.normal[:, where] = normal.T
         if bounce:
-            result.albedo[:, where] = fit_material(samples, normal, shape=shape).diffuse_albedo.T
+            first = fit_tinted(samples, normal, shape=shape)
+            result.albedo[:, where], result.roughness[where] = first.diffuse_albedo.T, first.roughness
     timings.stage("surface", 100)
     solved = (result.status == Status.OK).reshape(mask.shape)
     surface = integrate(camera, result.normal, solved, device, lambda part: timings.advance(round(100 * part)))
@@ -124,7 +125,8 @@ def solve_material(stack: Stack, lights: Lights, camera: Camera, mask: np.ndarra
                                             for material in materials.round(4).astype(float)]
     for where, samples in batches("normals"):
         clean(where, samples)
-        found = solve_svbrdf(samples, result.normal[:, where].T, shape=shape, shared=materials)
+        found = solve_svbrdf(samples, result.normal[:, where].T, shape=shape, shared=materials,
+                             roughness=result.roughness[where].astype(np.float32) if bounce else None)
         result.normal[:, where] = found.normal.T
         result.albedo[:, where] = found.diffuse_albedo.T
         result.specular[:, where] = found.specular.T
