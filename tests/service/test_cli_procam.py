@@ -1,6 +1,7 @@
 """relit calibrate procam and response, and relit import opencv-gray: from images on disk to a manifest that measures depth."""
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from tests.stage.calibration import test_procam as boards
 CAMERA = boards.CAMERA
 PROJECTOR = reference.Device(256, 192, 360.0, (-0.05, 0.01, 0.0), (-0.0005, 0.001))
 BITS = 8
-REAL = Path("/work/shared/data/graycode_chessboard")
+REAL = Path(os.environ.get("RELIT_TEST_DATA", Path(__file__).resolve().parents[3] / "shared" / "data")) / "graycode_chessboard"
 
 
 def phase(axis, period):
