@@ -19,6 +19,7 @@ import numpy as np
 from benchmarks.ablation import ablation_table
 from benchmarks.accuracy import SolveError, compare, diligent_errors, read_truth, sample_errors
 from benchmarks.large import large_rows, measure
+from benchmarks.left_out import left_out_table
 from benchmarks.materials import material_table
 from benchmarks.relighting import relighting_table
 from benchmarks.rig import rig_table
@@ -106,6 +107,11 @@ def relighting(given: argparse.Namespace) -> list[str]:
     return relighting_table(given.relighting)
 
 
+def left_out(given: argparse.Namespace) -> list[str] | None:
+    """Real lights predicted from the others."""
+    return None if given.data is None else left_out_table(given.data)
+
+
 def spin(_: argparse.Namespace) -> list[str]:
     """Where the time of a frame range goes."""
     return spin_table()
@@ -152,6 +158,7 @@ SECTIONS: dict[str, tuple[str, Section]] = {
     "materials": ("What sharing materials buys", materials),
     "ablation": ("What each part of `svbrdf` buys", ablation),
     "relighting": ("Relighting", relighting),
+    "left_out": ("Real lights left out", left_out),
     "spin": ("A spin of 240 frames", spin),
     "rig": ("Depth from projected light", rig),
     "speed": ("Speed", speed),

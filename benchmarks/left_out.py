@@ -1,0 +1,71 @@
+"""Real captures relit from seven eighths of their lights, against the images of the others: what lies between lights, on real objects."""
+
+import json
+import shutil
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.relighting import rgb
+from service.methods import LightWeights, Method
+from service.pipelines.relight import relight
+from service.pipelines.solve import solve
+from service.requests import RelightRequest, SolveRequest
+from stage.capture import Capture
+from stage.correction import Correction
+from stage.importers import diligent
+
+EVERY = 8
+"""One light of so many is left out."""
+DISC_DEGREES = 0.5
+
+
+def left_out_errors(source: Path) -> tuple[int, dict[str, float]]:
+    """Lights left out of a DiLiGenT object, and the relative RMSE of their images over the object.
+
+    Args:
+        source: folder of the object.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        work, whole = Path(folder), Path(folder) / "whole"
+        diligent.import_folder(source, whole)
+        manifest = json.loads((whole / "capture.json").read_text())
+        frames = manifest["frames"]
+        out = range(EVERY // 2, len(frames), EVERY)
+        capture = Capture.open(whole)
+        mask, correction = capture.mask(), Correction.of(capture)
+        truth = np.stack([correction.apply(capture.sources()[index]).pixels[mask] for index in out]).astype(np.float64)
+        rest = work / "rest"
+        shutil.copytree(whole, rest)
+        manifest["frames"] = [frame for index, frame in enumerate(frames) if index not in out]
+        (rest / "capture.json").write_text(json.dumps(manifest))
+        keys = {"schema": "relit.keys/1", "lights": [{
+            "name": frames[index]["image"],
+            "keys": [{"frame": number + 1, "direction": frames[index]["light"]["direction"], "angle_degrees": DISC_DEGREES,
+                      "irradiance": frames[index]["light"]["irradiance"] if number == place else [0, 0, 0], "interpolation": "step"}
+                     for number in range(len(out))]} for place, index in enumerate(out)]}
+        (work / "keys.json").write_text(json.dumps(keys))
+        solve(SolveRequest(capture=rest, out=work / "maps", method=Method.SVBRDF, cache=work))
+        errors = {}
+        for name, weights, maps in (("cells", LightWeights.CELLS, None), ("smooth", LightWeights.SMOOTH, None),
+                                    ("guided", None, work / "maps")):
+            result = relight(RelightRequest(capture=rest, keys=work / "keys.json", frames=f"1-{len(out)}", weights=weights, maps=maps,
+                                            out=str(work / f"{name}.##.exr"), cache=work))
+            ours = np.stack([rgb(path)[mask] for path in result.frames])
+            errors[name] = float(np.sqrt(((ours - truth) ** 2).mean() / (truth**2).mean()))
+        return len(out), errors
+
+
+def left_out_table(data: Path) -> list[str]:
+    """Lines of Markdown.
+
+    Args:
+        data: folder with diligent_ball and diligent_cat.
+    """
+    rows = []
+    for name in ("ball", "cat"):
+        count, errors = left_out_errors(data / f"diligent_{name}")
+        rows.append(f"| {name} | {count} | " + " | ".join(f"{errors[key]:.3f}" for key in ("cells", "smooth", "guided")) + " |")
+    return ["DiLiGenT objects, maps solved and frames summed without the lights left out; relative RMSE of their images.", "",
+            "| | left out | `--weights cells` | `--weights smooth` | `--maps` |", "|---|---|---|---|---|", *rows]
