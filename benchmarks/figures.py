@@ -27,6 +27,7 @@ from benchmarks.search_speed import search_rows
 from benchmarks.spin import spin_table
 from benchmarks.structured import structured_rows
 from benchmarks.tof import rows as tof_rows
+from benchmarks.tof_accuracy import accuracy_rows
 from service.methods import Method
 from service.pipelines.bench import bench
 from service.pipelines.solve import solve
@@ -127,6 +128,11 @@ def speed(_: argparse.Namespace) -> list[str]:
     return [*bench(None, 9), "", *search_rows()]
 
 
+def tof(_: argparse.Namespace) -> list[str]:
+    """Range errors of time of flight."""
+    return accuracy_rows()
+
+
 def depth_speed(_: argparse.Namespace) -> list[str]:
     """Decoders of projected codes and of time of flight against NumPy."""
     return ["Projected codes:", "", *structured_rows(), "", "Time of flight:", "", *tof_rows()]
@@ -162,6 +168,7 @@ SECTIONS: dict[str, tuple[str, Section]] = {
     "spin": ("A spin of 240 frames", spin),
     "rig": ("Depth from projected light", rig),
     "speed": ("Speed", speed),
+    "tof": ("Depth from time of flight", tof),
     "depth_speed": ("Speed of depth", depth_speed),
     "demo": ("The demo", demo),
     "memory": ("Memory", memory),
