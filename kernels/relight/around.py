@@ -6,7 +6,7 @@ import itertools
 import numpy as np
 
 from kernels.relight.latlong import first_of_equals
-from kernels.relight.triangulation import triangulate
+from kernels.relight.triangulation import find_faces, triangulate
 
 
 def lights_around(directions: np.ndarray, samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -26,13 +26,7 @@ def lights_around(directions: np.ndarray, samples: np.ndarray) -> tuple[np.ndarr
     triangles = triangulate(directions[kept])
     nearest = kept[np.argmax(triangles.vertex @ directions[kept].T, axis=1)]
     nearest[: len(kept)] = kept
-    corners = triangles.vertex[triangles.corner]
-    plane = np.cross(np.roll(corners, -1, axis=1), np.roll(corners, -2, axis=1))  # through the centre and the edge opposite
-    plane_unit = plane / np.linalg.norm(plane, axis=2, keepdims=True)
-    face = np.concatenate([np.einsum("sx,fkx->fks", part, plane_unit).min(axis=1).argmax(axis=0)
-                           for part in np.array_split(samples, max(1, len(samples) // 4096))])
-    share = np.maximum(np.einsum("sx,skx->sk", samples, plane[face]), 0)
-    share /= share.sum(axis=1, keepdims=True)
+    face, share = find_faces(triangles, samples)
     return nearest[triangles.corner[face]].astype(np.int32), share.astype(np.float32)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from kernels.errors import ArrayError
 from kernels.relight.environment import Weighting
 from kernels.relight.latlong import first_of_equals
-from kernels.relight.triangulation import triangulate
+from kernels.relight.triangulation import find_faces, triangulate
 
 SAMPLE_PITCH_DEGREES = 1.0
 MIN_SAMPLES = 256
@@ -49,7 +49,9 @@ def integrate_discs(middles: np.ndarray, angles_degrees: np.ndarray, directions:
         if triangles is None:
             shares = np.bincount((samples @ directions[kept].T).argmax(axis=1), minlength=len(kept)).astype(np.float64)
         else:
-            shares = _vertex_shares(samples, triangles.vertex, triangles.corner) @ triangles.share
+            face, part = find_faces(triangles, samples)
+            at_vertices = np.bincount(triangles.corner[face].reshape(-1), weights=part.reshape(-1), minlength=len(triangles.vertex))
+            shares = at_vertices @ triangles.share
         energy[disc, kept] = shares * (2 / (1 + math.cos(math.radians(angle / 2))) / len(samples))
     return energy
 
@@ -76,14 +78,3 @@ def disc_samples(middle: np.ndarray, angle_degrees: float) -> np.ndarray:
     x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
     x /= np.linalg.norm(x)
     return (across * np.cos(turn))[:, None] * x + (across * np.sin(turn))[:, None] * np.cross(z, x) + (1 - fall)[:, None] * z
-
-
-def _vertex_shares(samples: np.ndarray, vertex: np.ndarray, corner: np.ndarray) -> np.ndarray:
-    """[vertices] the sum of the samples' barycentric coordinates in the triangles that they lie in."""
-    corners = vertex[corner]  # [faces, 3, 3]
-    plane = np.cross(np.roll(corners, -1, axis=1), np.roll(corners, -2, axis=1))  # through the centre and the edge opposite
-    depth = np.einsum("sx,fkx->fks", samples, plane / np.linalg.norm(plane, axis=2, keepdims=True))
-    face = depth.min(axis=1).argmax(axis=0)
-    share = np.maximum(np.einsum("sx,skx->sk", samples, plane[face]), 0)
-    share /= share.sum(axis=1, keepdims=True)
-    return np.bincount(corner[face].reshape(-1), weights=share.reshape(-1), minlength=len(vertex))

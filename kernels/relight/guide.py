@@ -18,7 +18,7 @@ from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.microfacet import INVERSE_PI
 from kernels.packs import Band, as_packs, pack_type
-from kernels.relight.shading import Surface, lobes
+from kernels.relight.shading import Surface, lobes, require_same
 
 POOL = 2
 """Neighbours on each side whose sums count too."""
@@ -67,11 +67,8 @@ def compare_model(band: Band, surface: Surface, visible: wp.array, direction: np
     Raises:
         ArrayError: shapes that do not fit.
     """
-    band.require_channels(3)
     count, device = len(direction), surface.device
-    if band.packs != surface.packs or visible.shape[1] != surface.packs or min(visible.shape[0], band.light_count) < count:
-        raise ArrayError(f"band has {band.packs} packs of {band.light_count} lights, the surface {surface.packs}, visibility is "
-                         f"{visible.shape}, directions are {count}: give the same pixels and lights")
+    require_same(band, surface, visible, count)
     if np.shape(neighbours) != (count, 3) or np.shape(shares) != (count, 3):
         raise ArrayError(f"neighbours are {np.shape(neighbours)}, shares {np.shape(shares)}: give {(count, 3)} of both")
     pack = devices.pack_width(device)

@@ -15,10 +15,10 @@ from kernels.errors import ArrayError
 from kernels.microfacet import INVERSE_PI
 from kernels.packs import Band, as_packs, pack_type
 from kernels.relight.latlong import first_of_equals
-from kernels.relight.shading import Surface, lobes
-from kernels.relight.smooth import BESIDE_RADIANS
+from kernels.relight.shading import Surface, lobes, require_same
+from kernels.relight.smooth import walk
 from kernels.relight.sources import Sources
-from kernels.relight.triangulation import triangulate
+from kernels.relight.triangulation import edge_planes, triangulate
 
 LEAST_PART = 1e-3
 """Of the energy of an imaginary light: lights far from a hole that would get less get none, the others have it."""
@@ -42,11 +42,8 @@ def sum_near(band: Band, surface: Surface, visible: wp.array, sources: Sources, 
     Raises:
         ArrayError: shapes that do not fit, a captured light without irradiance, fewer than four lights, or all in one plane.
     """
-    band.require_channels(3)
     count, device = len(direction), surface.device
-    if band.packs != surface.packs or visible.shape[1] != surface.packs or min(visible.shape[0], band.light_count) < count:
-        raise ArrayError(f"band has {band.packs} packs of {band.light_count} lights, the surface {surface.packs}, visibility is "
-                         f"{visible.shape}, directions are {count}: give the same pixels and lights")
+    require_same(band, surface, visible, count)
     if not (irradiance > 0).all():
         light, channel = np.argwhere(~(irradiance > 0))[0]
         raise ArrayError(f"irradiance of light {light} is 0 in channel {'RGB'[channel]}: its image says nothing about light from there")
@@ -55,9 +52,7 @@ def sum_near(band: Band, surface: Surface, visible: wp.array, sources: Sources, 
     vertex, owner = np.nonzero(triangles.share > LEAST_PART)
     start = np.searchsorted(vertex, np.arange(len(triangles.vertex) + 1))
     part = triangles.share[vertex, owner] / np.add.reduceat(triangles.share[vertex, owner], start[:-1])[vertex]
-    corners = triangles.vertex[triangles.corner]
-    plane = np.cross(np.roll(corners, -1, axis=1), np.roll(corners, -2, axis=1))  # through the centre and the edge opposite
-    length = np.linalg.norm(plane, axis=2, keepdims=True)
+    inward, length = edge_planes(triangles)
     pack = devices.pack_width(device)
     factor = (scale[:count, None] / irradiance).astype(np.float32)
     place = np.concatenate([direction, np.zeros((count, 1))], axis=1).astype(np.float32)
@@ -70,7 +65,7 @@ def sum_near(band: Band, surface: Surface, visible: wp.array, sources: Sources, 
     position = wp.array(np.ascontiguousarray(surface.values.numpy()[12:15].reshape(3, -1)), dtype=wp.float32, device=device)
     devices.launch(_weights_kernel(), surface.packs * pack,
                    [position, upload(sources.place, wp.vec4), upload(sources.energy, wp.vec3), upload(sources.axis, wp.vec4),
-                    upload((plane / length).reshape(-1, 3).astype(np.float32), wp.vec3),
+                    upload(inward.reshape(-1, 3).astype(np.float32), wp.vec3),
                     upload(length.reshape(-1).astype(np.float32), wp.float32),
                     upload(triangles.neighbour.reshape(-1).astype(np.int32), wp.int32),
                     upload(triangles.corner.reshape(-1).astype(np.int32), wp.int32), upload(start.astype(np.int32), wp.int32),
@@ -112,23 +107,10 @@ def _weights_kernel() -> Any:
             if lobe[3] > 0.0:
                 ahead = wp.max(-(toward[0] * lobe[0] + toward[1] * lobe[1] + toward[2] * lobe[2]), 0.0)
                 arriving = arriving * wp.pow(ahead, lobe[3])
-            a, b, c = float(0.0), float(0.0), float(0.0)
-            for _ in range(inward.shape[0]):  # across the edge that it lies beyond, as in smooth weighting
-                a = wp.dot(toward, inward[3 * here])
-                b = wp.dot(toward, inward[3 * here + 1])
-                c = wp.dot(toward, inward[3 * here + 2])
-                least = wp.min(a, wp.min(b, c))
-                if least >= -BESIDE_RADIANS:
-                    break
-                if least == a:
-                    here = neighbour[3 * here]
-                elif least == b:
-                    here = neighbour[3 * here + 1]
-                else:
-                    here = neighbour[3 * here + 2]
-            a = wp.max(a, 0.0) * length[3 * here]
-            b = wp.max(b, 0.0) * length[3 * here + 1]
-            c = wp.max(c, 0.0) * length[3 * here + 2]
+            here, angles = walk(toward, here, inward, neighbour)
+            a = wp.max(angles[0], 0.0) * length[3 * here]
+            b = wp.max(angles[1], 0.0) * length[3 * here + 1]
+            c = wp.max(angles[2], 0.0) * length[3 * here + 2]
             given = energy[n] * (arriving / wp.max(a + b + c, 1.0e-20))
             for side in range(3):
                 share = wp.where(side == 0, a, wp.where(side == 1, b, c))

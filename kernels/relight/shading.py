@@ -13,7 +13,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.microfacet import INVERSE_PI
-from kernels.packs import as_packs, pack_type
+from kernels.packs import Band, as_packs, pack_type
 from kernels.relight.sources import Sources
 
 LEAST_ROUGHNESS = 0.05
@@ -105,6 +105,18 @@ def shade(surface: Surface, sources: Sources, visible: wp.array | None = None) -
     devices.launch(_shade_kernel(pack), surface.packs, [surface.values, *upload_sources(sources, surface.device), visible],
                    [as_packs(out, surface.device)], device=surface.device)
     return out
+
+
+def require_same(band: Band, surface: Surface, visible: wp.array, count: int) -> None:
+    """Refuse captured images and visibility of other pixels or fewer lights than a surface and its lights have.
+
+    Raises:
+        ArrayError: naming what was got.
+    """
+    band.require_channels(3)
+    if band.packs != surface.packs or visible.shape[1] != surface.packs or min(visible.shape[0], band.light_count) < count:
+        raise ArrayError(f"band has {band.packs} packs of {band.light_count} lights, the surface {surface.packs}, visibility is "
+                         f"{visible.shape}, directions are {count}: give the same pixels and lights")
 
 
 @cache

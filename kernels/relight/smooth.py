@@ -16,7 +16,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.relight.latlong import LightEnergy, Part, SampleGrid, check, first_of_equals, gather
-from kernels.relight.triangulation import Triangulation, triangulate
+from kernels.relight.triangulation import Triangulation, edge_planes, triangulate
 
 RUN = 64
 """Neighbouring samples of one thread: it seeks the first one's triangle over the whole sphere, the others' from the one before."""
@@ -74,11 +74,8 @@ def locate(grid: SampleGrid, triangles: Triangulation, rotation: np.ndarray, *, 
         rotation: [3, 3].
         device: where; the call waits for it.
     """
-    vertex = triangles.vertex[triangles.corner]  # [faces, 3, 3]
-    # the plane through the centre and the edge opposite to a corner; its length is what the corner's coordinate is weighted by
-    plane = np.cross(np.roll(vertex, -1, axis=1), np.roll(vertex, -2, axis=1))
-    length = np.linalg.norm(plane, axis=2)
-    inward = ((plane / length[..., None]) @ rotation).reshape(-1, 3).astype(np.float32)
+    planes, length = edge_planes(triangles)
+    inward = (planes @ rotation).reshape(-1, 3).astype(np.float32)
     rows, cols = len(grid.polar), len(grid.azimuth)
     runs = -(-cols // RUN)
     on_rows = np.stack([np.sin(grid.polar), np.cos(grid.polar)], axis=1).astype(np.float32)
@@ -92,6 +89,29 @@ def locate(grid: SampleGrid, triangles: Triangulation, rotation: np.ndarray, *, 
     found = face.numpy().reshape(-1)
     share = np.maximum(depth.numpy().reshape(-1, 3), 0) * length[found]
     return Located(found, share / share.sum(axis=1, keepdims=True))
+
+
+@wp.func
+def walk(direction: wp.vec3, start: int, inward: wp.array(dtype=wp.vec3), neighbour: wp.array(dtype=int)):
+    """The face that a direction lies in, sought from another one, and the sines of its angles from the three edges."""
+    here = wp.int32(start)
+    a, b, c = float(0.0), float(0.0), float(0.0)
+    # across the edge that the direction lies beyond, again and again: on a convex hull every step leads to a face whose plane the
+    # ray meets nearer to the centre, so that none comes twice
+    for _ in range(inward.shape[0]):
+        a = wp.dot(direction, inward[3 * here])
+        b = wp.dot(direction, inward[3 * here + 1])
+        c = wp.dot(direction, inward[3 * here + 2])
+        least = wp.min(a, wp.min(b, c))
+        if least >= -BESIDE_RADIANS:
+            break
+        if least == a:
+            here = neighbour[3 * here]
+        elif least == b:
+            here = neighbour[3 * here + 1]
+        else:
+            here = neighbour[3 * here + 2]
+    return here, wp.vec3(a, b, c)
 
 
 @cache
@@ -112,23 +132,8 @@ def _walk_kernel() -> Any:
         here = wp.int32(0)
         for col in range(begin, wp.min(begin + RUN, equator.shape[0])):
             direction = wp.vec3(polar[row][0] * equator[col][0], polar[row][1], polar[row][0] * equator[col][1])
-            a, b, c = float(0.0), float(0.0), float(0.0)
-            # across the edge that the direction lies beyond, again and again: on a convex hull every step leads to a face whose
-            # plane the ray meets nearer to the centre, so that none comes twice
-            for _ in range(inward.shape[0]):
-                a = wp.dot(direction, inward[3 * here])
-                b = wp.dot(direction, inward[3 * here + 1])
-                c = wp.dot(direction, inward[3 * here + 2])
-                least = wp.min(a, wp.min(b, c))
-                if least >= -BESIDE_RADIANS:
-                    break
-                if least == a:
-                    here = neighbour[3 * here]
-                elif least == b:
-                    here = neighbour[3 * here + 1]
-                else:
-                    here = neighbour[3 * here + 2]
+            here, angles = walk(direction, here, inward, neighbour)
             face[row, col] = here
-            depth[row, col] = wp.vec3(a, b, c)
+            depth[row, col] = angles
 
     return walk_kernel

@@ -10,6 +10,7 @@ Source: convex hull by insertion, de Berg et al., "Computational Geometry", chap
 loudspeakers of Zotter and Frank, "All-round ambisonic panning and decoding", JAES 2012.
 """
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +30,12 @@ SMALLEST_HOLE_DEGREES = 20.0
 """A face between lights is a hole when it is this many times as wide as the usual one, and not below this radius."""
 LARGEST_FACE_DEGREES = 80.0
 """Radius of any face's circle. At 90 degrees the centre would lie in the face; the faces of a regular tetrahedron have 70.5 degrees."""
+
+
+REMEMBERED = 4
+"""Sets of lights whose triangles are kept."""
+CHUNK = 4096
+"""Directions that are held against all faces at one time: bounds the memory."""
 
 
 class Triangulation(NamedTuple):
@@ -58,6 +65,14 @@ def triangulate(directions: np.ndarray) -> Triangulation:
     Raises:
         ArrayError: fewer than four lights, or all in one plane.
     """
+    unit = np.ascontiguousarray(directions, dtype=np.float64)
+    return _remembered(unit.tobytes(), len(unit))
+
+
+@lru_cache(maxsize=REMEMBERED)
+def _remembered(directions_bytes: bytes, count: int) -> Triangulation:
+    """The triangles of lights that are asked for again and again: by every frame, every batch of pixels."""
+    directions = np.frombuffer(directions_bytes).reshape(count, -1)
     random = np.random.default_rng(0)  # the same each time
 
     def shifted(unit: np.ndarray) -> np.ndarray:
@@ -83,6 +98,37 @@ def triangulate(directions: np.ndarray) -> Triangulation:
         faces = _insert(faces, points, [len(points) - 1])
     share = _hand_on(faces.corner, np.concatenate([np.eye(len(directions)), polygons]), len(vertex))
     return Triangulation(vertex, faces.corner, _neighbours(faces.corner), share)
+
+
+def edge_planes(triangles: Triangulation) -> tuple[np.ndarray, np.ndarray]:
+    """The planes through the centre and the edge opposite to each corner.
+
+    Returns:
+        inward: [faces, 3, 3] unit normals: a direction's sine of the angle from each edge is its product with them.
+        length: [faces, 3] what that sine is multiplied by to be the corner's coordinate, but for a common factor.
+    """
+    corners = triangles.vertex[triangles.corner]
+    plane = np.cross(np.roll(corners, -1, axis=1), np.roll(corners, -2, axis=1))
+    length = np.linalg.norm(plane, axis=2)
+    return plane / length[..., None], length
+
+
+def find_faces(triangles: Triangulation, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The triangle of each of some directions, too few for a launch.
+
+    Args:
+        triangles: that cover the sphere.
+        directions: [n, 3] unit vectors.
+
+    Returns:
+        [n] faces, and [n, 3] float64 shares of their corners; they sum to one.
+    """
+    inward, length = edge_planes(triangles)
+    face = np.concatenate([np.einsum("sx,fkx->fks", part, inward).min(axis=1).argmax(axis=0)
+                           for part in np.array_split(directions, max(1, len(directions) // CHUNK))])
+    share = np.maximum(np.einsum("sx,skx->sk", directions, inward[face]), 0) * length[face]
+    return face, share / share.sum(axis=1, keepdims=True)
+
 
 
 def _start(points: np.ndarray) -> tuple[_Faces, list[int]]:
