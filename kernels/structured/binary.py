@@ -21,7 +21,7 @@ from kernels.errors import ArrayError
 from kernels.packs import as_packs, pack_type
 from kernels.status import OK, Status
 from kernels.structured.decoded import Decoded
-from kernels.structured.frames import Frames, NoiseModel, check_noise, check_stripes
+from kernels.structured.frames import Frames, NoiseModel, check_noise, check_stripes, cut_in
 
 SHADOW_SIGMAS = 5.0
 """Contrast (white minus black, or the largest difference of a pair) over its deviation: below, the projector does not reach the pixel."""
@@ -146,6 +146,7 @@ _NUMBERS = {"binary": number_binary, "gray": number_gray, "xor": number_xor}
 def _stripe_kernel(pack: int, code: str = "gray", inverses: bool = True, references: bool = True) -> Any:
     float_pack, int_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32), pack_type(pack, wp.uint8)
     number_of = _NUMBERS[code]
+    cut_of = cut_in(pack)
 
     @wp.kernel(enable_backward=False, module="unique")
     def stripe_kernel(first: int,
@@ -167,12 +168,7 @@ def _stripe_kernel(pack: int, code: str = "gray", inverses: bool = True, referen
                       amplitude: wp.array(dtype=float_pack),
                       status: wp.array(dtype=byte_pack)):
         p = first + wp.tid()
-        cut = int_pack()
-        for group in range(masks.shape[0]):
-            flags = saturated[group, p]
-            mask = masks[group]
-            for k in range(pack):
-                cut[k] = cut[k] | (int(flags[k]) & mask)
+        cut = cut_of(saturated, masks, p)
         contrast, spread, middle = float_pack(), float_pack(), float_pack()
         if wp.static(references):
             on = values[white, p]

@@ -1,6 +1,7 @@
 """Frames under projected patterns, on a device: readings as packs, which of them saturate, and how noisy they are."""
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -8,7 +9,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
-from kernels.packs import MAX_PIXELS, as_packs
+from kernels.packs import MAX_PIXELS, as_packs, pack_type
 from kernels.structured.decoded import Decoded
 
 
@@ -125,6 +126,24 @@ def stack(images: Sequence[np.ndarray]) -> np.ndarray:
 def saturated_bits(saturated: np.ndarray) -> np.ndarray:
     """[⌈frames / 8⌉, pixels] uint8 of [frames, pixels] bool."""
     return np.packbits(np.pad(saturated, ((0, -len(saturated) % 8), (0, 0))), axis=0, bitorder="little")
+
+
+@cache
+def cut_in(pack: int) -> Any:
+    """Warp function: the bits of the frames of a mask that saturate at the pixels of a pack; 0 where none does."""
+    int_pack, byte_pack = pack_type(pack, wp.int32), pack_type(pack, wp.uint8)
+
+    @wp.func
+    def cut_of(saturated: wp.array2d(dtype=byte_pack), masks: wp.array(dtype=int), p: int):
+        cut = int_pack()
+        for group in range(masks.shape[0]):
+            flags = saturated[group, p]
+            mask = masks[group]
+            for k in range(pack):
+                cut[k] = cut[k] | (int(flags[k]) & mask)
+        return cut
+
+    return cut_of
 
 
 def check_noise(noise: NoiseModel) -> None:

@@ -22,7 +22,7 @@ from kernels.errors import ArrayError
 from kernels.packs import as_packs, pack_type
 from kernels.status import OK, Status
 from kernels.structured.decoded import Decoded
-from kernels.structured.frames import Frames, NoiseModel, check_noise, check_stripes
+from kernels.structured.frames import Frames, NoiseModel, check_noise, check_stripes, cut_in
 
 SHADOW_SIGMAS = 5.0
 """White minus black over its deviation (all channels together): below, the projector does not reach the pixel."""
@@ -122,6 +122,7 @@ def expected_levels(levels: np.ndarray, crosstalk: np.ndarray | None) -> np.ndar
 @cache
 def _kary_kernel(pack: int, channels: int = 1) -> Any:
     float_pack, int_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32), pack_type(pack, wp.uint8)
+    cut_of = cut_in(pack)
 
     @wp.kernel(enable_backward=False, module="unique")
     def kary_kernel(first: int,
@@ -143,12 +144,7 @@ def _kary_kernel(pack: int, channels: int = 1) -> Any:
                     amplitude: wp.array(dtype=float_pack),
                     status: wp.array(dtype=byte_pack)):
         p = first + wp.tid()
-        cut = int_pack()
-        for group in range(masks.shape[0]):
-            flags = saturated[group, p]
-            mask = masks[group]
-            for k in range(pack):
-                cut[k] = cut[k] | (int(flags[k]) & mask)
+        cut = cut_of(saturated, masks, p)
         lit, signal = float_pack(), float_pack()
         for channel in range(channels):
             on = values[white * channels + channel, p]

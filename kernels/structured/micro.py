@@ -20,7 +20,7 @@ from kernels.packs import as_packs, pack_type
 from kernels.status import OK, Status
 from kernels.structured.angles import TURN, cosine_of_turns, sine_of_turns
 from kernels.structured.decoded import Decoded
-from kernels.structured.frames import Frames, NoiseModel
+from kernels.structured.frames import Frames, NoiseModel, cut_in
 from kernels.structured.phase import decode_phase
 
 LEVEL_ERROR = 0.02
@@ -112,7 +112,8 @@ def _require_unlike(periods: np.ndarray, reference: float, others: np.ndarray, e
 
 @cache
 def _micro_kernel(pack: int) -> Any:
-    float_pack, int_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32), pack_type(pack, wp.uint8)
+    float_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.uint8)
+    cut_of = cut_in(pack)
 
     @wp.kernel(enable_backward=False, module="unique")
     def micro_kernel(first: int,
@@ -138,12 +139,7 @@ def _micro_kernel(pack: int) -> Any:
                      signal: wp.array(dtype=float_pack),
                      status: wp.array(dtype=byte_pack)):
         p = first + wp.tid()
-        cut = int_pack()
-        for group in range(masks.shape[0]):
-            flags = saturated[group, p]
-            mask = masks[group]
-            for k in range(pack):
-                cut[k] = cut[k] | (int(flags[k]) & mask)
+        cut = cut_of(saturated, masks, p)
         angle = phase[0, p]
         swing = amplitude[0, p]
         mean = offset[0, p]

@@ -18,7 +18,7 @@ from kernels.errors import ArrayError
 from kernels.packs import as_packs, pack_type
 from kernels.status import OK, Status
 from kernels.structured.angles import angle_of
-from kernels.structured.frames import Frames, NoiseModel, check_noise, unwritten
+from kernels.structured.frames import Frames, NoiseModel, check_noise, cut_in, unwritten
 from kernels.structured.phase import MIN_MODULATION, SIGNAL_SIGMAS, WrappedPhase, weights
 
 _SATURATED, _SHADOWED, _LOW_MODULATION = int(Status.SATURATED), int(Status.SHADOWED), int(Status.LOW_MODULATION)
@@ -63,7 +63,8 @@ def decode_modulated(frames: Frames, numbers: Sequence[Sequence[int]], *, period
 
 @cache
 def _modulated_kernel(pack: int) -> Any:
-    float_pack, int_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32), pack_type(pack, wp.uint8)
+    float_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.uint8)
+    cut_of = cut_in(pack)
 
     @wp.kernel(enable_backward=False, module="unique")
     def modulated_kernel(first: int,
@@ -82,12 +83,7 @@ def _modulated_kernel(pack: int) -> Any:
                          sigma: wp.array2d(dtype=float_pack),
                          status: wp.array2d(dtype=byte_pack)):
         p = first + wp.tid()
-        cut = int_pack()
-        for group in range(masks.shape[0]):
-            flags = saturated[group, p]
-            mask = masks[group]
-            for k in range(pack):
-                cut[k] = cut[k] | (int(flags[k]) & mask)
+        cut = cut_of(saturated, masks, p)
 
         # where the carrier stands at this pixel: the same at every step
         cosine, sine = float_pack(), float_pack()

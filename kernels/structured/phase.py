@@ -21,7 +21,7 @@ from kernels.errors import ArrayError
 from kernels.packs import as_packs, pack_type
 from kernels.status import OK, Status
 from kernels.structured.angles import angle_of
-from kernels.structured.frames import Frames, NoiseModel, check_noise, unwritten
+from kernels.structured.frames import Frames, NoiseModel, check_noise, cut_in, unwritten
 
 SIGNAL_SIGMAS = 5.0
 """Light of the projector over its deviation, below which a pixel is SHADOWED; amplitude over its deviation, below which it has
@@ -116,7 +116,8 @@ def weights(shifts: np.ndarray, period_px: float) -> np.ndarray:
 
 @cache
 def _phase_kernel(pack: int, ambient: bool = False) -> Any:
-    float_pack, int_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32), pack_type(pack, wp.uint8)
+    float_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.uint8)
+    cut_of = cut_in(pack)
 
     @wp.kernel(enable_backward=False, module="unique")
     def phase_kernel(first: int,
@@ -140,12 +141,7 @@ def _phase_kernel(pack: int, ambient: bool = False) -> Any:
         if wp.static(ambient):
             dark = values[black, p]
         for period in range(masks.shape[0]):
-            cut = int_pack()
-            for group in range(masks.shape[1]):
-                flags = saturated[group, p]
-                mask = masks[period, group]
-                for k in range(pack):
-                    cut[k] = cut[k] | (int(flags[k]) & mask)
+            cut = cut_of(saturated, masks[period], p)
             mean, along, across = float_pack(), float_pack(), float_pack()
             vaa, vcc, vss, vcs = float_pack(), float_pack(), float_pack(), float_pack()
             for n in range(starts[period], starts[period + 1]):

@@ -17,7 +17,7 @@ from kernels.errors import ArrayError
 from kernels.packs import as_packs, pack_type
 from kernels.status import OK, Status
 from kernels.structured.decoded import Decoded
-from kernels.structured.frames import Frames, NoiseModel, check_noise
+from kernels.structured.frames import Frames, NoiseModel, check_noise, cut_in
 
 SHADOW_SIGMAS = 5.0
 """Light of the projector over its deviation, below which a pixel is SHADOWED."""
@@ -89,7 +89,8 @@ def ratio_table(response: np.ndarray | None, *, pair: bool) -> np.ndarray:
 
 @cache
 def _ramp_kernel(pack: int, pair: bool = True, ambient: bool = True) -> Any:
-    float_pack, int_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32), pack_type(pack, wp.uint8)
+    float_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.uint8)
+    cut_of = cut_in(pack)
 
     @wp.kernel(enable_backward=False, module="unique")
     def ramp_kernel(first: int,
@@ -110,12 +111,7 @@ def _ramp_kernel(pack: int, pair: bool = True, ambient: bool = True) -> Any:
                     amplitude: wp.array(dtype=float_pack),
                     status: wp.array(dtype=byte_pack)):
         p = first + wp.tid()
-        cut = int_pack()
-        for group in range(masks.shape[0]):
-            flags = saturated[group, p]
-            mask = masks[group]
-            for k in range(pack):
-                cut[k] = cut[k] | (int(flags[k]) & mask)
+        cut = cut_of(saturated, masks, p)
         dark, dark_variance = float_pack(), float_pack()
         if wp.static(ambient):
             dark = values[black, p]

@@ -19,7 +19,7 @@ from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.packs import as_packs, pack_type, scalars
 from kernels.status import OK, Status
-from kernels.structured.frames import Frames, unwritten
+from kernels.structured.frames import Frames, cut_in, unwritten
 from kernels.structured.phase import WrappedPhase
 
 _SATURATED = int(Status.SATURATED)
@@ -102,7 +102,8 @@ def _outputs(pixels: int, device: str) -> Separation:
 
 @cache
 def _extremes_kernel(pack: int, ambient: bool = False) -> Any:
-    float_pack, int_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32), pack_type(pack, wp.uint8)
+    float_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.uint8)
+    cut_of = cut_in(pack)
 
     @wp.kernel(enable_backward=False, module="unique")
     def extremes_kernel(first: int,
@@ -117,12 +118,7 @@ def _extremes_kernel(pack: int, ambient: bool = False) -> Any:
                         indirect: wp.array(dtype=float_pack),
                         status: wp.array(dtype=byte_pack)):
         p = first + wp.tid()
-        cut, dark = int_pack(), float_pack()
-        for group in range(masks.shape[0]):
-            flags = saturated[group, p]
-            mask = masks[group]
-            for k in range(pack):
-                cut[k] = cut[k] | (int(flags[k]) & mask)
+        cut, dark = cut_of(saturated, masks, p), float_pack()
         if wp.static(ambient):
             dark = values[black, p]
         low = values[order[0], p]
