@@ -28,6 +28,23 @@ GIVEN = wp.constant(2)
 """Nothing: F0 and roughness are given, and albedo alone is fitted."""
 
 
+@wp.func
+def squared_misfit(reading: float, predicted: float, bright: float, noise: wp.vec2):
+    """A third of r²/σ² of one channel's reading."""
+    off = (reading - predicted) / wp.max(noise[0] * bright + noise[1] * wp.max(reading, 0.0), 1.0e-20)
+    return off * off / 3.0
+
+
+@wp.func
+def weigh(shining: float, expected: float, off2: float, bright: float, noise: wp.vec2, shadow: wp.vec2):
+    """The weight of a light in the robust fit, one for all channels because a shadow is one in each of them, and its cost."""
+    dark = wp.where(shining < shadow[1] * expected, 1, 0) * wp.where(off2 > shadow[0], 1, 0)
+    given = wp.where(shining >= 0.0, 1.0, 0.0)
+    relative = bright / wp.max(noise[0] * bright + noise[1] * wp.max(shining, 0.0) / 3.0, 1.0e-20)
+    trust = wp.where(shining > 0.0, wp.where(dark == 1, SHADOW_TRUST, 1.0), SHADOW_TRUST)
+    return given * trust * relative * relative / (1.0 + off2), given * wp.log(1.0 + wp.where(dark == 1, shadow[0], off2))
+
+
 @cache
 def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
     """The kernel for one width of packs and one kind of light.
@@ -97,19 +114,13 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
                         y = colour[c, at]
                         for k in range(lanes):
                             predicted = rho[c, k] * fd[k] + f0[c, k] * fs[k] + fixed[k]
-                            sigma = wp.max(noise[0] * bright[k] + noise[1] * wp.max(y[k], 0.0), 1.0e-20)
-                            off = (y[k] - predicted) / sigma
-                            off2[k] += wp.where(turn == 0, 0.0, off * off / 3.0)
+                            off2[k] += wp.where(turn == 0, 0.0, squared_misfit(y[k], predicted, bright[k], noise))
                             shining[k] += y[k]
                             expected[k] += predicted
                     for k in range(lanes):
-                        dark = wp.where(shining[k] < shadow[1] * expected[k], 1, 0) * wp.where(off2[k] > shadow[0], 1, 0)
-                        given = wp.where(shining[k] >= 0.0, 1.0, 0.0)
-                        cost[k] += given * wp.log(1.0 + wp.where(dark == 1, shadow[0], off2[k]))
-                        sigma = wp.max(noise[0] * bright[k] + noise[1] * wp.max(shining[k], 0.0) / 3.0, 1.0e-20)
-                        relative = bright[k] / sigma
-                        trust = wp.where(shining[k] > 0.0, wp.where(dark == 1, SHADOW_TRUST, 1.0), SHADOW_TRUST)
-                        w[k] = given * trust * relative * relative / (1.0 + off2[k])
+                        weight, added = weigh(shining[k], expected[k], off2[k], bright[k], noise, shadow)
+                        w[k] = weight
+                        cost[k] += added
                     for c in range(3):
                         y = colour[c, at]
                         for k in range(lanes):

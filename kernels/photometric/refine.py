@@ -18,8 +18,9 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.packs import pack_type
-from kernels.photometric.hypotheses import LEAST_NZ, SHADOW_TRUST, Diffuse, SearchOptions
+from kernels.photometric.hypotheses import LEAST_NZ, Diffuse, SearchOptions
 from kernels.photometric.lobes import Reflectance, direction_reflectance
+from kernels.photometric.material_kernel import squared_misfit, weigh
 from kernels.photometric.samples import Samples, per_pixel, to_host
 
 LINEAR_TURNS = 4
@@ -165,19 +166,13 @@ def _refine_kernel(lanes: int, reflectance: Reflectance) -> Any:
                     y = colour[c, at]
                     for k in range(lanes):
                         predicted = rho[c, k] * fd[k] + f0[c, k] * fs[k] + fixed[k]
-                        sigma = wp.max(noise[0] * bright[k] + noise[1] * wp.max(y[k], 0.0), 1.0e-20)
-                        off = (y[k] - predicted) / sigma
-                        off2[k] += wp.where(turn == 0, 0.0, off * off / 3.0)
+                        off2[k] += wp.where(turn == 0, 0.0, squared_misfit(y[k], predicted, bright[k], noise))
                         shining[k] += y[k]
                         expected[k] += predicted
                 for k in range(lanes):
-                    dark = wp.where(shining[k] < shadow[1] * expected[k], 1, 0) * wp.where(off2[k] > shadow[0], 1, 0)
-                    given = wp.where(shining[k] >= 0.0, 1.0, 0.0)
-                    cost[k] += given * wp.log(1.0 + wp.where(dark == 1, shadow[0], off2[k]))
-                    sigma = wp.max(noise[0] * bright[k] + noise[1] * wp.max(shining[k], 0.0) / 3.0, 1.0e-20)
-                    relative = bright[k] / sigma
-                    trust = wp.where(shining[k] > 0.0, wp.where(dark == 1, SHADOW_TRUST, 1.0), SHADOW_TRUST)
-                    w[k] = given * trust * relative * relative / (1.0 + off2[k])
+                    weight, added = weigh(shining[k], expected[k], off2[k], bright[k], noise, shadow)
+                    w[k] = weight
+                    cost[k] += added
                 for c in range(3):
                     y = colour[c, at]
                     for k in range(lanes):
