@@ -14,7 +14,7 @@ from kernels.photometric.hypotheses import Diffuse, SearchOptions, search_normal
 from kernels.photometric.lambert import NormalFit, solve_lambert
 from kernels.photometric.readings import Lights, grey_factors, grey_readings, pad_lights
 from kernels.photometric.robust import solve_robust
-from kernels.photometric.samples import Samples, gather
+from kernels.photometric.samples import Samples, evenly, gather
 from kernels.photometric.svbrdf import average_normals, solve_svbrdf
 from kernels.status import Status
 from service.pipelines.material import SPREAD_PIXELS, Parts, solve_material
@@ -62,7 +62,7 @@ def load_case(name: str, capture: Capture, truth: np.ndarray, cache: Path) -> Ca
     lights = pad_lights(lit.direction, lit.irradiance, stack.scale)
     factors = grey_factors(lights, GREY_WEIGHTS)
     inside = np.flatnonzero(capture.mask())
-    chosen = inside[np.unique(np.linspace(0, len(inside) - 1, min(PIXELS, len(inside))).astype(int))]
+    chosen = inside[evenly(len(inside), PIXELS)]
     band = packs.upload(*stack.pick(chosen), device="cpu")
 
     def normals(solver: Callable[..., NormalFit]) -> tuple[np.ndarray, np.ndarray]:
@@ -73,7 +73,7 @@ def load_case(name: str, capture: Capture, truth: np.ndarray, cache: Path) -> Ca
     solved = np.flatnonzero(lambert[1] & robust[1])
     samples = _gather(band, solved, lights, factors, stack.light_count)
     channels = tuple(_gather(band, solved, lights, grey_factors(lights, one), stack.light_count) for one in np.eye(3))
-    few = solved[np.unique(np.linspace(0, len(solved) - 1, min(SPREAD_PIXELS, len(solved))).astype(int))]
+    few = solved[evenly(len(solved), SPREAD_PIXELS)]
     shape, _ = choose_diffuse(_gather(band, few, lights, factors, stack.light_count), robust[0][few])
 
     def whole(parts: Parts) -> np.ndarray:

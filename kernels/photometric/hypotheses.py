@@ -148,6 +148,14 @@ def search_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse,
     return Search(to_host(samples, normal), to_host(samples, cost), to_host(samples, curvature), to_host(samples, weights))
 
 
+@wp.func
+def tangents(n: wp.vec3):
+    """Two unit vectors that are perpendicular to a unit normal and to each other."""
+    up = wp.where(wp.abs(n[2]) < 0.9, wp.vec3(0.0, 0.0, 1.0), wp.vec3(1.0, 0.0, 0.0))
+    tangent = wp.normalize(wp.cross(up, n))
+    return tangent, wp.cross(n, tangent)
+
+
 @cache
 def _search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> Any:
     lane_type = pack_type(lanes, wp.float32)
@@ -190,9 +198,7 @@ def _search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> 
         found = coefficients()
         for k in range(lanes):
             n = wp.vec3(cx[k], cy[k], cz[k])
-            up = wp.where(wp.abs(n[2]) < 0.9, wp.vec3(0.0, 0.0, 1.0), wp.vec3(1.0, 0.0, 0.0))
-            tangent = wp.normalize(wp.cross(up, n))
-            other = wp.cross(n, tangent)
+            tangent, other = tangents(n)
             tx[k] = tangent[0]
             ty[k] = tangent[1]
             tz[k] = tangent[2]

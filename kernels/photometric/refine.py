@@ -18,7 +18,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.packs import pack_type
-from kernels.photometric.hypotheses import LEAST_NZ, Diffuse, SearchOptions
+from kernels.photometric.hypotheses import LEAST_NZ, Diffuse, SearchOptions, tangents
 from kernels.photometric.lobes import Reflectance, direction_reflectance
 from kernels.photometric.material_kernel import squared_misfit, weigh
 from kernels.photometric.samples import Samples, per_pixel, to_host
@@ -134,9 +134,7 @@ def _refine_kernel(lanes: int, reflectance: Reflectance) -> Any:
             wider = lane_type()
             for k in range(lanes):
                 n = wp.vec3(nx[k], ny[k], nz[k])
-                up = wp.where(wp.abs(n[2]) < 0.9, wp.vec3(0.0, 0.0, 1.0), wp.vec3(1.0, 0.0, 0.0))
-                a = wp.normalize(wp.cross(up, n))
-                b = wp.cross(n, a)
+                a, b = tangents(n)
                 plus, aside = wp.normalize(n + TILT * a), wp.normalize(n + TILT * b)
                 ax[k] = a[0]
                 ay[k] = a[1]

@@ -43,6 +43,16 @@ def lanes_of(device: str) -> int:
     return devices.pack_width(device) if device == "cpu" else LANES_CUDA
 
 
+def evenly(count: int, most: int) -> np.ndarray:
+    """Indices at even steps through a number of things: all of them, or as many as asked for at the most.
+
+    Args:
+        count: one or more.
+        most: one or more.
+    """
+    return np.unique(np.linspace(0, count - 1, min(most, count)).astype(int))
+
+
 def gather(band: Band, pixels: np.ndarray, view: np.ndarray, lights: Lights, factors: np.ndarray, light_count: int,
            field: NearField | None = None) -> Samples:
     """Gather the readings of some pixels of a band.

@@ -12,7 +12,7 @@ import numpy as np
 
 from kernels.photometric.hypotheses import Diffuse, SearchOptions
 from kernels.photometric.material import fit_given, fit_material
-from kernels.photometric.samples import Samples
+from kernels.photometric.samples import Samples, evenly
 
 CANDIDATES = 100
 """Pixels whose materials are candidates."""
@@ -35,7 +35,7 @@ def choose_materials(samples: Samples, normal: np.ndarray, *, shape: Diffuse, op
         [materials, 4] float32: F0 and roughness, the one that explains most first. Waits for the device.
     """
     own = fit_material(samples, normal, shape=shape, options=options)
-    chosen = np.unique(np.linspace(0, len(normal) - 1, min(CANDIDATES, len(normal))).astype(int))
+    chosen = evenly(len(normal), CANDIDATES)
     candidates = np.concatenate([own.specular[chosen], own.roughness[chosen, None]], axis=1)
     costs = np.stack([fit_given(samples, normal, candidate, shape=shape, options=options).cost for candidate in candidates])
     materials: list[int] = []

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels.photometric.readings import Lights, channel_weights
+from kernels.photometric.samples import evenly
 from kernels.status import Status
 from service.pipelines.solution import Solution
 from stage.colour import GREY_WEIGHTS
@@ -46,7 +47,7 @@ def suspect_lights(solution: Solution, stack: Stack, lights: Lights) -> list[Sus
         return []
     confidence = solution.confidence[solved].astype(np.float32)
     sure = solved[confidence >= np.median(confidence)]
-    chosen = sure[np.unique(np.linspace(0, len(sure) - 1, min(PIXELS, len(sure))).astype(int))]
+    chosen = sure[evenly(len(sure), PIXELS)]
     values, _ = stack.pick(chosen)
     count = stack.light_count
     weights = channel_weights(lights, GREY_WEIGHTS)

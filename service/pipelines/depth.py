@@ -1,5 +1,6 @@
 """Capture → depth.exr, points.ply and report.json, whatever the depth is measured with: the capture's frames decide."""
 
+import hashlib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -159,8 +160,6 @@ def _advice(reasons: dict[str, int], using: Ranging) -> str:
 
 def _content(capture: Capture) -> str:
     """Content hash of every file that the capture names, combined."""
-    import hashlib
-
     names = sorted({name for _, name in capture.files()})
     hashes = Fingerprints(capture.folder, capture.folder / CACHE_FOLDER / "files.json").of(names)
     combined = hashlib.blake2b(digest_size=16)

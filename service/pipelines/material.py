@@ -16,7 +16,7 @@ from kernels.photometric.material import fit_tinted
 from kernels.photometric.near import NearField, see_near
 from kernels.photometric.readings import Lights, channel_weights, grey_factors, grey_readings
 from kernels.photometric.robust import solve_robust
-from kernels.photometric.samples import Samples, gather
+from kernels.photometric.samples import Samples, evenly, gather
 from kernels.photometric.shadowing import exclude_shadows
 from kernels.photometric.shared_materials import choose_materials
 from kernels.photometric.svbrdf import solve_svbrdf
@@ -162,7 +162,7 @@ def _start(result: Solution, stack: Stack, lights: Lights, factors: np.ndarray, 
 def _spread(stack: Stack, lights: Lights, factors: np.ndarray, view: View, solvable: np.ndarray, device: str,
             field: NearField | None) -> tuple[np.ndarray, Samples]:
     """Some pixels at even steps through the object, from which is chosen what all share: positions and readings."""
-    chosen = solvable[np.unique(np.linspace(0, len(solvable) - 1, min(SPREAD_PIXELS, len(solvable))).astype(int))]
+    chosen = solvable[evenly(len(solvable), SPREAD_PIXELS)]
     band = packs.upload(*stack.pick(chosen), device=device)
     return chosen, gather(band, np.arange(len(chosen)), view(chosen), lights, factors, stack.light_count,
                           None if field is None else field.at(chosen))
