@@ -28,6 +28,7 @@ from benchmarks.spin import spin_table
 from benchmarks.structured import structured_rows
 from benchmarks.tof import rows as tof_rows
 from benchmarks.tof_accuracy import accuracy_rows
+from benchmarks.tof_bound import bound_rows
 from service.methods import Method
 from service.pipelines.bench import bench
 from service.pipelines.solve import solve
@@ -130,7 +131,7 @@ def speed(_: argparse.Namespace) -> list[str]:
 
 def tof(_: argparse.Namespace) -> list[str]:
     """Range errors of time of flight."""
-    return accuracy_rows()
+    return [*accuracy_rows(), "", *bound_rows()]
 
 
 def depth_speed(_: argparse.Namespace) -> list[str]:

@@ -10,6 +10,7 @@ import numpy as np
 from service.depth_requests import DepthRequest
 from service.pipelines.depth import depth
 from service.tof_options import TofOptions
+from stage.depth_maps import DepthMaps
 from tests.reference import tof as scenes
 
 ROWS, COLS = 96, 128
@@ -19,8 +20,8 @@ WRONG_M = 0.9
 SEED = 11
 
 
-def measured(frames: list[tuple[np.ndarray, dict[str, Any]]], view: scenes.View, vote: bool = True) -> tuple[float, float, float, float]:
-    """Median error in mm, parts of the pixels wrong and unsolved, RMS of error over sigma."""
+def solved_maps(frames: list[tuple[np.ndarray, dict[str, Any]]], vote: bool = True) -> DepthMaps:
+    """What `relit depth` makes of raw frames."""
     with tempfile.TemporaryDirectory() as name:
         folder, entries = Path(name), []
         for index, (values, light) in enumerate(frames):
@@ -30,7 +31,12 @@ def measured(frames: list[tuple[np.ndarray, dict[str, Any]]], view: scenes.View,
             "schema": "relit.capture/1", "name": "room", "frames": entries,
             "camera": {"projection": "perspective", "resolution": [COLS, ROWS], "focal_px": [FOCAL_PX, FOCAL_PX]}}))
         options = TofOptions.model_validate({"vote": vote})
-        maps = depth(DepthRequest(capture=folder, out=folder / "out", tof=options, device="cpu")).maps
+        return depth(DepthRequest(capture=folder, out=folder / "out", tof=options, device="cpu")).maps
+
+
+def measured(frames: list[tuple[np.ndarray, dict[str, Any]]], view: scenes.View, vote: bool = True) -> tuple[float, float, float, float]:
+    """Median error in mm, parts of the pixels wrong and unsolved, RMS of error over sigma."""
+    maps = solved_maps(frames, vote)
     assert maps.range is not None and maps.sigma is not None
     error = (maps.range - view.distance)[maps.mask]
     right = np.abs(error) < WRONG_M

@@ -12,7 +12,8 @@ from service import __version__
 REPORTED = ("relit", "warp-lang", "numpy", "OpenEXR", "OpenImageIO", "opencv-python-headless", "usd-core")
 """Distributions whose versions a report names."""
 
-UNRECORDED = {"capture", "out", "maps", "environment", "keys", "sheet", "report", "cache", "device", "overwrite"}
+UNRECORDED = {"capture", "out", "maps", "environment", "keys", "sheet", "report", "cache", "device", "overwrite",
+              "only"}
 """Of a request: paths, and how it was carried out."""
 
 

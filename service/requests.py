@@ -1,4 +1,8 @@
-"""What can be asked of Relit: one frozen model a job, the same object for the command line, the API and the workflow."""
+"""What can be asked of Relit: one frozen model a job, the same object for the command line, the API and the workflow.
+
+An ...Options model holds what is chosen about the work; the ...Request on top of it adds where files are. A job of the service carries
+the options and names of captures, which its worker makes paths of.
+"""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,10 +20,14 @@ def _split(given: Any) -> Any:
     return tuple(part.strip() for part in given.split(",")) if isinstance(given, str) else given
 
 
-class Request(BaseModel):
-    """Base of every request."""
+class Options(BaseModel):
+    """Base of every model: what is not known is refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Request(Options):
+    """Base of every request."""
 
     device: str | None = None
     """cpu, cuda:0, …; None: the first CUDA device, else the CPU."""
@@ -27,8 +35,8 @@ class Request(BaseModel):
     """Folder for the stack cache; None: `.relit` in the capture's folder."""
 
 
-class StackRequest(Request):
-    """Base of requests on the images of a capture."""
+class StackOptions(Options):
+    """About the images of a capture."""
 
     align: bool = False
     """Warp the frames of a moving subject to the time of one tracking frame."""
@@ -41,19 +49,47 @@ class StackRequest(Request):
         return self.align or self.align_to is not None
 
 
-class SolveRequest(StackRequest):
+class SolveOptions(StackOptions):
+    """How normals, albedo and height are solved."""
+
+    method: Method | None = None
+    """None: gradient where there are gradient frames; else svbrdf where there are lights enough, else robust."""
+
+
+class SolveRequest(SolveOptions, Request):
     """Normals, albedo and height of a capture."""
 
     capture: Path
     out: Path
     """Folder for maps.exr and report.json."""
-    method: Method | None = None
-    """None: gradient where there are gradient frames; else svbrdf where there are lights enough, else robust."""
     reference_ball: Path | None = None
     """Capture of a ball of the object's material under the same lights, for the method reference."""
 
 
-class RelightRequest(StackRequest):
+class PictureOptions(Options):
+    """How a picture under new light is written."""
+
+    exposure: float = Field(default=0.0, ge=-MAX_STOPS, le=MAX_STOPS, allow_inf_nan=False)
+    """Stops: every picture is multiplied by 2 to this power."""
+    aov: Annotated[tuple[Layer, ...], BeforeValidator(_split)] = (Layer.BEAUTY,)
+    """Layers of a picture; as text, names with commas between."""
+    color_space: FrameSpace | None = None
+    """None: the capture's own scene-linear space."""
+    compression: FrameCompression = FrameCompression.ZIP
+
+
+class RelightOptions(PictureOptions, StackOptions):
+    """Which frames, and how light is shared out over the captured lights."""
+
+    frames: str | None = None
+    """A number, or first-last; None: 1, or 1 to the number of time steps."""
+    weights: LightWeights | None = None
+    """How light from between the captured lights is shared out over them; None: cells, with maps smooth."""
+    spin_degrees: float = Field(default=0.0, allow_inf_nan=False)
+    """How far the environment turns about +y over the whole range; the first frame is unturned, and a full turn closes."""
+
+
+class RelightRequest(RelightOptions, Request):
     """Frames of a capture, or of a sequence of captures, under lat-long environments and animated lights."""
 
     capture: Path
@@ -64,27 +100,16 @@ class RelightRequest(StackRequest):
     """A lat-long map; with #### in its name one a frame."""
     keys: Path | None = None
     """Light keys (schema relit.keys/1): animation of lights, environment, captured images and exposure."""
-    frames: str | None = None
-    """A number, or first-last; None: 1, or 1 to the number of time steps."""
-    weights: LightWeights | None = None
-    """How light from between the captured lights is shared out over them; None: cells, with maps smooth."""
-    exposure: float = Field(default=0.0, ge=-MAX_STOPS, le=MAX_STOPS, allow_inf_nan=False)
-    """Stops: every frame is multiplied by 2 to this power."""
+    only: str | None = None
+    """Of `frames`, the part that this run makes, in the same form: what a farm gives to one of its machines. None: all."""
     maps: Path | None = None
     """Folder of the solved maps (of a sequence: of a folder a time step, named as its capture): frames are guided by a model of them."""
-    aov: Annotated[tuple[Layer, ...], BeforeValidator(_split)] = (Layer.BEAUTY,)
-    """Layers of a frame; as text, names with commas between."""
-    color_space: FrameSpace | None = None
-    """None: the capture's own scene-linear space."""
-    compression: FrameCompression = FrameCompression.ZIP
     overwrite: bool = False
     """Make frames anew that an equal request has made already."""
     sheet: Path | None = None
     """A PNG that shows the frames for review."""
     report: Path | None = None
     """A JSON file that says what was made, and where the time went."""
-    spin_degrees: float = Field(default=0.0, allow_inf_nan=False)
-    """How far the environment turns about +y over the whole range; the first frame is unturned, and a full turn closes."""
 
     @property
     def weighting(self) -> LightWeights:
@@ -92,32 +117,30 @@ class RelightRequest(StackRequest):
         return self.weights or (LightWeights.CELLS if self.maps is None else LightWeights.SMOOTH)
 
 
-class ShadeRequest(Request):
+class ShadeOptions(PictureOptions):
+    """Lights near the surface, and how its environment is turned."""
+
+    light: tuple[GivenPoint, ...] = ()
+    sphere: tuple[GivenSphere, ...] = ()
+    rectangle: tuple[GivenRectangle, ...] = ()
+    turn_degrees: float = Field(default=0.0, allow_inf_nan=False)
+    """Of the environment about +y, +z towards +x."""
+
+
+class ShadeRequest(ShadeOptions, Request):
     """One picture of solved maps under near lights, area lights and an environment."""
 
     maps: Path
     """A folder with maps.exr, or the file."""
     out: Path
     """.exr."""
-    light: tuple[GivenPoint, ...] = ()
-    sphere: tuple[GivenSphere, ...] = ()
-    rectangle: tuple[GivenRectangle, ...] = ()
     environment: Path | None = None
     """A lat-long map."""
-    turn_degrees: float = Field(default=0.0, allow_inf_nan=False)
-    """Of the environment about +y, +z towards +x."""
     capture: Path | None = None
     """The capture of the maps: its images give what a model of the maps cannot, interreflection and scattering."""
-    exposure: float = Field(default=0.0, ge=-MAX_STOPS, le=MAX_STOPS, allow_inf_nan=False)
-    """Stops: the picture is multiplied by 2 to this power."""
-    aov: Annotated[tuple[Layer, ...], BeforeValidator(_split)] = (Layer.BEAUTY,)
-    """Layers of the picture; as text, names with commas between."""
-    color_space: FrameSpace | None = None
-    """None: that of the maps."""
-    compression: FrameCompression = FrameCompression.ZIP
 
 
-class BasisRequest(StackRequest):
+class BasisRequest(StackOptions, Request):
     """A capture reduced to a few coefficient images, for a browser or for viewers of relightable images."""
 
     capture: Path
@@ -130,16 +153,19 @@ class BasisRequest(StackRequest):
     lights on, else 4; ptm: six in any case."""
 
 
-class ExportRequest(BaseModel):
-    """A USD asset from solved maps or a depth."""
+class ExportOptions(Options):
+    """What a USD asset is called and made of."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    name: str | None = None
+    """Of the asset; None: what the maps say, else the file's stem."""
+    geometry: Geometry | None = None
+    """Of a depth (depth.exr in place of maps.exr); None: mesh."""
+
+
+class ExportRequest(ExportOptions):
+    """A USD asset from solved maps or a depth."""
 
     maps: Path
     """A folder with maps.exr or depth.exr, or the file."""
     out: Path
     """.usdz, .usda or .usdc."""
-    name: str | None = None
-    """Of the asset; None: what the maps say, else the file's stem."""
-    geometry: Geometry | None = None
-    """Of a depth (depth.exr in place of maps.exr); None: mesh."""

@@ -13,8 +13,10 @@ class ScanRequest(Request):
     scan: Path
     """A folder with a scan.json, or the file."""
     out: Path
-    """Folder for points.ply, points.usdc and report.json."""
+    """Folder for points.ply, points.usdc, points.las where it is asked for, and report.json."""
     near_m: float | None = Field(default=None, gt=0, allow_inf_nan=False)
     """Nearer returns are left out."""
     far_m: float | None = Field(default=None, gt=0, allow_inf_nan=False)
     """Farther returns are left out."""
+    las: bool = False
+    """Write points.las too (LAS 1.4)."""

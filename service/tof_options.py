@@ -12,7 +12,7 @@ def _split(given: Any) -> Any:
     return tuple(part.strip() for part in given.split(",") if part.strip()) if isinstance(given, str) else given
 
 
-class TofOptions(BaseModel):
+class TofChoices(BaseModel):
     """How time of flight is solved."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -23,7 +23,12 @@ class TofOptions(BaseModel):
     """Let neighbours decide between wraps that a pixel leaves open (continuous wave)."""
     which: WhichReturn = WhichReturn.STRONGEST
     """Of several returns (pulsed)."""
-    calibration: Path | None = None
-    """A relit.tof/1 file; None: noise and pulse are estimated from the capture, nothing is corrected."""
     temperature_c: float | None = Field(default=None, allow_inf_nan=False)
     """Of the camera, for a calibration with a temperature drift."""
+
+
+class TofOptions(TofChoices):
+    """The same, with the camera's calibration."""
+
+    calibration: Path | None = None
+    """A relit.tof/1 file; None: noise and pulse are estimated from the capture, nothing is corrected."""

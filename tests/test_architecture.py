@@ -66,7 +66,7 @@ def test_the_imports_are_read():
 
 
 @pytest.mark.parametrize(("floor", "allowed"), [
-    ("stage", {"stage", "numpy", "pydantic", "OpenEXR", "OpenImageIO", "cv2"}),
+    ("stage", {"stage", "numpy", "pydantic", "OpenEXR", "OpenImageIO", "cv2", "laspy"}),
     ("kernels", {"kernels", "numpy", "warp"}),
 ])
 def test_a_floor_knows_only_its_own_libraries(floor, allowed):
@@ -77,7 +77,7 @@ def test_a_floor_knows_only_its_own_libraries(floor, allowed):
 
 @pytest.mark.parametrize(("library", "home"), [
     ("pxr", "service.usd"), ("typer", "service.cli"), ("rich", "service.cli"),
-    ("fastapi", "service.api"), ("dbos", "service.jobs"),
+    ("fastapi", "service.api"), ("dbos", "service.jobs"), ("laspy", "stage.las"),
 ])
 def test_a_library_lives_in_one_place(library, home):
     assert {i.importer for i in IMPORTS if top(i.target) == library and not under(i.importer, home)} == set()

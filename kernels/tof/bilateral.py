@@ -4,6 +4,7 @@ The plain filter averages; where an edge of the guide cuts the window in two, th
 edge is drawn into the depth. A plane has no such error.
 """
 
+import math
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -26,6 +27,10 @@ LEAST_DETERMINANT = 1e-3
 """Of the plane's matrix, over that of independent unit spreads: below it the neighbours lie on a line, and are averaged."""
 LEAST_VARIANCE = 1e-12
 """m²: a micrometre, so that noise-free pixels have a weight."""
+LEAST_GUIDE = 1e-30
+"""So that one over the guide is a number where nothing was measured."""
+CUTOFF = 32.0
+"""(1 - u/32)^16 stands for exp(-u/2), which it is but for the tail, at most 2 % of a weight: a few operations for a whole pack."""
 
 _OK = int(Status.OK)
 
@@ -55,7 +60,7 @@ def smooth(ranges: wp.array, sigma: wp.array, guide: wp.array, status: wp.array,
         Ranges and their standard deviations. Invalid pixels stay invalid: nothing is filled in.
 
     Raises:
-        ArrayError: sizes do not match, or an option is not above zero.
+        ArrayError: sizes do not match, an array is a slice with gaps, or an option is not above zero.
 
     Source:
         Petschnigg et al., "Digital photography with flash and no-flash image pairs", SIGGRAPH 2004 (joint bilateral); of
@@ -68,58 +73,67 @@ def smooth(ranges: wp.array, sigma: wp.array, guide: wp.array, status: wp.array,
     pack = devices.pack_width(device)
     whole = -(-cols // pack) * pack
     pitch, size = whole + 2 * radius, (rows + 2 * radius) * (whole + 2 * radius)
-    planes = [wp.zeros(size, dtype=wp.float32, device=device) for _ in range(4)]
-    devices.launch(_frame_kernel, size, [ranges, sigma, guide, status, rows, cols, radius, pitch], planes, device=device)
-    result = [wp.zeros((rows, whole), dtype=wp.float32, device=device) for _ in range(2)]
+    planes = [wp.zeros(size, dtype=wp.float32, device=device) for _ in range(5)]
+    part = math.gcd(cols, pack)  # packs that fill a row and no more
+    devices.launch(frame_kernel(part), rows * cols // part, [
+        *(_packs(array, part, part, rows * cols // part) for array in (ranges, sigma, guide, status)), cols // part, radius, pitch],
+        [_packs(plane, part, 1, size - part + 1) for plane in planes], device=device)
+    result = [wp.empty((rows, whole), dtype=wp.float32, device=device) for _ in range(2)]  # the kernel writes every pixel
     distance = np.arange(-radius, radius + 1)
     falloff = np.exp(-0.5 * (distance[:, None] ** 2 + distance**2) / spatial_px**2)
     devices.launch(smooth_kernel(pack), rows * whole // pack, [
-        *(_every_place(plane, pack) for plane in planes), radius, pitch, whole // pack,
+        *(_packs(plane, pack, 1, size - pack + 1) for plane in planes), radius, pitch, whole // pack,
         wp.array(falloff.astype(np.float32).reshape(-1), dtype=wp.float32, device=device)],
         [as_packs(array, device) for array in result], device=device)
     return Smoothed(*((array if whole == cols else array[:, :cols].contiguous()).reshape((rows * cols,)) for array in result))
 
 
-def _every_place(plane: wp.array, pack: int) -> wp.array:
-    """The same memory as packs that begin at every value and overlap; the caller keeps the plane."""
-    return wp.array(ptr=plane.ptr, shape=(plane.shape[0] - pack + 1,), strides=(4,), dtype=pack_type(pack, wp.float32),
-                    device=plane.device, copy=False)
+def _packs(array: wp.array, pack: int, step: int, count: int) -> wp.array:
+    """The same memory as packs that begin at every `step` values and overlap where a pack is longer; the caller keeps the array."""
+    if not array.is_contiguous:
+        raise ArrayError(f"an array of shape {array.shape} is a slice with gaps: give contiguous ones")
+    return wp.array(ptr=array.ptr, shape=(count,), strides=(4 * step,), dtype=pack_type(pack, array.dtype), device=array.device, copy=False)
 
 
-@wp.kernel(module="unique")
-def _frame_kernel(first: int,
-                  ranges: wp.array(dtype=wp.float32),
-                  sigma: wp.array(dtype=wp.float32),
-                  guide: wp.array(dtype=wp.float32),
-                  status: wp.array(dtype=wp.int32),
-                  rows: int,
-                  cols: int,
-                  radius: int,
-                  pitch: int,
-                  # outputs
-                  place: wp.array(dtype=wp.float32),
-                  variance: wp.array(dtype=wp.float32),
-                  known: wp.array(dtype=wp.float32),  # 1 / variance; 0 where not OK and in the frame around the image
-                  look: wp.array(dtype=wp.float32)):
-    t = first + wp.tid()
-    r = t // pitch - radius
-    c = t - (t // pitch) * pitch - radius
-    v = float(1.0)
-    inside = r >= 0 and c >= 0 and r < rows and c < cols
-    look[t] = 1.0
-    if inside:
-        p = r * cols + c
-        place[t] = ranges[p]
-        look[t] = guide[p]
-        v = sigma[p] * sigma[p] + LEAST_VARIANCE
-        if status[p] == _OK:
-            known[t] = 1.0 / v
-    variance[t] = v
-
-
+@cache
 def frame_kernel(pack: int) -> Any:
-    """For the test that compiles it; single pixels whatever the pack."""
-    return _frame_kernel
+    """The kernel for packs of this many pixels, which divide a row; public for the test that compiles it for CUDA."""
+    float_pack, int_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def inset_kernel(first: int,
+                     ranges: wp.array(dtype=float_pack),
+                     sigma: wp.array(dtype=float_pack),
+                     guide: wp.array(dtype=float_pack),
+                     status: wp.array(dtype=int_pack),
+                     packs: int,  # of a row
+                     radius: int,
+                     pitch: int,
+                     # outputs, zeros in the frame around the image
+                     place: wp.array(dtype=float_pack),
+                     variance: wp.array(dtype=float_pack),
+                     known: wp.array(dtype=float_pack),  # 1 / variance; 0 where not OK
+                     look: wp.array(dtype=float_pack),
+                     look_inverse: wp.array(dtype=float_pack)):
+        t = first + wp.tid()
+        r = t // packs
+        q = (r + radius) * pitch + radius + (t - r * packs) * pack
+        s = sigma[t]
+        g = guide[t]
+        code = status[t]
+        v, sure, seen, inverse = float_pack(), float_pack(), float_pack(), float_pack()
+        for k in range(pack):
+            v[k] = s[k] * s[k] + LEAST_VARIANCE
+            sure[k] = wp.where(code[k] == _OK, 1.0 / v[k], 0.0)
+            seen[k] = wp.max(g[k], LEAST_GUIDE)
+            inverse[k] = 1.0 / seen[k]
+        place[q] = ranges[t]
+        variance[q] = v
+        known[q] = sure
+        look[q] = seen
+        look_inverse[q] = inverse
+
+    return inset_kernel
 
 
 @cache
@@ -133,6 +147,7 @@ def smooth_kernel(pack: int) -> Any:
                      variance: wp.array(dtype=float_pack),
                      known: wp.array(dtype=float_pack),
                      look: wp.array(dtype=float_pack),
+                     look_inverse: wp.array(dtype=float_pack),
                      radius: int,
                      pitch: int,
                      packs: int,  # of a row
@@ -147,49 +162,63 @@ def smooth_kernel(pack: int) -> Any:
         d = place[here]
         v0 = variance[here]
         g0 = look[here]
+        h0 = look_inverse[here]
         k0 = known[here]
         step2 = float_pack()
         for k in range(pack):
-            step2[k] = (LEAST_STEP * d[k]) * (LEAST_STEP * d[k]) + RANGE_SIGMAS * RANGE_SIGMAS * v0[k]
+            step2[k] = CUTOFF * ((LEAST_STEP * d[k]) * (LEAST_STEP * d[k]) + RANGE_SIGMAS * RANGE_SIGMAS * v0[k])
         m00, m01, m02, m11, m12, m22 = float_pack(), float_pack(), float_pack(), float_pack(), float_pack(), float_pack()  # Σ w
         n00, n01, n02, n11, n12, n22 = float_pack(), float_pack(), float_pack(), float_pack(), float_pack(), float_pack()  # Σ w² v
         t0, t1, t2 = float_pack(), float_pack(), float_pack()  # Σ w (range - d)
         for i in range(-radius, radius + 1):
+            w0, w1, w2, u0, u1, u2 = float_pack(), float_pack(), float_pack(), float_pack(), float_pack(), float_pack()  # of one row
+            s0, s1 = float_pack(), float_pack()
+            y = float(i)
             for j in range(-radius, radius + 1):
                 q = here + i * pitch + j
                 dq = place[q]
-                vq = variance[q]
                 kq = known[q]
                 gq = look[q]
+                hq = look_inverse[q]
                 f = falloff[(i + radius) * (2 * radius + 1) + j + radius]
-                x, y = float(j), float(i)
+                x = float(j)
                 for k in range(pack):
                     away = dq[k] - d[k]
-                    ratio = (gq[k] - g0[k]) / (GUIDE_RELATIVE * wp.max(wp.max(gq[k], g0[k]), 1.0e-30))
-                    unlike = ratio * ratio + away * away / (RANGE_SIGMAS * RANGE_SIGMAS * vq[k] + step2[k])
-                    like = wp.max(1.0 - unlike * 0.03125, 0.0)  # (1 - u/32)^16, exp(-u/2) but for its tail: the same for a whole pack
+                    up, down = gq[k] * h0[k], g0[k] * hq[k]
+                    ratio = 1.0 - wp.where(up < down, up, down)  # difference of the guide over the larger of the two, without a division
+                    unlike = ratio * ratio * (1.0 / (CUTOFF * GUIDE_RELATIVE * GUIDE_RELATIVE)) \
+                        + away * away * kq[k] / (CUTOFF * RANGE_SIGMAS * RANGE_SIGMAS + step2[k] * kq[k])  # over CUTOFF
+                    like = wp.max(1.0 - unlike, 0.0)
                     like = like * like
                     like = like * like
                     like = like * like
-                    like = like * like * f
-                    w = like * v0[k] * kq[k]
-                    u = like * v0[k] * w
-                    wx, wy, ux, uy = w * x, w * y, u * x, u * y
-                    m00[k] += w
-                    m01[k] += wx
-                    m02[k] += wy
-                    m11[k] += wx * x
-                    m12[k] += wx * y
-                    m22[k] += wy * y
-                    t0[k] += w * away
-                    t1[k] += wx * away
-                    t2[k] += wy * away
-                    n00[k] += u
-                    n01[k] += ux
-                    n02[k] += uy
-                    n11[k] += ux * x
-                    n12[k] += ux * y
-                    n22[k] += uy * y
+                    like = like * like * f * v0[k]
+                    w = like * kq[k]
+                    u = like * w
+                    w0[k] += w
+                    w1[k] += w * x
+                    w2[k] += w * x * x
+                    u0[k] += u
+                    u1[k] += u * x
+                    u2[k] += u * x * x
+                    s0[k] += w * away
+                    s1[k] += w * away * x
+            for k in range(pack):
+                m00[k] += w0[k]
+                m01[k] += w1[k]
+                m02[k] += w0[k] * y
+                m11[k] += w2[k]
+                m12[k] += w1[k] * y
+                m22[k] += w0[k] * y * y
+                n00[k] += u0[k]
+                n01[k] += u1[k]
+                n02[k] += u0[k] * y
+                n11[k] += u2[k]
+                n12[k] += u1[k] * y
+                n22[k] += u0[k] * y * y
+                t0[k] += s0[k]
+                t1[k] += s1[k]
+                t2[k] += s0[k] * y
         out, spread = float_pack(), float_pack()
         for k in range(pack):
             a = m11[k] * m22[k] - m12[k] * m12[k]

@@ -13,7 +13,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
-from kernels.packs import as_packs, pack_type, scalars
+from kernels.packs import as_packs, pack_type
 from kernels.tof.modulation import radians_per_metre
 
 LEAST_PHASES = 3
@@ -115,9 +115,10 @@ def decode(images: np.ndarray, modulation_hz: Sequence[float] | np.ndarray, refe
     delta = np.asarray(reference_phase_rad, dtype=np.float64)[order]
     factor = np.ones(len(rows)) if scale is None else np.asarray(scale, dtype=np.float64)[order]
     basis = np.stack([rows[order, 0], rows[order, 1], rows[order, 2], np.cos(delta), np.sin(delta), factor], axis=1)
-    readings = padded(images, device)
-    outputs = [scalars(images.shape[1], len(frequencies), wp.float32, device) for _ in range(6)]
-    devices.launch(decode_kernel(devices.pack_width(device)), readings.shape[1] // devices.pack_width(device), [
+    readings, pack = padded(images, device), devices.pack_width(device)
+    shape = len(frequencies), readings.shape[1]
+    outputs = [wp.empty(shape, dtype=wp.float32, device=device) for _ in range(6)]  # the kernel writes every pixel
+    devices.launch(decode_kernel(pack), shape[0] * shape[1] // pack, [
         as_packs(readings, device),
         wp.array(order.astype(np.int32), dtype=wp.int32, device=device),
         wp.array(np.concatenate([[0], np.cumsum(counts)]).astype(np.int32), dtype=wp.int32, device=device),
@@ -181,46 +182,47 @@ def decode_kernel(pack: int) -> Any:
                            offset: wp.array2d(dtype=float_pack),
                            evidence: wp.array2d(dtype=float_pack),
                            residual: wp.array2d(dtype=float_pack)):
-        p = first + wp.tid()
-        for f in range(begin.shape[0] - 1):
-            level, a, b = float_pack(), float_pack(), float_pack()
-            aa, ab, bb = float_pack(), float_pack(), float_pack()
-            blind, left = float_pack(), float_pack()
-            for j in range(begin[f], begin[f + 1]):
-                y = images[order[j], p]
-                row_p, row_a, row_b = basis[j, 0], basis[j, 1], basis[j, 2]
-                for k in range(pack):
-                    blind[k] += wp.where(wp.abs(y[k]) < saturation, 0.0, 1.0)  # NaN is not below it either
-                    variance = read_variance + shot * wp.max(y[k], shot) + (ROUNDING * y[k]) * (ROUNDING * y[k])  # an electron at the least
-                    level[k] += row_p * y[k]
-                    a[k] += row_a * y[k]
-                    b[k] += row_b * y[k]
-                    aa[k] += row_a * row_a * variance
-                    ab[k] += row_a * row_b * variance
-                    bb[k] += row_b * row_b * variance
-            for j in range(begin[f], begin[f + 1]):
-                y = images[order[j], p]
-                cosine, sine, factor = basis[j, 3], basis[j, 4], basis[j, 5]
-                for k in range(pack):
-                    e = y[k] * factor - level[k] - a[k] * cosine - b[k] * sine
-                    left[k] += e * e
-            angle, spread, strength, sure = float_pack(), float_pack(), float_pack(), float_pack()
+        t = first + wp.tid()
+        f = t // images.shape[1]  # one frequency after the other: fewer arrays are written side by side
+        p = t - f * images.shape[1]
+        level, a, b = float_pack(), float_pack(), float_pack()
+        aa, ab, bb = float_pack(), float_pack(), float_pack()
+        blind, left = float_pack(), float_pack()
+        for j in range(begin[f], begin[f + 1]):
+            y = images[order[j], p]
+            row_p, row_a, row_b = basis[j, 0], basis[j, 1], basis[j, 2]
             for k in range(pack):
-                q2 = a[k] * a[k] + b[k] * b[k]
-                safe = wp.max(q2, 1.0e-36)
-                across = (b[k] * b[k] * aa[k] - 2.0 * a[k] * b[k] * ab[k] + a[k] * a[k] * bb[k]) / safe  # at right angles to (a, b)
-                angle[k] = wp.where(blind[k] > 0.0, 0.0, phase_of(a[k], b[k]))
-                strength[k] = wp.where(blind[k] > 0.0, 0.0, wp.sqrt(q2))
-                level[k] = wp.where(blind[k] > 0.0, 0.0, level[k])
-                left[k] = wp.where(blind[k] > 0.0, 0.0, left[k])
-                lit = wp.where(q2 > 0.0, wp.sqrt(wp.max(across, 0.0) / safe), 0.0)
-                spread[k] = wp.where(blind[k] > 0.0, -1.0, lit)
-                sure[k] = wp.where(blind[k] > 0.0, 0.0, 2.0 * q2 / wp.max(aa[k] + bb[k], 1.0e-36))
-            phase[f, p] = angle
-            sigma[f, p] = spread
-            amplitude[f, p] = strength
-            offset[f, p] = level
-            evidence[f, p] = sure
-            residual[f, p] = left
+                blind[k] += wp.where(wp.abs(y[k]) < saturation, 0.0, 1.0)  # NaN is not below it either
+                variance = read_variance + shot * wp.max(y[k], shot) + (ROUNDING * y[k]) * (ROUNDING * y[k])  # an electron at the least
+                level[k] += row_p * y[k]
+                a[k] += row_a * y[k]
+                b[k] += row_b * y[k]
+                aa[k] += row_a * row_a * variance
+                ab[k] += row_a * row_b * variance
+                bb[k] += row_b * row_b * variance
+        for j in range(begin[f], begin[f + 1]):
+            y = images[order[j], p]
+            cosine, sine, factor = basis[j, 3], basis[j, 4], basis[j, 5]
+            for k in range(pack):
+                e = y[k] * factor - level[k] - a[k] * cosine - b[k] * sine
+                left[k] += e * e
+        angle, spread, strength, sure = float_pack(), float_pack(), float_pack(), float_pack()
+        for k in range(pack):
+            q2 = a[k] * a[k] + b[k] * b[k]
+            safe = wp.max(q2, 1.0e-36)
+            across = (b[k] * b[k] * aa[k] - 2.0 * a[k] * b[k] * ab[k] + a[k] * a[k] * bb[k]) / safe  # at right angles to (a, b)
+            angle[k] = wp.where(blind[k] > 0.0, 0.0, phase_of(a[k], b[k]))
+            strength[k] = wp.where(blind[k] > 0.0, 0.0, wp.sqrt(q2))
+            level[k] = wp.where(blind[k] > 0.0, 0.0, level[k])
+            left[k] = wp.where(blind[k] > 0.0, 0.0, left[k])
+            lit = wp.where(q2 > 0.0, wp.sqrt(wp.max(across, 0.0) / safe), 0.0)
+            spread[k] = wp.where(blind[k] > 0.0, -1.0, lit)
+            sure[k] = wp.where(blind[k] > 0.0, 0.0, 2.0 * q2 / wp.max(aa[k] + bb[k], 1.0e-36))
+        phase[f, p] = angle
+        sigma[f, p] = spread
+        amplitude[f, p] = strength
+        offset[f, p] = level
+        evidence[f, p] = sure
+        residual[f, p] = left
 
     return correlation_kernel

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from kernels import device as devices
-from kernels.packs import as_packs, pack_type, scalars
+from kernels.packs import as_packs, pack_type
 from kernels.status import Status
 from kernels.tof.continuous import Correlation
 from kernels.tof.modulation import radians_per_metre
@@ -59,7 +59,8 @@ def decide(found: Correlation, weighed: Hypotheses, *, agreement_rad: float = AG
     pack, count = devices.pack_width(device), len(found.modulation_hz)
     agree = [float("inf"), *(quantile(freedom, MULTIPATH_Z) for freedom in range(1, count))]
     signal = [float("inf"), *(quantile(2 * used, SIGNAL_Z) for used in range(1, count + 1))]
-    result = Ranges(*(scalars(pixels, None, dtype, device) for dtype in (wp.float32, wp.float32, wp.float32, wp.int32, wp.int32)))
+    result = Ranges(*(wp.empty(pixels, dtype=dtype, device=device)  # the kernel writes every pixel
+                      for dtype in (wp.float32, wp.float32, wp.float32, wp.int32, wp.int32)))
     devices.launch(decide_kernel(pack), pixels // pack, [
         *(as_packs(array, device) for array in (found.phase, found.sigma, found.evidence)),
         floats(radians_per_metre(found.modulation_hz), device), floats(agree, device), floats(signal, device),
@@ -93,11 +94,12 @@ def decide_kernel(pack: int) -> Any:
                       status: wp.array(dtype=int_pack)):
         p = first + wp.tid()
         d, best = float_pack(), float_pack()
-        p0, p1, p2 = probability[0, p], probability[1, p], probability[2, p]
-        d0, d1, d2 = ranges[0, p], ranges[1, p], ranges[2, p]
-        for k in range(pack):
-            best[k] = wp.max(p0[k], wp.max(p1[k], p2[k]))
-            d[k] = wp.where(p0[k] >= best[k], d0[k], wp.where(p1[k] >= best[k], d1[k], d2[k]))
+        for n in range(probability.shape[0]):
+            likely = probability[n, p]
+            there = ranges[n, p]
+            for k in range(pack):
+                d[k] = wp.where(likely[k] > best[k], there[k], d[k])
+                best[k] = wp.where(likely[k] > best[k], likely[k], best[k])
         used, blind, sure, cost = float_pack(), float_pack(), float_pack(), float_pack()
         for f in range(per_metre.shape[0]):
             s = sigma[f, p]
@@ -105,13 +107,13 @@ def decide_kernel(pack: int) -> Any:
             e = evidence[f, p]
             slope = per_metre[f]
             for k in range(pack):
-                there = wp.where(s[k] > 0.0, 1.0, 0.0)
+                usable = wp.where(s[k] > 0.0, 1.0, 0.0)
                 turns = (angle[k] - slope * d[k]) * (0.5 / wp.pi)
                 away = (turns - wp.floor(turns + 0.5)) * (2.0 * wp.pi)
-                used[k] += there
+                used[k] += usable
                 blind[k] += wp.where(s[k] < 0.0, 1.0, 0.0)
-                sure[k] += there * e[k]
-                cost[k] += there * away * away / (s[k] * s[k] + agreement)
+                sure[k] += usable * e[k]
+                cost[k] += usable * away * away / (s[k] * s[k] + agreement)
         spread = hypothesis_sigma[p]
         codes, turned = int_pack(), int_pack()
         last = per_metre[per_metre.shape[0] - 1] * (0.5 / wp.pi)

@@ -10,6 +10,8 @@ from kernels.errors import ArrayError
 
 wp.set_module_options({"enable_backward": False})
 
+LEFT_OVER = 0.5
+"""Pulses that count as left where a bin took them all: the logarithm of none has no value, and without the bin the return would move."""
 EXHAUSTED = 1e-3
 """Part of the pulses that must be left for a bin to be used: with fewer the correction is division by chance."""
 
@@ -19,6 +21,7 @@ class Exposed(NamedTuple):
 
     counts: wp.array  # float32: expected photons of the pulses that were left
     awake: wp.array  # float32, 0…1
+    pulses: float = np.inf  # of each histogram; finite where a pulse counts one photon at most: counts are binomial then, else Poisson
 
 
 def place(counts: np.ndarray, device: str) -> wp.array:
@@ -53,7 +56,7 @@ def correct_pileup(counts: wp.array, *, pulses: int) -> Exposed:
         pulses: laser pulses of each histogram.
 
     Returns:
-        Expected photons of the pulses that were left, and their part of all: a Poisson variable of mean awake · flux, whatever was lost.
+        Expected photons of the pulses that were left, of mean awake · flux whatever was lost, their part of all, and `pulses`.
         Bins with fewer than EXHAUSTED of the pulses left count as blind.
 
     Raises:
@@ -66,7 +69,7 @@ def correct_pileup(counts: wp.array, *, pulses: int) -> Exposed:
         raise ArrayError(f"pulses is {pulses}: pile-up is corrected with the number of laser pulses, one or more")
     corrected, awake = wp.zeros_like(counts), wp.zeros_like(counts)
     devices.launch(_coates_kernel, counts.shape[1], [counts, float(pulses)], [corrected, awake], device=str(counts.device))
-    return Exposed(corrected, awake)
+    return Exposed(corrected, awake, float(pulses))
 
 
 def unhurried(counts: wp.array) -> Exposed:
@@ -90,8 +93,8 @@ def _coates_kernel(first: int,
     left = float(pulses)
     for i in range(counts.shape[0]):
         n = counts[i, p]
-        if left > EXHAUSTED * pulses and n < left:
-            q = n / left
+        if left > EXHAUSTED * pulses:
+            q = wp.min(n, wp.max(left - LEFT_OVER, 0.5 * left)) / left
             rate = -wp.log(1.0 - q)
             if q < 1.0e-3:  # the logarithm of nearly one loses its digits
                 rate = q + 0.5 * q * q

@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
-from kernels.packs import as_packs, pack_type, scalars
+from kernels.packs import as_packs, pack_type
 from kernels.tof.continuous import Correlation
 from kernels.tof.modulation import radians_per_metre, require_span
 
@@ -22,6 +22,11 @@ FLOOR_RAD = 1e-3
 """Phases are not trusted further than this, however bright: 0.3 mm at 80 MHz."""
 FAR = 1e20
 """Cost of what is no hypothesis."""
+END_SIGMAS = 3.0
+"""Standard deviations beyond either end of the span at which a hypothesis is still one."""
+TURN = 2 * np.pi
+
+
 class Hypotheses(NamedTuple):
     """The best wraps of each pixel, on the device; pixels are padded to whole packs."""
 
@@ -36,7 +41,7 @@ def unwrap(found: Correlation, *, nearest_m: float, farthest_m: float) -> Hypoth
 
     Args:
         found: phases with their standard deviations.
-        nearest_m, farthest_m: the span to look in; three standard deviations beyond either end are looked at too.
+        nearest_m, farthest_m: the span to look in; END_SIGMAS standard deviations beyond either end are looked at too.
 
     Returns:
         The hypotheses, on the device.
@@ -54,9 +59,8 @@ def unwrap(found: Correlation, *, nearest_m: float, farthest_m: float) -> Hypoth
     pack = devices.pack_width(device)
     per_metre = radians_per_metre(found.modulation_hz)
     wave = 2 * np.pi / per_metre[-1]
-    ranges, probability = (scalars(pixels, HYPOTHESES, wp.float32, device) for _ in range(2))
-    sigma = scalars(pixels, None, wp.float32, device)
-    scratch = scalars(pixels, len(per_metre), wp.float32, device)
+    shapes = (HYPOTHESES, pixels), (HYPOTHESES, pixels), (pixels,), (len(per_metre), pixels)
+    ranges, probability, sigma, scratch = (wp.empty(shape, dtype=wp.float32, device=device) for shape in shapes)  # the kernel writes all
     devices.launch(unwrap_kernel(pack), pixels // pack, [
         as_packs(found.phase, device), as_packs(found.sigma, device), floats(per_metre, device), int(np.floor(nearest_m / wave)) - 1,
         int(np.ceil(farthest_m / wave)), float(nearest_m), float(farthest_m), as_packs(scratch, device)],
@@ -67,6 +71,22 @@ def unwrap(found: Correlation, *, nearest_m: float, farthest_m: float) -> Hypoth
 def floats(values: Any, device: Any) -> wp.array:
     """A small table on the device, float32."""
     return wp.array(np.asarray(values, dtype=np.float32), dtype=wp.float32, device=device)
+
+
+@wp.func
+def decay(x: float):
+    """exp(-x) of 0 … 80, to 3e-7 of it, and exp(-80) beyond: unlike the library's, the same few operations for a whole pack."""
+    near = wp.min(x, 80.0)
+    halvings = wp.rint(near * 1.44269504)
+    y = (halvings * 0.693359375 - near) - halvings * 2.12194440e-4  # ln 2 in two parts, the first product exact; -½ ln 2 … ½ ln 2
+    power = float(1.0 / 720.0)
+    power = power * y + 1.0 / 120.0
+    power = power * y + 1.0 / 24.0
+    power = power * y + 1.0 / 6.0
+    power = power * y + 0.5
+    power = power * y + 1.0
+    power = power * y + 1.0
+    return power * wp.cast((127 - int(halvings)) << 23, float)  # the exponent of a float32
 
 
 @cache
@@ -100,13 +120,16 @@ def unwrap_kernel(pack: int) -> Any:
                 about = w[k] * k2
                 total[k] += about
                 start[k] = wp.where(about > sharpest[k], angle[k] / per_metre[f], start[k])
-                wave[k] = wp.where(about > sharpest[k], 2.0 * wp.pi / per_metre[f], wave[k])
+                wave[k] = wp.where(about > sharpest[k], TURN / per_metre[f], wave[k])
                 sharpest[k] = wp.max(about, sharpest[k])
             weight[f, p] = w
-        spread, d0, d1, d2 = float_pack(), float_pack(), float_pack(), float_pack()
-        c0, c1, c2 = float_pack(), float_pack(), float_pack()
+        spread, variance, d0, d1, d2 = float_pack(), float_pack(), float_pack(), float_pack(), float_pack()
+        c0, c1, c2, low, high = float_pack(), float_pack(), float_pack(), float_pack(), float_pack()
         for k in range(pack):
-            spread[k] = 1.0 / wp.sqrt(wp.max(total[k], 1.0e-12))
+            variance[k] = 1.0 / wp.max(total[k], 1.0e-12)
+            spread[k] = wp.sqrt(variance[k])
+            low[k] = nearest - END_SIGMAS * spread[k]
+            high[k] = farthest + END_SIGMAS * spread[k]
             c0[k] = FAR
             c1[k] = FAR
             c2[k] = FAR
@@ -119,15 +142,16 @@ def unwrap_kernel(pack: int) -> Any:
                 w = weight[f, p]
                 slope = per_metre[f]
                 for k in range(pack):
-                    turns = (angle[k] - slope * d[k]) * (0.5 / wp.pi)
-                    away = (turns - wp.floor(turns + 0.5)) * (2.0 * wp.pi)  # radians from the hypothesis
-                    moved[k] += w[k] * slope * away
-                    cost[k] += w[k] * away * away
+                    turns = (angle[k] - slope * d[k]) * (1.0 / TURN)
+                    away = turns - wp.rint(turns)  # turns from the hypothesis
+                    pull = w[k] * away
+                    moved[k] += slope * pull
+                    cost[k] += pull * away
             for k in range(pack):
-                step = moved[k] / wp.max(total[k], 1.0e-12)
+                step = TURN * moved[k] * variance[k]
                 here = d[k] + step
-                beyond = wp.max(wp.max(nearest - here, here - farthest) - 3.0 * spread[k], 0.0)
-                c = cost[k] - moved[k] * step + 1.0e30 * beyond
+                c = TURN * (TURN * cost[k] - moved[k] * step)
+                c = wp.where(here < low[k], FAR, wp.where(here > high[k], FAR, c))
                 below0 = c < c0[k]
                 below1 = c < c1[k]
                 below2 = c < c2[k]
@@ -139,9 +163,9 @@ def unwrap_kernel(pack: int) -> Any:
                 c0[k] = wp.where(below0, c, c0[k])
         p0, p1, p2, kept = float_pack(), float_pack(), float_pack(), float_pack()
         for k in range(pack):
-            one = wp.where(c0[k] < FAR and total[k] > 0.0, 1.0, 0.0)
-            two = one * wp.where(c1[k] < FAR, wp.exp(-0.5 * wp.min(c1[k] - c0[k], 200.0)), 0.0)
-            three = one * wp.where(c2[k] < FAR, wp.exp(-0.5 * wp.min(c2[k] - c0[k], 200.0)), 0.0)
+            one = wp.where(c0[k] < FAR, wp.where(total[k] > 0.0, 1.0, 0.0), 0.0)
+            two = one * wp.where(c1[k] < FAR, decay(0.5 * (c1[k] - c0[k])), 0.0)
+            three = one * wp.where(c2[k] < FAR, decay(0.5 * (c2[k] - c0[k])), 0.0)
             share = 1.0 / wp.max(one + two + three, 1.0)
             p0[k] = one * share
             p1[k] = two * share

@@ -26,6 +26,9 @@ def relight(
         help="Light keys (JSON): animated lights, environment, captured images and exposure; docs/relight.md.")] = None,
     frames: Annotated[str | None, typer.Option(
         "--frames", show_default=False, help="A number, or first-last; without it 1, or one for each time step.")] = None,
+    only: Annotated[str | None, typer.Option(
+        "--only", metavar="FRAMES", show_default=False,
+        help="Make this part of --frames alone, such as 9-16: what a farm gives to one machine.")] = None,
     spin_degrees: Annotated[float, typer.Option(
         "--spin-degrees", help="Turn of the environment about +y over the range, +z towards +x; frame one is unturned.")] = 0.0,
     weights: Annotated[LightWeights | None, typer.Option(
@@ -62,10 +65,10 @@ def relight(
     from service.requests import RelightRequest
 
     request = RelightRequest.model_validate({
-        "capture": capture, "out": out, "environment": environment, "keys": keys, "frames": frames, "spin_degrees": spin_degrees,
-        "weights": weights, "exposure": exposure, "aov": aov, "maps": maps, "color_space": color_space, "compression": compression,
-        "overwrite": overwrite, "sheet": sheet, "report": report, "align": align, "align_to": align_to, "device": device,
-        "cache": cache})
+        "capture": capture, "out": out, "environment": environment, "keys": keys, "frames": frames, "only": only,
+        "spin_degrees": spin_degrees, "weights": weights, "exposure": exposure, "aov": aov, "maps": maps, "color_space": color_space,
+        "compression": compression, "overwrite": overwrite, "sheet": sheet, "report": report, "align": align, "align_to": align_to,
+        "device": device, "cache": cache})
     with Bar() as bar:
         result = run(request, bar)
     last = f" … {result.frames[-1].name}" if len(result.frames) > 1 else ""

@@ -1,4 +1,4 @@
-"""A scan folder → points.ply, points.usdc and report.json: shots of a platform that may move, as one cloud in the world."""
+"""A scan folder → points.ply, points.usdc, points.las and report.json: shots of a platform that may move, as one cloud in the world."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +19,7 @@ from service.scan_requests import ScanRequest
 from service.usd.points import write_points
 from stage.files import write_text
 from stage.fingerprint import Fingerprints
+from stage.las import LAS_FILE, las_is_installed, write_las
 from stage.ply import POINTS_FILE, PointCloud, write_ply
 from stage.tof.scan import FILE_NAME, Shots, place_points, read_scan
 
@@ -33,6 +34,8 @@ class ScanResult(NamedTuple):
     cloud: PointCloud
     points_path: Path
     usd_path: Path
+    las_path: Path | None
+    """Where it was asked for."""
     report_path: Path
     counts: dict[str, int]
     """Shots by what became of them."""
@@ -47,9 +50,11 @@ def scan(request: ScanRequest, progress: Progress | None = None) -> ScanResult:
 
     Raises:
         StageError, KernelError: bad input; nothing is written.
-        RequestError: no shot gives a point.
+        RequestError: no shot gives a point, or LAS is asked for without laspy.
         StorageError: the results cannot be written.
     """
+    if request.las and not las_is_installed():
+        raise RequestError(f"{LAS_FILE} is written with laspy, which is not installed: pip install 'relit[las]'")
     timings = Timings(progress)
     device = devices.resolve(request.device)
     timings.stage("read", 1)
@@ -60,7 +65,7 @@ def scan(request: ScanRequest, progress: Progress | None = None) -> ScanResult:
     inside = (range_m >= near) & (range_m <= far) & (range_m > 0)
     timings.stage("place", 1)
     points, covered = place_points(shots, index[inside], range_m[inside])
-    index, intensity, points = index[inside][covered], intensity[inside][covered], points[covered]
+    index, range_m, intensity, points = index[inside][covered], range_m[inside][covered], intensity[inside][covered], points[covered]
     if len(points) == 0:
         raise RequestError(f"{shots.folder / FILE_NAME}: no shot gives a point: {int((~covered).sum())} lie outside the track in time, "
                            f"{int((~inside).sum())} outside the span of ranges")
@@ -79,11 +84,17 @@ def scan(request: ScanRequest, progress: Progress | None = None) -> ScanResult:
     points_path, usd_path, report_path = (request.out / name for name in (POINTS_FILE, USD_FILE, REPORT_FILE))
     write_ply(cloud, points_path, comments=tuple(f"{key} {value}" for key, value in sources.items()))
     write_points(cloud, usd_path, name=shots.scan.name, provenance=sources)
+    las_path = None
+    if request.las:
+        las_path = request.out / LAS_FILE
+        scales = write_las(points, intensity, shots.time_s[index], index, range_m, las_path, provenance=sources)
+        facts["las"] = scales._asdict()
     write_text(report_path, report(
         inputs={"scan": str(request.scan), "name": shots.scan.name, "content": hashes, "poses": len(shots.scan.track)},
-        method="scan", options=request.model_dump(mode="json", include={"near_m", "far_m"}), found=facts, device=devices.describe(device),
-        timings_s=timings.close(), shots=counts, extent_m={"low": points.min(axis=0).tolist(), "high": points.max(axis=0).tolist()}))
-    return ScanResult(cloud, points_path, usd_path, report_path, counts)
+        method="scan", options=request.model_dump(mode="json", include={"near_m", "far_m", "las"}), found=facts,
+        device=devices.describe(device), timings_s=timings.close(), shots=counts,
+        extent_m={"low": points.min(axis=0).tolist(), "high": points.max(axis=0).tolist()}))
+    return ScanResult(cloud, points_path, usd_path, las_path, report_path, counts)
 
 
 def _returns(shots: Shots, device: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:

@@ -55,13 +55,12 @@ def solve_histograms(frames: Histograms, options: TofOptions, calibration: TofCa
     pulse, source = _pulse(frames, calibration, exposed, usable)
     found = find_returns(exposed, pulse, most=MOST_RETURNS, first_bin=(nearest - start_m) / bin_m, last_bin=(farthest - start_m) / bin_m)
     chosen = _choose(found, options.which)
-    position, sigma, photons, evidence = (np.take_along_axis(array.numpy(), chosen[None], axis=0)[0]
-                                          for array in (found.position, found.sigma, found.photons, found.evidence))
+    position, sigma, photons, confidence = (np.take_along_axis(array.numpy(), chosen[None], axis=0)[0]
+                                            for array in (found.position, found.sigma, found.photons, found.confidence))
     status = found.status.numpy()
     if limit is not None:
         status[(frames.counts >= limit).any(axis=1)] = int(Status.SATURATED)
     solved = np.isin(status, SOLVED)
-    confidence = 1 / (1 + frames.counts.shape[1] * np.exp(-0.5 * np.minimum(evidence, 200.0)))
     several = (found.photons.numpy() > 0).sum(axis=0)
     facts: dict[str, Any] = {
         "bins": frames.counts.shape[1],

@@ -13,7 +13,7 @@ from kernels.relight import basis, batch, cells, combine, display, guide, near_s
 from kernels.structured import binary, edges, kary, micro, modulated, phase, ramp, stripe, triangulate
 from kernels.structured import separation as light_parts
 from kernels.structured import unwrap as wraps
-from kernels.tof import bilateral, continuous, decide, flying, pileup, returns, unwrap, vote, wiggling
+from kernels.tof import bilateral, continuous, decide, flying, pileup, returns, times, unwrap, vote, wiggling
 
 devices.names()
 OLDEST = min(wp.get_cuda_supported_archs(), default=None)
@@ -30,7 +30,7 @@ OLDEST = min(wp.get_cuda_supported_archs(), default=None)
                                   guide._compare_kernel, near_sum._sum_kernel, occlusion._see_kernel,
                                   continuous.decode_kernel, unwrap.unwrap_kernel, vote.vote_kernel, decide.decide_kernel,
                                   wiggling.straighten_kernel, flying.flying_kernel, bilateral.smooth_kernel, bilateral.frame_kernel,
-                                  pileup.coates_kernel, returns.returns_kernel,
+                                  pileup.coates_kernel, returns.returns_kernel, times.times_kernel,
                                   *(partial(binary._stripe_kernel, code=code) for code in ("binary", "gray", "xor")),
                                   partial(binary._stripe_kernel, inverses=False), partial(binary._stripe_kernel, references=False),
                                   kary._kary_kernel, partial(kary._kary_kernel, channels=3), ramp._ramp_kernel,

@@ -118,3 +118,23 @@ def joint_bilateral(distance: np.ndarray, sigma: np.ndarray, guide: np.ndarray, 
             rule = np.linalg.solve(plane.T @ (w.ravel()[:, None] * plane), plane.T * w.ravel())[0]
             out[r, c], spread[r, c] = rule @ d.ravel(), np.sqrt((rule**2) @ v.ravel())
     return out, spread
+
+
+def time_posterior(counts: np.ndarray, background: float, sigma_bins: float, peak: float, reach: float, *, pulses: int | None = None
+                   ) -> tuple[float, float]:
+    """Mean and standard deviation of a return's time with a flat prior within `reach` bins of the peak, by trying times and strengths."""
+    edges, times = np.arange(len(counts) + 1), np.linspace(peak - reach, peak + reach, 2001)
+    part = np.diff(ndtr((edges - times[:, None]) / sigma_bins), axis=1)
+    strengths = np.maximum(counts.sum() - background * len(counts), 1.0) * np.geomspace(0.3, 10.0, 150)
+    best = np.full(len(times), -np.inf)
+    for strength in strengths:
+        mean = background + strength * part
+        if pulses is None:
+            likelihood = counts @ np.log(mean).T - mean.sum(axis=1)
+        else:
+            left = pulses - np.concatenate([[0.0], np.cumsum(counts)[:-1]])
+            likelihood = counts @ np.log(-np.expm1(-mean / pulses)).T - mean @ (left - counts) / pulses
+        best = np.maximum(best, likelihood)
+    weight = np.exp(best - best.max())
+    middle = np.average(times, weights=weight)
+    return float(middle), float(np.sqrt(np.average((times - middle) ** 2, weights=weight)))

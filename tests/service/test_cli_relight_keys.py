@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from service.pipelines.relighting.keys import SCHEMA, LightKeys, span, swung
+from service.light_keys import SCHEMA, LightKeys, span, swung
 from stage import exr
 from tests.captures import files_in, make_scene, write_capture, write_exr
 

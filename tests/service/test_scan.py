@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 
+import laspy
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom
@@ -70,12 +71,42 @@ def test_shots_outside_the_track_or_the_span_are_left_out_and_counted(tmp_path):
         scan(ScanRequest(scan=folder, out=tmp_path / "out", near_m=100, device="cpu"))
 
 
+def test_las_holds_the_points_of_the_scan(tmp_path):
+    n = 100
+    view = View(np.linspace(2, 6, n)[None], np.full((1, n), 0.9), np.ones((1, n)))
+    np.save(tmp_path / "w.npy", histogram(view, 2e5, seed=0, second=(2.5, 0.5))[0])
+    folder = write(tmp_path, ring(n)[:, :3], waveforms={"file": "w.npy", "bin_s": 1.5e-9})
+    result = scan(ScanRequest(scan=folder, out=tmp_path / "out", las=True, device="cpu"))
+    las = laspy.read(result.las_path)
+    scales = json.loads(result.report_path.read_text())["found"]["las"]
+    np.testing.assert_allclose(las.xyz, result.cloud.points, atol=0.5 * scales["scale_m"] + 1e-6)  # half a step, and float32 of the cloud
+    np.testing.assert_allclose(las.intensity * scales["intensity_scale"], result.cloud.intensity, atol=scales["intensity_scale"])
+    times, counts = np.unique(las.gps_time, return_counts=True)
+    np.testing.assert_array_equal(times, np.linspace(0, 1, n))
+    assert (counts == 2).all() and (las.number_of_returns == 2).all()
+    near = np.linalg.norm(las.xyz[las.return_number == 1], axis=1)
+    assert np.median(np.abs(np.sort(near) - view.distance[0])) < 0.02
+
+
+def test_las_is_left_out_where_it_is_not_asked_for(tmp_path):
+    result = scan(ScanRequest(scan=write(tmp_path, ring()), out=tmp_path / "out", device="cpu"))
+    assert result.las_path is None and not (tmp_path / "out" / "points.las").exists()
+
+
+def test_las_without_laspy_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "laspy", None)
+    with pytest.raises(RequestError, match=r"pip install 'relit\[las\]'"):
+        scan(ScanRequest(scan=write(tmp_path, ring()), out=tmp_path / "out", las=True, device="cpu"))
+    assert not (tmp_path / "out").exists()
+
+
 def test_the_command_prints_where_everything_is(tmp_path):
     write(tmp_path, ring())
-    command = [sys.executable, "-m", "service.cli.main", "scan", str(tmp_path), "--out", str(tmp_path / "o"), "--device", "cpu"]
+    command = [sys.executable, "-m", "service.cli.main", "scan", str(tmp_path), "--out", str(tmp_path / "o"), "--las",
+               "--device", "cpu"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
-    assert "points.ply" in done.stdout and "points.usdc" in done.stdout and "360 points" in done.stdout
+    assert "points.ply" in done.stdout and "points.usdc" in done.stdout and "points.las" in done.stdout and "360 points" in done.stdout
     command[4] = str(tmp_path / "no")
     missing = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert missing.returncode == 2 and "holds no scan.json" in missing.stderr

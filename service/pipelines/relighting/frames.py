@@ -1,4 +1,4 @@
-"""Which frames are asked for, where they go, and which of them are there already."""
+"""Where frames go, and which of them are there already."""
 
 import hashlib
 import json
@@ -13,38 +13,10 @@ from service.errors import RequestError
 from stage import exr
 from stage.errors import StageError, StorageError
 
-MAX_FRAMES = 100_000
-"""Over an hour of film; more is a slip of the finger that would fill the memory before the first frame."""
 ARITHMETIC = 1
 """Raised when frames of the same request come out otherwise, so that older ones are made anew."""
 REQUEST_ATTRIBUTE = "relit:request"
 """Of a frame: the hash of all that its pixels depend on."""
-
-
-def frame_numbers(text: str | None, steps: int) -> list[int]:
-    """`7` or `1-24` as numbers.
-
-    Args:
-        text: None: 1, or 1 to the number of steps.
-        steps: captures of the sequence, each of which gives one frame; 1 for a single capture, which gives any number.
-
-    Raises:
-        RequestError: not that form, backwards, more than MAX_FRAMES, or not one frame a step.
-    """
-    match = re.fullmatch(r"(\d+)(?:-(\d+))?", text.strip() if text is not None else f"1-{steps}")
-    if match is None:
-        raise RequestError(f"--frames {text}: give a number, or first-last such as 1-24")
-    first = int(match[1])
-    last = int(match[2]) if match[2] is not None else first
-    count = last - first + 1
-    if last < first:
-        raise RequestError(f"--frames {text}: runs backwards: give {last}-{first}")
-    if count > MAX_FRAMES:
-        raise RequestError(f"--frames {text}: asks for {count} frames: {MAX_FRAMES} at most in one run")
-    if steps > 1 and count != steps:
-        raise RequestError(f"--frames {text}: asks for {count} frames, the sequence has {steps} captures: "
-                           f"each gives one frame, such as {first}-{first + steps - 1}")
-    return list(range(first, last + 1))
 
 
 def frame_path(pattern: str, number: int) -> Path:

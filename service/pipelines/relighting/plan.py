@@ -4,9 +4,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+from service.errors import RequestError
+from service.frame_range import frame_numbers, part_of
+from service.light_keys import LightKeys
 from service.pipelines.relighting.environments import Environments
-from service.pipelines.relighting.frames import check_folders, frame_numbers, frame_path, refuse_inputs
-from service.pipelines.relighting.keys import LightKeys
+from service.pipelines.relighting.frames import check_folders, frame_path, refuse_inputs
 from service.pipelines.relighting.layers import check_layers, maps_file
 from service.pipelines.relighting.schedule import FrameLighting, schedule
 from service.pipelines.relighting.sequence import capture_files, time_steps
@@ -29,6 +31,7 @@ class Plan(NamedTuple):
     folders: tuple[Path, ...]
     """One capture, or one a time step."""
     frames: tuple[PlannedFrame, ...]
+    """That this run makes."""
     environments: Environments | None
     keys: LightKeys | None
 
@@ -42,8 +45,8 @@ class Plan(NamedTuple):
         if not self.is_sequence:
             yield self.folders[0], self.frames
             return
-        for folder, frame in zip(self.folders, self.frames, strict=True):
-            yield folder, (frame,)
+        for frame in self.frames:
+            yield self.folders[frame.place], (frame,)
 
 
 def make_plan(request: RelightRequest) -> Plan:
@@ -57,9 +60,12 @@ def make_plan(request: RelightRequest) -> Plan:
     folders = time_steps(request.capture)
     numbers = frame_numbers(request.frames, len(folders))
     paths = [frame_path(request.out, number) for number in numbers]
+    made = range(numbers[0], numbers[-1] + 1) if request.only is None else part_of(numbers, request.only)
     outputs = [(f"--out {request.out}", path) for path in paths]
     check_layers(request.aov, request.maps)
     if request.sheet is not None:
+        if request.only is not None:
+            raise RequestError(f"--sheet {request.sheet} shows the whole range, --only {request.only} makes a part of it: give one of them")
         check_sheet(request.sheet)
         outputs.append((f"--sheet {request.sheet}", request.sheet))
     if request.report is not None:
@@ -80,5 +86,5 @@ def make_plan(request: RelightRequest) -> Plan:
 
     refuse_inputs(outputs, inputs())
     check_folders(path for _, path in outputs)
-    return Plan(tuple(folders), tuple(PlannedFrame(*planned) for planned in zip(paths, lighting, range(len(paths)), strict=True)),
-                environments, keys)
+    planned = (PlannedFrame(*frame) for frame in zip(paths, lighting, range(len(paths)), strict=True))
+    return Plan(tuple(folders), tuple(frame for frame in planned if frame.lighting.number in made), environments, keys)

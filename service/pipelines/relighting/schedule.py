@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from service.errors import RequestError
+from service.light_keys import CapturedTrack, EnvironmentKey, LightKeys, LightTrack, mixed, span, swung
 from service.pipelines.relighting.environments import Environments
-from service.pipelines.relighting.keys import CapturedTrack, EnvironmentKey, LightKeys, LightTrack, mixed, span, swung
 from service.requests import RelightRequest
 from stage.frames import rotation_about, rotation_about_y
 

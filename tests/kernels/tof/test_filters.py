@@ -74,11 +74,14 @@ def test_wrong_sizes_and_options_are_refused(device):
         mark_flying(*arrays, 2, 3, least_m=0.0)
     with pytest.raises(ArrayError, match="radius"):
         smooth(arrays[0], arrays[1], arrays[0], arrays[2], 2, 3, radius=0)
+    with pytest.raises(ArrayError, match="a slice with gaps"):
+        smooth(arrays[0][::2], arrays[1], arrays[0], arrays[2], 1, 3)
 
 
-def test_bilateral_is_that_of_the_twin(device):
+@pytest.mark.parametrize("cols", [24, 37, 64])  # rows of packs of eight pixels, of single ones, of the widest
+def test_bilateral_is_that_of_the_twin(cols, device):
     rng = np.random.default_rng(5)
-    rows, cols = 13, 37
+    rows = 13
     v, u = np.mgrid[0:rows, 0:cols]
     distance = (2 + 0.01 * u + np.where(u > 20, 1.0, 0) + rng.normal(0, 0.01, (rows, cols))).astype(np.float32)
     sigma = rng.uniform(0.005, 0.02, (rows, cols)).astype(np.float32)

@@ -2,17 +2,23 @@
 
 import numpy as np
 import pytest
+import warp as wp
 
 from kernels.errors import ArrayError
 from kernels.status import Status
 from kernels.tof.continuous import Noise, decode
 from kernels.tof.decide import decide
-from kernels.tof.unwrap import unwrap
+from kernels.tof.unwrap import decay, unwrap
 from kernels.tof.vote import vote
 from tests.reference import tof
 
 FAR = 14.98
 NOISE = Noise(1.0, 5.0)
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def decay_kernel(x: wp.array(dtype=wp.float32), found: wp.array(dtype=wp.float32)):
+    found[wp.tid()] = decay(x[wp.tid()])
 
 
 def solve(images, settings, device, *, far=FAR, near=0.0, noise=NOISE, shape=None, **options):
@@ -132,3 +138,10 @@ def test_too_long_a_span_is_refused(device):
     settings = tof.even((20e6, 30e6), 4)
     with pytest.raises(ArrayError, match=r"repeat after 14.99 m"):
         solve(tof.correlations(flat_view(np.array([1.0])), 1e5, settings), settings, device, far=20.0)
+
+
+def test_decay_is_the_exponential(device):
+    x = np.concatenate([np.linspace(0, 80, 100_001), [80.0, 200.0, 1e20]]).astype(np.float32)
+    found = wp.empty(len(x), dtype=wp.float32, device=device)
+    wp.launch(decay_kernel, dim=len(x), inputs=[wp.array(x, device=device)], outputs=[found], device=device)
+    np.testing.assert_allclose(found.numpy(), np.exp(-np.minimum(x.astype(float), 80)), rtol=3e-7)  # the series 1.2e-7, the rest float32

@@ -1,0 +1,76 @@
+"""What every route is given: the service behind the app, who asks, and the token of a request that creates something."""
+
+from collections.abc import Callable
+from typing import Annotated, Any, NamedTuple
+
+import sqlalchemy as sa
+from fastapi import Depends, Header, Request, Security
+from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+
+from service.api.limits import Limiter
+from service.api.problems import ApiError
+from service.jobs.queue import JobQueue
+from service.settings import Settings
+from service.storage.folder import Storage
+from service.store import idempotency, keys
+from service.store.database import Database
+from service.store.keys import Caller, Scope
+
+DEFAULT_PROJECT = "default"
+ANONYMOUS = Caller(DEFAULT_PROJECT, Scope.ADMIN, None)
+
+
+class Service(NamedTuple):
+    """Behind the app."""
+
+    settings: Settings
+    database: Database
+    queue: JobQueue
+    storage: Storage
+    limiter: Limiter
+
+
+def service_of(request: Request) -> Service:
+    """The service of the app that got the request."""
+    found: Service = request.app.state.service
+    return found
+
+
+Behind = Annotated[Service, Depends(service_of)]
+bearer = HTTPBearer(auto_error=False, scheme_name="key", description="A key of `relit keys create`.")
+
+
+def caller_of(behind: Behind, given: Annotated[HTTPAuthorizationCredentials | None, Security(bearer)]) -> Caller:
+    """Who asks, within the limits of the key."""
+    caller = ANONYMOUS if behind.settings.anonymous else None
+    if given is not None:
+        caller = keys.find(behind.database, given.credentials)
+    if caller is None:
+        raise ApiError("unauthenticated", "give a key that is valid as Authorization: Bearer KEY", headers={"WWW-Authenticate": "Bearer"})
+    behind.limiter.take(caller.key)
+    return caller
+
+
+def _scoped(scope: Scope) -> Callable[[Caller], Caller]:
+    def check(caller: Annotated[Caller, Depends(caller_of)]) -> Caller:
+        if not caller.may(scope):
+            raise ApiError("forbidden", f"the key has the scope {caller.scope}, this needs {scope}")
+        return caller
+
+    return check
+
+
+Reader = Annotated[Caller, Depends(_scoped(Scope.READ))]
+Writer = Annotated[Caller, Depends(_scoped(Scope.WRITE))]
+Admin = Annotated[Caller, Depends(_scoped(Scope.ADMIN))]
+IdempotencyKey = Annotated[str | None, Header(
+    alias="Idempotency-Key", min_length=1, max_length=255, pattern=r"^[\x21-\x7e]+$",
+    description="Chosen by the client: the same request sent again with it creates nothing again.")]
+
+
+def once(behind: Service, caller: Caller, token: str | None, asked: Any, make: Callable[[sa.Connection], str]) -> tuple[str, bool]:
+    """Create something, once for an Idempotency-Key; arguments as `idempotency.once`."""
+    try:
+        return idempotency.once(behind.database, caller.project, token, asked, make)
+    except idempotency.TokenReused:
+        raise ApiError("invalid", f"Idempotency-Key {token}: came with another request before: choose a new one") from None

@@ -1,0 +1,60 @@
+"""relit serve and relit worker: the service, and a worker beside it."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+ConfigOption = Annotated[Path | None, typer.Option("--config", metavar="FILE.toml", show_default=False,
+                                                   help="Settings; docs/service.md lists them. RELIT_… in the environment goes first.")]
+DataOption = Annotated[Path | None, typer.Option("--data", metavar="DIR", show_default=False,
+                                                 help="Folder of the service; without it ./relit-data.")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    app.command("serve")(serve)
+    app.command("worker")(worker)
+
+
+def serve(
+    data: DataOption = None,
+    config: ConfigOption = None,
+    host: Annotated[str | None, typer.Option("--host", help="Address to listen on.", show_default=False)] = None,
+    port: Annotated[int | None, typer.Option("--port", help="Port to listen on; 0 takes a free one.", show_default=False)] = None,
+    anonymous: Annotated[bool | None, typer.Option(
+        "--anonymous/--keys-only", show_default=False, help="Let requests without a key in, on loopback addresses alone.")] = None,
+    device: Annotated[list[str] | None, typer.Option(
+        "--device", help="A worker on this device, again for more; none: no worker. Without it every GPU, else the CPU.",
+        show_default=False)] = None,
+) -> None:
+    """The service: the API, and a worker on each device."""
+    from service.server import serve as run
+
+    run(settings_of(config, data=data, host=host, port=port, anonymous=anonymous, devices=tuple(device) if device else None))
+
+
+def worker(
+    device: Annotated[str | None, typer.Option("--device", help="cpu, cuda:1, …; without it the first GPU, else the CPU.",
+                                               show_default=False)] = None,
+    data: DataOption = None,
+    config: ConfigOption = None,
+) -> None:
+    """A worker more, on any machine that sees the database and the storage."""
+    from service.server import work as run
+
+    run(settings_of(config, data=data), device)
+
+
+def settings_of(config: Path | None, **given: Any) -> Any:
+    """The settings, with what was given on the command line."""
+    import os
+
+    from service.errors import RequestError
+    from service.settings import Settings
+
+    if config is not None:
+        if not config.is_file():
+            raise RequestError(f"--config {config}: there is no such file")
+        os.environ["RELIT_CONFIG"] = str(config)
+    return Settings(**{name: value for name, value in given.items() if value is not None})

@@ -1,0 +1,55 @@
+"""Ranges of frame numbers as text: `7`, `1-24`."""
+
+import re
+
+from service.errors import RequestError
+
+MAX_FRAMES = 100_000
+"""Over an hour of film; more is a slip of the finger that would fill the memory before the first frame."""
+
+
+def frame_numbers(text: str | None, steps: int) -> list[int]:
+    """`7` or `1-24` as numbers.
+
+    Args:
+        text: None: 1, or 1 to the number of steps.
+        steps: captures of the sequence, each of which gives one frame; 1 for a single capture, which gives any number.
+
+    Raises:
+        RequestError: not that form, backwards, more than MAX_FRAMES, or not one frame a step.
+    """
+    first, last = _ends("--frames", text if text is not None else f"1-{steps}")
+    count = last - first + 1
+    if count > MAX_FRAMES:
+        raise RequestError(f"--frames {text}: asks for {count} frames: {MAX_FRAMES} at most in one run")
+    if steps > 1 and count != steps:
+        raise RequestError(f"--frames {text}: asks for {count} frames, the sequence has {steps} captures: "
+                           f"each gives one frame, such as {first}-{first + steps - 1}")
+    return list(range(first, last + 1))
+
+
+def part_of(numbers: list[int], text: str) -> range:
+    """A part of a range of frames, in the same form.
+
+    Args:
+        numbers: of the whole range, one after the other.
+        text: `7` or `1-24`.
+
+    Raises:
+        RequestError: not that form, or not within the range.
+    """
+    first, last = _ends("--only", text)
+    if first < numbers[0] or last > numbers[-1]:
+        raise RequestError(f"--only {text}: lies outside the frames {numbers[0]}-{numbers[-1]}")
+    return range(first, last + 1)
+
+
+def _ends(option: str, text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"(\d{1,9})(?:-(\d{1,9}))?", text.strip())
+    if match is None:
+        raise RequestError(f"{option} {text}: give a number, or first-last such as 1-24")
+    first = int(match[1])
+    last = int(match[2]) if match[2] is not None else first
+    if last < first:
+        raise RequestError(f"{option} {text}: runs backwards: give {last}-{first}")
+    return first, last

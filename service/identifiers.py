@@ -1,0 +1,30 @@
+"""Identifiers of what the service keeps: a prefix that says what it is, and 20 random letters and digits."""
+
+import secrets
+from typing import Annotated
+
+from pydantic import StringConstraints
+
+ALPHABET = "0123456789abcdefghjkmnpqrstvwxyz"
+"""Crockford's base 32 in small letters: none that are mistaken for another."""
+LENGTH = 20
+PROJECT_PATTERN = r"^[a-z0-9][a-z0-9-]{0,62}$"
+
+CAPTURE, ENVIRONMENT, UPLOAD, JOB, KEY = "cap", "env", "up", "job", "key"
+
+
+def new_id(prefix: str) -> str:
+    """A new identifier: 100 random bits."""
+    return f"{prefix}_" + "".join(secrets.choice(ALPHABET) for _ in range(LENGTH))
+
+
+def pattern(prefix: str) -> str:
+    """The regular expression of the identifiers with a prefix."""
+    return f"^{prefix}_[{ALPHABET}]{{{LENGTH}}}$"
+
+
+CaptureId = Annotated[str, StringConstraints(pattern=pattern(CAPTURE))]
+EnvironmentId = Annotated[str, StringConstraints(pattern=pattern(ENVIRONMENT))]
+UploadId = Annotated[str, StringConstraints(pattern=pattern(UPLOAD))]
+JobId = Annotated[str, StringConstraints(pattern=pattern(JOB))]
+Project = Annotated[str, StringConstraints(pattern=PROJECT_PATTERN)]

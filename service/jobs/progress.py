@@ -1,0 +1,71 @@
+"""What a running step tells the store, and how it learns that it is to stop."""
+
+import threading
+import time
+from collections.abc import Callable
+
+from service.store import jobs
+from service.store.database import Database
+
+EVERY_S = 0.5
+"""How often the store is told and asked."""
+FRAMES = "frames"
+"""The stage of a relight that counts frames."""
+
+
+class Stopped(Exception):
+    """The job was cancelled, or is another worker's now."""
+
+
+class JobProgress:
+    """A Progress of one step: tells the store, renews the deadline, and stops the step where the job is not wanted any more."""
+
+    def __init__(self, database: Database, job: str, attempt: int, *, alive: Callable[[], None], before: int = 0,
+                 of: int | None = None) -> None:
+        """Prepare.
+
+        Args:
+            database: the store's.
+            job, attempt: what is worked on.
+            alive: called at every sign of progress.
+            before: frames of steps before this one.
+            of: frames of the whole job; None: it makes none.
+        """
+        self._database, self._job, self._attempt = database, job, attempt
+        self._alive, self._before, self._of = alive, before, of
+        self._lock = threading.Lock()  # several threads of a pipeline may report
+        self._told_at = 0.0
+        self._stage, self._offset, self._total, self._began = "begin", 0, 0, time.monotonic()
+        self._opening = self._stopped = False
+
+    def stage(self, name: str, total: int) -> None:
+        """Begin a stage."""
+        with self._lock:
+            self._began, self._told_at = time.monotonic(), 0.0
+            self._opening = self._of is not None and name != FRAMES and self._before > 0
+            if self._of is not None and (name == FRAMES or self._before > 0):  # so that frames are never counted backwards
+                self._stage, self._offset, self._total = FRAMES, self._before, self._of
+            else:
+                self._stage, self._offset, self._total = name, 0, total
+        self.advance(0)
+
+    def advance(self, done: int) -> None:
+        """Tell the store, at most twice a second.
+
+        Raises:
+            Stopped: the job is not wanted any more.
+        """
+        self._alive()
+        with self._lock:
+            if self._stopped:
+                raise Stopped
+            now = time.monotonic()
+            if now - self._told_at < EVERY_S:
+                return
+            self._told_at = now
+            spent = now - self._began
+            counted = 0 if self._opening else done
+            progress = jobs.Progress(self._stage, self._offset + counted, self._total, counted / spent if counted and spent > 0 else None)
+            self._stopped = not jobs.advance(self._database, self._job, self._attempt, progress)
+            if self._stopped:
+                raise Stopped

@@ -1,0 +1,108 @@
+"""A worker: one process, one device, one job at a time; ended by a signal it finishes its step and hands the job back."""
+
+import os
+import secrets
+import signal
+import socket
+import threading
+from multiprocessing import parent_process
+from multiprocessing.sharedctypes import Synchronized
+from pathlib import Path
+
+from dbos import DBOS, DBOSConfig
+
+from service import log
+from service.jobs.presence import presence
+from service.jobs.queue import CHECKS, SERIALIZER, VERSION, WORK, JobQueue, prepare
+from service.jobs.steps import Site
+from service.jobs.takeover import Takeover
+from service.jobs.workflow import Desk
+from service.log import logger
+from service.settings import Settings
+from service.storage.open import open_storage
+from service.store import workers
+from service.store.database import connect
+
+POLL_S = 0.25
+"""How often a queue is asked for work."""
+APPLICATION = "relit"
+DEPOSED = 3
+"""Exit code of a worker that lost its lock."""
+
+
+def run_worker(settings: Settings, device: str, alive: "Synchronized[float]") -> None:
+    """Work until SIGTERM or the end of the parent process.
+
+    Args:
+        settings: of the service.
+        device: cpu, cuda:0, …
+        alive: set to the oldest last sign of progress of the running steps (monotonic seconds), 0 while nothing runs.
+    """
+    ending = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: ending.set())
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # of a terminal it comes to the supervisor too, which ends us in its order
+    _end_with_parent(ending)
+    log.configure(settings.log_level, settings.log_format)
+    database = connect(settings.sqlalchemy_url)
+    prepare(settings, database)
+    host = socket.gethostname()
+    name = f"{host}-{device.replace(':', '')}-{os.getpid()}-{secrets.token_hex(4)}"
+    lock = presence(database, settings.data / "locks", name)
+    if not lock.hold():
+        raise RuntimeError(f"the lock of {name} is held by another")  # the name is random
+    queue = JobQueue(database)
+    site = Site(database, open_storage(settings), cache_folder(settings), device, settings.max_pixels)
+    desk = Desk(site, name, alive=lambda oldest: _set(alive, oldest))
+    config: DBOSConfig = {
+        "name": APPLICATION, "system_database_url": settings.sqlalchemy_url, "system_database_engine": database.engine,
+        "application_version": VERSION, "executor_id": name, "serializer": SERIALIZER, "log_level": "ERROR", "run_migrations": False,
+        "use_listen_notify": False,
+    }
+    DBOS(config=config)
+    desk.register()
+    takeover = Takeover(database, queue, lock, name, every_s=settings.takeover_s, max_lost=settings.max_lost, deposed=_depose)
+    DBOS.launch()
+    for waiting in (WORK, CHECKS):
+        DBOS.register_queue(waiting, worker_concurrency=1, polling_interval_sec=POLL_S)
+    workers.appear(database, name, host=host, pid=os.getpid(), device=device)
+    takeover.start()
+    logger.info("worker ready", worker=name, device=device)
+    ending.wait()
+    logger.info("worker drains", worker=name)
+    workers.see(database, name, workers.DRAINING)
+    if not desk.drain(settings.drain_s):
+        logger.warning("step is given up", worker=name, after_s=settings.drain_s)
+    takeover.stop()
+    for workflow in queue.taken_by().get(name, []):
+        queue.hand_back(workflow)
+    workers.leave(database, name)
+    lock.close()
+    logger.info("worker ended", worker=name)
+    os._exit(0)  # threads of the queue wait in steps that will not begin
+
+
+def cache_folder(settings: Settings) -> Path:
+    """Of this machine's stack caches."""
+    return settings.data / "cache"
+
+
+def _set(alive: "Synchronized[float]", oldest: float) -> None:
+    alive.value = oldest
+
+
+def _depose() -> None:
+    logger.error("another has taken over: this worker ends")
+    os._exit(DEPOSED)
+
+
+def _end_with_parent(ending: threading.Event) -> None:
+    """A worker does not outlive the process that looks after it by more than a step."""
+    parent = parent_process()
+    if parent is None:
+        return
+
+    def watch() -> None:
+        parent.join()
+        ending.set()
+
+    threading.Thread(target=watch, name="relit-parent", daemon=True).start()

@@ -1,0 +1,1 @@
+"""Where captures and results lie: the data folder, or an object store."""

@@ -1,0 +1,1 @@
+"""What the service remembers, in one SQL database: keys, captures, uploads, jobs, workers."""

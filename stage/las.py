@@ -1,0 +1,104 @@
+"""Point clouds of scans as LAS 1.4, for surveying and lidar tools, through laspy: `pip install 'relit[las]'`."""
+
+import json
+from importlib.util import find_spec
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from stage.errors import ResultError
+from stage.files import replacing
+
+LAS_FILE = "points.las"
+POINT_FORMAT = 6
+"""Place, intensity, return of the shot, time: the plainest of LAS 1.4."""
+LEAST_SCALE_M = 1e-4
+"""Of the whole numbers that LAS holds coordinates in; grows by tens where the cloud is too large for it."""
+LARGEST_NUMBER = 2**31 - 1
+LARGEST_INTENSITY = 2**16 - 1
+RECORD_OWNER, RECORD_ID = "relit", 1
+"""Of the record that holds the scale of intensity, and provenance, as JSON."""
+MOST_RETURNS = 15
+"""LAS counts no more of a shot."""
+COORDINATES = ('LOCAL_CS["world of the scan",LOCAL_DATUM["world of the scan",0],UNIT["metre",1],'
+               'AXIS["x",OTHER],AXIS["y",OTHER],AXIS["z",OTHER]]')
+"""LAS 1.4 wants its coordinates named: they are those of the platform's track, and no map's."""
+
+
+class LasScales(NamedTuple):
+    """What the whole numbers of a LAS file stand for."""
+
+    scale_m: float
+    offset_m: tuple[float, float, float]
+    intensity_scale: float
+    """Intensity is this times the file's."""
+
+
+def las_is_installed() -> bool:
+    """Whether laspy is at hand."""
+    return find_spec("laspy") is not None
+
+
+def write_las(points: np.ndarray, intensity: np.ndarray, time_s: np.ndarray, shot: np.ndarray, range_m: np.ndarray, path: str | Path, *,
+              provenance: dict[str, str] | None = None) -> LasScales:
+    """Write the points of a scan, whole or not at all.
+
+    Args:
+        points: [n, 3] float64 metres, world: axes as they are, +y up where the track keeps it so.
+        intensity: [n], of which what is below zero becomes 0. Whole numbers that fit are kept, others scaled to the largest.
+        time_s: [n] of the shot, on the clock of the scan; stands as gps_time (GPS week time: seconds, no date).
+        shot: [n] which shot: its returns are numbered from the nearest, of those that are points.
+        range_m: [n] metres, which orders them.
+        path: of the file.
+        provenance: text, kept in a record beside the scale of intensity.
+
+    Returns:
+        Scale and offset of the coordinates, and scale of intensity.
+
+    Raises:
+        ResultError: there is no point.
+        StorageError: it cannot be written.
+
+    Source:
+        ASPRS, "LAS Specification 1.4 - R15", 2019: point data record format 6.
+    """
+    import laspy
+    from laspy.vlrs.known import WktCoordinateSystemVlr
+
+    if len(points) == 0:
+        raise ResultError(f"{path}: there is no point to write")
+    low, high = points.min(axis=0), points.max(axis=0)
+    offset = np.round(0.5 * (low + high))
+    reach = float(np.maximum(high - offset, offset - low).max())
+    scale = LEAST_SCALE_M * 10.0 ** max(0, int(np.ceil(np.log10(max(reach, 1e-9) / (LEAST_SCALE_M * LARGEST_NUMBER)))))
+    most = float(intensity.max())
+    whole = most <= LARGEST_INTENSITY and bool((intensity == np.rint(intensity)).all())
+    intensity_scale = 1.0 if whole or most <= 0 else most / LARGEST_INTENSITY
+
+    header = laspy.LasHeader(point_format=POINT_FORMAT, version="1.4")
+    header.creation_date = None  # equal scans make equal files
+    header.generating_software = "relit"
+    header.global_encoding.wkt = True
+    header.scales, header.offsets = np.full(3, scale), offset
+    notes = {"intensity_scale": intensity_scale, **(provenance or {})}
+    header.vlrs.append(WktCoordinateSystemVlr(COORDINATES))
+    header.vlrs.append(laspy.VLR(RECORD_OWNER, RECORD_ID, "scale of intensity, provenance", json.dumps(notes, sort_keys=True).encode()))
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = points.T
+    las.intensity = np.rint(np.clip(intensity / intensity_scale, 0, LARGEST_INTENSITY)).astype(np.uint16)
+    las.gps_time = time_s
+    number, count = _numbered(shot, range_m)
+    las.return_number, las.number_of_returns = np.minimum(number, MOST_RETURNS), np.minimum(count, MOST_RETURNS)
+    with replacing(path) as temporary:
+        las.write(str(temporary))
+    return LasScales(scale, (float(offset[0]), float(offset[1]), float(offset[2])), intensity_scale)
+
+
+def _numbered(shot: np.ndarray, range_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """[n] number of each point among those of its shot, 1 the nearest, and [n] how many these are."""
+    order = np.lexsort((range_m, shot))
+    _, group, counts = np.unique(shot, return_inverse=True, return_counts=True)
+    number = np.empty(len(shot), dtype=np.int64)
+    number[order] = np.arange(len(shot)) - np.repeat(np.cumsum(counts) - counts, counts) + 1
+    return number, counts[group]

@@ -1,0 +1,47 @@
+"""How well a photon histogram can tell range at all: the Cramér-Rao bound, to plan a pulsed camera and to judge a decoder."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from stage.tof.light_time import SPEED_OF_LIGHT
+from stage.tof.simulate import HistogramCamera, TofScene, histograms
+
+MEDIAN_PER_SIGMA = 0.674490
+"""Median of |error| over its standard deviation, of a normal error."""
+
+
+def range_bound_m(scene: TofScene, camera: HistogramCamera) -> np.ndarray:
+    """The least standard deviation that an unbiased estimate of each pixel's range can have.
+
+    With λ the mean of each bin, t the time of the return and s its photons, σ² ≥ 1/(F_tt - F_ts²/F_ss), F_xy = Σ λ_x·λ_y·w over the bins;
+    w is 1/λ for Poisson counts. Without background and with fine bins that is σ ≥ (c/2)·pulse_sigma_s/√s. Of N pulses that count one
+    photon at most, those still awake are the part a, and w is a/(N·(e^(λ/N) - 1)).
+
+    Args:
+        scene: range, albedo, cosine; the bound is that of the first return, with a second one known.
+        camera: bins, pulse, photons, background (taken as known), pulses.
+
+    Returns:
+        [rows, cols] float64 metres; infinite where no light of the return falls into the histogram.
+
+    Source:
+        Bar-David, "Communication under the Poisson regime", IEEE Trans. Information Theory 15(1), 1969; Kay, "Fundamentals of
+        Statistical Signal Processing: Estimation Theory", 1993, section 3.7 (an unknown that is not asked for).
+    """
+    mean = histograms(scene, replace(camera, pulses=None))
+    edges = camera.start_s + camera.bin_s * np.arange(camera.bins + 1)
+    range_m, signal = scene.returns(camera.signal_photons)[0]
+    away = (edges - 2 * range_m[..., None] / SPEED_OF_LIGHT) / camera.pulse_sigma_s
+    by_time = -signal[..., None] * np.diff(np.exp(-0.5 * away**2), axis=-1) / (camera.pulse_sigma_s * (2 * np.pi) ** 0.5)
+    only = histograms(replace(scene, second_part=0.0), replace(camera, pulses=None, background=0.0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if camera.pulses is None:
+            weight = 1 / mean
+        else:
+            awake = np.exp(-(np.cumsum(mean, axis=-1) - mean) / camera.pulses)
+            weight = awake / (camera.pulses * np.expm1(mean / camera.pulses))
+        weight = np.where(mean > 0, weight, 0)
+        tt, ts, ss = ((a * b * weight).sum(axis=-1) for a, b in ((by_time, by_time), (by_time, only), (only, only)))
+        sigma_s = 1 / np.sqrt(np.maximum(tt - np.where(ss > 0, ts**2 / ss, 0), 0))
+    return 0.5 * SPEED_OF_LIGHT * sigma_s

@@ -1,0 +1,72 @@
+"""A real server process for tests: `relit serve` on a free port, its log in a file."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx2
+
+START_S = 60.0
+
+
+class Server:
+    """A server that runs."""
+
+    def __init__(self, process: subprocess.Popen[str], url: str, data: Path, log: Path) -> None:
+        self.process, self.url, self.data, self.log = process, url, data, log
+
+    def client(self, key: str | None = None) -> httpx2.Client:
+        headers = {} if key is None else {"Authorization": f"Bearer {key}"}
+        return httpx2.Client(base_url=self.url, headers=headers, timeout=60)
+
+    def wait(self, client: httpx2.Client, path: str, until: tuple[str, ...], timeout_s: float = 120.0) -> dict:
+        """Look at something until its state is one of these."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            found = client.get(path).raise_for_status().json()
+            if found["state"] in until:
+                return found
+            assert time.monotonic() < deadline, f"{path} is still {found['state']}: {self.log.read_text()[-4000:]}"
+            time.sleep(0.1)
+
+
+@contextmanager
+def serving(folder: Path, *options: str, **settings: str) -> Iterator[Server]:
+    """Start a server, and end it. `settings` without RELIT_, as text; options of `relit serve` beside --data and --port."""
+    folder.mkdir(parents=True, exist_ok=True)
+    log = folder / "log.txt"
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("RELIT_")}
+    environment |= {f"RELIT_{name.upper()}": value for name, value in settings.items()}
+    with open(log, "a") as errors:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "service.cli.main", "serve", "--data", str(folder / "data"), "--port", "0", *options],
+            stdout=subprocess.PIPE, stderr=errors, text=True, env=environment, start_new_session=True)
+    try:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        found = re.search(r"http://\S+:\d+", line)
+        assert found is not None, f"the server did not start: {line!r} {log.read_text()[-4000:]}"
+        server = Server(process, found[0], folder / "data", log)
+        deadline = time.monotonic() + START_S
+        while True:
+            try:
+                httpx2.get(f"{server.url}/v1/openapi.json", timeout=5)
+                break
+            except httpx2.TransportError:
+                assert process.poll() is None and time.monotonic() < deadline, log.read_text()[-4000:]
+                time.sleep(0.05)
+        yield server
+    finally:
+        if process.poll() is None:
+            process.send_signal(signal.SIGTERM)
+            try:
+                process.wait(90)
+            except subprocess.TimeoutExpired:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
