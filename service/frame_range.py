@@ -45,7 +45,7 @@ def part_of(numbers: list[int], text: str) -> range:
 
 
 def _ends(option: str, text: str) -> tuple[int, int]:
-    match = re.fullmatch(r"(\d{1,9})(?:-(\d{1,9}))?", text.strip())
+    match = re.fullmatch(r"(\d{1,18})(?:-(\d{1,18}))?", text.strip())
     if match is None:
         raise RequestError(f"{option} {text}: give a number, or first-last such as 1-24")
     first = int(match[1])

@@ -38,6 +38,10 @@ LONGEST_PART = 0.25
 """Of one side of the peak: the longest segment. The first is as long as the bound, each next one twice as long."""
 NEGLIGIBLE = 12.0
 """Log likelihood under the top at which a side of the peak ends: what lies beyond adds a hundred-thousandth."""
+HIGHEST = 30.0
+"""Log likelihood over the top that float32 holds: where the search stopped short of it."""
+STRENGTH_STEPS, SMALL_CHANGE = 6, 0.2
+"""Newton steps towards the best strength, and the part of it from which the rest of the likelihood is that of a parabola."""
 LEAST_DETERMINANT = 1e-9
 """Of two returns' information, in units of their photons: with less, float32 cannot tell what one takes from the other."""
 
@@ -101,7 +105,8 @@ def _slopes(pulse: Shape, i: int, t: float, s: float):
 @wp.func
 def _bounds(given: Recorded, pulse: Shape, k: int, p: int, found: int, b: float,
             position: wp.array2d(dtype=wp.float32), photons: wp.array2d(dtype=wp.float32)):
-    """Information about the time of return k, and how much larger its variance is because its nearest neighbour is unknown too."""
+    """Of return k: information about its time; how the logarithm of its best strength changes with it; and how much larger the variance is
+    because its nearest neighbour is unknown too."""
     t = position[k, p]
     s = photons[k, p]
     near = wp.int32(-1)
@@ -127,32 +132,41 @@ def _bounds(given: Recorded, pulse: Shape, k: int, p: int, found: int, b: float,
     alone = both[0, 0] * both[1, 1] - both[0, 1] * both[0, 1]
     if near >= 0 and wp.determinant(both) > LEAST_DETERMINANT and alone > 0.0:
         wider = wp.max(wp.inverse(both)[0, 0] * alone / both[1, 1], 1.0)
-    return wp.vec2f(both[0, 0] / per_photon, wider)
+    return wp.vec3f(both[0, 0] / per_photon, -both[0, 1] / wp.max(both[1, 1], 1.0e-30), wider)
 
 
 @wp.func
-def _best_gain(given: Recorded, pulse: Shape, t: float, k: int, p: int, found: int, b: float,
+def _best_gain(given: Recorded, pulse: Shape, t: float, along: float, k: int, p: int, found: int, b: float,
                position: wp.array2d(dtype=wp.float32), photons: wp.array2d(dtype=wp.float32)):
     """Log likelihood of return k at t with its best strength, less that where it was found: a difference that float32 can hold."""
     top = position[k, p]
     s = photons[k, p]
-    bins = given.counts.shape[0]
-    # the strength that leaves its photons in the histogram, then one step of scoring
-    inside = share_before(pulse, float(bins) - t) - share_before(pulse, -t)
-    was_inside = share_before(pulse, float(bins) - top) - share_before(pulse, -top)
-    strength = s * was_inside / wp.max(inside, 0.05)
-    gain = float(0.0)
-    gs = float(0.0)
-    ss = float(0.0)
-    for i in range(first_bin_of(pulse, wp.min(t, top)), end_bin_of(pulse, wp.max(t, top), bins)):
-        part = share_before(pulse, float(i + 1) - t) - share_before(pulse, float(i) - t)
-        was = share_before(pulse, float(i + 1) - top) - share_before(pulse, float(i) - top)
-        others = mean_of_bin(pulse, i, p, k, found, b, position, photons)
-        mean = others + strength * part
-        gain += likelihood_gain(given, i, p, others + s * was, mean)
-        gs += likelihood_slope(given, i, p, mean) * part
-        ss += information(given, i, p, mean) * part * part
-    return gain + 0.5 * gs * gs / wp.max(ss, 1.0e-30)
+    strength = s * wp.exp(wp.clamp(along * (t - top), -2.0, 2.0))
+    best = float(-1.0e30)
+    going = wp.int32(STRENGTH_STEPS)
+    while going > 0:
+        gain = float(0.0)
+        gs = float(0.0)
+        ss = float(0.0)
+        for i in range(first_bin_of(pulse, wp.min(t, top)), end_bin_of(pulse, wp.max(t, top), given.counts.shape[0])):
+            part = share_before(pulse, float(i + 1) - t) - share_before(pulse, float(i) - t)
+            was = share_before(pulse, float(i + 1) - top) - share_before(pulse, float(i) - top)
+            others = mean_of_bin(pulse, i, p, k, found, b, position, photons)
+            mean = others + strength * part
+            gain += likelihood_gain(given, i, p, others + s * was, mean)
+            gs += likelihood_slope(given, i, p, mean) * part
+            ss += information(given, i, p, mean) * part * part
+        change = gs / wp.max(ss, 1.0e-30) / strength
+        rest = 0.5 * gs * gs / wp.max(ss, 1.0e-30)
+        best = wp.max(best, gain)
+        going -= 1
+        if wp.abs(change) < SMALL_CHANGE:
+            best = gain + rest
+            going = 0
+        elif gain + rest < -NEGLIGIBLE:
+            going = 0
+        strength *= wp.exp(wp.clamp(change, -1.0, 1.0))
+    return best
 
 
 @wp.kernel(module="unique")
@@ -192,8 +206,8 @@ def _times_kernel(first: int,
                 for node in range(NODES + 1):
                     away = start + each * float(node)
                     if node > 0:
-                        gain = _best_gain(given, pulse, top + sign * away, k, p, found, b, position, photons)
-                        height = wp.exp(wp.min(gain, 30.0))
+                        gain = _best_gain(given, pulse, top + sign * away, known[1], k, p, found, b, position, photons)
+                        height = wp.exp(wp.min(gain, HIGHEST))
                     weight = each * height / 3.0
                     if node > 0 and node < NODES:
                         weight *= wp.where(node % 2 == 1, 4.0, 2.0)
@@ -206,4 +220,4 @@ def _times_kernel(first: int,
                     start = stop
         moved = once / wp.max(whole, 1.0e-30)
         mean[k, p] = top + moved
-        sigma[k, p] = wp.sqrt(wp.max(twice / wp.max(whole, 1.0e-30) - moved * moved, 0.0) * known[1])
+        sigma[k, p] = wp.sqrt(wp.max(twice / wp.max(whole, 1.0e-30) - moved * moved, 0.0) * known[2])

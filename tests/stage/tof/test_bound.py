@@ -39,13 +39,12 @@ def test_it_is_the_curvature_of_the_likelihood(pulses):
         return float((counts * np.log(-np.expm1(-mean / pulses)) - (left - counts) * mean / pulses).sum())
 
     range_m = float(WALL.range_m[0, 2])
-    strength, step = 4000 * 0.45 / range_m**2, np.array([1e-3, 1e-2])
+    here, steps = np.array([range_m, 4000 * 0.45 / range_m**2]), np.diag([1e-3, 1e-2])
     fisher = np.zeros((2, 2))
     for i in range(2):
         for j in range(2):
-            terms = [a * b * likelihood(range_m + step[0] * ((i == 0) * a + (j == 0) * b), strength + step[1] * ((i == 1) * a + (j == 1) * b))
-                     for a in (1, -1) for b in (1, -1)]
-            fisher[i, j] = -sum(terms) / (4 * step[i] * step[j])
+            terms = [a * b * likelihood(*(here + a * steps[i] + b * steps[j])) for a in (1, -1) for b in (1, -1)]
+            fisher[i, j] = -sum(terms) / (4 * steps[i, i] * steps[j, j])
     assert range_bound_m(WALL, camera)[0, 2] == pytest.approx(np.linalg.inv(fisher)[0, 0] ** 0.5, rel=1e-3)
 
 
