@@ -21,7 +21,6 @@ USER_ERRORS: tuple[type[Exception], ...] = (RequestError, ValidationError, Stage
 
 
 def sentence(error: BaseException) -> str:
-    """The one line to show."""
-    if isinstance(error, ValidationError):
-        return describe(error)
-    return " ".join(str(error).split())
+    """The one line to show: names of files and fields come into it as others wrote them, so what is not plain text is escaped."""
+    text = describe(error) if isinstance(error, ValidationError) else " ".join(str(error).split())
+    return "".join(character if character.isprintable() else ascii(character)[1:-1] for character in text)

@@ -55,11 +55,11 @@ def read_header(path: str | Path) -> Header:
     try:
         with OpenEXR.File(str(path), header_only=True) as file:
             attributes = dict(file.header())
-    except (RuntimeError, ValueError, TypeError) as error:
+        (left, top), (right, bottom) = attributes["dataWindow"]
+        names = tuple(channel.name for channel in attributes["channels"])
+        header = Header(int(right - left + 1), int(bottom - top + 1), names, attributes)
+    except (RuntimeError, ValueError, TypeError, KeyError) as error:
         raise ImageError(f"{path}: is damaged or truncated: its header cannot be read") from error
-    (left, top), (right, bottom) = attributes["dataWindow"]
-    names = tuple(channel.name for channel in attributes["channels"])
-    header = Header(int(right - left + 1), int(bottom - top + 1), names, attributes)
     missing = _missing_bytes(path, header)
     if missing:
         raise ImageError(f"{path}: is truncated: {missing} or more bytes are missing")
@@ -153,10 +153,9 @@ def _missing_bytes(path: str | Path, header: Header) -> int:
         stream.seek(8)  # magic number and version
         while _skip_attribute(stream):
             pass
-        table = stream.read(8 * chunks)
-        if len(table) < 8 * chunks:
-            return 8 * chunks - len(table)
-        offsets = struct.unpack(f"<{chunks}Q", table)
+        if stream.tell() + 8 * chunks > size:  # before so much memory is asked for: the header can claim any number
+            return stream.tell() + 8 * chunks - size
+        offsets = struct.unpack(f"<{chunks}Q", stream.read(8 * chunks))
         last = max(offsets)
         if min(offsets) < stream.tell() or last >= size:
             return max(1, last - size)  # the table is written last: zeros where the writer stopped early
@@ -182,7 +181,7 @@ def _skip_attribute(stream: Any) -> bool:
         return False
     _text(stream)
     size = stream.read(4)
-    if len(size) < 4:
+    if len(size) < 4 or size[3] & 0x80:  # negative
         return False
     stream.seek(struct.unpack("<i", size)[0], 1)
     return True

@@ -46,6 +46,14 @@ def write_text(path: str | Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
+def resolved(path: Path) -> Path | None:
+    """Where a path leads, links followed; None where it leads nowhere: in a circle, or to a name that cannot be."""
+    try:
+        return path.resolve()
+    except (OSError, RuntimeError, ValueError):
+        return None
+
+
 def _umask() -> int:
     with _umask_lock:  # reading sets it to 0 for a moment, which another thread must not take for the umask
         current = os.umask(0)

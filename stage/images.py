@@ -19,6 +19,7 @@ class ImageHeader(NamedTuple):
     width: int
     height: int
     channels: int  # 1 grey, 3 RGB; alpha is not counted
+    stored: int  # all that the file holds, which are decoded together
 
 
 def read_header(path: str | Path) -> ImageHeader:
@@ -31,7 +32,7 @@ def read_header(path: str | Path) -> ImageHeader:
     suffix = Path(path).suffix.lower()
     if suffix == ".exr":
         header = exr.read_header(path)
-        return ImageHeader(header.width, header.height, len(_colour_channels(path, header.channels)))
+        return ImageHeader(header.width, header.height, len(_colour_channels(path, header.channels)), len(header.channels))
     if suffix not in OIIO_SUFFIXES:
         raise ImageError(f"{path}: has an unknown suffix: relit reads {', '.join(sorted(SUFFIXES))}")
     if suffix == ".png":
@@ -39,7 +40,7 @@ def read_header(path: str | Path) -> ImageHeader:
     source = _open(path)
     try:
         spec = source.spec()
-        return ImageHeader(spec.width, spec.height, 1 if spec.nchannels < 3 else 3)
+        return ImageHeader(spec.width, spec.height, 1 if spec.nchannels < 3 else 3, spec.nchannels)
     finally:
         source.close()
 

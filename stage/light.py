@@ -4,7 +4,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from stage.model import Direction, LitRgb, Positive, Rgb, Strict, Text, Vector
+from stage.model import Direction, FirstFault, LitRgb, Positive, Rgb, Strict, Text, Vector
 
 
 class DistantLight(Strict):
@@ -37,9 +37,9 @@ class ExtendedLight(Strict):
     """An area source as samples of the sphere (photometric sampling, Nayar, Ikeuchi and Kanade 1990)."""
 
     type: Literal["extended"]
-    directions: Annotated[tuple[Direction, ...], Field(min_length=1)]
-    radiance: Annotated[tuple[Rgb, ...], Field(min_length=1)]
-    solid_angle: Annotated[tuple[Positive, ...], Field(min_length=1)]
+    directions: Annotated[tuple[Direction, ...], Field(min_length=1), FirstFault]
+    radiance: Annotated[tuple[Rgb, ...], Field(min_length=1), FirstFault]
+    solid_angle: Annotated[tuple[Positive, ...], Field(min_length=1), FirstFault]
     """Steradians of each sample."""
 
     @model_validator(mode="after")

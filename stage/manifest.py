@@ -11,7 +11,7 @@ from stage.camera import Camera
 from stage.colour import ColorSpaceName
 from stage.files import write_text
 from stage.light import Light
-from stage.model import Positive, Strict, Text
+from stage.model import FirstFault, Positive, Strict, Text
 from stage.pattern import Pattern
 from stage.projector import Projector
 from stage.ranging import Laser, TimeOfFlight
@@ -55,7 +55,7 @@ class Manifest(Strict):
     dark: FileName | None = None
     flat: FileName | None = None
     saturation: Positive | None = None
-    frames: Annotated[tuple[Frame, ...], Field(min_length=1)]
+    frames: Annotated[tuple[Frame, ...], Field(min_length=1), FirstFault]
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -1,5 +1,6 @@
 """The strict base of every manifest model: unknown keys are errors, numbers are finite, values are frozen."""
 
+import math
 from typing import Annotated
 
 import numpy as np
@@ -15,10 +16,12 @@ class Strict(BaseModel):
 
 
 def _unit(vector: tuple[float, float, float]) -> tuple[float, float, float]:
-    length = float(np.linalg.norm(vector))
-    if length == 0.0:
+    largest = max(abs(c) for c in vector)
+    if largest == 0.0:
         raise ValueError("has zero length: give a direction")
-    x, y, z = (float(c) / length for c in vector)
+    scaled = [math.ldexp(c, -math.frexp(largest)[1]) for c in vector]  # exactly, so that no square is beyond what a float holds
+    length = float(np.linalg.norm(scaled))
+    x, y, z = (c / length for c in scaled)
     return (x, y, z)
 
 
@@ -41,6 +44,8 @@ def _not_blank(text: str) -> str:
     return text
 
 
+FirstFault = Field(fail_fast=True)
+"""Of a list that may be long, the first fault is told alone: those of a million entries would fill the memory."""
 Text = Annotated[str, AfterValidator(_not_blank)]
 """A name: anything but nothing."""
 Vector = tuple[float, float, float]

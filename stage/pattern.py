@@ -4,7 +4,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from stage.model import Count, Positive, Rgb, Strict
+from stage.model import Count, FirstFault, Positive, Rgb, Strict
 
 Axis = Literal["column", "row"]
 Index = Annotated[int, Field(ge=0)]
@@ -38,8 +38,8 @@ class KaryPattern(Strict):
     digits: Count
     stripe_px: Positive = 1
     reflected: bool = False
-    levels: tuple[Level, ...] | None = None
-    colors: tuple[Rgb, ...] | None = None
+    levels: Annotated[tuple[Level, ...], FirstFault] | None = None
+    colors: Annotated[tuple[Rgb, ...], FirstFault] | None = None
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -5,7 +5,7 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from stage.camera import Distortion
-from stage.model import NotNegative, Positive, Resolution, Rgb, Strict, Transform
+from stage.model import FirstFault, NotNegative, Positive, Resolution, Rgb, Strict, Transform
 
 
 class Projector(Strict):
@@ -16,7 +16,7 @@ class Projector(Strict):
     principal_px: tuple[float, float] | None = None
     distortion: Distortion | None = None
     camera_from_projector: Transform
-    response: Annotated[tuple[NotNegative, ...], Field(min_length=2)] | None = None
+    response: Annotated[tuple[NotNegative, ...], Field(min_length=2), FirstFault] | None = None
     """Its light at so many even levels from 0 to 1, rising; None: linear. Written by `relit calibrate response`."""
     crosstalk: tuple[Rgb, Rgb, Rgb] | None = None
     """Rows: what the camera's red, green and blue see of the projector's red, green and blue; None: each its own."""

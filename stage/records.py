@@ -9,6 +9,8 @@ from pydantic import BaseModel, ValidationError
 from stage.errors import ManifestError, storage
 
 Record = TypeVar("Record", bound=BaseModel)
+MAX_KEYS = 1000
+"""Of one object: no schema has as many, and each that is not known would be told."""
 
 
 def read_record(path: str | Path, model: type[Record], schema: str) -> Record:
@@ -98,6 +100,8 @@ def _short(value: Any) -> str:
 
 
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    if len(pairs) > MAX_KEYS:
+        raise ValueError(f"an object has more than {MAX_KEYS} keys")
     result: dict[str, Any] = {}
     for key, value in pairs:
         if key in result:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from tokenize import TokenError
 from typing import TypeVar
 
 import numpy as np
@@ -151,7 +152,7 @@ def read_array(path: Path) -> np.ndarray:
     with storage("read", path):
         try:
             values = np.load(path, allow_pickle=False)
-        except (ValueError, EOFError) as error:
+        except (ValueError, EOFError, SyntaxError, TokenError, MemoryError) as error:  # its header is read as Python
             raise ImageError(f"{path}: is not a whole .npy array") from error
     if not isinstance(values, np.ndarray) or not (np.issubdtype(values.dtype, np.floating) or np.issubdtype(values.dtype, np.integer)):
         raise ImageError(f"{path}: is not an array of real numbers")

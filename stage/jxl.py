@@ -1,0 +1,68 @@
+"""The size of a JPEG XL image, from its first bytes: the library behind OpenImageIO decodes all pixels before it tells."""
+
+import struct
+from pathlib import Path
+
+from stage.errors import ImageError, storage
+
+CODESTREAM = b"\xff\x0a"
+CONTAINER = b"\x00\x00\x00\x0cJXL \r\n\x87\n"
+SIZE_BYTES = 16
+"""More than SizeHeader takes: 2 bytes of signature and 1 + 32 + 3 + 32 bits."""
+SIZE_BITS = (9, 13, 18, 30)
+"""Of a dimension less one, by its selector (ISO/IEC 18181-1, table of SizeHeader)."""
+RATIOS = {1: (1, 1), 2: (12, 10), 3: (4, 3), 4: (3, 2), 5: (16, 9), 6: (5, 4), 7: (2, 1)}
+"""Width to height, where the width is not written out."""
+
+
+def resolution(path: str | Path) -> tuple[int, int]:
+    """Width and height.
+
+    Raises:
+        ImageError: not a JPEG XL file.
+        StorageError: it cannot be read.
+    """
+    with storage("read", path), open(path, "rb") as stream:
+        start = stream.read(len(CONTAINER))
+        if start[:2] == CODESTREAM:
+            stream.seek(0)
+            return _size(path, stream.read(SIZE_BYTES))
+        if start != CONTAINER:
+            raise ImageError(f"{path}: is not a JPEG XL file")
+        end = Path(path).stat().st_size
+        while len(header := stream.read(8)) == 8:
+            length, kind = struct.unpack(">I4s", header)
+            begin = stream.tell()
+            if length == 1:
+                begin, length = begin + 8, int.from_bytes(stream.read(8), "big") - 8
+            if kind in (b"jxlc", b"jxlp"):
+                stream.seek(begin + (4 if kind == b"jxlp" else 0))  # behind the number of the part
+                return _size(path, stream.read(SIZE_BYTES))
+            if length < 8 or begin + length - 8 > end:
+                break
+            stream.seek(begin + length - 8)
+    raise ImageError(f"{path}: is damaged or truncated: its header cannot be read")
+
+
+def _size(path: str | Path, start: bytes) -> tuple[int, int]:
+    if start[:2] != CODESTREAM:
+        raise ImageError(f"{path}: is damaged or truncated: its header cannot be read")
+    bits, at = int.from_bytes(start[2:], "little"), 0
+
+    def take(count: int) -> int:
+        nonlocal at
+        value = bits >> at & (1 << count) - 1
+        at += count
+        return value
+
+    small = take(1)
+
+    def dimension() -> int:
+        return 8 * (1 + take(5)) if small else 1 + take(SIZE_BITS[take(2)])
+
+    height, ratio = dimension(), take(3)
+    across, down = RATIOS.get(ratio, (0, 1))
+    width = height * across // down if ratio else dimension()
+    if at > 8 * len(start[2:]):
+        raise ImageError(f"{path}: is damaged or truncated: its header cannot be read")
+    return width, height
