@@ -1,4 +1,4 @@
-"""The layout of the storage: what lies where, below the data folder or the prefix of an object store (docs/service.md).
+"""The layout of the storage: what lies where, below the data folder or the prefix of an object store (docs/service_storage.md).
 
 projects/PROJECT/captures/ID/…        an uploaded capture
 projects/PROJECT/environments/ID/…    an uploaded environment, one image
@@ -8,6 +8,8 @@ projects/PROJECT/jobs/ID/…            results: maps.exr, report.json, asset.us
 from service.identifiers import CAPTURE, ENVIRONMENT
 
 MAPS = "maps.exr"
+SOLVED = (MAPS, "depth.exr", "points.ply")
+"""What other jobs and later steps read of a solve or a depth."""
 FRAMES = "frame.####.exr"
 PICTURE = "picture.exr"
 ASSET = "asset"

@@ -3,7 +3,20 @@
 from service.settings import Settings
 from service.storage.folder import FolderStorage, Storage
 
+SCRATCH = "scratch"
+"""Folder of the data folder for copies of objects."""
+
 
 def open_storage(settings: Settings) -> Storage:
-    """Open the storage; nothing is written."""
-    return FolderStorage(settings.data)
+    """Open the storage; nothing is written into it.
+
+    Raises:
+        RequestError: storage_url cannot be used.
+    """
+    if settings.storage_url is None:
+        return FolderStorage(settings.data)
+    from service.storage.bucket import Bucket
+    from service.storage.objects import ObjectStorage
+    from service.storage.scratch import Scratch
+
+    return ObjectStorage(Bucket(settings.storage_url), Scratch(settings.data / SCRATCH, settings.scratch_bytes))

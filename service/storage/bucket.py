@@ -1,0 +1,213 @@
+"""An object store as obstore reads it: objects listed, fetched in ranges, sent in parts, deleted; every fault one sentence.
+
+Credentials, region and endpoint of S3 come from the usual variables (AWS_ACCESS_KEY_ID, AWS_REGION, AWS_ENDPOINT_URL …).
+"""
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from datetime import timedelta
+from pathlib import Path
+from typing import Any, NamedTuple
+from urllib.parse import unquote, urlsplit
+
+from service.errors import RequestError
+from stage.errors import StorageError, storage
+
+PIECE_BYTES = PART_BYTES = 16 << 20
+"""Fetched and sent in one request: small enough that a slow line ends one within REQUEST_S, large enough that requests do not count."""
+MOST_PARTS = 9_000
+"""S3 takes an object in 10 000 parts at most."""
+PARTS_AT_ONCE = 2
+"""Of one file; several files are sent at one time."""
+DELETED_AT_ONCE = 1000
+CONNECT_S, REQUEST_S = 10, 120
+RETRIES, RETRY_S = 8, 120
+"""After faults of the network and of the store (5xx), with growing pauses; then the step fails."""
+PROBE_RETRIES, PROBE_S = 1, 5
+"""Of a look whether the store answers, which somebody waits for."""
+
+
+class Object(NamedTuple):
+    """One object."""
+
+    path: str
+    size: int
+    modified_at: float
+    version: str
+    """Another when the content is another: its ETag."""
+
+
+class Bucket:
+    """The objects below a URL."""
+
+    def __init__(self, url: str) -> None:
+        """Args: url: s3://bucket/prefix or file:///folder. Nothing is asked of the store yet.
+
+        Raises:
+            RequestError: another kind of URL, or obstore is not installed.
+        """
+        self.url = url.rstrip("/")
+        self._store = _store(url, retries=RETRIES, retry_s=RETRY_S, request_s=REQUEST_S)
+        self._probe = _store(url, retries=PROBE_RETRIES, retry_s=PROBE_S, request_s=PROBE_S)
+
+    def below(self, prefix: str) -> list[Object]:
+        """Every object whose path begins with a prefix and a /."""
+        import obstore
+
+        with self._told("list", prefix):
+            return [_object(meta) for batch in obstore.list(self._store, prefix=f"{prefix}/") for meta in batch]
+
+    def find(self, path: str) -> Object | None:
+        """One object; None: there is none."""
+        import obstore
+        from obstore.exceptions import GenericError
+
+        with self._told("look at", path):
+            try:
+                return _object(obstore.head(self._store, path))
+            except FileNotFoundError:
+                return None
+            except GenericError as error:
+                if "Not a directory" in str(error):  # a name below a file, of a store of files
+                    return None
+                raise
+
+    def fetch(self, found: Object, target: Path, moved: Callable[[], None]) -> None:
+        """Copy an object into a file; what takes its place meanwhile is noticed.
+
+        Args:
+            found: the object.
+            target: the file, which is written anew.
+            moved: called after every piece; what it raises ends the copy.
+        """
+        import obstore
+
+        with storage("write", target), open(target, "wb") as file:
+            for begin in range(0, found.size, PIECE_BYTES):
+                end = min(begin + PIECE_BYTES, found.size)
+                with self._told("fetch", found.path):
+                    got = obstore.get(self._store, found.path, options={"if_match": found.version, "range": (begin, end)}).bytes()
+                if len(got) != end - begin:
+                    raise StorageError(f"cannot fetch {self.url}/{found.path}: {len(got)} bytes came instead of {end - begin}")
+                file.write(got)
+                moved()
+
+    def send(self, file: Path, path: str, moved: Callable[[], None]) -> Object:
+        """Copy a file into an object, which appears whole or not at all; arguments as of `fetch`."""
+        import obstore
+
+        with storage("read", file), open(file, "rb") as source:
+            size = os.fstat(source.fileno()).st_size
+            part = max(PART_BYTES, -(-size // MOST_PARTS))
+            with self._told("send", path):
+                if size <= part:
+                    obstore.put(self._store, path, source.read(), use_multipart=False)
+                    moved()
+                else:
+                    obstore.put(self._store, path, _parts(source, part, moved), chunk_size=part, max_concurrency=PARTS_AT_ONCE)
+        sent = self.find(path)
+        if sent is None or sent.size != size:
+            raise StorageError(f"cannot send {self.url}/{path}: it is not there as it was sent")
+        return sent
+
+    def mark(self, path: str) -> None:
+        """Make an empty object."""
+        import obstore
+
+        with self._told("write", path):
+            obstore.put(self._store, path, b"", use_multipart=False)
+
+    def delete(self, paths: list[str]) -> None:
+        """Delete objects, those that are gone already too."""
+        import obstore
+
+        for begin in range(0, len(paths), DELETED_AT_ONCE):
+            with self._told("delete", paths[begin]):
+                try:
+                    obstore.delete(self._store, paths[begin : begin + DELETED_AT_ONCE])
+                except FileNotFoundError:  # not from S3, which takes that as done; one at a time then
+                    for path in paths[begin : begin + DELETED_AT_ONCE]:
+                        _delete(self._store, path)
+
+    def check(self, path: str) -> None:
+        """Write and delete an object, and do not wait long for it.
+
+        Raises:
+            StorageError: it cannot be done.
+        """
+        import obstore
+
+        with self._told("write", path):
+            obstore.put(self._probe, path, b"relit", use_multipart=False)
+            _delete(self._probe, path)
+
+    @contextmanager
+    def _told(self, action: str, path: str) -> Iterator[None]:
+        """Turn what obstore raises into one sentence."""
+        from obstore.exceptions import BaseError
+
+        try:
+            yield
+        except (StorageError, FileNotFoundError):
+            raise
+        except (BaseError, OSError, ValueError) as error:
+            raise StorageError(f"cannot {action} {self.url}/{path}: {_reason(error)}") from error
+
+
+def _store(url: str, *, retries: int, retry_s: int, request_s: int) -> Any:
+    try:
+        from obstore.exceptions import BaseError
+        from obstore.store import LocalStore, S3Store
+    except ModuleNotFoundError:
+        raise RequestError(f"storage_url {url}: needs obstore: install relit[s3]") from None
+    parts = urlsplit(url)
+    if parts.scheme == "file" and not parts.netloc and parts.path not in ("", "/"):
+        folder = Path(unquote(parts.path))
+        with storage("make", folder):
+            folder.mkdir(parents=True, exist_ok=True)
+        return LocalStore(folder)
+    if parts.scheme != "s3" or not parts.netloc or parts.query or parts.fragment or "@" in parts.netloc:
+        raise RequestError("storage_url: give s3://bucket/prefix or file:///folder; keys of the store come from AWS_… in the environment")
+    clear = os.environ.get("AWS_ALLOW_HTTP", "").lower() in ("1", "true")
+    endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL") or os.environ.get("AWS_ENDPOINT") or ""
+    if endpoint.startswith("http://") and not clear:
+        raise RequestError(f"AWS_ENDPOINT_URL {endpoint}: sends images in the clear: give https://, or allow it by AWS_ALLOW_HTTP=true")
+    try:
+        return S3Store.from_url(
+            url, client_options={"connect_timeout": timedelta(seconds=CONNECT_S), "timeout": timedelta(seconds=request_s),
+                                 "allow_http": clear},
+            retry_config={"max_retries": retries, "retry_timeout": timedelta(seconds=retry_s)})
+    except (BaseError, ValueError) as error:
+        raise RequestError(f"storage_url {url}: {_reason(error)}") from error
+
+
+def _object(meta: Any) -> Object:
+    return Object(meta["path"], meta["size"], meta["last_modified"].timestamp(),
+                  meta["e_tag"] or f"{meta['size']}-{meta['last_modified'].timestamp()}")
+
+
+def _parts(source: Any, size: int, moved: Callable[[], None]) -> Iterator[bytes]:
+    while part := source.read(size):
+        yield part
+        moved()
+
+
+def _delete(store: Any, path: str) -> None:
+    import obstore
+
+    with suppress(FileNotFoundError):
+        obstore.delete(store, path)
+
+
+def _reason(error: Exception) -> str:
+    """What obstore says, without what is for its own authors."""
+    from obstore import exceptions
+
+    if isinstance(error, exceptions.PermissionDeniedError):
+        return "permission denied"
+    if isinstance(error, exceptions.UnauthenticatedError):
+        return "the store does not know these keys"
+    if isinstance(error, exceptions.PreconditionError):
+        return "it was changed meanwhile"
+    return " ".join(str(error).partition("\n\nDebug source:")[0].split())
