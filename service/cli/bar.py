@@ -1,12 +1,31 @@
-"""Progress on a terminal; silence where the output is not one."""
+"""Progress on a terminal; silence where the output is not one; lines for the worker of a farm where they are asked for."""
 
 import sys
+from enum import StrEnum
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 if TYPE_CHECKING:
     from rich.progress import Progress as RichProgress
     from rich.progress import TaskID
+
+
+COUNTED = ("frames", "shade")
+"""Stages that a farm's percentage counts: the others are short, or come once."""
+
+
+class ProgressStyle(StrEnum):
+    """How progress is shown."""
+
+    BAR = "bar"
+    """On a terminal, else not at all."""
+    OPENJD = "openjd"
+    """Lines that a worker of a farm reads (Open Job Description)."""
+
+
+def show(style: ProgressStyle) -> "Bar | FarmLines":
+    """Progress in a style."""
+    return FarmLines() if style is ProgressStyle.OPENJD else Bar()
 
 
 class Bar:
@@ -52,3 +71,35 @@ class Bar:
         if self._bar is not None and self._task is not None:
             task = self._bar.tasks[self._task]
             self._bar.update(self._task, completed=task.total)
+
+
+class FarmLines:
+    """A service.progress.Progress that says on standard output what the task does, and how much of it is done.
+
+    Source: Open Job Description, How Jobs Are Run, Stdout/Stderr Messages.
+    """
+
+    def __init__(self) -> None:
+        """Nothing is said before the first stage."""
+        self._stage, self._total, self._told = "", 0, -1
+
+    def __enter__(self) -> Self:
+        """Nothing is to be begun."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        """All of it is done, unless an error ended it."""
+        if error is None:
+            print("openjd_progress: 100", flush=True)
+
+    def stage(self, name: str, total: int) -> None:
+        """Say what begins."""
+        self._stage, self._total = name, total
+        print(f"openjd_status: {name}", flush=True)
+
+    def advance(self, done: int) -> None:
+        """Say each whole percentage once."""
+        percent = 100 * done // max(self._total, 1)
+        if self._stage in COUNTED and self._told < percent < 100:
+            self._told = percent
+            print(f"openjd_progress: {percent}", flush=True)

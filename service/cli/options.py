@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from service.cli.bar import ProgressStyle
+
 CaptureArgument = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder with a capture.json.", show_default=False)]
 DeviceOption = Annotated[str | None, typer.Option("--device", help="cpu, cuda:0, …; without it the first CUDA device or the CPU.",
                                                   show_default=False)]
@@ -29,3 +31,5 @@ AlignToOption = Annotated[str | None, typer.Option(
     "--align-to", metavar="IMAGE", help="Align, to the time of this tracking frame.", show_default=False)]
 CacheOption = Annotated[Path | None, typer.Option("--cache", help="Folder for the image stack; without it .relit in the capture.",
                                                   show_default=False)]
+ProgressOption = Annotated[ProgressStyle, typer.Option(
+    "--progress", help="bar: on a terminal; openjd: lines that a farm's worker reads (docs/farm.md).")]

@@ -5,7 +5,8 @@ from typing import Annotated
 
 import typer
 
-from service.cli.options import AlignOption, AlignToOption, CacheOption, DeviceOption
+from service.cli.bar import ProgressStyle, show
+from service.cli.options import AlignOption, AlignToOption, CacheOption, DeviceOption, ProgressOption
 from service.methods import FrameCompression, FrameSpace, LightWeights
 
 
@@ -58,9 +59,9 @@ def relight(
     align_to: AlignToOption = None,
     device: DeviceOption = None,
     cache: CacheOption = None,
+    progress: ProgressOption = ProgressStyle.BAR,
 ) -> None:
     """Frames under HDR environments and animated lights."""
-    from service.cli.bar import Bar
     from service.pipelines.relight import relight as run
     from service.requests import RelightRequest
 
@@ -69,7 +70,7 @@ def relight(
         "spin_degrees": spin_degrees, "weights": weights, "exposure": exposure, "aov": aov, "maps": maps, "color_space": color_space,
         "compression": compression, "overwrite": overwrite, "sheet": sheet, "report": report, "align": align, "align_to": align_to,
         "device": device, "cache": cache})
-    with Bar() as bar:
+    with show(progress) as bar:
         result = run(request, bar)
     last = f" … {result.frames[-1].name}" if len(result.frames) > 1 else ""
     print(f"frames   {result.frames[0]}{last}")

@@ -5,7 +5,8 @@ from typing import Annotated
 
 import typer
 
-from service.cli.options import CacheOption, DeviceOption
+from service.cli.bar import ProgressStyle, show
+from service.cli.options import CacheOption, DeviceOption, ProgressOption
 from service.methods import FrameCompression, FrameSpace
 
 
@@ -39,9 +40,9 @@ def shade(
         "--compression", help="zip and piz keep every bit; dwaa is lossy and smaller.")] = FrameCompression.ZIP,
     device: DeviceOption = None,
     cache: CacheOption = None,
+    progress: ProgressOption = ProgressStyle.BAR,
 ) -> None:
     """A picture of solved maps under near lights, area lights and an environment, with cast shadows."""
-    from service.cli.bar import Bar
     from service.pipelines.shade import shade as run
     from service.requests import ShadeRequest
 
@@ -49,7 +50,7 @@ def shade(
         "maps": maps, "out": out, "light": light or (), "sphere": sphere or (), "rectangle": rectangle or (),
         "environment": environment, "turn_degrees": turn_degrees, "capture": capture, "exposure": exposure, "aov": aov,
         "color_space": color_space, "compression": compression, "device": device, "cache": cache})
-    with Bar() as bar:
+    with show(progress) as bar:
         result = run(request, bar)
     print(f"picture  {result.path}")
     if not result.metric:

@@ -28,7 +28,7 @@ class RelightResult(NamedTuple):
     """What a relight made."""
 
     frames: tuple[Path, ...]
-    """Of the whole range, in order."""
+    """Of the range, or of the part of it that was asked for, in order."""
     captures: int
     """More than one of a sequence."""
     skipped: int
@@ -83,7 +83,7 @@ def relight(request: RelightRequest, progress: Progress | None = None) -> Religh
         write_text(request.report, report(
             inputs={"capture": str(request.capture), "captures": captures},
             options=request.model_copy(update={"weights": request.weighting}).model_dump(
-                mode="json", exclude={"capture", "device", "cache", "report"}),
+                mode="json", exclude={"capture", "device", "cache", "report", "only"}),
             frames={"made": writer.written.frames, "skipped": skipped, "clipped_pixels": writer.written.clipped,
                     "first": str(paths[0]), "last": str(paths[-1])},
             device=devices.describe(device),
@@ -128,7 +128,7 @@ def _relight_step(step: Step, todo: list[tuple[PlannedFrame, str]], request: Rel
         with timings.part("weights"):
             weights = np.stack(list(islice(each_weights, len(chunk))))
         with timings.part("product"):
-            alone = len(plan.frames) == 1 or plan.is_sequence
+            alone = plan.total == 1 or plan.is_sequence  # of the whole range: a part of it is the same to the last bit
             frames = linear_frames(stack, weights, None if alone else [frame.place % size for frame, _ in chunk], device=device)
         shine = None
         if guide is not None:

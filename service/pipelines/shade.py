@@ -64,21 +64,11 @@ def shade(request: ShadeRequest, progress: Progress | None = None) -> ShadeResul
     timings = Timings(progress)
     device = devices.resolve(request.device)
     near: tuple[NearLight, ...] = (*request.light, *request.sphere, *request.rectangle)
-    if not near and request.environment is None:
-        raise RequestError("there is no light: give --light, --sphere, --rectangle or --environment")
-    if request.out.suffix.lower() != ".exr":
-        raise RequestError(f"--out {request.out}: pictures are OpenEXR: end the name in .exr")
     timings.stage("open", 1)
-    path = request.maps / MAPS_FILE if request.maps.is_dir() else request.maps
-    if not path.is_file():
-        raise ResultError(f"{path}: is not there: run `relit solve` first")
-    refuse_inputs([(f"--out {request.out}", request.out)], [path, *([request.environment] if request.environment else []),
-                                                            *(capture_files(request.capture) if request.capture else ())])
-    check_folders([request.out])
+    path = check(request)
     environments = Environments(request.environment) if request.environment is not None else None
     sky = None
     if environments is not None:
-        environments.check([1])
         sky = Sky(environments.path(1), request.turn_degrees, UPRIGHT, rotation_about_y(request.turn_degrees), 0.0)
     lighting = FrameLighting(1, sky, (), {}, request.exposure)
     if request.capture is None:
@@ -99,6 +89,31 @@ def shade(request: ShadeRequest, progress: Progress | None = None) -> ShadeResul
         writer.put([FrameFile(request.out, 2.0**request.exposure, facts)], frame[None], form, shine[None] if parts else None)
     timings.close()
     return ShadeResult(request.out, maps.camera.metric, writer.written.clipped)
+
+
+def check(request: ShadeRequest) -> Path:
+    """Refuse what cannot be, as far as that is cheap; nothing is written.
+
+    Returns:
+        The file of the maps.
+
+    Raises:
+        RequestError: no light, a file that is no .exr, or one that would replace an input.
+        StageError: maps, capture or folder are not there; names them.
+    """
+    if not (request.light or request.sphere or request.rectangle) and request.environment is None:
+        raise RequestError("there is no light: give --light, --sphere, --rectangle or --environment")
+    if request.out.suffix.lower() != ".exr":
+        raise RequestError(f"--out {request.out}: pictures are OpenEXR: end the name in .exr")
+    path = request.maps / MAPS_FILE if request.maps.is_dir() else request.maps
+    if not path.is_file():
+        raise ResultError(f"{path}: is not there: run `relit solve` first")
+    refuse_inputs([(f"--out {request.out}", request.out)], [path, *([request.environment] if request.environment else []),
+                                                            *(capture_files(request.capture) if request.capture else ())])
+    check_folders([request.out])
+    if request.environment is not None:
+        Environments(request.environment).check([1])
+    return path
 
 
 def _of_maps(maps: SurfaceMaps, path: Path, lighting: FrameLighting, environments: Environments | None, near: tuple[NearLight, ...],

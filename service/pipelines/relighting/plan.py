@@ -32,6 +32,8 @@ class Plan(NamedTuple):
     """One capture, or one a time step."""
     frames: tuple[PlannedFrame, ...]
     """That this run makes."""
+    total: int
+    """Frames of the whole range."""
     environments: Environments | None
     keys: LightKeys | None
 
@@ -74,7 +76,7 @@ def make_plan(request: RelightRequest) -> Plan:
     environments = Environments(request.environment) if request.environment is not None else None
     lighting = schedule(request, numbers, keys, environments)
     if environments is not None:
-        environments.check(numbers)
+        environments.check(made)
 
     def inputs() -> Iterator[Path]:
         yield from ([] if request.keys is None else [request.keys])
@@ -87,4 +89,4 @@ def make_plan(request: RelightRequest) -> Plan:
     refuse_inputs(outputs, inputs())
     check_folders(path for _, path in outputs)
     planned = (PlannedFrame(*frame) for frame in zip(paths, lighting, range(len(paths)), strict=True))
-    return Plan(tuple(folders), tuple(frame for frame in planned if frame.lighting.number in made), environments, keys)
+    return Plan(tuple(folders), tuple(frame for frame in planned if frame.lighting.number in made), len(numbers), environments, keys)

@@ -1,0 +1,1 @@
+"""Jobs for render farms: Open Job Description templates whose tasks are plain calls of this program."""
