@@ -1,12 +1,16 @@
 """Which workers live: each holds a lock named after it, which the operating system or the database drops when it dies.
 
-On SQLite all workers are on one machine and the lock is one on a file; on PostgreSQL it is an advisory lock of a session.
+On SQLite all workers are on one machine and the lock is one on a file; on PostgreSQL it is an advisory lock of a session. Who takes over
+from a dead worker holds its lock meanwhile, so that one alone does. Names are never used again.
 """
 
 import fcntl
 import os
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
+from enum import Enum
 from pathlib import Path
-from typing import IO, Protocol
+from typing import Protocol
 
 import sqlalchemy as sa
 from sqlalchemy.exc import DBAPIError
@@ -15,16 +19,28 @@ from service.store.database import Database
 
 SPACE = 7
 """Seed of the hash of names, so that our advisory locks meet no one else's."""
+KEEPALIVE = {"tcp_keepalives_idle": 3, "tcp_keepalives_interval": 1, "tcp_keepalives_count": 3}
+"""Seconds and tries after which the server ends the session of a machine that is gone; by itself it would wait for hours."""
+
+
+class Held(Enum):
+    """How the own lock is."""
+
+    KEPT = "kept"
+    ANEW = "anew"
+    """It had been lost, or is the first."""
+    REFUSED = "refused"
+    """Another has it."""
 
 
 class Presence(Protocol):
     """The lock of a worker, and whether others hold theirs."""
 
-    def hold(self) -> bool:
-        """Take the own lock, or make sure that it is still held; false where it is another's."""
+    def hold(self) -> Held:
+        """Take the own lock, or make sure that it is still held."""
 
-    def is_dead(self, worker: str) -> bool:
-        """Whether a worker does not hold its lock."""
+    def dead(self, worker: str) -> AbstractContextManager[bool]:
+        """Whether a worker does not hold its lock; where it does not, it cannot take it, nor can another, within the context."""
 
     def close(self) -> None:
         """Let go."""
@@ -36,39 +52,55 @@ class FilePresence:
     def __init__(self, folder: Path, worker: str) -> None:
         """Args: folder: of the locks. worker: who we are."""
         self._folder, self._worker = folder, worker
-        self._file: IO[bytes] | None = None
+        self._file: int | None = None
 
-    def hold(self) -> bool:
-        """A lock on a file lasts as long as the process."""
-        if self._file is None:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            file = open(self._path(self._worker), "wb")  # noqa: SIM115  (held until the end)
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            self._file = file
-        return True
+    def hold(self) -> Held:
+        """A lock on a file lasts as long as the process, and is seen by others as long as the file has its name."""
+        if self._file is not None:
+            if self._is_named(self._file, self._worker):
+                return Held.KEPT
+            os.close(self._file)
+        self._file = self._take(self._worker)
+        return Held.REFUSED if self._file is None else Held.ANEW
 
-    def is_dead(self, worker: str) -> bool:
+    @contextmanager
+    def dead(self, worker: str) -> Iterator[bool]:
         """Try its lock."""
+        file = self._take(worker)
         try:
-            file = os.open(self._path(worker), os.O_RDWR)
-        except FileNotFoundError:
-            return True
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return False
-        else:
-            self._path(worker).unlink(missing_ok=True)  # names are never used again
-            return True
+            yield file is not None
         finally:
-            os.close(file)
+            if file is not None:
+                self._drop(file, worker)
 
     def close(self) -> None:
         """Let go."""
         if self._file is not None:
-            self._path(self._worker).unlink(missing_ok=True)
-            self._file.close()
+            self._drop(self._file, self._worker)
             self._file = None
+
+    def _take(self, worker: str) -> int | None:
+        self._folder.mkdir(parents=True, exist_ok=True)
+        while True:
+            file = os.open(self._path(worker), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                os.close(file)
+                return None
+            if self._is_named(file, worker):
+                return file
+            os.close(file)  # another let go of it, and took its name, between our two calls
+
+    def _drop(self, file: int, worker: str) -> None:
+        self._path(worker).unlink(missing_ok=True)
+        os.close(file)
+
+    def _is_named(self, file: int, worker: str) -> bool:
+        try:
+            return os.path.samestat(os.fstat(file), os.stat(self._path(worker)))
+        except FileNotFoundError:
+            return False
 
     def _path(self, worker: str) -> Path:
         return self._folder / f"{worker.replace('/', '_')}.lock"
@@ -82,31 +114,39 @@ class SessionPresence:
         self._engine, self._worker = database.engine, worker
         self._session: sa.Connection | None = None
 
-    def hold(self) -> bool:
+    def hold(self) -> Held:
         """Ask the session, which after a restart of the server is a new one and has to take the lock again."""
         if self._session is not None:
             try:
                 self._session.execute(sa.text("SELECT 1"))
             except DBAPIError:
-                self._session.invalidate()
-                self._session.close()
-                self._session = None
+                self.close()
             else:
-                return True
+                return Held.KEPT
         session = self._engine.connect().execution_options(isolation_level="AUTOCOMMIT")
-        if not self._take(session, self._worker):
-            session.close()
-            return False
-        self._session = session
-        return True
+        try:
+            for name, value in KEEPALIVE.items():
+                session.execute(sa.text(f"SET {name} = {value}"))
+            if self._take(session, self._worker):
+                self._session = session
+                return Held.ANEW
+            return Held.REFUSED
+        finally:
+            if self._session is None:
+                session.close()
 
-    def is_dead(self, worker: str) -> bool:
+    @contextmanager
+    def dead(self, worker: str) -> Iterator[bool]:
         """Try its lock."""
-        assert self._session is not None, "hold the own lock first"
-        if not self._take(self._session, worker):
-            return False
-        self._session.execute(sa.text("SELECT pg_advisory_unlock(hashtextextended(:name, :space))"), {"name": worker, "space": SPACE})
-        return True
+        session = self._session
+        assert session is not None, "hold the own lock first"
+        taken = self._take(session, worker)
+        try:
+            yield taken
+        finally:
+            if taken:
+                with suppress(DBAPIError):  # a session that has ended holds nothing
+                    session.execute(sa.text("SELECT pg_advisory_unlock(hashtextextended(:name, :space))"), {"name": worker, "space": SPACE})
 
     def close(self) -> None:
         """End the session."""

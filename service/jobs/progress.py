@@ -4,13 +4,15 @@ import threading
 import time
 from collections.abc import Callable
 
+from service.log import logger
 from service.store import jobs
-from service.store.database import Database
+from service.store.database import UNANSWERED, Database
+from service.store.jobs import FRAMES, Claim
 
 EVERY_S = 0.5
 """How often the store is told and asked."""
-FRAMES = "frames"
-"""The stage of a relight that counts frames."""
+UNTOLD_S = 5.0
+"""Until it is told again after it did not answer: each try may take long, and the step waits for it."""
 
 
 class Stopped(Exception):
@@ -18,30 +20,35 @@ class Stopped(Exception):
 
 
 class JobProgress:
-    """A Progress of one step: tells the store, renews the deadline, and stops the step where the job is not wanted any more."""
+    """A Progress of one step: tells the store, renews the deadline, and stops the step where the job is not wanted any more.
 
-    def __init__(self, database: Database, job: str, attempt: int, *, alive: Callable[[], None], before: int = 0,
-                 of: int | None = None) -> None:
+    While the database does not answer nothing is told, and the step goes on.
+    """
+
+    def __init__(self, database: Database, claim: Claim, *, alive: Callable[[], None], before: int = 0, of: int | None = None) -> None:
         """Prepare.
 
         Args:
             database: the store's.
-            job, attempt: what is worked on.
+            claim: what is worked on.
             alive: called at every sign of progress.
             before: frames of steps before this one.
             of: frames of the whole job; None: it makes none.
         """
-        self._database, self._job, self._attempt = database, job, attempt
+        self._database, self._claim = database, claim
         self._alive, self._before, self._of = alive, before, of
         self._lock = threading.Lock()  # several threads of a pipeline may report
-        self._told_at = 0.0
+        self._tell_at = 0.0
         self._stage, self._offset, self._total, self._began = "begin", 0, 0, time.monotonic()
+        self._counted = 0
         self._opening = self._stopped = False
 
     def stage(self, name: str, total: int) -> None:
         """Begin a stage."""
         with self._lock:
-            self._began, self._told_at = time.monotonic(), 0.0
+            self._began, self._tell_at = time.monotonic(), 0.0
+            if self._stage == FRAMES and name != FRAMES:  # the frames of this step are made
+                self._before += self._counted
             self._opening = self._of is not None and name != FRAMES and self._before > 0
             if self._of is not None and (name == FRAMES or self._before > 0):  # so that frames are never counted backwards
                 self._stage, self._offset, self._total = FRAMES, self._before, self._of
@@ -59,13 +66,18 @@ class JobProgress:
         with self._lock:
             if self._stopped:
                 raise Stopped
+            self._counted = 0 if self._opening else done
             now = time.monotonic()
-            if now - self._told_at < EVERY_S:
+            if now < self._tell_at:
                 return
-            self._told_at = now
             spent = now - self._began
-            counted = 0 if self._opening else done
+            counted = self._counted
             progress = jobs.Progress(self._stage, self._offset + counted, self._total, counted / spent if counted and spent > 0 else None)
-            self._stopped = not jobs.advance(self._database, self._job, self._attempt, progress)
+            try:
+                self._stopped = not jobs.advance(self._database, self._claim, progress)
+                self._tell_at = time.monotonic() + EVERY_S
+            except UNANSWERED as error:
+                logger.warning("progress is not told", job=self._claim.job, error=str(getattr(error, "orig", error)))
+                self._tell_at = time.monotonic() + UNTOLD_S
             if self._stopped:
                 raise Stopped

@@ -10,6 +10,7 @@ from service.job_requests import CheckJob, JobRequest
 from service.settings import Settings
 from service.store import jobs
 from service.store.database import Database, create
+from service.store.jobs import Claim
 
 WORK, CHECKS = "work", "checks"
 """Queues: of what takes a device, and of quick looks at what came in."""
@@ -52,9 +53,10 @@ class JobQueue:
         self._client = DBOSClient(system_database_engine=database.engine, serializer=SERIALIZER, lazy=True, retry_connection_errors=False)
 
     def submit(self, connection: sa.Connection, *, project: str, key: str | None, request: JobRequest, chunk_frames: int,
-               inputs: list[str]) -> str:
+               inputs: list[str], trace: str | None = None) -> str:
         """Write down a new job and queue it, in the caller's transaction; arguments as `jobs.insert`."""
-        job = jobs.insert(connection, project=project, key=key, request=request, chunk_frames=chunk_frames, inputs=inputs)
+        job = jobs.insert(connection, project=project, key=key, request=request, chunk_frames=chunk_frames, inputs=inputs,
+                          trace=trace)
         self.enqueue(connection, job, 1, request)
         return job
 
@@ -77,18 +79,20 @@ class JobQueue:
             found.setdefault(status.executor_id or "", []).append(status.workflow_id)
         return found
 
-    def hand_back(self, workflow: str) -> None:
-        """Queue what the caller had begun and will not go on with."""
+    def hand_back(self, workflow: str, worker: str) -> None:
+        """Queue what the caller, a worker, had begun and will not go on with."""
         job, attempt = job_of(workflow)
-        request = self._database.transact(lambda connection: jobs.hand_back(connection, job, attempt))
-        if request is None:
-            self.call_off(job, attempt)
+        if self._database.transact(lambda connection: jobs.hand_back(connection, Claim(job, attempt, worker))):
+            self.put_back(workflow)
         else:
-            self.put_back(workflow, request)
+            self.call_off(job, attempt)
 
-    def put_back(self, workflow: str, request: JobRequest) -> None:
-        """Queue what a worker had begun."""
-        self._client.resume_workflow(workflow, queue_name=CHECKS if isinstance(request, CheckJob) else WORK)
+    def put_back(self, workflow: str) -> None:
+        """Queue what a worker had begun; its place in the queue is the one that it had."""
+        job, _ = job_of(workflow)
+        row = jobs.find(self._database, job)
+        if row is not None:
+            self._client.resume_workflow(workflow, queue_name=CHECKS if row["request"]["kind"] == "check" else WORK)
 
     def forget(self, job: str, attempts: int) -> None:
         """Remove the workflows of a job."""

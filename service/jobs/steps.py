@@ -1,11 +1,10 @@
 """A job → the steps that do it: names in place of paths made paths again, and the pipelines called."""
 
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from service.errors import RequestError
+from service.errors import USER_ERRORS, RequestError, sentence
 from service.frame_range import frame_numbers
 from service.identifiers import CAPTURE
 from service.job_requests import (
@@ -24,6 +23,7 @@ from service.storage import layout
 from service.storage.folder import Storage
 from service.store import intakes
 from service.store.database import Database
+from stage.files import resolved
 
 KEYS_FILE = "keys.json"
 """The light keys of a job, beside its frames."""
@@ -38,6 +38,12 @@ class Site(NamedTuple):
     """Folder for stack caches, one a capture."""
     device: str
     max_pixels: int
+    roots: tuple[Path, ...]
+    """That registered captures and environments lie under."""
+
+    def without_folder(self, sentence: str) -> str:
+        """A sentence for those who use the service: files by their names below its folder, which is nobody else's business."""
+        return sentence.replace(f"{self.cache.parent}/", "")
 
 
 class Step(NamedTuple):
@@ -77,7 +83,7 @@ def steps_of(job: Job, site: Site) -> list[Step]:
     if isinstance(request, ShadeJob):
         return [Step("shade", lambda progress: _shade(job, request, site, progress))]
     if isinstance(request, ExportJob):
-        return [Step("export", lambda progress: _export(job, request, job_maps(job, request.maps, site), site, progress))]
+        return [Step("export", lambda progress: _export(job, request, job_maps(job, request.maps, site, progress), site, progress))]
     if isinstance(request, RelightJob):
         return _frames(job, request, site)
     assert isinstance(request, PipelineJob), request
@@ -86,14 +92,13 @@ def steps_of(job: Job, site: Site) -> list[Step]:
     relight = RelightJob(kind="relight", capture=request.capture, environment=request.environment, keys=request.keys,
                          maps=job.id if request.guided else None, options=request.relight)
     return [Step("solve", lambda progress: _solve(job, solve, site, progress)),
-            Step("export", lambda progress: _export(job, export, job_maps(job, job.id, site), site, progress)),
+            Step("export", lambda progress: _export(job, export, job_maps(job, job.id, site, progress), site, progress)),
             *(_frames(job, relight, site) if request.environment is not None or request.keys is not None else [])]
 
 
-def job_maps(job: Job, maps: str, site: Site) -> Path:
-    """The folder of the results of a job of the same project, or of this one."""
-    prefix = layout.results(job.project, maps)
-    return site.storage.workspace(prefix) if maps == job.id else site.storage.local(prefix)
+def job_maps(job: Job, maps: str, site: Site, progress: Progress) -> Path:
+    """The folder of the results of a job of the same project, or of this one, with what was solved."""
+    return site.storage.local(layout.results(job.project, maps), layout.SOLVED, progress)
 
 
 def _frames(job: Job, request: RelightJob, site: Site) -> list[Step]:
@@ -110,11 +115,14 @@ def _frames(job: Job, request: RelightJob, site: Site) -> list[Step]:
 def _check(job: Job, request: CheckJob, site: Site, progress: Progress) -> None:
     from service.pipelines.admit import admit_capture, admit_environment
 
-    folder = _intake(job, request.intake, site)
-    if request.intake.startswith(CAPTURE):
-        facts = admit_capture(folder, max_pixels=site.max_pixels, progress=progress)
-    else:
-        facts = admit_environment(folder, max_pixels=site.max_pixels)
+    folder, _ = _place(job, request.intake, site, progress)
+    try:
+        if request.intake.startswith(CAPTURE):
+            facts = admit_capture(folder, max_pixels=site.max_pixels, progress=progress)
+        else:
+            facts = admit_environment(folder, max_pixels=site.max_pixels)
+    except USER_ERRORS as error:  # named as they were handed in, not by where the service keeps them
+        raise RequestError(sentence(error).replace(f"{folder}/", "")) from error
     intakes.accept(site.database, request.intake, facts)
 
 
@@ -122,8 +130,8 @@ def _solve(job: Job, request: SolveJob, site: Site, progress: Progress) -> None:
     from service.pipelines.solve import solve
     from service.requests import SolveRequest
 
-    ball = None if request.reference_ball is None else _intake(job, request.reference_ball, site)
-    solve(SolveRequest(capture=_intake(job, request.capture, site), out=_out(job, site), reference_ball=ball, device=site.device,
+    ball = None if request.reference_ball is None else _intake(job, request.reference_ball, site, progress)
+    solve(SolveRequest(capture=_intake(job, request.capture, site, progress), out=_out(job, site), reference_ball=ball, device=site.device,
                        cache=site.cache / request.capture, **dict(request.options)), progress)
 
 
@@ -132,7 +140,7 @@ def _depth(job: Job, request: DepthJob, site: Site, progress: Progress) -> None:
     from service.pipelines.depth import depth
     from service.tof_options import TofOptions
 
-    capture = _intake(job, request.capture, site)
+    capture = _intake(job, request.capture, site, progress)
     calibration = None if request.tof_calibration is None else _within(capture, request.tof_calibration)
     options = dict(request.options) | {"tof": TofOptions(calibration=calibration, **dict(request.options.tof))}
     depth(DepthRequest(capture=capture, out=_out(job, site), device=site.device, cache=site.cache / request.capture, **options), progress)
@@ -143,9 +151,9 @@ def _shade(job: Job, request: ShadeJob, site: Site, progress: Progress) -> None:
     from service.requests import ShadeRequest
 
     capture = request.capture
-    shade(ShadeRequest(maps=job_maps(job, request.maps, site), out=_out(job, site) / layout.PICTURE,
-                       environment=_environment(job, request.environment, site),
-                       capture=None if capture is None else _intake(job, capture, site), device=site.device,
+    shade(ShadeRequest(maps=job_maps(job, request.maps, site, progress), out=_out(job, site) / layout.PICTURE,
+                       environment=_environment(job, request.environment, site, progress),
+                       capture=None if capture is None else _intake(job, capture, site, progress), device=site.device,
                        cache=None if capture is None else site.cache / capture, **dict(request.options)), progress)
 
 
@@ -164,9 +172,10 @@ def _relight(job: Job, request: RelightJob, only: str, site: Site, progress: Pro
     out = _out(job, site)
     if request.keys is not None:
         write_text(out / KEYS_FILE, request.keys.model_dump_json(by_alias=True, indent=2, exclude_defaults=True))
-    relight(RelightRequest(capture=_intake(job, request.capture, site), environment=_environment(job, request.environment, site),
+    relight(RelightRequest(capture=_intake(job, request.capture, site, progress),
+                           environment=_environment(job, request.environment, site, progress),
                            keys=None if request.keys is None else out / KEYS_FILE, only=only, out=str(out / layout.FRAMES),
-                           maps=None if request.maps is None else job_maps(job, request.maps, site), device=site.device,
+                           maps=None if request.maps is None else job_maps(job, request.maps, site, progress), device=site.device,
                            cache=site.cache / request.capture, **dict(request.options)), progress)
 
 
@@ -174,28 +183,42 @@ def _out(job: Job, site: Site) -> Path:
     return site.storage.workspace(layout.results(job.project, job.id))
 
 
-def _intake(job: Job, identifier: str, site: Site) -> Path:
-    """The folder of a capture or environment of the job's project."""
+def _intake(job: Job, identifier: str, site: Site, progress: Progress) -> Path:
+    """The folder of a capture or environment of the job's project, as it was admitted; a registered one may have changed since."""
+    from service.pipelines.admit import admit_environment, recheck_capture
+
+    folder, registered = _place(job, identifier, site, progress)
+    if registered and identifier.startswith(CAPTURE):
+        recheck_capture(folder, max_pixels=site.max_pixels)
+    elif registered:
+        admit_environment(folder, max_pixels=site.max_pixels)
+    return folder
+
+
+def _place(job: Job, identifier: str, site: Site, progress: Progress) -> tuple[Path, bool]:
+    """The folder of a capture or environment of the job's project, or the file of an environment; and whether it was registered."""
     row = intakes.find(site.database, identifier, job.project)
     if row is None:
         raise RequestError(f"{identifier}: is not there any more")
-    return Path(row["folder"]) if row["folder"] is not None else site.storage.local(layout.intake(job.project, identifier))
+    if row["folder"] is None:
+        return site.storage.local(layout.intake(job.project, identifier), progress=progress), False
+    folder = Path(row["folder"])
+    if resolved(folder) != folder or not any(folder.is_relative_to(root) for root in site.roots):
+        raise RequestError(f"{identifier}: lies in none of the folders that the operator allows any more")
+    return folder, True
 
 
-def _environment(job: Job, identifier: str | None, site: Site) -> Path | None:
+def _environment(job: Job, identifier: str | None, site: Site, progress: Progress) -> Path | None:
     from service.pipelines.admit import environment_file
 
-    return None if identifier is None else environment_file(_intake(job, identifier, site))
+    return None if identifier is None else environment_file(_intake(job, identifier, site, progress))
 
 
 def _within(capture: Path, name: str) -> Path:
     path = capture / name
-    if not path.resolve().is_relative_to(capture.resolve()) or "\0" in name:
-        raise RequestError(f"tof_calibration: {name} leads out of the capture's folder")
+    place = None if "\0" in name else resolved(path)
+    if place is None or not place.is_relative_to(capture.resolve()):
+        raise RequestError(f"tof_calibration: {name!r} leads out of the capture's folder")
+    if not place.is_file():
+        raise RequestError(f"tof_calibration: {name!r} is no file of the capture")
     return path
-
-
-def drop_caches(cache: Path, captures: list[str]) -> None:
-    """Forget the stacks of captures that are gone."""
-    for capture in captures:
-        shutil.rmtree(cache / capture, ignore_errors=True)

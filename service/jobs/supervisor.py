@@ -5,16 +5,16 @@ import threading
 import time
 from dataclasses import dataclass, field
 from multiprocessing.context import SpawnProcess
-from multiprocessing.sharedctypes import Synchronized
 
+from service.jobs.pulse import Pulse
 from service.jobs.worker import run_worker
 from service.log import logger
 from service.settings import Settings
 
 LOOK_S = 0.5
 PAUSES_S = (0.0, 1.0, 5.0, 15.0, 60.0)
-"""Before a worker that died soon after its start is started again; the last one for ever after."""
-SOON_S = 60.0
+"""Before a worker is started again, by how often in a row it died before it was ready; the last one for ever after. One that had been
+ready is started again at once: what killed it was its work or somebody, and a job that kills workers is ended by `max_lost`."""
 KILL_AFTER_S = 10.0
 """Beyond the time to drain, before a worker that does not end is killed."""
 
@@ -24,10 +24,10 @@ class _Place:
     """A device and the worker on it."""
 
     device: str
-    alive: "Synchronized[float]"
     process: SpawnProcess | None = None
-    started_at: float = 0.0
-    deaths: int = 0
+    pulse: Pulse | None = None
+    failures: int = 0
+    """Starts in a row that came to nothing."""
     start_at: float = field(default_factory=time.monotonic)
 
 
@@ -38,7 +38,7 @@ class Supervisor:
         """Args: settings: of the service. devices: one worker on each."""
         self._settings = settings
         self._spawn = multiprocessing.get_context("spawn")  # a forked process cannot use CUDA
-        self._places = [_Place(device, self._spawn.Value("d", 0.0)) for device in devices]
+        self._places = [_Place(device) for device in devices]
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name="relit-supervisor", daemon=True)
 
@@ -60,29 +60,38 @@ class Supervisor:
                 process.kill()
                 process.join()
 
+    def kill(self) -> None:
+        """End the workers at once; what they do is taken over."""
+        for place in self._places:
+            if (process := place.process) is not None:
+                process.kill()
+
     def _run(self) -> None:
         while not self._ended.wait(LOOK_S):
             for place in self._places:
-                self._look(place)
+                try:
+                    self._look(place)
+                except OSError as error:  # no memory or no process left: at the next look there may be
+                    logger.error("worker cannot be started", device=place.device, error=str(error))
 
     def _look(self, place: _Place) -> None:
         now = time.monotonic()
         if place.process is None:
             if now >= place.start_at:
-                place.alive.value = 0.0
-                place.process = self._spawn.Process(target=run_worker, args=(self._settings, place.device, place.alive),
-                                                    name=f"relit-worker-{place.device}")
-                place.process.start()
-                place.started_at = now
+                pulse = Pulse()
+                process = self._spawn.Process(target=run_worker, args=(self._settings, place.device, pulse),
+                                              name=f"relit-worker-{place.device}")
+                process.start()
+                place.process, place.pulse = process, pulse
             return
+        assert place.pulse is not None, "it has been started"
         if not place.process.is_alive():
-            place.deaths = place.deaths + 1 if now - place.started_at < SOON_S else 0
-            pause = PAUSES_S[min(place.deaths, len(PAUSES_S) - 1)]
+            place.failures = 0 if place.pulse.was_ready else place.failures + 1
+            pause = PAUSES_S[min(place.failures, len(PAUSES_S) - 1)]
             logger.warning("worker is gone", device=place.device, exit_code=place.process.exitcode, again_in_s=pause)
+            place.process.close()
             place.process, place.start_at = None, now + pause
-            return
-        sign = place.alive.value
-        if sign > 0 and now - sign > self._settings.stall_s:
-            logger.error("worker hangs: it is killed", device=place.device, silent_s=round(now - sign))
+        elif place.pulse.silent_s > self._settings.stall_s:
+            logger.error("worker hangs: it is killed", device=place.device, silent_s=round(place.pulse.silent_s))
             place.process.kill()
             place.process.join()

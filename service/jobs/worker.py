@@ -6,13 +6,13 @@ import signal
 import socket
 import threading
 from multiprocessing import parent_process
-from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
 
 from dbos import DBOS, DBOSConfig
 
-from service import log
-from service.jobs.presence import presence
+from service import log, telemetry
+from service.jobs.presence import Held, presence
+from service.jobs.pulse import Pulse
 from service.jobs.queue import CHECKS, SERIALIZER, VERSION, WORK, JobQueue, prepare
 from service.jobs.steps import Site
 from service.jobs.takeover import Takeover
@@ -21,62 +21,75 @@ from service.log import logger
 from service.settings import Settings
 from service.storage.open import open_storage
 from service.store import workers
-from service.store.database import connect
+from service.store.database import LONGEST_PAUSE_S, UNANSWERED, Database, connect
 
 POLL_S = 0.25
 """How often a queue is asked for work."""
 APPLICATION = "relit"
 DEPOSED = 3
 """Exit code of a worker that lost its lock."""
+NICENESS = 5
+"""Of a worker, which fills every core for minutes: the API beside it answers first, and the worker alone on a machine is as fast."""
 
 
-def run_worker(settings: Settings, device: str, alive: "Synchronized[float]") -> None:
+def run_worker(settings: Settings, device: str, pulse: Pulse) -> None:
     """Work until SIGTERM or the end of the parent process.
 
     Args:
         settings: of the service.
         device: cpu, cuda:0, …
-        alive: set to the oldest last sign of progress of the running steps (monotonic seconds), 0 while nothing runs.
+        pulse: told that the worker lives, and that its steps do.
     """
+    os.nice(NICENESS)
     ending = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: ending.set())
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # of a terminal it comes to the supervisor too, which ends us in its order
     _end_with_parent(ending)
     log.configure(settings.log_level, settings.log_format)
+    tracing = telemetry.provider(settings)
     database = connect(settings.sqlalchemy_url)
-    prepare(settings, database)
+    _prepared(database, settings, ending)
     host = socket.gethostname()
     name = f"{host}-{device.replace(':', '')}-{os.getpid()}-{secrets.token_hex(4)}"
     lock = presence(database, settings.data / "locks", name)
-    if not lock.hold():
+    if lock.hold() is Held.REFUSED:
         raise RuntimeError(f"the lock of {name} is held by another")  # the name is random
     queue = JobQueue(database)
-    site = Site(database, open_storage(settings), cache_folder(settings), device, settings.max_pixels)
-    desk = Desk(site, name, alive=lambda oldest: _set(alive, oldest))
+    site = Site(database, open_storage(settings), cache_folder(settings), device, settings.max_pixels, settings.roots)
+    desk = Desk(site, queue, name, alive=pulse.step)
     config: DBOSConfig = {
         "name": APPLICATION, "system_database_url": settings.sqlalchemy_url, "system_database_engine": database.engine,
         "application_version": VERSION, "executor_id": name, "serializer": SERIALIZER, "log_level": "ERROR", "run_migrations": False,
         "use_listen_notify": False,
     }
-    DBOS(config=config)
+    dbos = DBOS(config=config)
+    log.adopt("dbos")
     desk.register()
-    takeover = Takeover(database, queue, lock, name, every_s=settings.takeover_s, max_lost=settings.max_lost, deposed=_depose)
+    takeover = Takeover(database, queue, lock, name, every_s=settings.takeover_s, max_lost=settings.max_lost,
+                        running=lambda: desk.running, beat=pulse.beat, deposed=_depose)
     DBOS.launch()
     for waiting in (WORK, CHECKS):
         DBOS.register_queue(waiting, worker_concurrency=1, polling_interval_sec=POLL_S)
     workers.appear(database, name, host=host, pid=os.getpid(), device=device)
     takeover.start()
+    pulse.ready()
     logger.info("worker ready", worker=name, device=device)
     ending.wait()
     logger.info("worker drains", worker=name)
-    workers.see(database, name, workers.DRAINING)
+    for stop in dbos.background_thread_stop_events:  # takes nothing more from the queues
+        stop.set()
+    takeover.state = workers.DRAINING
     if not desk.drain(settings.drain_s):
         logger.warning("step is given up", worker=name, after_s=settings.drain_s)
     takeover.stop()
-    for workflow in queue.taken_by().get(name, []):
-        queue.hand_back(workflow)
-    workers.leave(database, name)
+    try:
+        workers.leave(database, name)
+        for workflow in queue.taken_by().get(name, []):
+            queue.hand_back(workflow, name)
+    except UNANSWERED as error:
+        logger.warning("jobs are left to be taken over: the database does not answer", error=str(getattr(error, "orig", error)))
     lock.close()
+    telemetry.close(tracing)
     logger.info("worker ended", worker=name)
     os._exit(0)  # threads of the queue wait in steps that will not begin
 
@@ -86,8 +99,16 @@ def cache_folder(settings: Settings) -> Path:
     return settings.data / "cache"
 
 
-def _set(alive: "Synchronized[float]", oldest: float) -> None:
-    alive.value = oldest
+def _prepared(database: Database, settings: Settings, ending: threading.Event) -> None:
+    """Make the tables; wait for a database that does not answer."""
+    while True:
+        try:
+            prepare(settings, database)
+            return
+        except UNANSWERED as error:
+            logger.warning("database does not answer", error=str(getattr(error, "orig", error)))
+        if ending.wait(LONGEST_PAUSE_S):
+            os._exit(0)
 
 
 def _depose() -> None:

@@ -5,7 +5,8 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import sqlalchemy as sa
-from sqlalchemy.exc import DBAPIError, IntegrityError
+from sqlalchemy.exc import InterfaceError, InternalError, OperationalError
+from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 
 from service.store import tables
 
@@ -15,6 +16,8 @@ BUSY_MS = 30_000
 CREATE_LOCK = 0x72656C6974
 """Of the PostgreSQL advisory lock under which the tables are made."""
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 2.0
+UNANSWERED = (OperationalError, InterfaceError, InternalError, PoolTimeoutError)
+"""What a database raises that may answer another time: it restarts, its disk is full, it is locked for long."""
 
 
 class DatabaseError(Exception):
@@ -42,16 +45,14 @@ class Database:
             patience_s: how long to go on trying while the server cannot be reached or the disk is full.
 
         Raises:
-            DBAPIError: the database does not answer; IntegrityError: what is written is there already.
+            DBAPIError: the database does not answer, or takes what is written for wrong.
         """
         pause, deadline = FIRST_PAUSE_S, time.monotonic() + patience_s
         while True:
             try:
                 with self.engine.begin() as connection:
                     return work(connection)
-            except IntegrityError:
-                raise
-            except DBAPIError:
+            except UNANSWERED:
                 if time.monotonic() + pause > deadline:
                     raise
             time.sleep(pause)
@@ -118,12 +119,34 @@ def create(database: Database) -> None:
         version = connection.execute(sa.select(tables.about.c.version)).scalar()
         if version is None:
             connection.execute(tables.about.insert().values(version=tables.SCHEMA_VERSION))
-        elif version != tables.SCHEMA_VERSION:
-            raise DatabaseError(f"the database is of schema {version}, this program of {tables.SCHEMA_VERSION}: "
-                                "use the program that made it, or another data folder or database")
+        else:
+            _require(version)
+
+
+def require_version(database: Database) -> None:
+    """Look whether the tables are ours; nothing is created.
+
+    Raises:
+        DatabaseError: there are none, or those of another version of the program.
+    """
+    with database.engine.connect() as connection:
+        if not sa.inspect(connection).has_table(tables.about.name):
+            raise DatabaseError("the database has no tables of relit: relit serve makes them")
+        _require(connection.execute(sa.select(tables.about.c.version)).scalar())
+
+
+def _require(version: int | None) -> None:
+    if version != tables.SCHEMA_VERSION:
+        raise DatabaseError(f"the database is of schema {version}, this program of {tables.SCHEMA_VERSION}: "
+                            "use the program that made it, or another data folder or database")
 
 
 def _sqlite(connection: Any, _record: Any) -> None:
     connection.isolation_level = "IMMEDIATE"  # a write takes the lock at its beginning, so that none is turned away in its middle
     for pragma in (f"busy_timeout={BUSY_MS}", "journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON"):
         connection.execute(f"PRAGMA {pragma}")
+
+
+def storable(text: str) -> str:
+    """A sentence that every database takes: it may repeat a name with NUL, or with bytes that are no text."""
+    return text.replace("\0", "\ufffd").encode("utf-8", "replace").decode()

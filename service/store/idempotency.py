@@ -35,19 +35,17 @@ def once(database: Database, project: str, token: str | None, asked: Any, make: 
     """
     if token is None:
         return database.transact(make), True
-    fingerprint = hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
-    before = sa.select(idempotency).where(idempotency.c.project == project, idempotency.c.token == token)
+    fingerprint = _fingerprint(asked)
 
     def work(connection: sa.Connection) -> tuple[str, bool]:
-        row = connection.execute(before).mappings().one_or_none()
+        row = connection.execute(_by_token(project, token)).mappings().one_or_none()
         if row is not None:
-            if row["fingerprint"] != fingerprint:
-                raise TokenReused
-            return row["made"], False
-        made = make(connection)
-        connection.execute(idempotency.insert().values(project=project, token=token, fingerprint=fingerprint, made=made,
-                                                       created_at=time.time()))
-        return made, True
+            return _same(row, fingerprint), False
+        connection.execute(idempotency.insert().values(project=project, token=token, fingerprint=fingerprint, made="",
+                                                       created_at=time.time()))  # the same request, at the same time, waits here
+        created = make(connection)
+        connection.execute(idempotency.update().where(*_is(project, token)).values(made=created))
+        return created, True
 
     try:
         return database.transact(work)
@@ -55,6 +53,35 @@ def once(database: Database, project: str, token: str | None, asked: Any, make: 
         return database.transact(work)
 
 
+def made(database: Database, project: str, token: str, asked: Any) -> str | None:
+    """What was created with a token; None: nothing. Arguments and errors as of `once`."""
+    row = database.row(_by_token(project, token))
+    return None if row is None else _same(row, _fingerprint(asked))
+
+
+def forget(connection: sa.Connection, project: str, token: str, gone: str) -> None:
+    """What a token made is gone: it may make another, unless it has already."""
+    connection.execute(idempotency.delete().where(*_is(project, token), idempotency.c.made == gone))
+
+
 def drop_before(connection: sa.Connection, when: float) -> None:
     """Forget tokens of requests before a time."""
     connection.execute(idempotency.delete().where(idempotency.c.created_at < when))
+
+
+def _by_token(project: str, token: str) -> "sa.Select[Any]":
+    return sa.select(idempotency).where(*_is(project, token))
+
+
+def _is(project: str, token: str) -> "tuple[sa.ColumnElement[bool], ...]":
+    return idempotency.c.project == project, idempotency.c.token == token
+
+
+def _fingerprint(asked: Any) -> str:
+    return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
+
+
+def _same(row: sa.RowMapping, fingerprint: str) -> str:
+    if row["fingerprint"] != fingerprint:
+        raise TokenReused
+    return str(row["made"])

@@ -4,13 +4,14 @@ receiving (an upload) → checking → ready | refused. What is checking or read
 """
 
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import sqlalchemy as sa
 
-from service.store.database import Database
+from service.store.database import Database, storable
 from service.store.jobs import PATIENCE_S
-from service.store.tables import intakes, uploads
+from service.store.tables import intakes, job_inputs, jobs, uploads
 
 RECEIVING, CHECKING, READY, REFUSED = "receiving", "checking", "ready", "refused"
 
@@ -34,6 +35,25 @@ def latest(database: Database, project: str, kind: str, *, limit: int, before: t
     return database.rows(query.order_by(intakes.c.created_at.desc(), intakes.c.id.desc()).limit(limit))
 
 
+def hold(connection: sa.Connection, identifier: str, project: str) -> bool:
+    """Keep one that takes files from being checked or deleted until the transaction ends; what was refused is being mended now.
+
+    Returns:
+        False where it is not there, or takes none.
+    """
+    return connection.execute(intakes.update().where(
+        intakes.c.id == identifier, intakes.c.project == project, intakes.c.folder.is_(None), intakes.c.state.in_((RECEIVING, REFUSED)),
+    ).values(state=RECEIVING, problem=None)).rowcount == 1
+
+
+def last_used(database: Database, identifiers: Sequence[str]) -> dict[str, float]:
+    """Of those that there are: when a job that reads it last changed, or when it was created."""
+    used = sa.func.coalesce(sa.func.max(jobs.c.updated_at), intakes.c.created_at).label("used")
+    read = intakes.outerjoin(job_inputs, job_inputs.c.input == intakes.c.id).outerjoin(jobs, jobs.c.id == job_inputs.c.job)
+    query = sa.select(intakes.c.id, used).select_from(read).where(intakes.c.id.in_(identifiers))
+    return {row["id"]: row["used"] for row in database.rows(query.group_by(intakes.c.id, intakes.c.created_at))}
+
+
 def close(connection: sa.Connection, identifier: str) -> bool:
     """Take no more files, and wait for the check; false where it is checking or ready already."""
     return connection.execute(intakes.update().where(intakes.c.id == identifier, intakes.c.state.in_((RECEIVING, REFUSED))).values(
@@ -47,13 +67,19 @@ def accept(database: Database, identifier: str, facts: dict[str, Any]) -> None:
 
 def refuse(database: Database, identifier: str, problem: str) -> None:
     """The check found something: an upload may be mended and checked again."""
-    _judge(database, identifier, state=REFUSED, problem=problem)
+    _judge(database, identifier, state=REFUSED, problem=storable(problem))
 
 
-def remove(connection: sa.Connection, identifier: str) -> bool:
-    """Forget one, and its uploads."""
+def remove(connection: sa.Connection, identifier: str) -> list[str] | None:
+    """Forget one, and its uploads.
+
+    Returns:
+        Identifiers of uploads that were not complete; None where it was not there.
+    """
+    connection.execute(intakes.update().where(intakes.c.id == identifier).values(name=intakes.c.name))  # no upload may come meanwhile
+    parts = list(connection.execute(sa.select(uploads.c.id).where(uploads.c.intake == identifier, uploads.c.done.is_(False))).scalars())
     connection.execute(uploads.delete().where(uploads.c.intake == identifier))
-    return connection.execute(intakes.delete().where(intakes.c.id == identifier)).rowcount == 1
+    return parts if connection.execute(intakes.delete().where(intakes.c.id == identifier)).rowcount == 1 else None
 
 
 def _judge(database: Database, identifier: str, **values: Any) -> None:

@@ -1,7 +1,7 @@
 """Jobs: what was asked, how far it is, how it ended.
 
 queued → running → succeeded | failed | cancelled; failed and cancelled → queued again, as the next attempt. Every change of a worker
-names the attempt that it works on, so that one which was cancelled or given up for dead changes nothing any more.
+names the worker and the attempt (a Claim), so that one which was cancelled or given up for dead changes nothing any more.
 """
 
 import time
@@ -11,14 +11,26 @@ from typing import Any, NamedTuple
 import sqlalchemy as sa
 
 from service.identifiers import JOB, new_id
-from service.job_requests import ANY_JOB, JobRequest
-from service.store.database import Database
-from service.store.tables import job_inputs, jobs
+from service.job_requests import JobRequest
+from service.store.database import Database, storable
+from service.store.tables import intakes, job_inputs, jobs
 
+FRAMES = "frames"
+"""The stage that counts frames."""
 QUEUED, RUNNING, SUCCEEDED, FAILED, CANCELLED = "queued", "running", "succeeded", "failed", "cancelled"
 ACTIVE, ENDED = (QUEUED, RUNNING), (SUCCEEDED, FAILED, CANCELLED)
 PATIENCE_S = 600.0
-"""How long a worker waits for a database that does not answer."""
+"""How long a change of a worker waits for a database that does not answer."""
+LATELY_S = 60.0
+"""How long a job that has ended is still news; clocks of workers may differ by this much."""
+
+
+class Claim(NamedTuple):
+    """That a worker works on an attempt of a job."""
+
+    job: str
+    attempt: int
+    worker: str
 
 
 class Progress(NamedTuple):
@@ -32,7 +44,7 @@ class Progress(NamedTuple):
 
 
 def insert(connection: sa.Connection, *, project: str, key: str | None, request: JobRequest, chunk_frames: int,
-           inputs: Iterable[str]) -> str:
+           inputs: Iterable[str], trace: str | None = None) -> str:
     """Write down a new job in the caller's transaction.
 
     Args:
@@ -41,14 +53,16 @@ def insert(connection: sa.Connection, *, project: str, key: str | None, request:
         request: what is asked.
         chunk_frames: frames of a step; kept, so that the steps of a job stay the same whatever the settings become.
         inputs: identifiers of what it reads.
+        trace: traceparent of the request, so that the spans of its steps are found with it.
 
     Returns:
         Its identifier.
     """
     identifier, now = new_id(JOB), time.time()
     connection.execute(jobs.insert().values(
-        id=identifier, project=project, key=key, request=request.model_dump(mode="json", by_alias=True), chunk_frames=chunk_frames,
-        priority=request.priority, state=QUEUED, attempt=1, revision=1, created_at=now, updated_at=now, lost=0, finished_steps=[]))
+        id=identifier, project=project, key=key, request=request.model_dump(mode="json", by_alias=True), trace=trace,
+        chunk_frames=chunk_frames, priority=request.priority, state=QUEUED, attempt=1, revision=1, created_at=now, updated_at=now, lost=0,
+        reached=0, finished_steps=[]))
     if rows := [{"job": identifier, "input": name} for name in dict.fromkeys(inputs)]:
         connection.execute(job_inputs.insert(), rows)
     return identifier
@@ -79,6 +93,13 @@ def latest(database: Database, project: str, *, states: Sequence[str] = (), limi
     return database.rows(query.order_by(jobs.c.created_at.desc(), jobs.c.id.desc()).limit(limit))
 
 
+def watched(database: Database, topics: Sequence[str]) -> list[sa.RowMapping]:
+    """Identifier, project and revision of jobs, and of all jobs of projects that have not ended or ended lately."""
+    lately = jobs.c.state.in_(ACTIVE) | (jobs.c.updated_at > time.time() - LATELY_S)
+    return database.rows(sa.select(jobs.c.id, jobs.c.project, jobs.c.revision).where(
+        jobs.c.id.in_(topics) | (jobs.c.project.in_(topics) & lately)))
+
+
 def revisions(database: Database, identifiers: Sequence[str]) -> dict[str, sa.RowMapping]:
     """Jobs by identifier, for those who watch them."""
     return {row["id"]: row for row in database.rows(sa.select(jobs).where(jobs.c.id.in_(identifiers)))}
@@ -97,68 +118,98 @@ def counts(database: Database) -> dict[str, int]:
         sa.select(jobs.c.state, sa.func.count().label("count")).group_by(jobs.c.state))}
 
 
+def oldest_queued(database: Database) -> float | None:
+    """When the job that has waited for longest began to wait."""
+    row = database.row(sa.select(sa.func.min(jobs.c.updated_at).label("since")).where(jobs.c.state == QUEUED))
+    return None if row is None else row["since"]
+
+
+def frames(database: Database) -> int:
+    """Frames that all jobs together have made."""
+    row = database.row(sa.select(sa.func.sum(jobs.c.done).label("frames")).where(jobs.c.stage == FRAMES))
+    return int((row and row["frames"]) or 0)
+
+
 def users_of(connection: sa.Connection, input_id: str, *, active: bool) -> list[str]:
-    """Identifiers of jobs that read something; active: of those alone which have not ended."""
-    query = sa.select(jobs.c.id).join(job_inputs, job_inputs.c.job == jobs.c.id).where(job_inputs.c.input == input_id)
+    """Identifiers of jobs that read something; active: of those alone which have not ended.
+
+    Checks are left out: the state of what they check tells, and changes a moment before they have ended.
+    """
+    query = sa.select(jobs.c.id).join(job_inputs, job_inputs.c.job == jobs.c.id).where(
+        job_inputs.c.input == input_id, jobs.c.request["kind"].as_string() != "check")
     return list(connection.execute(query.where(jobs.c.state.in_(ACTIVE)) if active else query).scalars())
 
 
-def begin(database: Database, job: str, attempt: int, worker: str) -> bool:
-    """A worker takes a job up; false where it is not to be done any more."""
-    now = time.time()
-    return _change(database, job, attempt, state=RUNNING, worker=worker, started_at=sa.func.coalesce(jobs.c.started_at, now))
+def begin(database: Database, claim: Claim) -> bool:
+    """A worker takes a job up; false where it is not to be done any more, or is another worker's."""
+    free = sa.or_(jobs.c.worker.is_(None), jobs.c.worker == claim.worker)
+    return _change(database, claim, free, state=RUNNING, worker=claim.worker,
+                   started_at=sa.func.coalesce(jobs.c.started_at, time.time()))
 
 
-def is_wanted(database: Database, job: str, attempt: int) -> bool:
-    """Whether a worker shall go on with an attempt."""
-    row = database.row(sa.select(jobs.c.state, jobs.c.attempt).where(jobs.c.id == job))
-    return row is not None and row["attempt"] == attempt and row["state"] in ACTIVE
+def is_wanted(database: Database, claim: Claim) -> bool:
+    """Whether a worker shall go on."""
+    return database.row(sa.select(jobs.c.id).where(*_held(claim))) is not None
 
 
-def advance(database: Database, job: str, attempt: int, progress: Progress) -> bool:
-    """Note where a running job is; lost where the database does not answer at once."""
-    return _change(database, job, attempt, patience_s=0.0, **progress._asdict())
+def advance(database: Database, claim: Claim, progress: Progress) -> bool:
+    """Note where a running job is.
+
+    More frames than it ever had count as a finished step does: a job that comes further is not one that kills its workers.
+
+    Raises:
+        DBAPIError: the database does not answer at once.
+    """
+    reached: dict[str, Any] = {}
+    if progress.stage == FRAMES:
+        further = jobs.c.reached < progress.done
+        reached = {"reached": sa.case((further, progress.done), else_=jobs.c.reached), "lost": sa.case((further, 0), else_=jobs.c.lost)}
+    return _change(database, claim, patience_s=0.0, **progress._asdict(), **reached)
 
 
-def finish_step(database: Database, job: str, attempt: int, steps: Sequence[str]) -> bool:
+def finish_step(database: Database, claim: Claim, steps: Sequence[str]) -> bool:
     """Note the steps that are finished: all of them, this one too."""
-    return _change(database, job, attempt, finished_steps=list(steps), lost=0)
+    return _change(database, claim, finished_steps=list(steps), lost=0)
 
 
-def end(database: Database, job: str, attempt: int, state: str, error: str | None = None) -> bool:
+def end(database: Database, claim: Claim, state: str, error: str | None = None) -> bool:
     """A worker ends a job."""
     done: dict[str, Any] = {"done": jobs.c.total} if state == SUCCEEDED else {}  # what was told last may lie half a second back
-    return _change(database, job, attempt, state=state, error=error, finished_at=time.time(), **done)
+    return _change(database, claim, state=state, error=None if error is None else storable(error), finished_at=time.time(), **done)
 
 
-def lose_worker(connection: sa.Connection, job: str, attempt: int, limit: int, sentence: str) -> bool:
-    """A worker died with this job; false where it has lost too many, and has failed.
+def lose_worker(connection: sa.Connection, claim: Claim, limit: int, sentence: str) -> str | None:
+    """A worker died with this job, which waits for the next one, or has failed where it lost too many.
 
     Args:
         connection: of the caller's transaction.
-        job, attempt: what it worked on.
+        claim: of the dead.
         limit: workers that a job may lose in one step.
         sentence: the error of a job that lost more.
+
+    Returns:
+        The job's state; None where it had ended.
     """
-    row = connection.execute(sa.select(jobs.c.lost).where(
-        jobs.c.id == job, jobs.c.attempt == attempt, jobs.c.state.in_(ACTIVE)).with_for_update()).one_or_none()
+    active = [jobs.c.id == claim.job, jobs.c.attempt == claim.attempt, jobs.c.state.in_(ACTIVE)]
+    row = connection.execute(sa.select(jobs.c.lost, jobs.c.worker).where(*active).with_for_update()).one_or_none()
     if row is None:
-        return False
-    lost, now = row.lost + 1, time.time()
-    failed = lost > limit
-    connection.execute(jobs.update().where(jobs.c.id == job).values(
-        lost=lost, worker=None, updated_at=now, revision=jobs.c.revision + 1,
-        **({"state": FAILED, "error": sentence, "finished_at": now} if failed else {"state": QUEUED})))
-    return not failed
-
-
-def hand_back(connection: sa.Connection, job: str, attempt: int) -> JobRequest | None:
-    """A worker that ends gives a job back; what is asked, or None where the job is not wanted any more."""
-    done = connection.execute(jobs.update().where(jobs.c.id == job, jobs.c.attempt == attempt, jobs.c.state.in_(ACTIVE)).values(
-        state=QUEUED, worker=None, updated_at=time.time(), revision=jobs.c.revision + 1))
-    if done.rowcount != 1:
         return None
-    return ANY_JOB.validate_python(connection.execute(sa.select(jobs.c.request).where(jobs.c.id == job)).scalar_one())
+    lost = row.lost + (row.worker == claim.worker)  # not one that died before it began, and none twice
+    state, now = FAILED if lost > limit else QUEUED, time.time()
+    done = connection.execute(jobs.update().where(*active).values(
+        state=state, lost=lost, worker=None, updated_at=now, revision=jobs.c.revision + 1,
+        **({"error": sentence, "finished_at": now} if state == FAILED else {})))
+    if state == FAILED:
+        _end_check(connection, claim.job, sentence)
+    return state if done.rowcount == 1 else None
+
+
+def hand_back(connection: sa.Connection, claim: Claim) -> bool:
+    """A worker gives a job back; false where it is not wanted any more."""
+    mine = sa.or_(jobs.c.worker.is_(None), jobs.c.worker == claim.worker)
+    return connection.execute(jobs.update().where(
+        jobs.c.id == claim.job, jobs.c.attempt == claim.attempt, jobs.c.state.in_(ACTIVE), mine).values(
+        state=QUEUED, worker=None, updated_at=time.time(), revision=jobs.c.revision + 1)).rowcount == 1
 
 
 def cancel(connection: sa.Connection, job: str) -> bool:
@@ -166,6 +217,8 @@ def cancel(connection: sa.Connection, job: str) -> bool:
     now = time.time()
     done = connection.execute(jobs.update().where(jobs.c.id == job, jobs.c.state.in_(ACTIVE)).values(
         state=CANCELLED, finished_at=now, updated_at=now, revision=jobs.c.revision + 1))
+    if done.rowcount == 1:
+        _end_check(connection, job, "its check was cancelled: validate it again")
     return done.rowcount == 1
 
 
@@ -177,7 +230,7 @@ def begin_again(connection: sa.Connection, job: str, state: str) -> int | None:
     """
     done = connection.execute(jobs.update().where(jobs.c.id == job, jobs.c.state == state).values(
         state=QUEUED, attempt=jobs.c.attempt + 1, revision=jobs.c.revision + 1, updated_at=time.time(), finished_at=None,
-        error=None, lost=0, worker=None, stage=None, done=None, total=None, rate=None))
+        error=None, lost=0, reached=0, worker=None, stage=None, done=None, total=None, rate=None))
     if done.rowcount != 1:
         return None
     return int(connection.execute(sa.select(jobs.c.attempt).where(jobs.c.id == job)).scalar_one())
@@ -203,10 +256,23 @@ def remove(connection: sa.Connection, job: str) -> bool:
 
 def ended_before(database: Database, when: float) -> list[sa.RowMapping]:
     """Jobs that ended before a time."""
-    return database.rows(sa.select(jobs.c.id, jobs.c.project).where(jobs.c.state.in_(ENDED), jobs.c.finished_at < when))
+    return database.rows(sa.select(jobs.c.id, jobs.c.project, jobs.c.attempt).where(jobs.c.state.in_(ENDED), jobs.c.finished_at < when))
 
 
-def _change(database: Database, job: str, attempt: int, *, patience_s: float = PATIENCE_S, **values: Any) -> bool:
-    statement = jobs.update().where(jobs.c.id == job, jobs.c.attempt == attempt, jobs.c.state.in_(ACTIVE)).values(
-        updated_at=time.time(), revision=jobs.c.revision + 1, **values)
+def _held(claim: Claim) -> list[sa.ColumnElement[bool]]:
+    return [jobs.c.id == claim.job, jobs.c.attempt == claim.attempt, jobs.c.worker == claim.worker, jobs.c.state.in_(ACTIVE)]
+
+
+def _end_check(connection: sa.Connection, job: str, problem: str) -> None:
+    """What a check was to look at is refused, so that it does not wait for ever; other jobs read nothing that is being checked."""
+    connection.execute(intakes.update().where(
+        intakes.c.state == "checking", intakes.c.id.in_(sa.select(job_inputs.c.input).where(job_inputs.c.job == job))).values(
+        state="refused", problem=problem))
+
+
+def _change(database: Database, claim: Claim, free: sa.ColumnElement[bool] | None = None, *, patience_s: float = PATIENCE_S,
+            **values: Any) -> bool:
+    """Change what a worker holds, or what is free for it to take."""
+    found = _held(claim) if free is None else [jobs.c.id == claim.job, jobs.c.attempt == claim.attempt, jobs.c.state.in_(ACTIVE), free]
+    statement = jobs.update().where(*found).values(updated_at=time.time(), revision=jobs.c.revision + 1, **values)
     return database.transact(lambda connection: connection.execute(statement).rowcount == 1, patience_s=patience_s)

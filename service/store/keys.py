@@ -5,11 +5,12 @@ import hmac
 import secrets
 import time
 from enum import StrEnum
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import sqlalchemy as sa
+from pydantic import BaseModel, StringConstraints
 
-from service.identifiers import KEY, new_id
+from service.identifiers import KEY, Project, new_id
 from service.store.database import Database
 from service.store.tables import keys
 
@@ -31,6 +32,14 @@ class Scope(StrEnum):
 ORDER = list(Scope)
 
 
+class NewKey(BaseModel):
+    """A key that is to be made."""
+
+    project: Project
+    name: Annotated[str, StringConstraints(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]+$")]
+    scope: Scope
+
+
 class Caller(NamedTuple):
     """Who asks."""
 
@@ -44,7 +53,7 @@ class Caller(NamedTuple):
         return ORDER.index(self.scope) >= ORDER.index(scope)
 
 
-def create(database: Database, *, project: str, name: str, scope: Scope) -> str:
+def create(database: Database, wanted: NewKey) -> str:
     """Make a key.
 
     Returns:
@@ -52,7 +61,7 @@ def create(database: Database, *, project: str, name: str, scope: Scope) -> str:
     """
     identifier, secret = new_id(KEY), secrets.token_urlsafe(SECRET_BYTES)
     database.transact(lambda connection: connection.execute(keys.insert().values(
-        id=identifier, project=project, name=name, scope=scope, digest=_digest(secret), created_at=time.time())))
+        id=identifier, **wanted.model_dump(), digest=_digest(secret), created_at=time.time())))
     return f"{identifier}.{secret}"
 
 
@@ -72,7 +81,7 @@ def revoke(database: Database, identifier: str) -> bool:
 
 
 def listing(database: Database, project: str | None = None) -> list[sa.RowMapping]:
-    """Keys that were made, the oldest first."""
+    """Keys that were made, without their secrets; the oldest first."""
     query = sa.select(keys.c.id, keys.c.project, keys.c.name, keys.c.scope, keys.c.created_at, keys.c.revoked_at)
     return database.rows((query if project is None else query.where(keys.c.project == project)).order_by(keys.c.created_at))
 

@@ -6,6 +6,8 @@ SCHEMA_VERSION = 1
 """Raised with every change of a table; a database of another version is refused."""
 
 metadata = sa.MetaData()
+Bytewise = sa.Text().with_variant(sa.Text(collation="C"), "postgresql")
+"""Text in the order of its bytes, as SQLite has it anyway."""
 
 
 def _id() -> "sa.Column[str]":
@@ -41,17 +43,19 @@ uploads = sa.Table(
     "relit_uploads", metadata, _id(), _project(),
     sa.Column("intake", sa.String(32), sa.ForeignKey("relit_intakes.id"), nullable=False),
     sa.Column("path", sa.Text, nullable=False),  # within the capture
+    sa.Column("folded", Bytewise, nullable=False),  # the path where upper and lower case are one
     sa.Column("length", sa.BigInteger, nullable=False),
     sa.Column("received", sa.BigInteger, nullable=False),  # bytes that are safe on disk
     sa.Column("sha256", sa.String(64)),  # of the whole file, hexadecimal, where the client said it
     sa.Column("touched_at", sa.Float, nullable=False),
     sa.Column("done", sa.Boolean, nullable=False),
-    sa.UniqueConstraint("intake", "path", name="relit_uploads_of_path"))
+    sa.UniqueConstraint("intake", "folded", name="relit_uploads_of_path"))
 
 jobs = sa.Table(
     "relit_jobs", metadata, _id(), _project(),
     sa.Column("key", sa.String(32)),  # who asked; NULL: anonymous, or the service itself
     sa.Column("request", sa.JSON, nullable=False),  # service.job_requests
+    sa.Column("trace", sa.String(64)),  # traceparent of the request that made it, where traces are made
     sa.Column("chunk_frames", sa.Integer, nullable=False),
     sa.Column("priority", sa.Integer, nullable=False),
     sa.Column("state", sa.String(16), nullable=False),
@@ -62,7 +66,8 @@ jobs = sa.Table(
     sa.Column("started_at", sa.Float),
     sa.Column("finished_at", sa.Float),
     sa.Column("worker", sa.String(200)),
-    sa.Column("lost", sa.Integer, nullable=False),  # workers that died since the last finished step
+    sa.Column("lost", sa.Integer, nullable=False),  # workers that died since the job last came further
+    sa.Column("reached", sa.Integer, nullable=False),  # the most frames that it had in this attempt
     sa.Column("finished_steps", sa.JSON, nullable=False),  # names, of all attempts
     sa.Column("stage", sa.String(100)),
     sa.Column("done", sa.Integer),

@@ -33,3 +33,8 @@ def leave(database: Database, worker: str) -> None:
 def present(database: Database) -> list[sa.RowMapping]:
     """Workers that were seen lately."""
     return database.rows(sa.select(workers).where(workers.c.seen_at > time.time() - SILENT_S).order_by(workers.c.started_at))
+
+
+def silent(database: Database, since: float) -> list[sa.RowMapping]:
+    """Workers that were not seen since a time."""
+    return database.rows(sa.select(workers).where(workers.c.seen_at < since))

@@ -1,0 +1,278 @@
+"""What the service loses when its processes are killed, hang or are without their database: the table of docs/service_faults.md.
+
+python -m benchmarks.service_faults [--seed N] [--write docs/service_faults.md]; some minutes; needs the server programs of PostgreSQL.
+"""
+
+import argparse
+import os
+import random
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from service.identifiers import CAPTURE, ENVIRONMENT
+from service.store import jobs, workers
+from tests.captures import make_scene, write_capture, write_exr
+from tests.service.jobs.yard import Yard, digests, relit_relight, yard
+from tests.service.postgres import Postgres, binaries, postgres
+
+FRAMES, SIZE, LIGHTS, CHUNK_FRAMES, WORKERS = 200, 1024, 6, 8, 3
+TAKEOVER_LIMIT_S = 10.0
+STALL_S = 5.0
+AT_WORK, WITH_SUPERVISOR, SUPERVISOR, IDLE = (
+    "SIGKILL of the worker at work", "SIGKILL of the worker at work and of the `relit worker` over it, as when a machine dies",
+    "SIGKILL of the `relit worker` over the worker at work", "SIGKILL of a worker that waits")
+KILLS = {AT_WORK: 15, WITH_SUPERVISOR: 8, SUPERVISOR: 3, IDLE: 4}
+"""30, in random order."""
+
+
+class Fault(NamedTuple):
+    """A row of the table."""
+
+    kind: str
+    times: int
+    frames: int
+    """Of the jobs that were disturbed; all have to be there, once, in full."""
+    identical: int
+    """Of these, bit by bit as `relit relight` makes them."""
+    takeovers_s: Sequence[float]
+    """From the fault until another worker has the job."""
+    lost: int
+    """Jobs that did not succeed."""
+
+
+class Site(NamedTuple):
+    """What is relit, and what it comes to undisturbed."""
+
+    capture: Path
+    environment: Path
+    digests: dict[str, str]
+
+
+def make_site(folder: Path) -> Site:
+    capture = write_capture(folder / "capture", make_scene(size=SIZE, lights=LIGHTS))
+    environment = write_exr(folder / "sky.exr", np.random.default_rng(7).random((16, 32, 3)))
+    return Site(capture, environment, relit_relight(capture, environment, FRAMES, folder / "frames"))
+
+
+def submit(made: Yard, site: Site) -> str:
+    return made.relight(made.register(site.capture, CAPTURE), made.register(site.environment, ENVIRONMENT), FRAMES,
+                        chunk_frames=CHUNK_FRAMES)
+
+
+def settle(made: Yard, site: Site, job: str) -> tuple[int, int, int]:
+    """Wait for the job: frames that were to be there, those that are as undisturbed, jobs lost."""
+    row = made.ended(job, within_s=600)
+    there = digests(made.results(job))
+    assert there.keys() <= site.digests.keys(), f"besides the frames: {sorted(there.keys() - site.digests.keys())}"
+    made.until(lambda: made.queue.taken_by() == {}, "left by everybody")
+    made.never_two_at_once(job)
+    return FRAMES, sum(there.get(name) == digest for name, digest in site.digests.items()), int(row["state"] != jobs.SUCCEEDED)
+
+
+def tell(made: Yard, job: str, kind: str, took: float | None) -> None:
+    print(f"{made.frames_there(job):4d} frames  {'        ' if took is None else f'{took:6.2f} s'}  {kind}", flush=True)
+
+
+def taken_over(made: Yard, job: str, victim: str) -> float:
+    """Seconds until another worker has the job."""
+    began = time.monotonic()
+    made.holder(job, other_than=victim)
+    return time.monotonic() - began
+
+
+def machine_of(made: Yard, pid: int) -> "subprocess.Popen[bytes]":
+    """The `relit worker` over a worker; both are in a process group of their own."""
+    return next(process for process in made.supervisors if process.pid == os.getpgid(pid))
+
+
+def kill(made: Yard, job: str, kind: str, chance: random.Random) -> float | None:
+    """One kill; how long it took until the job was taken over, None where it need not be."""
+    holder = made.holder(job)
+    if kind == IDLE:
+        others = made.until(lambda: [row for row in workers.present(made.database) if row["id"] != holder and _lives(row["pid"])],
+                            "a worker that waits")
+        os.kill(chance.choice(others)["pid"], signal.SIGKILL)
+        return None
+    pid = made.pid_of(holder)
+    if kind == AT_WORK:
+        os.kill(pid, signal.SIGKILL)
+        return taken_over(made, job, holder)
+    machine = machine_of(made, pid)
+    if kind == SUPERVISOR:
+        os.kill(machine.pid, signal.SIGKILL)
+    else:
+        os.killpg(machine.pid, signal.SIGKILL)
+    machine.wait()
+    made.start()
+    return taken_over(made, job, holder)
+
+
+def _lives(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def kills(folder: Path, server: Postgres, site: Site, chance: random.Random) -> list[Fault]:
+    """The 30 kills in one job: each when so many frames are there, and up to a second later."""
+    order = [kind for kind, times in KILLS.items() for _ in range(times)]
+    chance.shuffle(order)
+    frames = sorted(chance.randrange(FRAMES - 2 * CHUNK_FRAMES) for _ in order)
+    takeovers: dict[str, list[float]] = {kind: [] for kind in KILLS}
+    with yard(folder, server.new_database(), max_lost=len(order)) as made:
+        for _ in range(WORKERS):
+            made.start()
+        made.ready(WORKERS)
+        job = submit(made, site)
+        for kind, at in zip(order, frames, strict=True):
+            made.until(lambda at=at: made.frames_there(job) >= at, f"{at} frames")
+            time.sleep(chance.uniform(0, 1))
+            took = kill(made, job, kind, chance)
+            tell(made, job, kind, took)
+            takeovers[kind] += [] if took is None else [took]
+        wanted, identical, lost = settle(made, site, job)
+    rows = [Fault(kind, times, 0, 0, takeovers[kind], 0) for kind, times in KILLS.items()]
+    dead = [each for kind in KILLS if kind != SUPERVISOR for each in takeovers[kind]]
+    return [*rows, Fault("**these together, in one job, in random order**", len(order), wanted, identical, dead, lost)]
+
+
+def disturbed(folder: Path, server: Postgres, site: Site, kind: str, times: int, disturb: Callable[[Yard, str], float | None], *,
+              environment: dict[str, str] | None = None, **settings: float) -> Fault:
+    """A job during which something happens so many times, evenly over its frames."""
+    takeovers: list[float] = []
+    with yard(folder, server.new_database(), **settings) as made:
+        for _ in range(WORKERS):
+            made.start(**(environment or {}))
+        made.ready(WORKERS)
+        job = submit(made, site)
+        for number in range(times):
+            made.until(lambda at=(2 * number + 1) * FRAMES // (2 * times + 1): made.frames_there(job) >= at, "that many frames")
+            took = disturb(made, job)
+            takeovers += [] if took is None else [took]
+            tell(made, job, kind, took)
+        wanted, identical, lost = settle(made, site, job)
+        return Fault(kind, times, wanted, identical, takeovers, lost)
+
+
+def kill_all(made: Yard, job: str) -> float:
+    holder = made.holder(job)
+    for process in made.supervisors:
+        if process.poll() is None:
+            for row in workers.present(made.database):
+                if _lives(row["pid"]) and os.getpgid(row["pid"]) == process.pid:
+                    os.kill(row["pid"], signal.SIGKILL)
+    return taken_over(made, job, holder)
+
+
+def stop_one(made: Yard, job: str) -> float:
+    holder = made.holder(job)
+    os.kill(made.pid_of(holder), signal.SIGSTOP)
+    return taken_over(made, job, holder)
+
+
+def ask_one_to_end(made: Yard, job: str) -> float:
+    holder = made.holder(job)
+    machine = machine_of(made, made.pid_of(holder))
+    machine.send_signal(signal.SIGTERM)
+    took = taken_over(made, job, holder)
+    assert machine.wait(30) == 0
+    made.start()
+    made.ready(WORKERS)
+    return took
+
+
+def restarted(server: Postgres, mode: str, away_s: float) -> Callable[[Yard, str], None]:
+    def restart(made: Yard, job: str) -> None:
+        before = made.row(job)["worker"]
+        server.restart(mode, away_s=away_s)
+        time.sleep(3 * made.settings.takeover_s)
+        assert made.row(job)["worker"] == before or made.row(job)["state"] in jobs.ENDED, "a worker that lives was given up for dead"
+
+    return restart
+
+
+def table(faults: list[Fault]) -> list[str]:
+    lines = ["| fault | times | frames | identical | another worker has the job after (median / longest) | jobs lost |",
+             "|---|---:|---:|---:|---:|---:|"]
+    for fault in faults:
+        took = fault.takeovers_s
+        lines.append(f"| {fault.kind} | {fault.times} | {fault.frames or ''} | {fault.identical if fault.frames else ''} "
+                     f"| {f'{statistics.median(took):.1f} s / {max(took):.1f} s' if took else ''} | {fault.lost if fault.frames else ''} |")
+    return lines
+
+
+def processor() -> str:
+    with open("/proc/cpuinfo") as file:
+        return next((line.partition(":")[2].strip() for line in file if line.startswith("model name")), "unknown")
+
+
+def document(faults: list[Fault], seed: int, seconds: float, load: float) -> str:
+    return f"""# Faults of the service, measured
+
+Measured on {datetime.now(UTC):%Y-%m-%d} on {os.cpu_count()} cores ({processor()}; load average before it began
+{load:.1f}) in {seconds / 60:.0f} minutes, seed {seed}, by
+
+    python -m benchmarks.service_faults --write docs/service_faults.md
+
+Each row is a relight of {FRAMES} frames ({SIZE} × {SIZE}, {LIGHTS} lights, {CHUNK_FRAMES} frames a step) with {WORKERS} workers
+on a private PostgreSQL, and faults in its course; the kills come at random moments, in random order. *Identical* are
+frames whose file is, bit by bit, the one that `relit relight` makes undisturbed. The script ends with an error where a
+frame is missing or another, where there is a file besides (hidden ones too), where two workers were at one job at a
+time, where a job is lost or left over in the queue, and where a takeover from a killed worker takes {TAKEOVER_LIMIT_S:g} s or
+longer. `tests/service/jobs` has these faults at small size, the kills on SQLite too, and others: a job that kills its
+workers, a full disk, a killed API.
+
+{chr(10).join(table(faults))}
+
+A worker that stands still is killed after `stall_s`, here {STALL_S:g} s, and its time contains that. A worker that is asked to end, or
+whose `relit worker` is killed, first finishes its step and then hands the job back, and its time contains that. A restart of PostgreSQL
+takes the job from nobody. In the run of kills `max_lost` is their number: as shipped a job that loses four workers without a frame more
+between them fails, since it may be what kills them.
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seed", type=int, default=random.randrange(2**32))
+    parser.add_argument("--write", type=Path, help="the document that the table goes into")
+    chosen = parser.parse_args(arguments)
+    programs = binaries()
+    if programs is None:
+        sys.exit("no PostgreSQL server programs: neither on the PATH nor in /usr/lib/postgresql")
+    print(f"seed {chosen.seed}")
+    began, load = time.monotonic(), os.getloadavg()[0]
+    with tempfile.TemporaryDirectory(prefix="relit-faults-") as name, postgres(programs) as server:
+        folder = Path(name)
+        site = make_site(folder)
+        faults = kills(folder / "kills", server, site, random.Random(chosen.seed))
+        for number, (kind, times, disturb, settings) in enumerate((
+                ("SIGKILL of all workers at once", 3, kill_all, {}),
+                ("SIGSTOP of the worker at work", 2, stop_one, {"stall_s": STALL_S}),
+                ("SIGTERM to the `relit worker` at work", 3, ask_one_to_end, {}),
+                ("PostgreSQL restarted (fast)", 3, restarted(server, "fast", 0.0), {}),
+                ("PostgreSQL restarted (immediate)", 3, restarted(server, "immediate", 0.0), {}),
+                ("PostgreSQL away for 10 s", 2, restarted(server, "fast", 10.0), {}))):
+            faults.append(disturbed(folder / str(number), server, site, kind, times, disturb, **settings))
+    text = document(faults, chosen.seed, time.monotonic() - began, load)
+    print(text)
+    dead = [each for fault in faults if "SIGKILL of the worker" in fault.kind or "all workers" in fault.kind for each in fault.takeovers_s]
+    assert all(fault.identical == fault.frames and fault.lost == 0 for fault in faults), "frames or jobs are lost"
+    assert max(dead) < TAKEOVER_LIMIT_S, f"a takeover took {max(dead):.1f} s"
+    if chosen.write is not None:
+        chosen.write.write_text(text)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,30 @@
+"""What a supervisor is given in place of a worker; in a module of its own, which the process that is spawned imports."""
+
+import os
+import time
+
+
+def never_ready(settings, device, pulse):
+    os._exit(1)
+
+
+def ready_and_dead(settings, device, pulse):
+    pulse.ready()
+    os._exit(1)
+
+
+def stuck_at_the_start(settings, device, pulse):
+    time.sleep(3600)
+
+
+def without_a_beat(settings, device, pulse):
+    pulse.ready()
+    time.sleep(3600)
+
+
+def stuck_in_a_step(settings, device, pulse):
+    pulse.ready()
+    pulse.step(time.monotonic())
+    while True:
+        pulse.beat()
+        time.sleep(0.05)
