@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Field
 
 from service.requests import MAX_STOPS
 from stage.colour import ColorSpaceName, is_linear
-from stage.model import Direction, NotNegative, Positive, Rgb, Strict, Text, Vector
+from stage.model import Direction, FirstFault, NotNegative, Positive, Rgb, Strict, Text, Vector
 from stage.records import read_record
 
 SCHEMA = "relit.keys/1"
@@ -19,13 +19,15 @@ SUN_DEGREES = 0.53
 OPPOSITE = -1 + 1e-6
 """Cosine of two directions between which no shortest way can be told: within 0.1 degrees of opposite."""
 
+LAST_FRAME = 999_999_999
+"""As large as the number of a frame may be."""
 Stops = Annotated[float, Field(ge=-MAX_STOPS, le=MAX_STOPS)]
 
 
 class Key(Strict):
     """A value at a frame."""
 
-    frame: Annotated[int, Field(ge=0)]
+    frame: Annotated[int, Field(ge=0, le=LAST_FRAME)]
     interpolation: Literal["linear", "step"] = "linear"
     """From this key to the next: an even change, or none until the next."""
 
@@ -104,14 +106,14 @@ class LightTrack(Strict):
     name: Text
     color_space: Annotated[ColorSpaceName, AfterValidator(_linear)] = "lin_rec709_scene"
     """Of its irradiance."""
-    keys: Annotated[tuple[LightKey, ...], Some, InOrder, AfterValidator(_ways)]
+    keys: Annotated[tuple[LightKey, ...], Some, FirstFault, InOrder, AfterValidator(_ways)]
 
 
 class CapturedTrack(Strict):
     """One animated image of the capture."""
 
     image: Text
-    keys: Annotated[tuple[WeightKey, ...], Some, InOrder]
+    keys: Annotated[tuple[WeightKey, ...], Some, FirstFault, InOrder]
 
 
 class LightKeys(Strict):
@@ -120,10 +122,10 @@ class LightKeys(Strict):
     schema_: Literal["relit.keys/1"] = Field(alias="schema")
     frames_per_second: Positive | None = None
     """For the reader of the frames: keys stand at frame numbers."""
-    environment: Annotated[tuple[EnvironmentKey, ...], InOrder, AfterValidator(_axes)] = ()
-    lights: tuple[LightTrack, ...] = ()
-    captured: tuple[CapturedTrack, ...] = ()
-    exposure: Annotated[tuple[ExposureKey, ...], InOrder] = ()
+    environment: Annotated[tuple[EnvironmentKey, ...], FirstFault, InOrder, AfterValidator(_axes)] = ()
+    lights: Annotated[tuple[LightTrack, ...], FirstFault] = ()
+    captured: Annotated[tuple[CapturedTrack, ...], FirstFault] = ()
+    exposure: Annotated[tuple[ExposureKey, ...], FirstFault, InOrder] = ()
 
     @classmethod
     def read(cls, path: Path) -> "LightKeys":

@@ -28,7 +28,7 @@ Light = Annotated[Vector, AfterValidator(_light)]
 
 
 class _NearLight(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
 
 
 class PointLight(_NearLight):
@@ -78,10 +78,12 @@ class RectangleLight(_NearLight):
 
 
 def _read(form: str, parts: tuple[_Part, ...], optional: int = 0) -> Any:
-    """Take text `a,b,c,…` apart; other input is left as it is."""
+    """Take text `a,b,c,…` apart; lists of JSON become tuples."""
     whole, least = sum(part.numbers for part in parts), sum(part.numbers for part in parts[: len(parts) - optional])
 
     def read(given: Any) -> Any:
+        if isinstance(given, dict):
+            return {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
         if not isinstance(given, str):
             return given
         try:

@@ -11,19 +11,22 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from service.methods import BasisKind, FrameCompression, FrameSpace, Geometry, Layer, LightWeights, Method
 from service.near_lights import GivenPoint, GivenRectangle, GivenSphere
+from stage.model import FirstFault
 
 MAX_STOPS = 32.0
 """Of exposure either way: more than half has from its smallest value to its largest."""
 
 
 def _split(given: Any) -> Any:
-    return tuple(part.strip() for part in given.split(",")) if isinstance(given, str) else given
+    if isinstance(given, str):
+        return tuple(part.strip() for part in given.split(","))
+    return tuple(given) if isinstance(given, list) else given  # which strict validation of JSON asks for
 
 
 class Options(BaseModel):
     """Base of every model: what is not known is refused."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
 
 class Request(Options):
@@ -71,7 +74,7 @@ class PictureOptions(Options):
 
     exposure: float = Field(default=0.0, ge=-MAX_STOPS, le=MAX_STOPS, allow_inf_nan=False)
     """Stops: every picture is multiplied by 2 to this power."""
-    aov: Annotated[tuple[Layer, ...], BeforeValidator(_split)] = (Layer.BEAUTY,)
+    aov: Annotated[tuple[Layer, ...], FirstFault, BeforeValidator(_split)] = (Layer.BEAUTY,)
     """Layers of a picture; as text, names with commas between."""
     color_space: FrameSpace | None = None
     """None: the capture's own scene-linear space."""
@@ -120,9 +123,9 @@ class RelightRequest(RelightOptions, Request):
 class ShadeOptions(PictureOptions):
     """Lights near the surface, and how its environment is turned."""
 
-    light: tuple[GivenPoint, ...] = ()
-    sphere: tuple[GivenSphere, ...] = ()
-    rectangle: tuple[GivenRectangle, ...] = ()
+    light: Annotated[tuple[GivenPoint, ...], FirstFault] = ()
+    sphere: Annotated[tuple[GivenSphere, ...], FirstFault] = ()
+    rectangle: Annotated[tuple[GivenRectangle, ...], FirstFault] = ()
     turn_degrees: float = Field(default=0.0, allow_inf_nan=False)
     """Of the environment about +y, +z towards +x."""
 

@@ -9,13 +9,15 @@ from service.tof_methods import TofFilter, WhichReturn
 
 
 def _split(given: Any) -> Any:
-    return tuple(part.strip() for part in given.split(",") if part.strip()) if isinstance(given, str) else given
+    if isinstance(given, str):
+        return tuple(part.strip() for part in given.split(",") if part.strip())
+    return tuple(given) if isinstance(given, list) else given  # which strict validation of JSON asks for
 
 
 class TofChoices(BaseModel):
     """How time of flight is solved."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
     filters: Annotated[tuple[TofFilter, ...], BeforeValidator(_split)] = ()
     """As text, names with commas between."""

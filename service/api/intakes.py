@@ -1,5 +1,6 @@
 """Captures and environments: created to be uploaded, or registered where they lie on the server; checked, listed, deleted."""
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -13,9 +14,12 @@ from service.api.submission import require_space, submit
 from service.api.views import IntakePage, IntakeView
 from service.identifiers import CAPTURE, ENVIRONMENT, CaptureId, EnvironmentId, new_id
 from service.job_requests import CheckJob
+from service.safe_names import shown
 from service.storage import layout
-from service.store import intakes, jobs
+from service.storage.parts import Part, parts_folder
+from service.store import intakes, jobs, uploads
 from service.store.keys import Caller, Scope
+from stage.files import resolved
 
 captures = APIRouter(prefix="/v1/captures", tags=["captures"], responses=responses(401, 403, 422, 429, 503))
 environments = APIRouter(prefix="/v1/environments", tags=["environments"], responses=responses(401, 403, 422, 429, 503))
@@ -44,48 +48,48 @@ class NewEnvironment(BaseModel):
     """Of the server, under one of its roots, as `folder` of a capture."""
 
 
-@captures.post("", status_code=201, responses=responses(409, 507), summary="Create a capture")
+@captures.post("", status_code=201, responses=responses(404, 409, 507), summary="Create a capture")
 def create_capture(behind: Behind, caller: Writer, response: Response, wanted: Annotated[NewCapture, Body(
         openapi_examples={"upload": {"value": {"name": "owl"}}, "register": {"value": {"name": "owl", "folder": "/captures/owl"}}})],
                    token: IdempotencyKey = None) -> IntakeView:
     """Create a capture, and then upload its files; or register a folder of the server, which is checked at once."""
     folder = None if wanted.folder is None else _registered(behind, caller, "folder", wanted.folder)
-    if folder is not None and not folder.is_dir():
+    if folder is not None and not os.path.isdir(folder):
         raise ApiError("invalid", "folder: there is no such folder")
     return _create(behind, caller, CAPTURE, wanted.name, folder, token, response)
 
 
-@environments.post("", status_code=201, responses=responses(409, 507), summary="Create an environment")
+@environments.post("", status_code=201, responses=responses(404, 409, 507), summary="Create an environment")
 def create_environment(behind: Behind, caller: Writer, response: Response, wanted: Annotated[NewEnvironment, Body(
         openapi_examples={"upload": {"value": {"name": "sky"}}, "register": {"value": {"name": "sky", "file": "/hdr/sky.exr"}}})],
                        token: IdempotencyKey = None) -> IntakeView:
     """Create an environment, and then upload its one lat-long image; or register a file of the server, which is checked at once."""
     file = None if wanted.file is None else _registered(behind, caller, "file", wanted.file)
-    if file is not None and not file.is_file():
+    if file is not None and not os.path.isfile(file):
         raise ApiError("invalid", "file: there is no such file")
     return _create(behind, caller, ENVIRONMENT, wanted.name, file, token, response)
 
 
-@captures.get("", summary="List captures, the newest first")
+@captures.get("", responses=responses(404), summary="List captures, the newest first")
 def list_captures(behind: Behind, caller: Reader, limit: Limit = 100, before: CaptureId | None = None) -> IntakePage:
     """Captures of the project, a page at a time."""
     return _page(behind, caller, CAPTURE, limit, before)
 
 
-@environments.get("", summary="List environments, the newest first")
+@environments.get("", responses=responses(404), summary="List environments, the newest first")
 def list_environments(behind: Behind, caller: Reader, limit: Limit = 100, before: EnvironmentId | None = None) -> IntakePage:
     """Environments of the project, a page at a time."""
     return _page(behind, caller, ENVIRONMENT, limit, before)
 
 
 @captures.get("/{capture}", responses=responses(404), summary="Look at a capture")
-def look_capture(behind: Behind, caller: Reader, capture: CaptureId) -> IntakeView:
+def get_capture(behind: Behind, caller: Reader, capture: CaptureId) -> IntakeView:
     """State of a capture, and what its check found."""
     return IntakeView.of(row_of(behind, caller, capture))
 
 
 @environments.get("/{environment}", responses=responses(404), summary="Look at an environment")
-def look_environment(behind: Behind, caller: Reader, environment: EnvironmentId) -> IntakeView:
+def get_environment(behind: Behind, caller: Reader, environment: EnvironmentId) -> IntakeView:
     """State of an environment, and what its check found."""
     return IntakeView.of(row_of(behind, caller, environment))
 
@@ -132,10 +136,10 @@ def _registered(behind: Service, caller: Caller, field: str, given: str) -> Path
     path = Path(given)
     if "\0" in given or not path.is_absolute() or ".." in path.parts:
         raise ApiError("invalid", f"{field}: give an absolute path of the server, without ..")
-    resolved = path.resolve()
-    if not any(resolved.is_relative_to(root) for root in behind.settings.roots):
+    place = resolved(path)
+    if place is None or not any(place.is_relative_to(root) for root in behind.settings.roots):
         raise ApiError("invalid", f"{field}: lies in none of the folders that the operator allows")
-    return resolved
+    return place
 
 
 def _create(behind: Service, caller: Caller, prefix: str, name: str, folder: Path | None, token: str | None,
@@ -170,6 +174,8 @@ def _validate(behind: Service, caller: Caller, identifier: str) -> IntakeView:
     def work(connection: sa.Connection) -> bool:
         if not intakes.close(connection, identifier):
             return False
+        if (file := uploads.unfinished(connection, identifier)) is not None:
+            raise ApiError("conflict", f"{identifier}: {shown(file['path'])} is not complete: go on with {file['id']}, or delete it")
         submit(behind, caller, CheckJob(kind="check", intake=identifier), connection, [identifier])
         return True
 
@@ -180,11 +186,16 @@ def _validate(behind: Service, caller: Caller, identifier: str) -> IntakeView:
 
 def _delete(behind: Service, caller: Caller, identifier: str) -> None:
     row = row_of(behind, caller, identifier)
+    if row["state"] == intakes.CHECKING:
+        raise ApiError("conflict", f"{identifier} is being checked")
 
-    def work(connection: sa.Connection) -> bool:
+    def work(connection: sa.Connection) -> list[str] | None:
         if users := jobs.users_of(connection, identifier, active=True):
             raise ApiError("conflict", f"{identifier} is read by {users[0]}, which has not ended")
         return intakes.remove(connection, identifier)
 
-    if behind.database.transact(work) and row["folder"] is None:
+    parts = behind.database.transact(work)
+    if parts is not None and row["folder"] is None:
+        for upload in parts:
+            Part.discard(parts_folder(behind.settings), upload)
         behind.storage.remove(layout.intake(caller.project, identifier))

@@ -3,6 +3,7 @@
 import math
 import threading
 import time
+from collections.abc import Callable
 
 from service.api.problems import ApiError
 
@@ -13,11 +14,15 @@ FORGET_ABOVE = 10_000
 class Limiter:
     """Token buckets by key."""
 
-    def __init__(self, per_second: float, burst: int) -> None:
-        """Args: per_second: that a bucket gains. burst: that it holds."""
-        self._per_second, self._burst = per_second, burst
+    def __init__(self, per_second: float, burst: int, *, clock: Callable[[], float] = time.monotonic) -> None:
+        """Args: per_second: that a bucket gains. burst: that it holds. clock: seconds."""
+        self._per_second, self._burst, self._clock = per_second, burst, clock
         self._buckets: dict[str | None, tuple[float, float]] = {}  # tokens, when they were counted
         self._lock = threading.Lock()
+
+    def __len__(self) -> int:
+        """Buckets that are kept."""
+        return len(self._buckets)
 
     def take(self, key: str | None) -> None:
         """Take a token of a key.
@@ -25,7 +30,7 @@ class Limiter:
         Raises:
             ApiError: there is none left.
         """
-        now = time.monotonic()
+        now = self._clock()
         with self._lock:
             tokens, counted = self._buckets.get(key, (float(self._burst), now))
             tokens = min(float(self._burst), tokens + (now - counted) * self._per_second)

@@ -8,19 +8,23 @@ from fastapi import FastAPI, Request
 from fastapi.encoders import jsonable_encoder
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
+from fastapi.routing import iter_route_contexts
 from pydantic import BaseModel, ConfigDict
-from sqlalchemy.exc import DBAPIError
-from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from starlette.exceptions import HTTPException
 
 from service.errors import RequestError, sentence
 from service.log import logger
+from service.store.database import UNANSWERED
 from stage.errors import StorageError
 
 MEDIA_TYPE = "application/problem+json"
 CHECKSUM_MISMATCH = 460
 """What the tus protocol gives a wrong checksum."""
 RETRY_S = 5
+MAX_FAULTS = 20
+"""Of a request, that are told."""
+MAX_TEXT, MAX_FAULTS = 2000, 20
+"""Characters of a sentence, and values, that an answer says at most: it may repeat what was sent."""
 
 
 class Kind(NamedTuple):
@@ -56,7 +60,7 @@ OF_STATUS = {kind.status: name for name, kind in KINDS.items()}
 class Fault(BaseModel):
     """One value that cannot be."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(use_attribute_docstrings=True)
 
     field: str
     """Where it is: body.options.frames, query.limit …"""
@@ -64,7 +68,9 @@ class Fault(BaseModel):
 
 
 class Problem(BaseModel):
-    """What a refused request is answered with."""
+    """What a refused request is answered with (RFC 9457)."""
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
 
     type: str
     """urn:relit:problem: and the kind."""
@@ -94,7 +100,7 @@ def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
 
 
 def install(app: FastAPI) -> None:
-    """Answer every error of the app from the table."""
+    """Answer every error of the app from the table; what is none of these, service.api.trace does."""
 
     @app.exception_handler(ApiError)
     async def refused(request: Request, error: ApiError) -> JSONResponse:
@@ -102,8 +108,8 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(RequestValidationError)
     async def invalid(request: Request, error: RequestValidationError) -> JSONResponse:
-        faults = [Fault(field=".".join(str(part) for part in fault["loc"]), message=str(fault["msg"]).removeprefix("Value error, "))
-                  for fault in error.errors()]
+        faults = [Fault(field=plain(".".join(map(str, fault["loc"]))), message=plain(fault["msg"].removeprefix("Value error, ")))
+                  for fault in error.errors()[:MAX_FAULTS]]
         return answer(request, "invalid", "; ".join(f"{fault.field}: {fault.message}" for fault in faults), faults=faults)
 
     @app.exception_handler(RequestError)
@@ -111,9 +117,11 @@ def install(app: FastAPI) -> None:
         return answer(request, "invalid", sentence(error))
 
     @app.exception_handler(HTTPException)
-    async def plain(request: Request, error: HTTPException) -> JSONResponse:
-        kind = OF_STATUS.get(error.status_code, "bad-request")
-        return answer(request, kind, str(error.detail or HTTPStatus(error.status_code).phrase), headers=error.headers)
+    async def routed(request: Request, error: HTTPException) -> JSONResponse:
+        kind, headers = OF_STATUS.get(error.status_code, "bad-request"), dict(error.headers or {})
+        if error.status_code == KINDS["method-not-allowed"].status:
+            headers["Allow"] = ", ".join(_allowed(request))
+        return answer(request, kind, str(error.detail or HTTPStatus(error.status_code).phrase), headers=headers)
 
     @app.exception_handler(StorageError)
     async def full(request: Request, error: StorageError) -> JSONResponse:
@@ -121,22 +129,31 @@ def install(app: FastAPI) -> None:
         return answer(request, "full", "the storage of the service cannot be written: its operator can see why in the log",
                       headers={"Retry-After": "60"})
 
-    @app.exception_handler(DBAPIError)
-    @app.exception_handler(PoolTimeoutError)
     async def unavailable(request: Request, error: Exception) -> JSONResponse:
         logger.error("database does not answer", error=str(getattr(error, "orig", error)))
         return answer(request, "unavailable", "the database does not answer: try again", headers={"Retry-After": str(RETRY_S)})
 
-    @app.exception_handler(Exception)
-    async def internal(request: Request, error: Exception) -> JSONResponse:
-        logger.error("request failed", exc_info=error)
-        return answer(request, "internal", "an error of relit itself: the log has more under this request_id")
+    for fault in UNANSWERED:
+        app.add_exception_handler(fault, unavailable)
+
+
+def plain(text: str) -> str:
+    """Text that can be sent: halves of characters, which JSON can say and UTF-8 cannot, are spelled out; and not too long."""
+    return text[:MAX_TEXT].encode("utf-8", "backslashreplace").decode()
+
+
+def _allowed(request: Request) -> list[str]:
+    """The methods of all routes of a path: the router knows those of the first alone."""
+    path = request.scope["path"]
+    found = (route.methods or () for route in iter_route_contexts(request.app.routes) if route.path_regex.match(path))
+    return sorted({method for methods in found for method in methods})
 
 
 def answer(request: Request, kind: str, detail: str, *, faults: list[Fault] | None = None,
            headers: Mapping[str, str] | None = None) -> JSONResponse:
     """The response of a kind."""
-    row = KINDS[kind]
+    row, detail = KINDS[kind], plain(detail)
+    request.state.problem = detail  # for the log
     problem = Problem(type=f"urn:relit:problem:{kind}", title=row.title, status=row.status, detail=detail,
                       request_id=getattr(request.state, "request_id", ""), errors=faults or [])
     return JSONResponse(jsonable_encoder(problem), row.status, headers=dict(headers or {}), media_type=MEDIA_TYPE)

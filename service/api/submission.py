@@ -4,6 +4,7 @@ import shutil
 
 import sqlalchemy as sa
 
+from service import telemetry
 from service.api.context import Service
 from service.api.problems import ApiError
 from service.frame_range import frame_numbers
@@ -17,11 +18,17 @@ QUEUE_RETRY_S = 30
 
 def submit(behind: Service, caller: Caller, request: JobRequest, connection: sa.Connection, inputs: list[str]) -> str:
     """Queue a job in the caller's transaction; of `inputs_of` and `spelled_out`."""
-    settings = behind.settings
-    if jobs.count_queued(connection, caller.project, caller.key) >= settings.max_queued:
-        raise ApiError("too-many", f"{settings.max_queued} jobs of this key have not begun", headers={"Retry-After": str(QUEUE_RETRY_S)})
-    return behind.queue.submit(connection, project=caller.project, key=caller.key, request=request, chunk_frames=settings.chunk_frames,
-                               inputs=inputs)
+    job = behind.queue.submit(connection, project=caller.project, key=caller.key, request=request, inputs=inputs,
+                              chunk_frames=behind.settings.chunk_frames, trace=telemetry.current())
+    require_queue(behind, caller, connection)
+    return job
+
+
+def require_queue(behind: Service, caller: Caller, connection: sa.Connection) -> None:
+    """Undo the transaction where the caller's key has more jobs waiting in it than it may."""
+    most = behind.settings.max_queued
+    if jobs.count_queued(connection, caller.project, caller.key) > most:
+        raise ApiError("too-many", f"{most} jobs of this key have not begun", headers={"Retry-After": str(QUEUE_RETRY_S)})
 
 
 def require_space(behind: Service) -> None:
@@ -76,7 +83,7 @@ def _with_frames(behind: Service, project: str, capture: str, options: RelightOp
 def _require_ready(behind: Service, project: str, field: str, identifier: str) -> None:
     row = intakes.find(behind.database, identifier, project)
     if row is None:
-        raise ApiError("invalid", f"{field}: {identifier} is not in this project")
+        raise ApiError("not-found", f"{field}: {identifier} is not in this project")
     if row["state"] != intakes.READY:
         raise ApiError("conflict", f"{field}: {identifier} is {row['state']}, not ready")
 
@@ -85,7 +92,7 @@ def _require_maps(behind: Service, project: str, identifier: str, *, depth: bool
     row = jobs.find(behind.database, identifier, project)
     kinds = ("solve", "pipeline", "depth") if depth else ("solve", "pipeline")
     if row is None:
-        raise ApiError("invalid", f"maps: {identifier} is not in this project")
+        raise ApiError("not-found", f"maps: {identifier} is not in this project")
     if row["request"]["kind"] not in kinds:
         raise ApiError("invalid", f"maps: {identifier} is a {row['request']['kind']} job: give one of {', '.join(kinds)}")
     if row["state"] != jobs.SUCCEEDED:

@@ -2,19 +2,27 @@
 
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
+from urllib.parse import quote
 
 import sqlalchemy as sa
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, ConfigDict, Field
 
 from service.identifiers import JobId
 from service.job_requests import AnyJob
+from service.storage.folder import Stored
 
 Time = Annotated[datetime, Field(description="UTC.")]
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 IntakeState = Literal["receiving", "checking", "ready", "refused"]
 
 
-class ProgressView(BaseModel):
+class View(BaseModel):
+    """Base of every answer: what is said beside a field is in the OpenAPI document too."""
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
+
+class ProgressView(View):
     """Where a running job is."""
 
     stage: str
@@ -27,7 +35,7 @@ class ProgressView(BaseModel):
     """Of this stage, at that rate."""
 
 
-class JobView(BaseModel):
+class JobView(View):
     """A job."""
 
     id: JobId
@@ -58,7 +66,7 @@ class JobView(BaseModel):
                    finished_at=moment_or_none(row["finished_at"]), progress=progress, error=row["error"])
 
 
-class JobPage(BaseModel):
+class JobPage(View):
     """Jobs, the newest first."""
 
     jobs: list[JobView]
@@ -66,7 +74,7 @@ class JobPage(BaseModel):
     """Give it as `before` for the page after this one; null: there is none."""
 
 
-class IntakeView(BaseModel):
+class IntakeView(View):
     """A capture or an environment."""
 
     id: str
@@ -87,12 +95,37 @@ class IntakeView(BaseModel):
                    facts=row["facts"], created_at=moment(row["created_at"]))
 
 
-class IntakePage(BaseModel):
+class IntakePage(View):
     """Captures or environments, the newest first."""
 
     items: list[IntakeView]
     next: str | None
     """Give it as `before` for the page after this one; null: there is none."""
+
+
+class ResultView(View):
+    """A file that a job has made."""
+
+    name: str
+    """Below the job, / between folders."""
+    size: int
+    """Bytes."""
+    modified_at: Time
+    url: str
+    """Where it is downloaded, on this server."""
+
+    @classmethod
+    def of(cls, job: str, file: Stored) -> "ResultView":
+        """From what the storage lists."""
+        return cls(name=file.name, size=file.size, modified_at=moment(file.modified_at), url=f"/v1/jobs/{job}/results/{quote(file.name)}")
+
+
+class ResultPage(View):
+    """What a job has made, by name."""
+
+    results: list[ResultView]
+    next: str | None
+    """Give it as `after` for the page after this one; null: there is none."""
 
 
 def moment(seconds: float) -> datetime:

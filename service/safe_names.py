@@ -1,0 +1,107 @@
+"""Names of uploaded files: what means the same file, and only that file, on every system that may see it.
+
+Results and captures are opened from Windows, macOS and Linux, so a name that one of them cannot hold, or would take for another's, is
+refused on all.
+"""
+
+import unicodedata
+
+from service.errors import RequestError
+
+MAX_PART_BYTES = 255
+"""Of a file or folder: what common file systems hold."""
+MAX_PATH_BYTES = 800
+"""Of the whole path. Folded it grows to three times as much at most, and PostgreSQL indexes no more than 2704 bytes."""
+MAX_DEPTH = 8
+"""Folders and the file: a capture needs one, a sequence of captures two."""
+FORBIDDEN = '<>:"\\|?*'
+"""On Windows; backslash and colon would lead elsewhere there."""
+HIDDEN_CATEGORIES = {
+    "Cc": "a control character",
+    "Cf": "a character that is not seen and changes how the others are",
+    "Cs": "half a character",
+    "Cn": "a character that is not assigned",
+    "Zl": "a line separator",
+    "Zp": "a paragraph separator",
+}
+DEVICES = {"con", "prn", "aux", "nul", "conin$", "conout$", *(f"{port}{digit}" for port in ("com", "lpt") for digit in "0123456789¹²³")}
+SHOWN = 100
+"""Characters of a bad name that a sentence repeats."""
+
+
+class NameFault(RequestError):
+    """A name cannot be that of a file: one sentence that says why."""
+
+
+def check_path(path: str) -> None:
+    """Refuse a path that is not safe everywhere.
+
+    Args:
+        path: within a capture, with / between.
+
+    Raises:
+        NameFault: with the reason.
+    """
+    if fault := _fault(path):
+        raise NameFault(f"path {shown(path)}: {fault}")
+
+
+def shown(path: str) -> str:
+    """A name as it can be put into a sentence: in quotes, everything that is not plain text escaped, and not too long."""
+    plain = (character if character.isprintable() and not _hidden(character) else ascii(character)[1:-1] for character in path[:SHOWN])
+    text = "".join(plain)
+    return f'"{text}"' if len(path) <= SHOWN else f'"{text}…"'
+
+
+def folded(path: str) -> str:
+    """What two paths share that a file system without upper and lower case takes for one (Unicode 3.13, canonical caseless matching)."""
+    return unicodedata.normalize("NFD", unicodedata.normalize("NFD", path).casefold())
+
+
+def folders_of(path: str) -> list[str]:
+    """The folders that a path lies in, the outermost first."""
+    parts = path.split("/")
+    return ["/".join(parts[:count]) for count in range(1, len(parts))]
+
+
+def _fault(path: str) -> str | None:
+    if not path:
+        return "is empty: a file has a name"
+    for character in path:
+        if what := _hidden(character):
+            return f"has {what} (U+{ord(character):04X}): leave it out"
+    if path.startswith("/"):
+        return "is absolute: give it relative to the capture"
+    for character in FORBIDDEN:
+        if character in path:
+            return f"has {character}, which cannot be in a name everywhere: folders have / between"
+    if unicodedata.normalize("NFC", path) != path:
+        return "is not in the Unicode form NFC: other systems would write the same name in other bytes"
+    if len(path.encode()) > MAX_PATH_BYTES:
+        return f"is longer than {MAX_PATH_BYTES} bytes"
+    parts = path.split("/")
+    if len(parts) > MAX_DEPTH:
+        return f"is {len(parts)} names deep, {MAX_DEPTH} are allowed"
+    return next((fault for part in parts if (fault := _part_fault(part))), None)
+
+
+def _part_fault(part: str) -> str | None:
+    if not part:
+        return "has an empty name between two /, or at its end"
+    if part == "..":
+        return "has .., which leads out of the folder"
+    if part.startswith("."):
+        return "has a name that begins with a dot: such files are hidden, and those of the service itself"
+    if part[-1] in " .":
+        return "has a name that ends with a space or a dot, which Windows leaves out"
+    if part[0] == " ":
+        return "has a name that begins with a space"
+    if len(part.encode()) > MAX_PART_BYTES:
+        return f"has a name longer than {MAX_PART_BYTES} bytes"
+    if part.partition(".")[0].rstrip().casefold() in DEVICES:
+        return "has the name of a device of Windows"
+    return None
+
+
+def _hidden(character: str) -> str | None:
+    return HIDDEN_CATEGORIES.get(unicodedata.category(character))

@@ -1,0 +1,42 @@
+"""An app asked without a server: paths are sent as they are, and the client can leave when a test wants it to."""
+
+import asyncio
+from typing import Any
+from urllib.parse import unquote_to_bytes
+
+
+class Call:
+    """One request, and what came of it so far."""
+
+    def __init__(self, app: Any, path: str, *, method: str = "GET", headers: dict[str, str] | None = None) -> None:
+        self._app, self.status, self.body = app, 0, b""
+        self._left = asyncio.Event()
+        self._asked = False
+        given = {"host": "127.0.0.1", **(headers or {})}
+        self._scope = {
+            "type": "http", "asgi": {"version": "3.0", "spec_version": "2.3"}, "http_version": "1.1", "method": method, "scheme": "http",
+            "path": unquote_to_bytes(path).decode(errors="replace"), "raw_path": path.encode(), "root_path": "", "query_string": b"",
+            "headers": [(name.lower().encode(), value.encode()) for name, value in given.items()],
+            "client": ("127.0.0.1", 1), "server": ("127.0.0.1", 1)}
+
+    def leave(self) -> None:
+        """Close the connection."""
+        self._left.set()
+
+    async def run(self) -> "Call":
+        """Until it is answered, or the client has left."""
+        await self._app(self._scope, self._receive, self._send)
+        return self
+
+    async def _receive(self) -> dict[str, Any]:
+        if not self._asked:
+            self._asked = True
+            return {"type": "http.request", "body": b"", "more_body": False}
+        await self._left.wait()
+        return {"type": "http.disconnect"}
+
+    async def _send(self, message: dict[str, Any]) -> None:
+        if message["type"] == "http.response.start":
+            self.status = message["status"]
+        else:
+            self.body += message.get("body", b"")
