@@ -43,7 +43,7 @@ class Refused(ClientError):
     """The service says no."""
 
     def __init__(self, status: int, kind: str, detail: str, *, request_id: str = "", errors: tuple[Fault, ...] = ()) -> None:
-        """Args: status: of HTTP. kind: not-found, conflict … detail: the sentence. request_id: in the log. errors: values that cannot be."""
+        """Args: status: of HTTP. kind: not-found, conflict … detail: the sentence. request_id: in the log. errors: wrong values."""
         super().__init__(detail)
         self.status, self.kind, self.detail, self.request_id, self.errors = status, kind, detail, request_id, errors
 

@@ -58,7 +58,7 @@ def hashed(files: list[tuple[Path, str]], *, parallel: int, tally: Tally) -> lis
         FileError: one cannot be read.
     """
     with ThreadPoolExecutor(parallel) as pool:
-        return list(pool.map(lambda one: _hashed(*one, tally), files))
+        return list(pool.map(lambda one: _hashed(one[0], one[1], tally), files))
 
 
 def manifest_hash(files: list[LocalFile]) -> str:

@@ -1,16 +1,17 @@
 """The link to the service: requests that are sent again where that is safe, and answers made objects or errors."""
 
 import random
+import secrets
 import time
 from collections.abc import Callable
 from email.utils import parsedate_to_datetime
-from typing import Any, TypeVar
+from typing import Any
+from urllib.parse import quote
 
 import httpx2
 
-from service.client.errors import Unreachable, refusal
+from service.client.errors import ClientError, Unreachable, refusal
 
-T = TypeVar("T")
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.2, 10.0
 LATER = (429, 503)
 """Statuses with which nothing was done, and may be soon."""
@@ -51,16 +52,30 @@ class Patience:
 class Link:
     """Requests to one service with one key; may be used from several threads."""
 
-    def __init__(self, server: str, key: str | None, *, patience_s: float, timeout_s: float, connections: int) -> None:
-        """Args: as of `Client`; connections: at once."""
-        self.server, self._patience_s = server.rstrip("/"), patience_s
+    def __init__(self, server: str, key: str | None, *, patience_s: float, timeout_s: float,
+                 transport: httpx2.BaseTransport | None = None) -> None:
+        """Args: as of `Client`."""
+        self.server, self._patience_s = server.rstrip("/").removesuffix("/v1"), patience_s
+        if key is not None and not (key.isascii() and key.isprintable()):
+            raise ClientError("the key has characters that no key has")
         try:
-            self.http = httpx2.Client(
-                base_url=self.server, headers={} if key is None else {"Authorization": f"Bearer {key}"}, timeout=timeout_s,
-                limits=httpx2.Limits(max_connections=connections, max_keepalive_connections=connections))
-            self.http.build_request("GET", "/v1/jobs")
-        except (httpx2.InvalidURL, UnicodeEncodeError) as error:
-            raise Unreachable(f"{server}: is no URL of a service, or the key is none") from error
+            url = httpx2.URL(self.server)
+        except httpx2.InvalidURL:
+            url = httpx2.URL()
+        if url.scheme not in ("http", "https") or not url.host:
+            raise Unreachable(f"{server}: is no URL of a service: give one such as https://relit.example")
+        self.http = httpx2.Client(base_url=url, headers={} if key is None else {"Authorization": f"Bearer {key}"}, timeout=timeout_s,
+                                  transport=transport)
+
+    @staticmethod
+    def token() -> str:
+        """A new Idempotency-Key."""
+        return secrets.token_hex(16)
+
+    @staticmethod
+    def path(*parts: str) -> str:
+        """A path of the API: the first part as it is, whatever the others hold as one part each."""
+        return "/".join([parts[0], *(quote(part, safe="") for part in parts[1:])])
 
     def patience(self) -> Patience:
         """A new one."""
@@ -78,15 +93,14 @@ class Link:
             Refused: the service says no.
             Unreachable: it does not answer.
         """
-        return self.retry(lambda: self.once(method, path, **options), repeatable=repeatable)
+        return self._retry(lambda: self.once(method, path, **options), repeatable=repeatable)
 
     def once(self, method: str, path: str, **options: Any) -> httpx2.Response:
         """Send a request once; an answer that is an error is returned like any other."""
         return self.http.request(method, path, **options)
 
-    def retry(self, attempt: Callable[[], httpx2.Response], *, repeatable: bool = True, patience: Patience | None = None) -> httpx2.Response:
-        """Call until it gives an answer to keep; as `send`."""
-        patience = patience or self.patience()
+    def _retry(self, attempt: Callable[[], httpx2.Response], *, repeatable: bool) -> httpx2.Response:
+        patience = self.patience()
         while True:
             try:
                 answer = attempt()

@@ -1,5 +1,6 @@
 """Uploads that can be resumed: the client's side of tus 1.0 (https://tus.io/protocols/resumable-upload)."""
 
+import hashlib
 import threading
 from base64 import b64encode
 from collections.abc import Iterator
@@ -37,7 +38,7 @@ def send_files(link: Link, intake: str, files: list[LocalFile], *, parallel: int
     ended = threading.Event()
     pool = ThreadPoolExecutor(parallel)
     try:
-        futures = [pool.submit(_send, link, intake, file, tally, ended) for file in files]
+        futures = [pool.submit(_Upload(link, intake, file, tally, ended).send) for file in files]
         done, _ = wait(futures, return_when=FIRST_EXCEPTION)
         for future in done:
             future.result()
@@ -46,54 +47,70 @@ def send_files(link: Link, intake: str, files: list[LocalFile], *, parallel: int
         pool.shutdown(cancel_futures=True)
 
 
-def _send(link: Link, intake: str, file: LocalFile, tally: Tally, ended: threading.Event) -> None:
-    if ended.is_set():
-        return
-    upload = _create(link, intake, file)
-    patience, sent = link.patience(), 0
-    while True:
-        offset = int(link.send("HEAD", upload, headers=TUS).headers["upload-offset"])
-        tally.add(offset - sent)
-        if offset > sent:
-            patience.refresh()
-        sent = offset
-        if sent == file.size:
+class _Upload:
+    """One file on its way."""
+
+    def __init__(self, link: Link, intake: str, file: LocalFile, tally: Tally, ended: threading.Event) -> None:
+        self._link, self._intake, self._file, self._tally, self._ended = link, intake, file, tally, ended
+        self._sent = 0
+
+    def send(self) -> None:
+        """Send what the service does not have yet, until it has all."""
+        if self._ended.is_set():
             return
-        try:
-            answer = link.once("PATCH", upload, content=_pieces(file, sent, ended), headers={
-                **TUS, "Upload-Offset": str(sent), "Content-Type": "application/offset+octet-stream", "Content-Length": str(file.size - sent)})
-        except _Ended:
-            return
-        except httpx2.TransportError as error:
-            if not patience.wait():
-                raise link.unreachable(error) from error
-            continue
-        if answer.status_code in (*ELSEWHERE, *LATER, *PROXY) and patience.wait(retry_after(answer)):
-            continue
-        if not answer.is_success:
-            raise refusal(answer.status_code, answer.headers.get("content-type", ""), answer.content)
-        if int(answer.headers["upload-offset"]) == file.size:
-            tally.add(file.size - sent)
-            return
+        file = self._file
+        upload, offset = self._create()
+        patience, before = self._link.patience(), offset
+        while offset < file.size:
+            if offset > before:
+                patience.refresh()
+            before = offset
+            self._tell(offset)
+            try:
+                answer = self._link.once("PATCH", upload, content=self._pieces(offset), headers={
+                    **TUS, "Upload-Offset": str(offset), "Content-Type": "application/offset+octet-stream",
+                    "Content-Length": str(file.size - offset)})
+            except _Ended:
+                return
+            except httpx2.TransportError as error:
+                if not patience.wait():
+                    raise self._link.unreachable(error) from error
+                offset = self._offset(upload)
+                continue
+            if answer.is_success:
+                offset = int(answer.headers["upload-offset"])
+            elif answer.status_code in (*ELSEWHERE, *LATER, *PROXY) and patience.wait(retry_after(answer)):
+                offset = self._offset(upload)
+            else:
+                raise refusal(answer.status_code, answer.headers.get("content-type", ""), answer.content)
+        self._tell(file.size)
 
+    def _create(self) -> tuple[str, int]:
+        """Path of the upload, and how much of it is there; the same one when it is asked for again, also by another run of the program."""
+        words = {"path": self._file.name, "sha256": self._file.sha256}
+        metadata = ",".join(f"{name} {b64encode(word.encode()).decode()}" for name, word in words.items())
+        token = hashlib.sha256(f"{self._intake}\0{self._file.name}\0{self._file.sha256}".encode()).hexdigest()
+        answer = self._link.send("POST", f"{self._intake}/files", headers={
+            **TUS, "Upload-Length": str(self._file.size), "Upload-Metadata": metadata, "Idempotency-Key": token})
+        path = httpx2.URL(answer.headers["location"]).path  # the key is for no other host
+        return path, int(answer.headers["upload-offset"])
 
-def _create(link: Link, intake: str, file: LocalFile) -> str:
-    words = {"path": file.name, "sha256": file.sha256}
-    metadata = ",".join(f"{name} {b64encode(word.encode()).decode()}" for name, word in words.items())
-    answer = link.send("POST", f"{intake}/files", headers={
-        **TUS, "Upload-Length": str(file.size), "Upload-Metadata": metadata, "Idempotency-Key": f"{intake}/{file.sha256}/{file.name}"})
-    return httpx2.URL(answer.headers["location"]).path
+    def _offset(self, upload: str) -> int:
+        return int(self._link.send("HEAD", upload, headers=TUS).headers["upload-offset"])
 
+    def _tell(self, sent: int) -> None:
+        self._tally.add(sent - self._sent)
+        self._sent = sent
 
-def _pieces(file: LocalFile, offset: int, ended: threading.Event) -> Iterator[bytes]:
-    with reading(file.path), open(file.path, "rb", buffering=0) as opened:
-        opened.seek(offset)
-        left = file.size - offset
-        while left > 0:
-            if ended.is_set():
-                raise _Ended
-            piece = opened.read(min(PIECE, left))
-            if not piece:
-                raise FileError(f"{file.path}: became shorter while it was sent")
-            left -= len(piece)
-            yield piece
+    def _pieces(self, offset: int) -> Iterator[bytes]:
+        with reading(self._file.path), open(self._file.path, "rb", buffering=0) as opened:
+            opened.seek(offset)
+            while offset < self._file.size:
+                if self._ended.is_set():
+                    raise _Ended
+                piece = opened.read(min(PIECE, self._file.size - offset))
+                if not piece:
+                    raise FileError(f"{self._file.path}: became shorter while it was sent")
+                offset += len(piece)
+                yield piece
+                self._tell(offset)

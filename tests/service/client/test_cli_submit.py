@@ -1,0 +1,176 @@
+"""relit submit and relit jobs, against a real service."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from service.cli import depth as depth_here
+from service.cli import relight as relight_here
+from service.cli import results as results_here
+from service.cli import service_options
+from service.cli import shade as shade_here
+from service.client import Client, client
+from service.depth_requests import DepthOptions
+from service.job_requests import DEFAULT_PRIORITY
+from service.requests import ExportOptions, RelightOptions, ShadeOptions, SolveOptions
+from service.tof_options import TofChoices
+from tests.captures import write_capture
+from tests.service.client.conftest import OWL, SKY
+
+
+@pytest.fixture(autouse=True)
+def environment(monkeypatch: pytest.MonkeyPatch, server, key):
+    monkeypatch.setenv("RELIT_SERVER", f"{server.url}/v1")
+    monkeypatch.setenv("RELIT_KEY", key)
+
+
+def said(out: str) -> dict[str, str]:
+    """Lines of `name  value`."""
+    return {line.partition(" ")[0]: line.partition(" ")[2].strip() for line in out.splitlines()}
+
+
+@pytest.mark.parametrize(("commands", "models"), [
+    ([results_here.solve], [SolveOptions]), ([relight_here.relight], [RelightOptions]), ([shade_here.shade], [ShadeOptions]),
+    ([results_here.export], [ExportOptions]), ([depth_here.depth], [DepthOptions, TofChoices]),
+    ([results_here.solve, results_here.export, relight_here.relight], [SolveOptions, ExportOptions, RelightOptions])])
+def test_what_may_be_chosen_here_may_be_chosen_there(commands, models):
+    """A field without an option could not be asked for, and an option without a field would be dropped."""
+    assert {option.name for option in service_options.options_of(*commands)} == {
+        name for model in models for name in model.model_fields if name != "tof"}
+
+
+def test_the_same_defaults_everywhere():
+    """The commands start without what would tell them."""
+    assert service_options.DEFAULT_SERVER == client.DEFAULT_SERVER
+    assert service_options.DEFAULT_PRIORITY == DEFAULT_PRIORITY
+
+
+def test_a_folder_becomes_maps_frames_and_an_asset(relit, tmp_path: Path):
+    capture = write_capture(tmp_path / "ball")
+    done = relit("submit", "pipeline", capture, "--environment", SKY, "--method", "lambert", "--frames", "1-2", "--spin-degrees", "360",
+                 "--exposure", "-1", "--compression", "piz", "--name", "marble", "--format", "usda", "--job-name", "first", "--out",
+                 tmp_path / "out")
+    assert (done.code, done.err) == (0, "")
+    found = said(done.out)
+    assert found["state"].startswith("succeeded, ")
+    assert {"maps.exr", "report.json", "asset.usda", "frame.0001.exr", "frame.0002.exr"} <= {
+        path.name for path in (tmp_path / "out").iterdir()}
+    with Client(os.environ["RELIT_SERVER"], os.environ["RELIT_KEY"]) as asking:
+        request = asking.jobs.get(found["job"]).request
+    assert (request.name, request.format, request.export.name, request.solve.method) == ("first", "usda", "marble", "lambert")
+    assert request.relight == RelightOptions(frames="1-2", spin_degrees=360, exposure=-1, compression="piz")
+    again = relit("submit", "shade", found["job"], "--light", "0,0,50,900,900,900", "--turn-degrees", "15")
+    assert again.code == 0
+    assert relit("jobs", "wait", said(again.out)["job"], "--out", tmp_path / "shaded").code == 0
+    assert (tmp_path / "shaded" / "picture.exr").is_file()
+    exported = relit("submit", "export", found["job"], "--wait")
+    assert exported.code == 0
+    assert "asset.usdz" in relit("jobs", "results", said(exported.out)["job"]).out
+
+
+def test_sources_of_all_three_kinds(relit, owl: str, sky: str, tmp_path: Path):
+    registered = relit("submit", "relight", f"server:{OWL}", "--environment", f"server:{SKY}", "--wait")
+    assert registered.code == 0
+    assert said(registered.out)["capture"].startswith("cap_")
+    named = relit("submit", "relight", owl, "--environment", sky, "--wait", "--priority", "60")
+    assert named.code == 0
+    assert "capture" not in said(named.out)
+    shown = relit("jobs", "show", said(named.out)["job"])
+    assert said(shown.out)["kind"] == "relight"
+    assert "priority 60" in said(shown.out)["state"]
+    one, other = [said(relit("submit", "solve", write_capture(tmp_path / place / "ball"), "--method", "lambert").out)["capture"]
+                  for place in ("here", "there")]
+    assert one == other
+
+
+def test_light_keys_go_with_the_job(relit, owl: str, tmp_path: Path):
+    keys = tmp_path / "keys.json"
+    keys.write_text('{"schema": "relit.keys/1", "captured": [{"image": "000.exr", "keys": [{"frame": 1, "weight": 1}]}]}')
+    assert relit("submit", "relight", owl, "--keys", keys, "--wait").code == 0
+    keys.write_text('{"schema": "relit.keys/1", "captured": [{"image": "missing.exr", "keys": [{"frame": 1, "weight": 1}]}]}')
+    failed = relit("submit", "relight", owl, "--keys", keys, "--wait")
+    assert failed.code == 1
+    assert "missing.exr" in failed.err
+    keys.write_text('{"schema": "relit.keys/1", "wrong": 1}')
+    assert relit("submit", "relight", owl, "--keys", keys).code == 2
+
+
+def test_a_job_that_fails_is_one_sentence_and_exit_code_1(relit, owl: str):
+    done = relit("submit", "solve", owl, "--method", "gradient", "--wait")
+    assert done.code == 1
+    assert done.err.startswith("relit: ")
+    assert len(done.err.splitlines()) == 1
+    job = said(done.out)["job"]
+    assert said(relit("jobs", "show", job).out)["error"] == done.err.removeprefix("relit: ").strip()
+    assert "attempt 2" in said(relit("jobs", "retry", job).out)["state"]
+    assert relit("jobs", "wait", job).code == 1
+    assert job in relit("jobs", "list").out
+
+
+@pytest.mark.parametrize(("arguments", "sentence"), [
+    (["solve", "missing"], "missing: there is no such file or folder"),
+    (["solve", "cap_0123456789abcdefghjk"], "cap_0123456789abcdefghjk"),
+    (["solve", "server:/elsewhere"], "folder: "),
+    (["export", "no-job"], "maps: "),
+    (["relight", str(OWL), "--exposure", "99"], "exposure: "),
+    (["relight", str(OWL), "--weights", "other"], "'--weights'"),
+    (["relight", str(OWL), "--frames", "9-1"], "runs backwards"),
+    (["relight", str(OWL)], "nothing lights the frames"),
+    (["solve", str(OWL), "--priority", "101"], "'--priority'"),
+    (["solve", str(OWL), "--job-name", "two\nlines"], "name: "),
+    (["solve", str(OWL), "--server", "nowhere"], "nowhere: is no URL of a service"),
+    (["solve", str(OWL), "--out", f"{SKY}/out"], "cannot make "),
+    (["solve", str(OWL), "--key", "key_wrong.wrong"], "give a key that is valid")])
+def test_bad_input_is_one_sentence_and_exit_code_2(relit, arguments, sentence):
+    done = relit("submit", *arguments)
+    assert done.code == 2
+    assert sentence in done.err
+    assert done.err.startswith("relit: ")
+    assert len(done.err.splitlines()) == 1
+
+
+def interrupted(*arguments: str) -> tuple[str, subprocess.CompletedProcess[str]]:
+    """The job, and the program, ended by Ctrl-C while it waits."""
+    process = subprocess.Popen([sys.executable, "-m", "service.cli.main", "submit", "relight", *arguments, "--frames", "1-5000", "--wait"],
+                               stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    line = process.stdout.readline()
+    time.sleep(1)  # until it waits; were it earlier, it would end all the same
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    return said(line)["job"], subprocess.CompletedProcess(process.args, process.returncode, out, err)
+
+
+def test_ctrl_c_leaves_the_job_running(relit, owl: str, sky: str):
+    job, done = interrupted(owl, "--environment", sky)
+    assert done.returncode == 130
+    assert done.stderr.splitlines() == [
+        f"relit: interrupted; {job} goes on: relit jobs wait {job} waits again, relit jobs cancel {job} ends it"]
+    with Client(os.environ["RELIT_SERVER"], os.environ["RELIT_KEY"]) as asking:
+        assert asking.jobs.get(job).state in ("queued", "running")
+    assert said(relit("jobs", "cancel", job).out)["state"].startswith("cancelled")
+    assert "attempt 2" in said(relit("jobs", "resume", job).out)["state"]
+    assert relit("jobs", "cancel", job).code == 0
+
+
+def test_ctrl_c_cancels_the_job_where_that_is_asked(owl: str, sky: str):
+    job, done = interrupted(owl, "--environment", sky, "--cancel-on-interrupt")
+    assert done.returncode == 130
+    assert done.stderr.splitlines() == [f"relit: interrupted; {job} is cancelled"]
+    with Client(os.environ["RELIT_SERVER"], os.environ["RELIT_KEY"]) as asking:
+        assert asking.jobs.get(job).state == "cancelled"
+
+
+def test_what_the_client_needs_and_what_not():
+    """A pipeline's interpreter loads neither the server nor a device for it."""
+    heavy = "fastapi", "starlette", "dbos", "warp", "pxr", "typer", "uvicorn", "service.pipelines"
+    code = f"import sys, service.client; print([name for name in {heavy!r} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.strip() == "[]"
+
+

@@ -1,0 +1,169 @@
+"""The client against the OpenAPI document: what it sends is documented, and what it reads is what the document promises."""
+
+import json
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qsl
+
+import httpx2
+import jsonschema_rs
+import pytest
+from pydantic import TypeAdapter
+
+from service.api import views
+from service.client import Client
+from service.job_requests import ExportJob, RelightJob, SolveJob, UserJob
+from service.methods import Method
+from service.requests import RelightOptions, SolveOptions
+from tests.captures import write_capture
+from tests.service.client.conftest import SKY, Between
+
+OF_HTTP = {"host", "accept", "accept-encoding", "connection", "user-agent", "authorization", "content-length", "content-type",
+           "transfer-encoding", "cache-control"}
+"""Headers that HTTP itself knows, and the key, which is a security scheme of the document."""
+USED = {
+    "POST /v1/captures", "GET /v1/captures", "GET /v1/captures/{capture}", "DELETE /v1/captures/{capture}",
+    "POST /v1/captures/{capture}/validate", "POST /v1/captures/{capture}/files", "HEAD /v1/uploads/{upload}", "PATCH /v1/uploads/{upload}",
+    "POST /v1/environments", "GET /v1/environments/{environment}",
+    "POST /v1/jobs", "GET /v1/jobs", "GET /v1/jobs/{job}", "PATCH /v1/jobs/{job}", "DELETE /v1/jobs/{job}", "POST /v1/jobs/{job}/cancel",
+    "POST /v1/jobs/{job}/retry", "POST /v1/jobs/{job}/resume", "GET /v1/jobs/{job}/events",
+    "GET /v1/jobs/{job}/results", "GET /v1/jobs/{job}/results/{name}", "HEAD /v1/jobs/{job}/results/{name}"}
+
+
+@pytest.fixture(scope="module")
+def document(server) -> dict[str, Any]:
+    return httpx2.get(f"{server.url}/v1/openapi.json").raise_for_status().json()
+
+
+def resolved(document: dict[str, Any], schema: dict[str, Any]) -> dict[str, Any]:
+    while "$ref" in schema:
+        found: Any = document
+        for part in schema["$ref"].removeprefix("#/").split("/"):
+            found = found[part]
+        schema = found
+    return schema
+
+
+class Recorded(Between):
+    """Every request with the status and the body of its answer."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.answers: list[tuple[httpx2.Request, int, str, bytes]] = []
+
+    def handle_request(self, request: httpx2.Request) -> httpx2.Response:
+        answer = super().handle_request(request)
+        media_type = answer.headers.get("content-type", "").partition(";")[0]
+        body = b""
+        if media_type == "application/json":
+            body = answer.read()
+        self.answers.append((request, answer.status_code, media_type, body))
+        return answer
+
+
+def operation_of(document: dict[str, Any], request: httpx2.Request) -> tuple[str, dict[str, Any]]:
+    """Its name, and what is said of it; of the paths that fit the most literal."""
+    parts = request.url.path.strip("/").split("/")
+    fitting = []
+    for path in document["paths"]:
+        pattern = path.strip("/").split("/")
+        if len(pattern) == len(parts) and all(one == other or one.startswith("{") for one, other in zip(pattern, parts, strict=True)):
+            fitting.append(path)
+    assert fitting, f"{request.url.path} is no path of the document"
+    path = min(fitting, key=lambda one: one.count("{"))
+    assert request.method.lower() in document["paths"][path], f"{request.method} {path} is not in the document"
+    return f"{request.method} {path}", document["paths"][path][request.method.lower()]
+
+
+def everything(client: Client, between: Between, folder: Path, owl: str, sky: str) -> None:
+    """Call all that the client can."""
+    def lose_one_answer(request: httpx2.Request, send: Any) -> httpx2.Response:
+        answer = send()
+        if request.method == "PATCH":
+            between.breaks = lambda request, send: send()
+            answer.read()
+            answer.close()
+            raise httpx2.ReadError("lost, so that HEAD is asked")
+        return answer
+
+    between.breaks = lose_one_answer
+    capture = client.captures.upload(write_capture(folder / "contract"))
+    list(client.captures.all())
+    client.environments.register(str(SKY))
+    blocker = client.jobs.submit(RelightJob(kind="relight", capture=owl, environment=sky, options=RelightOptions(frames="1-5000")))
+    solve = client.jobs.submit(SolveJob(kind="solve", capture=capture.id, options=SolveOptions(method=Method.LAMBERT), priority=10))
+    client.jobs.cancel(solve.id)
+    client.jobs.prioritise(client.jobs.resume(solve.id).id, 5)
+    client.jobs.cancel(client.jobs.get(blocker.id).id)
+    client.jobs.wait(solve.id)
+    failed = client.jobs.submit(SolveJob(kind="solve", capture=capture.id, options=SolveOptions(method=Method.GRADIENT)))
+    *_, last = client.jobs.follow(failed.id)
+    assert last.state == "failed"
+    client.jobs.retry(failed.id)
+    *_, _ = client.jobs.follow(failed.id)
+    export = client.jobs.submit(ExportJob(kind="export", maps=solve.id))
+    client.jobs.wait(export.id)
+    list(client.jobs.all(["succeeded"]))
+
+    def break_download(request: httpx2.Request, send: Any) -> httpx2.Response:
+        answer = send()
+        if request.url.path.endswith(".usdz"):
+            between.breaks = lambda request, send: send()
+            answer.close()
+            raise httpx2.ReadError("lost")
+        return answer
+
+    between.breaks = break_download
+    (folder / "out").mkdir()
+    (folder / "out" / f".asset.usdz.{'0' * 16}.part").write_bytes(b"of another version")  # so that HEAD is asked
+    client.jobs.download(export.id, folder / "out")
+    client.jobs.delete(export.id)
+    client.captures.delete(capture.id)
+
+
+def test_what_the_client_sends_is_documented_and_what_it_reads_is_promised(server, key, document, owl, sky, tmp_path: Path):
+    recorded = Recorded()
+    with Client(server.url, key, transport=recorded) as client:
+        everything(client, recorded, tmp_path, owl, sky)
+    used = set()
+    for request, status, media_type, body in recorded.answers:
+        name, operation = operation_of(document, request)
+        used.add(name)
+        parameters = [resolved(document, one) for one in operation.get("parameters", [])]
+        where = {(one["in"], one["name"].lower()) for one in parameters}
+        for given, _ in parse_qsl(request.url.query.decode()):
+            assert ("query", given.lower()) in where, f"{name}: query {given}"
+        for given in request.headers:
+            assert given in OF_HTTP or ("header", given) in where, f"{name}: header {given}"
+        for one in parameters:
+            if one.get("required") and one["in"] != "path":
+                sent = request.headers if one["in"] == "header" else dict(parse_qsl(request.url.query.decode()))
+                assert one["name"] in sent, f"{name}: {one['name']} is missing"
+        if request.headers.get("content-type") == "application/json":
+            schema = operation["requestBody"]["content"]["application/json"]["schema"]
+            jsonschema_rs.validator_for({**schema, "components": document["components"]}).validate(_json(request.read()))
+        assert str(status) in operation["responses"], f"{name}: {status}"
+        if media_type == "application/json" and body:
+            schema = operation["responses"][str(status)]["content"]["application/json"]["schema"]
+            jsonschema_rs.validator_for({**schema, "components": document["components"]}).validate(_json(body))
+    assert used == USED
+
+
+@pytest.mark.parametrize("model", [views.JobView, views.JobPage, views.IntakeView, views.IntakePage, views.ResultView, views.ResultPage])
+def test_the_fields_of_what_is_read_are_those_of_the_document(document, model):
+    promised = document["components"]["schemas"][model.__name__]
+    assert set(promised["properties"]) == set(model.model_fields)
+    assert set(promised["required"]) >= {name for name, field in model.model_fields.items() if field.is_required()}
+
+
+def test_the_jobs_that_can_be_handed_in_are_those_of_the_document(document):
+    body = document["paths"]["/v1/jobs"]["post"]["requestBody"]["content"]["application/json"]["schema"]
+    promised, ours = resolved(document, body)["discriminator"]["mapping"], TypeAdapter(UserJob).json_schema()
+    assert set(promised) == set(ours["discriminator"]["mapping"])
+    for kind, reference in promised.items():
+        name = ours["discriminator"]["mapping"][kind].rpartition("/")[2]
+        assert set(resolved(document, {"$ref": reference})["properties"]) == set(ours["$defs"][name]["properties"])
+
+
+def _json(body: bytes) -> Any:
+    return json.loads(body)

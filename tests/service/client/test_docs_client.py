@@ -1,0 +1,59 @@
+"""docs/client.md: its examples run, and what it names is there."""
+
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import pytest
+
+from service.client import Client
+from tests.captures import write_capture
+from tests.service.client.conftest import HOME, OWL, SKY
+
+TEXT = (HOME / "docs" / "client.md").read_text(encoding="utf-8")
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", TEXT, re.DOTALL)
+
+
+def test_the_program_runs(server, key, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    program, = blocks("python")
+    monkeypatch.chdir(tmp_path)
+    for said, meant in (("http://127.0.0.1:8470", server.url), ("key_…", key), ("samples/owl", str(OWL))):
+        assert said in program
+        program = program.replace(said, meant)
+    names: dict[str, object] = {}
+    exec(compile(program, "client.md", "exec"), names)
+    assert names["frames"] == [Path("result") / f"frame.{number:04d}.exr" for number in (1, 2, 3)]
+    assert sorted(path.name for path in (tmp_path / "result").iterdir()) == [path.name for path in names["frames"]]
+
+
+def test_the_first_command_runs(relit, server, key, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    line = next(line for line in blocks("sh")[1].splitlines() if "submit pipeline" in line)
+    small = write_capture(tmp_path / "ball")
+    shutil.copy(SKY, small)
+    words = shlex.split(line.replace("samples/owl", str(small)).replace("1-24", "1-2"))
+    monkeypatch.setenv("RELIT_SERVER", server.url)
+    monkeypatch.setenv("RELIT_KEY", key)
+    monkeypatch.chdir(tmp_path)
+    assert relit(*words[1:]).code == 0
+    assert {"asset.usdz", "frame.0001.exr", "maps.exr"} <= {path.name for path in (tmp_path / "result").iterdir()}
+
+
+def test_every_command_and_option_that_is_named_exists(relit):
+    lines = [shlex.split(line, comments=True) for block in blocks("sh")[1:] for line in block.splitlines() if line.startswith("relit")]
+    assert len(lines) > 6
+    for _, group, command, *words in lines:
+        shown = relit(group, command, "--help")
+        assert shown.code == 0, (group, command)
+        for word in words:
+            assert not word.startswith("--") or word in shown.out, (group, command, word)
+
+
+def test_every_method_is_named():
+    with Client() as client:
+        for part in (client.captures, client.jobs):
+            for name in dir(part):
+                assert name.startswith("_") or f"`{name}`" in TEXT, name

@@ -1,0 +1,175 @@
+"""What the client does when the service is away, busy, or not the service at all; the network is played."""
+
+import json
+import socket
+from collections.abc import Callable
+
+import httpx2
+import pytest
+
+from service.client import Busy, Client, ClientError, Conflict, Faulty, Invalid, NotAllowed, NotFound, Unreachable, link
+from service.job_requests import SolveJob
+
+JOB = "job_0123456789abcdefghjk"
+VIEW = {"id": JOB, "state": "queued", "attempt": 1, "revision": 1, "priority": 50, "request": {"kind": "solve",
+        "capture": "cap_0123456789abcdefghjk"}, "created_at": "2026-01-01T00:00:00Z", "started_at": None, "finished_at": None,
+        "progress": None, "error": None}
+
+
+class Played(httpx2.BaseTransport):
+    """Answers in turn; an exception is raised."""
+
+    def __init__(self, *answers: httpx2.Response | Exception) -> None:
+        self.answers, self.requests = list(answers), []
+
+    def handle_request(self, request: httpx2.Request) -> httpx2.Response:
+        self.requests.append(request)
+        answer = self.answers.pop(0)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+
+def problem(status: int, kind: str, detail: str, **headers: str) -> httpx2.Response:
+    body = {"type": f"urn:relit:problem:{kind}", "title": "", "status": status, "detail": detail, "request_id": "12ab", "errors": [
+        {"field": "body.name", "message": "is wrong"}]}
+    return httpx2.Response(status, headers={"Content-Type": "application/problem+json", **headers}, content=json.dumps(body))
+
+
+def view() -> httpx2.Response:
+    return httpx2.Response(200, json=VIEW)
+
+
+@pytest.fixture
+def pauses(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Pauses are noted and not made."""
+    found: list[float] = []
+    monkeypatch.setattr(link.time, "sleep", found.append)
+    return found
+
+
+def client(transport: httpx2.BaseTransport, **options: float) -> Client:
+    return Client("http://service.test", "a-key", transport=transport, **options)
+
+
+def test_a_busy_service_is_asked_again_when_it_says(pauses):
+    played = Played(problem(429, "too-many", "slow down", **{"Retry-After": "7"}), problem(503, "unavailable", "soon"), view())
+    assert client(played).jobs.get(JOB).id == JOB
+    assert pauses[0] == 7
+    assert 0 < pauses[1] <= link.FIRST_PAUSE_S * 2
+    assert len(pauses) == 2
+
+
+def test_one_that_asks_for_more_patience_than_there_is_is_not_waited_for(pauses):
+    with pytest.raises(Busy, match="slow down") as caught:
+        client(Played(problem(429, "too-many", "slow down", **{"Retry-After": "500"})), patience_s=100).jobs.get(JOB)
+    assert (caught.value.status, caught.value.kind, caught.value.request_id) == (429, "too-many", "12ab")
+    assert pauses == []
+
+
+def test_a_time_to_come_back_may_be_a_date():
+    answer = httpx2.Response(503, headers={"Retry-After": "Fri, 31 Dec 1999 23:59:59 GMT"})
+    assert link.retry_after(answer) == 0
+    assert link.retry_after(httpx2.Response(503, headers={"Retry-After": "soon"})) is None
+
+
+def test_a_job_is_handed_in_again_with_the_same_token(pauses):
+    played = Played(httpx2.ReadError("gone"), httpx2.ConnectError("refused"), httpx2.Response(502), view())
+    client(played).jobs.submit(SolveJob.model_validate(VIEW["request"]))
+    assert len({request.headers["idempotency-key"] for request in played.requests}) == 1
+    assert len(played.requests) == 4
+
+
+def test_every_job_has_a_token_of_its_own(pauses):
+    played = Played(view(), view())
+    with client(played) as asking:
+        for _ in range(2):
+            asking.jobs.submit(SolveJob.model_validate(VIEW["request"]))
+    assert len({request.headers["idempotency-key"] for request in played.requests}) == 2
+
+
+@pytest.mark.parametrize("error", [httpx2.ReadError("gone"), httpx2.ReadTimeout("silent"), httpx2.RemoteProtocolError("cut")])
+def test_what_may_have_been_done_is_not_done_twice(pauses, error):
+    played = Played(error)
+    with pytest.raises(Unreachable, match="may have done what was asked"):
+        client(played).jobs.cancel(JOB)
+    assert len(played.requests) == 1
+
+
+def test_what_was_not_sent_is_sent_again(pauses):
+    assert client(Played(httpx2.ConnectError("refused"), view())).jobs.cancel(JOB).id == JOB
+
+
+def test_patience_ends(pauses, monkeypatch: pytest.MonkeyPatch):
+    clock = iter(range(0, 1000, 10))
+    monkeypatch.setattr(link.time, "monotonic", lambda: next(clock))
+    played = Played(*[httpx2.ConnectError("refused")] * 100)
+    with pytest.raises(Unreachable, match=r"http://service\.test does not answer: refused"):
+        client(played, patience_s=50).jobs.get(JOB)
+    assert 1 < len(played.requests) < 10
+
+
+def test_nobody_listens():
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))  # and never listens
+        url = f"http://127.0.0.1:{taken.getsockname()[1]}"
+        with Client(url, patience_s=0) as asking, pytest.raises(Unreachable, match=f"{url} does not answer"):
+            asking.jobs.get(JOB)
+
+
+@pytest.mark.parametrize(("status", "kind", "error"), [
+    (401, "unauthenticated", NotAllowed), (403, "forbidden", NotAllowed), (404, "not-found", NotFound), (410, "gone", NotFound),
+    (409, "conflict", Conflict), (422, "invalid", Invalid), (460, "checksum-mismatch", Invalid), (507, "full", Busy),
+    (500, "internal", Faulty)])
+def test_a_problem_becomes_an_error(status, kind, error):
+    played = Played(problem(status, kind, "one sentence"))
+    with pytest.raises(error) as caught:
+        client(played).jobs.get(JOB)
+    assert (str(caught.value), caught.value.kind, caught.value.errors) == ("one sentence", kind, (("body.name", "is wrong"),))
+    assert type(caught.value) is error
+
+
+@pytest.mark.parametrize("answer", [
+    httpx2.Response(404, text="<html>"), httpx2.Response(302, headers={"Location": "http://elsewhere.test/"}),
+    httpx2.Response(400, headers={"Content-Type": "application/problem+json"}, content=b"\xff")])
+def test_something_else_answers(answer):
+    with pytest.raises(Unreachable, match=f"status {answer.status_code}: look at the server's URL"):
+        client(Played(answer)).jobs.get(JOB)
+
+
+@pytest.mark.parametrize("server", ["http://service.test", "http://service.test/", "http://service.test/v1", "http://service.test/v1/"])
+def test_the_address_may_be_the_one_that_serve_prints(server):
+    played = Played(view())
+    Client(server, transport=played).jobs.get(JOB)
+    assert str(played.requests[0].url) == f"http://service.test/v1/jobs/{JOB}"
+
+
+@pytest.mark.parametrize("server", ["", "service.test", "ftp://service.test", "http://"])
+def test_an_address_that_is_none(server):
+    with pytest.raises(Unreachable, match="is no URL of a service"):
+        Client(server)
+
+
+@pytest.mark.parametrize("key", ["schlüssel", "key\nX-Other: header", "key\x00"])
+def test_a_key_that_is_none(key):
+    with pytest.raises(ClientError, match="the key has characters that no key has"):
+        Client("http://service.test", key)
+
+
+def test_an_identifier_stays_one_part_of_the_path():
+    played = Played(problem(404, "not-found", "there is no such job"))
+    with pytest.raises(NotFound):
+        client(played).jobs.get("../keys?all=1#")
+    assert played.requests[0].url.raw_path == b"/v1/jobs/..%2Fkeys%3Fall%3D1%23"
+
+
+def play(calls: Callable[[Client], object], *answers: httpx2.Response) -> list[httpx2.Request]:
+    played = Played(*answers)
+    calls(client(played))
+    return played.requests
+
+
+def test_pages_are_followed():
+    pages = [httpx2.Response(200, json={"jobs": [VIEW], "next": JOB}), httpx2.Response(200, json={"jobs": [VIEW], "next": None})]
+    found = play(lambda asking: list(asking.jobs.all(["queued", "running"])), *pages)
+    assert [request.url.query for request in found] == [b"state=queued&state=running", b"state=queued&state=running&before=" + JOB.encode()]
