@@ -3,12 +3,15 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint bench figures samples lock clean
+.PHONY: demo serve test lint bench figures samples lock clean
 demo: $(VENV)/installed
 	$(BIN)/relit demo
 
+serve: $(VENV)/installed
+	$(BIN)/relit demo --serve
+
 test: $(VENV)/installed-dev
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q -n auto --maxprocesses 4 --dist loadfile
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff check .

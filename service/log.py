@@ -36,3 +36,10 @@ def configure(level: str, form: str) -> None:
     structlog.configure(processors=[*shared, structlog.stdlib.ProcessorFormatter.wrap_for_formatter],
                         logger_factory=structlog.stdlib.LoggerFactory(), wrapper_class=structlog.stdlib.BoundLogger,
                         cache_logger_on_first_use=True)
+
+
+def adopt(library: str) -> None:
+    """Let what a library says go the way of all lines: some set up a way of their own."""
+    theirs = logging.getLogger(library)
+    theirs.handlers.clear()
+    theirs.propagate = True

@@ -49,7 +49,9 @@ class Settings(BaseSettings):
     database_url: str | None = None
     """postgresql://user:password@host/name for several machines; without it SQLite in the data folder."""
     storage_url: str | None = None
-    """s3://bucket/prefix, or another store that obstore reads, for captures and results; without it the data folder."""
+    """s3://bucket/prefix (needs the extra `s3`) or file:///folder, for captures and results; without it the data folder."""
+    scratch_bytes: Count = 500 * 1024**3
+    """What copies of objects of `storage_url` may take in the data folder of each machine, beside those that are in use."""
     host: str = "127.0.0.1"
     """Address that the API listens on."""
     port: Annotated[int, Field(ge=0, le=65535)] = 8470
@@ -128,12 +130,7 @@ class Settings(BaseSettings):
     @cached_property
     def loopback(self) -> bool:
         """Whether the API listens to this machine alone."""
-        if self.host == "localhost":
-            return True
-        try:
-            return ip_address(self.host).is_loopback
-        except ValueError:
-            return False
+        return is_loopback(self.host)
 
     @property
     def is_sqlite(self) -> bool:
@@ -141,10 +138,15 @@ class Settings(BaseSettings):
         return self.database_url is None
 
     @property
+    def sqlite_file(self) -> Path:
+        """The database, where it is a file."""
+        return self.data / "relit.sqlite"
+
+    @property
     def sqlalchemy_url(self) -> str:
         """Of the database, with the driver that we install."""
         if self.database_url is None:
-            return f"sqlite:///{self.data / 'relit.sqlite'}"
+            return f"sqlite:///{self.sqlite_file}"
         scheme, _, rest = self.database_url.partition("://")
         return f"postgresql+psycopg://{rest}" if scheme in ("postgresql", "postgres") else self.database_url
 
@@ -156,6 +158,16 @@ class Settings(BaseSettings):
         assert isinstance(init_settings, InitSettingsSource)
         file = init_settings.init_kwargs.pop("config", None) or os.environ.get(CONFIG)
         return (init_settings, env_settings, *((InitSettingsSource(settings_cls, _of_file(Path(file))),) if file else ()))
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a name or address is this machine's alone."""
+    if host == "localhost":
+        return True
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 def unknown_variables(environment: Mapping[str, str]) -> dict[str, str | None]:

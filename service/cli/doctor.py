@@ -1,8 +1,11 @@
 """relit doctor: is this installation sound?"""
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from service.cli.server import ConfigOption, DataOption, settings_of
 
 ROOTS = ("stage", "kernels", "service")
 
@@ -14,11 +17,13 @@ def register(app: typer.Typer) -> None:
     app.command("doctor")(doctor)
 
 
-def doctor(only: DoctorDevice = None) -> None:
-    """Check this installation: versions, shadowed packages, devices, a kernel, a writable kernel cache."""
+def doctor(only: DoctorDevice = None, data: DataOption = None, config: ConfigOption = None) -> None:
+    """Check this installation: versions, shadowed packages, devices, a kernel, a writable kernel cache; and the service that is here.
+
+    The service is that of --data or --config, or of RELIT_DATA or ./relit-data where there is such a folder.
+    """
     import importlib.util
     import tempfile
-    from pathlib import Path
 
     from service import __version__
     from service.provenance import versions
@@ -49,8 +54,25 @@ def doctor(only: DoctorDevice = None) -> None:
                 faults.append(f"{name} gives wrong sums")
         with tempfile.TemporaryDirectory() as folder:
             print(f"{'temporary':<12} {folder} can be written")
+    faults += _service(data, config)
     for fault in faults:
         print(f"{'wrong':<12} {fault}")
     print("sound" if not faults else f"{len(faults)} faults")
     if faults:
-        raise typer.Exit(2)
+        raise typer.Exit(1)
+
+
+def _service(data: Path | None, config: Path | None) -> list[str]:
+    """Look at the service, where there is one; what is wrong."""
+    settings = settings_of(config, data=data)
+    if data is None and config is None and not settings.data.is_dir():
+        return []
+    from service.checkup import look
+
+    faults = []
+    for found in look(settings):
+        if found.fault:
+            faults.append(f"{found.subject}: {found.text}")
+        else:
+            print(f"{found.subject:<12} {found.text}")
+    return faults

@@ -8,11 +8,31 @@ from typing import Annotated
 import typer
 from typer.exceptions import TyperException
 
-from service.cli import basis, calibrate, capture, demo, depth, doctor, measure, patterns, relight, results, scan, server, shade, simulate
+from service.cli import (
+    basis,
+    calibrate,
+    capture,
+    demo,
+    depth,
+    doctor,
+    farm,
+    jobs,
+    keys,
+    measure,
+    patterns,
+    relight,
+    results,
+    scan,
+    server,
+    shade,
+    simulate,
+    submit,
+)
 
 app = typer.Typer(name="relit", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
                   help="Active-illumination captures to normals, materials, depth, USD assets and relit frames.")
-for module in (demo, capture, calibrate, results, depth, scan, simulate, patterns, relight, shade, basis, doctor, measure, server):
+for module in (demo, capture, calibrate, results, depth, scan, simulate, patterns, relight, shade, basis, doctor, measure, server, submit,
+               jobs, keys, farm):
     module.register(app)
 
 BAD_INPUT, INTERRUPTED = 2, 130

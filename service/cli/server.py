@@ -48,13 +48,6 @@ def worker(
 
 def settings_of(config: Path | None, **given: Any) -> Any:
     """The settings, with what was given on the command line."""
-    import os
-
-    from service.errors import RequestError
     from service.settings import Settings
 
-    if config is not None:
-        if not config.is_file():
-            raise RequestError(f"--config {config}: there is no such file")
-        os.environ["RELIT_CONFIG"] = str(config)
-    return Settings(**{name: value for name, value in given.items() if value is not None})
+    return Settings(config=config, **{name: value for name, value in given.items() if value is not None})  # type: ignore[call-arg]

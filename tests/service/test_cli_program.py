@@ -12,7 +12,8 @@ import service
 from stage.capture import Capture
 from tests.captures import edit_manifest, make_scene, write_capture, write_exr, write_image
 
-COMMANDS = ["demo", "import", "info", "calibrate", "solve", "relight", "basis", "export", "doctor", "bench"]
+COMMANDS = ["demo", "import", "info", "calibrate", "solve", "relight", "basis", "export", "doctor", "bench", "serve", "worker",
+            "keys"]
 ROOT = Path(service.__file__).parents[1]
 
 

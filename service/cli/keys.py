@@ -1,0 +1,96 @@
+"""relit keys: who may use the service."""
+
+from enum import StrEnum
+from typing import Annotated, Any
+
+import typer
+
+from service.cli.server import ConfigOption, DataOption, settings_of
+
+
+class ScopeName(StrEnum):
+    """What a key may do; a test compares it with service.store.keys.Scope, which costs time to load."""
+
+    READ = "read"
+    WRITE = "write"
+    ADMIN = "admin"
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    group = typer.Typer(name="keys", no_args_is_help=True, help="Make, list and revoke the keys of the service.")
+    group.command("create")(create)
+    group.command("list")(list_)
+    group.command("revoke")(revoke)
+    app.add_typer(group)
+
+
+def create(
+    project: Annotated[str, typer.Option("--project", help="Whose captures, jobs and results it opens: a-z, 0-9 and -.")],
+    name: Annotated[str, typer.Option("--name", help="Who holds it: a person or a program.")],
+    scope: Annotated[ScopeName, typer.Option("--scope", help="read: see; write: also upload and run jobs; admin: also register "
+                                                             "folders of the server, and /metrics.")],
+    data: DataOption = None,
+    config: ConfigOption = None,
+) -> None:
+    """Make a key and print it: it is kept as a hash alone, and cannot be shown again."""
+    import sys
+
+    from service.store import keys
+    from service.store.database import create as create_tables
+    from service.store.open import open_database
+
+    wanted = keys.NewKey(project=project, name=name, scope=keys.Scope(scope))
+
+    def prepare(settings: Any, database: Any) -> None:
+        settings.data.mkdir(parents=True, exist_ok=True)
+        create_tables(database)
+
+    print(keys.create(open_database(settings_of(config, data=data), prepare), wanted))
+    print("keep it: it is not shown again", file=sys.stderr)
+
+
+def list_(
+    project: Annotated[str | None, typer.Option("--project", help="Of this project alone.", show_default=False)] = None,
+    data: DataOption = None,
+    config: ConfigOption = None,
+) -> None:
+    """Show the keys that were made, without their secrets."""
+    from datetime import UTC, datetime
+
+    from service.store import keys
+
+    def day(seconds: float) -> str:
+        return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M")
+
+    rows = [("KEY", "PROJECT", "SCOPE", "CREATED (UTC)", "REVOKED", "NAME")]
+    rows += [(row["id"], row["project"], row["scope"], day(row["created_at"]), "" if row["revoked_at"] is None else day(row["revoked_at"]),
+              row["name"]) for row in keys.listing(_open(settings_of(config, data=data)), project)]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        print("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip())
+
+
+def revoke(
+    key: Annotated[str, typer.Argument(metavar="KEY_ID", help="As `relit keys list` shows it.")],
+    data: DataOption = None,
+    config: ConfigOption = None,
+) -> None:
+    """Take a key back: the next request with it is refused."""
+    from service.errors import RequestError
+    from service.store import keys
+
+    if not keys.revoke(_open(settings_of(config, data=data)), key.partition(".")[0]):
+        raise RequestError(f"{key.partition('.')[0]}: there is no such key that is not revoked")
+    print(f"revoked  {key.partition('.')[0]}")
+
+
+def _open(settings: Any) -> Any:
+    """The database of a service that is there: a wrong --data makes none."""
+    from service.errors import RequestError
+    from service.store.database import create as create_tables
+    from service.store.open import open_database
+
+    if settings.is_sqlite and not settings.sqlite_file.exists():
+        raise RequestError(f"data {settings.data}: there is no service in this folder")
+    return open_database(settings, lambda _settings, database: create_tables(database))
