@@ -18,10 +18,10 @@ from service.jobs.worker import cache_folder
 from service.log import logger
 from service.settings import Settings
 from service.storage import layout
-from service.storage.folder import Storage
+from service.storage.folder import Storage, drop_folder
 from service.storage.parts import parts_folder
 from service.store import idempotency, intakes, jobs, uploads, workers
-from service.store.database import UNANSWERED, Database
+from service.store.database import UNANSWERED, Database, said
 from stage.errors import StorageError
 
 EVERY_S = 600.0
@@ -68,7 +68,7 @@ class Housekeeper:
             try:
                 piece()
             except (*UNANSWERED, StorageError, OSError) as error:
-                logger.warning("housekeeping waits", piece=piece.__name__.strip("_"), error=str(getattr(error, "orig", error)))
+                logger.warning("housekeeping waits", piece=piece.__name__.strip("_"), error=said(error))
 
     def _run(self) -> None:
         while True:
@@ -140,7 +140,8 @@ def _forget(connection: sa.Connection, job: str) -> bool:
 
 def _clear(folder: Path) -> None:
     """Out of sight at once, so that no job finds half of it."""
-    doomed = folder.with_name(f".{folder.name}.removed") if not folder.name.startswith(".") else folder
-    folder.rename(doomed)
-    shutil.rmtree(doomed, ignore_errors=True)
+    if folder.name.startswith("."):  # it is hidden already
+        shutil.rmtree(folder, ignore_errors=True)
+    else:
+        drop_folder(folder)
     logger.info("stack cache removed", capture=folder.name)

@@ -10,7 +10,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from service.api.context import Behind, IdempotencyKey, Reader, Service, Writer, once
 from service.api.problems import ApiError, responses
-from service.api.submission import require_space, submit
+from service.api.space import FOR_WORK, require_space
+from service.api.submission import submit
 from service.api.views import IntakePage, IntakeView
 from service.identifiers import CAPTURE, ENVIRONMENT, CaptureId, EnvironmentId, new_id
 from service.job_requests import CheckJob
@@ -144,7 +145,7 @@ def _registered(behind: Service, caller: Caller, field: str, given: str) -> Path
 
 def _create(behind: Service, caller: Caller, prefix: str, name: str, folder: Path | None, token: str | None,
             response: Response) -> IntakeView:
-    require_space(behind)
+    require_space(behind, FOR_WORK)
 
     def make(connection: sa.Connection) -> str:
         identifier = new_id(prefix)

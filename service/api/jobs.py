@@ -11,7 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from service.api.context import Behind, IdempotencyKey, Reader, Service, Writer, made_before, once
 from service.api.exact import Exact
 from service.api.problems import ApiError, responses
-from service.api.submission import inputs_of, require_queue, require_space, spelled_out, submit
+from service.api.space import FOR_WORK, require_space
+from service.api.submission import inputs_of, require_queue, spelled_out, submit
 from service.api.views import JobPage, JobState, JobView
 from service.identifiers import JobId
 from service.job_requests import CheckJob, JobRequest, UserJob
@@ -51,7 +52,7 @@ def create_job(behind: Behind, caller: Writer, response: Response, request: Aske
     asked = ["job", request.model_dump(mode="json", by_alias=True)]
     job = made_before(behind, caller, token, asked)
     if job is None:
-        require_space(behind)
+        require_space(behind, FOR_WORK)
         inputs = inputs_of(behind, caller.project, request)
         spelled = spelled_out(behind, caller.project, request)
         job, _ = once(behind, caller, token, asked, lambda connection: submit(behind, caller, spelled, connection, inputs))
@@ -154,7 +155,7 @@ def view(behind: Service, caller: Caller, job: str) -> JobView:
 
 
 def _again(behind: Service, caller: Caller, job: str, state: str) -> JobView:
-    require_space(behind)
+    require_space(behind, FOR_WORK)
     before = view(behind, caller, job)
     request = before.request
     if isinstance(request, CheckJob):

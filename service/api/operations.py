@@ -1,6 +1,5 @@
 """For those who operate the service: whether it lives, whether it is ready, and its numbers."""
 
-import shutil
 import threading
 import time
 from typing import Annotated, Literal
@@ -13,6 +12,7 @@ from service.api.context import Behind, Service, bearer, caller_of
 from service.api.local import require_local
 from service.api.metrics import CONTENT_TYPE
 from service.api.problems import ApiError, responses
+from service.api.space import has_space
 from service.store import workers
 from service.store.database import UNANSWERED
 from service.store.keys import Scope
@@ -59,7 +59,7 @@ def _faults(behind: Service) -> list[str]:
         behind.storage.check()
     except StorageError:
         found.append("the storage cannot be written")
-    if shutil.disk_usage(behind.settings.data).free < behind.settings.min_free_bytes:
+    if not has_space(behind.settings):
         found.append("there is less space left than min_free_bytes")
     return found
 

@@ -3,12 +3,12 @@
 import contextlib
 import hashlib
 import hmac
-import shutil
 import time
 
 from service.api.context import Service
 from service.api.problems import ApiError
 from service.api.receive import RunningHashes, Writer
+from service.api.space import FOR_UPLOAD, require_space
 from service.api.tus import Checksum
 from service.log import logger
 from service.safe_names import shown
@@ -18,7 +18,6 @@ from service.store import uploads
 from service.store.uploads import Row
 
 BUSY_RETRY_S = 1
-FULL_RETRY_S = 600
 
 
 being_written: set[str] = set()
@@ -62,12 +61,12 @@ class Patch:
         if self._offset != start:
             raise ApiError("conflict", f"Upload-Offset: is {self._offset}, {start} bytes are here", headers={"Upload-Offset": str(start)})
         if not row["done"]:
-            require_free(self._behind, 0)
+            require_space(self._behind, FOR_UPLOAD)
             self._part.cut(start)
         self._whole = None if row["sha256"] is None or row["done"] else self._hashes.take(row["id"], start)
         digests = [digest for digest in (self._digest, self._whole) if digest is not None]
         self.writer = Writer(self._part, start, row["length"], digests=digests,
-                             save=self._save if self._checksum is None else None, guard=lambda: require_free(self._behind, 0))
+                             save=self._save if self._checksum is None else None, guard=lambda: require_space(self._behind, FOR_UPLOAD))
 
     def end(self, broken: str | None) -> Row:
         """Count what came.
@@ -178,10 +177,3 @@ def settled(behind: Service, row: Row) -> Row:
 def received_of(behind: Service, row: Row) -> int:
     """Bytes of an upload that need not be sent again."""
     return safe_offset(row, 0 if row["done"] else stored_bytes(parts_folder(behind.settings), row["id"]))
-
-
-def require_free(behind: Service, length: int) -> None:
-    """Refuse where so many bytes more would leave less space than the operator wants."""
-    settings = behind.settings
-    if shutil.disk_usage(settings.data).free - length < settings.min_free_bytes:
-        raise ApiError("full", "the service has no space left for this upload", headers={"Retry-After": str(FULL_RETRY_S)})

@@ -1,7 +1,5 @@
 """Whether a job can be handed in: what it reads is there and ready, and nothing is asked beyond the limits."""
 
-import shutil
-
 import sqlalchemy as sa
 
 from service import telemetry
@@ -29,12 +27,6 @@ def require_queue(behind: Service, caller: Caller, connection: sa.Connection) ->
     most = behind.settings.max_queued
     if jobs.count_queued(connection, caller.project, caller.key) > most:
         raise ApiError("too-many", f"{most} jobs of this key have not begun", headers={"Retry-After": str(QUEUE_RETRY_S)})
-
-
-def require_space(behind: Service) -> None:
-    """Refuse where the data folder is nearly full."""
-    if shutil.disk_usage(behind.settings.data).free < behind.settings.min_free_bytes:
-        raise ApiError("full", "the service has no space left for new work", headers={"Retry-After": "600"})
 
 
 def inputs_of(behind: Service, project: str, request: JobRequest) -> list[str]:
@@ -97,5 +89,3 @@ def _require_maps(behind: Service, project: str, identifier: str, *, depth: bool
         raise ApiError("invalid", f"maps: {identifier} is a {row['request']['kind']} job: give one of {', '.join(kinds)}")
     if row["state"] != jobs.SUCCEEDED:
         raise ApiError("conflict", f"maps: {identifier} is {row['state']}, not succeeded")
-
-

@@ -11,9 +11,10 @@ from pydantic import BaseModel
 
 from service.api.context import Behind, IdempotencyKey, Reader, Service, Writer, once
 from service.api.intakes import row_of
-from service.api.patch import Patch, being_written, received_of, require_free, settled
+from service.api.patch import Patch, being_written, received_of, settled
 from service.api.problems import ApiError, responses
 from service.api.receive import Broken, RunningHashes, TooLong, pour
+from service.api.space import FOR_UPLOAD, require_space
 from service.api.tus import (
     ALGORITHMS,
     CHECKSUM_PATTERN,
@@ -205,7 +206,7 @@ def _create(behind: Service, caller: Caller, intake: str, length: int, given: Me
     check_path(given.path)
     if length > settings.max_upload_bytes:
         raise ApiError("too-large", f"Upload-Length: is {length}, a file may have {settings.max_upload_bytes} bytes")
-    require_free(behind, length)
+    require_space(behind, FOR_UPLOAD, length)
 
     def make(connection: sa.Connection) -> str:
         _hold(behind, caller, connection, intake)

@@ -11,7 +11,7 @@ from service.api.views import JobView
 from service.identifiers import JOB
 from service.log import logger
 from service.store import jobs
-from service.store.database import UNANSWERED, Database
+from service.store.database import UNANSWERED, Database, said
 
 TICK_S = 0.25
 """Between two looks; of changes between them the last is told."""
@@ -115,7 +115,7 @@ class Watcher:
                     silent = False
                 except UNANSWERED as error:
                     if not silent:
-                        logger.warning("database does not answer: events wait", error=str(getattr(error, "orig", error)))
+                        logger.warning("database does not answer: events wait", error=said(error))
                     silent = True
                 await asyncio.sleep(TICK_S)
         except Exception as error:

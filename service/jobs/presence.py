@@ -4,7 +4,6 @@ On SQLite all workers are on one machine and the lock is one on a file; on Postg
 from a dead worker holds its lock meanwhile, so that one alone does. Names are never used again.
 """
 
-import fcntl
 import os
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
@@ -15,6 +14,7 @@ from typing import Protocol
 import sqlalchemy as sa
 from sqlalchemy.exc import DBAPIError
 
+from service import file_lock
 from service.store.database import Database
 
 SPACE = 7
@@ -57,7 +57,7 @@ class FilePresence:
     def hold(self) -> Held:
         """A lock on a file lasts as long as the process, and is seen by others as long as the file has its name."""
         if self._file is not None:
-            if self._is_named(self._file, self._worker):
+            if file_lock.is_named(self._file, self._path(self._worker)):
                 return Held.KEPT
             os.close(self._file)
         self._file = self._take(self._worker)
@@ -81,26 +81,11 @@ class FilePresence:
 
     def _take(self, worker: str) -> int | None:
         self._folder.mkdir(parents=True, exist_ok=True)
-        while True:
-            file = os.open(self._path(worker), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                os.close(file)
-                return None
-            if self._is_named(file, worker):
-                return file
-            os.close(file)  # another let go of it, and took its name, between our two calls
+        return file_lock.take(self._path(worker))
 
     def _drop(self, file: int, worker: str) -> None:
         self._path(worker).unlink(missing_ok=True)
         os.close(file)
-
-    def _is_named(self, file: int, worker: str) -> bool:
-        try:
-            return os.path.samestat(os.fstat(file), os.stat(self._path(worker)))
-        except FileNotFoundError:
-            return False
 
     def _path(self, worker: str) -> Path:
         return self._folder / f"{worker.replace('/', '_')}.lock"

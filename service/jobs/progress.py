@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from service.log import logger
 from service.store import jobs
-from service.store.database import UNANSWERED, Database
+from service.store.database import UNANSWERED, Database, said
 from service.store.jobs import FRAMES, Claim
 
 EVERY_S = 0.5
@@ -77,7 +77,7 @@ class JobProgress:
                 self._stopped = not jobs.advance(self._database, self._claim, progress)
                 self._tell_at = time.monotonic() + EVERY_S
             except UNANSWERED as error:
-                logger.warning("progress is not told", job=self._claim.job, error=str(getattr(error, "orig", error)))
+                logger.warning("progress is not told", job=self._claim.job, error=said(error))
                 self._tell_at = time.monotonic() + UNTOLD_S
             if self._stopped:
                 raise Stopped

@@ -12,7 +12,7 @@ from service.jobs.presence import Held, Presence
 from service.jobs.queue import JobQueue, job_of
 from service.log import logger
 from service.store import jobs, workers
-from service.store.database import UNANSWERED, Database
+from service.store.database import UNANSWERED, Database, said
 from service.store.jobs import Claim
 
 GRACE_ROUNDS = 2
@@ -84,7 +84,7 @@ class Takeover:
             try:
                 self.round()
             except UNANSWERED as error:
-                logger.warning("database does not answer", error=str(getattr(error, "orig", error)))
+                logger.warning("database does not answer", error=said(error))
             except Exception as error:  # the next round may do better; without any the worker would seem dead
                 logger.error("takeover failed", exc_info=error)
             if self._ended.wait(self._every_s):

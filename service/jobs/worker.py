@@ -21,7 +21,7 @@ from service.log import logger
 from service.settings import Settings
 from service.storage.open import open_storage
 from service.store import workers
-from service.store.database import LONGEST_PAUSE_S, UNANSWERED, Database, connect
+from service.store.database import LONGEST_PAUSE_S, UNANSWERED, Database, connect, said
 
 POLL_S = 0.25
 """How often a queue is asked for work."""
@@ -87,7 +87,7 @@ def run_worker(settings: Settings, device: str, pulse: Pulse) -> None:
         for workflow in queue.taken_by().get(name, []):
             queue.hand_back(workflow, name)
     except UNANSWERED as error:
-        logger.warning("jobs are left to be taken over: the database does not answer", error=str(getattr(error, "orig", error)))
+        logger.warning("jobs are left to be taken over: the database does not answer", error=said(error))
     lock.close()
     telemetry.close(tracing)
     logger.info("worker ended", worker=name)
@@ -106,7 +106,7 @@ def _prepared(database: Database, settings: Settings, ending: threading.Event) -
             prepare(settings, database)
             return
         except UNANSWERED as error:
-            logger.warning("database does not answer", error=str(getattr(error, "orig", error)))
+            logger.warning("database does not answer", error=said(error))
         if ending.wait(LONGEST_PAUSE_S):
             os._exit(0)
 

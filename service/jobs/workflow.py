@@ -18,7 +18,7 @@ from service.jobs.steps import Job, Site, steps_of
 from service.log import logger
 from service.storage import layout
 from service.store import intakes, jobs
-from service.store.database import FIRST_PAUSE_S, LONGEST_PAUSE_S, UNANSWERED
+from service.store.database import FIRST_PAUSE_S, LONGEST_PAUSE_S, UNANSWERED, said
 from service.store.jobs import Claim
 
 T = TypeVar("T")
@@ -86,7 +86,7 @@ class Desk:
                 log.info("job succeeded")
             return DONE
         except UNANSWERED as error:  # the queue could not record a step: the steps are to be gone through again, from the first
-            log.warning("job goes back to the queue: the database does not answer", error=str(getattr(error, "orig", error)))
+            log.warning("job goes back to the queue: the database does not answer", error=said(error))
             self._patiently(claim, lambda: self._queue.hand_back(workflow_id(claim.job, claim.attempt), self._worker))
             return STOPPED
         except USER_ERRORS as error:
@@ -165,7 +165,7 @@ class Desk:
             try:
                 return work()
             except UNANSWERED as error:
-                logger.warning("waiting for the database", job=claim.job, error=str(getattr(error, "orig", error)))
+                logger.warning("waiting for the database", job=claim.job, error=said(error))
             time.sleep(pause)
             pause = min(2 * pause, LONGEST_PAUSE_S)
             with self._changed:

@@ -121,17 +121,12 @@ class FolderStorage:
     def remove(self, prefix: str) -> None:
         """Delete the folder; hidden first, so that a half-deleted one is not seen."""
         folder = self._root / prefix
-        if not folder.exists():
-            return
-        doomed = folder.with_name(f".{folder.name}.removed")
         with storage("remove", folder):
-            folder.rename(doomed)
-        shutil.rmtree(doomed, ignore_errors=True)
+            drop_folder(folder)
 
     def tidy(self) -> None:
         """Delete what is hidden for it."""
-        for folder in self._root.glob("projects/*/*/.*.removed"):
-            shutil.rmtree(folder, ignore_errors=True)
+        drop_hidden(self._root)
 
     def check(self) -> None:
         """Write and remove a file."""
@@ -153,6 +148,23 @@ def _sync(folder: Path) -> None:
 def is_shown(name: str) -> bool:
     """Whether a name is one of a complete file: no part of it is empty, begins with a dot, or leads elsewhere."""
     return "\0" not in name and all(part and not part.startswith(".") for part in name.split("/"))
+
+
+def drop_folder(folder: Path) -> None:
+    """Delete a folder, where there is one; hidden first, so that nobody finds half of it."""
+    doomed = folder.with_name(f".{folder.name}.removed")
+    shutil.rmtree(doomed, ignore_errors=True)  # of a process that was killed here
+    try:
+        folder.rename(doomed)
+    except FileNotFoundError:
+        return
+    shutil.rmtree(doomed, ignore_errors=True)
+
+
+def drop_hidden(root: Path) -> None:
+    """Delete what killed processes had hidden, of prefixes below a folder."""
+    for folder in root.glob("projects/*/*/.*.removed"):
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def sweep(folder: Path) -> None:

@@ -1,6 +1,5 @@
 """The bytes of an upload that is not complete: one file each, <upload>.part, which one request writes at a time."""
 
-import fcntl
 import os
 import threading
 from collections.abc import Iterator, Sequence
@@ -8,6 +7,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from service import file_lock
 from service.settings import Settings
 from stage.errors import storage
 
@@ -39,19 +39,10 @@ class Part:
         path = _path(folder, upload)
         with storage("write", path):
             folder.mkdir(parents=True, exist_ok=True)
-            while True:
-                descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
-                try:
-                    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    if _is_at(descriptor, path):
-                        return cls(path, descriptor)
-                except BlockingIOError:
-                    os.close(descriptor)
-                    raise PartLocked from None
-                except BaseException:
-                    os.close(descriptor)
-                    raise
-                os.close(descriptor)  # it was removed, or moved to its place, before the lock was taken
+            descriptor = file_lock.take(path, 0o644)
+        if descriptor is None:
+            raise PartLocked
+        return cls(path, descriptor)
 
     @staticmethod
     def discard(folder: Path, upload: str) -> None:
@@ -159,11 +150,3 @@ def _behind(pieces: Sequence[bytes], written: int) -> list[bytes]:
 
 def _path(folder: Path, upload: str) -> Path:
     return folder / f"{upload}{SUFFIX}"
-
-
-def _is_at(descriptor: int, path: Path) -> bool:
-    try:
-        found = path.stat(follow_symlinks=False)
-    except FileNotFoundError:
-        return False
-    return os.path.samestat(found, os.fstat(descriptor))

@@ -5,16 +5,15 @@ data/scratch/PREFIX/objects.json   of each: version of the object, size, and whe
 data/scratch/PREFIX/lock           held while files are fetched or sent, so that two workers of a machine fetch once
 """
 
-import fcntl
 import json
 import os
-import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
 
+from service import file_lock
+from service.storage.folder import drop_folder, drop_hidden
 from stage.errors import storage
 from stage.files import write_text
 
@@ -80,10 +79,8 @@ class Scratch:
     @contextmanager
     def entry(self, prefix: str, waiting: Callable[[], None]) -> Iterator[Entry]:
         """Hold the copy of a prefix; `waiting` is called again and again while another holds it."""
-        folder = self._root / prefix
-        self.files(prefix)
-        with self._lock(folder, waiting):
-            entry = Entry(folder)
+        with self._lock(prefix, waiting):
+            entry = Entry(self._root / prefix)
             try:
                 yield entry
             finally:
@@ -91,12 +88,11 @@ class Scratch:
 
     def remove(self, prefix: str) -> None:
         """Drop the copy of a prefix."""
-        _drop(self._root / prefix)
+        drop_folder(self._root / prefix)
 
     def tidy(self) -> None:
         """Delete what is left of copies that were being dropped."""
-        for folder in self._root.glob("projects/*/*/.*.removed"):
-            shutil.rmtree(folder, ignore_errors=True)
+        drop_hidden(self._root)
 
     def make_room(self, wanted_bytes: int) -> None:
         """Drop copies, those longest unused first, until the others and what is wanted are within the limit; none that is in use."""
@@ -106,32 +102,25 @@ class Scratch:
         for used_at, size, folder in found:
             if total <= self._limit_bytes or used_at > time.time() - IN_USE_S:
                 return
-            _drop(folder)
+            drop_folder(folder)
             total -= size
 
     @contextmanager
-    def _lock(self, folder: Path, waiting: Callable[[], None]) -> Iterator[None]:
-        path = folder / LOCK
+    def _lock(self, prefix: str, waiting: Callable[[], None]) -> Iterator[None]:
+        path = self._root / prefix / LOCK
         while True:
+            self.files(prefix)  # the copy may be dropped while we wait
             with storage("make", path):
-                file = open(path, "wb")  # noqa: SIM115  (faults of the work under the lock are told as what they are)
-            with file:
-                while not _taken(file):
-                    waiting()
-                    time.sleep(WAIT_S)
-                if path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat()):
-                    os.utime(path)
-                    yield
-                    return
-            self.files(str(folder.relative_to(self._root)))  # the copy was dropped while we waited
-
-
-def _taken(file: IO[bytes]) -> bool:
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
+                descriptor = file_lock.take(path, 0o644)
+            if descriptor is not None:
+                break
+            waiting()
+            time.sleep(WAIT_S)
+        try:
+            os.utime(descriptor)
+            yield
+        finally:
+            os.close(descriptor)
 
 
 def _state(path: Path) -> list[object]:
@@ -150,13 +139,3 @@ def _used_at(folder: Path) -> float:
 
 def _size(folder: Path) -> int:
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-
-
-def _drop(folder: Path) -> None:
-    doomed = folder.with_name(f".{folder.name}.removed")
-    shutil.rmtree(doomed, ignore_errors=True)  # of a process that was killed here
-    try:
-        folder.rename(doomed)
-    except FileNotFoundError:
-        return
-    shutil.rmtree(doomed, ignore_errors=True)

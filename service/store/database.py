@@ -20,6 +20,11 @@ UNANSWERED = (OperationalError, InterfaceError, InternalError, PoolTimeoutError)
 """What a database raises that may answer another time: it restarts, its disk is full, it is locked for long."""
 
 
+def said(error: BaseException) -> str:
+    """What the database itself said, without the statement around it."""
+    return str(getattr(error, "orig", error))
+
+
 class DatabaseError(Exception):
     """The database cannot be used: the message says which and why."""
 

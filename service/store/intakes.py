@@ -11,7 +11,7 @@ import sqlalchemy as sa
 
 from service.store.database import Database, storable
 from service.store.jobs import PATIENCE_S
-from service.store.tables import intakes, job_inputs, jobs, uploads
+from service.store.tables import intakes, job_inputs, jobs, newest_first, uploads
 
 RECEIVING, CHECKING, READY, REFUSED = "receiving", "checking", "ready", "refused"
 
@@ -30,9 +30,7 @@ def find(database: Database, identifier: str, project: str) -> sa.RowMapping | N
 def latest(database: Database, project: str, kind: str, *, limit: int, before: tuple[float, str] | None = None) -> list[sa.RowMapping]:
     """Those of a project, the newest first; `before` as in `jobs.latest`."""
     query = sa.select(intakes).where(intakes.c.project == project, intakes.c.kind == kind)
-    if before is not None:
-        query = query.where(sa.tuple_(intakes.c.created_at, intakes.c.id) < sa.tuple_(*before))
-    return database.rows(query.order_by(intakes.c.created_at.desc(), intakes.c.id.desc()).limit(limit))
+    return database.rows(newest_first(query, intakes, limit=limit, before=before))
 
 
 def hold(connection: sa.Connection, identifier: str, project: str) -> bool:

@@ -13,7 +13,7 @@ import sqlalchemy as sa
 from service.identifiers import JOB, new_id
 from service.job_requests import JobRequest
 from service.store.database import Database, storable
-from service.store.tables import intakes, job_inputs, jobs
+from service.store.tables import intakes, job_inputs, jobs, newest_first
 
 FRAMES = "frames"
 """The stage that counts frames."""
@@ -88,9 +88,7 @@ def latest(database: Database, project: str, *, states: Sequence[str] = (), limi
     query = sa.select(jobs).where(jobs.c.project == project)
     if states:
         query = query.where(jobs.c.state.in_(states))
-    if before is not None:
-        query = query.where(sa.tuple_(jobs.c.created_at, jobs.c.id) < sa.tuple_(*before))
-    return database.rows(query.order_by(jobs.c.created_at.desc(), jobs.c.id.desc()).limit(limit))
+    return database.rows(newest_first(query, jobs, limit=limit, before=before))
 
 
 def watched(database: Database, topics: Sequence[str]) -> list[sa.RowMapping]:

@@ -1,5 +1,7 @@
 """The tables. They lie beside those of the job queue, so that one transaction can write both."""
 
+from typing import Any
+
 import sqlalchemy as sa
 
 SCHEMA_VERSION = 1
@@ -98,3 +100,17 @@ workers = sa.Table(
     sa.Column("started_at", sa.Float, nullable=False),
     sa.Column("seen_at", sa.Float, nullable=False),
     sa.Column("state", sa.String(16), nullable=False))
+
+
+def newest_first(query: "sa.Select[Any]", table: sa.Table, *, limit: int, before: tuple[float, str] | None) -> "sa.Select[Any]":
+    """A page of rows, by the time of their creation.
+
+    Args:
+        query: of rows of the table.
+        table: jobs or intakes.
+        limit: how many at most.
+        before: creation time and identifier of the last row of the page before; None: the first page.
+    """
+    if before is not None:
+        query = query.where(sa.tuple_(table.c.created_at, table.c.id) < sa.tuple_(*before))
+    return query.order_by(table.c.created_at.desc(), table.c.id.desc()).limit(limit)

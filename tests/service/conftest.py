@@ -7,6 +7,7 @@ from typing import NamedTuple
 import pytest
 
 from service.cli.main import main
+from tests.service.postgres import binaries, postgres
 
 
 class Outcome(NamedTuple):
@@ -30,3 +31,13 @@ def relit(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) ->
         return Outcome(int(ended.value.code or 0), out, err)
 
     return run
+
+
+@pytest.fixture(scope="session")
+def server_postgres():
+    """A PostgreSQL server."""
+    programs = binaries()
+    if programs is None:
+        pytest.skip("no PostgreSQL server programs: neither on the PATH nor in /usr/lib/postgresql")
+    with postgres(programs) as server:
+        yield server

@@ -16,7 +16,6 @@ from service.storage.open import open_storage
 from service.storage.parts import Part, parts_folder
 from service.store import idempotency, intakes, jobs, tables, uploads, workers
 from service.store.database import connect
-from tests.service.postgres import binaries, postgres
 
 DAYS = 30.0
 PROJECT = "larch"
@@ -62,15 +61,6 @@ class House:
         """What the queue knows, in its own table."""
         table = "workflow_status" if self.database.is_sqlite else "dbos.workflow_status"
         return {row["workflow_uuid"] for row in self.database.rows(sa.select(sa.text("workflow_uuid")).select_from(sa.text(table)))}
-
-
-@pytest.fixture(scope="module")
-def server_postgres():
-    programs = binaries()
-    if programs is None:
-        pytest.skip("no PostgreSQL server programs: neither on the PATH nor in /usr/lib/postgresql")
-    with postgres(programs) as server:
-        yield server
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])

@@ -8,7 +8,6 @@ import pytest
 
 from tests.captures import make_scene, write_capture, write_exr
 from tests.service.jobs.yard import relit_relight, yard
-from tests.service.postgres import binaries, postgres
 
 FRAMES = 36
 SIZE = 256
@@ -22,16 +21,6 @@ class Undisturbed(NamedTuple):
     environment: Path
     frames: int
     digests: dict[str, str]
-
-
-@pytest.fixture(scope="session")
-def server_postgres():
-    """A PostgreSQL server."""
-    programs = binaries()
-    if programs is None:
-        pytest.skip("no PostgreSQL server programs: neither on the PATH nor in /usr/lib/postgresql")
-    with postgres(programs) as server:
-        yield server
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
