@@ -17,8 +17,8 @@ from kernels.photometric.robust import solve_robust
 from kernels.photometric.samples import Samples, evenly, gather
 from kernels.photometric.svbrdf import average_normals, solve_svbrdf
 from kernels.status import Status
-from service.pipelines.material import SPREAD_PIXELS, Parts, solve_material
-from service.progress import Timings
+from service.reporting.progress import Timings
+from service.solve.material import SPREAD_PIXELS, Parts, solve_material
 from stage.capture import Capture
 from stage.colour import GREY_WEIGHTS
 from stage.importers import diligent

@@ -6,9 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.methods import Method
-from service.pipelines.solve import solve
-from service.requests import SolveRequest
+from service.requests.solve import Method, SolveRequest
+from service.solve.solve import solve
 from stage import exr
 from stage.capture import Capture
 from stage.importers import diligent

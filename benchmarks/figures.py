@@ -29,10 +29,9 @@ from benchmarks.structured import structured_rows
 from benchmarks.tof import rows as tof_rows
 from benchmarks.tof_accuracy import accuracy_rows
 from benchmarks.tof_bound import bound_rows
-from service.methods import Method
-from service.pipelines.bench import bench
-from service.pipelines.solve import solve
-from service.requests import SolveRequest
+from service.demo.bench import bench
+from service.requests.solve import Method, SolveRequest
+from service.solve.solve import solve
 from stage import exr
 from stage.capture import Capture
 from stage.files import write_text

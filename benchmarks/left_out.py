@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.relighting import rgb
-from service.methods import LightWeights, Method
-from service.pipelines.relight import relight
-from service.pipelines.solve import solve
-from service.requests import RelightRequest, SolveRequest
+from service.light.relight import relight
+from service.requests.relight import LightWeights, RelightRequest
+from service.requests.solve import Method, SolveRequest
+from service.solve.solve import solve
 from stage.capture import Capture
 from stage.correction import Correction
 from stage.importers import diligent

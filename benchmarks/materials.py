@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from kernels.photometric.readings import pad_lights
-from service.pipelines.material import Parts, solve_material
-from service.progress import Timings
+from service.reporting.progress import Timings
+from service.solve.material import Parts, solve_material
 from stage import exr
 from stage.capture import Capture
 from stage.ingest import open_stack

@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.accuracy import angles_deg, read_truth
-from service.methods import Method
-from service.pipelines.preview import write_sheet
-from service.pipelines.solve import solve
-from service.requests import SolveRequest
+from service.demo.preview import write_sheet
+from service.requests.solve import Method, SolveRequest
+from service.solve.solve import solve
 from stage import exr
 from stage.capture import Capture
 

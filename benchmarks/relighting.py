@@ -8,12 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.accuracy import SAMPLES
-from service.methods import LightWeights, Method
-from service.pipelines.preview import display, write_sheet
-from service.pipelines.relight import relight
-from service.pipelines.shade import shade
-from service.pipelines.solve import solve
-from service.requests import RelightRequest, ShadeRequest, SolveRequest
+from service.demo.preview import display, write_sheet
+from service.light.relight import relight
+from service.light.shade import shade
+from service.requests.relight import LightWeights, RelightRequest
+from service.requests.shade import ShadeRequest
+from service.requests.solve import Method, SolveRequest
+from service.solve.solve import solve
 from stage import exr
 from stage.capture import Capture
 from stage.maps import MAPS_FILE, SurfaceMaps

@@ -13,9 +13,9 @@ import numpy as np
 from scipy.ndimage import binary_erosion
 
 from benchmarks.pictures import FULL_SCALE_DEG, heat
-from service.depth_requests import DepthRequest
-from service.pipelines.depth import depth
-from service.pipelines.preview import write_sheet
+from service.demo.preview import write_sheet
+from service.depth.depth import depth
+from service.requests.depth import DepthRequest
 from stage import exr
 from stage.capture import Capture
 from stage.images import read_pixels

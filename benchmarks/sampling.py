@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.accuracy import angles_deg
-from service.pipelines.solve import solve
-from service.requests import SolveRequest
+from service.requests.solve import SolveRequest
+from service.solve.solve import solve
 from tests.reference import sampling as twin
 from tests.sampling_captures import COLOUR, SHARPNESS, VIEW, Ball, ball, light, write_sampling
 

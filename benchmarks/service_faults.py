@@ -19,11 +19,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.identifiers import CAPTURE, ENVIRONMENT
-from service.store import jobs, workers
+from service.requests.identifiers import CAPTURE, ENVIRONMENT
+from service.server.store import jobs, workers
 from tests.captures import make_scene, write_capture, write_exr
-from tests.service.jobs.yard import Yard, digests, relit_relight, yard
 from tests.service.postgres import Postgres, binaries, postgres
+from tests.service.server_process.jobs.yard import Yard, digests, relit_relight, yard
 
 FRAMES, SIZE, LIGHTS, CHUNK_FRAMES, WORKERS = 200, 1024, 6, 8, 3
 TAKEOVER_LIMIT_S = 10.0
@@ -231,7 +231,7 @@ on a private PostgreSQL, and faults in its course; the kills come at random mome
 frames whose file is, bit by bit, the one that `relit relight` makes undisturbed. The script ends with an error where a
 frame is missing or another, where there is a file besides (hidden ones too), where two workers were at one job at a
 time, where a job is lost or left over in the queue, and where a takeover from a killed worker takes {TAKEOVER_LIMIT_S:g} s or
-longer. `tests/service/jobs` has these faults at small size, the kills on SQLite too, and others: a job that kills its
+longer. `tests/service/server/jobs` has these faults at small size, the kills on SQLite too, and others: a job that kills its
 workers, a full disk, a killed API.
 
 {chr(10).join(table(faults))}

@@ -25,8 +25,8 @@ import numpy as np
 
 from benchmarks.service_process import SAMPLES, Running, running
 from service.client import Client, ClientError
-from service.job_requests import RelightJob
-from service.requests import RelightOptions
+from service.requests.jobs import RelightJob
+from service.requests.relight import RelightOptions
 
 OWL, SKY = SAMPLES / "owl", SAMPLES / "owl" / "environment.exr"
 FRAMES = 400

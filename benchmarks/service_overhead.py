@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 from benchmarks.service_process import SAMPLES, running
 from service.client import Client
-from service.job_requests import RelightJob
-from service.requests import RelightOptions
+from service.requests.jobs import RelightJob
+from service.requests.relight import RelightOptions
 
 OWL, SKY = SAMPLES / "owl", SAMPLES / "owl" / "environment.exr"
 HEAD = ("| frames | `relit relight`, s | job, submitted to finished, s | ratio | job, started to finished, s | ratio |\n"

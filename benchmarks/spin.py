@@ -6,10 +6,11 @@ import time
 from pathlib import Path
 
 from benchmarks.accuracy import SAMPLES
-from service.methods import FrameCompression, LightWeights, Method
-from service.pipelines.relight import relight
-from service.pipelines.solve import solve
-from service.requests import RelightRequest, SolveRequest
+from service.light.relight import relight
+from service.requests.picture import FrameCompression
+from service.requests.relight import LightWeights, RelightRequest
+from service.requests.solve import Method, SolveRequest
+from service.solve.solve import solve
 
 FRAMES = 240
 PARTS = ("ingest", "guide", "weights", "product", "waiting for files")

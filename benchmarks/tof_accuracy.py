@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from service.depth_requests import DepthRequest
-from service.pipelines.depth import depth
-from service.tof_options import TofOptions
+from service.depth.depth import depth
+from service.requests.depth import DepthRequest, TofOptions
 from stage.depth_maps import DepthMaps
 from tests.reference import tof as scenes
 

@@ -10,10 +10,10 @@ import numpy as np
 
 from benchmarks.pictures import heat
 from kernels.status import Status
-from service.pipelines.preview import write_sheet
-from service.pipelines.tof import solve_tof
-from service.progress import Timings
-from service.tof_options import TofOptions
+from service.demo.preview import write_sheet
+from service.depth.tof import solve_tof
+from service.reporting.progress import Timings
+from service.requests.depth import TofOptions
 from stage.camera import Camera
 from stage.capture import Capture
 from stage.tof.simulate import (

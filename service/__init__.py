@@ -1,4 +1,4 @@
-"""The roof: pipelines where stage and kernels meet, USD, and the doors that people use."""
+"""The roof: one folder a product, where stage and kernels meet; and the doors that people use."""
 
 from importlib.metadata import PackageNotFoundError, version
 

@@ -5,8 +5,8 @@ from typing import Literal, Self
 import numpy as np
 from pydantic import model_validator
 
-from stage.frames import pixel_centres
-from stage.model import Positive, Resolution, Strict, Transform
+from stage.frames import Transform, pixel_centres
+from stage.model import Positive, Resolution, Strict
 
 UNDISTORT_ITERATIONS = 20
 """Fixed-point steps of the inverse distortion; lenses of ordinary strength settle to 1e-10 in about ten."""

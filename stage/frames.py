@@ -5,8 +5,10 @@ continuous from the top-left corner of the image, u right and v down: the centre
 """
 
 import math
+from typing import Annotated
 
 import numpy as np
+from pydantic import AfterValidator
 
 RIGID_TOLERANCE = 1e-4
 """How far R Rᵀ may be from the identity: matrices are typed and printed with four or more digits."""
@@ -34,6 +36,18 @@ def rigid_fault(matrix: np.ndarray) -> str | None:
     if np.linalg.det(rotation) < 0:
         return "mirrors (its rotation has determinant -1)"
     return None
+
+
+def _rigid(rows: tuple[tuple[float, float, float, float], ...]) -> tuple[tuple[float, float, float, float], ...]:
+    fault = rigid_fault(np.array(rows, dtype=np.float64))
+    if fault:
+        raise ValueError(fault)
+    return rows
+
+
+Row = tuple[float, float, float, float]
+Transform = Annotated[tuple[Row, Row, Row, Row], AfterValidator(_rigid)]
+"""A 4×4 `a_from_b` of a manifest, rows; a rotation and a translation."""
 
 
 def rotation_about_y(degrees: float) -> np.ndarray:

@@ -3,10 +3,7 @@
 import math
 from typing import Annotated
 
-import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
-
-from stage.frames import rigid_fault
 
 
 class Strict(BaseModel):
@@ -20,7 +17,7 @@ def _unit(vector: tuple[float, float, float]) -> tuple[float, float, float]:
     if largest == 0.0:
         raise ValueError("has zero length: give a direction")
     scaled = [math.ldexp(c, -math.frexp(largest)[1]) for c in vector]  # exactly, so that no square is beyond what a float holds
-    length = float(np.linalg.norm(scaled))
+    length = math.sqrt(sum(c * c for c in scaled))
     x, y, z = (c / length for c in scaled)
     return (x, y, z)
 
@@ -29,13 +26,6 @@ def _lit(colour: tuple[float, float, float]) -> tuple[float, float, float]:
     if max(colour) == 0:
         raise ValueError("is zero in every channel: a light gives light; use {\"type\": \"off\"} for ambient frames")
     return colour
-
-
-def _rigid(rows: tuple[tuple[float, float, float, float], ...]) -> tuple[tuple[float, float, float, float], ...]:
-    fault = rigid_fault(np.array(rows, dtype=np.float64))
-    if fault:
-        raise ValueError(fault)
-    return rows
 
 
 def _not_blank(text: str) -> str:
@@ -56,9 +46,6 @@ Rgb = tuple[NotNegative, NotNegative, NotNegative]
 """Red, green, blue; none negative."""
 LitRgb = Annotated[Rgb, AfterValidator(_lit)]
 """Not zero in every channel either: what a light of its own gives."""
-Row = tuple[float, float, float, float]
-Transform = Annotated[tuple[Row, Row, Row, Row], AfterValidator(_rigid)]
-"""A 4×4 `a_from_b`, rows; a rotation and a translation."""
 Positive = Annotated[float, Field(gt=0)]
 Count = Annotated[int, Field(ge=1)]
 Resolution = tuple[Count, Count]

@@ -5,7 +5,8 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from stage.camera import Distortion
-from stage.model import FirstFault, NotNegative, Positive, Resolution, Rgb, Strict, Transform
+from stage.frames import Transform
+from stage.model import FirstFault, NotNegative, Positive, Resolution, Rgb, Strict
 
 
 class Projector(Strict):

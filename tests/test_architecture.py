@@ -11,6 +11,9 @@ import pytest
 
 HOME = Path(__file__).resolve().parents[1]
 ROOTS = ("stage", "kernels", "service")
+PRODUCTS = tuple(f"service.{name}" for name in ("solve", "depth", "light", "calibrate", "basis", "captures", "demo"))
+"""Where stage and kernels meet: captures go in, results come out."""
+DOORS = ("service.cli", "service.client", "service.farm", "service.server")
 
 
 class Import(NamedTuple):
@@ -60,8 +63,8 @@ def top(name: str) -> str:
 def test_the_imports_are_read():
     """If this fails, the others prove nothing."""
     assert len(FILES) > 60
-    assert Import("service.pipelines.solve", "stage.capture.Capture", False) in IMPORTS
-    assert Import("service.cli.results", "service.pipelines.solve.solve", True) in IMPORTS
+    assert Import("service.solve.solve", "stage.capture.Capture", False) in IMPORTS
+    assert Import("service.cli.results", "service.solve.solve.solve", True) in IMPORTS
     assert any(i.importer == "kernels.device" and i.target == "warp" for i in IMPORTS)
 
 
@@ -77,7 +80,7 @@ def test_a_floor_knows_only_its_own_libraries(floor, allowed):
 
 @pytest.mark.parametrize(("library", "home"), [
     ("pxr", "service.usd"), ("typer", "service.cli"), ("rich", "service.cli"),
-    ("fastapi", "service.api"), ("dbos", "service.jobs"), ("laspy", "stage.las"),
+    ("fastapi", "service.server.api"), ("dbos", "service.server.jobs"), ("laspy", "stage.las"),
 ])
 def test_a_library_lives_in_one_place(library, home):
     assert {i.importer for i in IMPORTS if top(i.target) == library and not under(i.importer, home)} == set()
@@ -88,36 +91,40 @@ def test_opencv_lives_where_motion_is_tracked_and_rigs_are_calibrated():
 
 
 @pytest.mark.parametrize(("package", "forbidden"), [
-    ("service.pipelines", ("service.cli", "service.jobs", "service.api")),
-    ("service.usd", ("service.cli", "service.jobs", "service.api", "service.pipelines", "kernels", "warp")),
-    ("service.jobs", ("service.cli", "service.api")),
-    ("service.api", ("service.cli", "service.pipelines", "kernels", "warp")),
+    *((product, DOORS) for product in (*PRODUCTS, "service.requests", "service.reporting")),
+    ("service.requests", (*PRODUCTS, "service.usd", "service.reporting", "kernels")),
+    ("service.usd", (*DOORS, *PRODUCTS, "kernels")),
+    ("service.server.jobs", ("service.cli", "service.client", "service.server.api")),
+    ("service.server.store", ("service.server.jobs", "service.server.api", *PRODUCTS, "stage", "kernels")),
+    ("service.server.storage", ("service.server.jobs", "service.server.api", *PRODUCTS, "kernels")),
+    ("service.server.api", ("service.cli", "service.client", *PRODUCTS, "service.usd", "kernels")),
+    ("service.client", ("service.cli", *PRODUCTS, "service.usd", "kernels")),
 ])
 def test_what_a_part_of_the_roof_must_not_know(package, forbidden):
     assert {i for i in IMPORTS if under(i.importer, package) and under(i.target, *forbidden)} == set()
 
 
-def test_stage_and_kernels_meet_in_pipelines_alone():
+def test_stage_and_kernels_meet_in_products_alone():
     """service.errors is the table of what either may raise, and takes no more from kernels than that."""
     meeting = {name for name in FILES
                if {"stage", "kernels"} <= {top(i.target) for i in IMPORTS if i.importer == name}
-               and not under(name, "service.pipelines")}
+               and not under(name, *PRODUCTS)}
     assert meeting <= {"service.errors"}
     taken = {i.target for i in IMPORTS if i.importer == "service.errors" and top(i.target) == "kernels"}
     assert taken == {"kernels.errors.KernelError"}
 
 
 def test_the_command_line_knows_kernels_and_warp_lightly():
-    """relit doctor runs a kernel, which is a check of the installation and no pipeline, and --device asks which devices there are; they
+    """relit doctor runs a kernel, which is a check of the installation and no product, and --device asks which devices there are; they
     may, when they are called."""
     knowing = {i for i in IMPORTS if under(i.importer, "service.cli") and top(i.target) in ("kernels", "warp")}
     assert all(i.lazy for i in knowing)
     assert {i.importer for i in knowing} <= {"service.cli.doctor", "service.cli.options"}
 
 
-def test_the_roof_outside_pipelines_knows_no_warp():
+def test_the_roof_outside_the_products_knows_no_warp():
     assert {i for i in IMPORTS if top(i.importer) == "service" and top(i.target) == "warp"
-            and not under(i.importer, "service.pipelines")} == set()
+            and not under(i.importer, *PRODUCTS)} == set()
 
 
 def test_no_module_takes_a_private_name_of_another():
@@ -137,6 +144,10 @@ def test_no_module_takes_a_private_name_of_another():
     assert reached == []
 
 
+def test_nothing_lies_loose_in_the_root_of_the_service():
+    assert {path.name for path in (HOME / "service").glob("*.py")} == {"__init__.py", "errors.py"}
+
+
 def test_no_cycles():
     graph: dict[str, set[str]] = {name: set() for name in FILES}
     for found in IMPORTS:
@@ -150,7 +161,7 @@ def test_no_cycles():
 
 
 def test_the_command_line_starts_without_heavy_libraries():
-    heavy = "warp", "pxr", "OpenEXR", "OpenImageIO", "numpy", "pydantic", "cv2"
+    heavy = "warp", "pxr", "OpenEXR", "OpenImageIO", "numpy", "cv2"
     code = f"import sys, service.cli.main; print([name for name in {heavy!r} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=HOME, timeout=60, check=True)
     assert done.stdout.strip() == "[]"

@@ -6,9 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.methods import Method
-from service.pipelines.solve import solve
-from service.requests import SolveRequest
+from service.requests.solve import Method, SolveRequest
+from service.solve.solve import solve
 from stage.capture import Capture
 from stage.importers import diligent
 from tests.captures import angles_degrees

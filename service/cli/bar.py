@@ -29,7 +29,7 @@ def show(style: ProgressStyle) -> "Bar | FarmLines":
 
 
 class Bar:
-    """A service.progress.Progress that draws one line a stage on standard error."""
+    """A service.reporting.progress.Progress that draws one line a stage on standard error."""
 
     def __init__(self) -> None:
         """Nothing is drawn before the first stage, and nothing at all when standard error is not a terminal."""
@@ -74,7 +74,7 @@ class Bar:
 
 
 class FarmLines:
-    """A service.progress.Progress that says on standard output what the task does, and how much of it is done.
+    """A service.reporting.progress.Progress that says on standard output what the task does, and how much of it is done.
 
     Source: Open Job Description, How Jobs Are Run, Stdout/Stderr Messages.
     """

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from service.cli.options import AlignOption, AlignToOption, CacheOption, CaptureArgument, DeviceOption
-from service.methods import BasisKind
+from service.requests.basis import BasisKind
 
 
 def register(app: typer.Typer) -> None:
@@ -31,9 +31,9 @@ def basis(
     cache: CacheOption = None,
 ) -> None:
     """A capture as a few coefficient images, for a browser or for RTI viewers."""
+    from service.basis.basis import make_basis
     from service.cli.bar import Bar
-    from service.pipelines.basis import make_basis
-    from service.requests import BasisRequest
+    from service.requests.basis import BasisRequest
 
     with Bar() as bar:
         result = make_basis(BasisRequest(capture=capture, out=out, kind=kind, count=count, align=align, align_to=align_to,

@@ -9,8 +9,8 @@ from service.cli import calibrate_projector, calibrate_tof
 from service.cli.options import CaptureArgument, HostOption
 
 if TYPE_CHECKING:
-    from service.calibrate_requests import Circle
-    from service.pipelines.calibration_results import Calibration
+    from service.calibrate.results import Calibration
+    from service.requests.calibrate import Circle
 
 TABLE_ROWS = 12
 """Lights that the table shows; the report holds all."""
@@ -51,9 +51,9 @@ def mirror_ball(
     device: HostOption = None,
 ) -> None:
     """Directions of far lights from one mirror ball."""
-    from service.calibrate_requests import MirrorBallRequest
+    from service.calibrate.lights import mirror_ball as run
     from service.cli.bar import Bar
-    from service.pipelines.calibrate import mirror_ball as run
+    from service.requests.calibrate import MirrorBallRequest
 
     request = MirrorBallRequest(capture=capture, circles=_circles(ball), masks=tuple(ball_mask or ()), level=level,
                                 drop_failed=drop_failed, apply_to=apply_to, out=out)
@@ -78,9 +78,9 @@ def light_positions(
     device: HostOption = None,
 ) -> None:
     """Positions of near lights from two or more mirror balls."""
-    from service.calibrate_requests import LightPositionsRequest
+    from service.calibrate.lights import light_positions as run
     from service.cli.bar import Bar
-    from service.pipelines.calibrate import light_positions as run
+    from service.requests.calibrate import LightPositionsRequest
 
     request = LightPositionsRequest(capture=capture, circles=_circles(ball), masks=tuple(ball_mask or ()),
                                     ball_radius_m=tuple(ball_radius_m or ()), ball_z_m=tuple(ball_z_m or ()), level=level,
@@ -109,9 +109,9 @@ def grey_ball(
     device: HostOption = None,
 ) -> None:
     """Brightness of each light from one grey ball."""
-    from service.calibrate_requests import GreyBallRequest
+    from service.calibrate.lights import grey_ball as run
     from service.cli.bar import Bar
-    from service.pipelines.calibrate import grey_ball as run
+    from service.requests.calibrate import GreyBallRequest
 
     request = GreyBallRequest(capture=capture, circles=_circles(ball), masks=tuple(ball_mask or ()), albedo=_albedo(albedo),
                               refine_direction=refine_direction, ball_radius_m=ball_radius_m, ball_z_m=ball_z_m,
@@ -130,9 +130,9 @@ def intensity(
     device: HostOption = None,
 ) -> None:
     """Brightness of lights of known direction from images of the object itself."""
-    from service.calibrate_requests import IntensityRequest
+    from service.calibrate.object import intensity as run
     from service.cli.bar import Bar
-    from service.pipelines.calibrate_object import intensity as run
+    from service.requests.calibrate import IntensityRequest
 
     request = IntensityRequest(capture=capture, pixels=pixels, drop_failed=drop_failed, apply_to=apply_to, out=out)
     with Bar() as bar:
@@ -142,9 +142,9 @@ def intensity(
 
 def dark(capture: CaptureArgument, images: ImagesArgument, device: HostOption = None) -> None:
     """The capture's dark.exr: mean of images with the lens covered."""
-    from service.calibrate_requests import DarkRequest
+    from service.calibrate.images import dark as run
     from service.cli.bar import Bar
-    from service.pipelines.calibrate_images import dark as run
+    from service.requests.calibrate import DarkRequest
 
     with Bar() as bar:
         result = run(DarkRequest(capture=capture, images=tuple(images)), bar)
@@ -162,9 +162,9 @@ def flat_field(
     device: HostOption = None,
 ) -> None:
     """The capture's flat.exr: mean of images of an evenly lit white card."""
-    from service.calibrate_requests import FlatFieldRequest
+    from service.calibrate.images import flat_field as run
     from service.cli.bar import Bar
-    from service.pipelines.calibrate_images import flat_field as run
+    from service.requests.calibrate import FlatFieldRequest
 
     with Bar() as bar:
         result = run(FlatFieldRequest(capture=capture, images=tuple(images), dark_images=tuple(dark or ())), bar)
@@ -179,9 +179,9 @@ def saturation(
     device: HostOption = None,
 ) -> None:
     """Where the readings of the frames pile up at the top of the histogram."""
-    from service.calibrate_requests import SaturationRequest
+    from service.calibrate.images import saturation as run
     from service.cli.bar import Bar
-    from service.pipelines.calibrate_images import saturation as run
+    from service.requests.calibrate import SaturationRequest
 
     with Bar() as bar:
         result = run(SaturationRequest(capture=capture, write=write), bar)
@@ -193,7 +193,7 @@ def saturation(
 
 
 def _circles(texts: list[str] | None) -> "tuple[Circle, ...]":
-    from service.calibrate_requests import Circle
+    from service.requests.calibrate import Circle
 
     circles = []
     for text in texts or ():

@@ -31,9 +31,9 @@ def procam(
     cache: CacheOption = None,
 ) -> None:
     """Camera, projector and their pose from a chessboard under projected columns and rows."""
-    from service.calibrate_requests import ProcamRequest
+    from service.calibrate.procam import procam as run
     from service.cli.bar import Bar
-    from service.pipelines.calibrate_procam import procam as run
+    from service.requests.calibrate import ProcamRequest
 
     request = ProcamRequest(captures=tuple(captures), board=size("--board", board), square_m=square_m,
                             projector=None if projector is None else size("--projector", projector), apply_to=tuple(apply_to or ()),
@@ -58,10 +58,10 @@ def response(
     device: HostOption = None,
 ) -> None:
     """The projector's light at each level (its gamma), for ramps."""
-    from service.calibrate_requests import ResponseRequest
+    from service.calibrate.response import response as run
     from service.cli.bar import Bar
     from service.errors import RequestError
-    from service.pipelines.calibrate_response import response as run
+    from service.requests.calibrate import ResponseRequest
 
     try:
         given = tuple(float(part) for part in levels.split(",")) if levels is not None else ()

@@ -20,8 +20,8 @@ def tof(
     device: DeviceOption = None,
 ) -> None:
     """Wiggling, scale, offset and drift of a time-of-flight camera from captures of a flat target at known distances."""
+    from service.calibrate.tof import calibrate_tof
     from service.cli.bar import Bar
-    from service.pipelines.calibrate_tof import calibrate_tof
 
     with Bar() as bar:
         result = calibrate_tof(sweep, out, device=device, progress=bar)

@@ -59,8 +59,8 @@ def import_(
 
 def info(capture: CaptureArgument, device: HostOption = None) -> None:
     """Say what a capture holds, and what is wrong with it."""
+    from service.captures.inspect import inspect
     from service.cli.bar import Bar
-    from service.pipelines.inspect import inspect
     from stage.errors import StageError
 
     with Bar() as bar:

@@ -23,7 +23,7 @@ def demo(
 ) -> None:
     """The main job on the shipped sample: solve, export, relight."""
     from service.cli.bar import Bar
-    from service.pipelines.demo import demo as run
+    from service.demo.demo import demo as run
 
     with Bar() as bar:
         result = run(out, device=device, progress=bar)
@@ -39,9 +39,9 @@ def demo(
 def open_service(data: Path, device: str | None) -> None:
     """A service for this machine alone, with the sample in it."""
     from service.cli.server import settings_of
-    from service.pipelines.demo import sample_folder
-    from service.sample import greet
-    from service.server import serve
+    from service.demo.demo import sample_folder
+    from service.server.sample import greet
+    from service.server.serve import serve
 
     sample = sample_folder()
     serve(settings_of(None, data=data, host="127.0.0.1", anonymous=True, roots=(sample,), devices=(device,) if device else None),

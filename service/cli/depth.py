@@ -6,8 +6,7 @@ from typing import Annotated
 import typer
 
 from service.cli.options import CacheOption, CaptureArgument, DeviceOption
-from service.methods import Ranging
-from service.tof_methods import WhichReturn
+from service.requests.depth import Ranging, WhichReturn
 
 
 def register(app: typer.Typer) -> None:
@@ -47,9 +46,8 @@ def depth(
 ) -> None:
     """Depth from projected patterns, a laser or time of flight."""
     from service.cli.bar import Bar
-    from service.depth_requests import DepthRequest
-    from service.pipelines.depth import depth as run
-    from service.tof_options import TofOptions
+    from service.depth.depth import depth as run
+    from service.requests.depth import DepthRequest, TofOptions
 
     tof = TofOptions.model_validate({"filters": filters, "which": which, "vote": vote, "calibration": tof_calibration,
                                      "temperature_c": temperature_c})

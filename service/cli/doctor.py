@@ -26,7 +26,7 @@ def doctor(only: DoctorDevice = None, data: DataOption = None, config: ConfigOpt
     import tempfile
 
     from service import __version__
-    from service.provenance import versions
+    from service.reporting.provenance import versions
 
     faults = []
     for name, value in versions().items():
@@ -67,7 +67,7 @@ def _service(data: Path | None, config: Path | None) -> list[str]:
     settings = settings_of(config, data=data)
     if data is None and config is None and not settings.data.is_dir():
         return []
-    from service.checkup import look
+    from service.server.checkup import look
 
     faults = []
     for found in look(settings):

@@ -14,7 +14,7 @@ from service.cli.service_options import with_parameters
 HERE = {"only", "overwrite", "sheet", "report", "progress"}
 """Parameters of the commands that a farm's tasks have no use for, or that the job itself sets."""
 CHUNK_FRAMES = 32
-"""As many as one product makes (service.pipelines.relighting.combine): with fewer the images are read more often."""
+"""As many as one product makes (service.light.combine): with fewer the images are read more often."""
 
 JobOption = Annotated[Path, typer.Option(
     "--job", metavar="FILE.yaml|DIR", show_default=False,
@@ -41,8 +41,8 @@ def relight(job: JobOption, chunk_frames: ChunkOption = CHUNK_FRAMES, gpu: GpuOp
     """Frames under new light, a task a chunk of them: bit by bit those of one run."""
     from service.farm.job import JobOptions
     from service.farm.relight import relight_job
-    from service.pipelines.relighting.plan import make_plan
-    from service.requests import RelightRequest
+    from service.light.plan import make_plan
+    from service.requests.relight import RelightRequest
 
     request = RelightRequest.model_validate({**chosen, "out": str(Path(chosen["out"]).absolute())})  # as its tasks are asked
     frames = make_plan(request).frames
@@ -54,8 +54,8 @@ def shade(job: JobOption, turns: TurnsOption = None, gpu: GpuOption = False, **c
     """A picture of solved maps, or a turn of the environment in pictures, a task each."""
     from service.farm.job import JobOptions
     from service.farm.shade import shade_job
-    from service.pipelines.shade import check
-    from service.requests import ShadeRequest
+    from service.light.shade import check
+    from service.requests.shade import ShadeRequest
 
     given = {name: value if name not in ("light", "sphere", "rectangle") else value or () for name, value in chosen.items()}
     request = ShadeRequest.model_validate(given)

@@ -11,8 +11,8 @@ from service.cli.service_options import DEFAULT_SERVER, CancelOption, KeyOption,
 from service.cli.waiting import download, wait_for
 
 if TYPE_CHECKING:
-    from service.api.views import JobView
     from service.client import Client
+    from service.server.api.views import JobView
 
 JobArgument = Annotated[str, typer.Argument(metavar="JOB", help="Its identifier: job_….", show_default=False)]
 OutOption = Annotated[Path | None, typer.Option(

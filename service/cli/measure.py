@@ -18,7 +18,7 @@ def bench(
 ) -> None:
     """Speed of the kernels against NumPy and against a plain copy, in the same run."""
     from service.cli.bar import Bar
-    from service.pipelines.bench import bench as run
+    from service.demo.bench import bench as run
 
     with Bar() as bar:
         lines = run(device, repeats, bar)

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from service.cli.options import HostOption
-from service.pattern_codes import PatternAxis, PatternCode
+from service.requests.patterns import PatternAxis, PatternCode
 
 
 def register(app: typer.Typer) -> None:
@@ -54,9 +54,9 @@ def patterns(
 ) -> None:
     """The images to project, and their manifest entries; or, with --plan, what each code costs."""
     from service.cli.bar import Bar
+    from service.depth.projection import BELONGS, make_patterns, make_plan
     from service.errors import RequestError
-    from service.pattern_requests import PatternsRequest, PlanRequest
-    from service.pipelines.patterns import BELONGS, make_patterns, make_plan
+    from service.requests.patterns import PatternsRequest, PlanRequest
 
     planned: dict[str, Any] = {"frame_rate": fps, "noise": noise, "baseline": baseline, "distance": distance, "focal": focal}
     drawn: dict[str, Any] = {"bits": bits, "gamma": gamma, "stripe": stripe, "inverses": inverses, "base_bit": base_bit,

@@ -7,7 +7,8 @@ import typer
 
 from service.cli.bar import ProgressStyle, show
 from service.cli.options import AlignOption, AlignToOption, CacheOption, DeviceOption, ProgressOption
-from service.methods import FrameCompression, FrameSpace, LightWeights
+from service.requests.picture import FrameCompression, FrameSpace
+from service.requests.relight import LightWeights
 
 
 def register(app: typer.Typer) -> None:
@@ -62,8 +63,8 @@ def relight(
     progress: ProgressOption = ProgressStyle.BAR,
 ) -> None:
     """Frames under HDR environments and animated lights."""
-    from service.pipelines.relight import relight as run
-    from service.requests import RelightRequest
+    from service.light.relight import relight as run
+    from service.requests.relight import RelightRequest
 
     request = RelightRequest.model_validate({
         "capture": capture, "out": out, "environment": environment, "keys": keys, "frames": frames, "only": only,

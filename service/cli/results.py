@@ -6,7 +6,8 @@ from typing import Annotated
 import typer
 
 from service.cli.options import AlignOption, AlignToOption, CacheOption, CaptureArgument, DeviceOption, HostOption
-from service.methods import Geometry, Method
+from service.requests.export import Geometry
+from service.requests.solve import Method
 
 
 def register(app: typer.Typer) -> None:
@@ -34,8 +35,8 @@ def solve(
 ) -> None:
     """Normals, albedo and height of a light-stage capture."""
     from service.cli.bar import Bar
-    from service.pipelines.solve import solve as run
-    from service.requests import SolveRequest
+    from service.requests.solve import SolveRequest
+    from service.solve.solve import solve as run
 
     with Bar() as bar:
         result = run(SolveRequest(capture=capture, out=out, method=method, reference_ball=reference_ball, align=align,
@@ -60,8 +61,8 @@ def export(
 ) -> None:
     """A USD asset: solved maps with the estimated material, a depth with its colours."""
     from service.cli.bar import Bar
-    from service.pipelines.export import export as run
-    from service.requests import ExportRequest
+    from service.requests.export import ExportRequest
+    from service.usd.export import export as run
 
     with Bar() as bar:
         print(f"asset    {run(ExportRequest(maps=maps, out=out, name=name, geometry=geometry), bar)}")

@@ -23,8 +23,8 @@ def scan(
 ) -> None:
     """Shots of a scanning laser, from a platform that may move, as one point cloud."""
     from service.cli.bar import Bar
-    from service.pipelines.scan import scan as run
-    from service.scan_requests import ScanRequest
+    from service.depth.scan import scan as run
+    from service.requests.scan import ScanRequest
 
     with Bar() as bar:
         result = run(ScanRequest(scan=folder, out=out, near_m=near_m, far_m=far_m, las=las, device=device), bar)

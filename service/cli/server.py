@@ -29,7 +29,7 @@ def serve(
         show_default=False)] = None,
 ) -> None:
     """The service: the API, and a worker on each device."""
-    from service.server import serve as run
+    from service.server.serve import serve as run
 
     run(settings_of(config, data=data, host=host, port=port, anonymous=anonymous, devices=tuple(device) if device else None))
 
@@ -41,13 +41,13 @@ def worker(
     config: ConfigOption = None,
 ) -> None:
     """A worker more, on any machine that sees the database and the storage."""
-    from service.server import work as run
+    from service.server.serve import work as run
 
     run(settings_of(config, data=data), device)
 
 
 def settings_of(config: Path | None, **given: Any) -> Any:
     """The settings, with what was given on the command line."""
-    from service.settings import Settings
+    from service.server.settings import Settings
 
     return Settings(config=config, **{name: value for name, value in given.items() if value is not None})  # type: ignore[call-arg]

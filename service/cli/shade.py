@@ -7,7 +7,7 @@ import typer
 
 from service.cli.bar import ProgressStyle, show
 from service.cli.options import CacheOption, DeviceOption, ProgressOption
-from service.methods import FrameCompression, FrameSpace
+from service.requests.picture import FrameCompression, FrameSpace
 
 
 def register(app: typer.Typer) -> None:
@@ -43,8 +43,8 @@ def shade(
     progress: ProgressOption = ProgressStyle.BAR,
 ) -> None:
     """A picture of solved maps under near lights, area lights and an environment, with cast shadows."""
-    from service.pipelines.shade import shade as run
-    from service.requests import ShadeRequest
+    from service.light.shade import shade as run
+    from service.requests.shade import ShadeRequest
 
     request = ShadeRequest.model_validate({
         "maps": maps, "out": out, "light": light or (), "sphere": sphere or (), "rectangle": rectangle or (),

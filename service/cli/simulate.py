@@ -36,8 +36,8 @@ def cw(
     noise: NoiseOption = True,
 ) -> None:
     """Correlation images of a continuous-wave camera."""
-    from service.pipelines.simulate_tof import simulate_tof
-    from service.simulate_requests import SimulateCwRequest
+    from service.depth.simulate import simulate_tof
+    from service.requests.simulate import SimulateCwRequest
 
     request = SimulateCwRequest.model_validate({
         "depth": depth, "out": out, "modulation_hz": modulation_hz, "phases": phases, "signal_electrons": signal_electrons,
@@ -61,8 +61,8 @@ def pulsed(
     noise: NoiseOption = True,
 ) -> None:
     """Photon histograms of a pulsed camera."""
-    from service.pipelines.simulate_tof import simulate_tof
-    from service.simulate_requests import SimulatePulsedRequest
+    from service.depth.simulate import simulate_tof
+    from service.requests.simulate import SimulatePulsedRequest
 
     request = SimulatePulsedRequest(depth=depth, out=out, bins=bins, bin_s=bin_s, pulse_sigma_s=pulse_sigma_s,
                                     signal_photons=signal_photons, background=background, pulses=pulses, albedo=albedo,

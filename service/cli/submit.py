@@ -33,9 +33,9 @@ if TYPE_CHECKING:
 
     from service.client import Client
     from service.client.intakes import Intakes
-    from service.job_requests import JobRequest
-    from service.light_keys import LightKeys
-    from service.requests import RelightOptions
+    from service.requests.jobs import JobRequest
+    from service.requests.light_keys import LightKeys
+    from service.requests.relight import RelightOptions
 
 Chosen = TypeVar("Chosen", bound="BaseModel")
 SOURCES = "a folder of this machine, which is uploaded; an identifier such as cap_…; or server:/path, which is registered"
@@ -95,8 +95,8 @@ class Site(NamedTuple):
 
 def solve(site: Site, capture: CaptureArgument, reference_ball: BallOption = None) -> "JobRequest":
     """Normals, albedo and height of a light-stage capture."""
-    from service.job_requests import SolveJob
-    from service.requests import SolveOptions
+    from service.requests.jobs import SolveJob
+    from service.requests.solve import SolveOptions
 
     return SolveJob(kind="solve", options=site.options(SolveOptions), **site.job, capture=site.capture(capture),
                     reference_ball=None if reference_ball is None else site.capture(reference_ball))
@@ -104,9 +104,8 @@ def solve(site: Site, capture: CaptureArgument, reference_ball: BallOption = Non
 
 def depth(site: Site, capture: CaptureArgument, tof_calibration: TofOption = None) -> "JobRequest":
     """Depth from projected patterns, a laser or time of flight."""
-    from service.depth_requests import DepthOptions
-    from service.job_requests import DepthJob
-    from service.tof_options import TofChoices
+    from service.requests.depth import DepthOptions, TofChoices
+    from service.requests.jobs import DepthJob
 
     return DepthJob(kind="depth", options=site.options(DepthOptions, tof=site.options(TofChoices)), tof_calibration=tof_calibration,
                     **site.job, capture=site.capture(capture))
@@ -115,7 +114,7 @@ def depth(site: Site, capture: CaptureArgument, tof_calibration: TofOption = Non
 def relight(site: Site, capture: CaptureArgument, environment: EnvironmentOption = None, keys: KeysOption = None,
             maps: MapsOption = None) -> "JobRequest":
     """Frames under HDR environments and animated lights."""
-    from service.job_requests import RelightJob
+    from service.requests.jobs import RelightJob
 
     return RelightJob(kind="relight", options=_frames(site), keys=_keys(keys), maps=maps, **site.job,
                       capture=site.capture(capture), environment=site.environment(environment))
@@ -123,8 +122,8 @@ def relight(site: Site, capture: CaptureArgument, environment: EnvironmentOption
 
 def shade(site: Site, maps: MapsArgument, environment: EnvironmentOption = None, capture: ShadedOption = None) -> "JobRequest":
     """A picture of solved maps under near lights, area lights and an environment, with cast shadows."""
-    from service.job_requests import ShadeJob
-    from service.requests import ShadeOptions
+    from service.requests.jobs import ShadeJob
+    from service.requests.shade import ShadeOptions
 
     return ShadeJob(kind="shade", maps=maps, options=site.options(ShadeOptions), **site.job, environment=site.environment(environment),
                     capture=None if capture is None else site.capture(capture))
@@ -132,8 +131,8 @@ def shade(site: Site, maps: MapsArgument, environment: EnvironmentOption = None,
 
 def export(site: Site, maps: MapsArgument, format: FormatOption = "usdz") -> "JobRequest":
     """A USD asset: solved maps with the estimated material, a depth with its colours."""
-    from service.job_requests import ExportJob
-    from service.requests import ExportOptions
+    from service.requests.export import ExportOptions
+    from service.requests.jobs import ExportJob
 
     return ExportJob(kind="export", maps=maps, format=format, options=site.options(ExportOptions), **site.job)
 
@@ -141,8 +140,9 @@ def export(site: Site, maps: MapsArgument, format: FormatOption = "usdz") -> "Jo
 def pipeline(site: Site, capture: CaptureArgument, environment: EnvironmentOption = None, keys: KeysOption = None,
              format: FormatOption = "usdz", guided: GuidedOption = False) -> "JobRequest":
     """Solve, then export, then relight, in one job; without light for frames it ends with the asset."""
-    from service.job_requests import PipelineJob
-    from service.requests import ExportOptions, SolveOptions
+    from service.requests.export import ExportOptions
+    from service.requests.jobs import PipelineJob
+    from service.requests.solve import SolveOptions
 
     return PipelineJob(kind="pipeline", solve=site.options(SolveOptions), export=site.options(ExportOptions),
                        relight=_frames(site), keys=_keys(keys), format=format, guided=guided, **site.job,
@@ -165,7 +165,7 @@ def _command(function: Callable[..., "JobRequest"], options: list[inspect.Parame
 def _submit(make: Callable[["Client", dict[str, Any]], "JobRequest"], *, server: ServerOption = DEFAULT_SERVER, key: KeyOption = None,
             job_name: NameOption = "", priority: PriorityOption = DEFAULT_PRIORITY, wait: WaitOption = False, out: ResultsOption = None,
             cancel_on_interrupt: CancelOption = False) -> None:
-    from service.job_requests import JobRequest
+    from service.requests.jobs import JobRequest
 
     common = dict(JobRequest(name=job_name, priority=priority))
     with connected(server, key) as client:
@@ -179,7 +179,7 @@ def _submit(make: Callable[["Client", dict[str, Any]], "JobRequest"], *, server:
 
 def _intake(intakes: "Intakes", what: str, given: str) -> str:
     from service.cli.bar import Bar
-    from service.identifiers import CAPTURE, ENVIRONMENT, pattern
+    from service.requests.identifiers import CAPTURE, ENVIRONMENT, pattern
 
     path = Path(given)
     if given.startswith(REGISTERED):
@@ -194,8 +194,8 @@ def _intake(intakes: "Intakes", what: str, given: str) -> str:
 
 
 def _frames(site: Site) -> "RelightOptions":
-    from service.frame_range import frame_numbers
-    from service.requests import RelightOptions
+    from service.requests.frame_range import frame_numbers
+    from service.requests.relight import RelightOptions
 
     options = site.options(RelightOptions)
     frame_numbers(options.frames, 1)  # what is no range is refused before files are sent
@@ -203,6 +203,6 @@ def _frames(site: Site) -> "RelightOptions":
 
 
 def _keys(path: Path | None) -> "LightKeys | None":
-    from service.light_keys import LightKeys
+    from service.requests.light_keys import LightKeys
 
     return None if path is None else LightKeys.read(path)

@@ -17,7 +17,7 @@ ClientError
 import json
 from typing import Any, NamedTuple
 
-from service.api.views import IntakeView, JobView
+from service.server.api.views import IntakeView, JobView
 
 
 class ClientError(Exception):

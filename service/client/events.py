@@ -5,8 +5,8 @@ from collections.abc import Iterator
 
 import httpx2
 
-from service.api.views import JobView
 from service.client.link import Link
+from service.server.api.views import JobView
 
 ENDED = ("succeeded", "failed", "cancelled")
 EVENT = "job"

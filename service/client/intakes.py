@@ -6,13 +6,13 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from service.api.views import IntakePage, IntakeView
 from service.client.errors import Conflict, IntakeRefused, NotFound
 from service.client.files import files_of, hashed, manifest_hash
 from service.client.link import Link
 from service.client.tally import Tally
 from service.client.uploads import send_files
-from service.progress import Progress
+from service.reporting.progress import Progress
+from service.server.api.views import IntakePage, IntakeView
 
 RECEIVING, CHECKING, READY, REFUSED = "receiving", "checking", "ready", "refused"
 FIRST_LOOK_S, LATER_LOOK_S = 0.1, 2.0

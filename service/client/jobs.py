@@ -3,14 +3,14 @@
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from service.api.views import JobPage, JobState, JobView, ResultPage, ResultView
 from service.client.errors import FileError, JobEnded
 from service.client.events import follow
 from service.client.link import Link
 from service.client.results import fetch
 from service.client.tally import Tally
-from service.job_requests import JobRequest
-from service.progress import Progress
+from service.reporting.progress import Progress
+from service.requests.jobs import JobRequest
+from service.server.api.views import JobPage, JobState, JobView, ResultPage, ResultView
 
 SUCCEEDED = "succeeded"
 PATH = "/v1/jobs"
@@ -27,7 +27,7 @@ class Jobs:
         """Hand a job in.
 
         Args:
-            request: a SolveJob, RelightJob … of service.job_requests.
+            request: a SolveJob, RelightJob … of service.requests.jobs.
             token: Idempotency-Key: the same request with the same token is the same job; None: a new job.
 
         Raises:

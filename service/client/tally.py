@@ -2,7 +2,7 @@
 
 import threading
 
-from service.progress import Progress
+from service.reporting.progress import Progress
 
 MIB = 1 << 20
 

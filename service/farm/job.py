@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 from service.farm.document import Plain
 from service.farm.parameters import Job, Parameters
-from service.methods import FrameCompression, Layer
-from service.requests import PictureOptions, Request
+from service.requests.base import Request
+from service.requests.picture import FrameCompression, Layer, PictureOptions
 
 NOTICE_S = 60
 """Between the signal that asks a task to end and the one that kills it: the frames that are being written are finished."""

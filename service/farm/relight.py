@@ -5,7 +5,7 @@ from pathlib import Path
 from service.farm.document import Plain
 from service.farm.job import JobOptions, job, picture_options, title
 from service.farm.parameters import Job, Parameters
-from service.requests import RelightRequest
+from service.requests.relight import RelightRequest
 
 
 def relight_job(request: RelightRequest, options: JobOptions, chunk_frames: int) -> Job:

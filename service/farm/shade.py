@@ -6,9 +6,9 @@ from service.errors import RequestError
 from service.farm.document import Plain
 from service.farm.job import JobOptions, job, picture_options, title
 from service.farm.parameters import Job, Parameters
-from service.near_lights import PointLight, RectangleLight, SphereLight
-from service.pipelines.relighting.frames import numbered
-from service.requests import ShadeRequest
+from service.light.frames import numbered
+from service.requests.near_lights import PointLight, RectangleLight, SphereLight
+from service.requests.shade import ShadeRequest
 
 MOST_TURNS = 1024
 """Values of a task's parameter, by the specification."""

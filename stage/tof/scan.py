@@ -8,7 +8,8 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from stage.errors import ImageError, ManifestError, storage
-from stage.model import Count, Positive, Strict, Text, Transform
+from stage.frames import Transform
+from stage.model import Count, Positive, Strict, Text
 from stage.records import read_record
 from stage.tof.frames import read_array
 from stage.tof.track import Pose, Track, poses_at

@@ -6,7 +6,8 @@ import numpy as np
 from pydantic import AfterValidator, Field
 
 from stage.errors import CalibrationError
-from stage.model import Strict, Transform
+from stage.frames import Transform
+from stage.model import Strict
 
 
 class Pose(Strict):

@@ -9,7 +9,7 @@ import httpx2
 import pytest
 
 from service.client import Client
-from tests.service.server import Server, serving
+from tests.service.server_process.serve import Server, serving
 
 HOME = Path(__file__).resolve().parents[3]
 OWL = HOME / "samples" / "owl"

@@ -15,10 +15,12 @@ from service.cli import results as results_here
 from service.cli import service_options
 from service.cli import shade as shade_here
 from service.client import Client, client
-from service.depth_requests import DepthOptions
-from service.job_requests import DEFAULT_PRIORITY
-from service.requests import ExportOptions, RelightOptions, ShadeOptions, SolveOptions
-from service.tof_options import TofChoices
+from service.requests.depth import DepthOptions, TofChoices
+from service.requests.export import ExportOptions
+from service.requests.jobs import DEFAULT_PRIORITY
+from service.requests.relight import RelightOptions
+from service.requests.shade import ShadeOptions
+from service.requests.solve import SolveOptions
 from tests.captures import write_capture
 from tests.service.client.conftest import OWL, SKY
 
@@ -168,7 +170,7 @@ def test_ctrl_c_cancels_the_job_where_that_is_asked(owl: str, sky: str):
 
 def test_what_the_client_needs_and_what_not():
     """A pipeline's interpreter loads neither the server nor a device for it."""
-    heavy = "fastapi", "starlette", "dbos", "warp", "pxr", "typer", "uvicorn", "service.pipelines"
+    heavy = "fastapi", "starlette", "dbos", "warp", "pxr", "typer", "uvicorn", "service.solve"
     code = f"import sys, service.client; print([name for name in {heavy!r} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout.strip() == "[]"

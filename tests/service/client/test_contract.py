@@ -10,11 +10,11 @@ import jsonschema_rs
 import pytest
 from pydantic import TypeAdapter
 
-from service.api import views
 from service.client import Client
-from service.job_requests import ExportJob, RelightJob, SolveJob, UserJob
-from service.methods import Method
-from service.requests import RelightOptions, SolveOptions
+from service.requests.jobs import ExportJob, RelightJob, SolveJob, UserJob
+from service.requests.relight import RelightOptions
+from service.requests.solve import Method, SolveOptions
+from service.server.api import views
 from tests.captures import write_capture
 from tests.service.client.conftest import SKY, Between
 

@@ -8,9 +8,9 @@ import httpx2
 import pytest
 
 from service.client import Client, Conflict, FileError, JobEnded, NotFound, Unreachable
-from service.job_requests import ExportJob, PipelineJob, RelightJob, SolveJob
-from service.methods import Method
-from service.requests import RelightOptions, SolveOptions
+from service.requests.jobs import ExportJob, PipelineJob, RelightJob, SolveJob
+from service.requests.relight import RelightOptions
+from service.requests.solve import Method, SolveOptions
 from tests.service.client.conftest import Between, Cut
 
 Send = Callable[[], httpx2.Response]

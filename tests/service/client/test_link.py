@@ -8,7 +8,7 @@ import httpx2
 import pytest
 
 from service.client import Busy, Client, ClientError, Conflict, Faulty, Invalid, NotAllowed, NotFound, Unreachable, link
-from service.job_requests import SolveJob
+from service.requests.jobs import SolveJob
 
 JOB = "job_0123456789abcdefghjk"
 VIEW = {"id": JOB, "state": "queued", "attempt": 1, "revision": 1, "priority": 50, "request": {"kind": "solve",

@@ -1,0 +1,1 @@
+"""Captures reduced to a few coefficient images."""

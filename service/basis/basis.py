@@ -1,0 +1,52 @@
+"""Capture → a few coefficient images: for a browser (svd), or for viewers of relightable images (ptm, lrgb-ptm, hsh)."""
+
+from pathlib import Path
+
+from kernels import device as devices
+from service.basis.layers import make_layers
+from service.basis.rti import make_rti
+from service.basis.source import BasisResult, open_source
+from service.errors import RequestError
+from service.reporting.progress import Progress, Timings
+from service.requests.basis import BasisKind, BasisRequest
+
+SUFFIXES = {BasisKind.SVD: ".exr", BasisKind.PTM: ".ptm", BasisKind.LRGB_PTM: ".ptm", BasisKind.HSH: ".rti"}
+"""Of the file of each kind; the first kind with a suffix is made where none is named."""
+
+
+def make_basis(request: BasisRequest, progress: Progress | None = None) -> BasisResult:
+    """Reduce a capture.
+
+    Args:
+        request: capture, kind, how many coefficients, and where to put them.
+        progress: told of every stage.
+
+    Raises:
+        RequestError: a suffix or a count that the kind does not have, or a result that would replace an input.
+        StageError, KernelError: bad input; names file and field.
+        StorageError: a file cannot be written; nothing half-written is left.
+    """
+    kind = resolve_kind(request.kind, request.out)
+    device = devices.resolve(request.device)
+    timings = Timings(progress)
+    source = open_source(request, timings)
+    if kind == BasisKind.SVD:
+        return make_layers(request, source, device, timings)
+    return make_rti(request, kind, source, device, timings)
+
+
+def resolve_kind(kind: BasisKind | None, out: Path) -> BasisKind:
+    """The kind to make.
+
+    Raises:
+        RequestError: the suffix is not that of the kind, or of none.
+    """
+    suffix = out.suffix.lower()
+    if kind is None:
+        kind = next((k for k, s in SUFFIXES.items() if s == suffix), None)
+        if kind is None:
+            raise RequestError(f"--out {out}: end the name in .exr (coefficient images), .ptm (polynomial texture map) or .rti "
+                               "(hemispherical harmonics)")
+    elif suffix != SUFFIXES[kind]:
+        raise RequestError(f"--out {out}: end the name in {SUFFIXES[kind]} for --kind {kind}")
+    return kind

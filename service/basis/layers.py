@@ -1,0 +1,76 @@
+"""The stack reduced to K coefficient images by a singular value decomposition of each channel."""
+
+import numpy as np
+
+from kernels.relight.basis import gram, principal, projection
+from kernels.relight.batch import combine_batch
+from kernels.relight.residual import squared_residual
+from service.basis.source import BasisResult, Source, parts
+from service.errors import RequestError
+from service.reporting.progress import Timings
+from service.requests.basis import BasisKind, BasisRequest
+from stage.ingest import TOP_EXPONENT
+from stage.light_basis import layer_name, layer_types, numbers, write_facts, write_layers
+
+DEFAULT_COUNT = 16
+
+
+def make_layers(request: BasisRequest, source: Source, device: str, timings: Timings) -> BasisResult:
+    """Coefficient images in an EXR, matrices and errors in JSON beside it.
+
+    Raises:
+        RequestError: more coefficients than lights.
+        StorageError: a file cannot be written.
+    """
+    stack, lights = source.stack, source.stack.light_count
+    count = min(DEFAULT_COUNT, lights) if request.count is None else request.count
+    if count > lights:
+        raise RequestError(f"--count {count}: {source.where} has {lights} lights: give 1 to {lights}")
+    scale = stack.scale[:lights].astype(np.float64)
+    products = np.zeros((3, lights, lights))
+    for part in parts(source, device, 0, timings, "products"):
+        products += gram(part.band, part.inside)[:, :lights, :lights]
+    products *= scale[:, None] * scale  # from stored values to radiance
+    basis = principal(products, count)
+    rms = basis.singular_values[:, :count].T / np.sqrt(source.pixels)
+    bound = float(np.linalg.norm(2.0**TOP_EXPONENT * scale))  # of a pixel's radiance over all lights, and so of its coefficients
+    layers = [np.zeros((3, stack.pixel_count), dtype=dtype) for dtype in layer_types(rms, bound)]
+    weights = projection(basis, stack.scale)
+    gains = np.broadcast_to(stack.scale, (3, stack.shape[1]))
+    functions = np.zeros((3, stack.shape[1], count))
+    functions[:, :lights] = np.swapaxes(basis.matrix, 1, 2)
+    left = np.zeros(3)
+    for part in parts(source, device, 3 * 12 * count, timings, "layers"):
+        coefficients = combine_batch(part.band, weights).numpy()
+        width = part.span.stop - part.span.start
+        for k, layer in enumerate(layers):
+            layer[:, part.span] = np.where(part.inside, coefficients[k], 0)[:, :width]
+            coefficients[k, :, :width] = layer[:, part.span]  # rounded as it is stored: what is left is what the file leaves
+        squares = squared_residual(part.band, gains, coefficients, functions).numpy()
+        left += squares[:, part.inside].sum(axis=1, dtype=np.float64)
+    timings.stage("write", 1)
+    rows, cols = source.capture.camera.height, source.capture.camera.width
+    whole = np.trace(products, axis1=1, axis2=2)
+    write_layers(request.out, [layer.reshape(3, rows, cols) for layer in layers],
+                 source.inside[: stack.pixel_count].reshape(rows, cols), color_space=source.space, metadata=source.provenance)
+    tail = (basis.singular_values[:, count:] ** 2).sum()
+    relative = _relative(left.sum(), whole.sum())
+    facts = write_facts(request.out, {
+        "kind": BasisKind.SVD, "capture": source.capture.name, "image": request.out.name, "resolution": [cols, rows], "count": count,
+        "layers": [layer_name(k) for k in range(count)], "color_space": source.space,
+        "lights": source.described_lights(np.arange(lights)),
+        "convention": "frame[c] = sum over k of (sum over l of matrix[c][k][l] * weight[c][l]) * layers[k][c]",
+        "matrix": numbers(basis.matrix),
+        "singular_values": numbers(basis.singular_values),
+        "error": {"relative_rms": numbers(relative),
+                  "relative_rms_rgb": numbers([_relative(*pair) for pair in zip(left, whole, strict=True)]),
+                  "truncation": numbers(_relative(tail, whole.sum())), "truncation_rgb": numbers(basis.truncation),
+                  "pixels": source.pixels},
+        "provenance": source.provenance,
+    })
+    timings.close()
+    return BasisResult(request.out, facts, BasisKind.SVD, count, source.pixels, lights, 0, source.near, relative, None)
+
+
+def _relative(left: float, whole: float) -> float:
+    return float(np.sqrt(left / whole)) if whole > 0 else 0.0

@@ -1,0 +1,182 @@
+"""The stack as a polynomial texture map or as hemispherical harmonics, fitted to display values as a viewer shows them.
+
+Coefficients are fitted twice, once for their ranges and once to be stored, so that only bytes are kept of the whole image.
+"""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from kernels.errors import ArrayError
+from kernels.packs import Band
+from kernels.relight.batch import combine_batch
+from kernels.relight.display import encode
+from kernels.relight.hemisphere import HSH_TERMS, PTM_TERMS, biquadratic, fit_weights, hemispherical_harmonics
+from kernels.relight.luminance import WHITE, separate
+from kernels.relight.residual import squared_residual
+from service.basis.source import BasisResult, Source, parts
+from service.errors import RequestError
+from service.reporting.progress import Timings
+from service.requests.basis import BasisKind, BasisRequest
+from stage.colour import rgb_matrix
+from stage.errors import ManifestError
+from stage.light_basis import numbers, write_facts
+from stage.rti import hsh, ptm
+from stage.rti.steps import Steps, from_bytes, steps_over, to_bytes
+
+DISPLAY_SPACE = "lin_rec709_scene"
+"""Linear values of an sRGB display."""
+WHITE_PERCENTILE = 99.9
+EXPOSURE_PIXELS = 1 << 16
+"""Pixels that the exposure is measured on, evenly spread where the mask has more."""
+LIGHTS_PER_TERM = 2
+"""Without --count hemispherical harmonics get so many lights a term: with fewer they swing between the lights."""
+
+
+class Model(NamedTuple):
+    """What is fitted to which lights."""
+
+    kind: BasisKind
+    front: np.ndarray  # indices of the lights with z > 0
+    functions: np.ndarray  # [lights padded, terms], display value = Σ function · coefficient; 0 for lights left out
+    weights: np.ndarray  # [terms, 3, lights padded] float32, coefficient = Σ weight · display value
+    gains: np.ndarray  # [3, lights padded], from stored to exposed scene-linear values; 0 for lights left out
+    display_from_stack: np.ndarray  # [3, 3]
+    exposure: float
+
+    @property
+    def terms(self) -> int:
+        """Coefficients of each channel."""
+        return int(self.functions.shape[1])
+
+    def shown(self, band: Band) -> Band:
+        """The display values."""
+        return encode(band, self.gains, self.display_from_stack)
+
+    def fit(self, shown: Band) -> tuple[np.ndarray, np.ndarray | None]:
+        """Coefficients [terms, 3 or 1, pixels padded] float32, and of a luminance its colour [3, pixels padded] uint8."""
+        fitted = combine_batch(shown, self.weights).numpy()
+        if self.kind != BasisKind.LRGB_PTM:
+            return fitted, None
+        luminance = separate(fitted, self.functions[self.front] * WHITE)
+        return luminance.coefficients[:, None], luminance.colour
+
+    def squared_difference(self, shown: Band, coefficients: np.ndarray, colour: np.ndarray | None, inside: np.ndarray) -> float:
+        """Σ (what a viewer shows − display value)² over channels, lights and the pixels inside."""
+        in_colour = coefficients if colour is None else coefficients * (colour / np.float32(WHITE))
+        functions = np.broadcast_to(self.functions, (3, *self.functions.shape))
+        squares = squared_residual(shown, (self.gains > 0).astype(np.float32), in_colour, functions, low=0.0, high=1.0).numpy()
+        return float(squares[:, inside].sum(dtype=np.float64))
+
+
+def make_rti(request: BasisRequest, kind: BasisKind, source: Source, device: str, timings: Timings) -> BasisResult:
+    """A `.ptm` or `.rti` file, and exposure, lights and errors in JSON beside it.
+
+    Raises:
+        RequestError: a count that the kind does not have.
+        ManifestError: too few lights in front of the object, or none that determine the coefficients.
+        StorageError: a file cannot be written.
+    """
+    model, stack = _model(request, kind, source), source.stack
+    terms, pixels = model.terms, stack.pixel_count
+    bytes_per_pixel = (6 + 4) * stack.shape[1] + 8 * 12 * terms  # display values, luminances, and coefficients in their stages
+    low, high = np.zeros(terms), np.zeros(terms)
+    for part in parts(source, device, bytes_per_pixel, timings, "fit"):
+        inside = model.fit(model.shown(part.band))[0][:, :, part.inside]
+        low, high = np.minimum(low, inside.min(axis=(1, 2))), np.maximum(high, inside.max(axis=(1, 2)))
+    steps = steps_over(low, high)
+    channels = 1 if kind == BasisKind.LRGB_PTM else 3
+    stored = np.tile(steps.zero.astype(np.uint8), (channels, pixels, 1))
+    colours = np.zeros((pixels, 3), dtype=np.uint8)
+    loss = np.zeros(3)  # as fitted, as stored, and without anything
+    for part in parts(source, device, bytes_per_pixel, timings, "store"):
+        shown = model.shown(part.band)
+        fitted, colour = model.fit(shown)
+        levels = to_bytes(np.where(part.inside, fitted, 0), steps)
+        width = part.span.stop - part.span.start
+        stored[:, part.span] = np.moveaxis(levels, 0, -1)[:, :width]
+        if colour is not None:
+            colours[part.span] = np.where(part.inside, colour, 0).T[:width]
+        loss += [model.squared_difference(shown, coefficients, colour, part.inside)
+                 for coefficients in (fitted, from_bytes(levels, steps), np.zeros_like(fitted))]
+    timings.stage("write", 1)
+    rows, cols = source.capture.camera.height, source.capture.camera.width
+    grid = stored.reshape(channels, rows, cols, terms)
+    if kind == BasisKind.HSH:
+        hsh.write(request.out, hsh.Hsh(grid, steps))
+    else:
+        ptm.write(request.out, ptm.Ptm(grid, steps, colours.reshape(rows, cols, 3) if channels == 1 else None))
+    readings = 3 * source.pixels * len(model.front)
+    error = {"relative_rms": np.sqrt(loss[1] / loss[2]), "levels_rms": WHITE * np.sqrt(loss[1] / readings),
+             "fit_relative_rms": np.sqrt(loss[0] / loss[2])}
+    facts = _write_facts(request, source, model, steps, {name: numbers(value) for name, value in error.items()})
+    timings.close()
+    return BasisResult(request.out, facts, kind, terms, source.pixels, len(model.front), stack.light_count - len(model.front),
+                       source.near, float(error["relative_rms"]), float(error["levels_rms"]))
+
+
+def _model(request: BasisRequest, kind: BasisKind, source: Source) -> Model:
+    directions, irradiance = source.lights
+    front = np.flatnonzero(directions[:, 2] > 0)
+    terms = _terms(request.count, kind, len(front))
+    if len(front) < terms:
+        others = len(directions) - len(front)
+        raise ManifestError(f"{source.where}: frames: {len(front)} are lit from in front of the object (z > 0; {others} others are left "
+                            f"out): {terms} coefficients of {kind} need {terms} or more")
+    dark = np.argwhere(irradiance[front] <= 0)
+    if len(dark):
+        light, channel = dark[0]
+        raise ManifestError(f"{source.where}: light.irradiance of {source.stack.frames[front[light]]}: is 0 in channel "
+                            f"{'RGB'[channel]}: {kind} shows the object under white light")
+    functions = hemispherical_harmonics(directions[front], terms) if kind == BasisKind.HSH else biquadratic(directions[front])
+    try:
+        fit = fit_weights(functions)
+    except ArrayError as error:
+        raise ManifestError(f"{source.where}: frames[].light.direction: {error}") from error
+    lights = source.stack.shape[1]
+    white = 1.0 if kind == BasisKind.HSH else WHITE
+    weights, padded, gains = np.zeros((terms, 3, lights), dtype=np.float32), np.zeros((lights, terms)), np.zeros((3, lights))
+    weights[:, :, front] = white * fit[:, None]
+    padded[front] = functions / white
+    gains[:, front] = (source.stack.scale[front, None] / irradiance[front]).T
+    matrix = rgb_matrix(source.space, DISPLAY_SPACE)
+    exposure = _exposure(source, gains, matrix)
+    return Model(kind, front, padded, weights, gains * exposure, matrix, exposure)
+
+
+def _terms(count: int | None, kind: BasisKind, lights: int) -> int:
+    if kind != BasisKind.HSH:
+        if count not in (None, PTM_TERMS):
+            raise RequestError(f"--count {count}: a polynomial texture map has six coefficients: leave --count out")
+        return PTM_TERMS
+    if count is None:
+        return 9 if lights >= LIGHTS_PER_TERM * 9 else 4
+    if count not in HSH_TERMS:
+        raise RequestError(f"--count {count}: hemispherical harmonics have 4, 9 or 16 coefficients")
+    return count
+
+
+def _exposure(source: Source, gains: np.ndarray, display_from_stack: np.ndarray) -> float:
+    """What radiance under a light of irradiance 1 is multiplied by: WHITE_PERCENTILE of the display-linear values becomes 1."""
+    pixels = np.flatnonzero(source.inside)
+    values, _ = source.stack.pick(pixels[:: -(-len(pixels) // EXPOSURE_PIXELS)])
+    lit = gains[0] > 0
+    scene = values[:, lit].astype(np.float32) * gains[:, lit, None].astype(np.float32)
+    white = float(np.quantile(np.tensordot(display_from_stack, scene, axes=1), WHITE_PERCENTILE / 100))
+    if not white > 0:
+        raise ManifestError(f"{source.where}: frames: the object is black under every light in front of it")
+    return 1 / white
+
+
+def _write_facts(request: BasisRequest, source: Source, model: Model, steps: Steps, error: dict[str, float]) -> Path:
+    camera = source.capture.camera
+    behind = np.setdiff1d(np.arange(source.stack.light_count), model.front)
+    return write_facts(request.out, {
+        "kind": model.kind, "capture": source.capture.name, "image": request.out.name, "resolution": [camera.width, camera.height],
+        "count": model.terms, "color_space": "srgb_texture",
+        "convention": f"display values, as under one white light of irradiance 1 times exposure; percentile {WHITE_PERCENTILE} is white",
+        "exposure": numbers(model.exposure), "step": numbers(steps.step), "zero": steps.zero.tolist(),
+        "lights": source.described_lights(model.front), "lights_left_out": [source.stack.frames[i] for i in behind],
+        "error": {**error, "pixels": source.pixels}, "provenance": source.provenance,
+    })

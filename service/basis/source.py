@@ -1,0 +1,127 @@
+"""What every kind of basis begins with: the capture, its stack and lights, and the pixels that count."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from kernels import packs
+from service.errors import RequestError
+from service.reporting.progress import Timings
+from service.reporting.provenance import metadata
+from service.requests.basis import BasisKind, BasisRequest
+from stage.capture import Capture
+from stage.colour import linear_space
+from stage.ingest import open_stack
+from stage.light import PointLight
+from stage.light_basis import facts_path, numbers
+from stage.lighting import lights_from_centre
+from stage.manifest import FILE_NAME
+from stage.motion.tracking import tracking_frames
+from stage.point_lights import DistantLights
+from stage.stack import Stack
+
+
+class Source(NamedTuple):
+    """A capture, opened."""
+
+    capture: Capture
+    stack: Stack
+    lights: DistantLights
+    near: int
+    """Point lights among them, taken as distant ones."""
+    inside: np.ndarray  # [pixels padded] bool, of the mask
+    space: str
+    """Scene-linear colour space of the stack."""
+    provenance: dict[str, str]
+
+    @property
+    def where(self) -> str:
+        """The manifest, for messages."""
+        return str(self.capture.folder / FILE_NAME)
+
+    @property
+    def pixels(self) -> int:
+        """How many count."""
+        return int(self.inside.sum())
+
+    def described_lights(self, chosen: np.ndarray) -> list[dict[str, Any]]:
+        """Image, direction and irradiance of some lights, for JSON."""
+        return [{"image": self.stack.frames[i], "direction": numbers(self.lights.direction[i]),
+                 "irradiance": numbers(self.lights.irradiance[i])} for i in chosen]
+
+
+class BasisResult(NamedTuple):
+    """What was made, and what it loses."""
+
+    path: Path
+    facts_path: Path
+    """JSON beside it."""
+    kind: BasisKind
+    terms: int
+    """Coefficients of each channel."""
+    pixels: int
+    lights: int
+    left_out: int
+    """Lights that are not in front of the object, and so not in an RTI file."""
+    near_lights: int
+    relative_rms: float
+    """Root mean square of (image as the file gives it − image), over that of the images."""
+    levels_rms: float | None
+    """The same in steps of an 8-bit display, where the file holds display values."""
+
+
+def open_source(request: BasisRequest, timings: Timings) -> Source:
+    """Open the capture of a request.
+
+    Raises:
+        RequestError: a result would replace an image of the capture.
+        StageError: bad input; names file and field.
+    """
+    timings.stage("open", 1)
+    capture = Capture.open(request.capture)
+    lights = lights_from_centre(capture)
+    mask = capture.mask()
+    tracking = tracking_frames(capture, to=request.align_to) if request.aligned else None
+    inputs = {capture.file(name).resolve() for _, name in capture.files()}
+    for path in (request.out, facts_path(request.out)):
+        if path.resolve() in inputs:
+            raise RequestError(f"--out {request.out}: {path} is an input: choose another folder or name")
+    timings.stage("ingest", len(capture.sources()))
+    stack = open_stack(capture, cache=request.cache, tracking=tracking, progress=lambda done, _: timings.advance(done))
+    inside = np.zeros(stack.shape[2], dtype=bool)
+    inside[: stack.pixel_count] = mask.reshape(-1)
+    near = len(capture.lit_by(PointLight))
+    provenance = metadata(request, capture=capture.name, inputs=stack.key)
+    if near:
+        provenance["relit:lights"] = f"{near} near lights taken as distant, as the object's centre sees them"
+    return Source(capture, stack, lights, near, inside, linear_space(capture.manifest.color_space), provenance)
+
+
+class Part(NamedTuple):
+    """A band of the stack in which some pixel counts."""
+
+    span: slice
+    """Of the image, without padding."""
+    band: packs.Band
+    inside: np.ndarray  # [pixels of the band] bool
+
+
+def parts(source: Source, device: str, bytes_per_pixel: int, timings: Timings, stage: str) -> Iterator[Part]:
+    """The bands of the stack on the device, one after another; bands without a pixel of the mask are left out.
+
+    Args:
+        source: the capture.
+        device: where.
+        bytes_per_pixel: what the caller allocates beside the stack for each pixel.
+        timings: told of the bands as one stage.
+        stage: its name.
+    """
+    ranges = list(source.stack.bands(bytes_per_pixel))
+    timings.stage(stage, len(ranges))
+    for done, (start, stop) in enumerate(ranges, start=1):
+        if source.inside[start:stop].any():
+            band = packs.upload(source.stack.band(start, stop), device=device)
+            yield Part(slice(start, min(stop, source.stack.pixel_count)), band, source.inside[start:stop])
+        timings.advance(done)

@@ -1,0 +1,1 @@
+"""Images of targets to calibrated captures."""

@@ -1,0 +1,144 @@
+"""Images of the dark, of a white card, of anything bright → dark.exr, flat.exr and the saturation of a capture."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from service import __version__
+from service.calibrate.results import digits, write_results
+from service.errors import RequestError
+from service.reporting.progress import Progress, Timings
+from service.requests.calibrate import DarkRequest, FlatFieldRequest, SaturationRequest
+from stage import exr, images
+from stage.calibration.flat_field import make_flat, mean_image, recorded_values
+from stage.calibration.saturation import TopHistogram, suggest
+from stage.capture import Capture
+from stage.errors import CalibrationError
+from stage.manifest import FILE_NAME
+
+DARK_FILE, FLAT_FILE = "dark.exr", "flat.exr"
+
+
+class ImageCalibration(NamedTuple):
+    """What was written."""
+
+    manifest_path: Path
+    report_path: Path
+    image_path: Path
+    noise: float
+    """Of one input, linear; 0 for one image."""
+
+
+class Saturation(NamedTuple):
+    """What the histogram shows."""
+
+    level: float
+    counts: tuple[int, int, int]
+    """Readings at or above it in red, green and blue."""
+    manifest_path: Path | None
+    report_path: Path | None
+
+
+def dark(request: DarkRequest, progress: Progress | None = None) -> ImageCalibration:
+    """Mean of dark images → dark.exr, named by the manifest.
+
+    Raises:
+        StageError, RequestError: bad input; nothing is written.
+    """
+    timings = Timings(progress)
+    timings.stage("open", 1)
+    capture = Capture.open(request.capture)
+    _refuse_overwrite(request.images, capture.folder / DARK_FILE)
+    timings.stage("images", len(request.images))
+    mean = mean_image(request.images, capture, progress=timings.advance)
+    timings.close()
+    return _write(DARK_FILE, "dark", request, capture, mean.pixels.astype(np.float32), {
+        "images": mean.images, "noise": float(f"{mean.noise:.4g}"), "mean": digits(mean.pixels.mean(axis=(0, 1)))})
+
+
+def flat_field(request: FlatFieldRequest, progress: Progress | None = None) -> ImageCalibration:
+    """Mean of white-card images, with the dark that correction takes off → flat.exr, named by the manifest.
+
+    Raises:
+        StageError, RequestError: bad input; nothing is written.
+    """
+    timings = Timings(progress)
+    timings.stage("open", 1)
+    capture = Capture.open(request.capture)
+    _refuse_overwrite([*request.images, *request.dark_images], capture.folder / FLAT_FILE)
+    timings.stage("images", len(request.images) + len(request.dark_images))
+    white = mean_image(request.images, capture, refuse_saturated=True, progress=timings.advance)
+    white_dark = None
+    if request.dark_images:
+        white_dark = mean_image(request.dark_images, capture, progress=lambda done: timings.advance(white.images + done))
+    flat = make_flat(white, white_dark, capture)
+    timings.close()
+    seen = flat[capture.mask()]
+    return _write(FLAT_FILE, "flat", request, capture, flat, {
+        "images": white.images, "noise": float(f"{white.noise:.4g}"),
+        "least": digits(seen.min(axis=0)), "most": digits(seen.max(axis=0))})
+
+
+def saturation(request: SaturationRequest, progress: Progress | None = None) -> Saturation:
+    """Where the readings of a capture's frames pile up at the top of the histogram.
+
+    Raises:
+        StageError: bad input, or nothing piles up; nothing is written.
+    """
+    timings = Timings(progress)
+    timings.stage("open", 1)
+    capture = Capture.open(request.capture)
+    paths = [capture.file(frame.image) for frame in capture.manifest.frames if Path(frame.image).suffix.lower() != ".npy"]
+    timings.stage("peaks", len(paths))
+    peaks = np.zeros(3)
+    for number, path in enumerate(paths, start=1):
+        peaks = np.maximum(peaks, _recorded(path).max(axis=(0, 1)))
+        timings.advance(number)
+    tops = [TopHistogram(float(peak)) for peak in peaks]
+    timings.stage("histogram", len(paths))
+    for number, path in enumerate(paths, start=1):
+        recorded = _recorded(path)
+        for channel, top in enumerate(tops):
+            top.add(recorded[..., channel])
+        timings.advance(number)
+    timings.close()
+    piles = [top.pile() for top in tops]
+    try:
+        level = suggest(piles)
+    except CalibrationError as error:
+        raise CalibrationError(f"{capture.folder}: {error}") from error
+    counts = piles[0].readings, piles[1].readings, piles[2].readings
+    if not request.write:
+        return Saturation(level, counts, None, None)
+    manifest_path = capture.folder / FILE_NAME
+    report = write_results("saturation", request, capture.manifest.model_copy(update={"saturation": level}), manifest_path,
+                           {"level": level, "counts": counts})
+    return Saturation(level, counts, manifest_path, report)
+
+
+def _recorded(path: Path) -> np.ndarray:
+    pixels = images.read_pixels(path)
+    images.check_radiance(path, pixels)
+    return pixels
+
+
+def _refuse_overwrite(inputs: Sequence[Path], target: Path) -> None:
+    for path in inputs:
+        if path.exists() and target.exists() and path.samefile(target):
+            raise RequestError(f"{path}: is the file that is written: give it another name")
+
+
+def _write(name: str, field: str, request: DarkRequest | FlatFieldRequest, capture: Capture, linear: np.ndarray,
+           section: dict[str, Any]) -> ImageCalibration:
+    """The image first, then the report and the manifest that names it."""
+    recorded = recorded_values(linear, capture)
+    channels = {channel: recorded[..., index] for index, channel in enumerate("RGB")}
+    kind = "flat-field" if field == "flat" else field
+    exr.write(capture.folder / name, channels, color_space=capture.manifest.color_space, metadata={
+        "relit:version": __version__, "relit:capture": capture.name, "relit:calibration": kind,
+        "relit:inputs": " ".join(path.name for path in request.images)})
+    manifest_path = capture.folder / FILE_NAME
+    report = write_results(kind, request, capture.manifest.model_copy(update={field: name}), manifest_path, section)
+    return ImageCalibration(manifest_path, report, capture.folder / name, section["noise"])

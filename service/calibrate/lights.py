@@ -1,0 +1,185 @@
+"""Images of balls → the lights of a manifest, with residuals."""
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+
+from service.calibrate.balls import ball_entry, balls_of, check_metric
+from service.calibrate.results import Calibration, Captures, Measured, digits, finish, kept, open_captures, triple
+from service.reporting.progress import Progress, Timings
+from service.requests.calibrate import GreyBallRequest, LightPositionsRequest, MirrorBallRequest
+from stage.calibration.apply import LitFrame, SingleLight, as_direction, as_position, lit_frames, with_brightness
+from stage.calibration.ball import BallView, view_ball
+from stage.calibration.grey_ball import fit_brightness, fit_direction
+from stage.calibration.light_positions import nearest_point
+from stage.calibration.mirror_ball import SpotOptions, find_spot
+from stage.correction import Correction
+from stage.errors import CalibrationError, ManifestError
+from stage.light import DistantLight, PointLight
+from stage.manifest import FILE_NAME
+
+READERS = 4
+"""Images that are decoded at one time: bounds the memory."""
+
+
+class Patch(NamedTuple):
+    """What one frame shows of a ball's box."""
+
+    radiance: np.ndarray  # [h, w, 3] float32
+    saturated: np.ndarray | None  # [h, w] bool
+
+
+def mirror_ball(request: MirrorBallRequest, progress: Progress | None = None) -> Calibration:
+    """Directions of far lights from the bright spot on one mirror ball.
+
+    Raises:
+        StageError, RequestError: bad input, or a light that cannot be measured; nothing is written.
+    """
+    timings = Timings(progress)
+    timings.stage("open", 1)
+    captures = open_captures(request)
+    (ball,) = balls_of(request, captures.source.camera, exactly=1)
+    view = view_ball(ball, captures.source.camera)
+    options = SpotOptions(level=request.level)
+    # what is not measured stays as the target has it
+    targets = _targets(captures)
+
+    def measure(lit: LitFrame, patches: Sequence[Patch]) -> Measured:
+        spot = find_spot(patches[0].radiance, patches[0].saturated, ball, view, options)
+        light = targets[lit.number]
+        flags = [*spot.flags, *(["irradiance set to 1"] if isinstance(light, PointLight) else [])]
+        entry = {"direction": digits(spot.direction), "uncertainty_degrees": round(spot.uncertainty_degrees, 4),
+                 "spot_degrees": round(spot.spot_degrees, 3), "spot_pixels": spot.pixels, "spot_uv": digits(spot.uv),
+                 "flags": flags}
+        row = (triple(spot.direction), f"{spot.uncertainty_degrees:.2f}°", f"{spot.spot_degrees:.2f}°")
+        return Measured(as_direction(light, spot.direction), entry, row, spot.uncertainty_degrees)
+
+    results = kept(captures, _each(captures, [view], measure, timings), drop_failed=request.drop_failed)
+    timings.close()
+    return finish("mirror-ball", request, captures, results, headings=("direction", "sure to", "spot"),
+                  summary={"balls": [ball_entry(ball)]})
+
+
+def light_positions(request: LightPositionsRequest, progress: Progress | None = None) -> Calibration:
+    """Positions of near lights from the bright spots on two or more mirror balls.
+
+    Raises:
+        StageError, RequestError: bad input, or a light that cannot be measured; nothing is written.
+    """
+    timings = Timings(progress)
+    timings.stage("open", 1)
+    captures = open_captures(request)
+    camera = captures.source.camera
+    balls = balls_of(request, camera, at_least=2, radii=request.ball_radius_m, heights=request.ball_z_m)
+    check_metric(captures.source, balls, request.ball_radius_m)
+    views = [view_ball(ball, camera) for ball in balls]
+    middle = np.mean([ball.centre for ball in balls], axis=0)
+    targets = _targets(captures)
+    options = SpotOptions(level=request.level)
+
+    def measure(lit: LitFrame, patches: Sequence[Patch]) -> Measured:
+        spots = []
+        for number, (patch, ball, view) in enumerate(zip(patches, balls, views, strict=True), start=1):
+            try:
+                spots.append(find_spot(patch.radiance, patch.saturated, ball, view, options))
+            except CalibrationError as error:
+                raise CalibrationError(f"ball {number}: {error}") from error
+        found = nearest_point(np.array([spot.point for spot in spots]), np.array([spot.direction for spot in spots]),
+                              np.array([spot.uncertainty_degrees for spot in spots]))
+        flags = [*found.flags, *(f"ball {n}: {flag}" for n, spot in enumerate(spots, start=1) for flag in spot.flags)]
+        entry = {"position_m": digits(found.position), "residual_m": float(f"{found.residual:.3g}"),
+                 "uncertainty_m": float(f"{found.uncertainty:.3g}"), "flags": flags}
+        row = (triple(found.position), f"{found.uncertainty:.2g} m", f"{found.residual:.2g} m")
+        return Measured(as_position(targets[lit.number], found.position, middle), entry, row, found.uncertainty)
+
+    results = kept(captures, _each(captures, views, measure, timings), drop_failed=request.drop_failed)
+    timings.close()
+    return finish("light-positions", request, captures, results, headings=("position, m", "sure to", "residual"),
+                  summary={"balls": [ball_entry(ball) for ball in balls]})
+
+
+def grey_ball(request: GreyBallRequest, progress: Progress | None = None) -> Calibration:
+    """Irradiance or intensity of each light from the shading of one grey ball.
+
+    Raises:
+        StageError, RequestError: bad input, or a light that cannot be measured; nothing is written.
+    """
+    timings = Timings(progress)
+    timings.stage("open", 1)
+    captures = open_captures(request)
+    camera = captures.source.camera
+    (ball,) = balls_of(request, camera, exactly=1, radii=() if request.ball_radius_m is None else (request.ball_radius_m,),
+                     heights=() if request.ball_z_m is None else (request.ball_z_m,))
+    near = next((lit for lit in captures.lit if isinstance(lit.light, PointLight)), None)
+    if near is not None:
+        where = f"{captures.source.folder / FILE_NAME}: frames[{near.number}].light: is point"
+        if request.refine_direction:
+            raise ManifestError(f"{where}: --refine-direction is for distant lights")
+        if not ball.metric:
+            need = "camera.pixel_size_m" if camera.projection == "orthographic" else "--ball-radius-m"
+            raise ManifestError(f"{where}: its distance to the ball needs {need}")
+    view = view_ball(ball, camera)
+
+    def measure(lit: LitFrame, patches: Sequence[Patch]) -> Measured:
+        patch, light, entry = patches[0], lit.light, {}
+        if request.refine_direction:
+            shading = fit_direction(patch.radiance, patch.saturated, view)
+            light = as_direction(light, shading.direction)
+            entry = {"direction": digits(shading.direction), "uncertainty_degrees": round(shading.uncertainty_degrees, 4)}
+        found = fit_brightness(patch.radiance, patch.saturated, light, view)
+        entry |= {"scale": digits(found.scale), "residual": round(found.residual, 5), "pixels": found.pixels,
+                  "flags": ["not Lambertian under this light"] if found.residual > 0.1 else []}
+        return Measured(with_brightness(light, found.scale), entry, (), found.residual)
+
+    results = kept(captures, _each(captures, [view], measure, timings), drop_failed=request.drop_failed)
+    timings.close()
+    return finish("grey-ball", request, captures, _scaled(results, request.albedo),
+                  headings=("irradiance", "residual"), summary={"balls": [ball_entry(ball)]})
+
+
+def _each(captures: Captures, views: Sequence[BallView], measure: Callable[[LitFrame, Sequence[Patch]], Measured],
+          timings: Timings) -> list[Measured | CalibrationError]:
+    """Measure every lit frame; a light that cannot be measured is its error in place of a result."""
+    correction = Correction.of(captures.source)
+
+    def one(lit: LitFrame) -> Measured | CalibrationError:
+        radiance = correction.apply(lit.frame)
+        patches = [Patch(radiance.pixels[view.box], None if radiance.saturated is None else radiance.saturated[view.box])
+                   for view in views]
+        try:
+            return measure(lit, patches)
+        except CalibrationError as error:
+            return error
+
+    timings.stage("frames", len(captures.lit))
+    results = []
+    with ThreadPoolExecutor(min(READERS, os.cpu_count() or 1), thread_name_prefix="relit-calibrate") as pool:
+        for result in pool.map(one, captures.lit):
+            results.append(result)
+            timings.advance(len(results))
+    return results
+
+
+def _targets(captures: Captures) -> dict[int, SingleLight]:
+    """What the target says now of the light of each measured frame, by the frame's number in the source."""
+    return {lit.number: own.light for lit, own in zip(captures.lit, lit_frames(captures.target), strict=True)}
+
+
+def _scaled(results: Sequence[Measured], albedo: tuple[float, float, float] | None) -> list[Measured]:
+    """Irradiance from ρ/π · irradiance: by the ball's albedo, or so that the mean over lights and channels is 1."""
+    scales = np.array([result.entry["scale"] for result in results if result.light is not None])
+    factor = np.full(3, 1 / scales.mean()) if albedo is None else np.pi / np.array(albedo)
+    scaled = []
+    for result in results:
+        if result.light is not None:
+            rgb = np.array(result.entry["scale"]) * factor
+            name = "irradiance" if isinstance(result.light, DistantLight) else "intensity"
+            entry = {name: digits(rgb), **{key: value for key, value in result.entry.items() if key != "scale"}}
+            scaled.append(Measured(with_brightness(result.light, rgb), entry, (triple(rgb), f"{result.entry['residual']:.3f}"),
+                                   result.doubt))
+        else:
+            scaled.append(result)
+    return scaled

@@ -1,0 +1,67 @@
+"""Images of the object itself → the brightness of its lights, when their directions are known."""
+
+import numpy as np
+
+from service.calibrate.results import Calibration, Measured, digits, finish, kept, open_captures, triple
+from service.reporting.progress import Progress, Timings
+from service.requests.calibrate import IntensityRequest
+from stage.calibration.apply import with_brightness
+from stage.calibration.semi_calibrated import check_directions, fit_intensities
+from stage.correction import Correction
+from stage.errors import CalibrationError, ManifestError
+from stage.light import DistantLight
+from stage.manifest import FILE_NAME
+
+BEHIND_Z = -0.2
+"""Flagged: a light more than 101° from the view axis, which the object shows at grazing angles only."""
+
+
+def intensity(request: IntensityRequest, progress: Progress | None = None) -> Calibration:
+    """Irradiance of each light of known direction from images of a mostly Lambertian object, mean 1.
+
+    Raises:
+        StageError, RequestError: bad input, or lights whose brightness cannot be told; nothing is written.
+    """
+    timings = Timings(progress)
+    timings.stage("open", 1)
+    captures = open_captures(request)
+    source = captures.source
+    for lit in captures.lit:
+        if not isinstance(lit.light, DistantLight):
+            raise ManifestError(f"{source.folder / FILE_NAME}: frames[{lit.number}].light: is {lit.light.type}: "
+                                "intensity is for distant lights of known direction")
+    directions = np.array([lit.light.direction for lit in captures.lit if isinstance(lit.light, DistantLight)])
+    try:
+        check_directions(directions)
+    except CalibrationError as error:
+        raise CalibrationError(f"{source.folder / FILE_NAME}: frames: {error}") from error
+    inside = np.flatnonzero(source.mask())
+    chosen = np.random.default_rng(0).choice(inside, min(request.pixels, len(inside)), replace=False)
+    correction = Correction.of(source)
+    timings.stage("frames", len(captures.lit))
+    readings, usable = np.empty((len(captures.lit), len(chosen), 3)), np.ones((len(captures.lit), len(chosen)), dtype=bool)
+    for number, lit in enumerate(captures.lit):
+        radiance = correction.apply(lit.frame)
+        readings[number] = radiance.pixels.reshape(-1, 3)[chosen]
+        if radiance.saturated is not None:
+            usable[number] = ~radiance.saturated.reshape(-1)[chosen]
+        timings.advance(number + 1)
+    timings.stage("fit", 1)
+    try:
+        found = fit_intensities(readings, usable, directions)
+    except CalibrationError as error:
+        raise CalibrationError(f"{source.folder}: {error}") from error
+    results: list[Measured | CalibrationError] = []
+    for lit, rgb, residual, sigma in zip(captures.lit, found.irradiance, found.residual, found.uncertainty, strict=True):
+        assert isinstance(lit.light, DistantLight)
+        if np.isnan(rgb).any():
+            results.append(CalibrationError("too few pixels of the object are lit by this light to tell its brightness"))
+            continue
+        flags = ["behind: seen at grazing angles only"] if lit.light.direction[2] < BEHIND_Z else []
+        entry = {"irradiance": digits(rgb), "uncertainty": digits(sigma), "residual": digits(residual), "flags": flags}
+        row = (triple(rgb), f"{100 * sigma.max():.2g} %", f"{residual.max():.3f}")
+        results.append(Measured(with_brightness(lit.light, rgb), entry, row, float(sigma.max())))
+    timings.close()
+    measured = kept(captures, results, drop_failed=request.drop_failed)
+    return finish("intensity", request, captures, measured, headings=("irradiance", "sure to", "residual"),
+                  summary={"pixels": found.pixels})

@@ -1,0 +1,171 @@
+"""Poses of a chessboard under projected light → camera, projector and pose in the manifests, with the error of each view."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from kernels import device as devices
+from kernels.status import SOLVED
+from kernels.structured.frames import NoiseModel
+from service.calibrate.results import digits, write_results
+from service.depth.codes import PatternDevice
+from service.depth.patterns import decoded_bands, full_scale, plan_codes, scene_colour
+from service.reporting.progress import Progress, Timings
+from service.requests.calibrate import ProcamRequest
+from service.requests.depth import DepthRequest
+from stage.calibration.procam import BoardView, Lens, ProCam, calibrate, find_corners, outliers, projector_corners
+from stage.camera import Camera
+from stage.capture import Capture
+from stage.colour import GREY_WEIGHTS
+from stage.errors import CalibrationError, ManifestError
+from stage.manifest import FILE_NAME, Manifest
+from stage.model import Resolution
+from stage.planes import frame_planes
+from stage.projector import Projector
+
+LEAST_CORNERS = 0.5
+"""Part of the board's corners that must be had in both devices, for a view to count."""
+
+
+class ProcamResult(NamedTuple):
+    """What was written."""
+
+    manifest_paths: tuple[Path, ...]
+    report_path: Path
+    """Beside the first manifest; each manifest has one."""
+    rows: list[tuple[str, ...]]
+    """View, camera error, projector error, remark."""
+    rms_px: float
+    baseline_m: float
+
+
+def procam(request: ProcamRequest, progress: Progress | None = None) -> ProcamResult:
+    """Calibrate a projector-camera pair.
+
+    Raises:
+        StageError, KernelError: bad input, or too few views show the board; nothing is written.
+    """
+    timings = Timings(progress)
+    device = devices.resolve(request.device)
+    timings.stage("open", len(request.captures) + len(request.apply_to))
+    captures = [Capture.open(path) for path in request.captures]
+    others = [Capture.open(path) for path in request.apply_to]
+    size = _projector_size(captures, request)
+    for capture in (*captures, *others):
+        if capture.camera.resolution != captures[0].camera.resolution:
+            raise ManifestError(f"{capture.folder / FILE_NAME}: camera.resolution: differs from that of {captures[0].folder}: "
+                                "one calibration is for one camera")
+    views: list[BoardView] = []
+    remarks: dict[str, str] = {}
+    timings.stage("views", len(captures))
+    for number, capture in enumerate(captures, start=1):
+        view = view_of(capture, size, request, device)
+        if isinstance(view, str):
+            remarks[str(capture.folder)] = view
+        else:
+            views.append(view)
+        timings.advance(number)
+    timings.stage("fit", 1)
+    camera_size = captures[0].camera.resolution
+    if not views and remarks:
+        folder, reason = next(iter(remarks.items()))
+        raise CalibrationError(f"{folder}: {reason} (and so with every view)")
+    found = calibrate(views, request.board, request.square_m, camera_size, size)
+    out = outliers(found)
+    if request.drop_outliers and out.any():
+        for view in (view for view, bad in zip(views, out, strict=True) if bad):
+            remarks[view.name] = "left out: its error stands out"
+        views = [view for view, bad in zip(views, out, strict=True) if not bad]
+        found = calibrate(views, request.board, request.square_m, camera_size, size)
+        out = outliers(found)
+    for view in (view for view, bad in zip(views, out, strict=True) if bad):
+        remarks[view.name] = "its error stands out: see --drop-outliers"
+    timings.close()
+    return _write(request, [*captures, *others], found, views, remarks, size)
+
+
+def view_of(capture: Capture, size: Resolution, request: ProcamRequest, device: str) -> BoardView | str:
+    """The corners of one capture in both devices, or why there are none."""
+    frames = [frame for frame in capture.manifest.frames if frame.pattern is not None]
+    collected, columns, rows = plan_codes(capture, frames, PatternDevice(size))
+    if columns is None or rows is None:
+        raise ManifestError(f"{capture.folder / FILE_NAME}: frames: no {'column' if columns is None else 'row'} code: "
+                            "calibration needs columns and rows")
+    scene = scene_colour(capture, frames, collected)
+    if scene is None:
+        raise ManifestError(f"{capture.folder / FILE_NAME}: frames: no white frame and no inverses: the board must be seen evenly lit")
+    corners = find_corners(scene @ np.array(GREY_WEIGHTS, np.float32), request.board)
+    if corners is None:
+        return f"the board of {request.board[0]}x{request.board[1]} inner corners is not found"
+    shape = (capture.camera.height, capture.camera.width)
+    u, v, decoded = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, bool)
+    options = DepthRequest.model_fields
+    with frame_planes(capture, frames, colour=columns.colour or rows.colour, cache=request.cache) as planes:
+        full = full_scale(planes, capture, frames)
+        noise = NoiseModel(options["read_noise"].default * full, options["photon_gain"].default * full)
+        for band, axes in decoded_bands(planes, (columns, rows), noise, device):
+            part = u[band].shape
+            count = part[0] * part[1]
+            first, second = (axis for axis in axes if axis is not None)
+            u[band], v[band] = (axis.coordinate.numpy()[:count].reshape(part) for axis in (first, second))
+            decoded[band] = np.logical_and(*(np.isin(axis.status.numpy()[:count], SOLVED).reshape(part) for axis in (first, second)))
+    lit = projector_corners(corners, u, v, decoded, request.board)
+    kept = np.flatnonzero(np.isfinite(lit).all(axis=-1))
+    if len(kept) < LEAST_CORNERS * len(corners):
+        return f"only {len(kept)} of {len(corners)} corners are decoded around"
+    return BoardView(str(capture.folder), corners[kept], lit[kept], kept)
+
+
+def _projector_size(captures: list[Capture], request: ProcamRequest) -> Resolution:
+    if request.projector is not None:
+        return request.projector
+    sizes = {capture.manifest.projector.resolution for capture in captures if capture.manifest.projector is not None}
+    if len(sizes) != 1:
+        fault = "differs between the captures" if sizes else "is missing"
+        raise ManifestError(f"{captures[0].folder / FILE_NAME}: projector: {fault}: "
+                            "--projector WIDTHxHEIGHT says how many pixels it has")
+    return sizes.pop()
+
+
+def _write(request: ProcamRequest, targets: list[Capture], found: ProCam, views: list[BoardView], remarks: dict[str, str],
+           size: Resolution) -> ProcamResult:
+    entries = [{"view": view.name, "corners": len(view.kept), "camera_px": float(f"{camera:.4g}"), "projector_px": float(f"{lit:.4g}"),
+                "remark": remarks.get(view.name, "")}
+               for view, camera, lit in zip(views, found.camera_error_px, found.projector_error_px, strict=True)]
+    used = {view.name for view in views}
+    left = [{"view": name, "remark": remark} for name, remark in remarks.items() if name not in used]
+    baseline = float(np.linalg.norm(found.camera_from_projector[:3, 3]))
+    section = {"captures": [str(path) for path in request.captures], "rms_px": float(f"{found.rms_px:.4g}"),
+               "baseline_m": float(f"{baseline:.6g}"), "camera": _entry(found.camera), "projector": _entry(found.projector),
+               "views": entries, "left_out": left}
+    paths, reports = [], []
+    for capture in targets:
+        path = capture.folder / FILE_NAME
+        reports.append(write_results("procam", request, _updated(capture.manifest, found, size), path, section))
+        paths.append(path)
+    rows: list[tuple[str, ...]] = [
+        (view.name, f"{camera:.3f}", f"{lit:.3f}", remarks.get(view.name, ""))
+        for view, camera, lit in zip(views, found.camera_error_px, found.projector_error_px, strict=True)]
+    rows += [(name, "", "", remark) for name, remark in remarks.items() if name not in used]
+    return ProcamResult(tuple(paths), reports[0], rows, found.rms_px, baseline)
+
+
+def _updated(manifest: Manifest, found: ProCam, size: Resolution) -> Manifest:
+    """The manifest with both devices; the camera's place in the world, and the projector's radiometry, stay."""
+    old = manifest.camera
+    surface = old.surface_z_m if old.projection == "perspective" else None
+    camera = Camera(projection="perspective", resolution=old.resolution, focal_px=found.camera.focal,
+                    principal_px=found.camera.principal, distortion=found.camera.distortion, surface_z_m=surface,
+                    world_from_camera=old.world_from_camera)
+    before = manifest.projector
+    projector = Projector.model_validate({
+        "resolution": size, "focal_px": found.projector.focal, "principal_px": found.projector.principal,
+        "distortion": found.projector.distortion, "camera_from_projector": found.camera_from_projector.tolist(),
+        **({} if before is None else {"response": before.response, "crosstalk": before.crosstalk})})
+    return manifest.model_copy(update={"camera": camera, "projector": projector})
+
+
+def _entry(lens: Lens) -> dict[str, Any]:
+    return {"focal_px": digits(lens.focal), "principal_px": digits(lens.principal), "k": digits(lens.distortion.k),
+            "p": digits(lens.distortion.p), "rms_alone_px": float(f"{lens.rms_px:.4g}")}

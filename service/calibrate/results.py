@@ -1,0 +1,142 @@
+"""What the kinds of `relit calibrate` share: the captures they read and write, and calibration.json."""
+
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pydantic import BaseModel
+
+from service.errors import RequestError
+from service.reporting.provenance import versions
+from service.requests.calibrate import LightsRequest
+from stage.calibration.apply import LitFrame, SingleLight, lit_frames, match, with_lights
+from stage.capture import Capture
+from stage.errors import CalibrationError
+from stage.files import write_text
+from stage.manifest import FILE_NAME, Manifest, write_manifest
+
+REPORT_FILE = "calibration.json"
+SCHEMA = "relit.calibration/1"
+
+
+class Calibration(NamedTuple):
+    """What a calibration wrote, and its table."""
+
+    manifest_path: Path
+    report_path: Path
+    headings: tuple[str, ...]
+    rows: list[tuple[str, ...]]
+    """One a measured light, the least sure first."""
+    summary: str
+
+
+class Captures(NamedTuple):
+    """Where lights are measured, and where they go."""
+
+    source: Capture
+    target: Capture
+    manifest_path: Path
+    lit: list[LitFrame]
+    """Of the source."""
+
+
+class Measured(NamedTuple):
+    """One light's result."""
+
+    light: SingleLight | None
+    """To write; None: the frame is left out."""
+    entry: dict[str, Any]
+    """For the report; `flags` name what to look at."""
+    row: tuple[str, ...] = ()
+    """For the table."""
+    doubt: float = 0.0
+    """What the table is sorted by."""
+
+
+def open_captures(request: LightsRequest) -> Captures:
+    """Open what a request names.
+
+    Raises:
+        RequestError: --out is not a .json file of its own.
+        StageError: a capture is wrong, or the two do not match.
+    """
+    source = Capture.open(request.capture)
+    lit = lit_frames(source)
+    target = source
+    if request.apply_to is not None:
+        target = Capture.open(request.apply_to)
+        match(source, target)
+    path = target.folder / FILE_NAME if request.out is None else request.out
+    if path.suffix.lower() != ".json" or path.name == REPORT_FILE or path.is_dir():
+        raise RequestError(f"--out {path}: must be a .json file of its own: it takes the place of {FILE_NAME}")
+    return Captures(source, target, path, lit)
+
+
+def kept(captures: Captures, results: Sequence[Measured | CalibrationError], *, drop_failed: bool) -> list[Measured]:
+    """The results with failures as frames to leave out.
+
+    Raises:
+        CalibrationError: a light failed and `drop_failed` is not asked, or every one failed; names the first frame.
+    """
+    failed = [(lit, result) for lit, result in zip(captures.lit, results, strict=True) if isinstance(result, CalibrationError)]
+    if failed and (not drop_failed or len(failed) == len(results)):
+        lit, error = failed[0]
+        others = f" (and {len(failed) - 1} more frames)" if len(failed) > 1 else ""
+        hint = "" if len(failed) == len(results) else "; --drop-failed leaves such frames out"
+        raise CalibrationError(f"{captures.source.file(lit.frame.image)}: {error}{others}{hint}")
+    return [Measured(None, {"dropped": str(result), "flags": ["dropped"]}) if isinstance(result, CalibrationError) else result
+            for result in results]
+
+
+def finish(kind: str, request: BaseModel, captures: Captures, results: Sequence[Measured], *, headings: tuple[str, ...],
+           summary: dict[str, Any]) -> Calibration:
+    """Write the report, then the manifest, each whole or not at all."""
+    manifest = with_lights(captures.target, [result.light for result in results])
+    lights = [{"frame": lit.number, "image": lit.frame.image, **result.entry,
+               "was": lit.light.model_dump(mode="json", exclude_none=True)}
+              for lit, result in zip(captures.lit, results, strict=True)]
+    measured = [(lit, result) for lit, result in zip(captures.lit, results, strict=True) if result.light is not None]
+    dropped = len(results) - len(measured)
+    flagged = sum(bool(result.entry["flags"]) for _, result in measured)
+    report = write_results(kind, request, manifest, captures.manifest_path, {
+        "capture": str(captures.source.folder), "applied_to": str(captures.target.folder),
+        "measured": len(measured), "dropped": dropped, "flagged": flagged, **summary, "lights": lights})
+    measured.sort(key=lambda pair: pair[1].doubt, reverse=True)
+    rows = [(lit.frame.image, *result.row, ", ".join(result.entry["flags"])) for lit, result in measured]
+    counts = (len(measured), "measured"), (dropped, "left out"), (flagged, "flagged")
+    text = ", ".join(f"{count} {what}" for count, what in counts if count)
+    return Calibration(captures.manifest_path, report, ("frame", *headings, "flags"), rows, text)
+
+
+def write_results(kind: str, request: BaseModel, manifest: Manifest, manifest_path: Path, section: dict[str, Any]) -> Path:
+    """Write calibration.json beside the manifest, keeping what other kinds put there, then the manifest itself.
+
+    Returns:
+        The path of the report.
+    """
+    path = manifest_path.parent / REPORT_FILE
+    options = request.model_dump(mode="json", exclude={"capture", "apply_to", "out"})
+    data = {"schema": SCHEMA, **_earlier(path), kind: {"options": options, **section, "versions": versions()}}
+    write_text(path, json.dumps(data, indent=2) + "\n")
+    write_manifest(manifest, manifest_path)
+    return path
+
+
+def digits(values: Iterable[float]) -> list[float]:
+    """Numbers for the report, with the six digits that a measurement may have."""
+    return [float(f"{value:.6g}") for value in values]
+
+
+def triple(values: Iterable[float]) -> str:
+    """Three numbers for the table."""
+    return " ".join(f"{value:7.3f}" for value in values)
+
+
+def _earlier(path: Path) -> dict[str, Any]:
+    """The other kinds' sections of a report that is there; nothing of a file that is something else."""
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return data if isinstance(data, dict) and data.get("schema") == SCHEMA else {}

@@ -1,0 +1,122 @@
+"""A sweep over known distances → the calibration of a time-of-flight camera: wiggling, scale, offset, drift, noise, pulse."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from kernels import device as devices
+from kernels.tof.continuous import decode
+from kernels.tof.noise import estimate_noise
+from service.depth.tof import solve_tof, z_per_range
+from service.errors import RequestError
+from service.reporting.progress import Progress, Timings
+from service.requests.depth import TofOptions
+from stage.capture import Capture
+from stage.tof.calibration import Harmonics, TofCalibration, fit_harmonics, fit_line, fit_temperature, write_calibration
+from stage.tof.frames import is_pulsed, read_correlations
+from stage.tof.sweep import Step, Sweep, read_sweep
+
+STEP_PIXELS = 400
+"""Of each step, evenly chosen: more do not make the harmonics better, which the steps limit."""
+SHARPEST_RAD = 0.3
+"""Phases with a larger standard deviation are not taken."""
+
+
+class TofCalibrationResult(NamedTuple):
+    """What was found."""
+
+    calibration: TofCalibration
+    path: Path
+    before_m: float
+    """RMS of the steps' median errors without the calibration."""
+    after_m: float
+    """And with it, on the steps that it was made from."""
+    steps: int
+
+
+def calibrate_tof(sweep: Path, out: Path, *, device: str | None = None, progress: Progress | None = None) -> TofCalibrationResult:
+    """Calibrate a time-of-flight camera.
+
+    Args:
+        sweep: a relit.tof-sweep/1 file.
+        out: the relit.tof/1 file to write.
+        device: where to solve.
+        progress: told of every stage.
+
+    Raises:
+        StageError, KernelError: a capture or the sweep cannot be used, or says too little; nothing is written.
+        RequestError: steps of both kinds, or a step without a solved pixel.
+    """
+    timings = Timings(progress)
+    where = devices.resolve(device)
+    plan = read_sweep(sweep)
+    captures = [Capture.open(sweep.parent / step.capture) for step in plan.steps]
+    kinds = {is_pulsed(capture) for capture in captures}
+    if len(kinds) > 1:
+        raise RequestError(f"{sweep}: steps: some are cw and some pulsed: give a sweep for each")
+    plain = _errors(plan, captures, None, where, timings)
+    if kinds == {True}:
+        known: dict[str, Any] = _line(plan, captures, plain)
+    else:
+        known = _wiggling(plan, captures, where, timings)
+    calibration = TofCalibration.model_validate(known)
+    after = _errors(plan, captures, calibration, where, timings)
+    if plan.has_drift:
+        warm = np.array([step.temperature_c for step in plan.steps], dtype=np.float64)
+        drift, level = fit_temperature(after, warm)
+        calibration = TofCalibration.model_validate({**known, "temperature": drift, "offset_m": calibration.offset_m + level})
+        after = after - level - drift.metres_per_c * (warm - drift.reference_c)
+    write_calibration(calibration, out)
+    timings.close()
+    return TofCalibrationResult(calibration, out, float(np.sqrt(np.mean(plain**2))), float(np.sqrt(np.mean(after**2))), len(plan.steps))
+
+
+def _errors(plan: Sweep, captures: list[Capture], calibration: TofCalibration | None, device: str, timings: Timings) -> np.ndarray:
+    """[step] median of measured less true range, metres."""
+    errors = []
+    for step, capture in zip(plan.steps, captures, strict=True):
+        solved = solve_tof(capture, TofOptions(), calibration=calibration, device=device, timings=timings)
+        if not solved.solved.any() or solved.range_m is None:
+            raise RequestError(f"{capture.folder}: no pixel of this step is solved: check its frames and its mask")
+        errors.append(float(np.median((solved.range_m - _true_range(step, capture))[solved.solved])))
+    return np.array(errors)
+
+
+def _true_range(step: Step, capture: Capture) -> np.ndarray:
+    """[rows, cols] along the rays to the plane of the target."""
+    return step.depth_m / z_per_range(capture.camera)
+
+
+def _line(plan: Sweep, captures: list[Capture], errors: np.ndarray) -> dict[str, Any]:
+    """Scale and offset, from the middle ranges of the steps."""
+    true = np.array([float(np.median(_true_range(step, capture)[capture.mask()]))
+                     for step, capture in zip(plan.steps, captures, strict=True)])
+    scale, offset = fit_line(true + errors, true)
+    return {"scale": scale, "offset_m": offset}
+
+
+def _wiggling(plan: Sweep, captures: list[Capture], device: str, timings: Timings) -> dict[str, Any]:
+    """Harmonics of each frequency from the steps at the commonest temperature."""
+    chosen = [(step, capture) for step, capture in zip(plan.steps, captures, strict=True)
+              if step.temperature_c == plan.commonest_temperature_c]
+    timings.stage("wiggling", len(chosen))
+    phases: dict[float, list[np.ndarray]] = {}
+    ranges: dict[float, list[np.ndarray]] = {}
+    for done, (step, capture) in enumerate(chosen, start=1):
+        frames = read_correlations(capture)
+        inside = np.nonzero(capture.mask().reshape(-1))[0]
+        some = inside[np.linspace(0, len(inside) - 1, min(STEP_PIXELS, len(inside))).astype(int)]
+        noise = estimate_noise(frames.images, frames.modulation_hz, frames.reference_phase_rad, cols=capture.camera.width,
+                               scale=frames.scale)
+        found = decode(frames.images, frames.modulation_hz, frames.reference_phase_rad, noise=noise,
+                       saturation=capture.manifest.saturation, scale=frames.scale, device=device)
+        true = _true_range(step, capture).reshape(-1)[some]
+        phase, sigma = found.phase.numpy()[:, some], found.sigma.numpy()[:, some]
+        for row, hz in enumerate(found.modulation_hz.tolist()):
+            good = (sigma[row] > 0) & (sigma[row] < SHARPEST_RAD)
+            phases.setdefault(hz, []).append(phase[row, good].astype(np.float64))
+            ranges.setdefault(hz, []).append(true[good])
+        timings.advance(done)
+    tables: list[Harmonics] = [fit_harmonics(np.concatenate(phases[hz]), np.concatenate(ranges[hz]), hz) for hz in phases]
+    return {"harmonics": tuple(tables)}

@@ -1,0 +1,1 @@
+"""Captures looked at before they are worked on."""

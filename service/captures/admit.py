@@ -1,0 +1,186 @@
+"""Whether what was handed in can be worked on: names, headers and sizes, before a pixel is decoded and in little memory."""
+
+import math
+from pathlib import Path
+from tokenize import TokenError
+from typing import Any
+
+import numpy as np
+
+from service.light.environments import SUFFIXES
+from service.light.sequence import time_steps
+from service.reporting.progress import Progress, Timings
+from stage import images, jxl
+from stage.capture import Capture
+from stage.errors import ImageError, ManifestError, storage
+from stage.files import resolved
+from stage.manifest import FILE_NAME, Manifest, read_manifest
+
+MAX_MANIFEST_BYTES = 16 << 20
+"""Of one capture.json: 20 000 frames have a quarter of it. Read, it takes up to 40 times as much memory."""
+MAX_CHANNELS = 4
+"""Of an image that has as many pixels as are allowed; a smaller one may have more, as its channels are decoded together."""
+
+
+def admit_capture(folder: Path, *, max_pixels: int, progress: Progress | None = None) -> dict[str, Any]:
+    """Look at the manifest of a capture, or of a sequence of captures, and the header of every file that it names.
+
+    Args:
+        folder: of the capture.
+        max_pixels: of an image.
+        progress: told of every capture.
+
+    Returns:
+        What it is: captures, frames, resolution, colour space.
+
+    Raises:
+        ManifestError: the manifest is wrong, or a file lies outside the folder; names the field.
+        ImageError: a file is no image, is cut short, or has more pixels than are allowed; names the file.
+        StorageError: a file cannot be read.
+    """
+    timings = Timings(progress)
+    frames, manifest = 0, None
+    _check_manifest_files(folder)
+    steps = time_steps(folder)
+    timings.stage("check", len(steps))
+    for done, step in enumerate(steps, start=1):
+        if (step / FILE_NAME).is_file():  # else opening it says what is missing
+            _check_places(step, read_manifest(step / FILE_NAME), folder, max_pixels)
+        manifest = Capture.open(step).manifest
+        frames += len(manifest.frames)
+        timings.advance(done)
+    timings.close()
+    assert manifest is not None, "time_steps gives one at the least"
+    return {"captures": len(steps), "frames": frames, "resolution": list(manifest.camera.resolution), "color_space": manifest.color_space,
+            "name": manifest.name}
+
+
+def recheck_capture(folder: Path, *, max_pixels: int) -> None:
+    """Look again at what may have changed since a capture was admitted: where its files lie, and their sizes.
+
+    Who opens it then looks at everything else. A file that is changed between the two is not noticed.
+
+    Raises:
+        ManifestError, ImageError, StorageError: as `admit_capture`.
+    """
+    _check_manifest_files(folder)
+    for step in time_steps(folder):
+        if (step / FILE_NAME).is_file():
+            _check_places(step, read_manifest(step / FILE_NAME), folder, max_pixels)
+
+
+def admit_environment(folder: Path, *, max_pixels: int) -> dict[str, Any]:
+    """Look at the header of an environment.
+
+    Args:
+        folder: which holds one image.
+        max_pixels: that it may have.
+
+    Returns:
+        What it is: its file and resolution.
+
+    Raises:
+        ImageError: not one image, or one of too many pixels.
+        StorageError: it cannot be read.
+    """
+    path = environment_file(folder)
+    if path.suffix.lower() not in SUFFIXES:
+        raise ImageError(f"{path}: an environment is a lat-long .exr or .hdr")
+    header = _check_image(path, max_pixels)
+    if header.width != 2 * header.height:
+        raise ImageError(f"{path}: is {header.width}x{header.height}: a lat-long map is twice as wide as it is high")
+    return {"file": path.name, "resolution": [header.width, header.height]}
+
+
+def environment_file(folder: Path) -> Path:
+    """The one image of an environment.
+
+    Args:
+        folder: which holds it; or the file itself, of one that was registered.
+
+    Raises:
+        ImageError: there is none, or there are several.
+    """
+    if folder.is_file():
+        return folder
+    with storage("read", folder):
+        found = [path for path in sorted(folder.iterdir()) if not path.name.startswith(".")] if folder.is_dir() else []
+    if len(found) != 1:
+        raise ImageError(f"the environment has {len(found)} files: it is one lat-long image")
+    return found[0]
+
+
+def _check_manifest_files(folder: Path) -> None:
+    """Every manifest is a file of the folder, and not so large that to read it fills the memory."""
+    with storage("read", folder):
+        first = folder / FILE_NAME
+        found = [first] if first.exists() or first.is_symlink() or not folder.is_dir() else sorted(folder.glob(f"*/{FILE_NAME}"))
+        for path in found:
+            if not path.exists():
+                continue  # opening it says so
+            _check_place(path, folder, f"{path}")
+            if (size := path.stat().st_size) > MAX_MANIFEST_BYTES:
+                raise ManifestError(f"{path}: has {size} bytes, {MAX_MANIFEST_BYTES} are read")
+
+
+def _check_places(step: Path, manifest: Manifest, folder: Path, max_pixels: int) -> None:
+    """Every file lies in the folder, links followed, and is not too large."""
+    width, height = manifest.camera.resolution
+    if width * height > max_pixels:
+        raise ImageError(f"{step / FILE_NAME}: camera.resolution: {width}x{height} is more than {max_pixels} pixels")
+    capture = Capture(step, manifest)
+    for field, name in capture.files():
+        path = capture.file(name)
+        with storage("read", path):
+            if not path.exists() and not path.is_symlink():
+                continue  # opening the capture says so
+            _check_place(path, folder, f"{step / FILE_NAME}: {field}: {name}")
+        if path.suffix.lower() == ".npy":
+            _check_array(path, max_pixels)
+        else:
+            _check_image(path, max_pixels)
+
+
+def _check_place(path: Path, folder: Path, named: str) -> None:
+    place = resolved(path)
+    if place is None:
+        raise ManifestError(f"{named} leads nowhere")
+    if not place.is_relative_to(folder.resolve()):
+        raise ManifestError(f"{named} leads out of the capture's folder")
+    if not place.is_file():  # to open a pipe would wait for ever
+        raise ManifestError(f"{named} is no file")
+
+
+def _check_image(path: Path, max_pixels: int) -> images.ImageHeader:
+    if path.suffix.lower() == ".jxl":
+        _check_size(path, *jxl.resolution(path), 1, max_pixels)
+    header = images.read_header(path)
+    _check_size(path, header.width, header.height, header.stored, max_pixels)
+    return header
+
+
+def _check_size(path: Path, width: int, height: int, channels: int, max_pixels: int) -> None:
+    if width * height > max_pixels:
+        raise ImageError(f"{path}: has {width}x{height} pixels, {max_pixels} are allowed")
+    if width * height * channels > MAX_CHANNELS * max_pixels:
+        raise ImageError(f"{path}: has {width}x{height} pixels of {channels} channels, {max_pixels} of {MAX_CHANNELS} are allowed")
+
+
+def _check_array(path: Path, max_pixels: int) -> None:
+    """The header of a .npy: real numbers, in two or three dimensions, and as many as its bytes."""
+    with storage("read", path), open(path, "rb") as stream:
+        try:
+            version = np.lib.format.read_magic(stream)
+            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            shape, _, dtype = read(stream)
+        except (ValueError, EOFError, SyntaxError, TokenError, RecursionError, MemoryError) as error:  # NumPy reads it as Python
+            raise ImageError(f"{path}: is not a .npy array") from error
+        present = path.stat().st_size - stream.tell()
+    if dtype.kind not in "iuf":
+        raise ImageError(f"{path}: is not an array of real numbers")
+    if len(shape) not in (2, 3) or min(shape) < 1:
+        raise ImageError(f"{path}: has the shape {shape}: give (rows, cols) or (rows, cols, bins)")
+    if shape[0] * shape[1] > max_pixels:
+        raise ImageError(f"{path}: has {shape[1]}x{shape[0]} pixels, {max_pixels} are allowed")
+    if math.prod(shape) * dtype.itemsize != present:
+        raise ImageError(f"{path}: is not a whole .npy array: it has {present} bytes of {math.prod(shape) * dtype.itemsize}")

@@ -1,0 +1,130 @@
+"""What a capture holds, and everything that is wrong with it: every frame is decoded and checked."""
+
+import os
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from service.reporting.progress import Progress, Timings
+from stage import images
+from stage.capture import Capture
+from stage.correction import Correction
+from stage.errors import StageError
+from stage.gradients import gradient_frames, has_gradients
+from stage.light import DistantLight
+from stage.lighting import check_solvable
+from stage.manifest import Frame
+from stage.point_lights import PlacedLights
+
+
+class Inspection(NamedTuple):
+    """Facts to print, and faults; a capture without faults can be solved."""
+
+    facts: list[tuple[str, str]]
+    faults: list[str]
+
+
+class _Level(NamedTuple):
+    peak: float
+    saturated: int
+    fault: str | None
+
+
+def inspect(path: Path, progress: Progress | None = None) -> Inspection:
+    """Look at every frame of a capture.
+
+    Raises:
+        StageError: the capture cannot be opened at all.
+    """
+    timings = Timings(progress)
+    timings.stage("open", 1)
+    capture = Capture.open(path)
+    frames = [frame for frame in capture.manifest.frames if Path(frame.image).suffix.lower() != ".npy"]
+    timings.stage("frames", len(frames))
+    levels = []
+    with ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="relit-inspect") as pool:
+        for level in pool.map(lambda frame: _level(capture, frame), frames):
+            levels.append(level)
+            timings.advance(len(levels))
+    timings.close()
+    faults = [level.fault for level in levels if level.fault is not None]
+    lights: object = None
+    if capture.sources():
+        try:
+            if has_gradients(capture):
+                gradient_frames(capture)
+            else:
+                lights = check_solvable(capture)
+        except StageError as error:
+            faults.append(str(error))
+    facts = list(_facts(capture))
+    if levels:
+        facts.append(("brightest", f"{max(level.peak for level in levels):.4g} recorded"))
+    if capture.manifest.saturation is not None:
+        count = sum(level.saturated for level in levels)
+        facts.append(("saturated", f"{count} readings at or above {capture.manifest.saturation:g}"))
+    try:
+        mask = capture.mask()
+        facts.append(("mask", f"{int(mask.sum())} of {mask.size} pixels"))
+    except StageError as error:
+        faults.append(str(error))
+    if isinstance(lights, PlacedLights):
+        facts.append(("near lights", _near(lights)))
+    if not faults:
+        try:
+            Correction.of(capture)
+        except StageError as error:
+            faults.append(str(error))
+    return Inspection(facts, faults)
+
+
+def _facts(capture: Capture) -> Iterator[tuple[str, str]]:
+    manifest, camera = capture.manifest, capture.camera
+    yield "name", capture.name
+    yield "folder", str(capture.folder)
+    scale = f"{camera.pixel_size_m:g} m a pixel" if camera.pixel_size_m else "metric" if camera.metric else "no scale"
+    yield "camera", f"{camera.projection}, {camera.width}x{camera.height}, {scale}"
+    yield "colour", manifest.color_space
+    kinds = Counter(_kind(frame) for frame in manifest.frames)
+    yield "frames", ", ".join(f"{count} {kind}" for kind, count in kinds.items())
+    given = [name for name in ("dark", "flat", "mask", "saturation", "projector") if getattr(manifest, name) is not None]
+    if manifest.frames[0].exposure_s is not None:
+        given.append("exposure_s")
+    yield "given", ", ".join(given) or "nothing beside the frames"
+    directions = np.array([light.direction for _, light in capture.lit_by(DistantLight)])
+    if len(directions):
+        behind = int((directions[:, 2] < 0).sum())
+        widest = np.degrees(np.arccos(np.clip(directions[:, 2].min(), -1, 1)))
+        yield "lights", f"{len(directions)} distant, up to {widest:.0f} degrees from the view axis, {behind} behind the object"
+
+
+def _near(lights: PlacedLights) -> str:
+    """How many there are, and how far away."""
+    near = lights.place[:, 3] == 1
+    distance = np.linalg.norm(lights.place[near, :3] - lights.centre, axis=1)
+    return f"{int(near.sum())}, {distance.min():.3g} to {distance.max():.3g} m from the object's centre"
+
+
+def _kind(frame: Frame) -> str:
+    if frame.light is not None:
+        return f"{frame.light.type} light"
+    if frame.pattern is not None:
+        return f"{frame.pattern.code} pattern"
+    return f"{frame.laser.type} laser" if frame.laser is not None else "time of flight"
+
+
+def _level(capture: Capture, frame: Frame) -> _Level:
+    """Brightest value and saturated readings of one frame, or what is wrong with it."""
+    path = capture.file(frame.image)
+    try:
+        pixels = images.read_pixels(path)
+        images.check_radiance(path, pixels)
+    except StageError as error:
+        return _Level(0.0, 0, str(error))
+    limit = capture.manifest.saturation
+    saturated = 0 if limit is None else int((pixels >= limit).any(axis=-1).sum())
+    return _Level(float(pixels.max()), saturated, None)

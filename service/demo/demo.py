@@ -1,0 +1,71 @@
+"""The main job on the shipped sample: solve, export, relight, and one picture of it all."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import service
+from service.demo.preview import write_preview
+from service.errors import RequestError
+from service.light.relight import relight
+from service.reporting.progress import Progress, Timings
+from service.requests.export import ExportRequest
+from service.requests.relight import LightWeights, RelightRequest
+from service.requests.solve import SolveRequest
+from service.solve.solve import SolveResult, solve
+from service.usd.export import export
+from stage.capture import Capture
+from stage.correction import Correction
+from stage.lighting import distant_lights
+
+SAMPLE = "owl"
+FRAMES = "1-24"
+KEY_LIGHT = (0.45, 0.5, 0.74)
+"""The captured image nearest to this direction, above right of the camera, is the one that the picture shows."""
+
+
+class DemoResult(NamedTuple):
+    """What the demo made."""
+
+    solved: SolveResult
+    asset: Path
+    frames: tuple[Path, ...]
+    preview: Path
+
+
+def sample_folder() -> Path:
+    """Where the shipped sample lies: inside the installed package, or in the checkout.
+
+    Raises:
+        RequestError: it is in neither.
+    """
+    package = Path(service.__file__).parent
+    for folder in (package / "samples" / SAMPLE, package.parent / "samples" / SAMPLE):
+        if (folder / "capture.json").exists():
+            return folder
+    raise RequestError(f"the sample capture {SAMPLE} is not installed: run the demo from a checkout of relit")
+
+
+def demo(out: Path, *, device: str | None = None, progress: Progress | None = None) -> DemoResult:
+    """Solve, export and relight the sample.
+
+    Args:
+        out: folder for the results; its `.relit` holds the stack cache, so that the sample itself is never written to.
+        device: cpu, cuda:0, …; None: the first CUDA device, else the CPU.
+        progress: told of every stage.
+    """
+    sample = sample_folder()
+    cache = out / ".relit"
+    solved = solve(SolveRequest(capture=sample, out=out, device=device, cache=cache), progress)
+    asset = export(ExportRequest(maps=out, out=out / "asset.usdz"), progress)
+    relit = relight(RelightRequest(capture=sample, environment=sample / "environment.exr", out=str(out / "frame.####.exr"),
+                                   frames=FRAMES, spin_degrees=360.0, weights=LightWeights.SMOOTH, device=device,
+                                   cache=cache), progress)
+    timings = Timings(progress)
+    timings.stage("preview", 1)
+    preview = out / "preview.png"
+    capture = Capture.open(sample)
+    nearest = int((distant_lights(capture).direction @ KEY_LIGHT).argmax())
+    captured = Correction.of(capture).apply(capture.sources()[nearest]).pixels
+    write_preview(preview, solved.maps, captured, relit.frames)
+    timings.close()
+    return DemoResult(solved, asset, relit.frames, preview)

@@ -1,0 +1,1 @@
+"""Projected patterns, lasers and time of flight to depth."""

@@ -1,0 +1,175 @@
+"""Capture → depth.exr, points.ply and report.json, whatever the depth is measured with: the capture's frames decide."""
+
+import hashlib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from kernels import device as devices
+from kernels.status import Status
+from service.depth.laser import check_laser, solve_laser
+from service.depth.patterns import solve_patterns
+from service.depth.points import point_cloud
+from service.depth.solution import DepthSolution
+from service.depth.tof import solve_tof
+from service.errors import RequestError
+from service.reporting.progress import Progress, Timings
+from service.reporting.provenance import metadata, report
+from service.requests.depth import DepthRequest, Ranging
+from stage.capture import Capture
+from stage.depth_maps import DEPTH_FILE, DepthMaps
+from stage.errors import ManifestError
+from stage.files import write_text
+from stage.fingerprint import Fingerprints
+from stage.ingest import CACHE_FOLDER
+from stage.manifest import FILE_NAME, Frame
+from stage.pattern import UniformPattern
+from stage.ply import POINTS_FILE, write_ply
+
+REPORT_FILE = "report.json"
+PLAUSIBLE_M = 0.005, 500.0
+"""Median depths that a projector or laser measures: outside, the units of the calibration are wrong."""
+
+
+class DepthResult(NamedTuple):
+    """What was made."""
+
+    maps: DepthMaps
+    depth_path: Path
+    points_path: Path
+    report_path: Path
+    method: str
+    points: int
+    counts: dict[str, int]
+    """Pixels of the mask per status."""
+
+
+def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResult:
+    """Measure the depth of a capture.
+
+    Args:
+        request: what to measure and where to put it.
+        progress: told of every stage.
+
+    Raises:
+        StageError, KernelError: bad input; nothing is written.
+        StorageError: the results cannot be written; nothing is left half-written.
+    """
+    timings = Timings(progress)
+    device = devices.resolve(request.device)
+    timings.stage("open", 1)
+    capture = Capture.open(request.capture)
+    using = _ranging(capture, request.using)
+    if request.normals and capture.camera.projection != "perspective":
+        raise RequestError("--normals: needs a perspective camera, that of the capture is orthographic")
+    mask = capture.mask()
+    solution = _solve(using, capture, mask, request, device, timings)
+    _check_plausible(solution, capture, using)
+    timings.stage("points", 1)
+    cloud = point_cloud(solution, capture.camera, color_space=capture.manifest.color_space, normals=request.normals)
+    timings.stage("write", 1)
+    content = _content(capture)
+    sources = metadata(request, capture=capture.name, inputs=content, method=solution.method)
+    maps = DepthMaps(camera=capture.camera, mask=solution.solved, depth=solution.depth, range=solution.range_m,
+                     projector_u=solution.projector_u, projector_v=solution.projector_v, amplitude=solution.amplitude,
+                     sigma=solution.sigma, confidence=solution.sureness(), status=solution.status, provenance=sources)
+    depth_path, points_path, report_path = (request.out / name for name in (DEPTH_FILE, POINTS_FILE, REPORT_FILE))
+    maps.write(depth_path)
+    write_ply(cloud, points_path, comments=tuple(f"{key} {value}" for key, value in sources.items()))
+    counts = solution.counts(mask)
+    write_text(report_path, report(
+        inputs={"capture": str(request.capture), "name": capture.name, "content": content, "frames": len(capture.manifest.frames),
+                "resolution": list(capture.camera.resolution), "color_space": capture.manifest.color_space},
+        method=solution.method,
+        options=request.model_dump(mode="json", exclude={"capture", "out", "device", "cache"}),
+        found=solution.facts,
+        device=devices.describe(device),
+        timings_s=timings.close(),
+        pixels={"mask": int(mask.sum()), **counts},
+        points=len(cloud.points),
+        depth_m=statistics(solution.depth[solution.solved]),
+        sigma_m=statistics(solution.sigma[solution.solved]) if solution.sigma is not None else {},
+    ))
+    return DepthResult(maps, depth_path, points_path, report_path, solution.method, len(cloud.points), counts)
+
+
+def _solve(using: Ranging, capture: Capture, mask: np.ndarray, request: DepthRequest, device: str, timings: Timings) -> DepthSolution:
+    """Each kind of frames to its own solver."""
+    near, far = request.near_m or 0.0, request.far_m or np.inf
+    if using is Ranging.TOF:
+        return solve_tof(capture, request.tof, near_m=request.near_m, far_m=request.far_m, device=device, timings=timings)
+    if using is Ranging.LASER:
+        check_laser(capture)
+        return solve_laser(capture, mask, device, near_m=near, far_m=far, timings=timings)
+    return solve_patterns(capture, mask, request, device, near_m=near, far_m=far, timings=timings)
+
+
+def _ranging(capture: Capture, wanted: Ranging | None) -> Ranging:
+    """What the frames are for. Black and white frames go with anything."""
+    found = [using for using in Ranging if any(_is(frame, using) for frame in capture.manifest.frames)]
+    where = f"{capture.folder / FILE_NAME}: frames"
+    if not found:
+        raise ManifestError(f"{where}: none has a pattern with a code, a laser or tof: relit depth needs such frames, "
+                            "relit solve takes light frames")
+    if wanted is not None:
+        if wanted not in found:
+            raise ManifestError(f"{where}: none has a {wanted}, which --using asks for: there are {_and(found)} frames")
+        return wanted
+    if len(found) > 1:
+        raise ManifestError(f"{where}: there are {_and(found)} frames: --using says which to take")
+    return found[0]
+
+
+def _is(frame: Frame, using: Ranging) -> bool:
+    if using is Ranging.PATTERN:
+        return frame.pattern is not None and not isinstance(frame.pattern, UniformPattern)
+    return getattr(frame, using.value) is not None
+
+
+def _and(words: Iterable[str]) -> str:
+    return " and ".join(words)
+
+
+def _check_plausible(solution: DepthSolution, capture: Capture, using: Ranging) -> None:
+    """Nothing solved, or depths that no such device measures, is bad input and no result."""
+    solved = solution.solved
+    if not solved.any():
+        reasons = {name: count for name, count in solution.counts(np.ones_like(solved)).items() if count and name != "unsolved"}
+        text = ", ".join(f"{count} {name}" for name, count in reasons.items()) or "nothing is inside the mask"
+        raise ManifestError(f"{capture.folder}: no pixel has a depth ({text}): {_advice(reasons, using)}")
+    middle = float(np.median(solution.depth[solved]))
+    if using is not Ranging.TOF and not PLAUSIBLE_M[0] <= middle <= PLAUSIBLE_M[1]:
+        field = "projector.camera_from_projector" if using is Ranging.PATTERN else "frames[].laser"
+        raise ManifestError(f"{capture.folder / FILE_NAME}: {field}: the median depth comes out as {middle:.3g} m: give lengths in metres")
+
+
+def _advice(reasons: dict[str, int], using: Ranging) -> str:
+    """What most often is the cause of the commonest status."""
+    most = max(reasons, key=lambda name: reasons[name], default="")
+    if most == Status.ILL_POSED.name.lower():
+        return "the projected coordinate does not change with depth: project columns from beside the camera, rows from above it"
+    if most == Status.OUT_OF_RANGE.name.lower():
+        return "check the pose of the projector and its units, and --near-m and --far-m"
+    if most in (Status.LOW_MODULATION.name.lower(), Status.SHADOWED.name.lower()):
+        return "the light of the device is not seen in the images"
+    return f"check the {using} frames"
+
+
+def _content(capture: Capture) -> str:
+    """Content hash of every file that the capture names, combined."""
+    names = sorted({name for _, name in capture.files()})
+    hashes = Fingerprints(capture.folder, capture.folder / CACHE_FOLDER / "files.json").of(names)
+    combined = hashlib.blake2b(digest_size=16)
+    for name in names:
+        combined.update(f"{name}\0{hashes[name]}\0".encode())
+    return combined.hexdigest()
+
+
+def statistics(values: np.ndarray) -> dict[str, Any]:
+    """Median and the 5th and 95th percentile of what was measured, for the report."""
+    if values.size == 0:
+        return {}
+    low, middle, high = np.percentile(values.astype(np.float64), [5, 50, 95])
+    return {"p05": float(f"{low:.6g}"), "median": float(f"{middle:.6g}"), "p95": float(f"{high:.6g}")}

@@ -1,0 +1,187 @@
+"""Pattern frames → depth: decode each axis band by band, then triangulate."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from kernels.status import SOLVED, Status
+from kernels.structured.decoded import Decoded
+from kernels.structured.frames import NoiseModel, saturated_bits, upload
+from kernels.structured.join import cropped
+from kernels.structured.triangulate import ProjectorModel, triangulate
+from service.depth.codes import AxisPlan, PatternDevice, Readings, plan_axis
+from service.depth.solution import DepthSolution
+from service.reporting.progress import Timings
+from service.requests.depth import DepthRequest
+from stage.capture import Capture
+from stage.colour import GREY_WEIGHTS, is_linear
+from stage.correction import Correction
+from stage.errors import ManifestError
+from stage.manifest import FILE_NAME, Frame
+from stage.patterns.collect import BinaryCode, Collected, collect
+from stage.planes import Planes, frame_planes
+from stage.projector import Projector
+from stage.rig_check import check_projector, device_from_camera, project
+
+SCALE_PERCENTILE = 99.9
+"""Of the brightest frame's pixels: full scale of images that have none of their own (floating point, no saturation given)."""
+SCALE_SAMPLE = 500_000
+"""Pixels of a frame from which it is taken."""
+DECODE_BYTES_PER_PIXEL = 200
+"""What decoding and triangulation allocate beside the planes."""
+
+
+def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, device: str, *, near_m: float, far_m: float,
+                   timings: Timings) -> DepthSolution:
+    """Decode the projector's columns, rows or both, and intersect them with the lines of sight.
+
+    Args:
+        capture: with a projector and pattern frames.
+        mask: [rows, cols] bool.
+        request: its noise and residual.
+        device: where.
+        near_m, far_m: depths outside are OUT_OF_RANGE.
+        timings: told of every stage.
+
+    Raises:
+        StageError: no projector, an incomplete code, an unreadable frame.
+    """
+    projector = check_projector(capture)
+    frames = [frame for frame in capture.manifest.frames if frame.pattern is not None]
+    collected, columns, rows = plan_codes(capture, frames, PatternDevice(projector.resolution, projector.response, projector.crosstalk),
+                                          refine=request.refine)
+    plans = (columns, rows)
+    colour = any(plan is not None and plan.colour for plan in plans)
+    timings.stage("frames", len(frames))
+    with frame_planes(capture, frames, colour=colour, cache=request.cache, progress=timings.advance) as planes:
+        full = full_scale(planes, capture, frames)
+        noise = NoiseModel(request.read_noise * full, request.photon_gain * full)
+        solution = _bands(planes, mask, plans, projector, capture, noise, device, (near_m, far_m, request.max_residual_px),
+                          timings)
+    solution.colour = scene_colour(capture, frames, collected)
+    solution.facts |= {"full_scale": float(f"{full:.6g}"), "frames": len(frames),
+                       "codes": {plan.axis: plan.name for plan in plans if plan is not None},
+                       "unused": [name for plan in plans if plan is not None for name in plan.unused]}
+    return solution
+
+
+def plan_codes(capture: Capture, frames: list[Frame], projector: PatternDevice, *,
+               refine: bool = False) -> tuple[Collected, AxisPlan | None, AxisPlan | None]:
+    """The codes of a capture and how each axis is decoded; what is missing is said with the file's name."""
+    try:
+        collect([frame.pattern for frame in capture.manifest.frames])  # so that what is wrong is said with the manifest's numbers
+        collected = collect([frame.pattern for frame in frames])
+        columns, rows = (plan_axis(collected, axis, projector, refine=refine) for axis in ("column", "row"))
+        return collected, columns, rows
+    except ManifestError as error:
+        raise ManifestError(f"{capture.folder / FILE_NAME}: frames: {error}") from error
+
+
+def _bands(planes: Planes, mask: np.ndarray, plans: tuple[AxisPlan | None, AxisPlan | None], projector: Projector, capture: Capture,
+           noise: NoiseModel, device: str, limits: tuple[float, float, float], timings: Timings) -> DepthSolution:
+    shape = mask.shape
+    columns, rows = plans
+    model = projector_model(projector)
+    x, y = capture.camera.plane_coordinates()
+    maps = {name: np.zeros(shape, np.float32) for name in ("depth", "sigma", "residual", "amplitude", "u", "v")}
+    status = np.zeros(shape, np.uint8)
+    guessed = {name: np.zeros(shape, dtype=bool) for name in "uv"}
+    timings.stage("decode", shape[0])
+    for band, decoded in decoded_bands(planes, plans, noise, device):
+        near_m, far_m, residual = limits
+        found = triangulate(x[band].ravel().astype(np.float32), y[band].ravel().astype(np.float32), decoded[0], decoded[1], model,
+                            near_m=near_m, far_m=far_m, max_residual_px=residual, device=device)
+        part = mask[band]
+
+        def place(name: str, values: np.ndarray, kept: np.ndarray, band: slice = band) -> None:
+            flat = values[:kept.size].reshape(kept.shape)
+            maps[name][band] = np.where(kept, flat, 0)
+
+        code = found.status.numpy()[:part.size].reshape(part.shape)
+        status[band] = np.where(part, code, int(Status.UNSOLVED))
+        solved = np.isin(status[band], SOLVED)
+        for name in ("depth", "sigma", "residual"):
+            place(name, getattr(found, name).numpy(), solved)
+        place("amplitude", _amplitude(decoded), part)
+        for name, axis in zip("uv", decoded, strict=True):
+            if axis is not None:
+                place(name, axis.coordinate.numpy(), solved)
+                sure = np.isin(axis.status.numpy()[:part.size].reshape(part.shape), SOLVED)
+                guessed[name][band] = solved & ~sure
+        timings.advance(band.stop)
+    for index, (name, missing) in enumerate(guessed.items()):
+        if missing.any():  # solved from the other axis alone: where the point lies in the projector
+            points = capture.camera.points(-maps["depth"])[missing]
+            maps[name][missing] = project(projector, points)[0][:, index]
+    solved = np.isin(status, SOLVED)
+    facts = {}
+    if columns is not None and rows is not None and solved.any():
+        low, high = np.percentile(maps["residual"][solved], [50, 95])
+        facts["residual_px"] = {"median": float(f"{low:.4g}"), "p95": float(f"{high:.4g}")}
+    names = sorted({plan.name for plan in plans if plan is not None})
+    return DepthSolution(method=", ".join(names), depth=maps["depth"], status=status, sigma=maps["sigma"],
+                         projector_u=maps["u"] if columns is not None else None, projector_v=maps["v"] if rows is not None else None,
+                         amplitude=maps["amplitude"], facts=facts)
+
+
+def decoded_bands(planes: Planes, plans: Sequence[AxisPlan | None], noise: NoiseModel,
+                  device: str) -> Iterator[tuple[slice, list[Decoded | None]]]:
+    """Decode the planes band by band.
+
+    Yields:
+        A range of rows, and each axis decoded in it; None where an axis has no plan.
+    """
+    _, height, _, width = planes.values.shape
+    halo = max((plan.halo for plan in plans if plan is not None), default=0)
+    for band in planes.bands(DECODE_BYTES_PER_PIXEL):
+        around = slice(max(band.start - halo, 0), min(band.stop + halo, height))
+        values = planes.band(around)
+        bits = None if planes.saturated is None else saturated_bits(planes.saturated[:, around].reshape(len(values), -1))
+        grey = values[:, 0] if values.shape[1] == 1 else np.tensordot(values, np.array(GREY_WEIGHTS, np.float32), ([1], [0]))
+        readings = Readings(upload(np.ascontiguousarray(grey), bits, device=device),
+                            upload(values, bits, device=device) if values.shape[1] > 1 else None, width)
+        decoded = [None if plan is None else plan.decode(readings, noise) for plan in plans]
+        if around != band:
+            first, count = (band.start - around.start) * width, (band.stop - band.start) * width
+            decoded = [None if axis is None else cropped(axis, first, count, device=device) for axis in decoded]
+        yield band, decoded
+
+
+def _amplitude(decoded: list[Decoded | None]) -> np.ndarray:
+    """The weaker of the axes: a pixel is as good as its worse one."""
+    return np.minimum.reduce([axis.amplitude.numpy() for axis in decoded if axis is not None])
+
+
+def projector_model(projector: Projector) -> ProjectorModel:
+    """The projector as triangulation takes it."""
+    width, height = projector.resolution
+    lens = projector.distortion
+    return ProjectorModel((width, height), projector.focal_px, projector.principal_px or (width / 2, height / 2),
+                          lens.k if lens is not None else (0.0, 0.0, 0.0), lens.p if lens is not None else (0.0, 0.0),
+                          device_from_camera(projector))
+
+
+def full_scale(planes: Planes, capture: Capture, frames: list[Frame]) -> float:
+    """The largest reading there can be, in the unit of the corrected images."""
+    exposure = min((frame.exposure_s for frame in frames if frame.exposure_s is not None), default=1.0)
+    manifest = capture.manifest
+    integers = all(Path(frame.image).suffix.lower() in (".png", ".jpg", ".jpeg") for frame in frames)
+    if integers or not is_linear(manifest.color_space):
+        return 1.0 / exposure
+    if manifest.saturation is not None:
+        return manifest.saturation / exposure
+    every = max(1, planes.values[0].size // SCALE_SAMPLE)
+    return max(float(max(np.percentile(frame.reshape(-1)[::every], SCALE_PERCENTILE) for frame in planes.values)), 1e-12)
+
+
+def scene_colour(capture: Capture, frames: list[Frame], collected: Collected) -> np.ndarray | None:
+    """[rows, cols, 3] what the scene looks like: the white frame, else a bit and its inverse, which light it evenly together."""
+    numbers = [collected.white] if collected.white is not None else []
+    for code in collected.codes:
+        if not numbers and isinstance(code, BinaryCode) and code.inverses is not None:
+            numbers = [code.frames[0], code.inverses[0]]
+    if not numbers:
+        return None
+    correction = Correction.of(capture)
+    return np.asarray(np.sum([correction.apply(frames[number]).pixels for number in numbers], axis=0))

@@ -1,0 +1,117 @@
+"""A scan folder → points.ply, points.usdc, points.las and report.json: shots of a platform that may move, as one cloud in the world."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from kernels import device as devices
+from kernels.status import SOLVED
+from kernels.tof.modulation import SPEED_OF_LIGHT
+from kernels.tof.pileup import correct_pileup, place, unhurried
+from kernels.tof.pulse import STEPS_PER_SIGMA
+from kernels.tof.pulse_width import estimate_pulse
+from kernels.tof.returns import find_returns
+from service.errors import RequestError
+from service.reporting.progress import Progress, Timings
+from service.reporting.provenance import metadata, report
+from service.requests.scan import ScanRequest
+from service.usd.points import write_points
+from stage.files import write_text
+from stage.fingerprint import Fingerprints
+from stage.las import LAS_FILE, las_is_installed, write_las
+from stage.ply import POINTS_FILE, PointCloud, write_ply
+from stage.tof.scan import FILE_NAME, Shots, place_points, read_scan
+
+USD_FILE, REPORT_FILE = "points.usdc", "report.json"
+MOST_RETURNS = 4
+WHITE_PERCENTILE = 99.0
+
+
+class ScanResult(NamedTuple):
+    """What was made."""
+
+    cloud: PointCloud
+    points_path: Path
+    usd_path: Path
+    las_path: Path | None
+    """Where it was asked for."""
+    report_path: Path
+    counts: dict[str, int]
+    """Shots by what became of them."""
+
+
+def scan(request: ScanRequest, progress: Progress | None = None) -> ScanResult:
+    """Turn a scan into a point cloud.
+
+    Args:
+        request: what to read and where to put it.
+        progress: told of every stage.
+
+    Raises:
+        StageError, KernelError: bad input; nothing is written.
+        RequestError: no shot gives a point, or LAS is asked for without laspy.
+        StorageError: the results cannot be written.
+    """
+    if request.las and not las_is_installed():
+        raise RequestError(f"{LAS_FILE} is written with laspy, which is not installed: pip install 'relit[las]'")
+    timings = Timings(progress)
+    device = devices.resolve(request.device)
+    timings.stage("read", 1)
+    shots = read_scan(request.scan)
+    timings.stage("returns", 1)
+    index, range_m, intensity, facts = _returns(shots, device)
+    near, far = request.near_m or 0.0, request.far_m or np.inf
+    inside = (range_m >= near) & (range_m <= far) & (range_m > 0)
+    timings.stage("place", 1)
+    points, covered = place_points(shots, index[inside], range_m[inside])
+    index, range_m, intensity, points = index[inside][covered], range_m[inside][covered], intensity[inside][covered], points[covered]
+    if len(points) == 0:
+        raise RequestError(f"{shots.folder / FILE_NAME}: no shot gives a point: {int((~covered).sum())} lie outside the track in time, "
+                           f"{int((~inside).sum())} outside the span of ranges")
+    shots_used = len(np.unique(index))
+    counts = {"shots": len(shots.time_s), "with_points": shots_used, "points": len(points),
+              "out_of_range": int((~inside).sum()), "outside_track": int((~covered).sum())}
+    white = float(np.percentile(intensity, WHITE_PERCENTILE))
+    grey = np.clip(intensity / white, 0, 1) if white > 0 else np.full(len(intensity), 0.5)
+    encoded = np.where(grey <= 0.0031308, 12.92 * grey, 1.055 * np.maximum(grey, 1e-9) ** (1 / 2.4) - 0.055)
+    colours = np.repeat(np.rint(255 * encoded).astype(np.uint8)[:, None], 3, axis=1)
+    cloud = PointCloud(points.astype(np.float32), colours, intensity=intensity.astype(np.float32))
+    timings.stage("write", 1)
+    names = [FILE_NAME, shots.scan.shots, *(() if shots.scan.waveforms is None else (shots.scan.waveforms.file,))]
+    hashes = Fingerprints(shots.folder, request.out / "files.json").of(names)
+    sources = metadata(request, capture=shots.scan.name, inputs=" ".join(hashes[name] for name in names), method="scan")
+    points_path, usd_path, report_path = (request.out / name for name in (POINTS_FILE, USD_FILE, REPORT_FILE))
+    write_ply(cloud, points_path, comments=tuple(f"{key} {value}" for key, value in sources.items()))
+    write_points(cloud, usd_path, name=shots.scan.name, provenance=sources)
+    las_path = None
+    if request.las:
+        las_path = request.out / LAS_FILE
+        scales = write_las(points, intensity, shots.time_s[index], index, range_m, las_path, provenance=sources)
+        facts["las"] = scales._asdict()
+    write_text(report_path, report(
+        inputs={"scan": str(request.scan), "name": shots.scan.name, "content": hashes, "poses": len(shots.scan.track)},
+        method="scan", options=request.model_dump(mode="json", include={"near_m", "far_m", "las"}), found=facts,
+        device=devices.describe(device), timings_s=timings.close(), shots=counts,
+        extent_m={"low": points.min(axis=0).tolist(), "high": points.max(axis=0).tolist()}))
+    return ScanResult(cloud, points_path, usd_path, las_path, report_path, counts)
+
+
+def _returns(shots: Shots, device: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    """Shot, range and intensity of each return, and what was found out about them."""
+    if shots.waveforms is None:
+        assert shots.range_m is not None and shots.intensity is not None  # the reader gives either these or waveforms
+        index = np.nonzero(np.isfinite(shots.range_m) & np.isfinite(shots.intensity))[0]
+        return index, shots.range_m[index], shots.intensity[index], {"ranges": "as recorded"}
+    waveforms = shots.scan.waveforms
+    assert waveforms is not None
+    counts = place(shots.waveforms, device)
+    exposed = correct_pileup(counts, pulses=waveforms.pulses or 1) if waveforms.first_photon_only else unhurried(counts)
+    pulse = estimate_pulse(exposed, shots.waveforms)
+    found = find_returns(exposed, pulse, most=MOST_RETURNS)
+    there = (found.photons.numpy() > 0) & np.isin(found.status.numpy(), SOLVED)
+    number, index = np.nonzero(there)
+    time_s = waveforms.start_s + found.position.numpy()[number, index].astype(np.float64) * waveforms.bin_s
+    facts = {"ranges": "from waveforms", "pulse_sigma_s": float(f"{pulse.step * STEPS_PER_SIGMA * waveforms.bin_s:.4g}"),
+             "shots_with_several_returns": int(there[1].sum())}
+    return index, SPEED_OF_LIGHT * time_s / 2, found.photons.numpy()[number, index], facts

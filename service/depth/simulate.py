@@ -1,0 +1,66 @@
+"""A depth → the capture that a time-of-flight camera would make of it, to plan with: simulate, solve, compare."""
+
+from pathlib import Path
+
+import numpy as np
+
+from service.depth.tof import z_per_range
+from service.requests.simulate import SimulateCwRequest, SimulatePulsedRequest, SimulateRequest
+from stage.camera import Camera
+from stage.depth_maps import DEPTH_FILE, DepthMaps
+from stage.depth_normals import depth_normals
+from stage.tof.simulate import (
+    CorrelationCamera,
+    HistogramCamera,
+    TofScene,
+    correlation_images,
+    histograms,
+    write_correlations,
+    write_histograms,
+)
+
+
+def simulate_tof(request: SimulateCwRequest | SimulatePulsedRequest) -> Path:
+    """Write a simulated capture.
+
+    Args:
+        request: scene, camera, where to.
+
+    Returns:
+        The capture.json.
+
+    Raises:
+        ResultError, ImageError: the depth cannot be read.
+        StorageError: the capture cannot be written.
+    """
+    maps = DepthMaps.read(request.depth / DEPTH_FILE if request.depth.is_dir() else request.depth)
+    scene, camera = _scene(maps, request), maps.camera
+    random = None if request.seed is None else np.random.default_rng(request.seed)
+    name = maps.provenance.get("relit:capture", request.depth.stem)
+    if isinstance(request, SimulateCwRequest):
+        sensor = CorrelationCamera(modulation_hz=request.modulation_hz, phases=request.phases, signal_electrons=request.signal_electrons,
+                                   ambient_electrons=request.ambient_electrons, read_noise_electrons=request.read_noise_electrons,
+                                   full_well=request.full_well)
+        return write_correlations(request.out, name, correlation_images(scene, sensor, random), camera, sensor)
+    counter = HistogramCamera(bins=request.bins, bin_s=request.bin_s, pulse_sigma_s=request.pulse_sigma_s,
+                              signal_photons=request.signal_photons, background=request.background, pulses=request.pulses)
+    return write_histograms(request.out, name, histograms(scene, counter, random), camera, counter)
+
+
+def _scene(maps: DepthMaps, request: SimulateRequest) -> TofScene:
+    """Ranges, and cosines from the normals of the depth; pixels without a depth are black, where the normal is not known it faces."""
+    range_m = np.where(maps.mask, maps.depth / z_per_range(maps.camera), 1.0)
+    rays = _rays(maps.camera)
+    normal = depth_normals(maps.depth, maps.mask, maps.camera).astype(np.float64)
+    known = np.linalg.norm(normal, axis=-1) > 0.5
+    cosine = np.where(known, np.clip(-(normal * rays).sum(axis=-1), 0, 1), 1.0)
+    return TofScene(range_m=range_m, albedo=np.where(maps.mask, request.albedo, 0.0), cosine=cosine)
+
+
+def _rays(camera: Camera) -> np.ndarray:
+    """[rows, cols, 3] unit directions away from the camera."""
+    x, y = camera.plane_coordinates()
+    away = -np.ones_like(x)
+    if camera.projection == "orthographic":
+        x, y = np.zeros_like(x), np.zeros_like(y)
+    return np.stack([x, y, away], axis=-1) / np.sqrt(x * x + y * y + 1)[..., None]

@@ -1,0 +1,1 @@
+"""Captures and solved maps under new light."""

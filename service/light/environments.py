@@ -1,0 +1,91 @@
+"""Environment maps: one for all frames or one a frame, checked by their headers at once and read when their frame comes."""
+
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from service.errors import RequestError
+from service.light.frames import numbered
+from stage import exr, fingerprint, images
+from stage.colour import convert
+from stage.errors import ImageError
+
+SUFFIXES = {".exr", ".hdr"}
+
+
+class Environments:
+    """The maps of `--environment`: a file, or a sequence of files where the name has a run of #."""
+
+    def __init__(self, pattern: Path) -> None:
+        """Args: pattern: as it was given.
+
+        Raises:
+            RequestError: several runs of #, or one in the folder.
+        """
+        self._pattern = pattern
+        self._sequence = "#" in str(pattern) and not pattern.is_file()
+        self._digests: dict[Path, str] = {}
+        self._last: tuple[Path, str, np.ndarray] | None = None
+        if self._sequence and (len(re.findall("#+", pattern.name)) != 1 or "#" in str(pattern.parent)):
+            raise RequestError(f"--environment {pattern}: the file name of a sequence has one run of # for the frame number")
+
+    def path(self, number: int) -> Path:
+        """The map of a frame."""
+        return self._pattern.with_name(numbered(self._pattern.name, number)) if self._sequence else self._pattern
+
+    def check(self, numbers: Iterable[int]) -> None:
+        """Look at the header of every map.
+
+        Raises:
+            RequestError: a map of the sequence is not there; names it and its frame.
+            ImageError: not EXR or HDR, or not twice as wide as high.
+            StorageError: a map cannot be opened.
+        """
+        for path, number in {self.path(number): number for number in numbers}.items():
+            if path.suffix.lower() not in SUFFIXES:
+                raise ImageError(f"{path}: an environment is a lat-long .exr or .hdr")
+            if self._sequence and not path.exists():
+                raise RequestError(f"--environment {self._pattern}: frame {number} has no map: {path} is not there")
+            header = images.read_header(path)
+            if header.width != 2 * header.height:
+                raise ImageError(f"{path}: is {header.width}x{header.height}: a lat-long map is twice as wide as high")
+
+    def read(self, path: Path, space: str) -> np.ndarray:
+        """The pixels of one map, in a working space; the last one read is kept.
+
+        Returns:
+            [rows, cols, 3] float32 scene-linear radiance.
+
+        Raises:
+            ImageError: impossible values (counted), or a colour space that is not known.
+        """
+        if self._last is None or self._last[:2] != (path, space):
+            self._last = (path, space, read_environment(path, space))
+        return self._last[2]
+
+    def content(self, path: Path) -> str:
+        """The content hash of a map."""
+        if path not in self._digests:
+            self._digests[path] = fingerprint.digest(path)
+        return self._digests[path]
+
+
+def read_environment(path: Path, space: str) -> np.ndarray:
+    """Read a lat-long map into a working space.
+
+    Returns:
+        [rows, cols, 3] float32 scene-linear radiance.
+
+    Raises:
+        ImageError: impossible values (counted), or a colour space that is not known.
+    """
+    pixels = images.read_pixels(path).astype(np.float32)
+    images.check_radiance(path, pixels)
+    try:
+        given = exr.color_space_of(exr.read_header(path).metadata) if path.suffix.lower() == ".exr" else "lin_rec709_scene"
+        converted = convert(pixels, given, space)
+    except ValueError as error:
+        raise ImageError(f"{path}: {error}") from error
+    return np.maximum(converted, 0)  # a colour outside the working space's gamut has a negative channel

@@ -1,0 +1,84 @@
+"""Solved maps as a surface that can be lit: its pixels in batches on a device, and what they see over its height."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from kernels.relight.occlusion import see_lights
+from kernels.relight.shading import Surface, upload_surface
+from service.solve.batches import view_directions
+from service.solve.material import projection_of
+from stage.errors import ResultError
+from stage.maps import SurfaceMaps
+
+BATCH_PIXELS = 1 << 17
+"""Pixels that are lit at one time: 8 MB of maps, and a byte each for every light that shadows are kept of."""
+
+
+class ModelBatch(NamedTuple):
+    """Some pixels of the surface."""
+
+    pixels: np.ndarray  # [n] row-major positions in the image
+    surface: Surface
+
+
+class SurfaceModel:
+    """A surface that can be lit."""
+
+    def __init__(self, maps: SurfaceMaps, where: Path, device: str) -> None:
+        """Take solved maps.
+
+        Args:
+            maps: with normal, diffuse albedo and height; without specular and roughness there is no specular lobe.
+            where: their file, for messages.
+            device: where.
+
+        Raises:
+            ResultError: a layer is not there, or no pixel is solved.
+        """
+        for name in ("normal", "diffuse_albedo", "height"):
+            if getattr(maps, name) is None:
+                raise ResultError(f"{where}: has no layer {name}, which lighting the maps needs: solve with lambert, robust or svbrdf")
+        assert maps.normal is not None and maps.diffuse_albedo is not None and maps.height is not None
+        self.maps, self.device = maps, device
+        normal = maps.normal.reshape(-1, 3)
+        whole = maps.mask.reshape(-1) & np.isfinite(maps.height).reshape(-1) & (np.abs(normal).sum(axis=1) > 0)
+        self.pixels = np.flatnonzero(whole)
+        """[n] Row-major positions of the solved pixels."""
+        if not len(self.pixels):
+            raise ResultError(f"{where}: no pixel is solved")
+        self._points = maps.camera.points(maps.height).reshape(-1, 3)
+        self._view = view_directions(maps.camera)
+        inside = whole.reshape(maps.mask.shape)
+        self._height = wp.array(np.where(inside, maps.height, 0).astype(np.float32), dtype=wp.float32, device=device)
+        self._mask = wp.array(inside.astype(np.uint8), dtype=wp.uint8, device=device)
+        self._projection = projection_of(maps.camera)
+
+    def batches(self) -> Iterator[ModelBatch]:
+        """The pixels, some at a time."""
+        maps = self.maps
+        assert maps.normal is not None and maps.diffuse_albedo is not None
+        for start in range(0, len(self.pixels), BATCH_PIXELS):
+            pixels = self.pixels[start : start + BATCH_PIXELS]
+
+            def rows(values: np.ndarray, pixels: np.ndarray = pixels) -> np.ndarray:
+                return values.reshape(maps.mask.size, -1)[pixels]
+
+            nothing = np.zeros((len(pixels), 3), np.float32)
+            shiny = maps.specular is not None and maps.roughness is not None
+            yield ModelBatch(pixels, upload_surface(
+                rows(maps.normal), rows(maps.diffuse_albedo), rows(maps.specular) if maps.specular is not None else nothing,
+                rows(maps.roughness) if shiny and maps.roughness is not None else nothing[:, :1], self._view(pixels),
+                self._points[pixels], device=self.device))
+
+    def see(self, place: np.ndarray, pixels: np.ndarray) -> wp.array:
+        """Which of these pixels see which of these lights: [n, P] uint8 packs, 255 or 0.
+
+        Args:
+            place: [n, 4] direction and 0, or position and 1.
+            pixels: [m] of a batch.
+        """
+        return see_lights(place, pixels, self._height, self._mask, self._projection, device=self.device)

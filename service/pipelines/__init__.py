@@ -1,1 +1,0 @@
-"""Jobs from files to files: the only place where stage and kernels are imported together."""

@@ -1,0 +1,1 @@
+"""The service: API, jobs, storage and store."""

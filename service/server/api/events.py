@@ -1,0 +1,66 @@
+"""Jobs as they change, as server-sent events (https://html.spec.whatwg.org/multipage/server-sent-events.html)."""
+
+import json
+from collections.abc import AsyncIterator
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Header, Response
+from fastapi.sse import KEEPALIVE_COMMENT, EventSourceResponse, format_sse_event
+
+from service.server.api.context import Behind, Reader
+from service.server.api.jobs import job_of
+from service.server.api.problems import responses
+from service.server.api.views import JobView
+from service.server.api.watch import Change, Watcher
+from service.server.store.jobs import ENDED
+
+router = APIRouter(tags=["events"], responses=responses(401, 403, 429, 503))
+
+SILENCE_S = 15.0
+"""After which a comment says that the service is there, so that nobody between closes the connection."""
+HEADERS = {"Cache-Control": "no-cache", "X-Accel-Buffering": "no"}  # the second for nginx, which would hold them back
+EXAMPLE = 'event: job\ndata: {"id": "job_0123456789abcdefghjk", "state": "running", …}\nid: 7\n\n'
+STREAM: dict[str, Any] = {
+    "description": "Events `job`, each with a JobView as data and its revision as id, and `gone` with the id of a job that was deleted.",
+    "content": {"text/event-stream": {"example": EXAMPLE}}}
+NOTHING_MORE: dict[str, Any] = {"description": "The job has ended, and Last-Event-ID is its last event: a browser connects no more."}
+LastEvent = Annotated[str | None, Header(
+    alias="Last-Event-ID", pattern=r"^[0-9]{1,18}$", description="Id of the last event that came: only later ones are sent.")]
+
+
+@router.get("/v1/jobs/{job}/events", responses={**responses(404, 422), 200: STREAM, 204: NOTHING_MORE}, response_class=Response,
+            summary="Watch a job")
+async def stream_job(behind: Behind, found: Annotated[JobView, Depends(job_of)], last: LastEvent = None) -> Response:
+    """The job as it is, then as it becomes with every change; the stream ends when the job has."""
+    known = int(last) if last is not None and int(last) <= found.revision else 0
+    if found.state in ENDED and known == found.revision:
+        return Response(status_code=204)
+    behind.watcher.require_room()
+    return EventSourceResponse(_stream(behind.watcher, found.id, known=known, to_its_end=True), headers=HEADERS)
+
+
+@router.get("/v1/events", responses={200: STREAM}, response_class=Response, summary="Watch all jobs of the project")
+async def stream_jobs(behind: Behind, caller: Reader) -> Response:
+    """The jobs that have not ended or ended a moment ago, then every job of the project as it changes; the stream does not end."""
+    behind.watcher.require_room()
+    return EventSourceResponse(_stream(behind.watcher, caller.project, to_its_end=False), headers=HEADERS)
+
+
+async def _stream(watcher: Watcher, topic: str, *, known: int = 0, to_its_end: bool) -> AsyncIterator[bytes]:
+    listener = watcher.listen(topic, after=known)
+    try:
+        while (news := await listener.take(SILENCE_S)) is not None:
+            if not news:
+                yield KEEPALIVE_COMMENT
+            for change in news:
+                yield _event(change, identified=to_its_end)
+            if to_its_end and any(change.ended for change in news):
+                return
+    finally:
+        watcher.leave(listener)
+
+
+def _event(change: Change, *, identified: bool) -> bytes:
+    if change.data is None:
+        return format_sse_event(event="gone", data_str=json.dumps({"id": change.job}))
+    return format_sse_event(event="job", data_str=change.data, id=str(change.revision) if identified else None)

@@ -1,0 +1,202 @@
+"""Captures and environments: created to be uploaded, or registered where they lie on the server; checked, listed, deleted."""
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import sqlalchemy as sa
+from fastapi import APIRouter, Body, Query, Response
+from pydantic import BaseModel, ConfigDict, Field
+
+from service.requests.identifiers import CAPTURE, ENVIRONMENT, CaptureId, EnvironmentId, new_id
+from service.requests.jobs import CheckJob
+from service.server.api.context import Behind, IdempotencyKey, Reader, Service, Writer, once
+from service.server.api.problems import ApiError, responses
+from service.server.api.space import FOR_WORK, require_space
+from service.server.api.submission import submit
+from service.server.api.views import IntakePage, IntakeView
+from service.server.safe_names import shown
+from service.server.storage import layout
+from service.server.storage.parts import Part, parts_folder
+from service.server.store import intakes, jobs, uploads
+from service.server.store.keys import Caller, Scope
+from stage.files import resolved
+
+captures = APIRouter(prefix="/v1/captures", tags=["captures"], responses=responses(401, 403, 422, 429, 503))
+environments = APIRouter(prefix="/v1/environments", tags=["environments"], responses=responses(401, 403, 422, 429, 503))
+
+Limit = Annotated[int, Query(ge=1, le=500)]
+Name = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]+$")]
+
+
+class NewCapture(BaseModel):
+    """A capture that is to come."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    name: Name
+    folder: str | None = None
+    """Of the server, under one of its roots: the capture is used where it lies. Needs the scope admin; null: files are uploaded."""
+
+
+class NewEnvironment(BaseModel):
+    """An environment that is to come."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    name: Name
+    file: str | None = None
+    """Of the server, under one of its roots, as `folder` of a capture."""
+
+
+@captures.post("", status_code=201, responses=responses(404, 409, 507), summary="Create a capture")
+def create_capture(behind: Behind, caller: Writer, response: Response, wanted: Annotated[NewCapture, Body(
+        openapi_examples={"upload": {"value": {"name": "owl"}}, "register": {"value": {"name": "owl", "folder": "/captures/owl"}}})],
+                   token: IdempotencyKey = None) -> IntakeView:
+    """Create a capture, and then upload its files; or register a folder of the server, which is checked at once."""
+    folder = None if wanted.folder is None else _registered(behind, caller, "folder", wanted.folder)
+    if folder is not None and not os.path.isdir(folder):
+        raise ApiError("invalid", "folder: there is no such folder")
+    return _create(behind, caller, CAPTURE, wanted.name, folder, token, response)
+
+
+@environments.post("", status_code=201, responses=responses(404, 409, 507), summary="Create an environment")
+def create_environment(behind: Behind, caller: Writer, response: Response, wanted: Annotated[NewEnvironment, Body(
+        openapi_examples={"upload": {"value": {"name": "sky"}}, "register": {"value": {"name": "sky", "file": "/hdr/sky.exr"}}})],
+                       token: IdempotencyKey = None) -> IntakeView:
+    """Create an environment, and then upload its one lat-long image; or register a file of the server, which is checked at once."""
+    file = None if wanted.file is None else _registered(behind, caller, "file", wanted.file)
+    if file is not None and not os.path.isfile(file):
+        raise ApiError("invalid", "file: there is no such file")
+    return _create(behind, caller, ENVIRONMENT, wanted.name, file, token, response)
+
+
+@captures.get("", responses=responses(404), summary="List captures, the newest first")
+def list_captures(behind: Behind, caller: Reader, limit: Limit = 100, before: CaptureId | None = None) -> IntakePage:
+    """Captures of the project, a page at a time."""
+    return _page(behind, caller, CAPTURE, limit, before)
+
+
+@environments.get("", responses=responses(404), summary="List environments, the newest first")
+def list_environments(behind: Behind, caller: Reader, limit: Limit = 100, before: EnvironmentId | None = None) -> IntakePage:
+    """Environments of the project, a page at a time."""
+    return _page(behind, caller, ENVIRONMENT, limit, before)
+
+
+@captures.get("/{capture}", responses=responses(404), summary="Look at a capture")
+def get_capture(behind: Behind, caller: Reader, capture: CaptureId) -> IntakeView:
+    """State of a capture, and what its check found."""
+    return IntakeView.of(row_of(behind, caller, capture))
+
+
+@environments.get("/{environment}", responses=responses(404), summary="Look at an environment")
+def get_environment(behind: Behind, caller: Reader, environment: EnvironmentId) -> IntakeView:
+    """State of an environment, and what its check found."""
+    return IntakeView.of(row_of(behind, caller, environment))
+
+
+@captures.post("/{capture}/validate", status_code=202, responses=responses(404, 409, 507), summary="Check an uploaded capture")
+def validate_capture(behind: Behind, caller: Writer, capture: CaptureId) -> IntakeView:
+    """Take no more files, and look at manifest, names and headers; jobs may use it once it is ready."""
+    return _validate(behind, caller, capture)
+
+
+@environments.post("/{environment}/validate", status_code=202, responses=responses(404, 409, 507), summary="Check an uploaded environment")
+def validate_environment(behind: Behind, caller: Writer, environment: EnvironmentId) -> IntakeView:
+    """Take no more files, and look at the image's header; jobs may use it once it is ready."""
+    return _validate(behind, caller, environment)
+
+
+@captures.delete("/{capture}", status_code=204, responses=responses(404, 409), summary="Delete a capture")
+def delete_capture(behind: Behind, caller: Writer, capture: CaptureId) -> None:
+    """Remove a capture that no running or waiting job reads; what was registered stays where it lies."""
+    _delete(behind, caller, capture)
+
+
+@environments.delete("/{environment}", status_code=204, responses=responses(404, 409), summary="Delete an environment")
+def delete_environment(behind: Behind, caller: Writer, environment: EnvironmentId) -> None:
+    """Remove an environment that no running or waiting job reads; what was registered stays where it lies."""
+    _delete(behind, caller, environment)
+
+
+def row_of(behind: Service, caller: Caller, identifier: str) -> sa.RowMapping:
+    """A capture or environment of the caller's project.
+
+    Raises:
+        ApiError: there is none.
+    """
+    row = intakes.find(behind.database, identifier, caller.project)
+    if row is None:
+        raise ApiError("not-found", f"there is no {identifier} in this project")
+    return row
+
+
+def _registered(behind: Service, caller: Caller, field: str, given: str) -> Path:
+    if not caller.may(Scope.ADMIN):
+        raise ApiError("forbidden", f"{field}: the key has the scope {caller.scope}, to register what lies on the server needs admin")
+    path = Path(given)
+    if "\0" in given or not path.is_absolute() or ".." in path.parts:
+        raise ApiError("invalid", f"{field}: give an absolute path of the server, without ..")
+    place = resolved(path)
+    if place is None or not any(place.is_relative_to(root) for root in behind.settings.roots):
+        raise ApiError("invalid", f"{field}: lies in none of the folders that the operator allows")
+    return place
+
+
+def _create(behind: Service, caller: Caller, prefix: str, name: str, folder: Path | None, token: str | None,
+            response: Response) -> IntakeView:
+    require_space(behind, FOR_WORK)
+
+    def make(connection: sa.Connection) -> str:
+        identifier = new_id(prefix)
+        intakes.insert(connection, identifier=identifier, project=caller.project, kind=prefix, name=name,
+                       folder=None if folder is None else str(folder))
+        if folder is not None:
+            submit(behind, caller, CheckJob(kind="check", intake=identifier), connection, [identifier])
+        return identifier
+
+    identifier, _ = once(behind, caller, token, [prefix, name, None if folder is None else str(folder)], make)
+    response.headers["Location"] = f"/v1/{layout.FOLDERS[prefix]}/{identifier}"
+    return IntakeView.of(row_of(behind, caller, identifier))
+
+
+def _page(behind: Service, caller: Caller, prefix: str, limit: int, before: str | None) -> IntakePage:
+    after = None
+    if before is not None:
+        row = row_of(behind, caller, before)
+        after = row["created_at"], row["id"]
+    rows = intakes.latest(behind.database, caller.project, prefix, limit=limit + 1, before=after)
+    return IntakePage(items=[IntakeView.of(row) for row in rows[:limit]], next=rows[limit - 1]["id"] if len(rows) > limit else None)
+
+
+def _validate(behind: Service, caller: Caller, identifier: str) -> IntakeView:
+    before = row_of(behind, caller, identifier)
+
+    def work(connection: sa.Connection) -> bool:
+        if not intakes.close(connection, identifier):
+            return False
+        if (file := uploads.unfinished(connection, identifier)) is not None:
+            raise ApiError("conflict", f"{identifier}: {shown(file['path'])} is not complete: go on with {file['id']}, or delete it")
+        submit(behind, caller, CheckJob(kind="check", intake=identifier), connection, [identifier])
+        return True
+
+    if not behind.database.transact(work):
+        raise ApiError("conflict", f"{identifier} is {before['state']} already")
+    return IntakeView.of(row_of(behind, caller, identifier))
+
+
+def _delete(behind: Service, caller: Caller, identifier: str) -> None:
+    row = row_of(behind, caller, identifier)
+    if row["state"] == intakes.CHECKING:
+        raise ApiError("conflict", f"{identifier} is being checked")
+
+    def work(connection: sa.Connection) -> list[str] | None:
+        if users := jobs.users_of(connection, identifier, active=True):
+            raise ApiError("conflict", f"{identifier} is read by {users[0]}, which has not ended")
+        return intakes.remove(connection, identifier)
+
+    parts = behind.database.transact(work)
+    if parts is not None and row["folder"] is None:
+        for upload in parts:
+            Part.discard(parts_folder(behind.settings), upload)
+        behind.storage.remove(layout.intake(caller.project, identifier))

@@ -1,0 +1,96 @@
+"""For those who operate the service: whether it lives, whether it is ready, and its numbers."""
+
+import threading
+import time
+from typing import Annotated, Literal
+
+from fastapi import APIRouter, Depends, Request, Response, Security
+from fastapi.security import HTTPAuthorizationCredentials
+from pydantic import BaseModel
+
+from service.server.api.context import Behind, Service, bearer, caller_of
+from service.server.api.local import require_local
+from service.server.api.metrics import CONTENT_TYPE
+from service.server.api.problems import ApiError, responses
+from service.server.api.space import has_space
+from service.server.store import workers
+from service.server.store.database import UNANSWERED
+from service.server.store.keys import Scope
+from stage.errors import StorageError
+
+router = APIRouter(tags=["operations"])
+KEEP_S = 1.0
+"""How long what was found is answered again, so that those who ask often cost nothing."""
+
+
+class Health(BaseModel):
+    """Nothing is wrong."""
+
+    status: Literal["ok"] = "ok"
+
+
+class Readiness:
+    """Looks whether the service can do its work."""
+
+    def __init__(self) -> None:
+        """Nothing is known yet."""
+        self._lock = threading.Lock()
+        self._looked_at, self._wrong = -KEEP_S, list[str]()
+
+    def wrong(self, behind: Service) -> list[str]:
+        """What is wrong: sentences that name nothing of the machine, for anybody may read them."""
+        if behind.draining.is_set():
+            return ["the service is ending"]
+        with self._lock:
+            now = time.monotonic()
+            if now - self._looked_at >= KEEP_S:
+                self._looked_at, self._wrong = now, _faults(behind)
+            return self._wrong
+
+
+def _faults(behind: Service) -> list[str]:
+    found = []
+    try:
+        if not workers.present(behind.database):
+            found.append(f"no worker was seen in the last {workers.SILENT_S:g} seconds")
+    except UNANSWERED:
+        found.append("the database does not answer")
+    try:
+        behind.storage.check()
+    except StorageError:
+        found.append("the storage cannot be written")
+    if not has_space(behind.settings):
+        found.append("there is less space left than min_free_bytes")
+    return found
+
+
+@router.get("/healthz", summary="Whether the process answers")
+async def get_health() -> Health:
+    """Ask whether the process is to be started again; needs no key."""
+    return Health()
+
+
+@router.get("/readyz", responses=responses(503), summary="Whether the service can do its work")
+def get_readiness(behind: Behind, request: Request) -> Health:
+    """Database, storage, space left and workers; 503 says what is wrong, also while the service ends. Needs no key."""
+    readiness: Readiness = request.app.state.readiness
+    if wrong := readiness.wrong(behind):
+        raise ApiError("unavailable", "; ".join(wrong), headers={"Retry-After": "5"})
+    return Health()
+
+
+def operator_of(behind: Behind, request: Request,
+                given: Annotated[HTTPAuthorizationCredentials | None, Security(bearer)]) -> None:
+    """Who may read the numbers: this machine where the service listens to it alone; else a key of scope admin."""
+    if given is None and behind.settings.loopback:
+        require_local(request)
+    elif not (caller := caller_of(behind, request, given)).may(Scope.ADMIN):
+        raise ApiError("forbidden", f"the key has the scope {caller.scope}, this needs {Scope.ADMIN}")
+
+
+@router.get("/metrics", dependencies=[Depends(operator_of)], responses={
+    **responses(401, 403, 429), 200: {"content": {"text/plain": {"schema": {"type": "string"}}}}},
+    response_class=Response, summary="Numbers for Prometheus", openapi_extra={"security": [{}]})
+def get_metrics(request: Request) -> Response:
+    """Requests, jobs by state, workers by device and more. A service that listens beyond this machine asks for a key of scope admin."""
+    return Response(request.app.state.metrics.text(), media_type=CONTENT_TYPE)

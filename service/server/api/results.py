@@ -1,0 +1,162 @@
+"""What a job has made: the listing, and files to download, whole or in part (RFC 9110: ETag, preconditions, ranges).
+
+A file is opened once, so that its ETag, its size and its bytes are those of one file, whatever takes its place meanwhile.
+"""
+
+import os
+from collections.abc import AsyncIterator, Iterator, Sequence
+from email.utils import formatdate
+from pathlib import PurePosixPath
+from typing import Annotated, Any, NamedTuple
+from urllib.parse import quote
+
+import anyio.to_thread
+from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
+from fastapi.responses import StreamingResponse
+
+from service.server.api.context import Behind, Reader
+from service.server.api.jobs import JobName, view
+from service.server.api.problems import ApiError, responses
+from service.server.api.ranges import Span, asked_for, content_range, multipart, names
+from service.server.api.views import ResultPage, ResultView
+from service.server.safe_names import NameFault, check_path
+from service.server.storage import layout
+
+router = APIRouter(prefix="/v1/jobs/{job}/results", tags=["results"], responses=responses(401, 403, 404, 422, 429, 503))
+
+MAX_PAGE = 1000
+PIECE_BYTES = 1 << 20
+"""Read and sent at a time."""
+MEDIA_TYPES = {".exr": "image/x-exr", ".usdz": "model/vnd.usdz+zip", ".usda": "model/vnd.usda", ".json": "application/json",
+               ".png": "image/png"}
+BYTES = "application/octet-stream"
+CONTENT: dict[str, Any] = {kind: {"schema": {} if kind == "application/json" else {"type": "string", "format": "binary"}}
+                           for kind in (*sorted(MEDIA_TYPES.values()), BYTES)}
+DOWNLOAD: dict[int | str, dict[str, Any]] = {
+    200: {"description": "The file.", "content": CONTENT},
+    206: {"description": "The part, or the parts, that Range names.", "content": CONTENT | {
+        "multipart/byteranges": {"schema": {"type": "string", "format": "binary"}}}},
+    304: {"description": "If-None-Match names the file as it is."},
+    **responses(412, 416),
+}
+Name = Annotated[str, Path(description="As the listing has it.", examples=["maps.exr"])]
+Tags = Annotated[str | None, Header(description="Entity tags, or *.")]
+
+
+class Opened(NamedTuple):
+    """A file that is read."""
+
+    name: str
+    descriptor: int
+    size: int
+    etag: str
+    modified_at: float
+
+
+def opened(behind: Behind, caller: Reader, request: Request, job: JobName, name: Name) -> Iterator[Opened]:
+    """The file of a name, open until the answer has been sent.
+
+    Raises:
+        ApiError: there is none.
+    """
+    view(behind, caller, job)
+    nothing = ApiError("not-found", f"{job} has no such result")
+    try:
+        check_path(name)
+    except NameFault:
+        raise nothing from None
+    if not request.scope["path"].endswith(f"/{name}"):  # the router leaves a line break at the end out
+        raise nothing
+    path = behind.storage.open(layout.results(caller.project, job), name)
+    if path is None:
+        raise nothing
+    try:
+        descriptor = os.open(path, os.O_RDONLY)
+    except FileNotFoundError:
+        raise nothing from None
+    try:
+        status = os.fstat(descriptor)
+        etag = f'"{status.st_ino:x}-{status.st_mtime_ns:x}-{status.st_size:x}"'  # files are replaced, and never written to again
+        yield Opened(name, descriptor, status.st_size, etag, status.st_mtime)
+    finally:
+        os.close(descriptor)
+
+
+@router.get("", summary="List what a job has made")
+def list_results(behind: Behind, caller: Reader, job: JobName,
+                 limit: Annotated[int, Query(ge=1, le=MAX_PAGE)] = MAX_PAGE,
+                 after: Annotated[str | None, Query(description="`next` of the page before.")] = None) -> ResultPage:
+    """Files by name, a page at a time; of a job that runs, those that are complete."""
+    view(behind, caller, job)
+    files = [file for file in behind.storage.files(layout.results(caller.project, job)) if after is None or file.name > after]
+    return ResultPage(results=[ResultView.of(job, file) for file in files[:limit]],
+                      next=files[limit - 1].name if len(files) > limit else None)
+
+
+@router.get("/{name:path}", responses=DOWNLOAD, response_class=Response, summary="Download a result")
+async def download_result(file: Annotated[Opened, Depends(opened)], if_match: Tags = None, if_none_match: Tags = None,
+                          wanted: Annotated[str | None, Header(alias="Range", description="bytes=0-99, for one, or several.")] = None,
+                          if_range: Annotated[str | None, Header(description="The entity tag that Range is meant for.")] = None,
+                          ) -> Response:
+    """A file, or parts of it. It never changes under its ETag, so that a download which broke off can be gone on with."""
+    headers = _headers(file)
+    if _unchanged(file, if_match, if_none_match):
+        return Response(status_code=304, headers=headers)
+    media_type = _media_type(file)
+    spans = asked_for(wanted, file.size) if if_range is None or if_range == file.etag else None
+    if spans is None:
+        return _answer(file, 200, [Span(0, file.size)], file.size, media_type, headers)
+    if not spans:
+        raise ApiError("range-not-satisfiable", f"{file.name} has {file.size} bytes, and {wanted} asks for none of them",
+                       headers={"Content-Range": f"bytes */{file.size}"})
+    if len(spans) > 1:
+        parts = multipart(spans, file.size, media_type)
+        return _answer(file, 206, parts.pieces, parts.length, parts.media_type, headers)
+    span, = spans
+    return _answer(file, 206, [span], span.stop - span.start, media_type, headers | {"Content-Range": content_range(span, file.size)})
+
+
+@router.head("/{name:path}", responses={200: DOWNLOAD[200], 304: DOWNLOAD[304], 412: DOWNLOAD[412]}, response_class=Response,
+             summary="Size and ETag of a result")
+async def head_result(file: Annotated[Opened, Depends(opened)], if_match: Tags = None, if_none_match: Tags = None) -> Response:
+    """What a download would be answered with, without the file."""
+    headers = _headers(file)
+    if _unchanged(file, if_match, if_none_match):
+        return Response(status_code=304, headers=headers)
+    return Response(headers=headers | {"Content-Length": str(file.size)}, media_type=_media_type(file))
+
+
+def _unchanged(file: Opened, if_match: str | None, if_none_match: str | None) -> bool:
+    if if_match is not None and not names(if_match, file.etag, strong=True):
+        raise ApiError("precondition-failed", f"{file.name} is another now: its ETag is {file.etag}", headers={"ETag": file.etag})
+    return if_none_match is not None and names(if_none_match, file.etag, strong=False)
+
+
+def _headers(file: Opened) -> dict[str, str]:
+    name = PurePosixPath(file.name).name
+    plain = f'filename="{name}"' if name.isascii() else f"filename*=UTF-8''{quote(name)}"
+    return {"ETag": file.etag, "Last-Modified": formatdate(file.modified_at, usegmt=True), "Accept-Ranges": "bytes",
+            "Cache-Control": "private, no-cache", "Content-Disposition": f"attachment; {plain}", "X-Content-Type-Options": "nosniff"}
+
+
+def _media_type(file: Opened) -> str:
+    return MEDIA_TYPES.get(PurePosixPath(file.name).suffix.lower(), BYTES)
+
+
+def _answer(file: Opened, status: int, pieces: Sequence[bytes | Span], length: int, media_type: str,
+            headers: dict[str, str]) -> StreamingResponse:
+    return StreamingResponse(_body(file.descriptor, pieces), status, headers | {"Content-Length": str(length)}, media_type)
+
+
+async def _body(descriptor: int, pieces: Sequence[bytes | Span]) -> AsyncIterator[bytes]:
+    for piece in pieces:
+        if isinstance(piece, bytes):
+            yield piece
+            continue
+        at = piece.start
+        while at < piece.stop:
+            read = await anyio.to_thread.run_sync(os.pread, descriptor, min(PIECE_BYTES, piece.stop - at), at)
+            if not read:
+                raise OSError("a result became shorter while it was sent")
+            at += len(read)
+            yield read

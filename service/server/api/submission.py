@@ -1,0 +1,91 @@
+"""Whether a job can be handed in: what it reads is there and ready, and nothing is asked beyond the limits."""
+
+import sqlalchemy as sa
+
+from service.requests.frame_range import frame_numbers
+from service.requests.jobs import ExportJob, JobRequest, PipelineJob, RelightJob, ShadeJob
+from service.requests.relight import RelightOptions
+from service.server import telemetry
+from service.server.api.context import Service
+from service.server.api.problems import ApiError
+from service.server.store import intakes, jobs
+from service.server.store.keys import Caller
+
+QUEUE_RETRY_S = 30
+
+
+def submit(behind: Service, caller: Caller, request: JobRequest, connection: sa.Connection, inputs: list[str]) -> str:
+    """Queue a job in the caller's transaction; of `inputs_of` and `spelled_out`."""
+    job = behind.queue.submit(connection, project=caller.project, key=caller.key, request=request, inputs=inputs,
+                              chunk_frames=behind.settings.chunk_frames, trace=telemetry.current())
+    require_queue(behind, caller, connection)
+    return job
+
+
+def require_queue(behind: Service, caller: Caller, connection: sa.Connection) -> None:
+    """Undo the transaction where the caller's key has more jobs waiting in it than it may."""
+    most = behind.settings.max_queued
+    if jobs.count_queued(connection, caller.project, caller.key) > most:
+        raise ApiError("too-many", f"{most} jobs of this key have not begun", headers={"Retry-After": str(QUEUE_RETRY_S)})
+
+
+def inputs_of(behind: Service, project: str, request: JobRequest) -> list[str]:
+    """What a job reads.
+
+    Raises:
+        ApiError: it is not there, or not ready.
+    """
+    read = []
+    for field in ("capture", "environment", "reference_ball"):
+        identifier = getattr(request, field, None)
+        if identifier is not None:
+            _require_ready(behind, project, field, identifier)
+            read.append(identifier)
+    if isinstance(request, RelightJob | ShadeJob | ExportJob) and request.maps is not None:
+        _require_maps(behind, project, request.maps, depth=isinstance(request, ExportJob))
+        read.append(request.maps)
+    return read
+
+
+def spelled_out(behind: Service, project: str, request: JobRequest) -> JobRequest:
+    """The request with its frames as numbers, so that its steps are known before the capture is opened.
+
+    Raises:
+        RequestError: the frames are no range.
+        ApiError: too many frames, or nothing lights them.
+    """
+    if isinstance(request, RelightJob):
+        if request.environment is None and request.keys is None:
+            raise ApiError("invalid", "nothing lights the frames: give an environment, or keys with lights or captured images")
+        return request.model_copy(update={"options": _with_frames(behind, project, request.capture, request.options)})
+    if isinstance(request, PipelineJob):
+        return request.model_copy(update={"relight": _with_frames(behind, project, request.capture, request.relight)})
+    return request
+
+
+def _with_frames(behind: Service, project: str, capture: str, options: RelightOptions) -> RelightOptions:
+    row = intakes.find(behind.database, capture, project)
+    steps = int((row["facts"] or {}).get("captures", 1)) if row is not None else 1
+    numbers = frame_numbers(options.frames, steps)
+    if len(numbers) > behind.settings.max_frames:
+        raise ApiError("invalid", f"frames {options.frames}: {len(numbers)} frames, {behind.settings.max_frames} are allowed in a job")
+    return options.model_copy(update={"frames": f"{numbers[0]}-{numbers[-1]}"})
+
+
+def _require_ready(behind: Service, project: str, field: str, identifier: str) -> None:
+    row = intakes.find(behind.database, identifier, project)
+    if row is None:
+        raise ApiError("not-found", f"{field}: {identifier} is not in this project")
+    if row["state"] != intakes.READY:
+        raise ApiError("conflict", f"{field}: {identifier} is {row['state']}, not ready")
+
+
+def _require_maps(behind: Service, project: str, identifier: str, *, depth: bool) -> None:
+    row = jobs.find(behind.database, identifier, project)
+    kinds = ("solve", "pipeline", "depth") if depth else ("solve", "pipeline")
+    if row is None:
+        raise ApiError("not-found", f"maps: {identifier} is not in this project")
+    if row["request"]["kind"] not in kinds:
+        raise ApiError("invalid", f"maps: {identifier} is a {row['request']['kind']} job: give one of {', '.join(kinds)}")
+    if row["state"] != jobs.SUCCEEDED:
+        raise ApiError("conflict", f"maps: {identifier} is {row['state']}, not succeeded")

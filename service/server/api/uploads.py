@@ -1,0 +1,292 @@
+"""Files of captures and environments: resumable uploads by tus 1.0 with creation, checksum, expiration and termination."""
+
+import asyncio
+import time
+from functools import partial
+from typing import Annotated, Any
+
+import sqlalchemy as sa
+from fastapi import APIRouter, Header, Query, Request, Response
+from pydantic import BaseModel
+
+from service.requests.identifiers import ENVIRONMENT, UPLOAD, CaptureId, EnvironmentId, UploadId, new_id
+from service.server.api.context import Behind, IdempotencyKey, Reader, Service, Writer, once
+from service.server.api.intakes import row_of
+from service.server.api.patch import Patch, being_written, received_of, settled
+from service.server.api.problems import ApiError, responses
+from service.server.api.receive import Broken, RunningHashes, TooLong, pour
+from service.server.api.space import FOR_UPLOAD, require_space
+from service.server.api.tus import (
+    ALGORITHMS,
+    CHECKSUM_PATTERN,
+    CONTENT_TYPE,
+    EXTENSIONS,
+    VERSION,
+    Checksum,
+    Metadata,
+    Speaking,
+    documented,
+    expires_at,
+    metadata_header,
+    state_headers,
+)
+from service.server.safe_names import check_path, shown
+from service.server.storage import layout
+from service.server.storage.parts import Part, PartLocked, parts_folder
+from service.server.store import idempotency, intakes, uploads
+from service.server.store.keys import Caller
+from service.server.store.uploads import Row
+
+router = APIRouter(prefix="/v1", tags=["uploads"], responses=responses(401, 403, 404, 412, 422, 429, 503), dependencies=[Speaking])
+listings = APIRouter(prefix="/v1", tags=["uploads"], responses=responses(401, 403, 404, 422, 429, 503))
+options = APIRouter(prefix="/v1", tags=["uploads"])
+hashes = RunningHashes()
+BREAK_S, LOOK_S = 2.0, 0.02
+"""A client whose connection broke asks how much came, maybe before the break is noticed here: this long it waits for that."""
+
+UploadLength = Annotated[int, Header(alias="Upload-Length", ge=0, description="Bytes that the file has.")]
+UploadMetadata = Annotated[str, Header(
+    alias="Upload-Metadata", max_length=4096, description="`path` and the name within the capture in base64; then, if you like, a comma, "
+    "`sha256` and its 64 hexadecimal digits in base64.",
+    openapi_examples={"one": {"value": "path MDAwLmV4cg=="}, "within a folder": {"value": "path c3RlcDEvMDAwLmV4cg=="}})]
+Limit = Annotated[int, Query(ge=1, le=5000)]
+After = Annotated[str | None, Query(max_length=4096, pattern=r"^[^\x00]*$")]
+CREATED: dict[int | str, dict[str, Any]] = {
+    201: {"description": "Created", "headers": documented("Location", "Upload-Offset", "Upload-Expires")}, **responses(409, 413, 507)}
+
+
+class FileView(BaseModel):
+    """A file of a capture or environment."""
+
+    upload: UploadId
+    """It goes on, or is deleted, at /v1/uploads/ and this."""
+    path: str
+    length: int
+    received: int
+    """Bytes that are safe."""
+    done: bool
+    sha256: str | None
+    """As the client said it; where the file is done, also as it was found."""
+
+    @classmethod
+    def of(cls, behind: Service, row: Row) -> "FileView":
+        """From its row."""
+        return cls(upload=row["id"], path=row["path"], length=row["length"], received=received_of(behind, row), done=row["done"],
+                   sha256=row["sha256"])
+
+
+class FilePage(BaseModel):
+    """Files, in the order of their paths where upper and lower case are one."""
+
+    files: list[FileView]
+    next: str | None
+    """Give it as `after` for the page after this one; null: there is none."""
+
+
+@options.options("/uploads", status_code=204, summary="What of tus is spoken here",
+                 responses={204: {"headers": documented("Tus-Version", "Tus-Extension", "Tus-Max-Size", "Tus-Checksum-Algorithm")}})
+@options.options("/uploads/{upload}", status_code=204, include_in_schema=False)
+@options.options("/captures/{capture}/files", status_code=204, include_in_schema=False)
+@options.options("/environments/{environment}/files", status_code=204, include_in_schema=False)
+def abilities(behind: Behind, response: Response) -> None:
+    """Version, extensions and limits."""
+    response.headers.update({"Tus-Version": VERSION, "Tus-Extension": ",".join(EXTENSIONS), "Tus-Checksum-Algorithm": ",".join(ALGORITHMS),
+                             "Tus-Max-Size": str(behind.settings.max_upload_bytes)})
+
+
+@router.post("/captures/{capture}/files", status_code=201, responses=CREATED, summary="Begin to upload a file of a capture")
+def create_capture_file(behind: Behind, caller: Writer, response: Response, capture: CaptureId, length: UploadLength,
+                        metadata: UploadMetadata, token: IdempotencyKey = None) -> FileView:
+    """The file takes the place of a complete one of the same path, while the capture is receiving or refused."""
+    return _create(behind, caller, capture, length, Metadata.of(metadata), token, response)
+
+
+@router.post("/environments/{environment}/files", status_code=201, responses=CREATED, summary="Begin to upload the file of an environment")
+def create_environment_file(behind: Behind, caller: Writer, response: Response, environment: EnvironmentId, length: UploadLength,
+                            metadata: UploadMetadata, token: IdempotencyKey = None) -> FileView:
+    """An environment has one file; it takes the place of a complete one of the same path."""
+    return _create(behind, caller, environment, length, Metadata.of(metadata), token, response)
+
+
+@router.head("/uploads/{upload}", response_class=Response, summary="How far an upload is", responses={
+    200: {"headers": documented("Upload-Offset", "Upload-Length", "Upload-Metadata")}, **responses(410)})
+async def head_upload(behind: Behind, caller: Reader, upload: UploadId) -> Response:
+    """Upload-Offset tells how many bytes are safe: go on there."""
+    deadline = time.monotonic() + BREAK_S
+    while upload in being_written and time.monotonic() < deadline:
+        await asyncio.sleep(LOOK_S)
+    row = await asyncio.to_thread(_row, behind, caller, upload)
+    received = await asyncio.to_thread(received_of, behind, row)
+    return Response(headers={**state_headers(row, received, behind.settings.upload_hours),
+                             "Upload-Length": str(row["length"]), "Upload-Metadata": metadata_header(row)})
+
+
+@router.patch("/uploads/{upload}", status_code=204, summary="Add to an upload", openapi_extra={
+    "requestBody": {"required": True, "content": {CONTENT_TYPE: {"schema": {"type": "string", "format": "binary"}}}}},
+    responses={204: {"headers": documented("Upload-Offset", "Upload-Expires")}, **responses(400, 409, 410, 413, 415, 423, 460, 507)})
+async def patch_upload(
+    behind: Behind, caller: Writer, request: Request, response: Response, upload: UploadId,
+    offset: Annotated[int, Header(alias="Upload-Offset", ge=0, description="Where the body begins: as many bytes as are there.")],
+    checksum: Annotated[str | None, Header(
+        alias="Upload-Checksum", json_schema_extra={"pattern": CHECKSUM_PATTERN},
+        description="`sha1` or `sha256`, a space, and the digest of the body in base64: a body with another is dropped.",
+        openapi_examples={"none": {"value": "sha1 2jmj7l5rSw0yVb/vlWAYkK/YBwk="}})] = None,
+) -> None:
+    """Write the body behind what is there. The last byte completes the file, which is then in the capture."""
+    if request.headers.get("content-type", "").partition(";")[0].strip().lower() != CONTENT_TYPE:
+        raise ApiError("unsupported-media-type", f"Content-Type: give {CONTENT_TYPE}")
+    expected = None if checksum is None else Checksum.of(checksum)
+    row: Row = await asyncio.to_thread(_row, behind, caller, upload)
+    announced = request.headers.get("content-length", "0")
+    if announced.isdigit() and offset + int(announced) > row["length"]:
+        raise _too_long(row)
+    patch = Patch(behind, hashes, row, offset=offset, checksum=expected)
+    try:
+        await asyncio.to_thread(patch.begin)
+        row = await _take(patch, request, row)
+    finally:
+        patch.close()
+    response.headers.update(state_headers(row, row["received"], behind.settings.upload_hours))
+
+
+@router.delete("/uploads/{upload}", status_code=204, responses=responses(409, 410, 423), summary="Delete an upload")
+def delete_upload(behind: Behind, caller: Writer, upload: UploadId) -> None:
+    """Give an upload up; or take a complete file out of a capture that is receiving or refused."""
+    row = _row(behind, caller, upload)
+    folder = parts_folder(behind.settings)
+    try:
+        part = Part.open(folder, upload)
+    except PartLocked:
+        raise ApiError("locked", f"{upload}: a request is adding to it", headers={"Retry-After": "1"}) from None
+    with part:
+        def work(connection: sa.Connection) -> None:
+            _hold(behind, caller, connection, row["intake"])
+            if uploads.remove(connection, upload):
+                behind.storage.delete(layout.intake(row["project"], row["intake"]), row["path"])
+
+        try:
+            behind.database.transact(work)
+        finally:
+            if row["done"] or uploads.find(behind.database, upload, caller.project) is None:
+                part.drop()
+
+
+@listings.get("/captures/{capture}/files", summary="List the files of a capture")
+def list_capture_files(behind: Behind, caller: Reader, capture: CaptureId, limit: Limit = 1000, after: After = None) -> FilePage:
+    """Files that were uploaded, complete or not; none of a capture that is registered."""
+    return _page(behind, caller, capture, limit, after)
+
+
+@listings.get("/environments/{environment}/files", summary="List the file of an environment")
+def list_environment_files(behind: Behind, caller: Reader, environment: EnvironmentId, limit: Limit = 1000,
+                           after: After = None) -> FilePage:
+    """The file that was uploaded, complete or not; none of an environment that is registered."""
+    return _page(behind, caller, environment, limit, after)
+
+
+async def _take(patch: Patch, request: Request, row: Row) -> Row:
+    broken = None
+    try:
+        try:
+            await pour(request.stream(), patch.writer)
+        except Broken as error:
+            broken = str(error)
+        except TooLong:
+            raise _too_long(row) from None
+    except Exception:
+        await asyncio.to_thread(patch.give_up)
+        raise
+    return await asyncio.to_thread(patch.end, broken)
+
+
+def _create(behind: Service, caller: Caller, intake: str, length: int, given: Metadata, token: str | None, response: Response,
+            ) -> FileView:
+    settings = behind.settings
+    row_of(behind, caller, intake)
+    check_path(given.path)
+    if length > settings.max_upload_bytes:
+        raise ApiError("too-large", f"Upload-Length: is {length}, a file may have {settings.max_upload_bytes} bytes")
+    require_space(behind, FOR_UPLOAD, length)
+
+    def make(connection: sa.Connection) -> str:
+        _hold(behind, caller, connection, intake)
+        before = uploads.at_path(connection, intake, given.path)
+        if before is not None and before["done"]:
+            uploads.remove(connection, before["id"])
+            behind.storage.delete(layout.intake(caller.project, intake), given.path)
+        elif before is not None:
+            raise ApiError("conflict", f"path {shown(given.path)}: is being uploaded as {before['id']}: go on with it, or delete it")
+        _require_room(behind, connection, intake)
+        identifier = new_id(UPLOAD)
+        try:
+            uploads.insert(connection, identifier=identifier, project=caller.project, intake=intake, path=given.path, length=length,
+                           sha256=given.sha256)
+        except uploads.PathTaken as error:
+            raise ApiError("conflict", str(error)) from None
+        return identifier
+
+    asked = ["upload", intake, given.path, length, given.sha256]
+    upload, _ = once(behind, caller, token, asked, make)
+    row = uploads.find(behind.database, upload, caller.project)
+    if row is None and token is not None:  # what the token made was deleted or replaced since: the same request makes another
+        behind.database.transact(partial(idempotency.forget, project=caller.project, token=token, gone=upload))
+        upload, _ = once(behind, caller, token, asked, make)
+        row = uploads.find(behind.database, upload, caller.project)
+    if row is None:
+        raise ApiError("conflict", f"{upload}: was deleted at the same time")
+    if length == 0 and not row["done"]:
+        return _answer(behind, _complete_empty(behind, row), response)
+    return _answer(behind, row, response)
+
+
+def _answer(behind: Service, row: Row, response: Response) -> FileView:
+    view = FileView.of(behind, row)
+    response.headers.update({"Location": f"/v1/uploads/{view.upload}",
+                             **state_headers(row, view.received, behind.settings.upload_hours)})
+    return view
+
+
+def _complete_empty(behind: Service, row: Row) -> Row:
+    patch = Patch(behind, hashes, row, offset=0, checksum=None)
+    try:
+        patch.begin()
+        return patch.end(None)
+    finally:
+        patch.close()
+
+
+def _hold(behind: Service, caller: Caller, connection: sa.Connection, intake: str) -> None:
+    if intakes.hold(connection, intake, caller.project):
+        return
+    row = row_of(behind, caller, intake)
+    state = "registered" if row["folder"] is not None else row["state"]
+    raise ApiError("conflict", f"{intake} is {state}: its files do not change any more")
+
+
+def _require_room(behind: Service, connection: sa.Connection, intake: str) -> None:
+    count, most = uploads.count(connection, intake), behind.settings.max_capture_files
+    if intake.startswith(ENVIRONMENT) and count > 0:
+        raise ApiError("conflict", f"{intake} has its file already: delete that, or give its path to replace it")
+    if count >= most:
+        raise ApiError("too-large", f"{intake} has {count} files, and more than {most} are not taken")
+
+
+def _row(behind: Service, caller: Caller, upload: str) -> Row:
+    row = uploads.find(behind.database, upload, caller.project)
+    if row is None:
+        raise ApiError("not-found", f"there is no {upload} in this project")
+    row = settled(behind, row)
+    if not row["done"] and expires_at(row, behind.settings.upload_hours) < time.time():
+        raise ApiError("gone", f"{upload}: nothing came for {behind.settings.upload_hours:g} hours: begin it again")
+    return row
+
+
+def _page(behind: Service, caller: Caller, intake: str, limit: int, after: str | None) -> FilePage:
+    row_of(behind, caller, intake)
+    rows = uploads.listing(behind.database, intake, limit=limit + 1, after=after)
+    files = [FileView.of(behind, row) for row in rows[:limit]]
+    return FilePage(files=files, next=files[-1].path if len(rows) > limit else None)
+
+
+def _too_long(row: Row) -> ApiError:
+    return ApiError("too-large", f"the body goes beyond the {row['length']} bytes that Upload-Length said")

@@ -1,0 +1,165 @@
+"""Watching jobs: one look at the database a tick for everybody who listens, however many they are."""
+
+import asyncio
+import threading
+from typing import NamedTuple
+
+import sqlalchemy as sa
+
+from service.requests.identifiers import JOB
+from service.server.api.problems import RETRY_S, ApiError
+from service.server.api.views import JobView
+from service.server.log import logger
+from service.server.store import jobs
+from service.server.store.database import UNANSWERED, Database, said
+
+TICK_S = 0.25
+"""Between two looks; of changes between them the last is told."""
+MAX_LISTENERS = 4096
+"""Of this process."""
+MAX_PENDING = 2000
+"""Jobs with news that a listener has not taken: one that lags further is let go, and begins again when it comes back."""
+
+
+class Change(NamedTuple):
+    """News of a job."""
+
+    job: str
+    revision: int
+    ended: bool
+    data: str | None
+    """A JobView as JSON; None: the job was deleted."""
+
+
+class Listener:
+    """Who listens to a job, or to all jobs of a project. It holds the last news of each job and no more."""
+
+    def __init__(self, topic: str, after: int) -> None:
+        """Args: topic: a job or a project. after: revision of the job that is known already."""
+        self.topic, self.fresh = topic, True
+        self._after = after
+        self._pending: dict[str, Change] = {}
+        self._closed = False
+        self._news = asyncio.Event()
+
+    def offer(self, change: Change) -> None:
+        """Take note of news."""
+        if change.data is None or change.revision > self._after:
+            self._pending[change.job] = change
+            self._news.set()
+        if len(self._pending) > MAX_PENDING:
+            self.close()
+
+    def close(self) -> None:
+        """There will be no more."""
+        self._closed = True
+        self._news.set()
+
+    async def take(self, within_s: float) -> list[Change] | None:
+        """The news since the last call; none came within this time: an empty list; None: there will be no more."""
+        if not self._news.is_set():
+            try:
+                await asyncio.wait_for(self._news.wait(), within_s)
+            except TimeoutError:
+                return []
+        self._news.clear()
+        if self._closed:
+            return None
+        taken, self._pending = list(self._pending.values()), {}
+        return taken
+
+
+class Watcher:
+    """Looks at jobs that somebody listens to. All of it but the queries runs in the event loop."""
+
+    def __init__(self, database: Database, closing: threading.Event) -> None:
+        """Args: database: of the store. closing: set when streams are to end, for the service does."""
+        self._database, self._closing = database, closing
+        self._listeners: dict[str, set[Listener]] = {}
+        self._seen: dict[str, tuple[str, int]] = {}  # project and revision of jobs as they were told last
+        self._task: asyncio.Task[None] | None = None
+
+    def require_room(self) -> None:
+        """Raises: ApiError: too many listen, or the service ends."""
+        if self._closing.is_set() or sum(map(len, self._listeners.values())) >= MAX_LISTENERS:
+            raise ApiError("unavailable", "no further stream of events can be opened here now", headers={"Retry-After": str(RETRY_S)})
+
+    def listen(self, topic: str, *, after: int = 0) -> Listener:
+        """Begin to listen; `leave` must follow.
+
+        Args:
+            topic: a job, or a project for all of its jobs that have not ended, or ended lately.
+            after: revision of the job that the listener knows.
+        """
+        listener = Listener(topic, after)
+        self._listeners.setdefault(topic, set()).add(listener)
+        if self._task is None or self._task.done():
+            self._task = asyncio.get_running_loop().create_task(self._run())
+        return listener
+
+    def leave(self, listener: Listener) -> None:
+        """Listen no more."""
+        others = self._listeners.get(listener.topic, set())
+        others.discard(listener)
+        if not others:
+            self._listeners.pop(listener.topic, None)
+
+    async def _run(self) -> None:
+        silent = False
+        try:
+            while self._listeners and not self._closing.is_set():
+                try:
+                    await self._look()
+                    if silent:
+                        logger.info("database answers again: events go on")
+                    silent = False
+                except UNANSWERED as error:
+                    if not silent:
+                        logger.warning("database does not answer: events wait", error=said(error))
+                    silent = True
+                await asyncio.sleep(TICK_S)
+        except Exception as error:
+            logger.error("watching jobs failed: streams of events end", exc_info=error)
+        finally:  # nobody is left to wait for ever
+            self._seen = {}
+            for listener in self._all():
+                listener.close()
+
+    async def _look(self) -> None:
+        present, topics, known = set(self._all()), list(self._listeners), set(self._seen)  # who comes while we look is told the next time
+        found = {row["id"]: row for row in await asyncio.to_thread(jobs.watched, self._database, topics)}
+        fresh = {listener.topic for listener in present if listener.fresh}
+        changed = {job for job, row in found.items() if job in fresh or row["project"] in fresh or job not in self._seen
+                   or self._seen[job][1] != row["revision"]}
+        missing = (known | {topic for topic in fresh if topic.startswith(f"{JOB}_")}) - set(found)  # deleted, or ended some time ago
+        rows = await asyncio.to_thread(jobs.revisions, self._database, list(changed | missing)) if changed | missing else {}
+        for job in changed | missing:
+            if (row := rows.get(job)) is not None:
+                self._tell(row, present)
+            else:
+                self._tell_gone(job, present)
+        self._seen = {job: (row["project"], rows.get(job, row)["revision"]) for job, row in found.items()
+                      if job not in changed or job in rows}
+        for listener in present:
+            listener.fresh = False
+
+    def _tell(self, row: sa.RowMapping, present: set[Listener]) -> None:
+        listeners = self._of(row["id"], row["project"]) & present
+        if self._seen.get(row["id"]) == (row["project"], row["revision"]):
+            listeners = {listener for listener in listeners if listener.fresh}
+        if listeners:
+            change = Change(row["id"], row["revision"], row["state"] in jobs.ENDED, JobView.of(row).model_dump_json(by_alias=True))
+            for listener in listeners:
+                listener.offer(change)
+
+    def _tell_gone(self, job: str, present: set[Listener]) -> None:
+        project, revision = self._seen.get(job, ("", 0))
+        for listener in self._of(job, project) & present:
+            if job in self._seen or listener.fresh:
+                listener.offer(Change(job, revision, True, None))
+
+    def _of(self, job: str, project: str) -> set[Listener]:
+        return self._listeners.get(job, set()) | self._listeners.get(project, set())
+
+    def _all(self) -> list[Listener]:
+        return [listener for listeners in self._listeners.values() for listener in listeners]

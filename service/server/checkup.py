@@ -1,0 +1,82 @@
+"""Is a service sound? What `relit doctor` looks at where there is one; nothing is made or changed."""
+
+import os
+import shutil
+from collections.abc import Iterator
+from importlib.metadata import version
+from typing import NamedTuple
+
+from sqlalchemy.exc import DBAPIError
+
+from service.server.settings import Settings, unknown_variables
+from service.server.storage.open import open_storage
+from service.server.store import jobs, keys, workers
+from service.server.store.database import Database, DatabaseError, connect, require_version
+from stage.errors import StorageError
+
+LIBRARIES = ("dbos", "fastapi", "sqlalchemy", "uvicorn", "psycopg")
+GIB = 1024**3
+
+
+class Finding(NamedTuple):
+    """One line."""
+
+    subject: str
+    text: str
+    fault: bool = False
+
+
+def look(settings: Settings) -> Iterator[Finding]:
+    """Look at the service of these settings, one thing after the other."""
+    yield Finding("service", ", ".join(f"{name} {version(name)}" for name in LIBRARIES))
+    for name, near in unknown_variables(os.environ).items():
+        yield Finding("settings", f"{name} is no setting" + (f": is {near} meant?" if near else ""), True)
+    yield from _storage(settings)
+    for root in settings.roots:
+        there = root.is_dir() and os.access(root, os.R_OK | os.X_OK)
+        yield Finding("root", f"{root} " + ("can be read" if there else "is no folder that can be read"), not there)
+    if settings.is_sqlite and not settings.sqlite_file.exists():
+        yield Finding("database", f"{settings.sqlite_file} is not there yet: relit serve makes it")
+        return
+    try:
+        database = connect(settings.sqlalchemy_url, connections=1)
+        require_version(database)
+        yield Finding("database", f"{settings.sqlite_file if settings.is_sqlite else 'PostgreSQL'} answers")
+        yield from _store(settings, database)
+    except DatabaseError as error:
+        yield Finding("database", str(error), True)
+    except DBAPIError as error:
+        yield Finding("database", f"does not answer: {' '.join(str(error.orig).split())}", True)
+
+
+def _storage(settings: Settings) -> Iterator[Finding]:
+    if not settings.data.is_dir():
+        yield Finding("data", f"{settings.data} is no folder", True)
+        return
+    try:
+        open_storage(settings).check()
+        yield Finding("storage", f"{settings.data if settings.storage_url is None else settings.storage_url} can be written")
+    except StorageError as error:
+        yield Finding("storage", str(error), True)
+    free = shutil.disk_usage(settings.data).free
+    full = free < settings.min_free_bytes
+    yield Finding("space", f"{free / GIB:.1f} GiB free" + (f", less than min_free_bytes ({settings.min_free_bytes / GIB:.1f} GiB)" if full
+                                                           else ""), full)
+
+
+def _store(settings: Settings, database: Database) -> Iterator[Finding]:
+    made = [row for row in keys.listing(database) if row["revoked_at"] is None]
+    if made:
+        yield Finding("keys", f"{len(made)}, of {len({row['project'] for row in made})} projects")
+    else:
+        yield Finding("keys", "none: requests without a key are let in" if settings.anonymous else
+                      "none, and requests without a key are refused: relit keys create makes one", not settings.anonymous)
+    counts = jobs.counts(database)
+    yield Finding("jobs", ", ".join(f"{counts[state]} {state}" for state in (*jobs.ACTIVE, *jobs.ENDED) if state in counts) or "none")
+    present = workers.present(database)
+    waiting = sum(counts.get(state, 0) for state in jobs.ACTIVE)
+    for worker in present:
+        yield Finding("worker", f"{worker['id']} on {worker['device']}, {worker['state']}")
+    if not present:
+        wait = f", and {waiting} jobs wait" if waiting else ""
+        yield Finding("worker", f"none was seen in the last {workers.SILENT_S:g} seconds{wait}", waiting > 0)

@@ -1,0 +1,147 @@
+"""What the service clears away by itself: old jobs, uploads that were given up, and what is left of workers and captures that are gone.
+
+Captures, environments and jobs that have not ended are never removed.
+"""
+
+import shutil
+import threading
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import sqlalchemy as sa
+
+from service.server.jobs.presence import FilePresence
+from service.server.jobs.queue import JobQueue
+from service.server.jobs.worker import cache_folder
+from service.server.log import logger
+from service.server.settings import Settings
+from service.server.storage import layout
+from service.server.storage.folder import Storage, drop_folder
+from service.server.storage.parts import parts_folder
+from service.server.store import idempotency, intakes, jobs, uploads, workers
+from service.server.store.database import UNANSWERED, Database, said
+from stage.errors import StorageError
+
+EVERY_S = 600.0
+HOUR_S, DAY_S = 3600.0, 86_400.0
+TOKEN_S = DAY_S
+"""How long the token of a request that created something is remembered."""
+UNFINISHED_S = DAY_S
+"""A stack that nothing was added to for this long will never be finished."""
+SILENT_S = HOUR_S
+"""A worker that was not seen for this long is forgotten, in the round after the one that noticed: one that the database was away from
+for as long is seen again between the two."""
+
+
+class Housekeeper:
+    """Clears away every few minutes, in a thread of its own."""
+
+    def __init__(self, settings: Settings, database: Database, storage: Storage, queue: JobQueue, *,
+                 clock: Callable[[], float] = time.time) -> None:
+        """Prepare.
+
+        Args:
+            settings, database, storage, queue: of the service.
+            clock: seconds since 1970.
+        """
+        self._settings, self._database, self._storage, self._queue, self._clock = settings, database, storage, queue, clock
+        self._silent: set[str] = set()
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="relit-housekeeping", daemon=True)
+
+    def start(self) -> None:
+        """Begin, with a round at once."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End, after the piece of work that is going on."""
+        self._ended.set()
+        self._thread.join()
+
+    def round(self) -> None:
+        """Clear away once; what one piece cannot do is tried again in the next round."""
+        for piece in (self._jobs, self._uploads, self._tokens, self._workers, self._caches, self._halves):
+            if self._ended.is_set():
+                return
+            try:
+                piece()
+            except (*UNANSWERED, StorageError, OSError) as error:
+                logger.warning("housekeeping waits", piece=piece.__name__.strip("_"), error=said(error))
+
+    def _run(self) -> None:
+        while True:
+            self.round()
+            if self._ended.wait(EVERY_S):
+                return
+
+    def _jobs(self) -> None:
+        if self._settings.retention_days is None:
+            return
+        for row in jobs.ended_before(self._database, self._clock() - self._settings.retention_days * DAY_S):
+            if self._ended.is_set():
+                return
+            if self._database.transact(partial(_forget, job=row["id"])):
+                self._storage.remove(layout.results(row["project"], row["id"]))
+                self._queue.forget(row["id"], row["attempt"])
+                logger.info("job removed", job=row["id"], project=row["project"])
+
+    def _uploads(self) -> None:
+        removed = uploads.expire(self._database, parts_folder(self._settings), self._clock() - self._settings.upload_hours * HOUR_S)
+        if removed:
+            logger.info("uploads removed", count=removed)
+
+    def _tokens(self) -> None:
+        self._database.transact(lambda connection: idempotency.drop_before(connection, self._clock() - TOKEN_S))
+
+    def _workers(self) -> None:
+        silent = {row["id"] for row in workers.silent(self._database, self._clock() - SILENT_S)}
+        for worker in silent & self._silent:
+            workers.leave(self._database, worker)
+            if self._database.is_sqlite:
+                with FilePresence(self._settings.data / "locks", "").dead(worker):  # which removes the lock of one that is
+                    pass
+            logger.info("worker forgotten", worker=worker)
+        self._silent = silent - self._silent
+
+    def _caches(self) -> None:
+        folder = cache_folder(self._settings)
+        if not folder.is_dir():
+            return
+        there = {path.name: path for path in folder.iterdir() if path.is_dir()}
+        kept = intakes.last_used(self._database, list(there))
+        for name in there.keys() - kept.keys():  # of captures that were deleted, or half removed
+            _clear(there[name])
+        if self._settings.cache_bytes is None:
+            return
+        sizes = {name: sum(file.stat().st_size for file in there[name].rglob("*") if file.is_file()) for name in kept}
+        total = sum(sizes.values())
+        for name in sorted(kept, key=lambda name: kept[name]):
+            if total <= self._settings.cache_bytes:
+                return
+            if not self._database.transact(partial(jobs.users_of, input_id=name, active=True)):
+                _clear(there[name])
+                total -= sizes[name]
+
+    def _halves(self) -> None:
+        """What was being removed, or made, when somebody pulled the plug."""
+        self._storage.tidy()
+        for path in cache_folder(self._settings).rglob(".*"):  # of a worker that was killed while it made a stack
+            if path.is_file() and path.stat().st_mtime < self._clock() - UNFINISHED_S:
+                path.unlink(missing_ok=True)
+                logger.info("unfinished stack removed", file=path.name)
+
+
+def _forget(connection: sa.Connection, job: str) -> bool:
+    """Whether a job was forgotten: not where another that has not ended reads its results, or it was begun again meanwhile."""
+    return not jobs.users_of(connection, job, active=True) and jobs.remove(connection, job)
+
+
+def _clear(folder: Path) -> None:
+    """Out of sight at once, so that no job finds half of it."""
+    if folder.name.startswith("."):  # it is hidden already
+        shutil.rmtree(folder, ignore_errors=True)
+    else:
+        drop_folder(folder)
+    logger.info("stack cache removed", capture=folder.name)

@@ -1,0 +1,213 @@
+"""A job → the steps that do it: names in place of paths made paths again, and the pipelines called."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from service.errors import USER_ERRORS, RequestError, sentence
+from service.reporting.progress import Progress
+from service.requests.frame_range import frame_numbers
+from service.requests.identifiers import CAPTURE
+from service.requests.jobs import ANY_JOB, CheckJob, DepthJob, ExportJob, JobRequest, PipelineJob, RelightJob, ShadeJob, SolveJob
+from service.server.storage import layout
+from service.server.storage.folder import Storage
+from service.server.store import intakes
+from service.server.store.database import Database
+from stage.files import resolved
+
+KEYS_FILE = "keys.json"
+"""The light keys of a job, beside its frames."""
+
+
+class Site(NamedTuple):
+    """Where a worker works."""
+
+    database: Database
+    storage: Storage
+    cache: Path
+    """Folder for stack caches, one a capture."""
+    device: str
+    max_pixels: int
+    roots: tuple[Path, ...]
+    """That registered captures and environments lie under."""
+
+    def without_folder(self, sentence: str) -> str:
+        """A sentence for those who use the service: files by their names below its folder, which is nobody else's business."""
+        return sentence.replace(f"{self.cache.parent}/", "")
+
+
+class Step(NamedTuple):
+    """A piece of a job that is done whole or again."""
+
+    name: str
+    run: Callable[[Progress], None]
+    before: int = 0
+    """Frames of the job before its own."""
+    of: int | None = None
+    """Frames of the job; None: the step makes none."""
+
+
+class Job(NamedTuple):
+    """What a worker knows of a job."""
+
+    id: str
+    project: str
+    request: JobRequest
+    chunk_frames: int
+
+    @classmethod
+    def of(cls, row: "dict[str, object]") -> "Job":
+        """From its row in the store."""
+        return cls(str(row["id"]), str(row["project"]), ANY_JOB.validate_python(row["request"]), int(str(row["chunk_frames"])))
+
+
+def steps_of(job: Job, site: Site) -> list[Step]:
+    """The steps of a job: always the same for the same job."""
+    request = job.request
+    if isinstance(request, CheckJob):
+        return [Step("check", lambda progress: _check(job, request, site, progress))]
+    if isinstance(request, SolveJob):
+        return [Step("solve", lambda progress: _solve(job, request, site, progress))]
+    if isinstance(request, DepthJob):
+        return [Step("depth", lambda progress: _depth(job, request, site, progress))]
+    if isinstance(request, ShadeJob):
+        return [Step("shade", lambda progress: _shade(job, request, site, progress))]
+    if isinstance(request, ExportJob):
+        return [Step("export", lambda progress: _export(job, request, job_maps(job, request.maps, site, progress), site, progress))]
+    if isinstance(request, RelightJob):
+        return _frames(job, request, site)
+    assert isinstance(request, PipelineJob), request
+    solve = SolveJob(kind="solve", capture=request.capture, options=request.solve)
+    export = ExportJob(kind="export", maps=job.id, format=request.format, options=request.export)
+    relight = RelightJob(kind="relight", capture=request.capture, environment=request.environment, keys=request.keys,
+                         maps=job.id if request.guided else None, options=request.relight)
+    return [Step("solve", lambda progress: _solve(job, solve, site, progress)),
+            Step("export", lambda progress: _export(job, export, job_maps(job, job.id, site, progress), site, progress)),
+            *(_frames(job, relight, site) if request.environment is not None or request.keys is not None else [])]
+
+
+def job_maps(job: Job, maps: str, site: Site, progress: Progress) -> Path:
+    """The folder of the results of a job of the same project, or of this one, with what was solved."""
+    return site.storage.local(layout.results(job.project, maps), layout.SOLVED, progress)
+
+
+def _frames(job: Job, request: RelightJob, site: Site) -> list[Step]:
+    numbers = frame_numbers(request.options.frames, 1)
+    chunks = [numbers[at : at + job.chunk_frames] for at in range(0, len(numbers), job.chunk_frames)]
+
+    def step(chunk: list[int]) -> Step:
+        only = f"{chunk[0]}-{chunk[-1]}"
+        return Step(f"frames {only}", lambda progress: _relight(job, request, only, site, progress), chunk[0] - numbers[0], len(numbers))
+
+    return [step(chunk) for chunk in chunks]
+
+
+def _check(job: Job, request: CheckJob, site: Site, progress: Progress) -> None:
+    from service.captures.admit import admit_capture, admit_environment
+
+    folder, _ = _place(job, request.intake, site, progress)
+    try:
+        if request.intake.startswith(CAPTURE):
+            facts = admit_capture(folder, max_pixels=site.max_pixels, progress=progress)
+        else:
+            facts = admit_environment(folder, max_pixels=site.max_pixels)
+    except USER_ERRORS as error:  # named as they were handed in, not by where the service keeps them
+        raise RequestError(sentence(error).replace(f"{folder}/", "")) from error
+    intakes.accept(site.database, request.intake, facts)
+
+
+def _solve(job: Job, request: SolveJob, site: Site, progress: Progress) -> None:
+    from service.requests.solve import SolveRequest
+    from service.solve.solve import solve
+
+    ball = None if request.reference_ball is None else _intake(job, request.reference_ball, site, progress)
+    solve(SolveRequest(capture=_intake(job, request.capture, site, progress), out=_out(job, site), reference_ball=ball, device=site.device,
+                       cache=site.cache / request.capture, **dict(request.options)), progress)
+
+
+def _depth(job: Job, request: DepthJob, site: Site, progress: Progress) -> None:
+    from service.depth.depth import depth
+    from service.requests.depth import DepthRequest, TofOptions
+
+    capture = _intake(job, request.capture, site, progress)
+    calibration = None if request.tof_calibration is None else _within(capture, request.tof_calibration)
+    options = dict(request.options) | {"tof": TofOptions(calibration=calibration, **dict(request.options.tof))}
+    depth(DepthRequest(capture=capture, out=_out(job, site), device=site.device, cache=site.cache / request.capture, **options), progress)
+
+
+def _shade(job: Job, request: ShadeJob, site: Site, progress: Progress) -> None:
+    from service.light.shade import shade
+    from service.requests.shade import ShadeRequest
+
+    capture = request.capture
+    shade(ShadeRequest(maps=job_maps(job, request.maps, site, progress), out=_out(job, site) / layout.PICTURE,
+                       environment=_environment(job, request.environment, site, progress),
+                       capture=None if capture is None else _intake(job, capture, site, progress), device=site.device,
+                       cache=None if capture is None else site.cache / capture, **dict(request.options)), progress)
+
+
+def _export(job: Job, request: ExportJob, maps: Path, site: Site, progress: Progress) -> None:
+    from service.requests.export import ExportRequest
+    from service.usd.export import export
+
+    export(ExportRequest(maps=maps, out=_out(job, site) / f"{layout.ASSET}.{request.format}", **dict(request.options)), progress)
+
+
+def _relight(job: Job, request: RelightJob, only: str, site: Site, progress: Progress) -> None:
+    from service.light.relight import relight
+    from service.requests.relight import RelightRequest
+    from stage.files import write_text
+
+    out = _out(job, site)
+    if request.keys is not None:
+        write_text(out / KEYS_FILE, request.keys.model_dump_json(by_alias=True, indent=2, exclude_defaults=True))
+    relight(RelightRequest(capture=_intake(job, request.capture, site, progress),
+                           environment=_environment(job, request.environment, site, progress),
+                           keys=None if request.keys is None else out / KEYS_FILE, only=only, out=str(out / layout.FRAMES),
+                           maps=None if request.maps is None else job_maps(job, request.maps, site, progress), device=site.device,
+                           cache=site.cache / request.capture, **dict(request.options)), progress)
+
+
+def _out(job: Job, site: Site) -> Path:
+    return site.storage.workspace(layout.results(job.project, job.id))
+
+
+def _intake(job: Job, identifier: str, site: Site, progress: Progress) -> Path:
+    """The folder of a capture or environment of the job's project, as it was admitted; a registered one may have changed since."""
+    from service.captures.admit import admit_environment, recheck_capture
+
+    folder, registered = _place(job, identifier, site, progress)
+    if registered and identifier.startswith(CAPTURE):
+        recheck_capture(folder, max_pixels=site.max_pixels)
+    elif registered:
+        admit_environment(folder, max_pixels=site.max_pixels)
+    return folder
+
+
+def _place(job: Job, identifier: str, site: Site, progress: Progress) -> tuple[Path, bool]:
+    """The folder of a capture or environment of the job's project, or the file of an environment; and whether it was registered."""
+    row = intakes.find(site.database, identifier, job.project)
+    if row is None:
+        raise RequestError(f"{identifier}: is not there any more")
+    if row["folder"] is None:
+        return site.storage.local(layout.intake(job.project, identifier), progress=progress), False
+    folder = Path(row["folder"])
+    if resolved(folder) != folder or not any(folder.is_relative_to(root) for root in site.roots):
+        raise RequestError(f"{identifier}: lies in none of the folders that the operator allows any more")
+    return folder, True
+
+
+def _environment(job: Job, identifier: str | None, site: Site, progress: Progress) -> Path | None:
+    from service.captures.admit import environment_file
+
+    return None if identifier is None else environment_file(_intake(job, identifier, site, progress))
+
+
+def _within(capture: Path, name: str) -> Path:
+    path = capture / name
+    place = None if "\0" in name else resolved(path)
+    if place is None or not place.is_relative_to(capture.resolve()):
+        raise RequestError(f"tof_calibration: {name!r} leads out of the capture's folder")
+    if not place.is_file():
+        raise RequestError(f"tof_calibration: {name!r} is no file of the capture")
+    return path

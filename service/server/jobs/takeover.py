@@ -1,0 +1,120 @@
+"""Taking over: what a dead worker had begun goes back to the queue.
+
+The queue itself gives a worker's jobs back to a worker of the same name alone. So each worker holds a lock named after it (presence), and
+each looks every few seconds whether one that has jobs has lost its lock. Who finds it takes that lock, so that no two do this at once.
+"""
+
+import threading
+from collections import Counter
+from collections.abc import Callable
+
+from service.server.jobs.presence import Held, Presence
+from service.server.jobs.queue import JobQueue, job_of
+from service.server.log import logger
+from service.server.store import jobs, workers
+from service.server.store.database import UNANSWERED, Database, said
+from service.server.store.jobs import Claim
+
+GRACE_ROUNDS = 2
+"""Rounds after the lock was taken anew in which nobody is given up for dead: after a restart of the database others, too, take theirs."""
+FORGOTTEN_ROUNDS = 3
+"""Rounds after which what we have by the queue's account, and know nothing of, is put back: the database died between its answer and us."""
+
+
+class Takeover:
+    """Looks after dead workers, and keeps the own lock."""
+
+    def __init__(self, database: Database, queue: JobQueue, presence: Presence, worker: str, *, every_s: float, max_lost: int,
+                 running: Callable[[], frozenset[str]], beat: Callable[[], None], deposed: Callable[[], None]) -> None:
+        """Prepare.
+
+        Args:
+            database, queue: of the service.
+            presence: the own lock, held.
+            worker: who we are.
+            every_s: between two looks.
+            max_lost: workers that a job may lose in one step.
+            running: the workflows that we go on with.
+            beat: called every round.
+            deposed: called when the own lock is another's for good.
+        """
+        self._database, self._queue, self._presence, self._worker = database, queue, presence, worker
+        self._every_s, self._max_lost = every_s, max_lost
+        self._running, self._beat, self._deposed = running, beat, deposed
+        self.state = workers.READY
+        """What others are told of us."""
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="relit-takeover", daemon=True)
+        self._grace = self._refused = 0
+        self._unknown: Counter[str] = Counter()
+
+    def start(self) -> None:
+        """Begin to look."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Look no more."""
+        self._ended.set()
+        self._thread.join()
+
+    def round(self) -> None:
+        """Look once."""
+        held = self._presence.hold()
+        self._refused = self._refused + 1 if held is Held.REFUSED else 0
+        if self._refused > GRACE_ROUNDS:  # another only holds it while it takes over from us, who were away
+            self._deposed()
+        if held is Held.REFUSED:
+            return
+        if held is Held.ANEW:
+            self._grace = GRACE_ROUNDS
+        workers.see(self._database, self._worker, self.state)
+        taken = self._queue.taken_by()
+        self._put_back_forgotten(taken.pop(self._worker, []))
+        if self._grace > 0:
+            self._grace -= 1
+            return
+        for worker in taken:
+            with self._presence.dead(worker) as dead:
+                if dead:
+                    self._inherit(worker)
+
+    def _run(self) -> None:
+        while True:
+            self._beat()
+            try:
+                self.round()
+            except UNANSWERED as error:
+                logger.warning("database does not answer", error=said(error))
+            except Exception as error:  # the next round may do better; without any the worker would seem dead
+                logger.error("takeover failed", exc_info=error)
+            if self._ended.wait(self._every_s):
+                return
+
+    def _inherit(self, worker: str) -> None:
+        workflows = self._queue.taken_by().get(worker, [])  # under its lock: another may have been quicker
+        if workflows:
+            logger.warning("worker died", dead=worker, jobs=[job_of(workflow)[0] for workflow in workflows])
+        for workflow in workflows:
+            self._take(workflow, worker)
+        workers.leave(self._database, worker)
+
+    def _take(self, workflow: str, worker: str) -> None:
+        """Put a workflow of a dead worker back into the queue, or end its job where it has cost too many workers."""
+        job, attempt = job_of(workflow)
+        row = jobs.find(self._database, job)
+        sentence = f"lost {self._max_lost + 1} workers in one step ({row['stage'] or 'begin' if row else ''}): " \
+                   "it may need more memory than they have"
+        state = self._database.transact(lambda connection: jobs.lose_worker(
+            connection, Claim(job, attempt, worker), self._max_lost, sentence))
+        if state == jobs.QUEUED:
+            self._queue.put_back(workflow)
+        else:
+            self._queue.call_off(job, attempt)
+
+    def _put_back_forgotten(self, workflows: list[str]) -> None:
+        unknown = set(workflows) - self._running()
+        self._unknown = Counter({workflow: self._unknown[workflow] + 1 for workflow in unknown})
+        for workflow, rounds in self._unknown.items():
+            if rounds >= FORGOTTEN_ROUNDS:
+                logger.warning("job is put back: this worker had it and did not begin", job=job_of(workflow)[0])
+                self._queue.hand_back(workflow, self._worker)

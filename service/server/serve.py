@@ -1,0 +1,187 @@
+"""The processes of the service: the API with the workers that it looks after, or a worker alone.
+
+Asked to end (SIGTERM or SIGINT), the service answers on, and is not ready, while its workers finish their steps and hand their jobs back;
+then streams and requests end, and it. Asked twice it ends at once: jobs are taken over, as after a crash.
+"""
+
+import multiprocessing
+import os
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from queue import SimpleQueue
+from typing import TypeVar
+
+import uvicorn
+
+from service.errors import RequestError
+from service.reporting.memory import keep_freed_blocks
+from service.server import log, telemetry
+from service.server.api.app import create_app
+from service.server.connection import Connection
+from service.server.housekeeping import Housekeeper
+from service.server.jobs.queue import JobQueue, prepare
+from service.server.jobs.supervisor import Supervisor
+from service.server.log import logger
+from service.server.settings import NO_WORKER, Settings, unknown_variables
+from service.server.storage.open import open_storage
+from service.server.store.database import Database
+from service.server.store.open import open_database
+
+T = TypeVar("T")
+CLOSE_S = 5
+"""How long open requests (streams of events among them) may take to end when the service ends."""
+BACKLOG = 2048
+"""Connections that wait to be accepted, as uvicorn has it."""
+SIGNALS = (signal.SIGTERM, signal.SIGINT)
+SAME_S = 1.0
+"""Signals that come together are one: terminals, `timeout` and supervisors signal a process and its group."""
+
+
+def serve(settings: Settings, *, greet: Callable[[str, Database, JobQueue], None] | None = None) -> None:
+    """Serve until SIGTERM or SIGINT; then let steps and requests end.
+
+    Args:
+        settings: of the service.
+        greet: called when it is about to answer, with its address, its database and its queue.
+
+    Raises:
+        RequestError: the address, the data folder or the database cannot be used, or a device is not on this machine.
+    """
+    supervisors: list[Supervisor] = []
+    asked = _signals(supervisors)
+    keep_freed_blocks()
+    _configure(settings)
+    listening = _listen(settings)
+    database = open_database(settings, prepare)
+    supervisor = Supervisor(settings, _devices(settings))
+    supervisors.append(supervisor)
+    tracing = telemetry.provider(settings)
+    app = create_app(settings, database, tracing)
+    server = _Server(uvicorn.Config(app, http=Connection, log_config=None, access_log=False, timeout_graceful_shutdown=CLOSE_S,
+                                    server_header=False))
+    housekeeper = Housekeeper(settings, database, open_storage(settings), JobQueue(database))
+    address = _address(settings.host, listening.getsockname()[1])
+    print(f"relit    {address}/v1", flush=True)
+    print(f"data     {settings.data}", flush=True)
+    if greet is not None:
+        greet(address, database, app.state.service.queue)
+
+    def end() -> None:
+        asked.get()
+        logger.info("service drains")
+        app.state.service.draining.set()
+        try:
+            housekeeper.stop()
+            supervisor.stop()
+        finally:
+            app.state.service.closing.set()
+            server.should_exit = True
+
+    supervisor.start()
+    housekeeper.start()
+    ending = threading.Thread(target=end, name="relit-end", daemon=True)
+    ending.start()
+    try:
+        server.run(sockets=[listening])
+    finally:
+        asked.put(0)  # where the server ended by itself
+        ending.join()
+        database.close()
+        telemetry.close(tracing)
+        logger.info("service ended")
+
+
+def work(settings: Settings, device: str | None) -> None:
+    """One worker, started again when it dies, until SIGTERM or SIGINT."""
+    supervisors: list[Supervisor] = []
+    asked = _signals(supervisors)
+    _configure(settings)
+    open_database(settings, prepare).close()
+    telemetry.close(telemetry.provider(settings))  # so that a missing extra is said here, and not by every worker
+    supervisors.append(Supervisor(settings, [_elsewhere(_resolve, device)]))
+    supervisors[0].start()
+    asked.get()
+    supervisors[0].stop()
+
+
+class _Server(uvicorn.Server):
+    """Signals are ours: uvicorn would stop to answer at the first."""
+
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        yield
+
+
+def _signals(supervisors: list[Supervisor]) -> "SimpleQueue[int]":
+    """Put the first signal into a queue; end at the second, and the workers with us."""
+    asked: SimpleQueue[int] = SimpleQueue()  # its put may interrupt its get
+    heard: list[float] = []
+
+    def hear(number: int, _frame: object) -> None:
+        now = time.monotonic()
+        if not heard:
+            heard.append(now)
+            asked.put(number)
+        elif now - heard[0] > SAME_S:
+            for supervisor in supervisors:
+                supervisor.kill()
+            os._exit(128 + number)
+
+    for number in SIGNALS:
+        signal.signal(number, hear)
+    return asked
+
+
+def _configure(settings: Settings) -> None:
+    log.configure(settings.log_level, settings.log_format)
+    for name, near in unknown_variables(os.environ).items():
+        logger.warning("a variable of the environment is no setting", variable=name, **({"meant": near} if near else {}))
+    for root in settings.roots:
+        if not root.is_dir():
+            logger.warning("a root is no folder", root=str(root))
+
+
+def _listen(settings: Settings) -> socket.socket:
+    try:
+        family, *_, address = socket.getaddrinfo(settings.host, settings.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+        listening = socket.create_server((str(address[0]), settings.port), family=family, backlog=BACKLOG)
+        # connections inherit it: without it the body of an answer waits 40 ms for the client to acknowledge the headers
+        listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        return listening
+    except OSError as error:  # gaierror too
+        why = (error.strerror or "").partition(" (")[0]
+        raise RequestError(f"cannot listen on host {settings.host}, port {settings.port}: {why}") from None
+
+
+def _address(host: str, port: int) -> str:
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+
+
+def _devices(settings: Settings) -> list[str]:
+    if settings.devices == (NO_WORKER,):
+        return []
+    if settings.devices:
+        return [_elsewhere(_resolve, device) for device in settings.devices]
+    return [name for name in _elsewhere(_names) if name.startswith("cuda")] or ["cpu"]
+
+
+def _elsewhere(ask: Callable[..., T], *arguments: object) -> T:
+    """Ask in a process of its own: this one never touches CUDA, so that a fault of a driver does not end it."""
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        return pool.apply(ask, arguments)
+
+
+def _names() -> list[str]:
+    from kernels.device import names
+
+    return names()
+
+
+def _resolve(device: str | None) -> str:
+    from kernels.device import resolve
+
+    return resolve(device)

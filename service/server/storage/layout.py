@@ -1,0 +1,26 @@
+"""The layout of the storage: what lies where, below the data folder or the prefix of an object store (docs/service_storage.md).
+
+projects/PROJECT/captures/ID/…        an uploaded capture
+projects/PROJECT/environments/ID/…    an uploaded environment, one image
+projects/PROJECT/jobs/ID/…            results: maps.exr, report.json, asset.usdz, frame.0001.exr …
+"""
+
+from service.requests.identifiers import CAPTURE, ENVIRONMENT
+
+MAPS = "maps.exr"
+SOLVED = (MAPS, "depth.exr", "points.ply")
+"""What other jobs and later steps read of a solve or a depth."""
+FRAMES = "frame.####.exr"
+PICTURE = "picture.exr"
+ASSET = "asset"
+FOLDERS = {CAPTURE: "captures", ENVIRONMENT: "environments"}
+
+
+def intake(project: str, identifier: str) -> str:
+    """Prefix of a capture or an environment."""
+    return f"projects/{project}/{FOLDERS[identifier.partition('_')[0]]}/{identifier}"
+
+
+def results(project: str, job: str) -> str:
+    """Prefix of the results of a job."""
+    return f"projects/{project}/jobs/{job}"

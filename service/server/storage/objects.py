@@ -1,0 +1,188 @@
+"""Storage in an object store. Workers read and write copies on their own disks; objects appear whole or not at all."""
+
+import threading
+import time
+from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from pathlib import Path
+from typing import TypeVar
+
+from service.reporting.progress import Progress
+from service.server.storage.bucket import Bucket, Object
+from service.server.storage.folder import Stored, is_shown, stored_below, sweep
+from service.server.storage.scratch import Entry, Scratch
+from stage.files import replacing
+
+T = TypeVar("T")
+TRANSFERS = 8
+"""Files on their way at one time."""
+LOOK_S = 0.5
+"""How often those who wait are told that bytes have moved."""
+REMOVED = "removed"
+"""removed/PREFIX is there while a prefix is being deleted, so that no half of it is shown."""
+PROBE = "probe"
+CHECK_S = 30.0
+"""How long a look at the store is good for: each costs two requests."""
+
+
+class ObjectStorage:
+    """The files of a prefix are the objects of that prefix."""
+
+    def __init__(self, bucket: Bucket, scratch: Scratch) -> None:
+        """Args: bucket: where objects are. scratch: their copies on this machine."""
+        self._bucket, self._scratch = bucket, scratch
+        self._checking = threading.Lock()
+        self._checked_at = -CHECK_S
+
+    def local(self, prefix: str, names: Collection[str] | None = None, progress: Progress | None = None) -> Path:
+        """A copy; what is there already of the same version is not fetched again.
+
+        Raises:
+            StorageError: the store cannot be read, or the copy not be written.
+        """
+        objects = self._objects(prefix)
+        with self._scratch.entry(prefix, _sign_of_life(progress)) as entry:
+            if names is None:
+                entry.forget_others(set(objects))
+            missing = {name: found for name, found in objects.items()
+                       if (names is None or name in names) and entry.version(name) != found.version}
+            self._fetch(entry, missing, progress)
+        return self._scratch.files(prefix)
+
+    def workspace(self, prefix: str) -> Path:
+        """A folder of this machine's copies."""
+        return self._scratch.files(prefix)
+
+    def publish(self, prefix: str, progress: Progress | None = None) -> None:
+        """Send files that are new or have changed.
+
+        Raises:
+            StorageError: a file cannot be sent; those that were are whole.
+        """
+        with self._scratch.entry(prefix, _sign_of_life(progress)) as entry:
+            sweep(entry.files)
+            new = [stored for stored in stored_below(entry.files) if entry.version(stored.name) is None]
+
+            def send(stored: Stored, moved: Callable[[], None]) -> tuple[str, str]:
+                return stored.name, self._bucket.send(entry.files / stored.name, f"{prefix}/{stored.name}", moved).version
+
+            _transfer("upload", new, send, entry, progress)
+
+    def put(self, file: Path, prefix: str, name: str) -> None:
+        """Send a file, and remove it here.
+
+        Raises:
+            StorageError: it cannot be sent.
+        """
+        self._bucket.send(file, f"{prefix}/{name}", lambda: None)
+        file.unlink()
+
+    def delete(self, prefix: str, name: str) -> None:
+        """Delete the object; copies lose it when they are brought up to date."""
+        self._bucket.delete([f"{prefix}/{name}"])
+
+    def files(self, prefix: str) -> list[Stored]:
+        """Every object."""
+        return sorted(Stored(name, found.size, found.modified_at) for name, found in self._objects(prefix).items())
+
+    def open(self, prefix: str, name: str) -> Path | None:
+        """A copy of one object, fetched if it has changed."""
+        if not is_shown(name) or self._is_removed(prefix):
+            return None
+        found = self._bucket.find(f"{prefix}/{name}")
+        if found is None:
+            return None
+        with self._scratch.entry(prefix, lambda: None) as entry:
+            if entry.version(name) != found.version:
+                self._fetch(entry, {name: found}, None)
+        return self._scratch.files(prefix) / name
+
+    def remove(self, prefix: str) -> None:
+        """Delete the objects; hidden first, so that half-deleted ones are not seen."""
+        self._bucket.mark(f"{REMOVED}/{prefix}")
+        self._scratch.remove(prefix)
+        self._bucket.delete([found.path for found in self._bucket.below(prefix)])
+        self._bucket.delete([f"{REMOVED}/{prefix}"])
+
+    def tidy(self) -> None:
+        """Delete what is marked for it, and what is left of copies."""
+        for found in self._bucket.below(REMOVED):
+            self.remove(found.path.removeprefix(f"{REMOVED}/"))
+        self._scratch.tidy()
+
+    def check(self) -> None:
+        """Write and delete an object, at most every CHECK_S."""
+        with self._checking:
+            if time.monotonic() - self._checked_at >= CHECK_S:
+                self._bucket.check(PROBE)
+                self._checked_at = time.monotonic()
+
+    def _is_removed(self, prefix: str) -> bool:
+        return self._bucket.find(f"{REMOVED}/{prefix}") is not None
+
+    def _objects(self, prefix: str) -> dict[str, Object]:
+        """Objects by their name below the prefix."""
+        if self._is_removed(prefix):
+            return {}
+        named = ((found.path.removeprefix(f"{prefix}/"), found) for found in self._bucket.below(prefix))
+        return {name: found for name, found in named if is_shown(name)}
+
+    def _fetch(self, entry: Entry, missing: dict[str, Object], progress: Progress | None) -> None:
+        if not missing:
+            return
+        self._scratch.make_room(sum(found.size for found in missing.values()))
+
+        def fetch(item: tuple[str, Object], moved: Callable[[], None]) -> tuple[str, str]:
+            name, found = item
+            with replacing(entry.files / name) as temporary:
+                self._bucket.fetch(found, temporary, moved)
+            return name, found.version
+
+        _transfer("download", list(missing.items()), fetch, entry, progress)
+
+
+class _Ended(Exception):
+    """The others are not wanted any more."""
+
+
+def _transfer(stage: str, items: Sequence[T], move: Callable[[T, Callable[[], None]], tuple[str, str]], entry: Entry,
+              progress: Progress | None) -> None:
+    """Move files, several at one time; the first fault ends all of them, and so does what `progress` raises.
+
+    Args:
+        stage: what to call it.
+        items: to be moved.
+        move: moves one, calls what it is given after every piece, and returns name and version.
+        entry: notes them.
+        progress: told whenever bytes have moved, so that silence means that nothing moves.
+    """
+    if not items:
+        return
+    if progress is not None:
+        progress.stage(stage, len(items))
+    ended, bytes_moved = threading.Event(), threading.Event()
+
+    def moved() -> None:
+        bytes_moved.set()
+        if ended.is_set():
+            raise _Ended
+
+    with ThreadPoolExecutor(TRANSFERS, thread_name_prefix=f"relit-{stage}") as pool:
+        waiting: set[Future[tuple[str, str]]] = {pool.submit(move, item, moved) for item in items}
+        try:
+            while waiting:
+                done, waiting = wait(waiting, LOOK_S, FIRST_COMPLETED)
+                for future in done:
+                    entry.note(*future.result())
+                if progress is not None and (done or bytes_moved.is_set()):
+                    bytes_moved.clear()
+                    progress.advance(len(items) - len(waiting))
+        except BaseException:
+            ended.set()
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+
+
+def _sign_of_life(progress: Progress | None) -> Callable[[], None]:
+    """Called while another worker of this machine moves the files."""
+    return (lambda: None) if progress is None else (lambda: progress.advance(0))

@@ -1,0 +1,22 @@
+"""The storage that the settings ask for."""
+
+from service.server.settings import Settings
+from service.server.storage.folder import FolderStorage, Storage
+
+SCRATCH = "scratch"
+"""Folder of the data folder for copies of objects."""
+
+
+def open_storage(settings: Settings) -> Storage:
+    """Open the storage; nothing is written into it.
+
+    Raises:
+        RequestError: storage_url cannot be used.
+    """
+    if settings.storage_url is None:
+        return FolderStorage(settings.data)
+    from service.server.storage.bucket import Bucket
+    from service.server.storage.objects import ObjectStorage
+    from service.server.storage.scratch import Scratch
+
+    return ObjectStorage(Bucket(settings.storage_url), Scratch(settings.data / SCRATCH, settings.scratch_bytes))

@@ -1,0 +1,141 @@
+"""Copies of objects on this machine: a folder a prefix, with a record of which version of which object each file is.
+
+data/scratch/PREFIX/files/…        the files
+data/scratch/PREFIX/objects.json   of each: version of the object, size, and when the file was written
+data/scratch/PREFIX/lock           held while files are fetched or sent, so that two workers of a machine fetch once
+"""
+
+import json
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from service.server import file_lock
+from service.server.storage.folder import drop_folder, drop_hidden
+from stage.errors import storage
+from stage.files import write_text
+
+FILES, RECORD, LOCK = "files", "objects.json", "lock"
+WAIT_S = 0.2
+IN_USE_S = 6 * 3600.0
+"""Prefixes used in this time stay, whatever the limit: a step may read or write them."""
+SAVE_S = 2.0
+"""How often the record is written while files come: a killed worker has so much to fetch again."""
+
+
+class Entry:
+    """The copy of one prefix, while its lock is held."""
+
+    def __init__(self, folder: Path) -> None:
+        """Args: folder: of the entry."""
+        self.files = folder / FILES
+        self._path = folder / RECORD
+        self._saved_at = time.monotonic()
+        try:
+            self._record: dict[str, list[object]] = json.loads(self._path.read_text(encoding="utf-8"))
+        except (FileNotFoundError, json.JSONDecodeError):
+            self._record = {}
+
+    def version(self, name: str) -> str | None:
+        """The version that a file is a copy of; None: it is not there, or was written since."""
+        noted = self._record.get(name)
+        return None if noted is None or noted[1:] != _state(self.files / name) else str(noted[0])
+
+    def note(self, name: str, version: str) -> None:
+        """A file is a copy of a version now."""
+        self._record[name] = [version, *_state(self.files / name)]
+        if time.monotonic() - self._saved_at > SAVE_S:
+            self.save()
+
+    def forget_others(self, names: set[str]) -> None:
+        """Remove copies of objects that are gone."""
+        for name in [name for name in self._record if name not in names]:
+            if self.version(name) is not None:
+                (self.files / name).unlink(missing_ok=True)
+            del self._record[name]
+
+    def save(self) -> None:
+        """Write the record."""
+        write_text(self._path, json.dumps(self._record))
+        self._saved_at = time.monotonic()
+
+
+class Scratch:
+    """The copies of a machine."""
+
+    def __init__(self, root: Path, limit_bytes: int) -> None:
+        """Args: root: their folder. limit_bytes: what prefixes may take that are not in use."""
+        self._root, self._limit_bytes = root, limit_bytes
+
+    def files(self, prefix: str) -> Path:
+        """The folder of the files of a prefix, which is made."""
+        folder = self._root / prefix / FILES
+        with storage("make", folder):
+            folder.mkdir(parents=True, exist_ok=True)
+        return folder
+
+    @contextmanager
+    def entry(self, prefix: str, waiting: Callable[[], None]) -> Iterator[Entry]:
+        """Hold the copy of a prefix; `waiting` is called again and again while another holds it."""
+        with self._lock(prefix, waiting):
+            entry = Entry(self._root / prefix)
+            try:
+                yield entry
+            finally:
+                entry.save()
+
+    def remove(self, prefix: str) -> None:
+        """Drop the copy of a prefix."""
+        drop_folder(self._root / prefix)
+
+    def tidy(self) -> None:
+        """Delete what is left of copies that were being dropped."""
+        drop_hidden(self._root)
+
+    def make_room(self, wanted_bytes: int) -> None:
+        """Drop copies, those longest unused first, until the others and what is wanted are within the limit; none that is in use."""
+        found = sorted((_used_at(lock.parent), _size(lock.parent / FILES), lock.parent)
+                       for lock in self._root.glob(f"projects/*/*/*/{LOCK}"))
+        total = wanted_bytes + sum(size for _, size, _ in found)
+        for used_at, size, folder in found:
+            if total <= self._limit_bytes or used_at > time.time() - IN_USE_S:
+                return
+            drop_folder(folder)
+            total -= size
+
+    @contextmanager
+    def _lock(self, prefix: str, waiting: Callable[[], None]) -> Iterator[None]:
+        path = self._root / prefix / LOCK
+        while True:
+            self.files(prefix)  # the copy may be dropped while we wait
+            with storage("make", path):
+                descriptor = file_lock.take(path, 0o644)
+            if descriptor is not None:
+                break
+            waiting()
+            time.sleep(WAIT_S)
+        try:
+            os.utime(descriptor)
+            yield
+        finally:
+            os.close(descriptor)
+
+
+def _state(path: Path) -> list[object]:
+    """Size and time of a file; empty where there is none."""
+    try:
+        status = path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+    return [status.st_size, status.st_mtime_ns]
+
+
+def _used_at(folder: Path) -> float:
+    """When a file was fetched, sent or written last."""
+    return max((path.stat().st_mtime for path in (folder / LOCK, folder / FILES) if path.exists()), default=0.0)
+
+
+def _size(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())

@@ -1,0 +1,157 @@
+"""The database: SQLite in the data folder, or PostgreSQL; opened, checked, and patient with a server that restarts."""
+
+import time
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import sqlalchemy as sa
+from sqlalchemy.exc import InterfaceError, InternalError, OperationalError
+from sqlalchemy.exc import TimeoutError as PoolTimeoutError
+
+from service.server.store import tables
+
+T = TypeVar("T")
+BUSY_MS = 30_000
+"""How long a write waits for another process's on SQLite."""
+CREATE_LOCK = 0x72656C6974
+"""Of the PostgreSQL advisory lock under which the tables are made."""
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 2.0
+UNANSWERED = (OperationalError, InterfaceError, InternalError, PoolTimeoutError)
+"""What a database raises that may answer another time: it restarts, its disk is full, it is locked for long."""
+
+
+def said(error: BaseException) -> str:
+    """What the database itself said, without the statement around it."""
+    return str(getattr(error, "orig", error))
+
+
+class DatabaseError(Exception):
+    """The database cannot be used: the message says which and why."""
+
+
+class Database:
+    """Transactions on the service's tables."""
+
+    def __init__(self, engine: sa.Engine) -> None:
+        """Args: engine: of `connect`."""
+        self.engine = engine
+
+    @property
+    def is_sqlite(self) -> bool:
+        """Whether it is a file."""
+        return self.engine.dialect.name == "sqlite"
+
+    def transact(self, work: Callable[[sa.Connection], T], *, patience_s: float = 0.0) -> T:
+        """Run work in one transaction: all of it happens, or nothing.
+
+        Args:
+            work: gets the connection; called again where the connection was lost and patience is left, so it must not do anything
+                but read and write the database.
+            patience_s: how long to go on trying while the server cannot be reached or the disk is full.
+
+        Raises:
+            DBAPIError: the database does not answer, or takes what is written for wrong.
+        """
+        pause, deadline = FIRST_PAUSE_S, time.monotonic() + patience_s
+        while True:
+            try:
+                with self.engine.begin() as connection:
+                    return work(connection)
+            except UNANSWERED:
+                if time.monotonic() + pause > deadline:
+                    raise
+            time.sleep(pause)
+            pause = min(2 * pause, LONGEST_PAUSE_S)
+
+    def rows(self, query: "sa.Select[Any]") -> list[sa.RowMapping]:
+        """What a query finds."""
+        with self.engine.connect() as connection:
+            return list(connection.execute(query).mappings())
+
+    def row(self, query: "sa.Select[Any]") -> sa.RowMapping | None:
+        """The first row that a query finds."""
+        found = self.rows(query.limit(1))
+        return found[0] if found else None
+
+    def check(self) -> None:
+        """Raises: DBAPIError: it does not answer."""
+        with self.engine.connect() as connection:
+            connection.execute(sa.text("SELECT 1"))
+
+    def close(self) -> None:
+        """Let go of the connections."""
+        self.engine.dispose()
+
+
+def connect(url: str, *, connections: int = 10) -> Database:
+    """Open a database; nothing is created.
+
+    Args:
+        url: SQLAlchemy's, sqlite:///path or postgresql+psycopg://….
+        connections: at most.
+
+    Raises:
+        DatabaseError: the URL is none.
+    """
+    try:
+        parsed = sa.make_url(url)
+        if parsed.get_backend_name() == "sqlite":
+            engine = sa.create_engine(parsed, pool_size=connections, max_overflow=0, pool_timeout=30)
+            sa.event.listen(engine, "connect", _sqlite)
+        elif parsed.get_backend_name() == "postgresql":
+            engine = sa.create_engine(parsed, pool_size=connections, max_overflow=0, pool_timeout=30, pool_pre_ping=True,
+                                      connect_args={"application_name": "relit", "connect_timeout": 10, "keepalives_idle": 5,
+                                                    "keepalives_interval": 2, "keepalives_count": 3})
+        else:
+            raise DatabaseError(f"database_url: {parsed.get_backend_name()} is not supported: give postgresql://…, or none for SQLite")
+    except (sa.exc.ArgumentError, sa.exc.NoSuchModuleError) as error:
+        raise DatabaseError("database_url: is not of the form postgresql://user:password@host/name") from error
+    return Database(engine)
+
+
+def create(database: Database) -> None:
+    """Make the tables where there are none.
+
+    Raises:
+        DatabaseError: they are those of another version of the program.
+    """
+    with database.engine.begin() as connection:
+        if database.is_sqlite:
+            connection.execute(sa.text("BEGIN IMMEDIATE"))
+        else:
+            connection.execute(sa.text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": CREATE_LOCK})
+        tables.metadata.create_all(connection)
+        version = connection.execute(sa.select(tables.about.c.version)).scalar()
+        if version is None:
+            connection.execute(tables.about.insert().values(version=tables.SCHEMA_VERSION))
+        else:
+            _require(version)
+
+
+def require_version(database: Database) -> None:
+    """Look whether the tables are ours; nothing is created.
+
+    Raises:
+        DatabaseError: there are none, or those of another version of the program.
+    """
+    with database.engine.connect() as connection:
+        if not sa.inspect(connection).has_table(tables.about.name):
+            raise DatabaseError("the database has no tables of relit: relit serve makes them")
+        _require(connection.execute(sa.select(tables.about.c.version)).scalar())
+
+
+def _require(version: int | None) -> None:
+    if version != tables.SCHEMA_VERSION:
+        raise DatabaseError(f"the database is of schema {version}, this program of {tables.SCHEMA_VERSION}: "
+                            "use the program that made it, or another data folder or database")
+
+
+def _sqlite(connection: Any, _record: Any) -> None:
+    connection.isolation_level = "IMMEDIATE"  # a write takes the lock at its beginning, so that none is turned away in its middle
+    for pragma in (f"busy_timeout={BUSY_MS}", "journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON"):
+        connection.execute(f"PRAGMA {pragma}")
+
+
+def storable(text: str) -> str:
+    """A sentence that every database takes: it may repeat a name with NUL, or with bytes that are no text."""
+    return text.replace("\0", "\ufffd").encode("utf-8", "replace").decode()

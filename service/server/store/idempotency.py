@@ -1,0 +1,87 @@
+"""A request that creates something, sent again with the same token, creates nothing again."""
+
+import hashlib
+import json
+import time
+from collections.abc import Callable
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy.exc import IntegrityError
+
+from service.server.store.database import Database
+from service.server.store.tables import idempotency
+
+
+class TokenReused(Exception):
+    """The token came with another request before."""
+
+
+def once(database: Database, project: str, token: str | None, asked: Any, make: Callable[[sa.Connection], str]) -> tuple[str, bool]:
+    """Create something, once for a token.
+
+    Args:
+        database: where.
+        project: whose.
+        token: that the client chose; None: every request creates.
+        asked: all that the request says, as JSON can hold it.
+        make: creates it in the transaction, and returns its identifier.
+
+    Returns:
+        The identifier, and whether it was created now.
+
+    Raises:
+        TokenReused: the token belongs to another request.
+    """
+    if token is None:
+        return database.transact(make), True
+    fingerprint = _fingerprint(asked)
+
+    def work(connection: sa.Connection) -> tuple[str, bool]:
+        row = connection.execute(_by_token(project, token)).mappings().one_or_none()
+        if row is not None:
+            return _same(row, fingerprint), False
+        connection.execute(idempotency.insert().values(project=project, token=token, fingerprint=fingerprint, made="",
+                                                       created_at=time.time()))  # the same request, at the same time, waits here
+        created = make(connection)
+        connection.execute(idempotency.update().where(*_is(project, token)).values(made=created))
+        return created, True
+
+    try:
+        return database.transact(work)
+    except IntegrityError:  # the same request, at the same time: it is there now, or the error is another's
+        return database.transact(work)
+
+
+def made(database: Database, project: str, token: str, asked: Any) -> str | None:
+    """What was created with a token; None: nothing. Arguments and errors as of `once`."""
+    row = database.row(_by_token(project, token))
+    return None if row is None else _same(row, _fingerprint(asked))
+
+
+def forget(connection: sa.Connection, project: str, token: str, gone: str) -> None:
+    """What a token made is gone: it may make another, unless it has already."""
+    connection.execute(idempotency.delete().where(*_is(project, token), idempotency.c.made == gone))
+
+
+def drop_before(connection: sa.Connection, when: float) -> None:
+    """Forget tokens of requests before a time."""
+    connection.execute(idempotency.delete().where(idempotency.c.created_at < when))
+
+
+def _by_token(project: str, token: str) -> "sa.Select[Any]":
+    return sa.select(idempotency).where(*_is(project, token))
+
+
+def _is(project: str, token: str) -> "tuple[sa.ColumnElement[bool], ...]":
+    return idempotency.c.project == project, idempotency.c.token == token
+
+
+def _fingerprint(asked: Any) -> str:
+    return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
+
+
+def _same(row: sa.RowMapping, fingerprint: str) -> str:
+    if row["fingerprint"] != fingerprint:
+        raise TokenReused
+    return str(row["made"])

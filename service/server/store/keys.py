@@ -1,0 +1,90 @@
+"""API keys: whom the service lets in. Only a hash of the secret is kept."""
+
+import hashlib
+import hmac
+import secrets
+import time
+from enum import StrEnum
+from typing import Annotated, NamedTuple
+
+import sqlalchemy as sa
+from pydantic import BaseModel, StringConstraints
+
+from service.requests.identifiers import KEY, Project, new_id
+from service.server.store.database import Database
+from service.server.store.tables import keys
+
+SECRET_BYTES = 32
+"""256 random bits: no one finds them by trying, so that one round of SHA-256 is enough."""
+
+
+class Scope(StrEnum):
+    """What a key allows; each allows what those before it do."""
+
+    READ = "read"
+    """See captures, jobs and results."""
+    WRITE = "write"
+    """Upload, hand in jobs, cancel them, delete what is the project's."""
+    ADMIN = "admin"
+    """Register folders of the server."""
+
+
+ORDER = list(Scope)
+
+
+class NewKey(BaseModel):
+    """A key that is to be made."""
+
+    project: Project
+    name: Annotated[str, StringConstraints(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]+$")]
+    scope: Scope
+
+
+class Caller(NamedTuple):
+    """Who asks."""
+
+    project: str
+    scope: Scope
+    key: str | None
+    """Identifier of the key; None: anonymous."""
+
+    def may(self, scope: Scope) -> bool:
+        """Whether the caller's scope allows what this one does."""
+        return ORDER.index(self.scope) >= ORDER.index(scope)
+
+
+def create(database: Database, wanted: NewKey) -> str:
+    """Make a key.
+
+    Returns:
+        The key as its user presents it; it cannot be shown again.
+    """
+    identifier, secret = new_id(KEY), secrets.token_urlsafe(SECRET_BYTES)
+    database.transact(lambda connection: connection.execute(keys.insert().values(
+        id=identifier, **wanted.model_dump(), digest=_digest(secret), created_at=time.time())))
+    return f"{identifier}.{secret}"
+
+
+def find(database: Database, presented: str) -> Caller | None:
+    """Who presents a key; None: it is none of ours, or was revoked."""
+    identifier, _, secret = presented.partition(".")
+    row = database.row(sa.select(keys).where(keys.c.id == identifier, keys.c.revoked_at.is_(None)))
+    if row is None or not hmac.compare_digest(row["digest"], _digest(secret)):
+        return None
+    return Caller(row["project"], Scope(row["scope"]), identifier)
+
+
+def revoke(database: Database, identifier: str) -> bool:
+    """Take a key back; false where there is none that is not revoked."""
+    return database.transact(lambda connection: connection.execute(keys.update().where(
+        keys.c.id == identifier, keys.c.revoked_at.is_(None)).values(revoked_at=time.time())).rowcount == 1)
+
+
+def listing(database: Database, project: str | None = None) -> list[sa.RowMapping]:
+    """Keys that were made, without their secrets; the oldest first."""
+    query = sa.select(keys.c.id, keys.c.project, keys.c.name, keys.c.scope, keys.c.created_at, keys.c.revoked_at)
+    return database.rows((query if project is None else query.where(keys.c.project == project)).order_by(keys.c.created_at))
+
+
+def _digest(secret: str) -> str:
+    return hashlib.sha256(secret.encode()).hexdigest()

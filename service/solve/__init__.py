@@ -1,0 +1,1 @@
+"""Light-stage captures to normals, reflectance and height."""

@@ -1,0 +1,136 @@
+"""Spherical gradient frames → diffuse and specular normals, albedo and, behind polarisers, F₀ and roughness, band by band."""
+
+from typing import Any
+
+import numpy as np
+
+from kernels import packs
+from kernels.photometric.gradient import diffuse_normals
+from kernels.photometric.highlight import fit_highlights, specular_normals
+from kernels.photometric.moments import Moments, fit_moments
+from kernels.photometric.separation import separate_by_colour, separate_polarised
+from kernels.status import Status
+from service.reporting.progress import Timings
+from service.solve.batches import view_directions
+from service.solve.solution import Solution
+from stage.camera import Camera
+from stage.colour import GREY_WEIGHTS
+from stage.gradients import GradientFrames
+from stage.stack import Stack
+
+BYTES_PER_PIXEL = 400
+"""Responses of up to three kinds of frames, separation, view and results, beside the stack's band."""
+CROSSED_GAIN = 2.0
+"""A crossed analyser passes half of the diffuse light, which has lost its polarisation (Malus)."""
+MIN_DIFFUSE = 0.01
+"""Diffuse over specular light, below which a pixel is metal: what is left of the diffuse is noise, and its direction too."""
+METAL_CONFIDENCE = 0.2
+"""Of a normal that only a highlight tells: a standard error of four degrees, since no second reading checks the lobe."""
+
+
+def solve_gradients(frames: GradientFrames, stack: Stack, camera: Camera, mask: np.ndarray, device: str,
+                    timings: Timings) -> Solution:
+    """Solve the gradient frames of a stack.
+
+    Args:
+        frames: which frames of the stack measure what.
+        stack: the ingested capture.
+        camera: for the lines of sight.
+        mask: [rows, cols] bool.
+        device: where.
+        timings: told of every band.
+    """
+    timings.stage("normals", stack.shape[2])
+    pixels = stack.pixel_count
+    view = view_vectors(camera, stack.shape[2])
+    inside = mask.reshape(-1)
+    result = Solution.empty(pixels)
+    if not frames.polarised or frames.parallel is not None:
+        result.specular_normal = np.zeros((3, pixels), np.float32)
+    if frames.parallel is not None:
+        result.specular, result.roughness = np.zeros((3, pixels), np.float16), np.zeros(pixels, np.float16)
+    length, separated, metal = np.zeros(pixels, np.float32), np.zeros(pixels, bool), np.zeros(pixels, bool)
+    gain = CROSSED_GAIN if frames.polarised else 1.0
+    for start, stop in stack.bands(BYTES_PER_PIXEL):
+        here = slice(start, min(stop, pixels))
+        kept = inside[here]
+        if kept.any():
+            band = packs.upload(stack.band(start, stop), stack.saturated(start, stop), device=device)
+            toward = view if view.shape[1] == 1 else view[:, start:stop]
+            diffuse = _moments(band, frames.diffuse, stack)
+            if not frames.polarised:
+                parts = separate_by_colour(diffuse, toward, pixel_count=band.pixel_count, device=device)
+                diffuse = parts.diffuse
+                normal = specular_normals(parts, GREY_WEIGHTS, toward, gain=gain, pixel_count=band.pixel_count, device=device)
+                _keep(result.specular_normal, here, kept, normal)
+            elif frames.parallel is not None:
+                parallel = _moments(band, frames.parallel, stack)
+                parts = separate_polarised(diffuse, parallel, GREY_WEIGHTS, pixel_count=band.pixel_count, device=device)
+                highlight = fit_highlights(parts, GREY_WEIGHTS, toward, gain=gain, pixel_count=band.pixel_count, device=device)
+                _keep(result.specular_normal, here, kept, highlight.normal)
+                _keep(result.specular, here, kept, highlight.f0)
+                _keep(result.roughness, here, kept, highlight.roughness)
+            fit = diffuse_normals(diffuse, GREY_WEIGHTS, gain=gain, pixel_count=band.pixel_count, device=device)
+            _keep(result.normal, here, kept, fit.normal)
+            _keep(result.albedo, here, kept, fit.albedo)
+            _keep(result.confidence, here, kept, fit.confidence)
+            _keep(result.residual, here, kept, diffuse.residual)
+            _keep(result.status, here, kept, fit.status)
+            _keep(length, here, kept, fit.length)
+            if frames.parallel is not None:
+                metal[here] = _take_highlight(result, here, parts.specular.numpy()[:3, : len(kept)])
+                result.residual[here] = np.where(metal[here], parallel.residual.numpy()[: len(kept)], result.residual[here])
+            separated[here] = kept & (diffuse.tilt.numpy()[: len(kept)] == 0)
+        timings.advance(stop)
+    result.facts = _facts(frames, result, length, separated, metal)
+    if result.specular_normal is not None and not result.specular_normal.any():
+        result.specular_normal = None  # a layer that holds nothing is absent
+    return result
+
+
+def view_vectors(camera: Camera, padded: int) -> np.ndarray:
+    """Unit vectors from the surface to the camera: [3, padded] float32, 0 in the padding, or [3, 1] when all are the same."""
+    if camera.projection == "orthographic":
+        return np.array([[0.0], [0.0], [1.0]], dtype=np.float32)
+    toward = view_directions(camera)(np.arange(camera.width * camera.height)).T
+    return np.pad(toward, ((0, 0), (0, padded - toward.shape[1])))
+
+
+def _facts(frames: GradientFrames, result: Solution, length: np.ndarray, separated: np.ndarray,
+           metal: np.ndarray) -> dict[str, Any]:
+    """What the report says beside the statistics that every method has."""
+    solved = result.status == Status.OK
+    how = "colour" if not frames.polarised else "polarisation" if frames.parallel is not None else "crossed polariser"
+    facts: dict[str, Any] = {"separation": how, "pixels_separated": int((solved & separated).sum()),
+                             "pixels_taken_as_diffuse": int((solved & ~separated).sum()), "frames_unused": list(frames.unused)}
+    if result.specular_normal is not None:
+        facts["pixels_with_specular_normal"] = int((solved & result.specular_normal.any(axis=0)).sum())
+        facts["pixels_by_highlight_alone"] = int(metal.sum())
+    solved &= ~metal
+    if solved.any():  # of the response vector, (3/2)|M|/M0: one on a convex Lambertian surface
+        middle, low = np.percentile(length[solved], [50, 5])
+        facts["response_length"] = {"median": round(float(middle), 5), "p5": round(float(low), 5)}
+    return facts
+
+
+def _take_highlight(result: Solution, here: slice, specular: np.ndarray) -> np.ndarray:
+    """Where the highlight is all there is, as on metal, its normal is the normal; says where."""
+    assert result.specular_normal is not None
+    normal = result.specular_normal[:, here]
+    metal = normal.any(axis=0) & (result.albedo[:, here].astype(np.float32).sum(axis=0) <= MIN_DIFFUSE * specular.sum(axis=0))
+    result.normal[:, here][:, metal] = normal[:, metal]
+    result.confidence[here][metal] = METAL_CONFIDENCE
+    result.status[here][metal] = int(Status.OK)
+    return metal
+
+
+def _keep(target: np.ndarray | None, here: slice, kept: np.ndarray, found: Any) -> None:
+    """Bring a band's result over; 0 outside the mask, which as a status is UNSOLVED."""
+    assert target is not None
+    target[..., here] = np.where(kept, found.numpy()[..., : len(kept)], 0)
+
+
+def _moments(band: packs.Band, rows: np.ndarray, stack: Stack) -> Moments:
+    padded = np.zeros((band.light_count, 4))
+    padded[: len(rows)] = rows
+    return fit_moments(band, padded, stack.scale, GREY_WEIGHTS)

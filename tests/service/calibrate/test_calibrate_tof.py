@@ -1,0 +1,72 @@
+"""relit calibrate tof: a sweep of simulated captures to a calibration, and the calibration used."""
+
+import json
+
+import numpy as np
+import pytest
+
+from service.calibrate.tof import calibrate_tof
+from stage.camera import Camera
+from stage.errors import StageError
+from stage.tof.calibration import read_calibration
+from tests.reference import tof
+from tests.service.depth.test_tof import cw_frames, pulsed_frames, run, write
+
+ROWS, COLS = 12, 16
+CAMERA = {"projection": "perspective", "resolution": [COLS, ROWS], "focal_px": [20.0, 20.0]}
+SETTINGS = tof.even(tof.HZ, 4)
+WAVES = {3: 0.08, 5: -0.02}
+
+
+def wall(depth_m: float, shift_m: float = 0.0) -> tof.View:
+    x, y = Camera.model_validate(CAMERA).plane_coordinates()
+    return tof.View(depth_m * np.sqrt(x**2 + y**2 + 1) + shift_m, np.full((ROWS, COLS), 0.8), np.ones((ROWS, COLS)))
+
+
+def sweep(folder, steps, frames):
+    for name, depth_m, shift_m, _ in steps:
+        write(folder / name, frames(wall(depth_m, shift_m)), camera=CAMERA)
+    entries = [{"capture": name, "depth_m": depth_m, **({} if warm is None else {"temperature_c": warm})}
+               for name, depth_m, _, warm in steps]
+    (folder / "sweep.json").write_text(json.dumps({"schema": "relit.tof-sweep/1", "steps": entries}))
+    return folder / "sweep.json"
+
+
+def cw(view):
+    return cw_frames(tof.correlations(view, 1e6, SETTINGS, seed=1, harmonics=WAVES), SETTINGS)
+
+
+def test_wiggling_offset_and_drift_of_a_sweep(tmp_path, relit):
+    steps = [(f"d{k}", depth, 0.04, 25.0) for k, depth in enumerate(np.linspace(0.8, 7.5, 40))]
+    steps += [(f"w{k}", 2.0 + k, 0.04 + 1e-3 * (warm - 25), warm) for k, warm in enumerate((15.0, 35.0, 45.0))]
+    outcome = relit("calibrate", "tof", sweep(tmp_path, steps, cw), "--out", tmp_path / "camera.json", "--device", "cpu")
+    assert outcome.code == 0, outcome.err
+    assert "wiggling at 80 MHz" in outcome.out and "before" in outcome.out
+    calibration = read_calibration(tmp_path / "camera.json")
+    assert calibration.temperature is not None
+    assert calibration.temperature.metres_per_c == pytest.approx(1e-3, rel=0.05)
+    folder = write(tmp_path / "new", cw(wall(3.3, 0.04 + 1e-3 * 15)), camera=CAMERA)
+    _, maps, _ = run(folder, calibration=tmp_path / "camera.json", temperature_c=40.0)
+    assert maps.mask.mean() > 0.99
+    assert abs(np.median(maps.depth[maps.mask]) - 3.3) < 2e-3
+    assert np.sqrt(np.mean((maps.depth[maps.mask] - 3.3) ** 2)) < 5e-3
+
+
+def test_scale_and_offset_of_a_pulsed_sweep(tmp_path):
+    steps = [(f"d{k}", depth, 0.05 + 0.01 * depth, None) for k, depth in enumerate(np.linspace(1, 8, 6))]
+    path = sweep(tmp_path, steps, lambda view: pulsed_frames(tof.histogram(view, 1e6, seed=0)))
+    result = calibrate_tof(path, tmp_path / "c.json", device="cpu")
+    assert result.before_m > 0.05 and result.after_m < 2e-3
+    assert result.calibration.offset_m == pytest.approx(0.05, abs=0.01)
+
+
+@pytest.mark.parametrize(("steps", "message"), [
+    ([("d0", 1.0, 0, None)], "steps"),
+    ([("d0", 1.0, 0, None), ("d1", 2.0, 0, 20.0)], "temperature_c is missing for some"),
+    ([("d0", 1.0, 0, None), ("d1", 1.02, 0, None)], "of a turn"),
+])
+def test_sweeps_that_say_too_little_are_refused(steps, message, tmp_path):
+    with pytest.raises(StageError) as caught:
+        calibrate_tof(sweep(tmp_path, steps, cw), tmp_path / "c.json", device="cpu")
+    assert message in str(caught.value)
+    assert not (tmp_path / "c.json").exists()

@@ -1,0 +1,149 @@
+"""relit calibrate procam and response, and relit import opencv-gray: from images on disk to a manifest that measures depth."""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stage.capture import Capture
+from stage.depth_maps import DepthMaps
+from tests.captures import edit_manifest, write_image, write_manifest
+from tests.depth_captures import BLACK_WHITE
+from tests.reference import projector as reference
+from tests.stage.calibration import test_procam as boards
+
+CAMERA = boards.CAMERA
+PROJECTOR = reference.Device(256, 192, 360.0, (-0.05, 0.01, 0.0), (-0.0005, 0.001))
+BITS = 8
+REAL = Path(os.environ.get("RELIT_TEST_DATA", Path(__file__).resolve().parents[4] / "shared" / "data")) / "graycode_chessboard"
+
+
+def phase(axis, period):
+    return [{"code": "phase", "axis": axis, "period_px": period, "step": step, "steps": 3} for step in range(3)]
+
+
+PATTERNS = [*phase("column", 24), *phase("column", 25), *phase("row", 24), *phase("row", 25), *BLACK_WHITE]
+
+
+def write_view(folder, pose, *, devices=False):
+    """One pose of the board under phases of both axes: with Gray codes it would be 34 images."""
+    radiance = boards.board_image(pose)
+    rays = reference.pixel_rays(CAMERA)
+    normal = pose[:3, 2]
+    points = rays * (pose[:3, 3] @ normal / (rays @ normal))[..., None]
+    uv = reference.seen_by(PROJECTOR, boards.POSE, points)
+    frames = []
+    for number, pattern in enumerate(PATTERNS):
+        if pattern["code"] == "phase":
+            u = uv[..., 0 if pattern["axis"] == "column" else 1]
+            light = (1 + np.cos(2 * np.pi * (u / pattern["period_px"] - pattern["step"] / pattern["steps"]))) / 2
+        else:
+            light = np.full(radiance.shape, float(pattern["code"] == "white"))
+        write_image(folder / f"{number}.png", np.rint(65535 * radiance * (0.02 + 0.9 * light)).astype(np.uint16))
+        frames.append({"image": f"{number}.png", "pattern": pattern})
+    write_manifest(folder, {"schema": "relit.capture/1", "name": folder.name, "frames": frames,
+                            "camera": {"projection": "orthographic", "resolution": [CAMERA.width, CAMERA.height]}})
+    return points
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory):
+    """Five poses of the board, and the true points of the first."""
+    folder = tmp_path_factory.mktemp("board")
+    points = [write_view(folder / f"pose{number}", pose) for number, pose in enumerate(boards.poses(5))]
+    return [folder / f"pose{number}" for number in range(5)], points[0]
+
+
+def test_a_rig_calibrates_itself_and_measures(relit, rig, tmp_path):
+    folders, points = rig
+    outcome = relit("calibrate", "procam", *folders, "--board", "9x6", "--square-m", 0.03, "--projector", "256x192")
+    assert (outcome.code, outcome.err) == (0, ""), outcome.err
+    assert "pose4" in outcome.out and "px RMS" in outcome.out
+    manifest = Capture.open(folders[2]).manifest
+    assert np.abs(np.array(manifest.camera.focal_px) / CAMERA.focal - 1).max() < 0.01
+    assert np.abs(np.array(manifest.projector.focal_px) / PROJECTOR.focal - 1).max() < 0.01
+    place = np.array(manifest.projector.camera_from_projector)[:3, 3]
+    assert np.linalg.norm(place - boards.POSE[:3, 3]) < 0.005
+    report = json.loads((folders[0] / "calibration.json").read_text())["procam"]
+    assert len(report["views"]) == 5 and report["rms_px"] < 0.3 and report["left_out"] == []
+    outcome = relit("depth", folders[0], "--out", tmp_path, "--read-noise", 0.0003)
+    assert (outcome.code, outcome.err) == (0, "")
+    maps = DepthMaps.read(tmp_path / "depth.exr")
+    corners = np.s_[100:200, 140:260]  # the board is in the middle
+    assert maps.mask[corners].mean() > 0.9
+    off = np.abs(maps.depth + points[..., 2])[corners][maps.mask[corners]]
+    assert np.median(off) < 0.01  # of 0.9 m: five views of corners that are good to 0.1 px
+
+
+def test_what_is_wrong_is_said(relit, rig, tmp_path):
+    folders, _ = rig
+
+    def refused(*arguments):
+        outcome = relit("calibrate", "procam", *arguments)
+        assert outcome.code == 2 and len(outcome.err.splitlines()) == 1
+        return outcome.err
+
+    given = "--square-m", 0.03, "--board"
+    assert "2 of the views can be used" in refused(*folders[:2], *given, "9x6", "--projector", "256x192")
+    assert "is not found (and so with every view)" in refused(folders[0], *given, "12x9", "--projector", "256x192")
+    assert "--board 9: give two whole numbers" in refused(folders[0], *given, "9")
+    write_view(tmp_path / "one", next(boards.poses(1)))
+    assert "--projector WIDTHxHEIGHT" in refused(tmp_path / "one", *given, "9x6")
+    data = json.loads((tmp_path / "one" / "capture.json").read_text())
+    edit_manifest(tmp_path / "one", frames=[frame for frame in data["frames"] if frame["pattern"].get("axis") != "row"])
+    assert "no row code" in refused(tmp_path / "one", *given, "9x6", "--projector", "256x192")
+
+
+def test_response_is_written_into_the_projector(relit, tmp_path):
+    levels = np.linspace(0, 1, 6)
+    rng = np.random.default_rng(0)
+    scale = rng.uniform(0.2, 0.8, (12, 16))
+    names = []
+    for number, level in enumerate(levels):
+        names.append(write_image(tmp_path / f"level{number}.png", np.rint(65535 * (0.02 + scale * level**2.2)).astype(np.uint16)))
+    write_manifest(tmp_path, {
+        "schema": "relit.capture/1", "name": "r", "camera": {"projection": "perspective", "resolution": [16, 12], "focal_px": [20, 20]},
+        "projector": {"resolution": [64, 48], "focal_px": [60, 60],
+                      "camera_from_projector": reference.look_at((0.1, 0, 0), (0, 0, -1)).tolist()},
+        "frames": [{"image": "level5.png", "pattern": {"code": "white"}}]})
+    outcome = relit("calibrate", "response", tmp_path, *names)
+    assert (outcome.code, outcome.err) == (0, "") and "level^2.20" in outcome.out
+    response = Capture.open(tmp_path).manifest.projector.response
+    assert np.abs(np.array(response) - np.linspace(0, 1, 256) ** 2.2).max() < 2e-3
+    outcome = relit("calibrate", "response", tmp_path, *names, "--levels", "0,1")
+    assert outcome.code == 2 and "--levels: has 2 values, there are 6 images" in outcome.err
+    outcome = relit("calibrate", "response", tmp_path, *names, "--levels", "a,1")
+    assert outcome.code == 2 and "give numbers from 0 to 1" in outcome.err
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="real captures are not part of the project")
+def test_a_real_scan_is_imported_and_decoded(relit, tmp_path):
+    """Corners of the real chessboard in the projector lie on one homography of the board: it is flat."""
+    import cv2
+
+    from service.calibrate import procam as calibrate_procam
+    from service.requests.calibrate import ProcamRequest
+
+    outcome = relit("import", "opencv-gray", REAL, tmp_path, "--projector", "1024x768")
+    assert (outcome.code, outcome.err) == (0, "")
+    capture = Capture.open(tmp_path)
+    request = ProcamRequest(captures=(tmp_path,), board=(9, 7), square_m=0.02)
+    view = calibrate_procam.view_of(capture, (1024, 768), request, "cpu")
+    assert len(view.kept) == 63
+    board = np.stack(np.meshgrid(np.arange(9), np.arange(7)), axis=-1).reshape(-1, 2).astype(float)
+    for corners, limit in ((view.camera, 0.5), (view.projector, 0.5)):
+        matrix, _ = cv2.findHomography(board, corners)
+        there = np.column_stack([board, np.ones(63)]) @ matrix.T
+        off = np.linalg.norm(there[:, :2] / there[:, 2:] - corners, axis=1)
+        assert np.sqrt((off**2).mean()) < limit
+    outcome = relit("depth", tmp_path, "--out", tmp_path / "out")
+    assert outcome.code == 2 and "projector: is missing" in outcome.err and "calibrate procam" in outcome.err
+
+
+def test_import_options_are_for_their_format(relit, tmp_path):
+    outcome = relit("import", "lp", tmp_path, tmp_path, "--projector", "16x6")
+    assert outcome.code == 2 and "are for opencv-gray" in outcome.err
+    outcome = relit("import", "opencv-gray", tmp_path, tmp_path)
+    assert outcome.code == 2 and "--projector is missing" in outcome.err

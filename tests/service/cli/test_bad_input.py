@@ -1,0 +1,302 @@
+"""Every bad input: exit code 2, one sentence that names the file or the field, and nothing half-written anywhere."""
+
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import service
+from tests.captures import edit_frame, edit_manifest, files_in, make_scene, write_capture, write_exr, write_image
+
+SCENE = make_scene(size=8, lights=5)
+MEMORY = ".relit/files.json"
+"""Remembered hashes: the one file that a refused run may leave in a capture."""
+
+
+def cut(path: Path, keep: float) -> None:
+    data = path.read_bytes()
+    path.write_bytes(data[: int(keep * len(data))])
+
+
+def image_with(path: Path, value: float) -> None:
+    image = SCENE.images[2].copy()
+    image[3, 4] = value
+    write_exr(path, image)
+
+
+def coplanar(cap: Path) -> None:
+    for index, x in enumerate((-0.5, -0.2, 0.1, 0.3, 0.6)):
+        edit_frame(cap, index, light={"type": "distant", "direction": [x, 0.0, 1.0], "irradiance": [1, 1, 1]})
+
+
+def one_light(cap: Path) -> None:
+    edit_manifest(cap, frames=json.loads((cap / "capture.json").read_text())["frames"][:1])
+
+
+def one_pixel(cap: Path) -> None:
+    for name in [path.name for path in cap.glob("*.exr")] + ["mask.png"]:
+        (cap / name).unlink()
+    write_capture(cap, make_scene(size=1, lights=5))
+
+
+def folder_in_place_of(path: Path) -> None:
+    path.unlink()
+    path.mkdir()
+
+
+def in_place_of_capture(cap: Path) -> None:
+    for path in cap.iterdir():
+        path.unlink()
+    cap.rmdir()
+    cap.write_text("not a folder")
+
+
+BAD = {
+    "missing file": (lambda cap: (cap / "002.exr").unlink(), "capture.json: frames[2].image: 002.exr is not in the folder"),
+    "missing mask": (lambda cap: (cap / "mask.png").unlink(), "capture.json: mask: mask.png is not in the folder"),
+    "truncated EXR": (lambda cap: cut(cap / "002.exr", 0.9), "002.exr: is truncated: "),
+    "half an EXR header": (lambda cap: cut(cap / "002.exr", 0.1), "002.exr: is damaged or truncated"),
+    "empty EXR": (lambda cap: cut(cap / "002.exr", 0), "002.exr: is not an OpenEXR file"),
+    "truncated PNG": (lambda cap: cut(cap / "mask.png", 0.9), "mask.png: is truncated"),
+    "wrong size": (lambda cap: write_exr(cap / "002.exr", np.ones((8, 9, 3))), "002.exr: is 9x8, camera.resolution says 8x8"),
+    "wrong mask size": (lambda cap: write_image(cap / "mask.png", np.full((9, 9), 255, np.uint8)), "mask.png: is 9x9"),
+    "NaN": (lambda cap: image_with(cap / "002.exr", np.nan),
+            "002.exr: 1 pixel is not finite (NaN or infinity), the first at row 3, column 4"),
+    "infinity": (lambda cap: image_with(cap / "002.exr", np.inf), "002.exr: 1 pixel is not finite"),
+    "negative": (lambda cap: image_with(cap / "002.exr", -0.01), "002.exr: 1 pixel is negative, the first at row 3, column 4"),
+    "zero direction": (lambda cap: edit_frame(cap, 2, light={"type": "distant", "direction": [0, 0, 0], "irradiance": [1, 1, 1]}),
+                       "capture.json: frames[2].light.direction: has zero length"),
+    "two frames of one name": (lambda cap: edit_frame(cap, 2, image="001.exr"),
+                               "capture.json: frames[2].image: 001.exr is already the image of frames[1]"),
+    "empty mask": (lambda cap: write_image(cap / "mask.png", np.zeros((8, 8), np.uint8)), "mask.png: the mask is empty"),
+    "coplanar lights": (coplanar, "capture.json: frames[].light.direction: all 5 lights lie in one plane"),
+    "one light": (one_light, "capture.json: frames: 1 lit by a distant light: a normal needs three or more"),
+    "one pixel": (one_pixel, "capture.json: camera.resolution: is 1x1"),
+    "unknown key": (lambda cap: edit_manifest(cap, color="red"), "capture.json: color: is not a known key"),
+    "not JSON": (lambda cap: (cap / "capture.json").write_text("{"), "capture.json: is not JSON"),
+    "no manifest": (lambda cap: (cap / "capture.json").unlink(), "cap: holds no capture.json"),
+    "a file for a folder": (in_place_of_capture, "cap: there is no such folder"),
+    "a folder for a file": (lambda cap: folder_in_place_of(cap / "002.exr"), "cannot read"),
+    "a path outside": (lambda cap: edit_frame(cap, 2, image="../002.exr"), "../002.exr leads out of the capture's folder"),
+    "unknown format": (lambda cap: edit_frame(cap, 2, image="capture.json"), "capture.json: has an unknown suffix"),
+    "dark of another size": (lambda cap: (write_exr(cap / "d.exr", np.zeros((2, 2))), edit_manifest(cap, dark="d.exr")),
+                             "d.exr: is 2x2"),
+    "NaN in the dark frame": (lambda cap: (write_exr(cap / "d.exr", np.full((8, 8), np.nan)), edit_manifest(cap, dark="d.exr")),
+                              "d.exr: 64 pixels are not finite"),
+}
+MAY_RELIGHT = {"coplanar lights", "one light", "one pixel", "empty mask"}
+"""Faults that stop a solver but not a sum of images."""
+
+
+def refused(outcome, words: str) -> None:
+    """Code 2 and one sentence."""
+    assert outcome.code == 2, outcome
+    assert outcome.err.startswith("relit: "), outcome
+    assert outcome.err.count("\n") == 1 and outcome.err.endswith("\n"), outcome
+    assert words in outcome.err, outcome
+    assert "Traceback" not in outcome.out + outcome.err
+
+
+@pytest.mark.parametrize(("command", "fault"), [(command, fault) for command in ("solve", "info", "relight") for fault in BAD
+                                                if command != "relight" or fault not in MAY_RELIGHT])
+def test_bad_captures(relit, tmp_path, command, fault):
+    cap, out = tmp_path / "cap", tmp_path / "out"
+    write_capture(cap, SCENE)
+    spoil, words = BAD[fault]
+    spoil(cap)
+    sky = write_exr(tmp_path / "sky.exr", np.ones((4, 8, 3)))
+    before = files_in(tmp_path)
+    arguments = {"solve": ["--out", out], "info": [], "relight": ["--environment", sky, "--out", out / "a.##.exr"]}[command]
+    outcome = relit(command, cap, *arguments)
+    refused(outcome, words)
+    assert outcome.err.count(str(cap)) <= 1  # the path is said once
+    assert files_in(tmp_path) - {f"cap/{MEMORY}"} == before
+    assert not out.exists()
+
+
+def test_info_faults_are_refused_even_where_a_later_step_would_find_them(relit, tmp_path):
+    write_capture(tmp_path, SCENE)
+    image_with(tmp_path / "004.exr", np.nan)
+    write_exr(tmp_path / "001.exr", np.full((8, 8, 3), -1.0))
+    outcome = relit("info", tmp_path)
+    refused(outcome, "001.exr: 64 pixels are negative")
+    assert "004.exr: 1 pixel is not finite" in outcome.out
+
+
+BAD_RELIGHT = {
+    "environment of another shape": ({"sky": np.ones((4, 9, 3))}, {}, "sky.exr: is 9x4: a lat-long map is twice as wide as high"),
+    "square environment": ({"sky": np.ones((4, 4, 3))}, {}, "sky.exr: is 4x4: a lat-long map is twice as wide as high"),
+    "NaN in the environment": ({"sky": np.full((4, 8, 3), np.nan)}, {}, "sky.exr: 32 pixels are not finite"),
+    "negative environment": ({"sky": np.full((4, 8, 3), -1.0)}, {}, "sky.exr: 32 pixels are negative"),
+    "no environment": ({}, {"environment": "none.exr"}, "none.exr: no such file or directory"),
+    "environment of another kind": ({}, {"environment": "sky.png"}, "sky.png: an environment is a lat-long .exr or .hdr"),
+    "frames backwards": ({}, {"frames": "5-3"}, "--frames 5-3: runs backwards: give 3-5"),
+    "frames in words": ({}, {"frames": "one"}, "--frames one: give a number, or first-last such as 1-24"),
+    "negative frame": ({}, {"frames": "-3"}, "--frames -3: give a number"),
+    "no number in the name": ({}, {"out": "out/a.exr"}, "a.exr: the file name needs one run of #"),
+    "two numbers in the name": ({}, {"out": "out/a.#.##.exr"}, "a.#.##.exr: the file name needs one run of #"),
+    "a number in the folder": ({}, {"out": "out.##/a.##.exr"}, "the file name needs one run of #"),
+    "wrong suffix": ({}, {"out": "out/a.##.png"}, "a.##.png: frames are OpenEXR: end the name in .exr"),
+    "over its own images": ({}, {"out": "cap/###.exr"}, "001.exr is an input: choose another folder or name"),
+    "more frames than a disk": ({}, {"frames": "1-99999999999"}, "--frames 1-99999999999: asks for 99999999999 frames"),
+    "endless spin": ({}, {"spin-degrees": "inf"}, "spin_degrees: is Infinity"),
+    "no spin": ({}, {"spin-degrees": "nan"}, "spin_degrees: is NaN"),
+    "a file for a folder": ({}, {"out": "file/a.##.exr"}, "cannot write file/a.01.exr: not a directory"),
+    "two numbers in the environment": ({}, {"environment": "sky.#.##.exr"}, "sky.#.##.exr: the file name of a sequence has one run of #"),
+    "an environment of a sequence": ({}, {"environment": "sky.##.exr"}, "frame 1 has no map: sky.01.exr is not there"),
+    "over its environment": ({}, {"environment": "env/a.##.exr", "out": "env/a.##.exr"}, "frame 1 has no map: env/a.01.exr"),
+    "no keys": ({}, {"keys": "none.json"}, "cannot read none.json: no such file"),
+    "far too bright": ({}, {"exposure": "99"}, "exposure: is 99.0: input should be less than or equal to 32"),
+    "not a number of stops": ({}, {"exposure": "nan"}, "exposure: is NaN"),
+    "a layer without maps": ({}, {"aov": "beauty,normal"}, "--aov normal needs --maps DIR"),
+    "confidence without maps": ({}, {"aov": "confidence"}, "--aov confidence needs --maps DIR"),
+    "an unknown layer": ({}, {"aov": "beauty,depth"}, 'aov[1]: is "depth": input should be \'beauty\', \'diffuse\''),
+    "maps for nothing": ({}, {"maps": "cap"}, "cap/maps.exr is not there: run `relit solve` first"),
+    "no maps there": ({}, {"maps": "cap", "aov": "normal"}, "cap/maps.exr is not there: run `relit solve` first"),
+    "another colour space": ({}, {"color-space": "srgb_texture"}, "'srgb_texture' is not one of 'lin_rec709_scene', 'lin_ap1_scene'"),
+    "another compression": ({}, {"compression": "jpeg"}, "'jpeg' is not one of 'zip', 'piz', 'dwaa'"),
+    "other weights": ({}, {"weights": "even"}, "'even' is not one of 'cells', 'smooth'"),
+    "smooth weights in one plane": ({"plane": True}, {"weights": "smooth"}, "smooth weighting needs lights that are not all in one plane"),
+    "a sheet of another kind": ({}, {"sheet": "s.jpg"}, "--sheet s.jpg: a contact sheet is a PNG"),
+    "a sheet over the mask": ({}, {"sheet": "cap/mask.png"}, "--sheet cap/mask.png: cap/mask.png is an input"),
+    "a report over the manifest": ({}, {"report": "cap/capture.json"}, "--report cap/capture.json: cap/capture.json is an input"),
+    "a report below a file": ({}, {"report": "file/r.json"}, "cannot write file/r.json: not a directory"),
+}
+
+
+@pytest.mark.parametrize("fault", BAD_RELIGHT)
+def test_bad_relights(relit, tmp_path, monkeypatch, fault):
+    monkeypatch.chdir(tmp_path)
+    write_capture(tmp_path / "cap", SCENE)
+    (tmp_path / "file").write_text("")
+    images, options, words = BAD_RELIGHT[fault]
+    if "plane" in images:
+        coplanar(tmp_path / "cap")
+    write_exr(tmp_path / "sky.exr", images.get("sky", np.ones((4, 8, 3))))
+    before = {name: (tmp_path / name).read_bytes() for name in files_in(tmp_path)}
+    given = {"environment": "sky.exr", "out": "out/a.##.exr", "frames": "1-2", **options}
+    refused(relit("relight", "cap", *[part for name, value in given.items() for part in (f"--{name}", value)]), words)
+    after = files_in(tmp_path)
+    assert {name for name in after if not name.startswith("cap/.relit/")} == set(before)
+    assert all((tmp_path / name).read_bytes() == content for name, content in before.items())
+
+
+@pytest.mark.parametrize(("out", "maps", "words"), [
+    ("a.usdz", "none", "none: is not there: run `relit solve` or `relit depth` first"),
+    ("a.usdz", "empty", "empty/maps.exr: is not there: run `relit solve` or `relit depth` first"),
+    ("a.usdz", "sky.exr", "sky.exr: carries no relit:camera attribute"),
+    ("a.obj", "solved", "a.obj"),
+    ("file/a.usdz", "solved", "cannot write"),
+])
+def test_bad_exports(relit, tmp_path, monkeypatch, out, maps, words):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("")
+    (tmp_path / "empty").mkdir()
+    write_exr(tmp_path / "sky.exr", np.ones((4, 8, 3)))
+    write_capture(tmp_path / "cap", SCENE)
+    assert relit("solve", "cap", "--out", "solved").code == 0
+    before = files_in(tmp_path)
+    refused(relit("export", maps, "--out", out), words)
+    assert files_in(tmp_path) == before
+
+
+def test_results_that_cannot_be_written(relit, tmp_path):
+    write_capture(tmp_path / "cap", SCENE)
+    (tmp_path / "file").write_text("")
+    refused(relit("solve", tmp_path / "cap", "--out", tmp_path / "file" / "out"), f"cannot write {tmp_path}/file/out/maps.exr: ")
+    assert not [name for name in files_in(tmp_path) if ".maps" in name]
+
+
+AS_NOBODY = """
+import os, sys
+import service.cli.main, service.errors, service.cli.bar, service.captures.inspect, service.solve.solve
+service.solve.solve.devices.names()  # what starting Warp writes is not the matter here
+if os.geteuid() == 0:
+    os.seteuid(65534)
+service.cli.main.main()
+"""
+"""The program without the superuser's leave to pass over permissions."""
+
+
+@pytest.fixture
+def open_folder():
+    """A folder that every user may enter, which pytest's own is not."""
+    with tempfile.TemporaryDirectory() as name:
+        Path(name).chmod(0o777)
+        yield Path(name)
+
+
+@pytest.mark.parametrize(("command", "locked", "mode", "words"), [
+    ("info", "", 0o000, "cap: permission denied"),
+    ("solve", "", 0o000, "cap: permission denied"),
+    ("solve", "002.exr", 0o000, "002.exr: permission denied"),
+    ("info", "capture.json", 0o000, "capture.json: permission denied"),
+    ("solve", "", 0o555, "cap/.relit: permission denied"),  # it can be read, but holds no cache; --cache says where to
+])
+def test_what_may_not_be_read_or_written(open_folder, command, locked, mode, words):
+    cap = write_capture(open_folder / "cap", SCENE)
+    before = files_in(open_folder)
+    (cap / locked).chmod(mode)
+    arguments = ["--out", str(open_folder / "out")] if command == "solve" else []
+    done = subprocess.run([sys.executable, "-c", AS_NOBODY, command, str(cap), *arguments], capture_output=True, text=True,
+                          timeout=60, cwd=Path(service.__file__).parents[1])
+    (cap / locked).chmod(0o755)
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.startswith("relit: cannot ") and done.stderr.count("\n") == 1
+    assert words in done.stderr
+    assert files_in(open_folder) == before
+
+
+def test_frames_into_a_locked_folder_are_refused_before_any_work(open_folder):
+    cap, out = write_capture(open_folder / "cap", SCENE), open_folder / "out"
+    sky = write_exr(open_folder / "sky.exr", np.ones((4, 8, 3)))
+    out.mkdir(mode=0o555)
+    arguments = ["relight", cap, "--environment", sky, "--out", out / "a.##.exr", "--cache", open_folder / "cache"]
+    done = subprocess.run([sys.executable, "-c", AS_NOBODY, *map(str, arguments)], capture_output=True, text=True,
+                          timeout=60, cwd=Path(service.__file__).parents[1])
+    assert (done.returncode, done.stderr) == (2, f"relit: cannot write {out}/a.01.exr: permission denied\n")
+    assert not (open_folder / "cache").exists() and files_in(out) == set()
+
+
+@pytest.mark.parametrize("command", ["solve", "info"])
+def test_a_folder_below_a_file(relit, tmp_path, command):
+    (tmp_path / "file").write_text("")
+    arguments = ["--out", tmp_path / "out"] if command == "solve" else []
+    refused(relit(command, tmp_path / "file" / "cap", *arguments), "file/cap: there is no such folder")
+
+
+LIMITED = """
+import resource, sys
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv.pop(1)),) * 2)
+from service.cli.main import main
+main()
+"""
+
+
+@pytest.mark.skipif(not hasattr(resource, "RLIMIT_FSIZE"), reason="no limit on file sizes here to stand for a full disk")
+@pytest.mark.parametrize(("stage", "limit", "words"), [
+    ("stack", 2500, "cannot make the stack cache"),
+    ("maps", 2000, "cannot write"),
+    ("frames", 400, "cannot write"),
+])
+def test_no_disk_space(relit, tmp_path, stage, limit, words):
+    cap, out = tmp_path / "cap", tmp_path / "out"
+    write_capture(cap, SCENE)
+    sky = write_exr(tmp_path / "sky.exr", np.ones((4, 8, 3)))
+    arguments = ["relight", cap, "--environment", sky, "--out", out / "a.##.exr", "--frames", "1-3"] if stage == "frames" else \
+        ["solve", cap, "--out", out]
+    # the compiled kernels, and except in the first case the stack, are there already: what fails is the file that is meant
+    assert relit(*[str(a).replace(str(out), str(tmp_path / "warm")) for a in arguments], "--cache", tmp_path / "cache").code == 0
+    cache = tmp_path / "fresh" if stage == "stack" else tmp_path / "cache"
+    before = files_in(tmp_path)
+    done = subprocess.run([sys.executable, "-c", LIMITED, str(limit), *map(str, arguments), "--cache", str(cache)],
+                          capture_output=True, text=True, timeout=120, cwd=Path(service.__file__).parents[1])
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.startswith(f"relit: {words}") and done.stderr.count("\n") == 1
+    assert str(cache if stage == "stack" else out) in done.stderr
+    assert files_in(tmp_path) == before

@@ -1,0 +1,190 @@
+"""The program itself: help, version, doctor, import and info, wrong options, and the way it ends."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import service
+from stage.capture import Capture
+from tests.captures import edit_manifest, make_scene, write_capture, write_exr, write_image
+
+COMMANDS = ["demo", "import", "info", "calibrate", "solve", "relight", "basis", "export", "doctor", "bench", "serve", "worker",
+            "keys"]
+ROOT = Path(service.__file__).parents[1]
+
+
+def test_version(relit):
+    assert relit("--version") == (0, f"relit {service.__version__}\n", "")
+
+
+def test_help_names_every_command(relit):
+    outcome = relit("--help")
+    assert outcome.code == 0
+    assert all(f" {name} " in outcome.out for name in COMMANDS)
+    assert relit().code == 2  # nothing asked: the same help, and not a success
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_of_each_command(relit, command):
+    outcome = relit(command, "--help")
+    assert (outcome.code, outcome.err) == (0, "")
+    assert f"relit {command}" in outcome.out and "--help" in outcome.out
+
+
+@pytest.mark.parametrize("command", [
+    ["demo", "--out", "OUT"], ["import", "lp", "CAPTURE", "OUT"], ["info", "CAPTURE"], ["solve", "CAPTURE", "--out", "OUT"],
+    ["relight", "CAPTURE", "--environment", "CAPTURE/000.exr", "--out", "OUT/f.####.exr"], ["export", "CAPTURE", "--out", "OUT/a.usdz"],
+    ["basis", "CAPTURE", "--out", "OUT/b.exr"],
+    ["calibrate", "mirror-ball", "CAPTURE", "--ball", "8,8,4"], ["calibrate", "intensity", "CAPTURE"], ["doctor"], ["bench"],
+], ids=lambda command: " ".join(command[:2]))
+def test_every_command_takes_a_device_and_refuses_one_that_is_not_there(relit, tmp_path, command):
+    capture = write_capture(tmp_path / "capture")
+    words = [word.replace("CAPTURE", str(capture)).replace("OUT", str(tmp_path / "out")) for word in command]
+    outcome = relit(*words, "--device", "cuda:99")
+    assert outcome.code == 2 and "cuda:99" in outcome.err and outcome.err.count("\n") == 1
+    assert not (tmp_path / "out").exists() or not any((tmp_path / "out").iterdir())
+
+
+def test_doctor_finds_this_installation_sound(relit):
+    outcome = relit("doctor")
+    assert outcome.code == 0, outcome.out
+    assert outcome.out.splitlines()[-1] == "sound"
+    assert "cpu" in outcome.out and "works" in outcome.out
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["paint"], "no such command 'paint'"),
+    (["solve"], "missing argument 'CAPTURE'"),
+    (["solve", "cap"], "missing option '--out'"),
+    (["solve", "cap", "--out", "o", "--method", "magic"],
+     "invalid value for '--method': 'magic' is not one of 'lambert', 'robust'"),
+    (["solve", "cap", "--colour"], "no such option: --colour"),
+    (["import", "zip", "a", "b"], "'zip' is not one of 'diligent', 'lp'"),
+    (["bench", "--repeats", "1"], "--repeats"),
+])
+def test_wrong_options_are_one_sentence(relit, arguments, words):
+    outcome = relit(*arguments)
+    assert (outcome.code, outcome.out) == (2, "")
+    assert outcome.err.startswith("relit: ") and outcome.err.count("\n") == 1
+    assert words in outcome.err
+
+
+def test_info_of_a_sound_capture(relit, tmp_path):
+    scene = make_scene(size=8, lights=4)
+    write_capture(tmp_path, scene, saturation=0.2)
+    outcome = relit("info", tmp_path)
+    assert (outcome.code, outcome.err) == (0, "")
+    facts = {line.split()[0]: line[13:] for line in outcome.out.splitlines()}
+    assert facts["name"] == "cap" and facts["frames"] == "4 distant light"
+    assert facts["camera"] == "orthographic, 8x8, no scale" and facts["mask"] == f"{scene.mask.sum()} of 64 pixels"
+    assert facts["lights"] == "4 distant, up to 30 degrees from the view axis, 0 behind the object"
+    assert facts["saturated"] == f"{int((scene.images.astype(np.float32) >= 0.2).any(axis=-1).sum())} readings at or above 0.2"
+
+
+def test_info_lists_every_fault_and_ends_with_the_first(relit, tmp_path):
+    write_capture(tmp_path, make_scene(size=8, lights=2))
+    write_exr(tmp_path / "000.exr", np.full((8, 8, 3), -1.0))
+    write_image(tmp_path / "mask.png", np.zeros((8, 8), np.uint8))
+    outcome = relit("info", tmp_path)
+    assert outcome.code == 2
+    wrong = [line[13:] for line in outcome.out.splitlines() if line.startswith("wrong ")]
+    assert len(wrong) == 3
+    assert "000.exr: 64 pixels are negative" in wrong[0] and "needs three or more" in wrong[1] and "mask is empty" in wrong[2]
+    assert outcome.err == f"relit: {wrong[0]} (and 2 more, above)\n"
+
+
+def test_info_of_a_structured_light_capture(relit, tmp_path):
+    frames = [{"image": f"{i:03d}.exr", "pattern": {"code": "gray", "axis": "column", "bit": i, "bits": 4}} for i in range(4)]
+    write_capture(tmp_path, make_scene(size=8, lights=4), frames=frames)
+    outcome = relit("info", tmp_path)
+    assert (outcome.code, outcome.err) == (0, "")
+    assert "4 gray pattern" in outcome.out
+
+
+def test_import_diligent_and_look_at_it(relit, tmp_path):
+    source = tmp_path / "ballPNG"
+    for index in range(3):
+        write_image(source / f"{index}.png", np.full((4, 4, 3), 9000, np.uint16))
+    (source / "filenames.txt").write_text("0.png\n1.png\n2.png\n")
+    (source / "light_directions.txt").write_text("0 0 1\n0.5 0 1\n0 0.5 1\n")
+    (source / "light_intensities.txt").write_text("1 1 1\n" * 3)
+    outcome = relit("import", "diligent", source, tmp_path / "ball")
+    assert outcome == (0, f"capture  {tmp_path}/ball/capture.json\n", "")
+    assert relit("info", tmp_path / "ball").code == 0
+    assert Capture.open(tmp_path / "ball").name == "ballPNG"
+    (source / "light_directions.txt").write_text("0 0 1\n0 0 0\n0 0.5 1\n")
+    outcome = relit("import", "diligent", source, tmp_path / "other")
+    assert outcome == (2, "", f"relit: {source}/light_directions.txt: row 2 has zero length: give a direction\n")
+    assert not (tmp_path / "other").exists()
+
+
+def test_import_lp(relit, tmp_path):
+    for index in range(3):
+        write_image(tmp_path / "rti" / f"my {index}.png", np.full((4, 4, 3), 90, np.uint8))
+    (tmp_path / "rti" / "dome.lp").write_text("3\nmy 0.png 0 0 1\nmy 1.png 0.5 0 1\nmy 2.png 0 0.5 1\n")
+    assert relit("import", "lp", tmp_path / "rti", tmp_path / "cap") == (0, f"capture  {tmp_path}/cap/capture.json\n", "")
+    outcome = relit("info", tmp_path / "cap")
+    assert outcome.code == 0 and "srgb_texture" in outcome.out
+
+
+def test_an_unknown_device_is_named(relit, tmp_path):
+    write_capture(tmp_path / "cap", make_scene(size=4, lights=3))
+    outcome = relit("solve", tmp_path / "cap", "--out", tmp_path / "out", "--device", "cuda:77")
+    assert outcome.code == 2 and outcome.err.startswith("relit: device cuda:77 is not on this machine: choose one of cpu")
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_interruption_ends_with_130_and_a_sentence(relit, tmp_path, monkeypatch):
+    from service.solve import solve
+
+    def interrupt(*arguments, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(solve, "open_stack", interrupt)
+    write_capture(tmp_path / "cap", make_scene(size=4, lights=4))
+    outcome = relit("solve", tmp_path / "cap", "--out", tmp_path / "out")
+    assert outcome.code == 130
+    assert outcome.err.startswith("relit: interrupted") and outcome.err.count("\n") == 1
+
+
+def test_a_defect_of_ours_keeps_its_traceback(monkeypatch, tmp_path):
+    from service.captures import inspect
+    from service.cli.main import main
+
+    def fail(*arguments):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(inspect.Capture, "open", fail)
+    monkeypatch.setattr(sys, "argv", ["relit", "info", str(tmp_path)])
+    with pytest.raises(ZeroDivisionError):
+        main()
+
+
+def run_program(*arguments: object) -> subprocess.CompletedProcess:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    return subprocess.run([sys.executable, "-m", "service.cli.main", *map(str, arguments)], capture_output=True, text=True,
+                          timeout=120, env=environment, cwd=ROOT)
+
+
+def test_as_a_program_of_its_own(tmp_path):
+    write_capture(tmp_path / "cap", make_scene(size=8, lights=4))
+    done = run_program("solve", tmp_path / "cap", "--method", "lambert", "--out", tmp_path / "out")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert (tmp_path / "out" / "maps.exr").exists()
+    edit_manifest(tmp_path / "cap", colour="red")
+    done = run_program("info", tmp_path / "cap")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == f"relit: {tmp_path}/cap/capture.json: colour: is not a known key\n"
+
+
+def test_a_reader_that_goes_away_is_no_traceback():
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run([sys.executable, "-m", "service.cli.main", "--help"], stdout=writer, stderr=subprocess.PIPE, text=True,
+                          cwd=ROOT, timeout=60)
+    os.close(writer)
+    assert "Traceback" not in done.stderr

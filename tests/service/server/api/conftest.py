@@ -1,0 +1,66 @@
+"""One server for the tests of the API, without keys and with one worker; each test makes its own captures and jobs."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from tests.service.server_process.serve import Server, serving
+
+HOME = Path(__file__).resolve().parents[4]
+SAMPLES = HOME / "samples"
+
+
+@pytest.fixture(scope="session")
+def server(tmp_path_factory: pytest.TempPathFactory):
+    folder = tmp_path_factory.mktemp("server")
+    with serving(folder, "--anonymous", "--device", "cpu", roots=os.pathsep.join([str(SAMPLES), str(folder / "registered")]),
+                 requests_per_second="10000", request_burst="10000", min_free_bytes="0") as running:
+        yield running
+
+
+@pytest.fixture(scope="session")
+def registered(server: Server):
+    """A folder of the server whose captures and environments may be registered, beside the samples."""
+    folder = server.data.parent / "registered"
+    folder.mkdir()
+    return folder
+
+
+def register(server: Server, client, name: str) -> str:
+    """A capture of the samples, registered and ready."""
+    made = client.post("/v1/captures", json={"name": name, "folder": str(SAMPLES / name)}).raise_for_status().json()
+    found = server.wait(client, f"/v1/captures/{made['id']}", ("ready", "refused"))
+    assert found["state"] == "ready", found["problem"]
+    return found["id"]
+
+
+@pytest.fixture(scope="session")
+def client(server: Server):
+    with server.client() as made:
+        yield made
+
+
+@pytest.fixture(scope="session")
+def owl(server: Server, client):
+    """The sample capture, registered and ready."""
+    return register(server, client, "owl")
+
+
+@pytest.fixture(scope="session")
+def dome(server: Server, client):
+    """A small capture whose light directions and shape are known."""
+    return register(server, client, "lambert")
+
+
+@pytest.fixture(scope="session")
+def rig(server: Server, client):
+    """A capture of projected patterns."""
+    return register(server, client, "rig")
+
+
+@pytest.fixture(scope="session")
+def sky(server: Server, client):
+    """An environment, registered and ready."""
+    made = client.post("/v1/environments", json={"name": "sky", "file": str(SAMPLES / "owl" / "environment.exr")}).raise_for_status().json()
+    return server.wait(client, f"/v1/environments/{made['id']}", ("ready", "refused"))["id"]

@@ -1,0 +1,119 @@
+"""schemathesis against a server that holds one of everything: requests made of the OpenAPI document, good, bad, and in sequences."""
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from service.requests.identifiers import CAPTURE, ENVIRONMENT, new_id
+from service.requests.jobs import RelightJob, SolveJob
+from service.server.jobs.queue import JobQueue
+from service.server.settings import Settings
+from service.server.storage import layout
+from service.server.store import intakes, jobs, keys, tables
+from service.server.store.database import Database, connect
+from tests.service.server_process.serve import Server
+
+PROJECT = "fuzz"
+SEED = "7"
+CONFIG = """
+request-timeout = 2.0
+max-stream-events = 1
+suppress-health-check = ["all"]
+
+[parameters]
+"path.capture" = {{ dictionary = "captures", probability = 0.5 }}
+"path.environment" = {{ dictionary = "environments", probability = 0.5 }}
+"path.job" = {{ dictionary = "jobs", probability = 0.7 }}
+"path.name" = {{ dictionary = "results", probability = 0.7 }}
+"body.capture" = {{ dictionary = "captures", probability = 0.7 }}
+"body.environment" = {{ dictionary = "environments", probability = 0.7 }}
+"body.maps" = {{ dictionary = "jobs", probability = 0.7 }}
+"header.Tus-Resumable" = "1.0.0"
+
+[dictionaries]
+captures = {{ values = {captures} }}
+environments = {{ values = {environments} }}
+jobs = {{ values = {jobs} }}
+results = {{ values = ["maps.exr", "report.json"] }}
+
+[generation]
+database = "none"
+
+[checks.positive_data_acceptance]
+# beside the default ones: what a schema cannot say (frames that run backwards, light keys out of order), a file that is larger than
+# allowed, a precondition, a range
+expected-statuses = ["2xx", "304", "401", "403", "404", "409", "410", "412", "413", "416", "422"]
+
+[[operations]]
+include-operation-id = "patch_upload"
+# a checksum of no algorithm is 400 by the tus protocol, and schemathesis takes a header that is empty for one of any pattern
+checks.positive_data_acceptance.expected-statuses = ["204", "400", "401", "403", "404", "409", "410", "412", "413", "422", "423", "460"]
+"""
+
+
+def seed(settings: Settings) -> tuple[str, dict[str, list[str]]]:
+    """A key, and captures, environments and jobs in several states; no worker is needed."""
+    database = connect(settings.sqlalchemy_url)
+    queue = JobQueue(database)
+    key = keys.create(database, keys.NewKey(project=PROJECT, name="fuzz", scope=keys.Scope.ADMIN))
+    captures = [_intake(database, CAPTURE, ready=state) for state in (True, True, False)]
+    environments = [_intake(database, ENVIRONMENT, ready=state) for state in (True, False)]
+    solve = SolveJob(kind="solve", capture=captures[0])
+    relight = RelightJob(kind="relight", capture=captures[0], environment=environments[0])
+    made = [database.transact(lambda connection, request=request: queue.submit(
+        connection, project=PROJECT, key=key.partition(".")[0], request=request, chunk_frames=8, inputs=[captures[0]]))
+        for request in (solve, solve, relight, relight)]
+    for job, state in zip(made, (jobs.SUCCEEDED, jobs.FAILED, jobs.CANCELLED, jobs.QUEUED), strict=True):
+        folder = settings.data / layout.results(PROJECT, job)
+        folder.mkdir(parents=True)
+        (folder / "maps.exr").write_bytes(bytes(range(256)) * 40)
+        (folder / "report.json").write_text("{}")
+        _put(database, job, state)
+    database.transact(lambda connection: connection.execute(tables.workers.insert().values(  # one that is seen for the whole run
+        id="fuzz", host="fuzz", pid=1, device="cpu", started_at=time.time(), seen_at=time.time() + 86_400, state="ready")))
+    database.close()
+    return key, {"captures": captures, "environments": environments, "jobs": made}
+
+
+def fuzz(server: Server, key: str, known: dict[str, list[str]], folder: Path, *, examples: int, phases: str, max_time_s: int | None,
+         exclude: str | None = None) -> subprocess.CompletedProcess[str]:
+    """Run it; its exit status is 0 where nothing is wrong. With a time it is another run every time, else always the same."""
+    config = folder / "schemathesis.toml"
+    config.write_text(CONFIG.format(**{name: str(values).replace("'", '"') for name, values in known.items()}))
+    limits = ["--seed", SEED] if max_time_s is None else ["--max-time", str(max_time_s)]
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("RELIT_")}
+    return subprocess.run(
+        [sys.executable, __file__, "--config-file", str(config), "run", f"{server.url}/v1/openapi.json",
+         "--header", f"Authorization: Bearer {key}", "--phases", phases, "--max-examples", str(examples),
+         "--checks", "all", "--continue-on-failure", "--no-color", "--warnings", "off", *limits,
+         *(["--exclude-operation-id-regex", exclude] if exclude else [])],
+        cwd=folder, env=environment, capture_output=True, text=True)
+
+
+def _intake(database: Database, kind: str, *, ready: bool) -> str:
+    identifier = new_id(kind)
+    database.transact(lambda connection: intakes.insert(
+        connection, identifier=identifier, project=PROJECT, kind=kind, name="owl", folder=None))
+    if ready:
+        database.transact(lambda connection: intakes.close(connection, identifier))
+        intakes.accept(database, identifier, {"captures": 1, "frames": 96, "resolution": [320, 320]})
+    return identifier
+
+
+def _put(database: Database, job: str, state: str) -> None:
+    ended = time.time() if state in jobs.ENDED else None
+    database.transact(lambda connection: connection.execute(tables.jobs.update().where(tables.jobs.c.id == job).values(
+        state=state, finished_at=ended, error="it is so" if state == jobs.FAILED else None)))
+
+
+if __name__ == "__main__":  # the program of schemathesis, which also sends parts of files
+    import schemathesis
+    from schemathesis.cli import schemathesis as program
+
+    @schemathesis.serializer("application/offset+octet-stream")
+    def octets(_context, value):
+        return value if isinstance(value, bytes) else str(value).encode()
+
+    sys.exit(program())

@@ -1,0 +1,267 @@
+"""Who may do what: keys, their scopes, projects that see nothing of each other, and a service that asks for no key."""
+
+import hashlib
+import json
+import re
+from typing import NamedTuple
+
+import httpx2
+import pytest
+
+from service.requests.identifiers import CAPTURE, ENVIRONMENT, JOB, UPLOAD, new_id
+from service.server.settings import Settings
+from service.server.store import intakes, keys
+from service.server.store.database import Database, connect
+from service.server.store.keys import NewKey, Scope
+from tests.service.server_process.api.conftest import SAMPLES
+from tests.service.server_process.serve import Server, serving
+
+OPEN = {("get", "/healthz"), ("get", "/readyz")}
+"""Need no key; nor does OPTIONS, which says what tus can do here."""
+STREAMS = {"/v1/events", "/v1/jobs/{job}/events"}
+CHANGES = {"post", "put", "patch", "delete"}
+TUS = {"Tus-Resumable": "1.0.0"}
+SECRET_NAME = "nightingale"
+"""Of what the first project has: the second must never read it."""
+
+
+class Site(NamedTuple):
+    """A server with keys, and two projects; the first has a capture, an environment, an upload and a job with a result."""
+
+    server: Server
+    database: Database
+    ours: dict[str, str]
+
+    def key(self, project: str, scope: Scope) -> str:
+        return keys.create(self.database, NewKey(project=project, name="test", scope=scope))
+
+    def client(self, project: str, scope: Scope = Scope.ADMIN) -> httpx2.Client:
+        return self.server.client(self.key(project, scope))
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    with serving(tmp_path_factory.mktemp("access"), "--device", "none", host="0.0.0.0", roots=str(SAMPLES), requests_per_second="10000",
+                 request_burst="10000", min_free_bytes="0") as server:
+        database = connect(Settings(data=server.data).sqlalchemy_url)
+        made = Site(server, database, {})
+        with made.client("larch") as client:
+            capture = client.post("/v1/captures", json={"name": SECRET_NAME, "folder": str(SAMPLES / "owl")}).json()["id"]
+            sky = client.post("/v1/environments", json={"name": SECRET_NAME}).json()["id"]
+            files = client.post(f"/v1/environments/{sky}/files", headers={
+                **TUS, "Upload-Length": "5", "Upload-Metadata": "path c2t5LmV4cg=="}).raise_for_status()
+            intakes.accept(database, capture, {"captures": 1})  # there is no worker that would
+            job = client.post("/v1/jobs", json={"kind": "solve", "capture": capture, "name": SECRET_NAME}).raise_for_status().json()["id"]
+        results = server.data / "projects/larch/jobs" / job
+        results.mkdir(parents=True)
+        (results / "maps.exr").write_bytes(b"maps")
+        made.ours.update(capture=capture, environment=sky, upload=files.headers["Location"].rpartition("/")[2], job=job, name="maps.exr")
+        yield made
+        database.close()
+
+
+def operations(site: Site) -> list[tuple[str, str]]:
+    """Method and path of everything that the OpenAPI document names."""
+    with site.server.client() as client:
+        document = client.get("/v1/openapi.json").raise_for_status().json()
+    found = [(method, path) for path, item in document["paths"].items() for method in item if method not in ("parameters", "options")]
+    assert len(found) > 25
+    return found
+
+
+def ask(client: httpx2.Client, method: str, path: str, names: dict[str, str]) -> httpx2.Response:
+    """One request; of a stream only its beginning."""
+    url = re.sub(r"{(\w+)}", lambda found: names[found[1]], path)
+    body = {"json": {}} if method in ("post", "patch") and "uploads" not in path and "files" not in path else {}
+    headers = {**TUS, "Upload-Offset": "0", "Upload-Length": "5", "Upload-Metadata": "path c2t5LmV4cg=="} if (
+        "upload" in path or "files" in path) else {}
+    if method == "patch" and "uploads" in path:
+        headers |= {"Content-Type": "application/offset+octet-stream"}
+    with client.stream(method.upper(), url, headers=headers, **body) as response:
+        if path not in STREAMS or response.status_code != 200:
+            response.read()
+        return response
+
+
+def problem(response: httpx2.Response) -> dict:
+    assert response.headers["Content-Type"] == "application/problem+json"
+    return response.json()
+
+
+def test_every_route_but_those_of_health_asks_for_a_key(site):
+    with site.server.client() as client:
+        for method, path in operations(site):
+            response = ask(client, method, path, site.ours)
+            if (method, path) in OPEN:
+                assert response.status_code in (200, 503)
+                continue
+            assert response.status_code == 401, (method, path, response.text)
+            assert response.headers["WWW-Authenticate"] == "Bearer"
+            if method != "head":
+                assert problem(response)["type"] == "urn:relit:problem:unauthenticated"
+
+
+def test_what_is_no_key_of_ours_is_refused(site):
+    good = site.key("larch", Scope.READ)
+    identifier, _, secret = good.partition(".")
+    other = site.key("larch", Scope.READ)
+    with site.server.client() as client:
+        assert client.get("/v1/jobs", headers={"Authorization": f"Bearer {good}"}).status_code == 200
+        for given in ("x", identifier, f"{identifier}.", f"{identifier}.{secret[:-1]}", f"{identifier}.{secret}x",
+                      f"{other.partition('.')[0]}.{secret}", f".{secret}", hashlib.sha256(secret.encode()).hexdigest(), "\u00e9" * 3):
+            response = client.get("/v1/jobs", headers={"Authorization": f"Bearer {given}".encode()})
+            assert response.status_code == 401, given
+        assert client.get("/v1/jobs", headers={"Authorization": f"Basic {good}"}).status_code == 401
+        assert client.get("/v1/jobs", params={"key": good}).status_code in (401, 422)
+
+
+def test_a_revoked_key_is_refused_at_once(site):
+    key = site.key("larch", Scope.ADMIN)
+    with site.server.client(key) as client:
+        assert client.get("/v1/jobs").status_code == 200
+        assert keys.revoke(site.database, key.partition(".")[0])
+        assert client.get("/v1/jobs").status_code == 401
+        assert not keys.revoke(site.database, key.partition(".")[0])
+
+
+def test_only_a_hash_of_a_key_is_kept(site):
+    identifier, _, secret = site.key("larch", Scope.READ).partition(".")
+    kept = b"".join(path.read_bytes() for path in site.server.data.glob("relit.sqlite*"))
+    assert identifier.encode() in kept and hashlib.sha256(secret.encode()).hexdigest().encode() in kept
+    assert secret.encode() not in kept
+    assert secret not in site.server.log.read_text()
+
+
+def test_a_key_that_reads_changes_nothing(site):
+    with site.client("larch", Scope.READ) as client:
+        for method, path in operations(site):
+            response = ask(client, method, path, site.ours)
+            if method in CHANGES or path == "/metrics":
+                assert response.status_code == 403, (method, path, response.text)
+                assert "has the scope read, this needs" in problem(response)["detail"]
+            else:
+                assert response.status_code not in (401, 403), (method, path)
+        assert client.get(f"/v1/jobs/{site.ours['job']}").json()["state"] == "queued"
+
+
+def test_a_key_that_writes_registers_no_folders_and_reads_no_numbers(site):
+    with site.client("larch", Scope.WRITE) as client:
+        for method, path in operations(site):
+            if path.endswith("}") and method == "delete":
+                continue  # it may, and the others still need it
+            assert (ask(client, method, path, site.ours).status_code == 403) == (path == "/metrics"), (method, path)
+        owl = SAMPLES / "owl"
+        for kind, what in (("captures", {"folder": str(owl)}), ("environments", {"file": str(owl / "environment.exr")})):
+            refused = client.post(f"/v1/{kind}", json={"name": "owl", **what})
+            assert refused.status_code == 403 and "needs admin" in problem(refused)["detail"]
+            assert client.post(f"/v1/{kind}", json={"name": "mine"}).status_code == 201
+    with site.client("larch", Scope.ADMIN) as client:
+        assert client.get("/metrics").status_code == 200
+
+
+def test_a_project_finds_nothing_of_another(site):
+    """By any identifier on any route: as if it did not exist, to the word."""
+    absent = {"capture": new_id(CAPTURE), "environment": new_id(ENVIRONMENT), "upload": new_id(UPLOAD), "job": new_id(JOB),
+              "name": "maps.exr"}
+    walked = 0
+    with site.client("willow") as client:
+        for method, path in operations(site):
+            if "{" not in path:
+                continue
+            theirs, nothing = (ask(client, method, path, names) for names in (site.ours, absent))
+            walked += 1
+            if method in CHANGES and theirs.status_code == 422:  # the empty body is looked at first
+                assert nothing.status_code == 422
+                continue
+            assert theirs.status_code == nothing.status_code == 404, (method, path, theirs.text)
+            if method != "head":
+                assert in_general(theirs, site.ours) == in_general(nothing, absent), (method, path)
+    assert walked > 15
+    assert (site.server.data / "projects/larch/jobs" / site.ours["job"] / "maps.exr").exists()
+    with site.client("larch") as client:
+        assert client.get(f"/v1/jobs/{site.ours['job']}").json()["state"] == "queued"
+
+
+def in_general(response: httpx2.Response, names: dict[str, str]) -> dict:
+    """A problem, with names in place of identifiers and without that of the request."""
+    text = response.text
+    for name, value in names.items():
+        text = text.replace(value, f"<{name}>")
+    return json.loads(text) | {"request_id": ""}
+
+
+def test_a_project_lists_and_names_nothing_of_another(site):
+    with site.client("willow") as client:
+        for path in ("/v1/captures", "/v1/environments", "/v1/jobs"):
+            assert next(value for value in client.get(path).raise_for_status().json().values() if isinstance(value, list)) == []
+        for path, name, mine in (("captures", "capture", CAPTURE), ("environments", "environment", ENVIRONMENT), ("jobs", "job", JOB)):
+            theirs = client.get(f"/v1/{path}", params={"before": site.ours[name]})
+            absent = new_id(mine)
+            nothing = client.get(f"/v1/{path}", params={"before": absent})
+            assert theirs.status_code == nothing.status_code and theirs.status_code in (404, 422)
+            assert in_general(theirs, {"it": site.ours[name]}) == in_general(nothing, {"it": absent})
+
+
+@pytest.mark.parametrize("job", [
+    {"kind": "solve", "capture": "capture"}, {"kind": "relight", "capture": "capture", "environment": "environment"},
+    {"kind": "export", "maps": "job"}, {"kind": "shade", "maps": "job", "environment": "environment"},
+], ids=lambda job: job["kind"])
+def test_a_job_cannot_read_what_is_anothers(site, job):
+    made = {"capture": new_id(CAPTURE), "environment": new_id(ENVIRONMENT), "job": new_id(JOB)}
+    with site.client("willow") as client:
+        theirs = client.post("/v1/jobs", json={field: site.ours.get(value, value) for field, value in job.items()})
+        nothing = client.post("/v1/jobs", json={field: made.get(value, value) for field, value in job.items()})
+    assert theirs.status_code == nothing.status_code and theirs.status_code in (404, 422)
+    assert in_general(theirs, {name: site.ours[name] for name in made}) == in_general(nothing, made)
+
+
+def test_the_same_token_of_two_projects_is_two_requests(site):
+    made = []
+    for project in ("larch", "willow", "willow"):
+        with site.client(project) as client:
+            made.append(client.post("/v1/captures", json={"name": "x"}, headers={"Idempotency-Key": "once"}).json()["id"])
+    assert made[0] != made[1] == made[2]
+
+
+def test_the_numbers_name_no_project_and_no_identifier(site):
+    with site.client("larch") as client:
+        client.get(f"/v1/jobs/{site.ours['job']}")
+        client.get(f"/v1/{SECRET_NAME}")
+        text = client.get("/metrics").text
+    assert 'route="/v1/jobs/{job}"' in text
+    for word in ("larch", "willow", SECRET_NAME, *(value for name, value in site.ours.items() if name != "name"), "key_"):
+        assert word not in text
+
+
+def test_a_service_without_keys_answers_this_machine(server, client):
+    port = server.url.rpartition(":")[2]
+    for host in ("localhost", f"localhost:{port}", "127.0.0.1", "127.5.0.1:80", f"[::1]:{port}"):
+        assert client.get("/v1/jobs", headers={"Host": host}).status_code == 200, host
+    assert client.get("/v1/jobs", headers={"Origin": server.url}).status_code == 200
+
+
+@pytest.mark.parametrize("headers", [
+    {"Host": "relit.example.com"}, {"Host": "127.0.0.1.example.com"}, {"Host": "localhost.example.com:80"}, {"Host": "[::1"}, {"Host": ""},
+    {"Host": "192.168.1.7:8470"}, {"Origin": "https://example.com"}, {"Origin": "null"}, {"Origin": "http://localhost:1"},
+    {"X-Forwarded-For": "10.0.0.7"}, {"Forwarded": "for=10.0.0.7"}, {"Via": "1.1 proxy"},
+], ids=lambda headers: " ".join(f"{name}: {value}" for name, value in headers.items()))
+def test_a_service_without_keys_refuses_proxies_and_pages_of_other_sites(client, headers):
+    """A name that was made to point at this machine, a form of another site, a proxy that lets the world in."""
+    for path in ("/v1/jobs", "/metrics"):
+        refused = client.get(path, headers=headers)
+        assert refused.status_code == 403 and "without a key" in problem(refused)["detail"], path
+    made = client.post("/v1/captures", json={"name": "x"}, headers=headers)
+    assert made.status_code == 403
+    assert client.get("/healthz", headers=headers).status_code == 200
+
+
+def test_a_key_is_looked_at_where_none_is_needed(client):
+    """A wrong key is refused, and no anonymous request."""
+    assert client.get("/v1/jobs", headers={"Authorization": "Bearer key_x.y"}).status_code == 401
+
+
+def test_what_a_form_of_another_site_can_send_is_no_json(client):
+    """Content types that a browser sends across sites without asking."""
+    for kind in ("text/plain", "application/x-www-form-urlencoded", "multipart/form-data; boundary=x"):
+        refused = client.post("/v1/captures", content=b'{"name": "x"}', headers={"Content-Type": kind})
+        assert refused.status_code in (415, 422), kind

@@ -1,0 +1,340 @@
+"""Bad input through a real server and its worker: refused by name, logged once, nothing left behind, and both go on."""
+
+import json
+import os
+import pickle
+import random
+import re
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service.captures.admit import MAX_MANIFEST_BYTES
+from tests.service.server_process.api.captures import (
+    lying_exr,
+    lying_jxl,
+    lying_npy,
+    lying_png,
+    lying_tiff,
+    manifest,
+    write_capture,
+    write_image,
+)
+from tests.service.server_process.api.conftest import SAMPLES
+from tests.service.server_process.api.tus import Tus, encoded
+
+PEAK_BYTES = 1 << 30
+"""Of a worker: its libraries take a fifth, and a manifest of MAX_MANIFEST_BYTES up to 40 times its size."""
+PATIENCE_S = 30.0
+TOF = {"type": "cw", "modulation_hz": 3e7, "reference_phase_rad": 0.0}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def worker_lives(server, client, owl):
+    """None of this costs the worker its life, or more memory than it may have."""
+    before = workers(server)
+    assert before
+    yield
+    assert client.get("/v1/captures").status_code == 200
+    assert workers(server) == before
+    for pid in before:
+        peak = re.search(r"VmHWM:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text())
+        assert peak is not None and 1024 * int(peak[1]) < PEAK_BYTES
+    assert '"level": "error"' not in server.log.read_text()
+
+
+def workers(server) -> list[int]:
+    """Processes of the server's workers, from their names."""
+    names = [json.loads(line)["worker"] for line in server.log.read_text().splitlines() if '"event": "worker ready"' in line]
+    return [pid for pid in (int(name.split("-")[-2]) for name in names) if Path(f"/proc/{pid}").exists()]
+
+
+def test_bad_requests_are_refused_by_name_and_logged_once(server, client, registered):
+    (registered / "out").symlink_to(SAMPLES.parent)
+    (registered / "circle").symlink_to(registered / "circle")
+    (registered / "file").write_text("no folder")
+    bad = [
+        ("/v1/captures", {"name": "x", "colour": "red"}, "colour"),
+        ("/v1/captures", {}, "name"),
+        ("/v1/captures", {"name": ""}, "name"),
+        ("/v1/captures", {"name": "a\0b"}, "name"),
+        ("/v1/captures", {"name": "half \ud800"}, ""),
+        ("/v1/captures", {"name": "x" * 201}, "name"),
+        ("/v1/captures", {"name": 5}, "name"),
+        ("/v1/captures", {"name": "x", "folder": "relative"}, "folder"),
+        ("/v1/captures", {"name": "x", "folder": ""}, "folder"),
+        ("/v1/captures", {"name": "x", "folder": f"{registered}/../data"}, "folder"),
+        ("/v1/captures", {"name": "x", "folder": f"{registered}/a\0b"}, "folder"),
+        ("/v1/captures", {"name": "x", "folder": f"{registered}/\ud800"}, ""),
+        ("/v1/captures", {"name": "x", "folder": "/etc"}, "folder"),
+        ("/v1/captures", {"name": "x", "folder": str(server.data)}, "folder"),
+        ("/v1/captures", {"name": "x", "folder": f"{registered}/out/tests"}, "folder"),
+        ("/v1/captures", {"name": "x", "folder": f"{registered}/circle"}, "folder"),
+        ("/v1/captures", {"name": "x", "folder": f"{registered}/nothing"}, "folder"),
+        ("/v1/captures", {"name": "x", "folder": f"{registered}/file"}, "folder"),
+        ("/v1/captures", {"name": "x", "folder": f"{registered}/{'x' * 5000}"}, "folder"),
+        ("/v1/environments", {"name": "x", "file": str(registered)}, "file"),
+        ("/v1/environments", {"name": "x", "file": "/etc/passwd"}, "file"),
+        ("/v1/environments", {"name": "x", "folder": "/etc"}, "folder"),
+    ]
+    count = len(client.get("/v1/captures", params={"limit": 500}).json()["items"])
+    refused = []
+    for path, body, field in bad:
+        answer = client.post(path, content=json.dumps(body), headers={"Content-Type": "application/json"})
+        assert answer.status_code in (400, 422), (body, answer.text)
+        problem = answer.json()
+        assert problem["status"] == answer.status_code and field in problem["detail"], (body, problem)
+        assert "passwd" not in problem["detail"]
+        refused.append(problem["request_id"])
+    assert [len(lines_of(server, request)) for request in refused] == [1] * len(bad)
+    assert len(client.get("/v1/captures", params={"limit": 500}).json()["items"]) == count
+
+
+def lines_of(server, request_id: str) -> list[dict]:
+    """What was logged of a request; the last line of it may come after its answer."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not (found := [json.loads(line) for line in server.log.read_text().splitlines() if request_id in line]):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    return found
+
+
+@pytest.mark.parametrize("body", [b"", b"{", b"[" * 100_000, b"null", b"[]", b'{"name": 1e999}', b'\xff\xfe{"name": "x"}',
+                                  b'{"name": ' + b"9" * 10_000 + b"}"])
+def test_bodies_that_are_no_request_are_refused(client, body):
+    answer = client.post("/v1/captures", content=body, headers={"Content-Type": "application/json"})
+    assert answer.status_code in (400, 422)
+    assert answer.json()["status"] == answer.status_code
+
+
+@pytest.mark.parametrize("path", [
+    "../capture.json", "a/../../b", "/etc/passwd", "C:/x", "\\\\server\\share", "a\\b", "nul\0", "new\nline", "\u202egnp.exe",
+    "zero\u200bwidth",
+    "e\u0301.exr", ".hidden", "a/.part", "CON", "aux.exr", "end.", "end ", "x" * 256, "/".join("abcdefghi"), ""])
+def test_names_that_are_not_safe_are_refused_and_leave_nothing(server, client, path):
+    capture = f"/v1/captures/{client.post('/v1/captures', json={'name': 'names'}).json()['id']}"
+    before = sorted((server.data / "uploads").glob("*")) if (server.data / "uploads").exists() else []
+    answer = Tus(server.url).create(capture, 4, encoded(path=path))
+    problem = json.loads(answer.body)
+    assert (answer.status, problem["detail"].startswith("path ")) == (422, True)
+    assert problem["detail"].isprintable()
+    assert client.get(f"{capture}/files").json()["files"] == []
+    assert (sorted((server.data / "uploads").glob("*")) if (server.data / "uploads").exists() else []) == before
+    logged = lines_of(server, problem["request_id"])
+    assert [line["problem"] for line in logged] == [problem["detail"]]
+
+
+@pytest.mark.parametrize(("first", "second"), [
+    ("Frame.exr", "frame.EXR"), ("straße", "STRASSE"), ("a/x", "A/y"), ("a", "a/b"), ("A", "a/b"), ("a/b", "a"), ("a/b/c", "a/B")])
+def test_names_that_are_one_without_case_are_refused(server, client, first, second):
+    capture = f"/v1/captures/{client.post('/v1/captures', json={'name': 'names'}).json()['id']}"
+    tus = Tus(server.url)
+    tus.send(capture, first, b"first")
+    answer = tus.create(capture, 4, encoded(path=second))
+    assert (answer.status, first in json.loads(answer.body)["detail"]) == (409, True)
+    assert [file["path"] for file in client.get(f"{capture}/files").json()["files"]] == [first]
+
+
+@pytest.mark.parametrize("metadata", ["", "path", "filename YQ==", "path YQ==,owner YQ==", "path YQ==,path Yg==", "path !!!", "path /w==",
+                                      "path YQ==,sha256 YQ==", "sha256 YQ=="])
+def test_metadata_that_is_not_known_is_refused(server, client, metadata):
+    capture = f"/v1/captures/{client.post('/v1/captures', json={'name': 'metadata'}).json()['id']}"
+    answer = Tus(server.url).create(capture, 4, metadata)
+    assert (answer.status, json.loads(answer.body)["detail"].startswith(("Upload-Metadata", "path "))) == (422, True)
+
+
+def edited(**more: object) -> Callable[[Path], None]:
+    def change(folder: Path) -> None:
+        found = json.loads((folder / "capture.json").read_text())
+        (folder / "capture.json").write_text(json.dumps(found | more))
+
+    return change
+
+
+def named(name: str) -> Callable[[Path], None]:
+    return edited(frames=[{"image": name, "light": {"type": "full"}}])
+
+
+def replaced(name: str, content: bytes) -> Callable[[Path], None]:
+    def change(folder: Path) -> None:
+        named(name)(folder)
+        (folder / name).write_bytes(content)
+
+    return change
+
+
+def timed(name: str, content: bytes) -> Callable[[Path], None]:
+    def change(folder: Path) -> None:
+        edited(frames=[{"image": name, "tof": TOF}])(folder)
+        (folder / name).write_bytes(content)
+
+    return change
+
+
+def linked(name: str, to: Path | str) -> Callable[[Path], None]:
+    def change(folder: Path) -> None:
+        (folder / name).unlink()
+        (folder / name).symlink_to(to)
+
+    return change
+
+
+def text(content: str) -> Callable[[Path], None]:
+    return lambda folder: (folder / "capture.json").write_text(content) and None
+
+
+def piped(folder: Path) -> None:
+    (folder / "001.exr").unlink()
+    os.mkfifo(folder / "001.exr")
+
+
+def cut(folder: Path) -> None:
+    content = (folder / "001.exr").read_bytes()
+    (folder / "001.exr").write_bytes(content[:-7])
+
+
+def step_outside(folder: Path) -> None:
+    (folder / "capture.json").unlink()
+    (folder / "step1").symlink_to(SAMPLES / "lambert")
+
+
+def wide(folder: Path) -> None:
+    write_image(folder / "001.exr", np.zeros((2, 2), np.float16))
+
+
+HUGE = 32_768  # squared: a billion pixels
+HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
+    "parent": (named("../../data/relit.sqlite"), r"frames\[0\].*leads out of the capture's folder|leads out of the capture's folder"),
+    "absolute": (named("/etc/passwd"), "leads out of the capture's folder"),
+    "nul": (named("a\0b.exr"), r"a\\x00b.exr leads out of the capture's folder"),
+    "missing": (named("nothing.exr"), "nothing.exr is not in the folder"),
+    "directory": (named("."), "is no file"),
+    "frame link": (linked("001.exr", SAMPLES / "lambert" / "001.exr"), r"frames\[1\].image: 001.exr leads out"),
+    "manifest link": (linked("capture.json", SAMPLES / "lambert" / "capture.json"), "capture.json leads out"),
+    "circle": (linked("001.exr", "001.exr"), r"frames\[1\].image: 001.exr leads nowhere"),
+    "step link": (step_outside, "step1/capture.json leads out"),
+    "pipe": (piped, "001.exr is no file"),
+    "truncated": (cut, "001.exr: is truncated"),
+    "size": (wide, "001.exr: is 2x2, camera.resolution says 8x8"),
+    "billion exr": (replaced("big.exr", lying_exr(HUGE, HUGE)), "big.exr: "),
+    "billion tiles": (replaced("big.exr", lying_exr(HUGE, HUGE, 1)), "big.exr: "),
+    "billion png": (replaced("big.png", lying_png(HUGE, HUGE)), "big.png: "),
+    "billion tiff": (replaced("big.tif", lying_tiff(HUGE, HUGE)), "big.tif: "),
+    "channels": (replaced("big.tif", lying_tiff(8, 8, 65_535)), "big.tif: "),
+    "billion jxl": (replaced("big.jxl", lying_jxl(HUGE, HUGE)), f"big.jxl: has {HUGE}x{HUGE} pixels"),
+    "camera": (edited(camera=manifest([], side=HUGE)["camera"]), f"camera.resolution: {HUGE}x{HUGE}"),
+    "text": (replaced("a.exr", b"no image"), "a.exr: is not an OpenEXR file"),
+    "suffix": (replaced("a.svg", b"<svg/>"), "a.svg: has an unknown suffix"),
+    "pickle": (timed("a.npy", lying_npy("(8, 8)", "|O", pickle.dumps([1]))), "a.npy: is not an array of real numbers"),
+    "shape": (timed("a.npy", lying_npy("(99999999, 99999999)")), "a.npy: has 99999999x99999999 pixels"),
+    "bins": (timed("a.npy", lying_npy("(8, 8, 9999999999999)")), "a.npy: is not a whole .npy array"),
+    "empty type": (timed("a.npy", lying_npy("(8, 8, 9999999999999)", "|V0")), "a.npy: is not an array of real numbers"),
+    "negative": (timed("a.npy", lying_npy("(-8, 8)")), "a.npy: has the shape"),
+    "shape code": (timed("a.npy", lying_npy("__import__('os')")), "a.npy: is not a .npy array"),
+    "unknown": (edited(colour="red"), "capture.json: colour: is not a known key"),
+    "nested": (text('{"schema":' + "[" * 200_000 + "]" * 200_000 + "}"), "capture.json: is nested too deeply"),
+    "long": (text(" " * (MAX_MANIFEST_BYTES + 1)), f"capture.json: has {MAX_MANIFEST_BYTES + 1} bytes"),
+    "many frames": (text(json.dumps(manifest([])).replace('"frames": []', '"frames": [' + "0," * (MAX_MANIFEST_BYTES // 2 - 200) + "0]")),
+                    r"capture.json: frames\[0\]: is 0: must be an object"),
+    "many keys": (text("{" + ",".join(f'"k{number}":0' for number in range(500_000)) + "}"), "capture.json: an object has more than"),
+    "not text": (lambda folder: (folder / "capture.json").write_bytes(b"\xff\xfe\0"), "capture.json: is not UTF-8 text"),
+    "no json": (text("relit"), "capture.json: is not JSON"),
+    "numbers": (text('{"schema": "relit.capture/1", "name": "x", "saturation": NaN}'), "capture.json: NaN is not a JSON number"),
+}
+
+
+def failures(server) -> list[str]:
+    """Errors of jobs, one a job."""
+    return [json.loads(line)["error"] for line in server.log.read_text().splitlines() if '"event": "job failed"' in line]
+
+
+def test_hostile_captures_are_refused_by_name(server, client, registered):
+    made = {}
+    for number, (what, (change, _)) in enumerate(HOSTILE.items()):
+        folder = write_capture(registered / f"hostile{number}")
+        change(folder)
+        made[what] = client.post("/v1/captures", json={"name": what, "folder": str(folder)}).raise_for_status().json()["id"]
+    for what, (_, sentence) in HOSTILE.items():
+        found = server.wait(client, f"/v1/captures/{made[what]}", ("ready", "refused"))
+        assert found["state"] == "refused", what
+        assert re.search(sentence, found["problem"]), (what, found["problem"])
+        assert str(registered) not in found["problem"] and len(found["problem"]) < 400 and found["problem"].isprintable()
+        assert found["problem"] in failures(server)
+
+
+def test_hostile_environments_are_refused_by_name(server, client, registered):
+    folder = registered / "environments"
+    folder.mkdir()
+    hostile = {"big.exr": (lying_exr(2 * HUGE, HUGE), "big.exr: "), "a.txt": (b"text", "a.txt: an environment is a lat-long"),
+               "cut.exr": ((SAMPLES / "owl/environment.exr").read_bytes()[:-9], "cut.exr: is truncated"),
+               "square.exr": ((SAMPLES / "owl/000.exr").read_bytes(), "square.exr: is 320x320")}
+    made = {}
+    for name, (content, _) in hostile.items():
+        (folder / name).write_bytes(content)
+        made[name] = client.post("/v1/environments", json={"name": "x", "file": str(folder / name)}).raise_for_status().json()["id"]
+    for name, (_, sentence) in hostile.items():
+        found = server.wait(client, f"/v1/environments/{made[name]}", ("ready", "refused"))
+        assert (found["state"], sentence in found["problem"]) == ("refused", True), found["problem"]
+
+
+def solve(client, capture: str) -> str:
+    asked = {"kind": "solve", "capture": capture, "options": {"method": "lambert"}}
+    return client.post("/v1/jobs", json=asked).raise_for_status().json()["id"]
+
+
+def test_fuzzed_images_through_uploads(server, client, tmp_path):
+    """A quarter is cut short, which the check always sees; of the others it lets through what only decoding tells."""
+    source, tus = write_capture(tmp_path / "source"), Tus(server.url)
+    good = (source / "001.exr").read_bytes()
+    made = []
+    for seed in range(16):
+        numbers, damaged = random.Random(seed), bytearray(good)
+        if seed % 4 == 0:
+            del damaged[numbers.randrange(8, len(good)) :]
+        else:
+            for _ in range(numbers.choice((1, 4, 32))):
+                damaged[numbers.randrange(len(good))] = numbers.randrange(256)
+        capture = f"/v1/captures/{client.post('/v1/captures', json={'name': f'fuzz {seed}'}).json()['id']}"
+        for path in source.iterdir():
+            tus.send(capture, path.name, bytes(damaged) if path.name == "001.exr" else path.read_bytes())
+        client.post(f"{capture}/validate").raise_for_status()
+        made.append((seed, capture))
+    solves = []
+    for seed, capture in made:
+        found = server.wait(client, capture, ("ready", "refused"))
+        if found["state"] == "refused":
+            assert "001.exr" in found["problem"], found["problem"]
+        else:
+            assert seed % 4, "a file that is cut short was taken for whole"
+            solves.append(solve(client, capture.rpartition("/")[2]))
+    for job in solves:
+        ended = server.wait(client, f"/v1/jobs/{job}", ("succeeded", "failed"))
+        assert ended["error"] is None or "001.exr" in ended["error"], ended["error"]
+
+
+def test_a_registered_capture_that_changed_is_not_read(server, client, registered):
+    folder = write_capture(registered / "changing")
+    capture = client.post("/v1/captures", json={"name": "changing", "folder": str(folder)}).raise_for_status().json()["id"]
+    assert server.wait(client, f"/v1/captures/{capture}", ("ready", "refused"))["state"] == "ready"
+
+    def solve_error() -> str:
+        ended = server.wait(client, f"/v1/jobs/{solve(client, capture)}", ("succeeded", "failed"))
+        assert ended["state"] == "failed"
+        return ended["error"]
+
+    shutil.copy(folder / "001.exr", registered / "elsewhere.exr")
+    linked("001.exr", registered / "elsewhere.exr")(folder)
+    assert "001.exr leads out of the capture's folder" in solve_error()
+    (folder / "001.exr").unlink()
+    (folder / "001.exr").write_bytes(lying_exr(HUGE, HUGE))
+    assert "001.exr" in solve_error()
+    folder.rename(registered / "moved")
+    folder.symlink_to(SAMPLES / "lambert")
+    assert "none of the folders that the operator allows" in solve_error()
+    folder.unlink()
+    folder.symlink_to(registered.parent)
+    assert "none of the folders that the operator allows" in solve_error()

@@ -1,0 +1,173 @@
+"""Limits, on a server where they are small: what is too much is refused by name, and the next who asks is served."""
+
+from collections.abc import Iterator
+
+import httpx2
+import pytest
+
+from service.server.api import limits
+from service.server.api.limits import Limiter
+from service.server.api.problems import ApiError
+from service.server.settings import Settings
+from service.server.store import intakes, jobs, keys
+from service.server.store.database import Database, connect
+from service.server.store.keys import NewKey, Scope
+from tests.service.server_process.api.conftest import SAMPLES
+from tests.service.server_process.serve import Server, serving
+
+BURST, QUEUED, FRAMES, FILES, BYTES = 30, 2, 10, 2, 1000
+PER_SECOND = 0.01
+"""So slow that no test gains a token."""
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory) -> Iterator[tuple[Server, Database]]:
+    with serving(tmp_path_factory.mktemp("limits"), "--device", "none", roots=str(SAMPLES), requests_per_second=str(PER_SECOND),
+                 request_burst=str(BURST), max_queued=str(QUEUED), max_frames=str(FRAMES), max_capture_files=str(FILES),
+                 max_upload_bytes=str(BYTES), min_free_bytes="0") as server:
+        database = connect(Settings(data=server.data).sqlalchemy_url)
+        yield server, database
+        database.close()
+
+
+@pytest.fixture
+def client(small) -> Iterator[httpx2.Client]:
+    """With a key, and so with limits, of its own."""
+    server, database = small
+    with server.client(key(database)) as made:
+        yield made
+
+
+def key(database: Database) -> str:
+    return keys.create(database, NewKey(project="larch", name="test", scope=Scope.ADMIN))
+
+
+@pytest.fixture
+def capture(small, client) -> str:
+    """Ready, though there is no worker that would say so."""
+    made = client.post("/v1/captures", json={"name": "owl", "folder": str(SAMPLES / "owl")}).raise_for_status().json()["id"]
+    _, database = small
+    intakes.accept(database, made, {"captures": 1})
+    for job in jobs.latest(database, "larch", limit=100):  # of the check
+        database.transact(lambda connection, job=job["id"]: jobs.cancel(connection, job))
+    return made
+
+
+def refused(response: httpx2.Response, status: int, words: str, *, later: bool = False) -> None:
+    assert response.status_code == status, response.text
+    assert words in response.json()["detail"]
+    assert ("Retry-After" in response.headers) == later
+    if later:
+        assert int(response.headers["Retry-After"]) >= 1
+
+
+def test_a_key_that_asks_too_often_waits_and_others_do_not(small, client):
+    server, database = small
+    for _ in range(BURST):
+        assert client.get("/v1/jobs").status_code == 200
+    response = client.get("/v1/jobs")
+    refused(response, 429, f"more than {PER_SECOND:g} times a second", later=True)
+    assert int(response.headers["Retry-After"]) <= 1 / PER_SECOND
+    refused(client.post("/v1/captures", json={"name": "x"}), 429, "more than", later=True)
+    assert client.get("/healthz").status_code == 200
+    with server.client(key(database)) as other:
+        assert other.get("/v1/jobs").status_code == 200
+
+
+def test_tokens_come_back_with_time():
+    now = 0.0
+    limiter = Limiter(2.0, 3, clock=lambda: now)
+    for _ in range(3):
+        limiter.take("a")
+    with pytest.raises(ApiError) as error:
+        limiter.take("a")
+    assert error.value.headers == {"Retry-After": "1"}
+    limiter.take("b")
+    now = 0.5  # one token at two a second
+    limiter.take("a")
+    with pytest.raises(ApiError):
+        limiter.take("a")
+    now = 1000.0  # no more than the bucket holds
+    for _ in range(3):
+        limiter.take("a")
+    with pytest.raises(ApiError):
+        limiter.take("a")
+
+
+def test_keys_that_ask_no_more_are_forgotten(monkeypatch):
+    monkeypatch.setattr(limits, "FORGET_ABOVE", 10)
+    now = 0.0
+    limiter = Limiter(1.0, 1, clock=lambda: now)
+    for number in range(10):
+        limiter.take(str(number))
+    now = 100.0
+    for number in range(10, 12):
+        limiter.take(str(number))
+        with pytest.raises(ApiError):
+            limiter.take(str(number))  # who asks now is not
+    assert len(limiter) == 2
+
+
+def test_a_key_has_no_more_jobs_in_the_queue_than_it_may(small, client, capture):
+    server, database = small
+    job = {"kind": "solve", "capture": capture}
+    made = [client.post("/v1/jobs", json=job).raise_for_status().json()["id"] for _ in range(QUEUED)]
+    refused(client.post("/v1/jobs", json=job), 429, f"{QUEUED} jobs of this key have not begun", later=True)
+    assert len(client.get("/v1/jobs", params={"state": "queued"}).json()["jobs"]) == QUEUED  # nothing of it is left
+    with server.client(key(database)) as other:
+        assert other.post("/v1/jobs", json=job).status_code == 202
+    client.post(f"/v1/jobs/{made[0]}/cancel").raise_for_status()
+    assert client.post("/v1/jobs", json=job).status_code == 202
+    refused(client.post(f"/v1/jobs/{made[0]}/resume"), 429, "have not begun", later=True)
+    assert client.get(f"/v1/jobs/{made[0]}").json()["state"] == "cancelled"
+
+
+def test_a_body_that_is_larger_than_json_has_to_be(client):
+    large = b'{"name": "' + b"x" * (1 << 20) + b'"}'
+    json = {"Content-Type": "application/json"}
+    refused(client.post("/v1/captures", content=large, headers=json), 413, "larger than 1048576 bytes")
+    pieces = (large[at : at + 65536] for at in range(0, len(large), 65536))
+    refused(client.post("/v1/captures", content=pieces, headers=json), 413, "larger than 1048576 bytes")
+
+
+@pytest.mark.parametrize("body", [
+    b"[" * 500_000, b'{"name": ' * 100_000, b'{"priority": ' + b"9" * 100_000 + b"}", b'{"name": "\xff"}', b"\x00",
+], ids=["deep list", "deep object", "long number", "no UTF-8", "NUL"])
+def test_a_body_that_is_made_to_hurt(client, body):
+    response = client.post("/v1/captures", content=body, headers={"Content-Type": "application/json"})
+    assert response.status_code in (400, 422), response.text
+
+
+def test_more_frames_than_a_job_may_have(small, client, capture):
+    sky = client.post("/v1/environments", json={"name": "sky", "file": str(SAMPLES / "owl" / "environment.exr")}).json()["id"]
+    _, database = small
+    intakes.accept(database, sky, {})
+    job = {"kind": "relight", "capture": capture, "environment": sky}
+    refused(client.post("/v1/jobs", json=job | {"options": {"frames": f"1-{FRAMES + 1}"}}), 422, f"{FRAMES} are allowed")
+    refused(client.post("/v1/jobs", json=job | {"options": {"frames": "1-999999999999"}}), 422, "frames")
+    assert client.post("/v1/jobs", json=job | {"options": {"frames": f"1-{FRAMES}"}}).status_code == 202
+
+
+def test_files_that_are_too_large_or_too_many(client):
+    capture = client.post("/v1/captures", json={"name": "x"}).json()["id"]
+
+    def begin(name: str, length: int) -> httpx2.Response:
+        return client.post(f"/v1/captures/{capture}/files", headers={
+            "Tus-Resumable": "1.0.0", "Upload-Length": str(length), "Upload-Metadata": f"path {name}"})
+
+    refused(begin("YQ==", BYTES + 1), 413, f"a file may have {BYTES} bytes")
+    assert begin("YQ==", BYTES).status_code == begin("Yg==", 1).status_code == 201
+    refused(begin("Yw==", 1), 413, f"more than {FILES} are not taken")
+
+
+def test_without_space_nothing_new_is_taken_and_the_service_says_so(tmp_path):
+    """What is there can be read on."""
+    with serving(tmp_path, "--anonymous", "--device", "none", roots=str(SAMPLES), min_free_bytes=str(10**18)) as server, \
+            server.client() as client:
+        for path, body in (("/v1/captures", {"name": "x"}), ("/v1/captures", {"name": "x", "folder": str(SAMPLES / "owl")}),
+                           ("/v1/environments", {"name": "x"})):
+            refused(client.post(path, json=body), 507, "no space left", later=True)
+        ready = client.get("/readyz")
+        assert ready.status_code == 503 and "less space left than min_free_bytes" in ready.json()["detail"]
+        for path in ("/v1/captures", "/v1/jobs", "/healthz", "/metrics"):
+            assert client.get(path).status_code == 200

@@ -1,0 +1,357 @@
+"""Operating the service: health, numbers, the log, traces, and how it ends."""
+
+import json
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import httpx2
+import pytest
+from fastapi.testclient import TestClient
+from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTraceServiceRequest
+from prometheus_client.parser import text_string_to_metric_families
+
+from service.errors import RequestError
+from service.server import log, telemetry
+from service.server.api.app import create_app
+from service.server.jobs.queue import prepare
+from service.server.settings import Settings
+from service.server.store import jobs, workers
+from service.server.store.database import connect
+from tests.service.postgres import binaries, postgres
+from tests.service.server_process.api.conftest import SAMPLES
+from tests.service.server_process.serve import Server, serving
+
+PATIENCE_S = 60.0
+DRAIN_S = 4.0
+"""Of the server that is ended while it works; its step takes longer."""
+
+
+def until(look, what: str):
+    """Look again and again until there is something."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not (found := look()):
+        assert time.monotonic() < deadline, what
+        time.sleep(0.05)
+    return found
+
+
+def lines_of(server: Server) -> list[dict]:
+    """The log, of which every line is JSON."""
+    return [json.loads(line) for line in server.log.read_text().splitlines()]
+
+
+def numbers_of(client: httpx2.Client) -> dict[str, list]:
+    return {family.name: family.samples for family in text_string_to_metric_families(client.get("/metrics").raise_for_status().text)}
+
+
+def number(numbers: dict[str, list], family: str, sample: str | None = None, **labels: str) -> float:
+    return sum(found.value for found in numbers.get(family, [])
+               if found.name == (sample or family) and labels.items() <= found.labels.items())
+
+
+@pytest.fixture
+def app(tmp_path):
+    """The app over a database of its own, in this process and without workers."""
+    settings = Settings(data=tmp_path / "data", anonymous=True, min_free_bytes=0)
+    database = connect(settings.sqlalchemy_url)
+    prepare(settings, database)
+    yield create_app(settings, database)
+    database.close()
+
+
+@pytest.fixture
+def inside(app) -> TestClient:
+    return TestClient(app, base_url="http://localhost")
+
+
+def test_a_service_with_a_worker_is_ready(server, client):
+    assert client.get("/healthz").json() == {"status": "ok"}
+    until(lambda: client.get("/readyz").status_code == 200, "never ready")
+    assert client.get("/readyz").json() == {"status": "ok"}
+
+
+def test_a_service_that_cannot_work_says_why_and_names_nothing(app, inside, tmp_path):
+    assert "no worker was seen in the last 30 seconds" in inside.get("/readyz").json()["detail"]
+    app.state.service.database.close()
+    shutil.rmtree(tmp_path / "data")
+    (tmp_path / "data").write_text("no folder")
+    said = until(lambda: (found := inside.get("/readyz").json()["detail"]) != "" and "database" in found and found, "it is still content")
+    assert said == "the database does not answer; the storage cannot be written"
+    assert inside.get("/readyz").status_code == 503 and inside.get("/healthz").status_code == 200
+    assert 'relit_database_up 0.0' in inside.get("/metrics").text
+
+
+def test_a_database_that_goes_away_and_comes_back(tmp_path):
+    programs = binaries()
+    if programs is None:
+        pytest.skip("no PostgreSQL server programs: neither on the PATH nor in /usr/lib/postgresql")
+    with postgres(programs) as database, serving(tmp_path, "--anonymous", "--device", "none", database_url=database.new_database(),
+                                                 min_free_bytes="0") as server, server.client() as client:
+        assert client.get("/v1/jobs").status_code == 200
+        database.stop("immediate")
+        refused = client.get("/v1/jobs")
+        assert (refused.status_code, refused.headers["Content-Type"]) == (503, "application/problem+json")
+        assert refused.headers["Retry-After"] and "database does not answer" in refused.json()["detail"]
+        until(lambda: "the database does not answer" in client.get("/readyz").json()["detail"], "it does not say so")
+        assert client.get("/healthz").status_code == 200 and "relit_database_up 0.0" in client.get("/metrics").text
+        database.start()
+        until(lambda: client.get("/v1/jobs").status_code == 200, "it does not come back")
+        assert "Traceback" not in server.log.read_text()
+
+
+def test_a_worker_of_its_own_makes_the_service_ready_and_ends_clean(tmp_path):
+    with serving(tmp_path, "--anonymous", "--device", "none", min_free_bytes="0") as server, server.client() as client:
+        assert "no worker" in client.get("/readyz").json()["detail"]
+        environment = {name: value for name, value in os.environ.items() if not name.startswith("RELIT_")}
+        with open(tmp_path / "worker.txt", "w") as errors:
+            worker = subprocess.Popen([sys.executable, "-m", "service.cli.main", "worker", "--data", str(server.data), "--device", "cpu"],
+                                      stderr=errors, env=environment)
+        try:
+            until(lambda: client.get("/readyz").status_code == 200, "never ready")
+        finally:
+            worker.terminate()
+            assert worker.wait(PATIENCE_S) == 0
+        until(lambda: client.get("/readyz").status_code == 503, "still ready")
+        assert "interrupted" not in (tmp_path / "worker.txt").read_text()
+
+
+def test_what_was_found_is_told_again_for_a_moment(app, monkeypatch):
+    """Who asks a thousand times a second costs one look."""
+    looks = []
+    monkeypatch.setattr("service.server.api.operations._faults", lambda behind: looks.append(1) or [])
+    for _ in range(100):
+        app.state.readiness.wrong(app.state.service)
+    assert len(looks) < 100
+
+
+def test_requests_are_counted_by_route_and_not_by_path(server, client):
+    before = numbers_of(client)
+    for name in ("job_00000000000000000000", "job_11111111111111111111", "nothing"):
+        client.get(f"/v1/jobs/{name}")
+    for path in ("/v1/no/such/thing", "/wp-login.php", "/v1/jobs/a/b/c/d"):
+        client.get(path)
+    client.request("BREW", "/v1/jobs")
+    made = client.post("/v1/captures", content=b'{"name": "abc"}', headers={"Content-Type": "application/json"})
+    assert made.status_code == 201
+    after = numbers_of(client)
+
+    def more(family: str, sample: str, **labels: str) -> float:
+        return number(after, family, sample, **labels) - number(before, family, sample, **labels)
+
+    requests = ("relit_http_requests", "relit_http_requests_total")
+    assert more(*requests, method="GET", route="/v1/jobs/{job}", status="404") == 2
+    assert more(*requests, method="GET", route="/v1/jobs/{job}") == 3
+    assert more(*requests, route="other", status="404") >= 3
+    assert more(*requests, method="other") == 1
+    assert more(*requests, route="/v1/captures", method="POST", status="201") == 1
+    assert more("relit_http_wait_seconds", "relit_http_wait_seconds_count", route="/v1/captures", method="POST") == 1
+    assert more("relit_http_received_bytes", "relit_http_received_bytes_total", route="/v1/captures") == len(b'{"name": "abc"}')
+    assert "job_0000" not in client.get("/metrics").text and "wp-login" not in client.get("/metrics").text
+
+
+def test_numbers_of_jobs_workers_and_the_process(server, client, owl, sky):
+    done = client.post("/v1/jobs", json={"kind": "relight", "capture": owl, "environment": sky, "options": {"frames": "1-2"}}).json()
+    server.wait(client, f"/v1/jobs/{done['id']}", ("succeeded",))
+    numbers = numbers_of(client)
+    assert number(numbers, "relit_jobs", state="succeeded") >= 3  # two checks, and this
+    assert {sample.labels["state"] for sample in numbers["relit_jobs"]} == {"queued", "running", "succeeded", "failed", "cancelled"}
+    assert number(numbers, "relit_workers", device="cpu", state="ready") == 1
+    assert number(numbers, "relit_job_frames") >= 2
+    assert number(numbers, "relit_database_up") == 1
+    assert number(numbers, "relit_storage_free_bytes") > 0 and number(numbers, "process_resident_memory_bytes") > 0
+    assert number(numbers, "relit_queue_age_seconds") >= 0
+
+
+def test_the_queue_ages(inside, app):
+    service = app.state.service
+    assert "relit_queue_age_seconds 0.0" in inside.get("/metrics").text
+    inside.post("/v1/captures", json={"name": "x"}).raise_for_status()
+    capture = inside.get("/v1/captures").json()["items"][0]["id"]
+    inside.post(f"/v1/captures/{capture}/validate").raise_for_status()
+    numbers = {family.name: family.samples for family in text_string_to_metric_families(inside.get("/metrics").text)}
+    assert number(numbers, "relit_queue_age_seconds") > 0 and number(numbers, "relit_jobs", state="queued") == 1
+    assert service.database is not None
+
+
+def test_every_request_is_one_line_of_the_log(server, client):
+    name = client.get("/v1/jobs", params={"limit": 7}).headers["X-Request-ID"]
+    found = until(lambda: [line for line in lines_of(server) if line.get("request") == name], "not logged")
+    assert len(found) == 1
+    assert found[0] | {"ms": 0, "timestamp": ""} == {
+        "event": "request", "level": "info", "timestamp": "", "request": name, "method": "GET", "path": "/v1/jobs", "status": 200, "ms": 0,
+        "client": "127.0.0.1", "project": "default", "key": None}
+    refused = client.get("/v1/jobs/job_00000000000000000000")
+    assert refused.json()["request_id"] == refused.headers["X-Request-ID"]
+    until(lambda: any(line.get("request") == refused.headers["X-Request-ID"] for line in lines_of(server)), "not logged")
+    for path in ("/healthz", "/readyz", "/metrics"):  # of level debug, which is not asked for
+        assert not any(line.get("request") == client.get(path).headers["X-Request-ID"] for line in lines_of(server))
+
+
+def test_what_libraries_say_is_in_the_same_log(server):
+    """Here uvicorn, of bytes that are no HTTP."""
+    host, port = server.url.removeprefix("http://").split(":")
+    with socket.create_connection((host, int(port))) as connection:
+        connection.sendall(b"\x16\x03\x01\x00\xff no http\r\n\r\n")
+        connection.recv(100)
+    until(lambda: [line for line in lines_of(server) if line.get("logger") == "uvicorn.error"], "nothing of uvicorn")
+
+
+def test_a_job_is_followed_through_the_log(server, client, owl):
+    job = client.post("/v1/jobs", json={"kind": "solve", "capture": owl, "options": {"method": "lambert"}}).json()["id"]
+    server.wait(client, f"/v1/jobs/{job}", ("succeeded",))
+    events = until(lambda: [line["event"] for line in lines_of(server) if line.get("job") == job][2:] and [
+        line["event"] for line in lines_of(server) if line.get("job") == job], "not logged")
+    assert events[:2] == ["step begins", "step done"]
+
+
+def test_a_fault_of_our_own_is_a_problem_too_and_logged_once(app, capfd):
+    log.configure("info", "json")
+
+    @app.get("/v1/broken")
+    def broken() -> None:
+        raise RuntimeError("a secret of the machine")
+
+    with TestClient(app, base_url="http://localhost") as client:
+        response = client.get("/v1/broken")
+    assert (response.status_code, response.headers["Content-Type"]) == (500, "application/problem+json")
+    assert response.json()["request_id"] == response.headers["X-Request-ID"] and "secret" not in response.text
+    lines = [json.loads(line) for line in capfd.readouterr().err.splitlines()]
+    faults = [line for line in lines if line["event"] == "request failed"]
+    assert len(faults) == 1 and "RuntimeError: a secret of the machine" in faults[0]["exception"]
+    assert faults[0]["request"] == response.headers["X-Request-ID"]
+    assert 'route="/v1/broken",status="500"} 1.0' in TestClient(app, base_url="http://localhost").get("/metrics").text
+
+
+@pytest.fixture
+def busy(tmp_path) -> Iterator[tuple[Server, httpx2.Client, str]]:
+    """A server whose worker is in a step that takes longer than it may take to drain."""
+    with serving(tmp_path, "--anonymous", "--device", "cpu", roots=str(SAMPLES), drain_s=str(DRAIN_S), min_free_bytes="0") as server, \
+            server.client() as client:
+        capture = client.post("/v1/captures", json={"name": "owl", "folder": str(SAMPLES / "owl")}).json()["id"]
+        server.wait(client, f"/v1/captures/{capture}", ("ready",))
+        job = client.post("/v1/jobs", json={"kind": "solve", "capture": capture, "options": {"method": "svbrdf"}}).json()["id"]
+        server.wait(client, f"/v1/jobs/{job}", ("running",))
+        yield server, client, job
+
+
+def test_the_service_drains_and_ends_clean(busy):
+    """While the worker drains, the service answers on and is not ready; streams end as streams do; the job waits for the next worker."""
+    server, client, job = busy
+    lines: list[str] = []
+
+    def listen() -> None:
+        with server.client() as other, other.stream("GET", f"/v1/jobs/{job}/events") as stream:
+            lines.extend(stream.iter_lines())
+        lines.append("END")
+
+    listener = threading.Thread(target=listen)
+    listener.start()
+    until(lambda: lines, "no event")
+    server.process.send_signal(signal.SIGTERM)
+    response = until(lambda: (found := client.get("/readyz")).status_code == 503 and found, "still ready")
+    assert response.json()["detail"] == "the service is ending" and response.headers["Retry-After"]
+    assert client.get("/healthz").status_code == 200
+    assert client.get(f"/v1/jobs/{job}").json()["state"] == "running"
+    assert server.process.wait(PATIENCE_S) == 0
+    listener.join(PATIENCE_S)
+    assert lines[-1] == "END"
+    text = server.log.read_text()
+    assert "interrupted" not in text and "Traceback" not in text
+    assert lines_of(server)[-1]["event"] == "service ended"
+    assert not list((server.data / "locks").glob("*.lock"))
+    database = connect(Settings(data=server.data).sqlalchemy_url)
+    assert jobs.find(database, job)["state"] == "queued" and workers.present(database) == []
+    database.close()
+
+
+def test_asked_twice_it_ends_at_once(busy):
+    server, _, _ = busy
+    children = children_of(server.process.pid)
+    assert children
+    server.process.send_signal(signal.SIGINT)
+    server.process.send_signal(signal.SIGINT)  # together with the first, it is the same
+    until(lambda: "service drains" in server.log.read_text(), "does not drain")
+    while server.process.poll() is None:
+        time.sleep(0.2)
+        server.process.send_signal(signal.SIGINT)
+    assert server.process.returncode == 128 + signal.SIGINT
+    assert "step is given up" not in server.log.read_text()  # which comes after DRAIN_S
+    until(lambda: not any(alive(child) for child in children), "a worker lives on")
+
+
+def children_of(pid: int) -> list[int]:
+    return [int(child) for task in Path(f"/proc/{pid}/task").iterdir() for child in (task / "children").read_text().split()]
+
+
+def alive(pid: int) -> bool:
+    try:
+        return re.search(r"^State:\s+Z", Path(f"/proc/{pid}/status").read_text(), re.MULTILINE) is None
+    except FileNotFoundError:
+        return False
+
+
+class Collector(BaseHTTPRequestHandler):
+    """Takes OTLP over HTTP as collectors do."""
+
+    spans: list
+
+    def do_POST(self) -> None:
+        body = self.rfile.read(int(self.headers["Content-Length"]))
+        assert self.path == "/v1/traces"
+        for resource in ExportTraceServiceRequest.FromString(body).resource_spans:
+            attributes = {pair.key: pair.value.string_value for pair in resource.resource.attributes}
+            assert attributes["service.name"] == "relit"
+            self.spans.extend(span for scope in resource.scope_spans for span in scope.spans)
+        self.send_response(200)
+        self.end_headers()
+
+    def log_message(self, *_arguments: object) -> None:
+        """Say nothing."""
+
+
+@pytest.fixture
+def collector() -> Iterator[tuple[str, list]]:
+    spans: list = []
+    server = ThreadingHTTPServer(("127.0.0.1", 0), type("Collecting", (Collector,), {"spans": spans}))
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    yield f"http://127.0.0.1:{server.server_port}", spans
+    server.shutdown()
+    thread.join()
+    server.server_close()
+
+
+def test_a_request_and_the_steps_of_its_job_are_one_trace(collector, tmp_path):
+    address, spans = collector
+    with serving(tmp_path, "--anonymous", "--device", "cpu", roots=str(SAMPLES), otel_endpoint=address, min_free_bytes="0") as server, \
+            server.client() as client:
+        ours = "4bf92f3577b34da6a3ce929d0e0e4736"
+        made = client.post("/v1/captures", json={"name": "owl", "folder": str(SAMPLES / "owl")},
+                           headers={"traceparent": f"00-{ours}-00f067aa0ba902b7-01"}).json()
+        server.wait(client, f"/v1/captures/{made['id']}", ("ready",))
+        client.get("/healthz")
+        server.process.send_signal(signal.SIGTERM)
+        assert server.process.wait(PATIENCE_S) == 0
+    found = {span.name: span for span in spans}
+    asked, step = found["POST /v1/captures"], found["check"]
+    assert asked.trace_id.hex() == step.trace_id.hex() == ours
+    assert step.parent_span_id == asked.span_id
+    assert {pair.key: pair.value.string_value for pair in step.attributes}["relit.job"].startswith("job_")
+    assert "GET /v1/captures/{capture}" in found and "GET /healthz" not in found
+
+
+def test_traces_without_the_extra_are_one_sentence(monkeypatch):
+    monkeypatch.setitem(sys.modules, "opentelemetry.exporter.otlp.proto.http.trace_exporter", None)
+    with pytest.raises(RequestError, match="otel_endpoint: the extra otel is not installed"):
+        telemetry.provider(Settings(otel_endpoint="http://127.0.0.1:4318"))
+    assert telemetry.provider(Settings()) is None

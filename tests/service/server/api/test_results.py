@@ -1,0 +1,284 @@
+"""Results: listed while they are made, downloaded whole and in parts, and nothing but results."""
+
+import asyncio
+import email
+import http.client
+import os
+import time
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service.requests.identifiers import new_id
+from service.requests.jobs import SolveJob
+from service.server.api.app import create_app
+from service.server.api.ranges import MAX_RANGES, Span, asked_for, names
+from service.server.jobs.queue import JobQueue, prepare
+from service.server.settings import Settings
+from service.server.storage.folder import FolderStorage
+from service.server.store.database import connect
+from stage.errors import StorageError
+from tests.service.server_process.api.asgi import Call
+from tests.service.server_process.serve import Server
+
+ENDED = ("succeeded", "failed", "cancelled")
+LARGE = 64 << 20
+"""More than the sockets between server and client hold, so that a download of it is under way for as long as nobody reads."""
+
+
+@pytest.fixture(scope="module")
+def frames(server, client, dome, sky) -> str:
+    """A job that made frames, with what a listing saw while it did."""
+    made = client.post("/v1/jobs", json={"kind": "relight", "capture": dome, "environment": sky, "options": {"frames": "1-40"}})
+    return made.raise_for_status().json()["id"]
+
+
+@pytest.fixture(scope="module")
+def folder(server, client, frames) -> Path:
+    assert server.wait(client, f"/v1/jobs/{frames}", ENDED)["state"] == "succeeded"
+    return server.data / "projects/default/jobs" / frames
+
+
+def raw(server: Server, method: str, path: str) -> tuple[int, bytes]:
+    """A request whose path is sent as it is."""
+    address = urlsplit(server.url)
+    connection = http.client.HTTPConnection(address.hostname, address.port, timeout=60)
+    try:
+        connection.request(method, path)
+        response = connection.getresponse()
+        return response.status, response.read()
+    finally:
+        connection.close()
+
+
+def test_what_is_listed_while_a_job_runs_is_complete(server, client, frames):
+    seen: dict[str, bytes] = {}
+    while client.get(f"/v1/jobs/{frames}").json()["state"] not in ENDED:
+        listed = client.get(f"/v1/jobs/{frames}/results").raise_for_status().json()["results"]
+        for file in listed:
+            if file["name"] not in seen:
+                seen[file["name"]] = client.get(file["url"]).raise_for_status().content
+                assert len(seen[file["name"]]) == file["size"]
+        time.sleep(0.02)
+    after = client.get(f"/v1/jobs/{frames}/results").json()["results"]
+    assert [file["name"] for file in after] == [f"frame.{number:04d}.exr" for number in range(1, 41)]
+    for name, content in seen.items():
+        assert client.get(f"/v1/jobs/{frames}/results/{name}").content == content
+
+
+def test_the_listing_comes_a_page_at_a_time(client, frames, folder):
+    whole = client.get(f"/v1/jobs/{frames}/results").json()
+    assert whole["next"] is None
+    found, after = [], {}
+    while after is not None:
+        page = client.get(f"/v1/jobs/{frames}/results", params={"limit": 15, **after}).raise_for_status().json()
+        found += page["results"]
+        after = None if page["next"] is None else {"after": page["next"]}
+    assert found == whole["results"] and len(found) == 40
+
+
+def test_a_file_is_downloaded_with_what_clients_need(client, frames, folder):
+    url, content = f"/v1/jobs/{frames}/results/frame.0001.exr", (folder / "frame.0001.exr").read_bytes()
+    response = client.get(url)
+    assert (response.status_code, response.content) == (200, content)
+    assert response.headers["Content-Type"] == "image/x-exr"
+    assert response.headers["Content-Disposition"] == 'attachment; filename="frame.0001.exr"'
+    assert response.headers["X-Content-Type-Options"] == "nosniff"
+    assert response.headers["Accept-Ranges"] == "bytes"
+    assert response.headers["ETag"].startswith('"') and response.headers["ETag"].endswith('"')
+    head = client.head(url)
+    assert (head.status_code, head.content) == (200, b"")
+    same = ("Content-Type", "Content-Length", "Content-Disposition", "ETag", "Last-Modified", "Accept-Ranges")
+    assert {name: head.headers[name] for name in same} == {name: response.headers[name] for name in same}
+
+
+@pytest.mark.parametrize("name, media_type", [
+    ("maps.exr", "image/x-exr"), ("asset.usdz", "model/vnd.usdz+zip"), ("asset.usda", "model/vnd.usda"),
+    ("asset.usdc", "application/octet-stream"), ("report.json", "application/json"), ("preview.png", "image/png"),
+    ("points.ply", "application/octet-stream"), ("page.html", "application/octet-stream"), ("none", "application/octet-stream")])
+def test_media_types(client, frames, folder, name, media_type):
+    (folder / name).write_bytes(b"{}")
+    try:
+        assert client.get(f"/v1/jobs/{frames}/results/{name}").headers["Content-Type"] == media_type
+    finally:
+        (folder / name).unlink()
+
+
+def test_a_name_beyond_ascii_keeps_its_name(client, frames, folder):
+    (folder / "step 1").mkdir()
+    (folder / "step 1" / "Über.exr").write_bytes(b"x")
+    try:
+        file = client.get(f"/v1/jobs/{frames}/results", params={"after": "step"}).json()["results"][0]
+        assert (file["name"], file["url"]) == ("step 1/Über.exr", f"/v1/jobs/{frames}/results/step%201/%C3%9Cber.exr")
+        response = client.get(file["url"])
+        assert response.content == b"x"
+        assert response.headers["Content-Disposition"] == "attachment; filename*=UTF-8''%C3%9Cber.exr"
+    finally:
+        (folder / "step 1" / "Über.exr").unlink()
+        (folder / "step 1").rmdir()
+
+
+def test_what_the_client_has_is_not_sent_again(client, frames, folder):
+    url = f"/v1/jobs/{frames}/results/frame.0002.exr"
+    etag = client.get(url).headers["ETag"]
+    for method in ("GET", "HEAD"):
+        for given_tags in (etag, f'"other", {etag}', f"W/{etag}", "*"):
+            response = client.request(method, url, headers={"If-None-Match": given_tags})
+            assert (response.status_code, response.content, response.headers["ETag"]) == (304, b"", etag)
+        assert client.request(method, url, headers={"If-None-Match": '"other"'}).status_code == 200
+        assert client.request(method, url, headers={"If-Match": etag}).status_code == 200
+        response = client.request(method, url, headers={"If-Match": f'W/{etag}, "other"'})  # weak tags are never the same
+        assert (response.status_code, response.headers["ETag"]) == (412, etag)
+
+
+def test_parts(client, frames, folder):
+    url, content = f"/v1/jobs/{frames}/results/frame.0003.exr", (folder / "frame.0003.exr").read_bytes()
+    size = len(content)
+    for wanted, start, part in (("0-9", 0, content[:10]), ("10-10", 10, content[10:11]), (f"{size - 3}-", size - 3, content[-3:]),
+                                ("-7", size - 7, content[-7:]), (f"-{size + 5}", 0, content), (f"5-{size + 100}", 5, content[5:])):
+        response = client.get(url, headers={"Range": f"bytes={wanted}"})
+        assert (response.status_code, response.content) == (206, part)
+        assert response.headers["Content-Range"] == f"bytes {start}-{start + len(part) - 1}/{size}"
+        assert int(response.headers["Content-Length"]) == len(part)
+    for ignored in ("lines=0-9", "bytes=9-3", "bytes=x", "bytes=", "bytes=-", ",".join(["bytes=0-1", *["3-4"] * MAX_RANGES])):
+        response = client.get(url, headers={"Range": ignored})
+        assert (response.status_code, response.content) == (200, content)
+    for outside in (f"bytes={size}-", "bytes=-0", f"bytes={size + 1}-{size + 2},{size}-"):
+        response = client.get(url, headers={"Range": outside})
+        assert (response.status_code, response.headers["Content-Range"]) == (416, f"bytes */{size}")
+        assert response.headers["Content-Type"] == "application/problem+json"
+
+
+def test_several_parts_at_once(client, frames, folder):
+    url, content = f"/v1/jobs/{frames}/results/frame.0003.exr", (folder / "frame.0003.exr").read_bytes()
+    response = client.get(url, headers={"Range": "bytes=5-9, -3, 999999999-, 0-0"})
+    assert response.status_code == 206 and int(response.headers["Content-Length"]) == len(response.content)
+    message = email.message_from_bytes(b"Content-Type: " + response.headers["Content-Type"].encode() + b"\r\n\r\n" + response.content)
+    assert message.get_content_type() == "multipart/byteranges"
+    parts = [(part.get_content_type(), part["Content-Range"]) for part in message.get_payload()]
+    size = len(content)
+    assert parts == [("image/x-exr", f"bytes {span}/{size}") for span in ("5-9", f"{size - 3}-{size - 1}", "0-0")]
+    boundary = response.headers["Content-Type"].partition("boundary=")[2].encode()
+    bodies = [part.partition(b"\r\n\r\n")[2].removesuffix(b"\r\n") for part in response.content.split(b"--" + boundary)[1:-1]]
+    assert bodies == [content[5:10], content[-3:], content[:1]]
+
+
+def test_a_download_is_gone_on_with_only_where_the_file_is_the_same(client, frames, folder):
+    path = folder / "other.bin"
+    path.write_bytes(b"0123456789")
+    url = f"/v1/jobs/{frames}/results/other.bin"
+    try:
+        etag = client.get(url).headers["ETag"]
+        response = client.get(url, headers={"Range": "bytes=4-", "If-Range": etag})
+        assert (response.status_code, response.content) == (206, b"456789")
+        replace(path, b"abcdefghij")
+        response = client.get(url, headers={"Range": "bytes=4-", "If-Range": etag})
+        assert (response.status_code, response.content) == (200, b"abcdefghij")
+        assert response.headers["ETag"] != etag
+        for unclear in (f"W/{response.headers['ETag']}", response.headers["Last-Modified"]):
+            assert client.get(url, headers={"Range": "bytes=4-", "If-Range": unclear}).status_code == 200
+    finally:
+        path.unlink()
+
+
+def replace(path: Path, content: bytes) -> None:
+    """As the writers of results do."""
+    new = path.with_name(f".{path.name}.new")
+    new.write_bytes(content)
+    os.replace(new, path)
+
+
+def test_a_download_is_of_one_file_whatever_takes_its_place(client, frames, folder):
+    path = folder / "large.bin"
+    path.write_bytes(b"a" * LARGE)
+    try:
+        with client.stream("GET", f"/v1/jobs/{frames}/results/large.bin") as response:
+            pieces = response.iter_bytes()
+            got = [next(pieces)]
+            replace(path, b"b" * 10)
+            got += pieces
+        whole = b"".join(got)
+        assert len(whole) == LARGE and whole.count(b"a") == LARGE
+    finally:
+        path.unlink()
+
+
+TRICKS = ["..", "../", "../../../../relit.sqlite", "..%2f..%2f..%2f..%2frelit.sqlite", "%2e%2e/%2e%2e/%2e%2e/%2e%2e/relit.sqlite",
+          "/etc/passwd", "%2fetc%2fpasswd", "./frame.0001.exr", "x/../frame.0001.exr", "frame.0001.exr/", "frame.0001.exr/.",
+          "frame.0001.exr%00", "frame.0001.exr%00.json", "frame.0001.exr%0a", ".hidden", "a/.hidden", "..%5c..%5crelit.sqlite",
+          "C:%5cwindows", "%e2%80%aeframe.0001.exr", "a" * 300, "a/" * 500 + "a", ""]
+ABSENT = ["%c0%ae%c0%ae/frame.0001.exr", "%ff", "~root", "%252e%252e", "frame.0001.EXR", "frame.9999.exr"]
+"""Names like any other, of which there is no file."""
+
+
+@pytest.mark.parametrize("name", TRICKS + ABSENT)
+@pytest.mark.parametrize("method", ["GET", "HEAD"])
+def test_names_with_tricks_are_not_there(server, frames, folder, method, name):
+    (folder / ".hidden").write_bytes(b"x")
+    status, body = raw(server, method, f"/v1/jobs/{frames}/results/{name}")
+    assert status == 404
+    assert method == "HEAD" or b"has no such result" in body
+
+
+def test_links_out_of_the_results_are_not_followed(server, client, frames, folder):
+    (folder / "link.exr").symlink_to(server.data / "relit.sqlite")
+    (folder / "inner").symlink_to(server.data, target_is_directory=True)
+    try:
+        listed = {file["name"] for file in client.get(f"/v1/jobs/{frames}/results").json()["results"]}
+        assert not any(name.startswith(("link", "inner")) for name in listed)
+        assert client.get(f"/v1/jobs/{frames}/results/link.exr").status_code == 404
+        assert client.get(f"/v1/jobs/{frames}/results/inner/relit.sqlite").status_code == 404
+        assert client.get(f"/v1/jobs/{frames}/results/inner/projects/default/jobs/{frames}/frame.0001.exr").status_code == 404
+    finally:
+        (folder / "link.exr").unlink()
+        (folder / "inner").unlink()
+
+
+class Untouched(FolderStorage):
+    """A storage that nobody may open a file of."""
+
+    def open(self, prefix: str, name: str) -> Path | None:
+        raise StorageError(f"{name!r} was looked for")
+
+
+def test_names_with_tricks_never_reach_the_storage(tmp_path):
+    settings = Settings(data=tmp_path, anonymous=True)
+    database = connect(settings.sqlalchemy_url)
+    prepare(settings, database)
+    app = create_app(settings, database)
+    job = database.transact(lambda connection: JobQueue(database).submit(
+        connection, project="default", key=None, request=SolveJob(kind="solve", capture=new_id("cap")), chunk_frames=1, inputs=[]))
+    app.state.service = app.state.service._replace(storage=Untouched(tmp_path))
+
+    def status(name: str) -> int:
+        return asyncio.run(Call(app, f"/v1/jobs/{job}/results/{name}").run()).status
+
+    assert status("maps.exr") == 507
+    assert {name: status(name) for name in TRICKS} == dict.fromkeys(TRICKS, 404)
+    database.close()
+
+
+def test_only_results_of_a_job_that_is_there(client, frames):
+    nobody = new_id("job")
+    for path in ("", "/frame.0001.exr"):
+        response = client.get(f"/v1/jobs/{nobody}/results{path}")
+        assert (response.status_code, response.headers["Content-Type"]) == (404, "application/problem+json")
+    assert client.request("DELETE", f"/v1/jobs/{frames}/results/frame.0001.exr").headers["Allow"] == "GET, HEAD"
+    assert client.get(f"/v1/jobs/{frames}/results", params={"limit": 1001}).json()["errors"][0]["field"] == "query.limit"
+
+
+@given(st.lists(st.tuples(st.integers(0, 120), st.integers(0, 120)), min_size=1, max_size=MAX_RANGES), st.integers(0, 100))
+def test_ranges_are_cut_to_the_file(pairs, size):
+    asked = [(min(pair), max(pair)) for pair in pairs]
+    spans = asked_for("bytes=" + ",".join(f"{first}-{last}" for first, last in asked), size)
+    assert spans == [Span(first, min(last + 1, size)) for first, last in asked if first < size]
+
+
+@given(st.text())
+def test_any_range_and_any_tag_can_be_said(text):
+    spans = asked_for(text, 10)
+    assert spans is None or all(0 <= span.start < span.stop <= 10 for span in spans)
+    assert names(text, '"a"', strong=True) <= names(text, '"a"', strong=False)

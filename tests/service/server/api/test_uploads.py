@@ -1,0 +1,492 @@
+"""Resumable uploads, as a client sees them that knows the tus protocol alone (tests/service/server/api/tus.py)."""
+
+import hashlib
+import os
+import random
+import resource
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from service.requests.identifiers import CAPTURE, new_id
+from service.server.storage.parts import Part, PartLocked
+from service.server.store import keys, uploads
+from service.server.store.database import connect, create
+from service.server.store.intakes import insert as insert_intake
+from service.server.store.keys import NewKey, Scope
+from tests.service.postgres import binaries, postgres
+from tests.service.server_process.api.conftest import SAMPLES
+from tests.service.server_process.api.tus import VERSION, Answer, Tus, checksum, encoded
+from tests.service.server_process.serve import Server, serving
+
+KIB, MIB = 1 << 10, 1 << 20
+PATIENCE_S = 30.0
+
+
+@pytest.fixture(scope="session")
+def tus(server: Server) -> Tus:
+    return Tus(server.url)
+
+
+@pytest.fixture
+def capture(client) -> str:
+    return made(client, "captures")
+
+
+def made(client, kind: str) -> str:
+    return f"/v1/{kind}/{client.post(f'/v1/{kind}', json={'name': 'test'}).raise_for_status().json()['id']}"
+
+
+def begun(tus: Tus, place: str, length: int, path: str = "file.bin", **words: str) -> str:
+    answer = tus.create(place, length, encoded(path=path, **words))
+    assert answer.status == 201, answer.body
+    return answer.headers["location"]
+
+
+def stored(server: Server, place: str, path: str) -> Path:
+    return server.data / "projects/default" / place.removeprefix("/v1/") / path
+
+
+def part(server: Server, upload: str) -> Path:
+    return server.data / "uploads" / f"{upload.rpartition('/')[2]}.part"
+
+
+def soon(found: Callable[[], object]) -> object:
+    deadline = time.monotonic() + PATIENCE_S
+    while not (value := found()):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    return value
+
+
+def half_sent(tus: Tus, upload: str, offset: int, body: bytes, sent: int, *more: str) -> socket.socket:
+    """A PATCH of which only the first bytes are sent."""
+    connection = socket.create_connection((tus.host, tus.port))
+    lines = [f"PATCH {upload} HTTP/1.1", f"Host: {tus.host}", f"Tus-Resumable: {VERSION}", f"Upload-Offset: {offset}",
+             "Content-Type: application/offset+octet-stream", f"Content-Length: {len(body)}", *more]
+    connection.sendall("\r\n".join([*lines, "", ""]).encode() + body[:sent])
+    return connection
+
+
+def test_the_server_says_what_it_speaks(tus):
+    answer = tus.ask("OPTIONS", "/v1/uploads", version=None)
+    assert answer.status == 204
+    assert answer.headers["tus-version"] == VERSION
+    assert set(answer.headers["tus-extension"].split(",")) == {"creation", "checksum", "termination", "expiration"}
+    assert set(answer.headers["tus-checksum-algorithm"].split(",")) == {"sha1", "sha256"}
+    assert int(answer.headers["tus-max-size"]) > 0
+
+
+def test_another_version_is_refused_and_every_answer_names_ours(tus, capture):
+    upload = begun(tus, capture, 4)
+    other = tus.ask("PATCH", upload, b"data", version="0.2.2", Upload_Offset="0", Content_Type="application/offset+octet-stream")
+    assert (other.status, other.headers["tus-version"]) == (412, VERSION)
+    assert tus.ask("HEAD", upload, version=None).status == 422
+    for answer in (other, tus.head(upload), tus.head("/v1/uploads/up_00000000000000000000"), tus.head("/v1/uploads/nonsense"),
+                   tus.create(capture, 1, "nonsense"), tus.ask("PUT", upload)):
+        assert answer.headers["tus-resumable"] == VERSION
+
+
+@pytest.mark.parametrize("length", [0, 1, 3 * MIB + 17])
+def test_a_file_comes_in_pieces(server, client, tus, capture, length):
+    content = random.Random(length).randbytes(length)
+    upload = tus.send(capture, "step 1/görl.bin", content)
+    head = tus.head(upload)
+    assert (head.status, head.offset, int(head.headers["upload-length"])) == (200, length, length)
+    assert head.headers["cache-control"] == "no-store"
+    assert head.headers["upload-metadata"] == encoded(path="step 1/görl.bin")
+    assert stored(server, capture, "step 1/görl.bin").read_bytes() == content
+    assert not part(server, upload).exists()
+    listed = client.get(f"{capture}/files").raise_for_status().json()
+    assert listed == {"files": [{"upload": upload.rpartition("/")[2], "path": "step 1/görl.bin", "length": length, "received": length,
+                                 "done": True, "sha256": None}], "next": None}
+
+
+def test_the_method_may_come_in_a_header(server, tus, capture):
+    upload = begun(tus, capture, 4)
+    answer = tus.ask("POST", upload, b"data", Upload_Offset="0", Content_Type="application/offset+octet-stream",
+                     X_HTTP_Method_Override="PATCH")
+    assert (answer.status, answer.offset) == (204, 4)
+    assert stored(server, capture, "file.bin").read_bytes() == b"data"
+
+
+def test_a_wrong_offset_length_or_type_changes_nothing(tus, capture):
+    upload = begun(tus, capture, 10)
+    assert tus.patch(upload, 0, b"01234").offset == 5
+    away = tus.patch(upload, 0, b"01234")
+    assert (away.status, away.offset) == (409, 5)
+    assert tus.patch(upload, 6, b"6").status == 409
+    assert tus.patch(upload, 5, b"567890").status == 413
+    assert tus.ask("PATCH", upload, b"5", Upload_Offset="5", Content_Type="application/octet-stream").status == 415
+    assert tus.ask("PATCH", upload, b"5", Upload_Offset="-5", Content_Type="application/offset+octet-stream").status == 422
+    assert tus.head(upload).offset == 5
+
+
+def test_a_body_of_unknown_length_may_not_go_beyond_the_end(server, tus, capture):
+    upload = begun(tus, capture, 2 * MIB)
+    for size, status in ((2 * MIB + 1, 413), (2 * MIB, 204)):
+        content = bytes(size)
+        answer = tus.ask("PATCH", upload, iter([content[:MIB], content[MIB:]]), Upload_Offset="0",  # type: ignore[arg-type]
+                         Content_Type="application/offset+octet-stream")
+        assert answer.status == status
+    assert stored(server, capture, "file.bin").stat().st_size == 2 * MIB
+
+
+@pytest.mark.parametrize("algorithm", ["sha1", "sha256"])
+def test_a_piece_with_a_wrong_checksum_is_dropped(server, tus, capture, algorithm):
+    content = random.Random(1).randbytes(3 * MIB)
+    upload = begun(tus, capture, len(content))
+    assert tus.patch(upload, 0, content[:MIB], Upload_Checksum=checksum(algorithm, content[:MIB])).status == 204
+    wrong = tus.patch(upload, MIB, content[MIB:], Upload_Checksum=checksum(algorithm, content))
+    assert (wrong.status, wrong.body.count(b"checksum-mismatch")) == (460, 1)
+    assert tus.head(upload).offset == MIB
+    assert part(server, upload).stat().st_size == MIB
+    assert tus.patch(upload, MIB, content[MIB:], Upload_Checksum=checksum(algorithm, content[MIB:])).status == 204
+    assert stored(server, capture, "file.bin").read_bytes() == content
+
+
+@pytest.mark.parametrize("header", ["md5 1B2M2Y8AsgTpgAmY7PhCfg==", "sha1", "sha1 AAAA", "sha256 ###", ""])
+def test_a_checksum_that_is_none_is_refused(tus, capture, header):
+    upload = begun(tus, capture, 4)
+    answer = tus.patch(upload, 0, b"data", Upload_Checksum=header)
+    assert (answer.status, b"Upload-Checksum" in answer.body) == (400, True)
+    assert tus.head(upload).offset == 0
+
+
+def test_a_whole_file_with_a_wrong_checksum_is_dropped(server, client, tus, capture):
+    content = random.Random(2).randbytes(2 * MIB)
+    upload = begun(tus, capture, len(content), sha256=hashlib.sha256(content).hexdigest())
+    assert tus.patch(upload, 0, content[:MIB]).status == 204
+    wrong = tus.patch(upload, MIB, bytes(MIB))
+    assert (wrong.status, b'file.bin' in wrong.body) == (460, True)
+    assert (tus.head(upload).offset, part(server, upload).stat().st_size) == (0, 0)
+    assert not stored(server, capture, "file.bin").exists()
+    assert tus.patch(upload, 0, content).status == 204
+    assert stored(server, capture, "file.bin").read_bytes() == content
+
+
+@pytest.mark.parametrize("checked", [False, True])
+def test_a_broken_connection_keeps_what_needs_no_check(server, tus, capture, checked):
+    content = random.Random(3).randbytes(3 * MIB)
+    upload = begun(tus, capture, len(content))
+    connection = half_sent(tus, upload, 0, content, MIB + 5, *([f"Upload-Checksum: {checksum('sha1', content)}"] if checked else []))
+    soon(lambda: part(server, upload).exists() and part(server, upload).stat().st_size >= MIB)  # a block of it is written
+    connection.close()
+    soon(lambda: tus.patch(upload, len(content), b"").status == 409)  # until it is noticed the upload is locked
+    kept = tus.head(upload).offset
+    assert kept == part(server, upload).stat().st_size == (0 if checked else MIB + 5)
+    assert tus.patch(upload, kept, content[kept:]).status == 204
+    assert stored(server, capture, "file.bin").read_bytes() == content
+
+
+def test_an_upload_is_written_by_one_request_at_a_time(server, tus, capture):
+    content = random.Random(4).randbytes(2 * MIB)
+    upload = begun(tus, capture, len(content))
+    with half_sent(tus, upload, 0, content, MIB) as first:
+        soon(lambda: part(server, upload).exists())
+        soon(lambda: tus.patch(upload, 0, content).status == 423)
+        assert tus.ask("DELETE", upload).status == 423
+        assert tus.head(upload).offset == 0
+        first.sendall(content[MIB:])
+        assert first.recv(KIB).startswith(b"HTTP/1.1 204")
+    assert stored(server, capture, "file.bin").read_bytes() == content
+
+
+def at_once(count: int, ask: Callable[[int], Answer]) -> list[Answer]:
+    ready = threading.Barrier(count)
+
+    def one(number: int) -> Answer:
+        ready.wait()
+        return ask(number)
+
+    with ThreadPoolExecutor(count) as pool:
+        return list(pool.map(one, range(count)))
+
+
+def test_of_many_uploads_of_a_path_at_once_one_begins(client, tus, capture):
+    answers = at_once(8, lambda number: tus.create(capture, 10 + number, encoded(path="same.bin")))
+    assert sorted(answer.status for answer in answers) == [201] + 7 * [409]
+    assert len(client.get(f"{capture}/files").json()["files"]) == 1
+
+
+def test_the_same_request_at_once_is_one_upload(client, tus, capture):
+    answers = at_once(8, lambda _: tus.create(capture, 10, encoded(path="same.bin"), Idempotency_Key=f"once-{capture}"))
+    assert {answer.status for answer in answers} == {201}
+    assert len({answer.headers["location"] for answer in answers}) == 1
+    assert tus.create(capture, 11, encoded(path="same.bin"), Idempotency_Key=f"once-{capture}").status == 422
+
+
+def test_a_token_whose_upload_was_deleted_makes_another(tus, capture):
+    def ask() -> str:
+        return tus.create(capture, 4, encoded(path="a"), Idempotency_Key=f"again-{capture}").headers["location"]
+
+    first = ask()
+    assert tus.ask("DELETE", first).status == 204
+    second = ask()
+    assert second != first
+    assert tus.patch(second, 0, b"data").status == 204
+
+
+def test_many_files_come_at_once(server, tus, capture):
+    contents = {f"{number:02}.bin": random.Random(number).randbytes(700 * KIB) for number in range(12)}
+    with ThreadPoolExecutor(6) as pool:
+        list(pool.map(lambda item: tus.send(capture, *item, piece=256 * KIB), contents.items()))
+    for name, content in contents.items():
+        assert stored(server, capture, name).read_bytes() == content
+
+
+def test_a_deleted_upload_leaves_nothing(server, client, tus, capture):
+    halfway, whole = begun(tus, capture, 8, "half/way"), tus.send(capture, "whole/file", b"whole")
+    assert tus.patch(halfway, 0, b"data").status == 204
+    for upload in (halfway, whole):
+        assert tus.ask("DELETE", upload).status == 204
+        assert tus.head(upload).status == 404
+        assert not part(server, upload).exists()
+    assert client.get(f"{capture}/files").json()["files"] == []
+    assert not stored(server, capture, "whole").exists()
+
+
+def test_a_deleted_capture_takes_its_uploads_along(server, client, tus, capture):
+    halfway = begun(tus, capture, 8)
+    assert tus.patch(halfway, 0, b"data").status == 204
+    tus.send(capture, "whole", b"whole")
+    with half_sent(tus, begun(tus, capture, 2 * MIB, "late"), 0, bytes(2 * MIB), MIB) as late:
+        client.delete(capture).raise_for_status()
+        late.sendall(bytes(MIB))
+        assert late.recv(KIB).startswith(b"HTTP/1.1 404")
+    assert tus.head(halfway).status == 404
+    assert not part(server, halfway).exists()
+    assert not stored(server, capture, "").exists()
+
+
+def test_files_are_listed_in_pages(client, tus, capture):
+    for name in ("b", "a", "C"):
+        begun(tus, capture, 1, name)
+    first = client.get(f"{capture}/files", params={"limit": 2}).json()
+    second = client.get(f"{capture}/files", params={"limit": 2, "after": first["next"]}).json()
+    assert [file["path"] for file in first["files"] + second["files"]] == ["a", "b", "C"]
+    assert second["next"] is None
+
+
+def test_a_capture_that_was_refused_is_mended(server, client, tus, capture):
+    sample = SAMPLES / "lambert"
+    for path in sample.iterdir():
+        if path.is_file() and path.name != "capture.json":
+            tus.send(capture, path.name, path.read_bytes())
+    begun(tus, capture, 5, "capture.json")
+    early = client.post(f"{capture}/validate")
+    assert (early.status_code, "capture.json" in early.json()["detail"]) == (409, True)
+    listed = {file["path"]: file["upload"] for file in client.get(f"{capture}/files").json()["files"]}
+    assert tus.patch(f"/v1/uploads/{listed['capture.json']}", 0, b"{bad}").status == 204
+    client.post(f"{capture}/validate").raise_for_status()
+    refused = server.wait(client, capture, ("ready", "refused"))
+    assert refused["state"] == "refused" and "capture.json" in refused["problem"]
+    tus.send(capture, "capture.json", (sample / "capture.json").read_bytes())
+    assert client.get(capture).json()["state"] == "receiving"
+    client.post(f"{capture}/validate").raise_for_status()
+    ready = server.wait(client, capture, ("ready", "refused"))
+    assert (ready["state"], ready["problem"]) == ("ready", None)
+    closed = tus.create(capture, 1, encoded(path="more"))
+    assert (closed.status, b"ready" in closed.body) == (409, True)
+    assert tus.ask("DELETE", f"/v1/uploads/{listed['000.exr']}").status == 409
+
+
+def test_an_environment_is_one_file(server, client, tus):
+    environment = made(client, "environments")
+    sky = (SAMPLES / "owl/environment.exr").read_bytes()
+    tus.send(environment, "sky.exr", sky)
+    assert tus.create(environment, 1, encoded(path="other.exr")).status == 409
+    tus.send(environment, "sky.exr", sky)
+    client.post(f"{environment}/validate").raise_for_status()
+    assert server.wait(client, environment, ("ready", "refused"))["state"] == "ready"
+
+
+def test_a_registered_capture_takes_no_files(tus, owl):
+    answer = tus.create(f"/v1/captures/{owl}", 1, encoded(path="a"))
+    assert (answer.status, b"registered" in answer.body) == (409, True)
+
+
+def test_a_killed_server_loses_nothing_that_it_told(tmp_path):
+    settings = {"requests_per_second": "10000", "request_burst": "10000", "min_free_bytes": "0"}
+    contents = {f"{number}.bin": random.Random(number).randbytes(4 * MIB + number) for number in range(4)}
+    told: dict[str, int] = {}
+    place, uploads_of = "", {}
+    for delay in (0.15, 0.4, None):
+        with serving(tmp_path, "--anonymous", "--device", "none", **settings) as server, server.client() as client:
+            tus = Tus(server.url)
+            place = place or made(client, "captures")
+            for name, content in contents.items():
+                if name not in uploads_of:
+                    uploads_of[name] = begun(tus, place, len(content), name, sha256=hashlib.sha256(content).hexdigest())
+
+            def go_on(name: str, tus: Tus = tus) -> None:
+                content, upload = contents[name], uploads_of[name]
+                offset = tus.head(upload).offset
+                assert offset >= told.get(name, 0)
+                while offset < len(content):
+                    piece = content[offset : offset + MIB // 2]
+                    checked = {"Upload_Checksum": checksum("sha256", piece)} if name < "2" else {}
+                    offset = told[name] = tus.patch(upload, offset, piece, **checked).offset
+
+            with ThreadPoolExecutor(len(contents)) as pool:
+                futures = [pool.submit(go_on, name) for name in contents]
+                if delay is not None:
+                    time.sleep(delay)
+                    os.killpg(server.process.pid, signal.SIGKILL)
+            broken = [error for future in futures if (error := future.exception()) is not None]
+            assert all(isinstance(error, OSError) or "http" in type(error).__module__ for error in broken), broken
+            if delay is None:
+                assert not broken
+                for name, content in contents.items():
+                    assert stored(server, place, name).read_bytes() == content
+                assert list((server.data / "uploads").iterdir()) == []
+
+
+@pytest.mark.skipif(binaries() is None, reason="no PostgreSQL server programs: neither on the PATH nor in /usr/lib/postgresql")
+def test_postgresql_tells_the_same_paths_and_requests(tmp_path):
+    programs = binaries()
+    assert programs is not None
+    with postgres(programs) as database, serving(
+            tmp_path, "--anonymous", "--device", "none", database_url=database.new_database(), min_free_bytes="0",
+            requests_per_second="10000", request_burst="10000") as server, server.client() as client:
+        place, tus = made(client, "captures"), Tus(server.url)
+        answers = at_once(8, lambda number: tus.create(place, 10 + number, encoded(path="same.bin")))
+        assert sorted(answer.status for answer in answers) == [201] + 7 * [409]
+        answers = at_once(8, lambda _: tus.create(place, 10, encoded(path="a b/once.bin"), Idempotency_Key="once"))
+        assert {answer.status for answer in answers} == {201}
+        assert len({answer.headers["location"] for answer in answers}) == 1
+        for path in ("A B/other", "a b", "SAME.bin/x", "sAme.bin"):
+            assert tus.create(place, 1, encoded(path=path)).status == 409
+        for path in ("a b/other", "a b2", "a!b/x", "ä/x"):
+            tus.send(place, path, b"data")
+        listed = client.get(f"{place}/files").json()["files"]
+        assert [file["path"] for file in listed] == ["a b/once.bin", "a b/other", "a b2", "a!b/x", "ä/x", "same.bin"]  # ä begins with an a
+        assert client.get(f"{place}/files", params={"after": "a b2"}).json()["files"] == listed[3:]
+        assert client.delete(place).status_code == 204
+
+
+def test_bytes_behind_what_was_counted_are_cut_off(server, tus, capture):
+    """As a kill leaves them: written, and neither synchronised nor found right."""
+    upload = begun(tus, capture, 8)
+    assert tus.patch(upload, 0, b"good").status == 204
+    with open(part(server, upload), "ab") as file:
+        file.write(b"bad and more")
+    assert tus.head(upload).offset == 4
+    assert tus.patch(upload, 4, b"data").status == 204
+    assert stored(server, capture, "file.bin").read_bytes() == b"gooddata"
+
+
+def test_a_complete_file_that_was_moved_and_not_noted_is_complete(server, client, tus, capture):
+    """As a kill leaves it between the two."""
+    upload = begun(tus, capture, 8)
+    assert tus.patch(upload, 0, b"good").status == 204
+    stored(server, capture, "").mkdir(parents=True)
+    part(server, upload).rename(stored(server, capture, "file.bin"))
+    assert tus.head(upload).offset == 0  # half of it is not all of it
+    with open(stored(server, capture, "file.bin"), "ab") as file:
+        file.write(b"data")
+    assert tus.head(upload).offset == 8
+    assert [file["done"] for file in client.get(f"{capture}/files").json()["files"]] == [True]
+
+
+def test_a_part_that_is_lost_begins_again(server, tus, capture):
+    upload = begun(tus, capture, 8)
+    assert tus.patch(upload, 0, b"good").status == 204
+    part(server, upload).unlink()
+    assert tus.head(upload).offset == 0
+    assert tus.patch(upload, 4, b"data").status == 409
+    assert tus.patch(upload, 0, b"all of it"[:8]).status == 204
+    assert stored(server, capture, "file.bin").read_bytes() == b"all of i"
+
+
+@pytest.mark.skipif(not hasattr(resource, "prlimit"), reason="the limit of another process can be set on Linux alone")
+def test_a_disk_that_refuses_is_said_and_the_part_is_cut_back(tmp_path):
+    with serving(tmp_path, "--anonymous", "--device", "none", min_free_bytes="0") as server, server.client() as client:
+        place, tus = made(client, "captures"), Tus(server.url)
+        content = random.Random(5).randbytes(12 * MIB)
+        upload = begun(tus, place, len(content))
+        assert tus.patch(upload, 0, content[:MIB]).status == 204
+        before = resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE)
+        resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE, (8 * MIB, before[1]))  # files grow no further, as on a full disk
+        full = tus.patch(upload, MIB, content[MIB:])
+        assert (full.status, full.headers["retry-after"].isdigit()) == (507, True)
+        assert tus.head(upload).offset == part(server, upload).stat().st_size == MIB
+        resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE, before)
+        assert tus.patch(upload, MIB, content[MIB:]).status == 204
+        assert stored(server, place, "file.bin").read_bytes() == content
+
+
+def test_limits_and_projects(tmp_path):
+    with serving(tmp_path, "--device", "none", max_upload_bytes=str(MIB), max_capture_files="2", min_free_bytes="0",
+                 upload_hours="0.0005") as server:
+        database = connect(f"sqlite:///{server.data / 'relit.sqlite'}")
+        ours, theirs = (keys.create(database, NewKey(project=project, name="test", scope=Scope.WRITE)) for project in ("ours", "theirs"))
+        with server.client(ours) as client:
+            place, tus, key = made(client, "captures"), Tus(server.url), {"Authorization": f"Bearer {ours}"}
+            large = tus.create(place, MIB + 1, encoded(path="a"), **key)
+            assert (large.status, str(MIB).encode() in large.body) == (413, True)
+            upload = tus.create(place, 8, encoded(path="a"), **key).headers["location"]
+            assert tus.create(place, 8, encoded(path="b"), **key).status == 201
+            many = tus.create(place, 8, encoded(path="c"), **key)
+            assert (many.status, b"2 files" in many.body) == (413, True)
+            other = {"Authorization": f"Bearer {theirs}"}
+            assert tus.create(place, 8, encoded(path="d"), **other).status == 404
+            assert tus.ask("HEAD", upload, **other).status == tus.ask("DELETE", upload, **other).status == 404
+            assert tus.patch(upload, 0, b"12345678", **other).status == 404
+            assert tus.ask("HEAD", upload).status == 401
+            soon(lambda: tus.ask("HEAD", upload, **key).status == 410)  # 1.8 s after it was touched
+            assert tus.patch(upload, 0, b"data", **key).status == 410
+        database.close()
+
+
+def test_a_server_without_space_takes_nothing(tmp_path):
+    with serving(tmp_path, "--anonymous", "--device", "none", min_free_bytes=str(1 << 60)) as server, server.client() as client:
+        database, capture = connect(f"sqlite:///{server.data / 'relit.sqlite'}"), new_id(CAPTURE)
+        database.transact(lambda connection: insert_intake(  # a request for one is refused, too
+            connection, identifier=capture, project="default", kind=CAPTURE, name="test", folder=None))
+        database.close()
+        answer = Tus(server.url).create(f"/v1/captures/{capture}", 1, encoded(path="a"))
+        assert (answer.status, "retry-after" in answer.headers) == (507, True)
+        assert client.get(f"/v1/captures/{capture}/files").json()["files"] == []
+
+
+def test_what_nobody_adds_to_expires(tmp_path):
+    database, folder = connect(f"sqlite:///{tmp_path / 'test.sqlite'}"), tmp_path / "uploads"
+    create(database)
+    ids = {name: f"up_{name:0>20}" for name in ("old", "busy", "new", "done")}
+
+    def fill(connection) -> None:
+        insert_intake(connection, identifier="cap_1", project="p", kind="cap", name="test", folder=None)
+        for name, identifier in ids.items():
+            uploads.insert(connection, identifier=identifier, project="p", intake="cap_1", path=name, length=4, sha256=None)
+
+    database.transact(fill)
+    assert uploads.finish(database, ids["done"], 4)
+    for identifier in ids.values():
+        Part.open(folder, identifier).close()
+    limit = time.time()
+    assert uploads.advance(database, ids["new"], 2)
+    Part.open(folder, "up_orphan").close()
+    os.utime(folder / "up_orphan.part", (limit + 1, limit + 1))  # the clock of files is a coarse one
+    with Part.open(folder, ids["busy"]):
+        assert uploads.expire(database, folder, limit) == 1
+    assert {name for name, identifier in ids.items() if uploads.find(database, identifier, "p") is not None} == {"busy", "new", "done"}
+    assert {path.stem for path in folder.iterdir()} == {ids["busy"], ids["new"], "up_orphan"}
+    assert uploads.expire(database, folder, time.time() + 60) == 2
+    assert list(folder.iterdir()) == []
+    assert uploads.find(database, ids["done"], "p") is not None
+    database.close()
+
+
+def test_a_part_is_locked_once(tmp_path):
+    with Part.open(tmp_path, "up_1") as first, pytest.raises(PartLocked):
+        first.append([b"da", b"", b"ta"])
+        Part.open(tmp_path, "up_1")
+    with Part.open(tmp_path, "up_1") as again:
+        assert again.size == 4

@@ -1,0 +1,49 @@
+"""Both databases, and a small capture with what `relit relight` makes of it."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from tests.captures import make_scene, write_capture, write_exr
+from tests.service.server_process.jobs.yard import relit_relight, yard
+
+FRAMES = 36
+SIZE = 256
+"""Of the images: large enough that a frame takes some hundredths of a second, so that workers die between frames."""
+
+
+class Undisturbed(NamedTuple):
+    """What nobody disturbed."""
+
+    capture: Path
+    environment: Path
+    frames: int
+    digests: dict[str, str]
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def database_url(request: pytest.FixtureRequest) -> str | None:
+    """Of each kind of database; those on PostgreSQL are a new one each."""
+    return None if request.param == "sqlite" else request.getfixturevalue("server_postgres").new_database()
+
+
+@pytest.fixture
+def on_postgres(server_postgres) -> str:
+    return server_postgres.new_database()
+
+
+@pytest.fixture
+def still_yard(tmp_path: Path, database_url: str | None):
+    """A yard without workers."""
+    with yard(tmp_path, database_url) as made:
+        yield made
+
+
+@pytest.fixture(scope="session")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Undisturbed:
+    folder = tmp_path_factory.mktemp("undisturbed")
+    capture = write_capture(folder / "capture", make_scene(size=SIZE, lights=6))
+    environment = write_exr(folder / "sky.exr", np.random.default_rng(7).random((16, 32, 3)))
+    return Undisturbed(capture, environment, FRAMES, relit_relight(capture, environment, FRAMES, folder / "frames"))

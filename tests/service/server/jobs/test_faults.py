@@ -1,0 +1,157 @@
+"""What else may happen to workers: the database restarts, a step hangs, a job kills whoever takes it, they are asked to end, the disk is
+full."""
+
+import os
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from service.requests.identifiers import CAPTURE, ENVIRONMENT
+from service.server.store import jobs, workers
+from tests.service.server_process.jobs.yard import digests, yard
+
+SABOTAGE = str(Path(__file__).parent / "sabotage")
+
+
+def begin(made, undisturbed, *, frames=None, chunk_frames=8):
+    return made.relight(made.register(undisturbed.capture, CAPTURE), made.register(undisturbed.environment, ENVIRONMENT),
+                        frames or undisturbed.frames, chunk_frames=chunk_frames)
+
+
+def frames_there(made, job, count):
+    made.until(lambda: made.frames_there(job) >= count, f"{count} frames", every_s=0.002)
+
+
+def test_restarts_of_postgresql_cost_nothing(tmp_path, server_postgres, on_postgres, undisturbed):
+    with yard(tmp_path, on_postgres, takeover_s=0.5) as made:
+        for _ in range(2):
+            made.start(PYTHONPATH=SABOTAGE, SABOTAGE="slow")
+        there = {row["id"] for row in made.ready(2)}
+        job = begin(made, undisturbed, chunk_frames=6)
+        for frames, mode, away_s in ((4, "fast", 0.0), (13, "immediate", 0.0), (22, "fast", 3.0)):
+            frames_there(made, job, frames)
+            server_postgres.restart(mode, away_s=away_s)
+        row = made.until(lambda: found if (found := made.row(job))["state"] in jobs.ENDED else None, "ended")
+        assert (row["state"], row["error"], row["lost"]) == (jobs.SUCCEEDED, None, 0)
+        assert digests(made.results(job)) == undisturbed.digests
+        made.never_two_at_once(job)
+        assert {row["id"] for row in made.ready(2)} == there
+        assert [event for event in made.events() if event["event"] in ("worker died", "worker is gone")] == []
+
+
+@pytest.mark.parametrize("how", ["stopped", "in a step"])
+def test_a_worker_that_hangs_is_killed_and_its_job_taken_over(tmp_path, undisturbed, how):
+    with yard(tmp_path, stall_s=3, takeover_s=0.5) as made:
+        made.start(**({} if how == "stopped" else {"PYTHONPATH": SABOTAGE, "SABOTAGE": "hang"}))
+        made.ready(1)
+        job = begin(made, undisturbed)
+        victim = made.holder(job)
+        if how == "stopped":
+            frames_there(made, job, 1)
+            os.kill(made.pid_of(victim), signal.SIGSTOP)
+        made.start()
+        row = made.ended(job)
+        assert (row["state"], row["error"]) == (jobs.SUCCEEDED, None)
+        assert row["worker"] != victim
+        assert digests(made.results(job)) == undisturbed.digests
+        assert any(event["event"] == "worker hangs: it is killed" for event in made.events())
+
+
+def test_a_worker_that_is_asked_to_end_finishes_its_step_and_hands_the_job_back(tmp_path, on_postgres, undisturbed):
+    with yard(tmp_path, on_postgres) as made:
+        worker = made.start(PYTHONPATH=SABOTAGE, SABOTAGE="slow")
+        made.ready(1)
+        job = begin(made, undisturbed, chunk_frames=6)
+        frames_there(made, job, 8)  # in the second step
+        worker.send_signal(signal.SIGTERM)
+        assert worker.wait(60) == 0
+        row = made.row(job)
+        assert (row["state"], row["worker"], row["lost"]) == (jobs.QUEUED, None, 0)
+        assert row["finished_steps"] == ["frames 1-6", "frames 7-12"]
+        assert len(digests(made.results(job))) == 12
+        assert workers.present(made.database) == []
+        made.start()
+        assert made.ended(job)["state"] == jobs.SUCCEEDED
+        assert digests(made.results(job)) == undisturbed.digests
+
+
+def test_a_step_that_does_not_end_in_time_is_given_up(tmp_path, undisturbed):
+    with yard(tmp_path, drain_s=1) as made:
+        worker = made.start(PYTHONPATH=SABOTAGE, SABOTAGE="hang")
+        made.ready(1)
+        job = begin(made, undisturbed)
+        made.holder(job)
+        worker.send_signal(signal.SIGTERM)
+        assert worker.wait(30) == 0
+        row = made.row(job)
+        assert (row["state"], row["worker"], row["lost"]) == (jobs.QUEUED, None, 0)
+
+
+def test_a_worker_ends_with_the_process_that_looks_after_it(tmp_path, undisturbed):
+    with yard(tmp_path) as made:
+        worker = made.start(PYTHONPATH=SABOTAGE, SABOTAGE="slow")
+        made.ready(1)
+        job = begin(made, undisturbed, chunk_frames=6)
+        frames_there(made, job, 1)
+        os.kill(worker.pid, signal.SIGKILL)
+        made.until(lambda: made.row(job)["state"] == jobs.QUEUED, "handed back")
+        row = made.row(job)
+        assert row["lost"] == 0 and row["finished_steps"][0] == "frames 1-6"
+        made.until(lambda: any(event["event"] == "worker ended" for event in made.events()), "ended")
+
+
+def test_a_job_that_kills_its_workers_fails_with_a_sentence(tmp_path, undisturbed):
+    with yard(tmp_path, max_lost=1, takeover_s=0.2) as made:
+        made.start(PYTHONPATH=SABOTAGE, SABOTAGE="kill")
+        job = begin(made, undisturbed)
+        row = made.ended(job)
+        assert (row["state"], row["lost"]) == (jobs.FAILED, 2)
+        assert row["error"] == "lost 2 workers in one step (frames): it may need more memory than they have"
+        assert [event["again_in_s"] for event in made.events() if event["event"] == "worker is gone"] == [0.0, 0.0]  # they had been ready
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of some megabytes."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=16m", "tmpfs", str(folder)]
+    if os.geteuid() != 0 or subprocess.run(mount, capture_output=True).returncode != 0:
+        pytest.skip("a small file system is mounted by root alone")
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", "-l", folder], check=True)
+
+
+def fill(folder: Path, *, leave: int) -> Path:
+    """Take the space of a file system but for some bytes."""
+    ballast = folder / "ballast"
+    free = os.statvfs(folder)
+    ballast.write_bytes(bytes(free.f_bavail * free.f_frsize - leave))
+    return ballast
+
+
+def test_a_job_on_a_full_disk_fails_with_a_sentence_and_goes_on_when_there_is_space(small_disk, tmp_path, on_postgres, undisturbed):
+    with yard(small_disk, on_postgres) as made:
+        made.log = tmp_path / "log.txt"
+        made.start()
+        made.ready(1)
+        ballast = fill(small_disk, leave=3_500_000)  # the stack of images, and some frames
+        job = begin(made, undisturbed)
+        row = made.ended(job)
+        assert row["state"] == jobs.FAILED
+        assert row["error"].startswith("cannot write ") and "no space left" in row["error"].lower()
+        there = digests(made.results(job))
+        assert 0 < len(there) < undisturbed.frames
+        assert there.items() <= undisturbed.digests.items()  # nothing half-written, hidden neither
+        ballast.unlink()
+        attempt = made.database.transact(lambda connection: jobs.begin_again(connection, job, jobs.FAILED))
+        assert attempt == 2
+        request = made.request(job)
+        made.database.transact(lambda connection: made.queue.enqueue(connection, job, attempt, request))
+        row = made.ended(job)
+        assert (row["state"], row["error"]) == (jobs.SUCCEEDED, None)
+        assert digests(made.results(job)) == undisturbed.digests

@@ -1,0 +1,70 @@
+"""What a step tells the store, and what it does when the store does not answer or does not want it any more."""
+
+import pytest
+import sqlalchemy as sa
+from sqlalchemy.exc import OperationalError
+
+from service.requests.identifiers import CAPTURE, ENVIRONMENT, new_id
+from service.server.jobs import progress
+from service.server.jobs.progress import JobProgress, Stopped
+from service.server.store import jobs
+from service.server.store.database import Database
+from service.server.store.jobs import Claim
+from tests.service.server_process.jobs.yard import yard
+
+
+@pytest.fixture
+def claim(tmp_path, monkeypatch):
+    monkeypatch.setattr(progress, "EVERY_S", 0.0)
+    monkeypatch.setattr(progress, "UNTOLD_S", 0.0)
+    with yard(tmp_path) as made:
+        job = made.relight(new_id(CAPTURE), new_id(ENVIRONMENT), 10, chunk_frames=5)
+        claim = Claim(job, 1, "one")
+        jobs.begin(made.database, claim)
+        yield made, claim
+
+
+def told(made, claim):
+    row = made.row(claim.job)
+    return row["stage"], row["done"], row["total"]
+
+
+def test_frames_are_counted_over_all_steps(claim):
+    made, claim = claim
+    step = JobProgress(made.database, claim, alive=lambda: None, before=5, of=10)
+    step.stage("open", 1)
+    assert told(made, claim) == ("frames", 5, 10)
+    step.advance(1)
+    assert told(made, claim) == ("frames", 5, 10)  # of opening
+    step.stage("frames", 5)
+    step.advance(2)
+    assert told(made, claim) == ("frames", 7, 10)
+
+
+def test_a_database_that_does_not_answer_does_not_end_the_step(claim):
+    made, claim = claim
+    signs = []
+    gone = Database(sa.create_engine(f"sqlite:///{made.folder / 'nowhere' / 'relit.sqlite'}"))
+    with pytest.raises(OperationalError):
+        jobs.is_wanted(gone, claim)
+    step = JobProgress(gone, claim, alive=lambda: signs.append(1), of=10)
+    step.stage("frames", 10)
+    step.advance(3)
+    assert len(signs) == 2  # the deadline is renewed all the same
+
+
+@pytest.mark.parametrize("end", ["cancel", "another"])
+def test_a_step_that_is_not_wanted_stops_and_stays_so(claim, end):
+    made, claim = claim
+    step = JobProgress(made.database, claim, alive=lambda: None, of=10)
+    step.stage("frames", 10)
+    if end == "cancel":
+        made.database.transact(lambda connection: jobs.cancel(connection, claim.job))
+    else:
+        made.database.transact(lambda connection: jobs.lose_worker(connection, claim, 3, ""))
+        jobs.begin(made.database, Claim(claim.job, 1, "two"))
+    before = dict(made.row(claim.job))
+    for done in (1, 2):
+        with pytest.raises(Stopped):
+            step.advance(done)
+    assert dict(made.row(claim.job)) == before

@@ -1,0 +1,112 @@
+"""`relit serve` with a worker: killed, asked to end, without space; and what its processes are."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+from service.server.settings import Settings
+from service.server.store import jobs, workers
+from service.server.store.database import connect
+from tests.service.server_process.jobs.test_faults import SABOTAGE, fill, small_disk  # noqa: F401  (a fixture)
+from tests.service.server_process.jobs.yard import WAIT_S, digests
+from tests.service.server_process.serve import Server, serving
+
+OPTIONS = ("--anonymous", "--device", "cpu")
+SETTINGS = {"chunk_frames": "6", "requests_per_second": "1000", "min_free_bytes": "0"}
+
+
+def begin(server: Server, client, undisturbed) -> str:
+    """A relight of the undisturbed capture."""
+    made = client.post("/v1/captures", json={"name": "cap", "folder": str(undisturbed.capture)}).raise_for_status().json()
+    sky = client.post("/v1/environments", json={"name": "sky", "file": str(undisturbed.environment)}).raise_for_status().json()
+    for kind, found in (("captures", made), ("environments", sky)):
+        assert server.wait(client, f"/v1/{kind}/{found['id']}", ("ready", "refused"))["state"] == "ready"
+    job = client.post("/v1/jobs", json={"kind": "relight", "capture": made["id"], "environment": sky["id"], "options": {
+        "frames": f"1-{undisturbed.frames}", "spin_degrees": 360}}).raise_for_status().json()
+    return job["id"]
+
+
+def results(server: Server, job: str) -> Path:
+    return server.data / "projects" / "default" / "jobs" / job
+
+
+def until(true, what: str):
+    deadline = time.monotonic() + WAIT_S
+    while not (found := true()):
+        assert time.monotonic() < deadline, f"not {what}"
+        time.sleep(0.02)
+    return found
+
+
+def frames_there(server: Server, job: str, count: int) -> None:
+    until(lambda: results(server, job).is_dir() and len(list(results(server, job).glob("frame.*"))) >= count, f"{count} frames")
+
+
+def children(pid: int) -> list[int]:
+    """Of all its threads."""
+    return [int(child) for thread in Path(f"/proc/{pid}/task").iterdir() for child in (thread / "children").read_text().split()]
+
+
+def test_jobs_go_on_after_the_api_was_killed(tmp_path, undisturbed, monkeypatch):
+    settings = SETTINGS | {"roots": str(undisturbed.capture.parent)}
+    monkeypatch.setenv("PYTHONPATH", SABOTAGE)
+    monkeypatch.setenv("SABOTAGE", "slow")
+    with serving(tmp_path, *OPTIONS, **settings) as server, server.client() as client:
+        job = begin(server, client, undisturbed)
+        frames_there(server, job, 8)
+        os.kill(server.process.pid, signal.SIGKILL)
+        server.process.wait()
+        until(lambda: "worker ended" in server.log.read_text(), "ended")  # after its step
+        database = connect(Settings(data=server.data).sqlalchemy_url)
+        row = jobs.find(database, job)
+        database.close()
+        assert (row["state"], row["lost"], row["finished_steps"]) == (jobs.QUEUED, 0, ["frames 1-6", "frames 7-12"])
+    with serving(tmp_path, *OPTIONS, **settings) as server, server.client() as client:
+        assert server.wait(client, f"/v1/jobs/{job}", jobs.ENDED)["state"] == jobs.SUCCEEDED
+        assert digests(results(server, job)) == undisturbed.digests
+
+
+def test_the_service_drains_when_it_is_asked_to_end(tmp_path, undisturbed, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", SABOTAGE)
+    monkeypatch.setenv("SABOTAGE", "slow")
+    with serving(tmp_path, *OPTIONS, **SETTINGS, roots=str(undisturbed.capture.parent)) as server, server.client() as client:
+        job = begin(server, client, undisturbed)
+        frames_there(server, job, 8)
+        server.process.send_signal(signal.SIGTERM)
+        assert server.process.wait(WAIT_S) == 0
+        database = connect(Settings(data=server.data).sqlalchemy_url)
+        row = jobs.find(database, job)
+        assert (row["state"], row["worker"], row["finished_steps"]) == (jobs.QUEUED, None, ["frames 1-6", "frames 7-12"])
+        assert workers.present(database) == []
+        database.close()
+
+
+def test_the_api_has_no_warp_and_workers_are_spawned(tmp_path, undisturbed):
+    with serving(tmp_path, *OPTIONS, **SETTINGS, roots=str(undisturbed.capture.parent)) as server, server.client() as client:
+        job = begin(server, client, undisturbed)
+        assert server.wait(client, f"/v1/jobs/{job}", jobs.ENDED)["state"] == jobs.SUCCEEDED
+        processes = children(server.process.pid)
+        commands = {pid: Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode() for pid in processes}
+        for command in commands.values():  # a forked child would have its parent's
+            assert "multiprocessing.spawn" in command or "multiprocessing.resource_tracker" in command
+        [worker] = [pid for pid, command in commands.items() if "multiprocessing.spawn" in command]
+        assert "/warp/" in Path(f"/proc/{worker}/maps").read_text()  # so that it would be seen
+        assert "/warp/" not in Path(f"/proc/{server.process.pid}/maps").read_text()
+
+
+def test_the_service_stays_when_its_database_has_no_space(small_disk, undisturbed):  # noqa: F811
+    (small_disk.parent / "data").symlink_to(small_disk)
+    with (serving(small_disk.parent, *OPTIONS, **SETTINGS, roots=str(undisturbed.capture.parent)) as server, server.client() as client):
+        job = begin(server, client, undisturbed)
+        assert server.wait(client, f"/v1/jobs/{job}", jobs.ENDED)["state"] == jobs.SUCCEEDED
+        request = {"name": "x" * 200, "folder": str(undisturbed.capture)}
+        ballast = fill(small_disk, leave=0)
+        statuses = [client.post("/v1/captures", json=request).status_code for _ in range(20)]
+        assert set(statuses) <= {201, 202, 503, 507}  # the journal may have had room for some
+        assert statuses[-1] in (503, 507)
+        assert client.get(f"/v1/jobs/{job}").json()["state"] == jobs.SUCCEEDED
+        ballast.unlink()
+        until(lambda: client.post("/v1/captures", json=request).is_success, "taken again")
+        job = begin(server, client, undisturbed)
+        assert server.wait(client, f"/v1/jobs/{job}", jobs.ENDED)["state"] == jobs.SUCCEEDED

@@ -1,0 +1,180 @@
+"""A data folder with a database, jobs in it, and real worker processes (`relit worker`) that do them; no API between."""
+
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import sqlalchemy as sa
+from dbos import DBOSClient
+
+from service.requests.identifiers import CAPTURE, ENVIRONMENT, new_id
+from service.requests.jobs import ANY_JOB, JobRequest, RelightJob
+from service.requests.relight import RelightOptions
+from service.server.jobs.queue import JobQueue, prepare, workflow_id
+from service.server.settings import Settings
+from service.server.storage import layout
+from service.server.store import intakes, jobs, workers
+from service.server.store.database import connect
+
+PROJECT = "yard"
+WAIT_S = 120.0
+"""Far beyond what anything takes here, so that a slow machine fails no test."""
+
+
+class Yard:
+    """Where workers work."""
+
+    def __init__(self, folder: Path, database_url: str | None, **settings: Any) -> None:
+        self.folder = folder
+        settings = {"roots": folder.anchor} | settings  # captures may lie anywhere
+        self.settings = Settings(data=folder / "data", database_url=database_url, **settings)
+        self.database = connect(self.settings.sqlalchemy_url)
+        prepare(self.settings, self.database)
+        self.queue = JobQueue(self.database)
+        self.log = folder / "log.txt"
+        self._environment = {name: value for name, value in os.environ.items() if not name.startswith("RELIT_")}
+        self._environment |= {f"RELIT_{name.upper()}": str(value) for name, value in settings.items()}
+        if database_url is not None:
+            self._environment["RELIT_DATABASE_URL"] = database_url
+        self.supervisors: list[subprocess.Popen[bytes]] = []
+
+    def start(self, **environment: str) -> subprocess.Popen[bytes]:
+        """Another `relit worker`, in a process group of its own."""
+        with open(self.log, "ab") as log:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "service.cli.main", "worker", "--device", "cpu", "--data", str(self.settings.data)],
+                stdout=log, stderr=log, env=self._environment | environment, start_new_session=True)
+        self.supervisors.append(process)
+        return process
+
+    def close(self) -> None:
+        for process in self.supervisors:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+        self.database.close()
+
+    def register(self, path: Path, kind: str) -> str:
+        """A capture or an environment that needs no check."""
+        identifier = new_id(kind)
+        self.database.transact(lambda connection: intakes.insert(
+            connection, identifier=identifier, project=PROJECT, kind={CAPTURE: "capture", ENVIRONMENT: "environment"}[kind],
+            name=path.name, folder=str(path.resolve())))
+        intakes.accept(self.database, identifier, {})
+        return identifier
+
+    def submit(self, request: JobRequest, *, chunk_frames: int) -> str:
+        return self.database.transact(lambda connection: self.queue.submit(
+            connection, project=PROJECT, key=None, request=request, chunk_frames=chunk_frames, inputs=[]))
+
+    def relight(self, capture: str, environment: str, frames: int, *, chunk_frames: int) -> str:
+        return self.submit(RelightJob(kind="relight", capture=capture, environment=environment,
+                                      options=RelightOptions(frames=f"1-{frames}", spin_degrees=360)), chunk_frames=chunk_frames)
+
+    def request(self, job: str) -> JobRequest:
+        return ANY_JOB.validate_python(self.row(job)["request"])
+
+    def row(self, job: str) -> sa.RowMapping:
+        row = jobs.find(self.database, job)
+        assert row is not None
+        return row
+
+    def until(self, true: Callable[[], Any], what: str, *, within_s: float = WAIT_S, every_s: float = 0.02) -> Any:
+        """Wait for something, and return it."""
+        deadline = time.monotonic() + within_s
+        while not (found := true()):
+            assert time.monotonic() < deadline, f"not {what} within {within_s:g} s: {self.tail()}"
+            time.sleep(every_s)
+        return found
+
+    def ended(self, job: str, **options: float) -> sa.RowMapping:
+        """The job, when it has ended."""
+        self.until(lambda: self.row(job)["state"] in jobs.ENDED, f"{job} ended", **options)
+        return self.row(job)
+
+    def ready(self, count: int) -> list[sa.RowMapping]:
+        """The workers, when there are so many."""
+        return self.until(lambda: found if len(found := workers.present(self.database)) >= count else None, f"{count} workers ready")
+
+    def pid_of(self, worker: str) -> int:
+        """Of the process of a worker, which is part of its name."""
+        return int(worker.split("-")[-2])
+
+    def holder(self, job: str, *, other_than: str | None = None) -> str:
+        """The worker that does a job."""
+
+        def found() -> str | None:
+            row = self.row(job)
+            assert row["state"] in jobs.ACTIVE, f"{job} is {row['state']}: {row['error']}"
+            return row["worker"] if row["worker"] != other_than else None
+
+        return str(self.until(found, f"{job} at a worker other than {other_than}"))
+
+    def take(self, job: str, worker: str) -> None:
+        """What the queue does when a worker takes a job."""
+        table = "workflow_status" if self.database.is_sqlite else "dbos.workflow_status"
+        done = self.database.transact(lambda connection: connection.execute(
+            sa.text(f"UPDATE {table} SET status = 'PENDING', executor_id = :worker WHERE workflow_uuid = :id AND status = 'ENQUEUED'"),
+            {"worker": worker, "id": workflow_id(job, 1)}).rowcount)
+        assert done == 1
+
+    def in_queue(self, job: str) -> tuple[str, str | None]:
+        """How the first attempt of a job is in the queue, and in which."""
+        found = DBOSClient(system_database_engine=self.database.engine, lazy=True).retrieve_workflow(workflow_id(job, 1)).get_status()
+        return found.status, found.queue_name
+
+    def results(self, job: str) -> Path:
+        return self.settings.data / layout.results(PROJECT, job)
+
+    def frames_there(self, job: str) -> int:
+        """How many frames others see."""
+        folder = self.results(job)
+        return sum(not path.name.startswith(".") for path in folder.iterdir()) if folder.is_dir() else 0
+
+    def never_two_at_once(self, job: str) -> None:
+        """By the log: when a worker begins a step, the one before it has ended its own, or was found dead."""
+        at = None
+        for line in self.events():
+            if line["event"] == "worker died" and line["dead"] == at:
+                at = None
+            if line.get("job") == job and line["event"] == "step begins":
+                assert at in (None, line["worker"]), f"{line['worker']} began while {at} was at work"
+                at = line["worker"]
+            if line.get("job") == job and line["event"] in ("step done", "step stopped"):
+                at = None
+
+    def events(self) -> list[dict[str, Any]]:
+        """The lines of the workers' logs, in their order."""
+        return [json.loads(line) for line in self.log.read_text().splitlines() if line.startswith("{")]
+
+    def tail(self) -> str:
+        return self.log.read_text()[-6000:] if self.log.exists() else ""
+
+
+@contextmanager
+def yard(folder: Path, database_url: str | None = None, **settings: Any) -> Iterator[Yard]:
+    made = Yard(folder, database_url, **settings)
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+def digests(folder: Path) -> dict[str, str]:
+    """SHA-256 of every file of a folder, hidden ones too."""
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.iterdir())}
+
+
+def relit_relight(capture: Path, environment: Path, frames: int, out: Path) -> dict[str, str]:
+    """The digests of what `relit relight` makes of the same."""
+    subprocess.run([sys.executable, "-m", "service.cli.main", "relight", str(capture), "--environment", str(environment), "--device", "cpu",
+                    "--out", str(out / layout.FRAMES), "--frames", f"1-{frames}", "--spin-degrees", "360"], check=True, capture_output=True)
+    return digests(out)

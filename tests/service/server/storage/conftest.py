@@ -1,0 +1,84 @@
+"""Storages of every kind, each empty: the data folder, an object store of files, and one that speaks S3 where a server can be had.
+
+RELIT_TEST_S3 names the address of such a server (with the usual AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, which may write anything
+there); without it moto's is started where moto is installed.
+"""
+
+import importlib.util
+import os
+import socket
+import subprocess
+import sys
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import httpx2
+import pytest
+
+from service.server.storage.bucket import Bucket
+from service.server.storage.folder import FolderStorage, Storage
+from service.server.storage.objects import ObjectStorage
+from service.server.storage.scratch import Scratch
+
+LIMIT = 1 << 30
+START_S = 60.0
+BUCKET = "relit-test"
+
+
+@pytest.fixture(scope="session")
+def s3_server() -> Iterator[str]:
+    """The address of a server that speaks S3."""
+    if named := os.environ.get("RELIT_TEST_S3"):
+        yield named
+        return
+    if importlib.util.find_spec("moto") is None:
+        pytest.skip("no S3 server: name one in RELIT_TEST_S3, or install moto[server]")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    process = subprocess.Popen([sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)], stdout=subprocess.DEVNULL,
+                               stderr=subprocess.DEVNULL)
+    try:
+        yield f"http://127.0.0.1:{port}"
+    finally:
+        process.kill()
+        process.wait()
+
+
+@pytest.fixture
+def s3(s3_server: str, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A URL below which a bucket of the server is empty, and the environment that reaches it."""
+    for name, value in {"AWS_ENDPOINT_URL": s3_server, "AWS_ALLOW_HTTP": "true", "AWS_REGION": "us-east-1"}.items():
+        monkeypatch.setenv(name, value)
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.setenv(name, os.environ.get(name, "test"))
+    deadline = time.monotonic() + START_S
+    while True:
+        try:
+            httpx2.put(f"{s3_server}/{BUCKET}", timeout=5)  # there already, or not ours to make: the tests tell
+            break
+        except httpx2.TransportError:
+            assert time.monotonic() < deadline, f"no S3 server answers at {s3_server}"
+            time.sleep(0.1)
+    return f"s3://{BUCKET}/{uuid.uuid4()}"
+
+
+Machine = Callable[[str], Storage]
+
+
+@pytest.fixture(params=["file", "s3"])
+def machine(request: pytest.FixtureRequest, tmp_path: Path) -> Machine:
+    """The same object store as machines of these names see it, each with a disk of its own."""
+    url = (tmp_path / "store").as_uri() if request.param == "file" else request.getfixturevalue("s3")
+    return lambda name: ObjectStorage(Bucket(url), Scratch(tmp_path / name, LIMIT))
+
+
+@pytest.fixture(params=["folder", "file", "s3"])
+def storage(request: pytest.FixtureRequest, tmp_path: Path) -> Storage:
+    """A storage of each kind."""
+    if request.param == "folder":
+        return FolderStorage(tmp_path / "data")
+    url = (tmp_path / "store").as_uri() if request.param == "file" else request.getfixturevalue("s3")
+    return ObjectStorage(Bucket(url), Scratch(tmp_path / "scratch", LIMIT))

@@ -1,0 +1,44 @@
+"""docs/service_storage.md: the layout that it promises is the one that there is."""
+
+import os
+from pathlib import Path
+
+from service.requests.identifiers import CAPTURE, ENVIRONMENT, JOB, new_id
+from service.server.jobs import progress as progresses
+from service.server.jobs.progress import JobProgress
+from service.server.jobs.steps import KEYS_FILE
+from service.server.jobs.worker import cache_folder
+from service.server.settings import Settings
+from service.server.storage import layout, objects, scratch
+from service.server.storage.open import SCRATCH
+from service.server.storage.parts import parts_folder
+from service.server.store.jobs import FRAMES
+
+TEXT = (Path(__file__).parents[4] / "docs" / "service_storage.md").read_text(encoding="utf-8")
+
+
+def test_every_name_is_in_the_docs(tmp_path):
+    settings = Settings(data=tmp_path)
+    for kind in (CAPTURE, ENVIRONMENT):
+        assert f"{os.path.dirname(layout.intake('PROJECT', new_id(kind)))}/ID/…" in TEXT and f"`{kind}_…`" in TEXT
+    assert f"{os.path.dirname(layout.results('PROJECT', new_id(JOB)))}/ID/…" in TEXT
+    for name in (*layout.SOLVED, layout.FRAMES.replace("####", "0001"), layout.PICTURE, f"{layout.ASSET}.usdz", KEYS_FILE,
+                 f"{parts_folder(settings).name}/", f"{cache_folder(settings).name}/", f"{SCRATCH}/", f"{objects.REMOVED}/", objects.PROBE,
+                 "storage_url", "scratch_bytes", "chunk_frames", "database_url"):
+        assert name in TEXT, name
+    assert {"storage_url", "scratch_bytes", "chunk_frames", "database_url"} <= Settings.model_fields.keys()
+    assert scratch.IN_USE_S == 6 * 3600 and "the last six hours" in TEXT
+
+
+def test_frames_are_not_counted_backwards_while_they_are_sent(monkeypatch):
+    """A later chunk of a relight: what the store is told while its frames are made, and then sent."""
+    told = []
+    monkeypatch.setattr(progresses, "EVERY_S", 0.0)
+    monkeypatch.setattr(progresses.jobs, "advance", lambda database, claim, progress: told.append(progress[:3]) or True)
+    progress = JobProgress(None, None, alive=lambda: None, before=4, of=10)
+    progress.stage("open", 1)
+    for stage, total in ((FRAMES, 2), ("upload", 2)):
+        progress.stage(stage, total)
+        for done in (1, 2):
+            progress.advance(done)
+    assert told == [(FRAMES, done, 10) for done in (4, 4, 5, 6, 6, 6, 6)]

@@ -1,0 +1,151 @@
+"""What every storage does, whatever is behind it."""
+
+import time
+from pathlib import Path
+
+import pytest
+
+from service.server.storage.bucket import PIECE_BYTES
+from service.server.storage.folder import FolderStorage, Storage
+
+RESULTS = "projects/film/jobs/job_0123456789abcdefghjk"
+CAPTURE = "projects/film/captures/cap_0123456789abcdefghjk"
+NAMES = ("capture.json", "sub folder/ü 1.exr", "100%.png", "[a]{b}~'\"$x.exr")
+
+
+def write(folder: Path, name: str, content: bytes) -> None:
+    (folder / name).parent.mkdir(parents=True, exist_ok=True)
+    (folder / name).write_bytes(content)
+
+
+def names(storage: Storage, prefix: str) -> list[str]:
+    return [stored.name for stored in storage.files(prefix)]
+
+
+def test_what_is_published_is_there(storage):
+    before = time.time()
+    folder = storage.workspace(RESULTS)
+    write(folder, "maps.exr", b"maps")
+    write(folder, "deep/er/report.json", b"{}")
+    storage.publish(RESULTS)
+    found = storage.files(RESULTS)
+    assert [(stored.name, stored.size) for stored in found] == [("deep/er/report.json", 2), ("maps.exr", 4)]
+    assert all(before - 5 < stored.modified_at < time.time() + 5 for stored in found)  # clocks of stores count in seconds, and differ
+    path = storage.open(RESULTS, "maps.exr")
+    assert path is not None and path.read_bytes() == b"maps"
+    assert (storage.local(RESULTS) / "deep/er/report.json").read_bytes() == b"{}"
+
+
+def test_half_written_files_are_never_part_of_it(storage):
+    folder = storage.workspace(RESULTS)
+    write(folder, ".frame.0001.k3j.exr", b"half")
+    write(folder, "frame.0002.exr", b"whole")
+    storage.publish(RESULTS)
+    assert names(storage, RESULTS) == ["frame.0002.exr"]
+    assert not (folder / ".frame.0001.k3j.exr").exists()
+    assert storage.open(RESULTS, ".frame.0001.k3j.exr") is None
+
+
+def test_files_are_put_with_any_name_that_a_file_may_have(storage, tmp_path):
+    for index, name in enumerate(NAMES):
+        upload = tmp_path / f"upload{index}"
+        upload.write_bytes(name.encode())
+        storage.put(upload, CAPTURE, name)
+        assert not upload.exists()
+    assert names(storage, CAPTURE) == sorted(NAMES)
+    folder = storage.local(CAPTURE)
+    for name in NAMES:
+        assert (folder / name).read_bytes() == name.encode()
+        opened = storage.open(CAPTURE, name)
+        assert opened is not None and opened.read_bytes() == name.encode()
+
+
+def test_a_file_put_again_takes_the_place_of_the_first(storage, tmp_path):
+    for content in (b"first", b"other"):  # of equal size, in the same second
+        (tmp_path / "upload").write_bytes(content)
+        storage.put(tmp_path / "upload", CAPTURE, "000.exr")
+        assert (storage.local(CAPTURE) / "000.exr").read_bytes() == content
+        opened = storage.open(CAPTURE, "000.exr")
+        assert opened is not None and opened.read_bytes() == content
+    assert names(storage, CAPTURE) == ["000.exr"]
+
+
+def test_a_workspace_file_written_again_is_published_again(storage):
+    for content in (b"first", b"other"):
+        write(storage.workspace(RESULTS), "report.json", content)
+        storage.publish(RESULTS)
+    opened = storage.open(RESULTS, "report.json")
+    assert opened is not None and opened.read_bytes() == b"other"
+
+
+@pytest.mark.parametrize("size", [0, 1, PIECE_BYTES, PIECE_BYTES + 1, 3 * PIECE_BYTES])
+def test_files_of_every_size(storage, tmp_path, size):
+    content = bytes(range(256)) * (size // 256) + bytes(size % 256)
+    (tmp_path / "upload").write_bytes(content)
+    storage.put(tmp_path / "upload", CAPTURE, "000.exr")
+    assert [stored.size for stored in storage.files(CAPTURE)] == [size]
+    assert (storage.local(CAPTURE) / "000.exr").read_bytes() == content
+
+
+@pytest.mark.parametrize("name", ["../maps.exr", "/etc/passwd", "", ".", "..", "a//b", "none.exr", "maps.exr/x", "a\0b", ".hidden", "deep"])
+def test_names_that_are_none(storage, name):
+    write(storage.workspace(RESULTS), "maps.exr", b"maps")
+    write(storage.workspace(RESULTS), "deep/file", b"file")
+    storage.publish(RESULTS)
+    assert storage.open(RESULTS, name) is None
+
+
+def test_prefixes_do_not_see_each_other(storage):
+    other = RESULTS[:-1]  # the beginning of the name
+    for prefix in (RESULTS, other):
+        write(storage.workspace(prefix), "maps.exr", prefix.encode())
+        storage.publish(prefix)
+    assert names(storage, other) == ["maps.exr"]
+    storage.remove(other)
+    assert names(storage, other) == [] and names(storage, RESULTS) == ["maps.exr"]
+
+
+def test_what_is_removed_is_gone(storage):
+    write(storage.workspace(RESULTS), "maps.exr", b"maps")
+    write(storage.workspace(RESULTS), "deep/file", b"file")
+    storage.publish(RESULTS)
+    storage.remove(RESULTS)
+    assert storage.files(RESULTS) == [] and storage.open(RESULTS, "maps.exr") is None
+    storage.remove(RESULTS)  # once more is no fault
+
+
+def test_tidying_leaves_what_is_not_removed(storage):
+    write(storage.workspace(RESULTS), "maps.exr", b"maps")
+    storage.publish(RESULTS)
+    storage.remove(CAPTURE)
+    storage.tidy()
+    assert names(storage, RESULTS) == ["maps.exr"] and (storage.local(RESULTS) / "maps.exr").read_bytes() == b"maps"
+
+
+def test_a_half_removed_folder_is_finished(tmp_path):
+    half = tmp_path / "projects/film/jobs/.job_0123456789abcdefghjk.removed"
+    write(half, "maps.exr", b"maps")
+    FolderStorage(tmp_path).tidy()
+    assert not half.exists()
+
+
+def test_one_file_is_deleted(storage, tmp_path):
+    for name in ("deep/er/000.exr", "001.exr"):
+        (tmp_path / "upload").write_bytes(b"image")
+        storage.put(tmp_path / "upload", CAPTURE, name)
+    storage.local(CAPTURE)
+    for _ in range(2):  # once more is no fault
+        storage.delete(CAPTURE, "deep/er/000.exr")
+        assert names(storage, CAPTURE) == ["001.exr"] and storage.open(CAPTURE, "deep/er/000.exr") is None
+    assert not (storage.local(CAPTURE) / "deep/er/000.exr").exists()
+
+
+def test_a_prefix_of_nothing(storage):
+    assert storage.files(RESULTS) == [] and storage.open(RESULTS, "maps.exr") is None
+    storage.remove(RESULTS)
+
+
+def test_a_storage_that_can_be_written_is_sound(storage, tmp_path):
+    (tmp_path / "data").mkdir()
+    storage.check()
+    assert not list((tmp_path / "data").iterdir())

@@ -1,0 +1,92 @@
+"""docs/service.md: the walk runs as it stands, and what it says about keys, routes and metrics is so."""
+
+import json
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import httpx2
+import pytest
+
+from service.demo.demo import sample_folder
+from service.server.jobs.queue import JobQueue, prepare
+from service.server.sample import greet
+from service.server.settings import Settings
+from service.server.store.database import connect
+from service.server.store.keys import Scope
+
+HOME = Path(__file__).parents[3]
+TEXT = (HOME / "docs" / "service.md").read_text(encoding="utf-8")
+PORT = "8470"
+
+
+def free_port() -> str:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return str(server.getsockname()[1])
+
+
+@pytest.mark.skipif(shutil.which("curl") is None, reason="curl is not installed")
+def test_the_walk_runs(tmp_path):
+    port = free_port()
+    script = "\n".join(re.findall(r"```sh\n(.*?)```", TEXT, re.DOTALL)).replace(PORT, port)
+    assert script.count(port) >= 2
+    (tmp_path / "samples").symlink_to(HOME / "samples")
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("RELIT_")}
+    environment |= {"RELIT_PORT": port, "RELIT_DEVICES": "cpu", "RELIT_MIN_FREE_BYTES": "0",
+                    "PATH": f"{Path(sys.executable).parent}:{environment['PATH']}"}
+    walk = subprocess.Popen(["bash", "-euo", "pipefail", "-c", script], cwd=tmp_path, env=environment, text=True, start_new_session=True,
+                            stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    try:
+        out, err = walk.communicate(timeout=240)
+    finally:
+        if walk.poll() is None:
+            os.killpg(walk.pid, signal.SIGKILL)
+    assert walk.returncode == 0, (out[-3000:], err[-3000:])
+    events = re.findall(r'^data: .*"state":"(\w+)"', out, re.MULTILINE)
+    assert events[-1] == "succeeded"
+    assert out.splitlines()[-1] == "report.json" and "frame.0008.exr" in out and '"maps.exr"' in out
+    assert (tmp_path / "asset.usdz").stat().st_size > 1000
+
+
+def test_every_scope_is_described():
+    assert re.findall(r"^\| `(\w+)` \| (?:captures|also)", TEXT, re.MULTILINE) == [scope.value for scope in Scope]
+
+
+def test_the_service_of_the_demo_says_what_to_try_and_that_works(tmp_path):
+    """`relit demo --serve`, without the demo itself."""
+    assert "relit demo --serve" in (HOME / "Makefile").read_text() and "make serve" in TEXT
+    code = "import sys; from pathlib import Path; from service.cli.demo import open_service; open_service(Path(sys.argv[1]), 'cpu')"
+    with open(tmp_path / "log", "w") as log:
+        process = subprocess.Popen([sys.executable, "-c", code, str(tmp_path / "data")], cwd=HOME, text=True, stdout=subprocess.PIPE,
+                                   stderr=log, env=os.environ | {"RELIT_PORT": "0", "RELIT_DRAIN_S": "1", "RELIT_MIN_FREE_BYTES": "0"})
+    try:
+        said = [process.stdout.readline() for _ in range(6)]
+        urls = [re.search(r"http://\S+", line)[0] for line in (said[0], said[2], said[3])]
+        body = json.loads(re.search(r"-d '(.*)'", said[4])[1])
+        with httpx2.Client(timeout=60) as client:
+            deadline = time.monotonic() + 60
+            while {client.get(url).json()["state"] for url in urls[1:]} != {"ready"}:
+                assert time.monotonic() < deadline, (tmp_path / "log").read_text()
+                time.sleep(0.1)
+            assert client.post(f"{urls[0]}/jobs", json=body).status_code == 202
+            assert len(client.get(f"{urls[0]}/captures").json()["items"]) == 1
+    finally:
+        process.terminate()
+        assert process.wait(90) == 0, (tmp_path / "log").read_text()
+
+
+def test_the_sample_is_registered_once(tmp_path, capsys):
+    settings = Settings(data=tmp_path / "data")
+    database = connect(settings.sqlalchemy_url)
+    prepare(settings, database)
+    for _ in range(2):
+        greet("http://x", database, JobQueue(database), sample_folder())
+    first, second = capsys.readouterr().out.split("capture ")[1:]
+    assert first == second
+    database.close()

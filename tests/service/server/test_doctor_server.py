@@ -1,0 +1,126 @@
+"""relit doctor, of a service."""
+
+import pytest
+import sqlalchemy as sa
+
+from service.requests.identifiers import CAPTURE, new_id
+from service.requests.jobs import CheckJob
+from service.server.jobs.queue import JobQueue, prepare
+from service.server.settings import Settings
+from service.server.store import keys, workers
+from service.server.store.database import connect
+from service.server.store.keys import NewKey, Scope
+from service.server.store.tables import about
+
+
+@pytest.fixture
+def data(tmp_path, monkeypatch):
+    monkeypatch.setenv("RELIT_MIN_FREE_BYTES", "0")
+    folder = tmp_path / "data"
+    settings = Settings(data=folder)
+    database = connect(settings.sqlalchemy_url)
+    prepare(settings, database)
+    keys.create(database, NewKey(project="larch", name="x", scope=Scope.READ))
+    database.close()
+    return folder
+
+
+@pytest.fixture
+def database(data):
+    made = connect(Settings(data=data).sqlalchemy_url)
+    yield made
+    made.close()
+
+
+def lines_of(outcome) -> dict[str, str]:
+    """By their first word; the last of each."""
+    return {line.split(maxsplit=1)[0]: line.split(maxsplit=1)[1] for line in outcome.out.splitlines() if " " in line}
+
+
+def test_a_sound_service(relit, data, database, tmp_path, monkeypatch):
+    workers.appear(database, "w1", host="h", pid=1, device="cuda:1")
+    monkeypatch.setenv("RELIT_ROOTS", str(tmp_path))
+    outcome = relit("doctor", "--device", "cpu", "--data", data)
+    assert (outcome.code, outcome.err) == (0, ""), outcome.out
+    lines = lines_of(outcome)
+    assert "dbos" in lines["service"] and "fastapi" in lines["service"]
+    assert lines["storage"] == f"{data} can be written" and lines["database"] == f"{data / 'relit.sqlite'} answers"
+    assert lines["keys"] == "1, of 1 projects" and lines["worker"] == "w1 on cuda:1, ready" and lines["root"] == f"{tmp_path} can be read"
+    assert "GiB free" in lines["space"] and lines["jobs"] == "none"
+    assert outcome.out.splitlines()[-1] == "sound"
+
+
+def test_nothing_is_asked_of_a_service_that_is_not_there(relit, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    outcome = relit("doctor", "--device", "cpu")
+    assert outcome.code == 0 and "database" not in outcome.out
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_folder_that_is_here_is_looked_at(relit, data, tmp_path, monkeypatch):
+    data.rename(tmp_path / "relit-data")
+    monkeypatch.chdir(tmp_path)
+    assert "database" in lines_of(relit("doctor", "--device", "cpu"))
+
+
+def test_one_that_was_not_started_yet(relit, tmp_path):
+    (tmp_path / "new").mkdir()
+    outcome = relit("doctor", "--device", "cpu", "--data", tmp_path / "new")
+    assert outcome.code == 0 and "is not there yet" in lines_of(outcome)["database"]
+    assert list((tmp_path / "new").iterdir()) == []
+
+
+def wrong(relit, *arguments: object) -> list[str]:
+    """What is wrong."""
+    outcome = relit("doctor", "--device", "cpu", *arguments)
+    assert (outcome.code, outcome.err) == (1, "")
+    return [line.split(maxsplit=1)[1] for line in outcome.out.splitlines() if line.startswith("wrong ")]
+
+
+def test_no_key(relit, data, database, monkeypatch):
+    keys.revoke(database, keys.listing(database)[0]["id"])
+    assert wrong(relit, "--data", data) == ["keys: none, and requests without a key are refused: relit keys create makes one"]
+    monkeypatch.setenv("RELIT_ANONYMOUS", "true")
+    assert relit("doctor", "--device", "cpu", "--data", data).code == 0
+
+
+def test_jobs_that_wait_for_nobody(relit, data, database):
+    queue = JobQueue(database)
+    database.transact(lambda connection: queue.submit(
+        connection, project="larch", key=None, request=CheckJob(kind="check", intake=new_id(CAPTURE)), chunk_frames=1, inputs=[]))
+    assert wrong(relit, "--data", data) == ["worker: none was seen in the last 30 seconds, and 1 jobs wait"]
+
+
+def test_a_database_of_another_version(relit, data, database):
+    database.transact(lambda connection: connection.execute(about.update().values(version=99)))
+    assert wrong(relit, "--data", data)[0].startswith("database: the database is of schema 99, this program of ")
+
+
+def test_a_database_of_something_else(relit, data):
+    (data / "relit.sqlite").unlink()
+    other = sa.create_engine(f"sqlite:///{data / 'relit.sqlite'}")
+    with other.begin() as connection:
+        connection.execute(sa.text("CREATE TABLE cats (name TEXT)"))
+    other.dispose()
+    assert wrong(relit, "--data", data) == ["database: the database has no tables of relit: relit serve makes them"]
+    (data / "relit.sqlite").write_bytes(b"no database" * 1000)
+    assert wrong(relit, "--data", data)[0].startswith("database: does not answer: ")
+
+
+def test_a_database_server_that_is_not_there(relit, data, monkeypatch):
+    monkeypatch.setenv("RELIT_DATABASE_URL", "postgresql://u:secret@127.0.0.1:1/relit")
+    found = wrong(relit, "--data", data)
+    assert len(found) == 1 and found[0].startswith("database: does not answer: ") and "secret" not in found[0]
+    monkeypatch.setenv("RELIT_DATABASE_URL", "mysql://u@h/x")
+    assert "mysql is not supported" in wrong(relit, "--data", data)[0]
+
+
+def test_folders_and_variables(relit, data, tmp_path, monkeypatch):
+    monkeypatch.setenv("RELIT_ROOTS", str(tmp_path / "gone"))
+    monkeypatch.setenv("RELIT_PROT", "1")
+    monkeypatch.setenv("RELIT_MIN_FREE_BYTES", str(10**18))
+    found = wrong(relit, "--data", data)
+    assert [line.partition(":")[0] for line in found] == ["settings", "space", "root"]
+    assert "is RELIT_PORT meant?" in found[0] and "less than min_free_bytes" in found[1]
+    monkeypatch.setenv("RELIT_DATA", str(tmp_path / "nowhere"))
+    assert f"data: {tmp_path / 'nowhere2'} is no folder" in wrong(relit, "--data", tmp_path / "nowhere2")

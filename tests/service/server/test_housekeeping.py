@@ -1,0 +1,250 @@
+"""What the service clears away by itself, and what it leaves alone; days pass by an injected clock."""
+
+import time
+from pathlib import Path
+
+import pytest
+import sqlalchemy as sa
+
+from service.requests.identifiers import CAPTURE, ENVIRONMENT, UPLOAD, new_id
+from service.requests.jobs import ExportJob, SolveJob
+from service.server.housekeeping import DAY_S, HOUR_S, UNFINISHED_S, Housekeeper
+from service.server.jobs.queue import JobQueue, prepare
+from service.server.settings import Settings
+from service.server.storage import layout
+from service.server.storage.open import open_storage
+from service.server.storage.parts import Part, parts_folder
+from service.server.store import idempotency, intakes, jobs, tables, uploads, workers
+from service.server.store.database import connect
+
+DAYS = 30.0
+PROJECT = "larch"
+
+
+class House:
+    """A service without processes, and its housekeeper."""
+
+    def __init__(self, data: Path, **settings: object) -> None:
+        self.settings = Settings(data=data, **settings)
+        self.database = connect(self.settings.sqlalchemy_url)
+        prepare(self.settings, self.database)
+        self.storage, self.queue = open_storage(self.settings), JobQueue(self.database)
+        self.now = time.time()
+        self.keeper = Housekeeper(self.settings, self.database, self.storage, self.queue, clock=lambda: self.now)
+
+    def capture(self, kind: str = CAPTURE) -> str:
+        made = new_id(kind)
+        self.database.transact(lambda connection: intakes.insert(
+            connection, identifier=made, project=PROJECT, kind=kind, name="x", folder=None))
+        return made
+
+    def job(self, state: str = jobs.SUCCEEDED, *, inputs: tuple[str, ...] = (), request=None) -> str:
+        request = request or SolveJob(kind="solve", capture=inputs[0] if inputs else new_id(CAPTURE))
+        made = self.database.transact(lambda connection: self.queue.submit(
+            connection, project=PROJECT, key=None, request=request, chunk_frames=8, inputs=list(inputs)))
+        self.database.transact(lambda connection: connection.execute(tables.jobs.update().where(tables.jobs.c.id == made).values(
+            state=state, finished_at=self.now if state in jobs.ENDED else None)))
+        (self.results(made)).mkdir(parents=True)
+        (self.results(made) / "maps.exr").write_bytes(b"maps")
+        return made
+
+    def results(self, job: str) -> Path:
+        return self.settings.data / layout.results(PROJECT, job)
+
+    def cache(self, capture: str, size: int = 1000) -> Path:
+        folder = self.settings.data / "cache" / capture
+        folder.mkdir(parents=True)
+        (folder / "stack.npy").write_bytes(b"\0" * size)
+        return folder
+
+    def workflows(self) -> set[str]:
+        """What the queue knows, in its own table."""
+        table = "workflow_status" if self.database.is_sqlite else "dbos.workflow_status"
+        return {row["workflow_uuid"] for row in self.database.rows(sa.select(sa.text("workflow_uuid")).select_from(sa.text(table)))}
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def house(request, tmp_path):
+    url = None if request.param == "sqlite" else request.getfixturevalue("server_postgres").new_database()
+    made = House(tmp_path / "data", retention_days=DAYS, upload_hours=48, database_url=url)
+    yield made
+    made.database.close()
+
+
+def test_old_jobs_go_with_their_results_and_their_place_in_the_queue(house):
+    old = [house.job(state) for state in jobs.ENDED]
+    house.now += 0.9 * DAYS * DAY_S
+    young = house.job()
+    waiting, running = house.job(jobs.QUEUED), house.job(jobs.RUNNING)
+    capture, sky = house.capture(), house.capture(ENVIRONMENT)
+    house.keeper.round()
+    assert all(house.results(job).exists() for job in [*old, young])
+    house.now += 0.2 * DAYS * DAY_S
+    house.keeper.round()
+    left = {row["id"] for row in jobs.latest(house.database, PROJECT, limit=100)}
+    assert left == {young, waiting, running}
+    assert {path.name for path in house.results(young).parent.iterdir()} == left
+    assert house.workflows() == {f"{job}.1" for job in left}
+    house.now += 1000 * DAYS * DAY_S
+    house.keeper.round()
+    assert {row["id"] for row in jobs.latest(house.database, PROJECT, limit=100)} == {waiting, running}
+    assert intakes.find(house.database, capture, PROJECT) and intakes.find(house.database, sky, PROJECT)
+
+
+def test_without_retention_jobs_stay(tmp_path):
+    house = House(tmp_path / "data")
+    job = house.job()
+    house.now += 100_000 * DAY_S
+    house.keeper.round()
+    assert house.results(job).exists() and jobs.find(house.database, job)
+    house.database.close()
+
+
+def test_results_that_a_waiting_job_reads_stay_until_it_has_ended(house):
+    solved = house.job()
+    reader = house.job(jobs.QUEUED, inputs=(solved,), request=ExportJob(kind="export", maps=solved))
+    house.now += 2 * DAYS * DAY_S
+    house.keeper.round()
+    assert house.results(solved).exists()
+    house.database.transact(lambda connection: jobs.cancel(connection, reader))
+    house.keeper.round()
+    assert not house.results(solved).exists() and jobs.find(house.database, solved) is None
+
+
+def test_uploads_that_nobody_goes_on_with_expire(house):
+    capture, upload, folder = house.capture(), new_id(UPLOAD), parts_folder(house.settings)
+    house.database.transact(lambda connection: uploads.insert(
+        connection, identifier=upload, project=PROJECT, intake=capture, path="000.exr", length=10, sha256=None))
+    with Part.open(folder, upload) as part:
+        part.append([b"12345"])
+    house.now += 47 * HOUR_S
+    house.keeper.round()
+    assert uploads.find(house.database, upload, PROJECT) and part.path.exists()
+    house.now += 2 * HOUR_S
+    with Part.open(folder, upload):  # a request adds to it
+        house.keeper.round()
+        assert uploads.find(house.database, upload, PROJECT)
+    house.keeper.round()
+    assert uploads.find(house.database, upload, PROJECT) is None and not part.path.exists()
+    assert intakes.find(house.database, capture, PROJECT)
+
+
+def test_tokens_are_remembered_for_a_day(house):
+    made: list[str] = []
+
+    def make(_connection) -> str:
+        made.append(new_id(CAPTURE))
+        return made[-1]
+
+    def ask() -> str:
+        return idempotency.once(house.database, PROJECT, "token", ["x"], make)[0]
+
+    ask()
+    house.now += 0.9 * DAY_S
+    house.keeper.round()
+    assert ask() == made[0]
+    house.now += 0.2 * DAY_S
+    house.keeper.round()
+    assert ask() == made[1]
+
+
+def test_workers_that_are_gone_are_forgotten_and_those_that_come_back_are_not(house):
+    for name in ("dead", "alive"):
+        workers.appear(house.database, name, host="h", pid=1, device="cpu")
+    locks = house.settings.data / "locks"
+    locks.mkdir()
+    (locks / "dead.lock").write_bytes(b"")
+
+    def known() -> set[str]:
+        return {row["id"] for row in house.database.rows(sa.select(tables.workers))}
+
+    house.now += 2 * HOUR_S  # as after a database that was away
+    house.keeper.round()
+    assert known() == {"dead", "alive"}
+    house.database.transact(lambda connection: connection.execute(
+        tables.workers.update().where(tables.workers.c.id == "alive").values(seen_at=house.now)))
+    house.keeper.round()
+    assert known() == {"alive"}
+    assert (locks / "dead.lock").exists() != house.settings.is_sqlite  # on PostgreSQL locks are no files, and this is none of ours
+
+
+def test_stack_caches_go_with_their_captures(house):
+    kept, gone = house.capture(), house.capture()
+    folders = house.cache(kept), house.cache(gone)
+    half = house.settings.data / "cache" / f".{new_id(CAPTURE)}.removed"
+    half.mkdir()
+    house.keeper.round()
+    assert folders[0].exists() and folders[1].exists() and not half.exists()
+    house.database.transact(lambda connection: intakes.remove(connection, gone))
+    house.keeper.round()
+    assert folders[0].exists() and not folders[1].exists()
+
+
+def test_beyond_their_limit_the_caches_go_that_were_not_read_for_longest(tmp_path):
+    house = House(tmp_path / "data", cache_bytes=2500)
+    captures = [house.capture() for _ in range(4)]
+    folders = [house.cache(capture) for capture in captures]
+    in_use = house.job(jobs.QUEUED, inputs=(captures[1],))
+    last = house.job(inputs=(captures[0],))
+    for moment, job in enumerate((in_use, last)):
+        house.database.transact(lambda connection, job=job, at=house.now + 100 + moment: connection.execute(
+            tables.jobs.update().where(tables.jobs.c.id == job).values(updated_at=at)))
+    house.keeper.round()  # 4000 bytes: two go, those that no job has read
+    assert [folder.exists() for folder in folders] == [True, True, False, False]
+    house.database.transact(lambda connection: connection.execute(
+        tables.jobs.update().where(tables.jobs.c.id == in_use).values(updated_at=house.now - 100)))
+    unread = house.cache(house.capture())
+    house.keeper.round()  # the oldest is in use, the next is the one that no job has read since it was made
+    assert [folder.exists() for folder in (*folders[:2], unread)] == [True, True, False]
+    house.database.close()
+
+
+def test_what_was_half_removed_is_removed(house):
+    job = house.job()
+    half = house.results(job).with_name(f".{new_id('job')}.removed")
+    half.mkdir()
+    (half / "frame.0001.exr").write_bytes(b"x")
+    house.keeper.round()
+    assert not half.exists() and house.results(job).exists()
+
+
+def test_stacks_that_a_killed_worker_began_are_removed(house):
+    capture = house.capture()
+    begun = house.cache(capture) / ".stack.abc.npy"
+    begun.write_bytes(b"half")
+    house.keeper.round()
+    assert begun.exists()  # it may be in the making
+    house.now += UNFINISHED_S + HOUR_S
+    house.keeper.round()
+    assert not begun.exists() and (begun.parent / "stack.npy").exists()
+
+
+def test_one_piece_that_fails_does_not_stop_the_others(house, monkeypatch):
+    def fail(*_arguments: object) -> None:
+        raise OSError("no such disk")
+
+    old = house.job()
+    house.now += 2 * DAYS * DAY_S
+    monkeypatch.setattr(type(house.storage), "remove", fail)
+    capture = house.cache(new_id(CAPTURE))
+    house.keeper.round()
+    assert not capture.exists() and jobs.find(house.database, old) is None
+
+
+def test_the_thread_makes_a_round_at_once_and_ends_when_it_is_asked(house):
+    folder = house.cache(new_id(CAPTURE))
+    house.keeper.start()
+    deadline = time.monotonic() + 60
+    while folder.exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    house.keeper.stop()
+
+
+def test_it_knows_only_its_own_database(house, tmp_path):
+    """Results that no job of the database knows stay: it may be another database that is pointed at them."""
+    stray = house.results("job_00000000000000000000")
+    stray.mkdir(parents=True)
+    house.now += 10 * DAYS * DAY_S
+    house.keeper.round()
+    assert stray.exists()

@@ -1,0 +1,87 @@
+"""relit keys."""
+
+import pytest
+
+from service.cli.keys import ScopeName
+from service.server.settings import Settings
+from service.server.store import keys
+from service.server.store.database import connect
+from service.server.store.keys import Scope
+
+
+@pytest.fixture
+def data(tmp_path):
+    return tmp_path / "data"
+
+
+@pytest.fixture
+def made(relit, data):
+    """Make a key; the key."""
+    def make(project="larch", name="Ann B.", scope="write"):
+        outcome = relit("keys", "create", "--data", data, "--project", project, "--name", name, "--scope", scope)
+        assert (outcome.code, outcome.err) == (0, "keep it: it is not shown again\n")
+        return outcome.out.removesuffix("\n")
+
+    return make
+
+
+def test_the_scopes_are_those_of_the_store():
+    assert {scope.name: scope.value for scope in ScopeName} == {scope.name: scope.value for scope in Scope}
+
+
+def test_a_key_is_printed_alone_and_opens_its_project(made, data):
+    key = made()
+    database = connect(Settings(data=data).sqlalchemy_url)
+    assert keys.find(database, key) == keys.Caller("larch", Scope.WRITE, key.partition(".")[0])
+    database.close()
+
+
+def test_keys_are_listed_without_their_secrets(relit, made, data):
+    first, second = made(), made("willow", "render farm", "read")
+    outcome = relit("keys", "list", "--data", data)
+    assert (outcome.code, outcome.err) == (0, "")
+    lines = outcome.out.splitlines()
+    assert len(lines) == 3 and [line.split()[0] for line in lines[1:]] == [key.partition(".")[0] for key in (first, second)]
+    assert all(word in lines[2] for word in ("willow", "read", "render farm"))
+    assert not any(key.partition(".")[2] in outcome.out for key in (first, second))
+    assert len(relit("keys", "list", "--data", data, "--project", "willow").out.splitlines()) == 2
+
+
+def test_a_key_is_revoked_once(relit, made, data):
+    identifier = made().partition(".")[0]
+    assert relit("keys", "revoke", identifier, "--data", data) == (0, f"revoked  {identifier}\n", "")
+    again = relit("keys", "revoke", identifier, "--data", data)
+    assert again.code == 2 and again.err == f"relit: {identifier}: there is no such key that is not revoked\n"
+    database = connect(Settings(data=data).sqlalchemy_url)
+    assert [row["revoked_at"] is not None for row in keys.listing(database)] == [True]
+    database.close()
+
+
+def test_the_secret_may_stand_behind_the_identifier(relit, made, data):
+    """Who has only the key revokes with it; its secret is not shown again."""
+    key = made()
+    outcome = relit("keys", "revoke", key, "--data", data)
+    assert outcome.code == 0 and key.partition(".")[2] not in outcome.out
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["create", "--project", "Larch", "--name", "x", "--scope", "read"], "project"),
+    (["create", "--project", "../x", "--name", "x", "--scope", "read"], "project"),
+    (["create", "--project", "larch", "--name", "", "--scope", "read"], "name"),
+    (["create", "--project", "larch", "--name", "a\nb", "--scope", "read"], "name"),
+    (["create", "--project", "larch", "--name", "x", "--scope", "root"], "'root' is not one of 'read', 'write', 'admin'"),
+    (["create", "--project", "larch", "--name", "x"], "--scope"),
+    (["list"], "there is no service in this folder"),
+    (["revoke", "key_x"], "there is no service in this folder"),
+])
+def test_what_cannot_be_is_one_sentence_and_makes_nothing(relit, data, arguments, words):
+    outcome = relit("keys", *arguments, "--data", data)
+    assert (outcome.code, outcome.out) == (2, "") and outcome.err.count("\n") == 1 and words in outcome.err
+    assert not data.exists()
+
+
+def test_a_database_that_cannot_be_used_is_one_sentence(relit, data):
+    data.mkdir()
+    (data / "relit.sqlite").write_bytes(b"no database" * 1000)
+    outcome = relit("keys", "list", "--data", data)
+    assert outcome.code == 2 and "the database in it cannot be used" in outcome.err and outcome.err.count("\n") == 1
