@@ -23,7 +23,7 @@ from service.requests.identifiers import CAPTURE, ENVIRONMENT
 from service.server.store import jobs, workers
 from tests.captures import make_scene, write_capture, write_exr
 from tests.service.postgres import Postgres, binaries, postgres
-from tests.service.server_process.jobs.yard import Yard, digests, relit_relight, yard
+from tests.service.server.jobs.yard import Yard, digests, relit_relight, yard
 
 FRAMES, SIZE, LIGHTS, CHUNK_FRAMES, WORKERS = 200, 1024, 6, 8, 3
 TAKEOVER_LIMIT_S = 10.0

@@ -20,7 +20,7 @@ from urllib.parse import urlsplit
 
 import httpx2
 
-from tests.service.server_process.serve import Server, serving
+from tests.service.server_process import Server, serving
 
 ROUNDS = 5
 MIB = 1 << 20

@@ -13,7 +13,7 @@ from stage import exr, jxl
 from stage.errors import ImageError, ManifestError, StageError
 from stage.manifest import read_manifest
 from stage.tof.frames import read_array
-from tests.service.server_process.api.captures import lying_exr, lying_jxl, lying_npy, manifest
+from tests.service.server.api.captures import lying_exr, lying_jxl, lying_npy, manifest
 
 MIB = 1 << 20
 

@@ -9,7 +9,7 @@ import httpx2
 import pytest
 
 from service.client import Client
-from tests.service.server_process.serve import Server, serving
+from tests.service.server_process import Server, serving
 
 HOME = Path(__file__).resolve().parents[3]
 OWL = HOME / "samples" / "owl"

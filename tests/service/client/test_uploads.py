@@ -11,7 +11,7 @@ import pytest
 from service.client import Client, ClientError, FileError, IntakeRefused, Invalid, NotFound
 from tests.captures import edit_manifest, files_in, write_capture, write_exr
 from tests.service.client.conftest import OWL, SKY, Between, Cut
-from tests.service.server_process.serve import Server
+from tests.service.server_process import Server
 
 Send = Callable[[], httpx2.Response]
 CUT = 1_500_000

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.service.server_process.serve import Server, serving
+from tests.service.server_process import Server, serving
 
 HOME = Path(__file__).resolve().parents[4]
 SAMPLES = HOME / "samples"

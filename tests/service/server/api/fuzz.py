@@ -13,7 +13,7 @@ from service.server.settings import Settings
 from service.server.storage import layout
 from service.server.store import intakes, jobs, keys, tables
 from service.server.store.database import Database, connect
-from tests.service.server_process.serve import Server
+from tests.service.server_process import Server
 
 PROJECT = "fuzz"
 SEED = "7"

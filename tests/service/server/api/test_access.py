@@ -13,8 +13,8 @@ from service.server.settings import Settings
 from service.server.store import intakes, keys
 from service.server.store.database import Database, connect
 from service.server.store.keys import NewKey, Scope
-from tests.service.server_process.api.conftest import SAMPLES
-from tests.service.server_process.serve import Server, serving
+from tests.service.server.api.conftest import SAMPLES
+from tests.service.server_process import Server, serving
 
 OPEN = {("get", "/healthz"), ("get", "/readyz")}
 """Need no key; nor does OPTIONS, which says what tus can do here."""

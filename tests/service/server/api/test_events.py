@@ -23,8 +23,8 @@ from service.server.settings import Settings
 from service.server.store import jobs, tables
 from service.server.store.database import Database, connect
 from tests.service.postgres import binaries, postgres
-from tests.service.server_process.api.asgi import Call
-from tests.service.server_process.serve import serving
+from tests.service.server.api.asgi import Call
+from tests.service.server_process import serving
 
 PROJECT, OTHER = "larch", "birch"
 WAIT_S = 60.0

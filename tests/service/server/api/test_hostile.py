@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from service.captures.admit import MAX_MANIFEST_BYTES
-from tests.service.server_process.api.captures import (
+from tests.service.server.api.captures import (
     lying_exr,
     lying_jxl,
     lying_npy,
@@ -24,8 +24,8 @@ from tests.service.server_process.api.captures import (
     write_capture,
     write_image,
 )
-from tests.service.server_process.api.conftest import SAMPLES
-from tests.service.server_process.api.tus import Tus, encoded
+from tests.service.server.api.conftest import SAMPLES
+from tests.service.server.api.tus import Tus, encoded
 
 PEAK_BYTES = 1 << 30
 """Of a worker: its libraries take a fifth, and a manifest of MAX_MANIFEST_BYTES up to 40 times its size."""

@@ -13,8 +13,8 @@ from service.server.store import idempotency, intakes, keys
 from service.server.store.database import Database, connect, create
 from service.server.store.keys import NewKey, Scope
 from tests.service.postgres import binaries, postgres
-from tests.service.server_process.api.conftest import SAMPLES
-from tests.service.server_process.serve import Server, serving
+from tests.service.server.api.conftest import SAMPLES
+from tests.service.server_process import Server, serving
 
 PROJECT = "larch"
 AT_ONCE = 12

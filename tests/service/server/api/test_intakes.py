@@ -7,8 +7,8 @@ from service.requests.jobs import CheckJob
 from service.server.store import intakes, jobs
 from service.server.store.database import connect, create
 from service.server.store.jobs import Claim
-from tests.service.server_process.api.captures import write_capture
-from tests.service.server_process.api.conftest import SAMPLES
+from tests.service.server.api.captures import write_capture
+from tests.service.server.api.conftest import SAMPLES
 
 
 def test_a_capture_is_created_looked_at_and_deleted(client):

@@ -9,7 +9,7 @@ import pytest
 
 from service.requests.identifiers import new_id
 from service.server.store.database import storable
-from tests.service.server_process.serve import Server
+from tests.service.server_process import Server
 
 ENDED = ("succeeded", "failed", "cancelled")
 WAIT_S = 120.0

@@ -12,8 +12,8 @@ from service.server.settings import Settings
 from service.server.store import intakes, jobs, keys
 from service.server.store.database import Database, connect
 from service.server.store.keys import NewKey, Scope
-from tests.service.server_process.api.conftest import SAMPLES
-from tests.service.server_process.serve import Server, serving
+from tests.service.server.api.conftest import SAMPLES
+from tests.service.server_process import Server, serving
 
 BURST, QUEUED, FRAMES, FILES, BYTES = 30, 2, 10, 2, 1000
 PER_SECOND = 0.01

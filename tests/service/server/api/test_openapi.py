@@ -27,8 +27,8 @@ from service.server.jobs.queue import prepare
 from service.server.settings import Settings
 from service.server.store.database import connect
 from tests.service.postgres import binaries, postgres
-from tests.service.server_process.api.fuzz import fuzz, seed
-from tests.service.server_process.serve import serving
+from tests.service.server.api.fuzz import fuzz, seed
+from tests.service.server_process import serving
 
 LONG_S = int(os.environ.get("FUZZ_SECONDS", "0"))
 FREE = {"get_health", "get_readiness", "abilities"}

@@ -28,8 +28,8 @@ from service.server.settings import Settings
 from service.server.store import jobs, workers
 from service.server.store.database import connect
 from tests.service.postgres import binaries, postgres
-from tests.service.server_process.api.conftest import SAMPLES
-from tests.service.server_process.serve import Server, serving
+from tests.service.server.api.conftest import SAMPLES
+from tests.service.server_process import Server, serving
 
 PATIENCE_S = 60.0
 DRAIN_S = 4.0

@@ -21,8 +21,8 @@ from service.server.settings import Settings
 from service.server.storage.folder import FolderStorage
 from service.server.store.database import connect
 from stage.errors import StorageError
-from tests.service.server_process.api.asgi import Call
-from tests.service.server_process.serve import Server
+from tests.service.server.api.asgi import Call
+from tests.service.server_process import Server
 
 ENDED = ("succeeded", "failed", "cancelled")
 LARGE = 64 << 20

@@ -21,9 +21,9 @@ from service.server.store.database import connect, create
 from service.server.store.intakes import insert as insert_intake
 from service.server.store.keys import NewKey, Scope
 from tests.service.postgres import binaries, postgres
-from tests.service.server_process.api.conftest import SAMPLES
-from tests.service.server_process.api.tus import VERSION, Answer, Tus, checksum, encoded
-from tests.service.server_process.serve import Server, serving
+from tests.service.server.api.conftest import SAMPLES
+from tests.service.server.api.tus import VERSION, Answer, Tus, checksum, encoded
+from tests.service.server_process import Server, serving
 
 KIB, MIB = 1 << 10, 1 << 20
 PATIENCE_S = 30.0

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.captures import make_scene, write_capture, write_exr
-from tests.service.server_process.jobs.yard import relit_relight, yard
+from tests.service.server.jobs.yard import relit_relight, yard
 
 FRAMES = 36
 SIZE = 256

@@ -10,7 +10,7 @@ import pytest
 
 from service.requests.identifiers import CAPTURE, ENVIRONMENT
 from service.server.store import jobs, workers
-from tests.service.server_process.jobs.yard import digests, yard
+from tests.service.server.jobs.yard import digests, yard
 
 SABOTAGE = str(Path(__file__).parent / "sabotage")
 

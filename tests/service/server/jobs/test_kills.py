@@ -6,7 +6,7 @@ import signal
 
 from service.requests.identifiers import CAPTURE, ENVIRONMENT
 from service.server.store import jobs
-from tests.service.server_process.jobs.yard import digests, yard
+from tests.service.server.jobs.yard import digests, yard
 
 KILLS, WORKERS = 3, 2
 

@@ -3,7 +3,7 @@
 import sqlalchemy as sa
 
 from service.server.jobs.presence import KEEPALIVE, FilePresence, Held, SessionPresence, presence
-from tests.service.server_process.jobs.yard import yard
+from tests.service.server.jobs.yard import yard
 
 
 def pair(yard):

@@ -10,7 +10,7 @@ from service.server.jobs.progress import JobProgress, Stopped
 from service.server.store import jobs
 from service.server.store.database import Database
 from service.server.store.jobs import Claim
-from tests.service.server_process.jobs.yard import yard
+from tests.service.server.jobs.yard import yard
 
 
 @pytest.fixture

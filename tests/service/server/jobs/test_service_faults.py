@@ -8,9 +8,9 @@ from pathlib import Path
 from service.server.settings import Settings
 from service.server.store import jobs, workers
 from service.server.store.database import connect
-from tests.service.server_process.jobs.test_faults import SABOTAGE, fill, small_disk  # noqa: F401  (a fixture)
-from tests.service.server_process.jobs.yard import WAIT_S, digests
-from tests.service.server_process.serve import Server, serving
+from tests.service.server.jobs.test_faults import SABOTAGE, fill, small_disk  # noqa: F401  (a fixture)
+from tests.service.server.jobs.yard import WAIT_S, digests
+from tests.service.server_process import Server, serving
 
 OPTIONS = ("--anonymous", "--device", "cpu")
 SETTINGS = {"chunk_frames": "6", "requests_per_second": "1000", "min_free_bytes": "0"}

@@ -6,7 +6,7 @@ import pytest
 
 from service.server.jobs import pulse, supervisor
 from service.server.settings import Settings
-from tests.service.server_process.jobs import stand_ins
+from tests.service.server.jobs import stand_ins
 
 PAUSES_S = (0.0, 0.01, 0.02)
 STALL_S = 1.0

@@ -7,8 +7,8 @@ import pytest
 
 from service.server.storage import layout
 from tests.captures import files_in, make_scene, write_capture, write_exr
-from tests.service.server_process.api.tus import Tus
-from tests.service.server_process.serve import serving
+from tests.service.server.api.tus import Tus
+from tests.service.server_process import serving
 
 
 def sent(client, tus, kind, files):
