@@ -1,65 +1,43 @@
-"""Colour spaces: what a capture may declare, and the way from recorded to scene-linear values.
+"""Conversion of pixels between colour spaces.
 
-The arithmetic is OpenColorIO's (through OpenImageIO, with the built-in ACES configuration); this file only says which
-names of the Color Interop Forum a capture may use and what each one is linearised to.
+The arithmetic is OpenColorIO's, through OpenImageIO, with the built-in ACES configuration.
 """
-
-from typing import Literal, get_args
 
 import numpy as np
 import OpenImageIO as oiio
 
+from stage.colour_spaces import is_linear, linear_space
+
 CONFIG = "ocio://default"
-
-ColorSpaceName = Literal[
-    "lin_rec709_scene", "lin_ap1_scene", "lin_ap0_scene", "lin_rec2020_scene", "lin_p3d65_scene", "lin_adobergb_scene",
-    "srgb_texture", "srgb_rec709_scene", "g22_rec709_scene", "g18_rec709_scene", "srgb_p3d65_scene", "g22_adobergb_scene",
-]
-"""What `color_space` may be: scene-linear spaces, and display-encoded ones of 8-bit cameras and textures."""
-
-_LINEAR_OF: dict[str, str] = {
-    "srgb_texture": "lin_rec709_scene",
-    "srgb_rec709_scene": "lin_rec709_scene",
-    "g22_rec709_scene": "lin_rec709_scene",
-    "g18_rec709_scene": "lin_rec709_scene",
-    "srgb_p3d65_scene": "lin_p3d65_scene",
-    "g22_adobergb_scene": "lin_adobergb_scene",
-}
+"""The OpenColorIO configuration: the newest ACES configuration that is built into the library."""
 
 GREY_WEIGHTS = (0.299, 0.587, 0.114)
-"""Luma weights of ITU-R BT.601: the grey on which published photometric stereo figures are computed."""
-
-
-def is_linear(space: str) -> bool:
-    """Whether recorded values are already proportional to radiance."""
-    return space not in _LINEAR_OF
-
-
-def linear_space(space: str) -> str:
-    """The scene-linear space with the primaries of `space`: the working space of a capture."""
-    if space not in get_args(ColorSpaceName):
-        raise ValueError(f"{space} is not a colour space that relit knows")
-    return _LINEAR_OF.get(space, space)
+"""The luma weights of red, green and blue by ITU-R BT.601: published photometric stereo figures are computed on this grey."""
 
 
 def linearise(pixels: np.ndarray, space: str) -> np.ndarray:
-    """Recorded values to scene-linear ones with the same primaries.
+    """Convert recorded values to scene-linear values with the same primaries.
 
     Args:
-        pixels: [rows, cols, channels] float32, encoded as `space` says.
+        pixels: [rows, cols, channels] float32, encoded in `space`.
         space: a ColorSpaceName.
 
     Returns:
-        [rows, cols, channels] float32; the input itself when it is linear already.
+        [rows, cols, channels] float32; `pixels` without a copy when `space` is linear already.
     """
     return pixels if is_linear(space) else convert(pixels, space, linear_space(space))
 
 
 def convert(pixels: np.ndarray, source: str, target: str) -> np.ndarray:
-    """Convert between two colour spaces by their interchange names.
+    """Convert pixels from one colour space to another.
 
     Args:
-        pixels: [rows, cols, 1 or 3] float32; one channel is taken as equal red, green and blue.
+        pixels: [rows, cols, 1 or 3] float32, encoded in `source`; one channel stands for equal red, green and blue.
+        source: the interchange name of the colour space of `pixels`.
+        target: the interchange name of the colour space of the result.
+
+    Returns:
+        Float32 in the shape of `pixels`; of one channel, the red channel of the converted grey.
 
     Raises:
         ValueError: OpenColorIO does not know one of the names.
@@ -77,10 +55,10 @@ def convert(pixels: np.ndarray, source: str, target: str) -> np.ndarray:
 
 
 def rgb_matrix(source: str, target: str) -> np.ndarray:
-    """The matrix between two scene-linear spaces.
+    """Return the matrix that converts column vectors from one scene-linear space to another.
 
     Returns:
-        [3, 3] float32, column vectors: target = matrix @ source.
+        [3, 3] float32: rgb in `target` = matrix @ rgb in `source`.
 
     Raises:
         ValueError: OpenColorIO does not know one of the names.
@@ -90,10 +68,10 @@ def rgb_matrix(source: str, target: str) -> np.ndarray:
 
 
 def pixels_of(buffer: oiio.ImageBuf) -> np.ndarray:
-    """The pixels of an OpenImageIO buffer, [rows, cols, channels] float32.
+    """Return the pixels of an OpenImageIO buffer, [rows, cols, channels] float32.
 
     Raises:
-        ValueError: the buffer holds an error in place of pixels.
+        ValueError: OpenImageIO has put an error message in the place of the pixels.
     """
     pixels = buffer.get_pixels(oiio.FLOAT)
     if pixels is None:

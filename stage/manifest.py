@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from stage.camera import Camera
-from stage.colour import ColorSpaceName
+from stage.colour_spaces import ColorSpaceName
 from stage.files import write_text
 from stage.light import Light
 from stage.model import FirstFault, Positive, Strict, Text

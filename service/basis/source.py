@@ -12,7 +12,7 @@ from service.reporting.progress import Timings
 from service.reporting.provenance import metadata
 from service.requests.basis import BasisKind, BasisRequest
 from stage.capture import Capture
-from stage.colour import linear_space
+from stage.colour_spaces import linear_space
 from stage.ingest import open_stack
 from stage.light import PointLight
 from stage.light_basis import facts_path, numbers

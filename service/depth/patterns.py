@@ -15,7 +15,8 @@ from service.depth.solution import DepthSolution
 from service.reporting.progress import Timings
 from service.requests.depth import DepthRequest
 from stage.capture import Capture
-from stage.colour import GREY_WEIGHTS, is_linear
+from stage.colour import GREY_WEIGHTS
+from stage.colour_spaces import is_linear
 from stage.correction import Correction
 from stage.errors import ManifestError
 from stage.manifest import FILE_NAME, Frame

@@ -4,7 +4,8 @@ import numpy as np
 
 from service.depth.solution import DepthSolution
 from stage.camera import Camera
-from stage.colour import convert, linear_space
+from stage.colour import convert
+from stage.colour_spaces import linear_space
 from stage.depth_normals import depth_normals
 from stage.ply import PointCloud
 

@@ -15,7 +15,7 @@ from service.requests.picture import Layer
 from service.requests.relight import RelightRequest
 from stage import fingerprint
 from stage.capture import Capture
-from stage.colour import linear_space
+from stage.colour_spaces import linear_space
 from stage.ingest import Ingest
 from stage.light import PointLight
 from stage.lighting import lights_from_centre

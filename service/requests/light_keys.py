@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import AfterValidator, Field
 
 from service.requests.picture import MAX_STOPS
-from stage.colour import ColorSpaceName, is_linear
+from stage.colour_spaces import ColorSpaceName, is_linear
 from stage.model import Direction, FirstFault, NotNegative, Positive, Rgb, Strict, Text, Vector
 from stage.records import read_record
 

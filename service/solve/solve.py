@@ -22,7 +22,7 @@ from service.solve.height import integrate, mark_not_facing
 from service.solve.near import solve_near
 from service.solve.reference import solve_by_reference
 from stage.capture import Capture
-from stage.colour import linear_space
+from stage.colour_spaces import linear_space
 from stage.errors import ManifestError
 from stage.extended_lights import ExtendedLights
 from stage.files import write_text

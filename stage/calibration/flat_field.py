@@ -12,7 +12,8 @@ import numpy as np
 
 from stage import images
 from stage.capture import Capture
-from stage.colour import convert, linear_space, linearise
+from stage.colour import convert, linearise
+from stage.colour_spaces import linear_space
 from stage.errors import CalibrationError, ImageError
 
 Progress = Callable[[int], None]

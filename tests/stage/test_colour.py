@@ -1,9 +1,14 @@
 """Colour: sRGB against its closed form, AP1 against the published matrix, and what stays untouched."""
 
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from stage.colour import convert, is_linear, linear_space, linearise, rgb_matrix
+from stage.colour import convert, linearise, rgb_matrix
+from stage.colour_spaces import is_linear, linear_space
 
 AP1_TO_REC709 = np.array([[1.70505, -0.62179, -0.08326], [-0.13026, 1.14080, -0.01055], [-0.02400, -0.12897, 1.15297]])
 """ACEScg to linear Rec.709 with Bradford adaptation, five digits, as ACES and its CTL publish it."""
@@ -76,3 +81,10 @@ def test_the_matrix_is_the_conversion():
     converted = convert(colours, "lin_rec709_scene", "lin_ap1_scene")
     assert np.allclose(colours @ rgb_matrix("lin_rec709_scene", "lin_ap1_scene").T, converted, atol=1e-6)
     assert np.array_equal(rgb_matrix("lin_ap1_scene", "lin_ap1_scene"), np.eye(3))
+
+
+def test_requests_can_check_a_name_without_numpy_or_an_image_library():
+    """service.requests imports these modules, and the command line imports service.requests at its start."""
+    code = "import sys, stage.colour_spaces, stage.errors, stage.model, stage.records; print({'numpy', 'OpenImageIO'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=Path(__file__).parents[2], timeout=60, check=True)
+    assert done.stdout.strip() == "set()"
