@@ -86,5 +86,6 @@ def test_the_matrix_is_the_conversion():
 def test_requests_can_check_a_name_without_numpy_or_an_image_library():
     """service.requests imports these modules, and the command line imports service.requests at its start."""
     code = "import sys, stage.colour_spaces, stage.errors, stage.model, stage.records; print({'numpy', 'OpenImageIO'} & set(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=Path(__file__).parents[2], timeout=60, check=True)
+    home = Path(__file__).parents[2]
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=home, timeout=60, check=True)
     assert done.stdout.strip() == "set()"
