@@ -8,9 +8,10 @@ import numpy as np
 
 from service.errors import RequestError
 from service.light.environments import Environments
-from service.requests.light_keys import CapturedTrack, EnvironmentKey, LightKeys, LightTrack, mixed, span, swung
+from service.requests.light_keys import CapturedTrack, EnvironmentKey, Key, LightKeys, LightTrack
 from service.requests.relight import RelightRequest
 from stage.frames import rotation_about, rotation_about_y
+from stage.model import Vector
 
 UPRIGHT = (0.0, 1.0, 0.0)
 
@@ -92,33 +93,70 @@ def schedule(request: RelightRequest, numbers: Sequence[int], keys: LightKeys | 
             result.append(FrameLighting(number, sky, (), {}, stops))
             continue
         if keys.exposure:
-            at = span(keys.exposure, number)
-            stops += float(mixed((keys.exposure[at.first].stops,), (keys.exposure[at.second].stops,), at.fraction)[0])
+            at = key_interval(keys.exposure, number)
+            stops += float(lerp((keys.exposure[at.first].stops,), (keys.exposure[at.second].stops,), at.fraction)[0])
         discs = tuple(_disc(track, number) for track in keys.lights)
         result.append(FrameLighting(number, sky, discs, _captured(keys.captured, number), stops))
     return result
 
 
 def _keyed_sky(path: Path, keys: Sequence[EnvironmentKey], number: int) -> Sky:
-    at = span(keys, number)
+    at = key_interval(keys, number)
     one, other = keys[at.first], keys[at.second]
-    turn, stops = mixed((one.turn_degrees, one.exposure), (other.turn_degrees, other.exposure), at.fraction)
-    x, y, z = swung(one.axis, other.axis, at.fraction)
+    turn, stops = lerp((one.turn_degrees, one.exposure), (other.turn_degrees, other.exposure), at.fraction)
+    x, y, z = slerp(one.axis, other.axis, at.fraction)
     axis = float(x), float(y), float(z)
     return Sky(path, float(turn), axis, rotation_about(axis, float(turn)), float(stops))
 
 
 def _disc(track: LightTrack, number: int) -> Disc:
-    at = span(track.keys, number)
+    at = key_interval(track.keys, number)
     one, other = track.keys[at.first], track.keys[at.second]
-    return Disc(swung(one.direction, other.direction, at.fraction), mixed(one.irradiance, other.irradiance, at.fraction),
-                float(mixed((one.angle_degrees,), (other.angle_degrees,), at.fraction)[0]), track.color_space)
+    return Disc(slerp(one.direction, other.direction, at.fraction), lerp(one.irradiance, other.irradiance, at.fraction),
+                float(lerp((one.angle_degrees,), (other.angle_degrees,), at.fraction)[0]), track.color_space)
 
 
 def _captured(tracks: Sequence[CapturedTrack], number: int) -> dict[str, float]:
     weights: dict[str, float] = {}
     for track in tracks:
-        at = span(track.keys, number)
-        weight = float(mixed((track.keys[at.first].weight,), (track.keys[at.second].weight,), at.fraction)[0])
+        at = key_interval(track.keys, number)
+        weight = float(lerp((track.keys[at.first].weight,), (track.keys[at.second].weight,), at.fraction)[0])
         weights[track.image] = weights.get(track.image, 0.0) + weight
     return weights
+
+
+class KeyInterval(NamedTuple):
+    """Where a frame lies between two neighbouring keys."""
+
+    first: int
+    second: int
+    fraction: float
+    """0 at the first, 1 at the second."""
+
+
+def key_interval(keys: Sequence[Key], frame: int) -> KeyInterval:
+    """Return the keys around a frame; before the first and after the last key their values hold."""
+    after = next((index for index, key in enumerate(keys) if key.frame > frame), len(keys))
+    if after == 0 or after == len(keys) or keys[after - 1].interpolation == "step":
+        held = max(0, after - 1)
+        return KeyInterval(held, held, 0.0)
+    one, other = keys[after - 1], keys[after]
+    return KeyInterval(after - 1, after, (frame - one.frame) / (other.frame - one.frame))
+
+
+def lerp(first: Sequence[float], second: Sequence[float], fraction: float) -> np.ndarray:
+    """Return the linear interpolation of two values, float64."""
+    return (1 - fraction) * np.asarray(first, dtype=np.float64) + fraction * np.asarray(second, dtype=np.float64)
+
+
+def slerp(first: Vector, second: Vector, fraction: float) -> np.ndarray:
+    """Return the unit vector on the shorter great circle between two, at an even pace.
+
+    Source: Shoemake, "Animating Rotation with Quaternion Curves", SIGGRAPH 1985 (slerp).
+    """
+    one, other = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
+    sine = float(np.linalg.norm(np.cross(one, other)))
+    angle = float(np.arctan2(sine, one @ other))
+    if sine < 1e-12:  # the same direction: there is no way between
+        return one
+    return (np.sin((1 - fraction) * angle) * one + np.sin(fraction * angle) * other) / sine

@@ -3,14 +3,13 @@
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple, TypeVar
+from typing import Annotated, Literal, TypeVar
 
-import numpy as np
 from pydantic import AfterValidator, Field
 
 from service.requests.picture import MAX_STOPS
 from stage.colour_spaces import ColorSpaceName, is_linear
-from stage.model import Direction, FirstFault, NotNegative, Positive, Rgb, Strict, Text, Vector
+from stage.model import Direction, FirstFault, NotNegative, Positive, Rgb, Strict, Text
 from stage.records import read_record
 
 SCHEMA = "relit.keys/1"
@@ -76,7 +75,8 @@ def _in_order(keys: tuple[AnyKey, ...]) -> tuple[AnyKey, ...]:
 
 def _no_opposites(keys: Sequence[Key], field: str) -> None:
     for index, (one, other) in enumerate(pairwise(keys), start=1):
-        if one.interpolation == "linear" and np.dot(getattr(one, field), getattr(other, field)) < OPPOSITE:
+        cosine = sum(a * b for a, b in zip(getattr(one, field), getattr(other, field), strict=True))
+        if one.interpolation == "linear" and cosine < OPPOSITE:
             raise ValueError(f"key {index}: its {field} is opposite to the one before: give a key between, so that the way is known")
 
 
@@ -136,40 +136,3 @@ class LightKeys(Strict):
             ManifestError: not JSON, or a field is wrong; the message names file and field.
         """
         return read_record(path, cls, SCHEMA)
-
-
-class Span(NamedTuple):
-    """Where a frame lies between two neighbouring keys."""
-
-    first: int
-    second: int
-    fraction: float
-    """0 at the first, 1 at the second."""
-
-
-def span(keys: Sequence[Key], frame: int) -> Span:
-    """The keys around a frame; before the first and after the last key their values hold."""
-    after = next((index for index, key in enumerate(keys) if key.frame > frame), len(keys))
-    if after == 0 or after == len(keys) or keys[after - 1].interpolation == "step":
-        held = max(0, after - 1)
-        return Span(held, held, 0.0)
-    one, other = keys[after - 1], keys[after]
-    return Span(after - 1, after, (frame - one.frame) / (other.frame - one.frame))
-
-
-def mixed(first: Sequence[float], second: Sequence[float], fraction: float) -> np.ndarray:
-    """Linear interpolation, float64."""
-    return (1 - fraction) * np.asarray(first, dtype=np.float64) + fraction * np.asarray(second, dtype=np.float64)
-
-
-def swung(first: Vector, second: Vector, fraction: float) -> np.ndarray:
-    """The unit vector on the shorter great circle between two, at an even pace.
-
-    Source: Shoemake, "Animating Rotation with Quaternion Curves", SIGGRAPH 1985 (slerp).
-    """
-    one, other = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
-    sine = float(np.linalg.norm(np.cross(one, other)))
-    angle = float(np.arctan2(sine, one @ other))
-    if sine < 1e-12:  # the same direction: there is no way between
-        return one
-    return (np.sin((1 - fraction) * angle) * one + np.sin(fraction * angle) * other) / sine

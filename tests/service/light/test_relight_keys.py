@@ -5,7 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from service.requests.light_keys import SCHEMA, LightKeys, span, swung
+from service.light.schedule import key_interval, slerp
+from service.requests.light_keys import SCHEMA, LightKeys
 from stage import exr
 from tests.captures import files_in, make_scene, write_capture, write_exr
 
@@ -159,12 +160,12 @@ def test_spin_and_keys_do_not_both_turn(relit, tmp_path, cap):
 
 def test_values_hold_before_the_first_key_and_after_the_last():
     keys = LightKeys.model_validate({"schema": SCHEMA, "exposure": [{"frame": 10, "stops": 1}, {"frame": 20, "stops": 2}]}).exposure
-    assert [span(keys, frame) for frame in (0, 10, 14, 20, 99)] == [(0, 0, 0), (0, 1, 0), (0, 1, 0.4), (1, 1, 0), (1, 1, 0)]
+    assert [key_interval(keys, frame) for frame in (0, 10, 14, 20, 99)] == [(0, 0, 0), (0, 1, 0), (0, 1, 0.4), (1, 1, 0), (1, 1, 0)]
 
 
 @pytest.mark.parametrize("second", [(0, 0, 1), (0.6, 0, 0.8), (1, 0, 0), (0.8, 0, -0.6)])
 def test_directions_keep_an_even_pace(second):
     whole = np.arccos(second[2])
     for part in (0.0, 0.25, 0.5, 1.0):
-        at = swung((0.0, 0.0, 1.0), second, part)
+        at = slerp((0.0, 0.0, 1.0), second, part)
         assert np.allclose(at, [np.sin(part * whole), 0, np.cos(part * whole)])
