@@ -2,8 +2,9 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
+PYTEST := $(BIN)/python -m pytest -q -n auto --maxprocesses 4 --dist loadfile
 
-.PHONY: demo serve test lint bench figures samples lock clean
+.PHONY: demo serve test test-all lint bench figures samples lock clean
 demo: $(VENV)/installed
 	$(BIN)/relit demo
 
@@ -11,7 +12,11 @@ serve: $(VENV)/installed
 	$(BIN)/relit demo --serve
 
 test: $(VENV)/installed-dev
-	$(BIN)/python -m pytest -q -n auto --maxprocesses 4 --dist loadfile
+	$(PYTEST) -m "not long"
+
+# with the long suites: workers and servers killed, databases restarted, load, random requests
+test-all: $(VENV)/installed-dev
+	$(PYTEST)
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff check .
