@@ -18,7 +18,8 @@ from kernels.photometric.samples import Samples, evenly, gather
 from kernels.photometric.svbrdf import average_normals, solve_svbrdf
 from kernels.status import Status
 from service.reporting.progress import Timings
-from service.solve.material import SPREAD_PIXELS, Parts, solve_material
+from service.solve.distant import SPREAD_PIXELS, MaterialOptions, solve_material
+from service.solve.solution import SolveInput
 from stage.capture import Capture
 from stage.colour import GREY_WEIGHTS
 from stage.importers import diligent
@@ -44,7 +45,7 @@ class Case:
     """The same pixels with the readings of one channel as their grey."""
     shape: Diffuse
     """The shared diffuse shape, chosen on SPREAD_PIXELS of them."""
-    whole: Callable[[Parts], np.ndarray]
+    whole: Callable[[MaterialOptions], np.ndarray]
     """Solves the whole image; [n, 3] of its normals."""
 
 
@@ -76,8 +77,8 @@ def load_case(name: str, capture: Capture, truth: np.ndarray, cache: Path) -> Ca
     few = solved[evenly(len(solved), SPREAD_PIXELS)]
     shape, _ = choose_diffuse(_gather(band, few, lights, factors, stack.light_count), robust[0][few])
 
-    def whole(parts: Parts) -> np.ndarray:
-        solution = solve_material(stack, lights, capture.camera, capture.mask(), "cpu", Timings(), parts=parts)
+    def whole(options: MaterialOptions) -> np.ndarray:
+        solution = solve_material(SolveInput(stack, capture.camera, capture.mask(), "cpu", Timings()), lights, options=options)
         return solution.normal[:, chosen[solved]].T
 
     return Case(name, truth.reshape(-1, 3)[chosen[solved]], lambert[0][solved], robust[0][solved], samples, channels, shape, whole)
@@ -103,8 +104,8 @@ VARIANTS: dict[str, Callable[[Case], np.ndarray]] = {
     "· the same with the three channels searched apart and averaged by cost (left out)": _channels_apart,
     "+ averaged over nearby shapes": lambda case: solve_svbrdf(case.samples, case.robust, shape=case.shape, single_lobe=False).normal,
     "+ a single lobe fitted jointly with the normal": lambda case: solve_svbrdf(case.samples, case.robust, shape=case.shape).normal,
-    "+ cast shadows of the height taken out": lambda case: case.whole(Parts(bounce=False)),
-    "+ light that the object throws on itself taken off, materials shared (`svbrdf`)": lambda case: case.whole(Parts()),
+    "+ cast shadows of the height taken out": lambda case: case.whole(MaterialOptions(interreflection=False)),
+    "+ light that the object throws on itself taken off, materials shared (`svbrdf`)": lambda case: case.whole(MaterialOptions()),
 }
 
 

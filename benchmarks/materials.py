@@ -7,19 +7,20 @@ import numpy as np
 
 from kernels.photometric.readings import pad_lights
 from service.reporting.progress import Timings
-from service.solve.material import Parts, solve_material
+from service.solve.distant import MaterialOptions, solve_material
+from service.solve.solution import SolveInput
 from stage import exr
 from stage.capture import Capture
 from stage.ingest import open_stack
 from stage.lighting import distant_lights
 
 
-def material_errors(folder: Path, parts: Parts) -> dict[str, tuple[float, float]]:
+def material_errors(folder: Path, options: MaterialOptions) -> dict[str, tuple[float, float]]:
     """Median and 90th percentile of errors over the solved pixels.
 
     Args:
         folder: a capture of distant lights with a truth.exr, a dielectric, or a metal where its name ends so.
-        parts: of the solver.
+        options: the steps of the solver that are left out.
 
     Returns:
         `albedo`, relative (only of a dielectric), `F0`, relative of a metal and absolute of a dielectric, `roughness`, absolute.
@@ -28,8 +29,8 @@ def material_errors(folder: Path, parts: Parts) -> dict[str, tuple[float, float]
     lit = distant_lights(capture)
     with tempfile.TemporaryDirectory() as cache:
         stack = open_stack(capture, cache=Path(cache))
-        solution = solve_material(stack, pad_lights(lit.direction, lit.irradiance, stack.scale), capture.camera, capture.mask(), "cpu",
-                                  Timings(), parts=parts)
+        solution = solve_material(SolveInput(stack, capture.camera, capture.mask(), "cpu", Timings()),
+                                  pad_lights(lit.direction, lit.irradiance, stack.scale), options=options)
     inside = np.flatnonzero(capture.mask())
 
     def plane(name: str) -> np.ndarray:
@@ -56,8 +57,9 @@ def material_table(glossy: Path) -> list[str]:
     lines = ["Error, median / 90th percentile; albedo and a metal's F0 relative, a dielectric's F0 (0.04) and roughness absolute:",
              "", "| | albedo | F0 | roughness |", "|---|---|---|---|"]
     for name in ("glossy", "glossy_metal"):
-        for what, parts in (("every pixel for itself", Parts(sharing=False)), ("materials shared (`svbrdf`)", Parts())):
-            errors = material_errors(glossy / name, parts)
+        for what, options in (("every pixel for itself", MaterialOptions(sharing=False)),
+                              ("materials shared (`svbrdf`)", MaterialOptions())):
+            errors = material_errors(glossy / name, options)
             relative = {"albedo"} if name == "glossy" else {"F0"}
             cells = [" / ".join(f"{100 * e:.2g} %" if key in relative else f"{e:.2g}" for e in errors[key]) if key in errors else "–"
                      for key in ("albedo", "F0", "roughness")]

@@ -10,7 +10,7 @@ import warp as wp
 from kernels.relight.occlusion import see_lights
 from kernels.relight.shading import Surface, upload_surface
 from service.solve.batches import view_directions
-from service.solve.material import projection_of
+from service.solve.surface import projection_of
 from stage.errors import ResultError
 from stage.maps import SurfaceMaps
 

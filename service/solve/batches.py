@@ -1,4 +1,4 @@
-"""Pixels of an image as samples, as many at a time as memory allows: what every solver that works hard per pixel walks over."""
+"""The pixels of an image as readings on the device, as many at a time as memory allows."""
 
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
@@ -6,64 +6,127 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels import packs
-from kernels.photometric.near import NearField
-from kernels.photometric.readings import Lights
+from kernels.photometric.near import Near, NearField, see_near
+from kernels.photometric.readings import Lights, Readings, grey_factors, grey_readings
 from kernels.photometric.samples import Samples, gather
-from service.solve.solution import READING_BYTES
+from kernels.status import Status
+from service.solve.solution import SolveInput
 from stage.camera import Camera
-from stage.stack import Stack
+from stage.colour import GREY_WEIGHTS
 
+READING_BYTES = 4
+"""A grey reading, per light and pixel, beside the stack's band."""
+NEAR_BYTES = READING_BYTES + 16
+"""The same where lights are near: with a direction and a falloff."""
 SAMPLE_FLOATS = 7
-"""Per light and pixel of the samples: grey and colour readings, direction."""
+"""Numbers per light and pixel of the samples: grey and colour readings, direction."""
 BATCH_BYTES = 256 << 20
-"""Of samples and lobes that are worked on at one time."""
+"""Memory for the samples and lobes that are worked on at one time."""
+LEAST_READINGS = 3
+"""Frames with a reading, dark or not, that a normal needs."""
 
 View = Callable[[np.ndarray], np.ndarray]
 """From pixel positions (row-major, [n]) to unit directions to the viewer [n, 3] float32."""
 
 
-class Batch(NamedTuple):
-    """Some pixels."""
+class ReadBand(NamedTuple):
+    """A band of the image with its readings on the device."""
 
-    where: np.ndarray  # [n] positions in the image
+    span: slice
+    """Its pixels, as row-major positions in the image."""
+    inside: np.ndarray  # [n] bool: which of these pixels are inside the mask
+    band: packs.Band
+    readings: Readings
+    near: Near | None
+    """Direction and falloff of each light at each pixel, where some light is near."""
+
+
+class Batch(NamedTuple):
+    """Chosen pixels with their readings on the device."""
+
+    pixels: np.ndarray  # [n] row-major positions in the image
     samples: Samples
 
 
-def pixel_batches(stack: Stack, lights: Lights, factors: np.ndarray, view: View, pixels: np.ndarray, device: str, *,
-                  lobes: int, field: NearField | None = None) -> Iterator[Batch]:
-    """Gather pixels of a stack, batch by batch.
+def bands(given: SolveInput, lights: Lights, field: NearField | None = None) -> Iterator[ReadBand]:
+    """Yield the image band by band, without the bands that lie outside the mask, and say how far it is.
 
     Args:
-        stack: the images.
-        lights: of the stack, padded.
-        factors: of readings.grey_factors.
-        view: of the camera.
-        pixels: [n] positions, ascending.
-        device: where.
-        lobes: values that the search keeps for each light and pixel.
+        given: the images.
+        lights: lights of the stack, padded.
         field: where the lights are, where some light is near.
     """
+    stack, inside = given.stack, given.mask.reshape(-1)
+    factors = grey_factors(lights, GREY_WEIGHTS)
+    for start, stop in stack.bands((READING_BYTES if field is None else NEAR_BYTES) * stack.shape[1]):
+        span = slice(start, min(stop, stack.pixel_count))
+        if inside[span].any():
+            band = packs.upload(stack.band(start, stop), stack.saturated(start, stop), device=given.device)
+            readings = grey_readings(band, factors)
+            near = None if field is None else see_near(band, readings, field.at(np.arange(start, stop)))
+            yield ReadBand(span, inside[span], band, readings, near)
+        given.timings.advance(stop)
+
+
+def pixel_batches(given: SolveInput, lights: Lights, view: View, pixels: np.ndarray, *, lobes: int,
+                  field: NearField | None = None) -> Iterator[Batch]:
+    """Yield pixels of the images with their readings, batch by batch.
+
+    Args:
+        given: the images.
+        lights: lights of the stack, padded.
+        view: directions to the viewer.
+        pixels: [n] positions, ascending.
+        lobes: values that the solver keeps for each light and pixel.
+        field: where the lights are, where some light is near.
+    """
+    stack, factors = given.stack, grey_factors(lights, GREY_WEIGHTS)
     size = max(1, BATCH_BYTES // (4 * (SAMPLE_FLOATS + lobes) * stack.light_count))
     for start, stop in stack.bands(READING_BYTES * stack.shape[1]):
         local = pixels[(pixels >= start) & (pixels < stop)] - start
         if not len(local):
             continue
-        band = packs.upload(stack.band(start, stop), stack.saturated(start, stop), device=device)
+        band = packs.upload(stack.band(start, stop), stack.saturated(start, stop), device=given.device)
         for first in range(0, len(local), size):
             part = local[first : first + size]
-            where = start + part
-            yield Batch(where, gather(band, part, view(where), lights, factors, stack.light_count,
-                                      None if field is None else field.at(where)))
+            chosen = start + part
+            yield Batch(chosen, gather(band, part, view(chosen), lights, factors, stack.light_count,
+                                       None if field is None else field.at(chosen)))
+
+
+def pick_pixels(given: SolveInput, lights: Lights, view: View, pixels: np.ndarray, field: NearField | None = None) -> Samples:
+    """Return the readings of a few pixels, wherever they lie in the image.
+
+    Args:
+        given: the images.
+        lights: lights of the stack, padded.
+        view: directions to the viewer.
+        pixels: [n] positions.
+        field: where the lights are, where some light is near.
+    """
+    band = packs.upload(*given.stack.pick(pixels), device=given.device)
+    return gather(band, np.arange(len(pixels)), view(pixels), lights, grey_factors(lights, GREY_WEIGHTS), given.stack.light_count,
+                  None if field is None else field.at(pixels))
+
+
+def readable(samples: Samples) -> np.ndarray:
+    """Return [n] uint8 status: OK where enough frames have a reading and one of them is above zero. Waits for the device."""
+    width = (samples.packs, samples.light_count) if samples.light_stride == 1 else (samples.light_count, samples.packs)
+    values = samples.grey.numpy().reshape(*width, samples.lanes)
+    values = values.transpose(1, 0, 2) if samples.light_stride == 1 else values
+    values = values.reshape(samples.light_count, -1)[:, : samples.pixel_count]
+    status = np.where((values > 0).any(axis=0), int(Status.OK), int(Status.DARK))
+    return np.where((values >= 0).sum(axis=0) >= LEAST_READINGS, status, int(Status.TOO_FEW_LIGHTS)).astype(np.uint8)
 
 
 def view_directions(camera: Camera) -> View:
-    """Where the viewer is from each pixel."""
+    """Return the function that gives the direction from each pixel's surface point to the viewer."""
     if camera.projection == "orthographic":
-        return lambda positions: np.tile(np.array([0, 0, 1], dtype=np.float32), (len(positions), 1))
+        return lambda pixels: np.tile(np.array([0, 0, 1], dtype=np.float32), (len(pixels), 1))
     x, y = (plane.reshape(-1) for plane in camera.plane_coordinates())
 
-    def towards(positions: np.ndarray) -> np.ndarray:
-        rays = np.stack([-x[positions], -y[positions], np.ones(len(positions))], axis=1)
+    def toward(pixels: np.ndarray) -> np.ndarray:
+        rays = np.stack([-x[pixels], -y[pixels], np.ones(len(pixels))], axis=1)
         return (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
 
-    return towards
+    return toward

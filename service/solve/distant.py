@@ -1,52 +1,169 @@
-"""Stack → normals and reflectance by the methods that take one light a frame, band by band."""
+"""Normals and reflectance by the methods that take one light a frame: `lambert` and `robust`, and `svbrdf`, which fits a material.
+
+svbrdf walks over the image several times: a first search, the height that its normals give, the shadows and the interreflection
+that follow from this height, the materials that pixels share, and the final solve.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
+import warp as wp
 
-from kernels import packs
 from kernels.photometric.albedo import fit_albedo
+from kernels.photometric.bounce import subtract_bounce
+from kernels.photometric.diffuse_shape import choose_diffuse
+from kernels.photometric.hypotheses import Diffuse, search_normals
 from kernels.photometric.lambert import solve_lambert
-from kernels.photometric.near import NearField, see_near
-from kernels.photometric.readings import Lights, grey_factors, grey_readings
+from kernels.photometric.lobes import GEOMETRY, MIXTURE
+from kernels.photometric.material import fit_tinted
+from kernels.photometric.near import NearField
+from kernels.photometric.readings import Lights, channel_weights, pad_lights
 from kernels.photometric.robust import solve_robust
-from service.reporting.progress import Timings
+from kernels.photometric.samples import Samples, evenly
+from kernels.photometric.shadowing import exclude_shadows
+from kernels.photometric.shared_materials import choose_materials
+from kernels.photometric.svbrdf import solve_svbrdf
+from kernels.status import Status
 from service.requests.solve import Method
-from service.solve.material import solve_material
-from service.solve.solution import NEAR_BYTES, READING_BYTES, Solution
-from stage.camera import Camera
+from service.solve.batches import Batch, bands, pick_pixels, pixel_batches, view_directions
+from service.solve.interreflection import arriving_light
+from service.solve.solution import Solution, SolveInput, suspect_lights
+from service.solve.surface import integrate, projection_of
 from stage.colour import GREY_WEIGHTS
-from stage.stack import Stack
+from stage.point_lights import DistantLights
+
+SPREAD_PIXELS = 384
+"""Pixels, spread over the object, from which the shape of the diffuse lobe and the shared materials are chosen."""
+LARGEST_ALBEDO = 0.98
+"""The part of light that a surface can send on; a fitted albedo may be larger where the scale of the lights is not absolute."""
 
 
-def solve_normals(method: Method, stack: Stack, lights: Lights, camera: Camera, mask: np.ndarray, device: str,
-                  timings: Timings, field: NearField | None = None) -> Solution:
+@dataclass(frozen=True)
+class MaterialOptions:
+    """Steps of the svbrdf solver that can be left out, to measure what each contributes."""
+
+    shadows: bool = True
+    """Leave out readings in cast shadow."""
+    interreflection: bool = True
+    """Subtract the light that the object throws on itself."""
+    sharing: bool = True
+    """Let pixels share materials."""
+
+
+WHOLE_SOLVER = MaterialOptions()
+
+
+def solve_distant(given: SolveInput, lights: DistantLights, *, method: Method) -> Solution:
+    """Solve every pixel of the mask under distant lights, and name the lights that disagree with the others.
+
+    Args:
+        given: the images.
+        lights: lights of the stack.
+        method: lambert, robust or svbrdf.
+    """
+    padded = pad_lights(lights.direction, lights.irradiance, given.stack.scale)
+    solution = solve_normals(given, padded, method)
+    solution.suspects = suspect_lights(solution, given.stack, padded)
+    return solution
+
+
+def solve_normals(given: SolveInput, lights: Lights, method: Method, field: NearField | None = None) -> Solution:
     """Solve every pixel of the mask with one of the methods that take one light a frame.
 
     Args:
+        given: the images.
+        lights: lights of the stack, padded.
         method: lambert, robust or svbrdf.
-        stack: the images.
-        lights: of the stack, padded.
-        camera: of the capture; says which way the viewer is.
-        mask: [rows, cols] bool.
-        device: where.
-        timings: told of every stage.
-        field: where the lights are, and the point of each pixel, where some light is near.
+        field: where the lights are, and the surface point of each pixel, where some light is near.
     """
     if method is Method.SVBRDF:
-        return solve_material(stack, lights, camera, mask, device, timings, field)
+        return solve_material(given, lights, field)
     solver = {Method.LAMBERT: solve_lambert, Method.ROBUST: solve_robust}[method]
-    timings.stage("normals", stack.shape[2])
+    given.timings.stage("normals", given.stack.shape[2])
+    result = Solution.empty(given.stack.pixel_count)
+    for span, inside, band, readings, near in bands(given, lights, field):
+        fit = solver(band, readings, lights.direction, near)
+        result.place(span, inside, fit)
+        albedo = fit_albedo(band, readings, fit, lights, near).numpy()[:, : len(inside)]
+        result.albedo[:, span] = np.where(inside, albedo, 0)
+    return result
+
+
+def solve_material(given: SolveInput, lights: Lights, field: NearField | None = None,
+                   options: MaterialOptions = WHOLE_SOLVER) -> Solution:
+    """Solve every pixel of the mask for normal, diffuse albedo, F0 and roughness.
+
+    Args:
+        given: the images.
+        lights: lights of the stack, padded.
+        field: where the lights are, and the surface point of each pixel, where some light is near; then interreflection is not
+            subtracted.
+        options: the steps that are left out.
+    """
+    stack, timings, view = given.stack, given.timings, view_directions(given.camera)
     result = Solution.empty(stack.pixel_count)
-    factors = grey_factors(lights, GREY_WEIGHTS)
-    inside = mask.reshape(-1)
-    for start, stop in stack.bands((READING_BYTES if field is None else NEAR_BYTES) * stack.shape[1]):
-        here = slice(start, min(stop, stack.pixel_count))
-        if inside[here].any():
-            band = packs.upload(stack.band(start, stop), stack.saturated(start, stop), device=device)
-            readings = grey_readings(band, factors)
-            near = None if field is None else see_near(band, readings, field.at(np.arange(start, stop)))
-            fit = solver(band, readings, lights.direction, near)
-            result.place(here, inside[here], fit)
-            albedo = fit_albedo(band, readings, fit, lights, near).numpy()[:, : here.stop - start]
-            result.albedo[:, here] = np.where(inside[here], albedo, 0)
-        timings.advance(stop)
+    result.specular = np.zeros((3, stack.pixel_count), np.float16)
+    result.roughness = np.zeros(stack.pixel_count, np.float16)
+    timings.stage("start", stack.shape[2])
+    for span, inside, band, readings, near in bands(given, lights, field):
+        result.place(span, inside, solve_robust(band, readings, lights.direction, near))
+    solvable = np.flatnonzero(result.status == Status.OK)
+    spread = solvable[evenly(len(solvable), SPREAD_PIXELS)] if len(solvable) else solvable
+    timings.stage("shape", 1)
+    shape = Diffuse()
+    if len(spread):
+        shape, tried = choose_diffuse(pick_pixels(given, lights, view, spread, field), result.normal[:, spread].T)
+        result.facts = {"diffuse_roughness": None if shape.rough < 0 else shape.rough, "diffuse_slope": shape.slope,
+                        "shapes_tried": len(tried)}
+
+    def batches(phase: str) -> Iterator[Batch]:
+        timings.stage(phase, len(solvable))
+        done = 0
+        for batch in pixel_batches(given, lights, view, solvable, lobes=MIXTURE + GEOMETRY, field=field):
+            yield batch
+            done += len(batch.pixels)
+            timings.advance(done)
+
+    interreflection = options.interreflection and field is None
+    for pixels, samples in batches("search"):
+        normal = search_normals(samples, result.normal[:, pixels].T, shape=shape).normal
+        result.normal[:, pixels] = normal.T
+        if interreflection:
+            first = fit_tinted(samples, normal, shape=shape)
+            result.albedo[:, pixels], result.roughness[pixels] = first.diffuse_albedo.T, first.roughness
+    solved = (result.status == Status.OK).reshape(given.mask.shape)
+    surface = integrate(given, result.normal, solved, phase="surface")
+    on_device = wp.array(solved.astype(np.uint8), dtype=wp.uint8, device=given.device)
+    projection, arriving = projection_of(given.camera), None
+    if interreflection and surface is not None:
+        arriving = arriving_light(given, lights, result.normal, surface.height, solved)
+
+    def clean(pixels: np.ndarray, samples: Samples) -> None:
+        """Take cast shadows and interreflection, which follow from the height, out of the readings."""
+        assert surface is not None  # there are pixels
+        if options.shadows:
+            exclude_shadows(samples, pixels, surface.height, on_device, projection, None if field is None else field.places)
+        if arriving is not None:
+            corners, shares = arriving.at(*np.divmod(pixels, given.camera.width))
+            albedo = np.minimum(result.albedo[:, pixels].T.astype(np.float32), LARGEST_ALBEDO)
+            subtract_bounce(samples, arriving.light, corners, shares, albedo, channel_weights(lights, GREY_WEIGHTS))
+
+    materials = None
+    if options.sharing and len(spread):
+        samples = pick_pixels(given, lights, view, spread, field)
+        clean(spread, samples)
+        materials = choose_materials(samples, result.normal[:, spread].T, shape=shape)
+        result.facts["shared_materials"] = [{"specular": material[:3].tolist(), "roughness": float(material[3])}
+                                            for material in materials.round(4).astype(float)]
+    for pixels, samples in batches("normals"):
+        clean(pixels, samples)
+        found = solve_svbrdf(samples, result.normal[:, pixels].T, shape=shape, shared=materials,
+                             roughness=result.roughness[pixels].astype(np.float32) if interreflection else None)
+        result.normal[:, pixels] = found.normal.T
+        result.albedo[:, pixels] = found.diffuse_albedo.T
+        result.specular[:, pixels] = found.specular.T
+        result.roughness[pixels] = found.roughness
+        result.confidence[pixels] = found.confidence
+        result.residual[pixels] = found.residual
     return result

@@ -1,4 +1,4 @@
-"""Spherical gradient frames → diffuse and specular normals, albedo and, behind polarisers, F₀ and roughness, band by band."""
+"""Diffuse and specular normals, albedo and, behind polarisers, F₀ and roughness from spherical gradient frames, band by band."""
 
 from typing import Any
 
@@ -10,9 +10,8 @@ from kernels.photometric.highlight import fit_highlights, specular_normals
 from kernels.photometric.moments import Moments, fit_moments
 from kernels.photometric.separation import separate_by_colour, separate_polarised
 from kernels.status import Status
-from service.reporting.progress import Timings
 from service.solve.batches import view_directions
-from service.solve.solution import Solution
+from service.solve.solution import Solution, SolveInput
 from stage.camera import Camera
 from stage.colour import GREY_WEIGHTS
 from stage.gradients import GradientFrames
@@ -23,27 +22,22 @@ BYTES_PER_PIXEL = 400
 CROSSED_GAIN = 2.0
 """A crossed analyser passes half of the diffuse light, which has lost its polarisation (Malus)."""
 MIN_DIFFUSE = 0.01
-"""Diffuse over specular light, below which a pixel is metal: what is left of the diffuse is noise, and its direction too."""
+"""Ratio of diffuse to specular light below which a pixel is metal: what is left of the diffuse is noise, and its direction too."""
 METAL_CONFIDENCE = 0.2
-"""Of a normal that only a highlight tells: a standard error of four degrees, since no second reading checks the lobe."""
+"""Confidence of a normal that only a highlight tells: a standard error of four degrees, since no second reading checks the lobe."""
 
 
-def solve_gradients(frames: GradientFrames, stack: Stack, camera: Camera, mask: np.ndarray, device: str,
-                    timings: Timings) -> Solution:
-    """Solve the gradient frames of a stack.
+def solve_gradients(given: SolveInput, frames: GradientFrames) -> Solution:
+    """Solve every pixel of the mask from gradient frames.
 
     Args:
+        given: the images.
         frames: which frames of the stack measure what.
-        stack: the ingested capture.
-        camera: for the lines of sight.
-        mask: [rows, cols] bool.
-        device: where.
-        timings: told of every band.
     """
-    timings.stage("normals", stack.shape[2])
+    stack, device, inside = given.stack, given.device, given.mask.reshape(-1)
+    given.timings.stage("normals", stack.shape[2])
     pixels = stack.pixel_count
-    view = view_vectors(camera, stack.shape[2])
-    inside = mask.reshape(-1)
+    view = view_vectors(given.camera, stack.shape[2])
     result = Solution.empty(pixels)
     if not frames.polarised or frames.parallel is not None:
         result.specular_normal = np.zeros((3, pixels), np.float32)
@@ -81,7 +75,7 @@ def solve_gradients(frames: GradientFrames, stack: Stack, camera: Camera, mask: 
                 metal[here] = _take_highlight(result, here, parts.specular.numpy()[:3, : len(kept)])
                 result.residual[here] = np.where(metal[here], parallel.residual.numpy()[: len(kept)], result.residual[here])
             separated[here] = kept & (diffuse.tilt.numpy()[: len(kept)] == 0)
-        timings.advance(stop)
+        given.timings.advance(stop)
     result.facts = _facts(frames, result, length, separated, metal)
     if result.specular_normal is not None and not result.specular_normal.any():
         result.specular_normal = None  # a layer that holds nothing is absent
@@ -89,7 +83,7 @@ def solve_gradients(frames: GradientFrames, stack: Stack, camera: Camera, mask: 
 
 
 def view_vectors(camera: Camera, padded: int) -> np.ndarray:
-    """Unit vectors from the surface to the camera: [3, padded] float32, 0 in the padding, or [3, 1] when all are the same."""
+    """Return unit vectors from the surface to the camera: [3, padded] float32, 0 in the padding, or [3, 1] when all are the same."""
     if camera.projection == "orthographic":
         return np.array([[0.0], [0.0], [1.0]], dtype=np.float32)
     toward = view_directions(camera)(np.arange(camera.width * camera.height)).T
@@ -98,7 +92,7 @@ def view_vectors(camera: Camera, padded: int) -> np.ndarray:
 
 def _facts(frames: GradientFrames, result: Solution, length: np.ndarray, separated: np.ndarray,
            metal: np.ndarray) -> dict[str, Any]:
-    """What the report says beside the statistics that every method has."""
+    """Return what the report says beside the statistics that every method has."""
     solved = result.status == Status.OK
     how = "colour" if not frames.polarised else "polarisation" if frames.parallel is not None else "crossed polariser"
     facts: dict[str, Any] = {"separation": how, "pixels_separated": int((solved & separated).sum()),
@@ -107,14 +101,14 @@ def _facts(frames: GradientFrames, result: Solution, length: np.ndarray, separat
         facts["pixels_with_specular_normal"] = int((solved & result.specular_normal.any(axis=0)).sum())
         facts["pixels_by_highlight_alone"] = int(metal.sum())
     solved &= ~metal
-    if solved.any():  # of the response vector, (3/2)|M|/M0: one on a convex Lambertian surface
+    if solved.any():  # the length of the response vector, (3/2)|M|/M0, is one on a convex Lambertian surface
         middle, low = np.percentile(length[solved], [50, 5])
         facts["response_length"] = {"median": round(float(middle), 5), "p5": round(float(low), 5)}
     return facts
 
 
 def _take_highlight(result: Solution, here: slice, specular: np.ndarray) -> np.ndarray:
-    """Where the highlight is all there is, as on metal, its normal is the normal; says where."""
+    """Take the normal of the highlight where there is no diffuse light, as on metal, and return [n] bool where that is."""
     assert result.specular_normal is not None
     normal = result.specular_normal[:, here]
     metal = normal.any(axis=0) & (result.albedo[:, here].astype(np.float32).sum(axis=0) <= MIN_DIFFUSE * specular.sum(axis=0))
@@ -125,7 +119,7 @@ def _take_highlight(result: Solution, here: slice, specular: np.ndarray) -> np.n
 
 
 def _keep(target: np.ndarray | None, here: slice, kept: np.ndarray, found: Any) -> None:
-    """Bring a band's result over; 0 outside the mask, which as a status is UNSOLVED."""
+    """Store the result of a band; 0 outside the mask, which as a status is UNSOLVED."""
     assert target is not None
     target[..., here] = np.where(kept, found.numpy()[..., : len(kept)], 0)
 

@@ -1,7 +1,8 @@
-"""The light that an object throws on itself, from its height, normals and albedo and from its own pictures.
+"""The light that an object throws on itself, from its height and normals and from its own images.
 
-The picture is cut into square patches; their radiance under each light is measured, so that all bounces are in it, and form
-factors carry it from patch to patch. What arrives is interpolated between patches and taken off the readings of each pixel.
+The image is cut into square patches. Their radiance under each light is measured, so that all bounces are in it, and form factors
+carry it from patch to patch (kernels/surface/interreflection.py). The light that arrives is interpolated between patches and
+subtracted from the readings of each pixel (kernels/photometric/bounce.py).
 """
 
 import math
@@ -12,12 +13,12 @@ import warp as wp
 
 from kernels.photometric.readings import Lights
 from kernels.surface.interreflection import form_factors
-from kernels.surface.shadows import Projection
-from stage.camera import Camera
+from service.solve.solution import SolveInput
+from service.solve.surface import projection_of
 from stage.stack import Stack
 
 PATCHES = 2500
-"""At the most: pairs grow with their square, and twice as many change normals by a few hundredths of a degree."""
+"""Most patches: pairs grow with their square, and twice as many change normals by a few hundredths of a degree."""
 PIXELS_PER_PATCH = 9
 """Pixels whose mean stands for the radiance of a patch."""
 LEAST_COVER = 0.5
@@ -27,14 +28,15 @@ LEAST_FACING = 0.15
 
 
 class ArrivingLight(NamedTuple):
-    """What arrives at each patch, and how pixels lie between patches."""
+    """The light that arrives at each patch of the image, to interpolate between patches."""
 
-    light: np.ndarray  # [patches, 3, lights] float32, per irradiance; sent on by albedo 1
-    numbers: np.ndarray  # [rows, cols] of patches, int; -1 where there is none
+    light: np.ndarray  # [patches, 3, lights] float32: radiance that albedo 1 sends on / irradiance of the light
+    numbers: np.ndarray  # [rows, cols] int: the number of each patch; -1 where there is none
     side: int
+    """Pixels along a side of a patch."""
 
     def at(self, rows: np.ndarray, cols: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The four patches about pixels and their bilinear shares; a missing one gives its share to the others.
+        """Return the four patches around each pixel and their bilinear shares; a missing patch gives its share to the others.
 
         Args:
             rows, cols: [n] pixel positions.
@@ -55,23 +57,17 @@ class ArrivingLight(NamedTuple):
         return np.stack(corners, axis=1), (np.stack(shares, axis=1) / np.maximum(total, 1e-6)[:, None]).astype(np.float32)
 
 
-def arriving_light(stack: Stack, lights: Lights, camera: Camera, projection: Projection, normal: np.ndarray, height: wp.array,
-                   solved: np.ndarray, device: str) -> ArrivingLight | None:
-    """Compute what the object throws on itself.
+def arriving_light(given: SolveInput, lights: Lights, normal: np.ndarray, height: wp.array, solved: np.ndarray) -> ArrivingLight | None:
+    """Return the light that the object throws on itself, or None when the solved pixels cover fewer than two patches.
 
     Args:
-        stack: the images.
+        given: the images.
         lights: distant lights of the stack, padded.
-        camera: of the capture.
-        projection: of the camera.
         normal: [3, pixels] float32.
         height: [rows, cols] float32 on the device.
         solved: [rows, cols] bool.
-        device: where.
-
-    Returns:
-        The light, or None when fewer than two patches are covered.
     """
+    camera, projection = given.camera, projection_of(given.camera)
     rows, cols = solved.shape
     side = max(1, math.ceil(math.sqrt(solved.sum() / PATCHES)))
     shape = (-(-rows // side), -(-cols // side))
@@ -97,16 +93,16 @@ def arriving_light(stack: Stack, lights: Lights, camera: Camera, projection: Pro
     to_viewer = -centres / np.linalg.norm(centres, axis=1, keepdims=True) if perspective else np.array([[0.0, 0.0, 1.0]])
     pixel = (-centres[:, 2] if perspective else np.ones(len(kept))) / float(np.mean(projection.scale))
     areas = count[kept] * pixel**2 / np.maximum((facing * to_viewer).sum(axis=1), LEAST_FACING)
-    factors = form_factors(centres, facing, areas, height, wp.array(solved.astype(np.uint8), dtype=wp.uint8, device=device),
-                           projection, device=device)
-    radiance = _patch_radiance(stack, lights, pixels, patch, len(kept))
+    on_device = wp.array(solved.astype(np.uint8), dtype=wp.uint8, device=given.device)
+    factors = form_factors(centres, facing, areas, height, on_device, projection, device=given.device)
+    radiance = _patch_radiance(given.stack, lights, pixels, patch, len(kept))
     matrix = factors.numpy()
     light = np.stack([matrix @ radiance[:, channel] for channel in range(3)], axis=1)
     return ArrivingLight(light.astype(np.float32), number.reshape(shape), side)
 
 
 def _patch_radiance(stack: Stack, lights: Lights, pixels: np.ndarray, patch: np.ndarray, patches: int) -> np.ndarray:
-    """[patches, 3, lights] float32: mean radiance / irradiance of a few pixels of each patch, evenly chosen."""
+    """Return [patches, 3, lights] float32: mean radiance / irradiance of a few pixels of each patch, evenly chosen."""
     order = np.argsort(patch, kind="stable")
     sizes = np.bincount(patch, minlength=patches)
     first = np.cumsum(sizes) - sizes

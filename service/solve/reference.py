@@ -1,69 +1,59 @@
-"""Normals from a reference ball over an image: its readings as a table, then the search, batch by batch."""
-
-from pathlib import Path
+"""Normals from a reference ball of the object's material: its readings as a table, then a search in it, batch by batch."""
 
 import numpy as np
 
-from kernels.photometric.readings import grey_factors, pad_lights
+from kernels.photometric.readings import pad_lights
 from kernels.photometric.reference_table import reference_table, solve_reference
 from kernels.photometric.response_table import SEARCH_LOBES, nodes
 from kernels.status import Status
-from service.reporting.progress import Timings
-from service.solve.batches import pixel_batches, view_directions
-from service.solve.extended import readable
-from service.solve.solution import Solution
-from stage.camera import Camera
+from service.solve.batches import pixel_batches, readable, view_directions
+from service.solve.solution import Solution, SolveInput
 from stage.colour import GREY_WEIGHTS
 from stage.ingest import open_stack
 from stage.reference_ball import ReferenceBall
 from stage.stack import Stack
 
 CACHE_FOLDER = "reference"
-"""Of the ball's stack, inside the folder that --cache names."""
+"""Folder of the ball's stack, inside the folder that --cache names."""
 
 
-def solve_by_reference(stack: Stack, ball: ReferenceBall, camera: Camera, mask: np.ndarray, cache: Path | None, device: str,
-                       timings: Timings) -> Solution:
-    """Solve every pixel of the mask: the normal, and nothing of its reflectance.
+def solve_by_reference(given: SolveInput, ball: ReferenceBall) -> Solution:
+    """Solve every pixel of the mask for its normal alone.
 
     Args:
-        stack: the images.
-        ball: under the same lights.
-        camera: of the capture.
-        mask: [rows, cols] bool.
-        cache: folder for the ball's stack cache; None: `.relit` in its folder.
-        device: where.
-        timings: told of every stage.
+        given: the images.
+        ball: the ball under the same lights.
     """
-    count = stack.light_count
+    stack, timings, count = given.stack, given.timings, given.stack.light_count
     timings.stage("reference", count)
-    theirs = open_stack(ball.capture, cache=None if cache is None else cache / CACHE_FOLDER,
-                        progress=lambda done, _: timings.advance(done))
-    readings = ball_readings(theirs, ball)
+    ball_stack = open_stack(ball.capture, cache=None if given.cache is None else given.cache / CACHE_FOLDER,
+                            progress=lambda done, _: timings.advance(done))
+    readings = ball_readings(ball_stack, ball)
     strength = np.maximum(readings.mean(axis=0), 1e-20)  # lights in units of what the ball returns on average
-    table = reference_table(readings / strength, device)
+    table = reference_table(readings / strength, given.device)
     padded = pad_lights(np.tile([0.0, 0.0, 1.0], (count, 1)), np.repeat(strength[:, None], 3, axis=1), stack.scale)
-    factors, view = grey_factors(padded, GREY_WEIGHTS), view_directions(camera)
-    inside = np.flatnonzero(mask.reshape(-1))
+    view = view_directions(given.camera)
+    inside = np.flatnonzero(given.mask.reshape(-1))
     result = Solution.empty(stack.pixel_count)
-    result.facts = {"reference": {"capture": str(ball.capture.folder), "content": theirs.key,
+    result.facts = {"reference": {"capture": str(ball.capture.folder), "content": ball_stack.key,
                                   "radius_px": round(ball.ball.radius_px, 2),
                                   "outline_error_px": round(ball.ball.outline_error_px, 4)}}
     timings.stage("normals", len(inside))
-    for where, samples in pixel_batches(stack, padded, factors, view, inside, device, lobes=SEARCH_LOBES):
-        found = solve_reference(samples, table, view(where))
+    for pixels, samples in pixel_batches(given, padded, view, inside, lobes=SEARCH_LOBES):
+        found = solve_reference(samples, table, view(pixels))
         status = readable(samples)
         ok = status == Status.OK
-        result.status[where] = status
-        result.normal[:, where[ok]] = found.normal.T[:, ok]
-        result.confidence[where[ok]] = found.confidence[ok]
-        result.residual[where[ok]] = found.residual[ok]
-        timings.advance(int(np.searchsorted(inside, where[-1])) + 1)
+        kept = pixels[ok]
+        result.status[pixels] = status
+        result.normal[:, kept] = found.normal.T[:, ok]
+        result.confidence[kept] = found.confidence[ok]
+        result.residual[kept] = found.residual[ok]
+        timings.advance(int(np.searchsorted(inside, pixels[-1])) + 1)
     return result
 
 
 def ball_readings(stack: Stack, ball: ReferenceBall) -> np.ndarray:
-    """[nodes, lights] grey radiance of the ball at the normals of the table, bilinear; not negative."""
+    """Return [nodes, lights] the grey radiance of the ball at the normals of the table, bilinear and not negative."""
     width, height = ball.capture.camera.resolution
     column, row = ball.pixel_of(nodes())
     left = np.clip(np.floor(column).astype(int), 0, width - 2)

@@ -1,23 +1,62 @@
-"""What every solver of a whole image gives back."""
+"""What every solver takes and returns, and what is said about a solution afterwards: pixels in doubt, lights that do not fit."""
 
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from kernels.photometric.lambert import NormalFit
+from kernels.photometric.readings import Lights, channel_weights
+from kernels.photometric.samples import evenly
 from kernels.status import Status
+from kernels.surface.integrate import Integration
+from service.reporting.progress import Timings
+from stage.camera import Camera
+from stage.colour import GREY_WEIGHTS
+from stage.stack import Stack
 
-READING_BYTES = 4
-"""A grey reading, per light and pixel, beside the stack's band."""
+LOOSE_CONFIDENCE = 1.0 / (1.0 + 5.0)
+"""Confidence of a normal whose standard error is five degrees."""
+PIXELS_AT_ONCE = 1 << 16
+"""Pixels whose saturation bits are counted in one piece: bounds the memory."""
 
-NEAR_BYTES = READING_BYTES + 16
-"""The same where lights are near: with a direction and a falloff."""
+SUSPECT_PIXELS = 512
+"""Pixels, spread over the object, by which the lights are compared."""
+LEAST_COSINE = 0.25
+"""Lights lower over the surface are not compared: shadows and grazing reflection are no fault of theirs."""
+LEAST_TOWARDS = 0.4
+"""Lights further round than this cosine to the view axis are not judged: rims reflect them like mirrors, and most pixels are hidden."""
+LEAST_PIXELS = 20
+"""A light that fewer of these pixels see is not judged."""
+SUSPECT_OFF, SUSPECT_TIMES = 0.1, 4.0
+"""A light is suspect when its median relative misfit is above the first, and above the second times that of all lights."""
+
+
+@dataclass(frozen=True)
+class SolveInput:
+    """The images of a capture, and how they are worked on."""
+
+    stack: Stack
+    camera: Camera
+    mask: np.ndarray  # [rows, cols] bool: the pixels to solve
+    device: str
+    timings: Timings
+    cache: Path | None = None
+    """Folder for stack caches; None: `.relit` in the folder of each capture."""
+
+
+class SuspectLight(NamedTuple):
+    """A light that disagrees with the others."""
+
+    image: str
+    misfit: float
+    """Median over pixels of |reading / (level · n·l) - 1|, the level being the pixel's own median over its lights."""
 
 
 @dataclass
 class Solution:
-    """What was found at every pixel of the image; only pixels with a status of kernels.status.SOLVED have values."""
+    """What a solver found at every pixel of the image; only pixels with a status of kernels.status.SOLVED have values."""
 
     normal: np.ndarray  # [3, pixels] float32
     albedo: np.ndarray  # [3, pixels] float16
@@ -28,25 +67,87 @@ class Solution:
     roughness: np.ndarray | None = None  # [pixels] float16
     specular_normal: np.ndarray | None = None  # [3, pixels] float32
     regime: np.ndarray | None = None  # [pixels] uint8, codes of kernels.photometric.sampling.Regime
+    height: np.ndarray | None = None  # [rows, cols] float32, camera-frame z, 0 where not solved; None: not integrated yet
+    integration: Integration | None = None
+    """The last integration of the normals, from which the height came."""
+    suspects: list[SuspectLight] = field(default_factory=list)
     facts: dict[str, Any] = field(default_factory=dict)
-    """For the report."""
+    """What the report says under `found`."""
 
     @classmethod
     def empty(cls, pixels: int) -> "Solution":
-        """Nothing solved yet."""
+        """Return a solution in which no pixel is solved."""
         return cls(np.zeros((3, pixels), np.float32), np.zeros((3, pixels), np.float16), np.zeros(pixels, np.float16),
                    np.zeros(pixels, np.float16), np.zeros(pixels, np.uint8))
 
-    def place(self, here: slice, kept: np.ndarray, fit: NormalFit) -> None:
-        """Take over the normals of a band.
+    def place(self, span: slice, inside: np.ndarray, fit: NormalFit) -> None:
+        """Store the normals of a band.
 
         Args:
-            here: its pixels.
-            kept: [n] bool, which of them are inside the mask.
-            fit: of the band, padded.
+            span: its pixels.
+            inside: [n] bool, which of them are inside the mask.
+            fit: normals of the band, with padding.
         """
-        count = len(kept)
-        self.normal[:, here] = np.where(kept, fit.normal.numpy()[:, :count], 0)
-        self.confidence[here] = np.where(kept, fit.confidence.numpy()[:count], 0)
-        self.residual[here] = np.where(kept, fit.residual.numpy()[:count], 0)
-        self.status[here] = np.where(kept, fit.status.numpy()[:count], int(Status.UNSOLVED))
+        count = len(inside)
+        self.normal[:, span] = np.where(inside, fit.normal.numpy()[:, :count], 0)
+        self.confidence[span] = np.where(inside, fit.confidence.numpy()[:count], 0)
+        self.residual[span] = np.where(inside, fit.residual.numpy()[:count], 0)
+        self.status[span] = np.where(inside, fit.status.numpy()[:count], int(Status.UNSOLVED))
+
+
+def mark_not_facing(camera: Camera, solution: Solution) -> None:
+    """Set the status NOT_FACING where a normal points away from its line of sight: a visible surface cannot."""
+    x, y, toward = solution.normal
+    if camera.projection == "perspective":
+        right, up = (plane.reshape(-1) for plane in camera.plane_coordinates())
+        toward = toward - x * right - y * up
+    solution.status[(solution.status == Status.OK) & (toward <= 0)] = Status.NOT_FACING
+
+
+def refine_status(solution: Solution, stack: Stack) -> None:
+    """Say why pixels have too few lights, and which normals are uncertain, by the status of these pixels.
+
+    Pixels with too few lights become SATURATED where one reading or more saturates, else SHADOWED; solved pixels with a
+    confidence under 1/6 become AMBIGUOUS and keep their values.
+    """
+    few = np.flatnonzero(solution.status == Status.TOO_FEW_LIGHTS)
+    for first in range(0, len(few), PIXELS_AT_ONCE):
+        part = few[first : first + PIXELS_AT_ONCE]
+        bits = stack.pick_saturated(part)
+        saturated = np.unpackbits(bits, axis=0, bitorder="little")[: stack.light_count].sum(axis=0)
+        solution.status[part] = np.where(saturated >= 1, int(Status.SATURATED), int(Status.SHADOWED))
+    loose = (solution.status == Status.OK) & (solution.confidence.astype(np.float32) < LOOSE_CONFIDENCE)
+    solution.status[loose] = Status.AMBIGUOUS
+
+
+def suspect_lights(solution: Solution, stack: Stack, lights: Lights) -> list[SuspectLight]:
+    """Return the lights whose direction or strength in the manifest the images contradict, worst first.
+
+    Args:
+        solution: normals that were solved under these lights.
+        stack: the images.
+        lights: distant lights of the stack, padded.
+    """
+    solved = np.flatnonzero(solution.status == Status.OK)
+    if len(solved) < 2 * LEAST_PIXELS:
+        return []
+    confidence = solution.confidence[solved].astype(np.float32)
+    sure = solved[confidence >= np.median(confidence)]
+    chosen = sure[evenly(len(sure), SUSPECT_PIXELS)]
+    values, _ = stack.pick(chosen)
+    count = stack.light_count
+    weights = channel_weights(lights, GREY_WEIGHTS)
+    factor = np.divide(weights * lights.scale[:count, None], lights.irradiance[:count],
+                       out=np.zeros((count, 3)), where=lights.irradiance[:count] > 0)
+    readings = np.einsum("lc,clp->lp", factor, values[:, :count].astype(np.float64))
+    cosine = lights.direction[:count].astype(np.float64) @ solution.normal[:, chosen]
+    seen = (cosine > LEAST_COSINE) & (lights.direction[:count, 2:] > LEAST_TOWARDS)
+    ratio = np.where(seen, readings / np.maximum(cosine, LEAST_COSINE), np.nan)
+    lit = seen.any(axis=0)
+    judged = np.flatnonzero(seen[:, lit].sum(axis=1) >= LEAST_PIXELS)
+    if not len(judged):
+        return []
+    level = np.maximum(np.nanmedian(ratio[:, lit], axis=0), 1e-12)
+    misfit = np.nanmedian(np.abs(ratio[np.ix_(judged, lit)] / level - 1), axis=1)
+    limit = max(SUSPECT_OFF, SUSPECT_TIMES * float(np.median(misfit)))
+    return [SuspectLight(stack.frames[judged[i]], round(float(misfit[i]), 3)) for i in np.argsort(-misfit) if misfit[i] > limit]

@@ -1,26 +1,26 @@
-"""Capture → maps.exr and report.json: normals and albedo band by band, then height."""
+"""Solve a capture: images → normals, reflectance and height, in maps.exr and report.json."""
 
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from kernels import device as devices
-from kernels.photometric.readings import pad_lights
 from kernels.status import SOLVED, Status
 from kernels.surface.integrate import Integration
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import metadata, report
 from service.requests.solve import Method, SolveRequest
-from service.solve.causes import name_causes
-from service.solve.consistency import Suspect, suspect_lights
-from service.solve.distant import solve_normals
+from service.solve.distant import solve_distant
 from service.solve.extended import solve_extended
 from service.solve.gradient import solve_gradients
-from service.solve.height import integrate, mark_not_facing
 from service.solve.near import solve_near
 from service.solve.reference import solve_by_reference
+from service.solve.solution import Solution, SolveInput, SuspectLight, mark_not_facing, refine_status
+from service.solve.surface import integrate
 from stage.capture import Capture
 from stage.colour_spaces import linear_space
 from stage.errors import ManifestError
@@ -37,9 +37,41 @@ from stage.point_lights import DistantLights, PlacedLights
 from stage.reference_ball import ReferenceBall, reference_ball
 
 SVBRDF_LIGHTS = 12
-"""From this many lights on the general solver is the default: it fits six lobes and a direction to each pixel, and was better than
-robust on every object tried with eight to 96 lights (docs/figures.md)."""
+"""From this many lights on svbrdf is the default: it fits six lobes and a direction to each pixel, and was better than robust on
+every object tried with eight to 96 lights (docs/figures.md)."""
 REPORT_FILE = "report.json"
+
+Solver = Callable[[SolveInput, Any], Solution]
+
+
+class MethodEntry(NamedTuple):
+    """What one method needs of a capture, and the functions that solve it."""
+
+    read_lights: Callable[..., Any]
+    """Returns the lights or frames that the method works with. Takes the capture, and that of the reference ball where there is one;
+    raises a StageError that says what they lack."""
+    solvers: Mapping[type, Solver]
+    """One function for each kind of lights; a kind that is not here is refused."""
+    is_default: Callable[[Capture], bool] = lambda capture: False
+    """Whether a capture is solved by this method when the request names none."""
+
+
+def _suits_svbrdf(capture: Capture) -> bool:
+    return bool(capture.lit_by(ExtendedLight)) or len(capture.sources()) >= SVBRDF_LIGHTS
+
+
+def _single_lights(method: Method) -> dict[type, Solver]:
+    return {DistantLights: partial(solve_distant, method=method), PlacedLights: partial(solve_near, method=method)}
+
+
+METHODS: Mapping[Method, MethodEntry] = {
+    Method.GRADIENT: MethodEntry(gradient_frames, {GradientFrames: solve_gradients}, has_gradients),
+    Method.SVBRDF: MethodEntry(check_solvable, {**_single_lights(Method.SVBRDF), ExtendedLights: solve_extended}, _suits_svbrdf),
+    Method.ROBUST: MethodEntry(check_solvable, _single_lights(Method.ROBUST), is_default=lambda capture: True),
+    Method.LAMBERT: MethodEntry(check_solvable, _single_lights(Method.LAMBERT)),
+    Method.REFERENCE: MethodEntry(reference_ball, {ReferenceBall: solve_by_reference}),
+}
+"""Every method. The default for a capture is the first whose `is_default` says so."""
 
 
 class SolveResult(NamedTuple):
@@ -49,85 +81,49 @@ class SolveResult(NamedTuple):
     maps_path: Path
     report_path: Path
     counts: dict[str, int]
-    """Pixels of the mask per status."""
-    suspects: tuple[Suspect, ...]
+    """Pixels of the mask by the name of their status."""
+    suspects: tuple[SuspectLight, ...]
     """Distant lights that disagree with the others."""
 
 
 def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResult:
-    """Solve a capture.
+    """Solve a capture, and write its maps and a report.
 
     Args:
-        request: what to solve and where to put it.
-        progress: told of every stage.
+        request: the capture, the method and the folder of the results.
+        progress: told how far the work is.
 
     Raises:
-        StageError, KernelError: bad input; nothing is written.
+        StageError, KernelError: the input is wrong; nothing is written.
         StorageError: the results cannot be written; nothing is left half-written.
     """
     timings = Timings(progress)
     device = devices.resolve(request.device)
     timings.stage("open", 1)
     capture = Capture.open(request.capture)
-    method = request.method or _default_method(capture)
+    method = request.method or next(method for method, entry in METHODS.items() if entry.is_default(capture))
     if (method is Method.REFERENCE) != (request.reference_ball is not None):
         raise RequestError("--method reference and --reference-ball CAPTURE go together: give both or neither")
-    lights: GradientFrames | ReferenceBall | DistantLights | PlacedLights | ExtendedLights
-    if method is Method.GRADIENT:
-        lights = gradient_frames(capture)
-    elif request.reference_ball is not None:
-        lights = reference_ball(capture, Capture.open(request.reference_ball))
-    else:
-        lights = check_solvable(capture)
-    if isinstance(lights, ExtendedLights) and method is not Method.SVBRDF:
+    balls = [] if request.reference_ball is None else [Capture.open(request.reference_ball)]
+    lights = METHODS[method].read_lights(capture, *balls)
+    solver = METHODS[method].solvers.get(type(lights))
+    if solver is None:  # every method for lights takes distant and near ones
         raise ManifestError(f"{capture.folder / FILE_NAME}: frames[].light: some are extended: --method svbrdf solves these, "
                             f"{method} needs lights of one direction each")
     mask = capture.mask()
     tracking = tracking_frames(capture, to=request.align_to) if request.aligned else None
     timings.stage("ingest", len(capture.sources()))
     stack = open_stack(capture, cache=request.cache, tracking=tracking, progress=lambda done, _: timings.advance(done))
-    camera, integration, height = capture.camera, None, None
-    suspects: list[Suspect] = []
-    if isinstance(lights, PlacedLights):
-        solution, height, integration = solve_near(method, stack, lights, camera, mask, device, timings)
-    elif isinstance(lights, ExtendedLights):
-        solution = solve_extended(stack, lights, camera, mask, device, timings)
-    elif isinstance(lights, ReferenceBall):
-        solution = solve_by_reference(stack, lights, camera, mask, request.cache, device, timings)
-    elif isinstance(lights, GradientFrames):
-        solution = solve_gradients(lights, stack, camera, mask, device, timings)
-    else:
-        padded = pad_lights(lights.direction, lights.irradiance, stack.scale)
-        solution = solve_normals(method, stack, padded, camera, mask, device, timings)
-        suspects = suspect_lights(solution, stack, padded)
-    rows, cols = mask.shape
-    status = solution.status.reshape(rows, cols)
-    mark_not_facing(camera, solution)
-    name_causes(solution, stack)
+    given = SolveInput(stack, capture.camera, mask, device, timings, request.cache)
+    solution = solver(given, lights)
+    mark_not_facing(capture.camera, solution)
+    refine_status(solution, stack)
+    status = solution.status.reshape(mask.shape)
     solved = np.isin(status, SOLVED)
-    if integration is None:
-        timings.stage("height", 100)
-        integration = integrate(camera, solution.normal, solved, device, lambda part: timings.advance(round(100 * part)))
-
-    def image(planes: np.ndarray | None) -> np.ndarray | None:
-        if planes is None:
-            return None
-        return planes.reshape(rows, cols) if planes.ndim == 1 else np.moveaxis(planes.reshape(-1, rows, cols), 0, -1)
-
-    maps = SurfaceMaps(
-        camera=camera,
-        mask=solved,
-        normal=image(solution.normal),
-        diffuse_albedo=None if method is Method.REFERENCE else image(solution.albedo),
-        specular=image(solution.specular),
-        roughness=image(solution.roughness),
-        regime=image(solution.regime),
-        specular_normal=image(solution.specular_normal),
-        height=integration.height.numpy() if height is None and integration is not None else height,
-        confidence=image(solution.confidence),
-        color_space=linear_space(capture.manifest.color_space),
-        provenance=metadata(request, method=method, capture=capture.name, inputs=stack.key),
-    )
+    if solution.integration is None:  # near lights have found the height with the normals
+        solution.integration = integrate(given, solution.normal, solved)
+        solution.height = None if solution.integration is None else solution.integration.height.numpy()
+    maps = _maps(solution, solved, method, capture, metadata(request, method=method, capture=capture.name, inputs=stack.key))
     timings.stage("write", 1)
     maps_path, report_path = request.out / MAPS_FILE, request.out / REPORT_FILE
     maps.write(maps_path)
@@ -139,28 +135,43 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
         options=request.model_dump(mode="json", include={"method", *(("reference_ball",) if request.reference_ball else ()),
                                                          *(("align", "align_to") if request.aligned else ())}),
         found=solution.facts,
-        suspect_lights=[suspect._asdict() for suspect in suspects],
+        suspect_lights=[suspect._asdict() for suspect in solution.suspects],
         device=devices.describe(device),
         timings_s=timings.close(),
         pixels={"mask": int(mask.sum()), **counts},
-        residual=_residual_statistics(solution.residual.reshape(rows, cols)[solved]),
+        residual=_residual_statistics(solution.residual.reshape(mask.shape)[solved]),
         albedo_above_one=int((maps.diffuse_albedo[solved] > 1).any(axis=-1).sum()) if maps.diffuse_albedo is not None else 0,
-        height=_height_report(integration, capture),
+        height=_height_report(solution.integration, capture),
         **({} if stack.motion is None else {"motion": stack.motion}),
     ))
-    return SolveResult(maps, maps_path, report_path, counts, tuple(suspects))
+    return SolveResult(maps, maps_path, report_path, counts, tuple(solution.suspects))
 
 
-def _default_method(capture: Capture) -> Method:
-    if has_gradients(capture):
-        return Method.GRADIENT
-    if capture.lit_by(ExtendedLight):
-        return Method.SVBRDF
-    return Method.SVBRDF if len(capture.sources()) >= SVBRDF_LIGHTS else Method.ROBUST
+def _maps(solution: Solution, solved: np.ndarray, method: Method, capture: Capture, provenance: dict[str, str]) -> SurfaceMaps:
+    """Return a solution as images; what the method does not estimate is absent."""
+    def image(values: np.ndarray | None) -> np.ndarray | None:
+        if values is None:
+            return None
+        return values.reshape(solved.shape) if values.ndim == 1 else np.moveaxis(values.reshape(-1, *solved.shape), 0, -1)
+
+    return SurfaceMaps(
+        camera=capture.camera,
+        mask=solved,
+        normal=image(solution.normal),
+        diffuse_albedo=None if method is Method.REFERENCE else image(solution.albedo),
+        specular=image(solution.specular),
+        roughness=image(solution.roughness),
+        regime=image(solution.regime),
+        specular_normal=image(solution.specular_normal),
+        height=solution.height,
+        confidence=image(solution.confidence),
+        color_space=linear_space(capture.manifest.color_space),
+        provenance=provenance,
+    )
 
 
 def _residual_statistics(residual: np.ndarray) -> dict[str, float]:
-    """Of the relative residual of each solved pixel's lit readings."""
+    """Return the median and the 95th percentile of the relative residual of each solved pixel's lit readings."""
     if residual.size == 0:
         return {}
     values = np.percentile(residual.astype(np.float32), [50, 95])

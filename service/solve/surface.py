@@ -1,0 +1,135 @@
+"""Normals → height: of the solved pixels, and from these of the whole mask."""
+
+import numpy as np
+import warp as wp
+
+from kernels.surface.components import label_runs
+from kernels.surface.integrate import Integration, IntegrationOptions, integrate_normals
+from kernels.surface.shadows import Projection
+from service.solve.solution import SolveInput
+from stage.camera import Camera
+
+OPTIONS = IntegrationOptions(discontinuities=True, max_reweightings=0)
+"""The surface may break where slopes around a pixel contradict each other: objects hide parts of themselves. The bilateral rounds
+that may follow gain little more on real objects and can settle on a wrong break where normals are noisy."""
+RINGS = 8
+"""Unsolved pixels this near to solved ones are filled from their neighbours; farther ones, which few solves have, by blocks."""
+
+
+def integrate(given: SolveInput, normal: np.ndarray, solved: np.ndarray, *, phase: str = "height") -> Integration | None:
+    """Integrate the normals of the solved pixels.
+
+    Args:
+        given: the camera and the device.
+        normal: [3, pixels] float32.
+        solved: [rows, cols] bool.
+        phase: what the progress calls this work.
+
+    Returns:
+        The height on the device, or None when no pixel is solved.
+    """
+    given.timings.stage(phase, 100)
+    if not solved.any():
+        return None
+    camera = given.camera
+    x, y = camera.plane_coordinates()
+    return integrate_normals(normal.reshape(3, *solved.shape), solved, x.astype(np.float32), y.astype(np.float32),
+                             perspective=camera.projection == "perspective", mean_z=mean_height(camera), options=OPTIONS,
+                             device=given.device, progress=lambda part: given.timings.advance(round(100 * part)))
+
+
+def mean_height(camera: Camera) -> float:
+    """Return the camera-frame z that the mean of the surface is given.
+
+    It is the capture's, else 0, or for a perspective camera without a scale the distance at which one pixel spans one unit.
+    """
+    if camera.projection == "perspective" and camera.surface_z_m is None:
+        assert camera.focal_px is not None
+        return -sum(camera.focal_px) / 2
+    return camera.surface_z_m or 0.0
+
+
+def projection_of(camera: Camera) -> Projection:
+    """Return how camera-frame points fall on the image; lens distortion, which moves shadows by its own few pixels, is left out."""
+    centre = camera.principal_px or (camera.width / 2, camera.height / 2)
+    if camera.projection == "perspective":
+        assert camera.focal_px is not None
+        return Projection(True, wp.vec2(*camera.focal_px), wp.vec2(*centre))
+    per_unit = 1.0 / (camera.pixel_size_m or 1.0)
+    return Projection(False, wp.vec2(per_unit, per_unit), wp.vec2(*centre))
+
+
+def whole_surface(height: np.ndarray, solved: np.ndarray, mask: np.ndarray, *, mean_z: float, perspective: bool) -> np.ndarray:
+    """Return a height for every pixel of the mask, so that lights find a surface wherever they shine.
+
+    Args:
+        height: [rows, cols] float32, camera-frame z of the solved pixels; each connected part has an unknown constant of its own.
+        solved: [rows, cols] bool, one pixel or more, inside the mask.
+        mask: [rows, cols] bool.
+        mean_z: the mean over the mask of what is returned.
+        perspective: whether the constants are factors of the depth; else they are added.
+
+    Returns:
+        [rows, cols] float32, finite everywhere. In each connected part of the mask the largest solved part stays, and smaller
+        ones are moved to where it would reach them; unsolved pixels have the mean height of solved ones around them.
+    """
+    out = height.astype(np.float64)
+    part, whole = _labels(solved), _labels(mask)[solved]
+    size = np.bincount(part[solved])
+    home = np.zeros(len(size), dtype=np.int64)  # the part of the mask that each solved part lies in
+    home[part[solved]] = whole
+    order = np.lexsort((size, home))  # the largest of each home last
+    largest = np.zeros(len(size), dtype=bool)
+    largest[order[np.append(home[order][1:] != home[order][:-1], True)]] = True
+    if not largest.all():
+        kept = solved & largest[np.where(solved, part, 0)]
+        reached = _grown(out, kept, mask)
+        there, here = (np.bincount(part[solved], weights=z[solved]) / size for z in (reached, out))
+        there[largest] = here[largest]
+        moved = out * (there / here)[part] if perspective else out + (there - here)[part]
+        out = np.where(solved, moved, out)
+    out = _grown(out, solved, mask)
+    mean = out[mask].mean()
+    return (out * (mean_z / mean) if perspective else out + (mean_z - mean)).astype(np.float32)
+
+
+def _labels(mask: np.ndarray) -> np.ndarray:
+    """Return [rows, cols] the number of the connected part of each pixel; 0 outside too."""
+    runs = label_runs(mask)
+    out = np.zeros(mask.shape, dtype=np.int64)
+    out[mask] = np.repeat(runs.label, runs.end_col - runs.first_col)  # runs lie in the order of pixels
+    return out
+
+
+def _grown(height: np.ndarray, known: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Return the known heights, and a height for all other pixels."""
+    out, known = np.where(known, height, 0), known.copy()
+    for _ in range(RINGS):
+        total, count = _around(out), _around(known.astype(np.float64))
+        ring = mask & ~known & (count > 0)
+        if not ring.any():
+            break
+        out[ring] = total[ring] / count[ring]
+        known |= ring
+    return _filled(out, known.astype(np.float64))
+
+
+def _around(values: np.ndarray) -> np.ndarray:
+    """Return the sum of the four neighbours of each pixel."""
+    framed = np.pad(values, 1)
+    return framed[:-2, 1:-1] + framed[2:, 1:-1] + framed[1:-1, :-2] + framed[1:-1, 2:]
+
+
+def _filled(total: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Return the mean where a height is known; elsewhere that of the smallest block of 2, 4, 8, … pixels that holds one.
+
+    Args:
+        total, count: [rows, cols] float64, sum and number of the heights known at each place; count is above 0 somewhere.
+    """
+    if (count > 0).all():
+        return total / count
+    rows, cols = total.shape
+    even = ((0, rows % 2), (0, cols % 2))
+    coarse = _filled(*(np.pad(a, even).reshape(-(-rows // 2), 2, -(-cols // 2), 2).sum(axis=(1, 3)) for a in (total, count)))
+    finer = coarse.repeat(2, axis=0).repeat(2, axis=1)[:rows, :cols]
+    return np.where(count > 0, total / np.maximum(count, 1), finer)
