@@ -347,6 +347,7 @@ def test_streams_end_with_the_service(tmp_path: Path):
         assert server.process.wait(WAIT_S) == 0
 
 
+@pytest.mark.long
 @pytest.mark.skipif(binaries() is None, reason="no PostgreSQL server programs: neither on the PATH nor in /usr/lib/postgresql")
 def test_streams_stay_open_while_postgresql_restarts(tmp_path: Path):
     with postgres(binaries()) as server_postgres:

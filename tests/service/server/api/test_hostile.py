@@ -286,6 +286,7 @@ def solve(client, capture: str) -> str:
     return client.post("/v1/jobs", json=asked).raise_for_status().json()["id"]
 
 
+@pytest.mark.long
 def test_fuzzed_images_through_uploads(server, client, tmp_path):
     """A quarter is cut short, which the check always sees; of the others it lets through what only decoding tells."""
     source, tus = write_capture(tmp_path / "source"), Tus(server.url)

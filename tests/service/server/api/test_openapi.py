@@ -184,16 +184,19 @@ def run(folder: Path, *, phases: str, examples: int, exclude: str | None = None,
     assert '"request failed"' not in log and "Traceback" not in log
 
 
+@pytest.mark.long
 @pytest.mark.skipif(LONG_S > 0, reason="FUZZ_SECONDS asks for the long run")
 def test_schemathesis_finds_nothing_at_the_edges_of_every_value(tmp_path):
     run(tmp_path, phases="examples,coverage", examples=1, exclude="^(create_job|list_.*)$")  # of these there are thousands: the next test
 
 
+@pytest.mark.long
 @pytest.mark.skipif(LONG_S > 0, reason="FUZZ_SECONDS asks for the long run")
 def test_schemathesis_finds_nothing_in_random_requests_and_sequences(tmp_path):
     run(tmp_path, phases="fuzzing,stateful", examples=6)
 
 
+@pytest.mark.long
 @pytest.mark.skipif(LONG_S == 0, reason="set FUZZ_SECONDS to run schemathesis for that long")
 @pytest.mark.parametrize("database", ["sqlite", "postgresql"])
 def test_schemathesis_finds_nothing_for_long(tmp_path, database):

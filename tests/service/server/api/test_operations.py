@@ -91,6 +91,7 @@ def test_a_service_that_cannot_work_says_why_and_names_nothing(app, inside, tmp_
     assert 'relit_database_up 0.0' in inside.get("/metrics").text
 
 
+@pytest.mark.long
 def test_a_database_that_goes_away_and_comes_back(tmp_path):
     programs = binaries()
     if programs is None:
@@ -274,6 +275,7 @@ def test_the_service_drains_and_ends_clean(busy):
     database.close()
 
 
+@pytest.mark.long
 def test_asked_twice_it_ends_at_once(busy):
     server, _, _ = busy
     children = children_of(server.process.pid)
@@ -331,6 +333,7 @@ def collector() -> Iterator[tuple[str, list]]:
     server.server_close()
 
 
+@pytest.mark.long
 def test_a_request_and_the_steps_of_its_job_are_one_trace(collector, tmp_path):
     address, spans = collector
     with serving(tmp_path, "--anonymous", "--device", "cpu", roots=str(SAMPLES), otel_endpoint=address, min_free_bytes="0") as server, \

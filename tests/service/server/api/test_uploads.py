@@ -312,6 +312,7 @@ def test_a_registered_capture_takes_no_files(tus, owl):
     assert (answer.status, b"registered" in answer.body) == (409, True)
 
 
+@pytest.mark.long
 def test_a_killed_server_loses_nothing_that_it_told(tmp_path):
     settings = {"requests_per_second": "10000", "request_burst": "10000", "min_free_bytes": "0"}
     contents = {f"{number}.bin": random.Random(number).randbytes(4 * MIB + number) for number in range(4)}
@@ -348,6 +349,7 @@ def test_a_killed_server_loses_nothing_that_it_told(tmp_path):
                 assert list((server.data / "uploads").iterdir()) == []
 
 
+@pytest.mark.long
 @pytest.mark.skipif(binaries() is None, reason="no PostgreSQL server programs: neither on the PATH nor in /usr/lib/postgresql")
 def test_postgresql_tells_the_same_paths_and_requests(tmp_path):
     programs = binaries()

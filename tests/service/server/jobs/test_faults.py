@@ -24,6 +24,7 @@ def frames_there(made, job, count):
     made.until(lambda: made.frames_there(job) >= count, f"{count} frames", every_s=0.002)
 
 
+@pytest.mark.long
 def test_restarts_of_postgresql_cost_nothing(tmp_path, server_postgres, on_postgres, undisturbed):
     with yard(tmp_path, on_postgres, takeover_s=0.5) as made:
         for _ in range(2):
@@ -41,6 +42,7 @@ def test_restarts_of_postgresql_cost_nothing(tmp_path, server_postgres, on_postg
         assert [event for event in made.events() if event["event"] in ("worker died", "worker is gone")] == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("how", ["stopped", "in a step"])
 def test_a_worker_that_hangs_is_killed_and_its_job_taken_over(tmp_path, undisturbed, how):
     with yard(tmp_path, stall_s=3, takeover_s=0.5) as made:
@@ -77,6 +79,7 @@ def test_a_worker_that_is_asked_to_end_finishes_its_step_and_hands_the_job_back(
         assert digests(made.results(job)) == undisturbed.digests
 
 
+@pytest.mark.long
 def test_a_step_that_does_not_end_in_time_is_given_up(tmp_path, undisturbed):
     with yard(tmp_path, drain_s=1) as made:
         worker = made.start(PYTHONPATH=SABOTAGE, SABOTAGE="hang")
@@ -89,6 +92,7 @@ def test_a_step_that_does_not_end_in_time_is_given_up(tmp_path, undisturbed):
         assert (row["state"], row["worker"], row["lost"]) == (jobs.QUEUED, None, 0)
 
 
+@pytest.mark.long
 def test_a_worker_ends_with_the_process_that_looks_after_it(tmp_path, undisturbed):
     with yard(tmp_path) as made:
         worker = made.start(PYTHONPATH=SABOTAGE, SABOTAGE="slow")
@@ -102,6 +106,7 @@ def test_a_worker_ends_with_the_process_that_looks_after_it(tmp_path, undisturbe
         made.until(lambda: any(event["event"] == "worker ended" for event in made.events()), "ended")
 
 
+@pytest.mark.long
 def test_a_job_that_kills_its_workers_fails_with_a_sentence(tmp_path, undisturbed):
     with yard(tmp_path, max_lost=1, takeover_s=0.2) as made:
         made.start(PYTHONPATH=SABOTAGE, SABOTAGE="kill")
@@ -134,6 +139,7 @@ def fill(folder: Path, *, leave: int) -> Path:
     return ballast
 
 
+@pytest.mark.long
 def test_a_job_on_a_full_disk_fails_with_a_sentence_and_goes_on_when_there_is_space(small_disk, tmp_path, on_postgres, undisturbed):
     with yard(small_disk, on_postgres) as made:
         made.log = tmp_path / "log.txt"

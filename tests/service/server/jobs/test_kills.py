@@ -4,24 +4,29 @@ import os
 import random
 import signal
 
+import pytest
+
 from service.requests.identifiers import CAPTURE, ENVIRONMENT
 from service.server.store import jobs
 from tests.service.server.jobs.yard import digests, yard
 
-KILLS, WORKERS = 3, 2
+WORKERS = 2
 
 
-def test_every_frame_is_there_once_and_as_undisturbed(tmp_path, database_url, undisturbed):
+@pytest.mark.parametrize(("database_url", "kills"), [
+    ("sqlite", 1), pytest.param("sqlite", 3, marks=pytest.mark.long), pytest.param("postgresql", 3, marks=pytest.mark.long),
+], indirect=["database_url"])
+def test_every_frame_is_there_once_and_as_undisturbed(tmp_path, database_url, kills, undisturbed):
     seed = random.randrange(2**32)
     print(f"seed {seed}")
     chance = random.Random(seed)
-    with yard(tmp_path, database_url, takeover_s=0.5, max_lost=KILLS) as made:
+    with yard(tmp_path, database_url, takeover_s=0.5, max_lost=kills) as made:
         for _ in range(WORKERS):
             made.start()
         made.ready(WORKERS)
         job = made.relight(made.register(undisturbed.capture, CAPTURE), made.register(undisturbed.environment, ENVIRONMENT),
                            undisturbed.frames, chunk_frames=8)
-        kill_at = sorted(chance.sample(range(undisturbed.frames * 3 // 4), KILLS))  # frames that are there
+        kill_at = sorted(chance.sample(range(undisturbed.frames * 3 // 4), kills))  # frames that are there
         victim = None
         for kill, frames in enumerate(kill_at):
             made.until(lambda at=frames: made.frames_there(job) >= at, f"{frames} frames", every_s=0.002)

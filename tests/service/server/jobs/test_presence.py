@@ -1,5 +1,6 @@
 """Locks that tell whether a worker lives."""
 
+import pytest
 import sqlalchemy as sa
 
 from service.server.jobs.presence import KEEPALIVE, FilePresence, Held, SessionPresence, presence
@@ -64,6 +65,7 @@ def test_a_lock_whose_file_was_removed_is_taken_anew(tmp_path):
     assert not is_dead(two, "one")
 
 
+@pytest.mark.long
 def test_a_restart_of_the_server_takes_the_locks_and_they_are_taken_anew(server_postgres, on_postgres, tmp_path):
     with yard(tmp_path, on_postgres) as made:
         one, two = pair(made)

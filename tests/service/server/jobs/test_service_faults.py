@@ -5,6 +5,8 @@ import signal
 import time
 from pathlib import Path
 
+import pytest
+
 from service.server.settings import Settings
 from service.server.store import jobs, workers
 from service.server.store.database import connect
@@ -48,6 +50,7 @@ def children(pid: int) -> list[int]:
     return [int(child) for thread in Path(f"/proc/{pid}/task").iterdir() for child in (thread / "children").read_text().split()]
 
 
+@pytest.mark.long
 def test_jobs_go_on_after_the_api_was_killed(tmp_path, undisturbed, monkeypatch):
     settings = SETTINGS | {"roots": str(undisturbed.capture.parent)}
     monkeypatch.setenv("PYTHONPATH", SABOTAGE)
@@ -67,6 +70,7 @@ def test_jobs_go_on_after_the_api_was_killed(tmp_path, undisturbed, monkeypatch)
         assert digests(results(server, job)) == undisturbed.digests
 
 
+@pytest.mark.long
 def test_the_service_drains_when_it_is_asked_to_end(tmp_path, undisturbed, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", SABOTAGE)
     monkeypatch.setenv("SABOTAGE", "slow")
@@ -95,6 +99,7 @@ def test_the_api_has_no_warp_and_workers_are_spawned(tmp_path, undisturbed):
         assert "/warp/" not in Path(f"/proc/{server.process.pid}/maps").read_text()
 
 
+@pytest.mark.long
 def test_the_service_stays_when_its_database_has_no_space(small_disk, undisturbed):  # noqa: F811
     (small_disk.parent / "data").symlink_to(small_disk)
     with (serving(small_disk.parent, *OPTIONS, **SETTINGS, roots=str(undisturbed.capture.parent)) as server, server.client() as client):
