@@ -98,7 +98,8 @@ def test_opencv_lives_where_motion_is_tracked_and_rigs_are_calibrated():
     ("service.server.store", ("service.server.jobs", "service.server.api", *PRODUCTS, "stage", "kernels")),
     ("service.server.storage", ("service.server.jobs", "service.server.api", *PRODUCTS, "kernels")),
     ("service.server.api", ("service.cli", "service.client", *PRODUCTS, "service.usd", "kernels")),
-    ("service.client", ("service.cli", *PRODUCTS, "service.usd", "kernels")),
+    ("service.client", ("service.cli", "service.farm", "service.server", *PRODUCTS, "service.usd", "stage", "kernels")),
+    ("service.views", (*DOORS, *PRODUCTS, "service.usd", "service.reporting", "stage", "kernels")),
 ])
 def test_what_a_part_of_the_roof_must_not_know(package, forbidden):
     assert {i for i in IMPORTS if under(i.importer, package) and under(i.target, *forbidden)} == set()
@@ -163,6 +164,16 @@ def test_no_cycles():
 def test_the_command_line_starts_without_heavy_libraries():
     heavy = "warp", "pxr", "OpenEXR", "OpenImageIO", "numpy", "cv2"
     code = f"import sys, service.cli.main; print([name for name in {heavy!r} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=HOME, timeout=60, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_the_client_starts_without_heavy_libraries():
+    """A pipeline's interpreter loads no server, database, image library or device, even when it makes a client and a job."""
+    heavy = ("fastapi", "starlette", "dbos", "uvicorn", "sqlalchemy", "numpy", "warp", "OpenEXR", "OpenImageIO", "cv2", "pxr", "typer",
+             "kernels", "service.server", "service.solve", "stage.images", "stage.capture")
+    code = ("import sys; from service.client import Client; from service.requests.jobs import SolveJob; Client().close(); "
+            f"print([name for name in {heavy!r} if name in sys.modules])")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=HOME, timeout=60, check=True)
     assert done.stdout.strip() == "[]"
 

@@ -12,7 +12,7 @@ from service.cli.waiting import download, wait_for
 
 if TYPE_CHECKING:
     from service.client import Client
-    from service.server.api.views import JobView
+    from service.views.jobs import JobView
 
 JobArgument = Annotated[str, typer.Argument(metavar="JOB", help="Its identifier: job_….", show_default=False)]
 OutOption = Annotated[Path | None, typer.Option(

@@ -52,9 +52,9 @@ def make_folder(out: Path) -> None:
     Raises:
         FileError: it cannot be made.
     """
-    from service.client.files import reading
+    from service.client.local_files import file_errors
 
-    with reading(out, "make"):
+    with file_errors(out, "make"):
         out.mkdir(parents=True, exist_ok=True)
 
 

@@ -1,4 +1,4 @@
-"""A client of the service for Python programs; docs/client.md has a walk through it."""
+"""A client of the service for Python programs; docs/client.md explains its use."""
 
 from service.client.client import Client
 from service.client.errors import (

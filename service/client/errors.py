@@ -1,27 +1,30 @@
 """Errors of the client; the text of each is one sentence for a person.
 
 ClientError
-├── Unreachable      the service does not answer, or something that answers in its place is not it
-├── Refused          the service says no: has its status, kind, sentence and request_id
-│   ├── NotAllowed   401, 403: there is no key, it is not valid, or it does not allow this
-│   ├── NotFound     404, 410
-│   ├── Conflict     409, 412, 423: not in a state for this
-│   ├── Invalid      other 4xx: a value cannot be; `errors` names the fields
-│   ├── Busy         429, 503, 507: later, and for longer than the client had patience
-│   └── Faulty       other 5xx: an error of relit itself; its log has more under request_id
-├── IntakeRefused    the check found a capture or environment that cannot be used
-├── JobEnded         the job that was waited for has failed, or was cancelled
-└── FileError        a file cannot be read or written here, or is not what was sent
+├── Unreachable      the service does not answer, or something else answers in its place
+├── Refused          the service answers with an error: `status`, `kind`, `detail` (the sentence), `request_id`, `errors`
+│   ├── NotAllowed   401, 403: the key is missing, invalid, or does not allow the request
+│   ├── NotFound     404, 410: the project of the key has no such thing, or no longer
+│   ├── Conflict     409, 412, 423: the state of the thing does not allow the request
+│   ├── Invalid      other 4xx: a value is invalid; `errors` names the fields
+│   ├── Busy         429, 503, 507: the service cannot do it now, and could not until the client's patience ended
+│   └── Faulty       other 5xx: an error inside the service; its log has more under `request_id`
+├── IntakeRefused    the check of a capture or environment found that it cannot be used
+├── JobEnded         the job that was waited for failed or was cancelled
+└── FileError        a local file cannot be read or written, or changed while it was sent
 """
 
 import json
 from typing import Any, NamedTuple
 
-from service.server.api.views import IntakeView, JobView
+import httpx2
+
+from service.views.intakes import IntakeView
+from service.views.jobs import JobView
 
 
 class ClientError(Exception):
-    """Base of all."""
+    """Base of all errors of the client."""
 
 
 class Unreachable(ClientError):
@@ -29,39 +32,40 @@ class Unreachable(ClientError):
 
 
 class FileError(ClientError):
-    """A file cannot be used; the message names it."""
+    """A local file cannot be used; the message names it."""
 
 
 class Fault(NamedTuple):
-    """One value that cannot be."""
+    """One invalid value of a request."""
 
     field: str
+    """Where the value stands: body.options.frames, query.limit …"""
     message: str
 
 
 class Refused(ClientError):
-    """The service says no."""
+    """The service answers with an error."""
 
     def __init__(self, status: int, kind: str, detail: str, *, request_id: str = "", errors: tuple[Fault, ...] = ()) -> None:
-        """Args: status: of HTTP. kind: not-found, conflict … detail: the sentence. request_id: in the log. errors: wrong values."""
+        """Args: status: of HTTP. kind: not-found, conflict … detail: the sentence. request_id: in the log. errors: invalid values."""
         super().__init__(detail)
         self.status, self.kind, self.detail, self.request_id, self.errors = status, kind, detail, request_id, errors
 
 
 class NotAllowed(Refused):
-    """There is no key, it is not valid, or it does not allow this."""
+    """The key is missing, invalid, or does not allow the request."""
 
 
 class NotFound(Refused):
-    """There is no such thing in the project of the key, or not any more."""
+    """The project of the key has no such thing, or no longer."""
 
 
 class Conflict(Refused):
-    """It is not in a state for this."""
+    """The state of the thing does not allow the request."""
 
 
 class Invalid(Refused):
-    """A value cannot be."""
+    """A value of the request is invalid."""
 
 
 class Busy(Refused):
@@ -69,23 +73,23 @@ class Busy(Refused):
 
 
 class Faulty(Refused):
-    """An error of relit itself."""
+    """An error inside the service."""
 
 
 class IntakeRefused(ClientError):
-    """A capture or environment cannot be used."""
+    """The check of a capture or environment found that it cannot be used."""
 
     def __init__(self, intake: IntakeView) -> None:
-        """Args: intake: that was refused."""
+        """Args: intake: the capture or environment."""
         super().__init__(f"{intake.name} ({intake.id}): {intake.problem}")
         self.intake = intake
 
 
 class JobEnded(ClientError):
-    """A job did not succeed."""
+    """A job failed or was cancelled."""
 
     def __init__(self, job: JobView) -> None:
-        """Args: job: that failed or was cancelled."""
+        """Args: job: as it ended."""
         super().__init__(job.error if job.error is not None else f"{job.id} was {job.state}")
         self.job = job
 
@@ -95,15 +99,15 @@ OF_STATUS: dict[int, type[Refused]] = {401: NotAllowed, 403: NotAllowed, 404: No
                                        423: Conflict, 429: Busy, 503: Busy, 507: Busy}
 
 
-def refusal(status: int, media_type: str, body: bytes) -> ClientError:
-    """The error that an answer is.
+def refusal(answer: httpx2.Response) -> ClientError:
+    """Return the error for an answer with status 300 or more.
 
     Args:
-        status: 300 or more.
-        media_type: of the body.
-        body: a problem of the service; whatever else comes from something that answered in its place, such as a proxy.
+        answer: of the service, with a problem (RFC 9457) as its body; or of something else that answers in its place, such as a proxy.
+            A streamed answer is read to its end here.
     """
-    problem = _problem(body) if media_type.partition(";")[0].strip() == PROBLEM else None
+    body, status = answer.read(), answer.status_code
+    problem = _problem(body) if answer.headers.get("content-type", "").partition(";")[0].strip() == PROBLEM else None
     if problem is None:
         return Unreachable(f"something that is not the service answers with status {status}: look at the server's URL")
     error = OF_STATUS.get(status, Faulty if status >= 500 else Invalid)

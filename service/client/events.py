@@ -1,30 +1,30 @@
-"""A job as it changes: server-sent events, connected again when they break, with a plain look whenever they bring nothing."""
+"""Following a job by server-sent events, reconnected when they break, and by plain requests while they bring nothing."""
 
 import time
 from collections.abc import Iterator
 
 import httpx2
 
-from service.client.link import Link
-from service.server.api.views import JobView
+from service.client.connection import Connection
+from service.views.jobs import JobView
+from service.views.states import ENDED
 
-ENDED = ("succeeded", "failed", "cancelled")
 EVENT = "job"
 SILENCE_S = 45.0
-"""After which a stream is given up: the service says at least every 15 s that it is there."""
+"""A stream without a byte for this long is given up: the service sends at least a comment every 15 s."""
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.2, 2.0
-"""Between two looks, while events bring nothing."""
+"""Between two plain requests, while events bring nothing."""
 
 
-def follow(link: Link, job: str) -> Iterator[JobView]:
-    """A job as it is, then as it becomes with every change, until it has ended.
+def follow(connection: Connection, job: str) -> Iterator[JobView]:
+    """Yield a job as it is now, and again after every change, until it has ended.
 
     Args:
-        link: to the service.
-        job: its path.
+        connection: to the service.
+        job: path of the job in the API.
 
     Raises:
-        Refused: there is no such job, or the key does not allow to see it.
+        Refused: there is no such job, or the key does not allow to read it.
         Unreachable: the service does not answer.
     """
     last: JobView | None = None
@@ -32,7 +32,7 @@ def follow(link: Link, job: str) -> Iterator[JobView]:
     while True:
         before = last
         try:
-            for view in _stream(link, job, last):
+            for view in _stream(connection, job, last):
                 if last is None or view.revision > last.revision:
                     last = view
                     yield view
@@ -43,7 +43,7 @@ def follow(link: Link, job: str) -> Iterator[JobView]:
         if last is not before:
             pause = FIRST_PAUSE_S
             continue
-        view = JobView.model_validate_json(link.send("GET", job).content)  # says, too, why there are no events
+        view = JobView.model_validate_json(connection.send("GET", job).content)  # its error also says why there are no events
         if last is None or view.revision > last.revision:
             last = view
             yield view
@@ -53,10 +53,10 @@ def follow(link: Link, job: str) -> Iterator[JobView]:
         pause = min(2 * pause, LONGEST_PAUSE_S)
 
 
-def _stream(link: Link, job: str, last: JobView | None) -> Iterator[JobView]:
-    """What one connection brings; nothing where it is refused."""
+def _stream(connection: Connection, job: str, last: JobView | None) -> Iterator[JobView]:
+    """Yield the views of one stream of events after `last`; nothing if the service refuses the stream."""
     headers = {} if last is None else {"Last-Event-ID": str(last.revision)}
-    with link.http.sse(f"{job}/events", headers=headers, timeout=SILENCE_S) as events:
+    with connection.http.sse(f"{job}/events", headers=headers, timeout=SILENCE_S) as events:
         if events.response.is_success:
             for event in events:
                 if event.event == EVENT:

@@ -1,69 +1,69 @@
-"""Jobs: handed in, looked at, waited for, steered; and what they made."""
+"""Jobs: submitted, watched, controlled, and their results downloaded."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from service.client.connection import Connection
+from service.client.downloads import download_files
 from service.client.errors import FileError, JobEnded
 from service.client.events import follow
-from service.client.link import Link
-from service.client.results import fetch
-from service.client.tally import Tally
+from service.client.transfer import TransferProgress
 from service.reporting.progress import Progress
 from service.requests.jobs import JobRequest
-from service.server.api.views import JobPage, JobState, JobView, ResultPage, ResultView
+from service.views.jobs import JobPage, JobView, ResultPage, ResultView
+from service.views.states import SUCCEEDED, JobState
 
-SUCCEEDED = "succeeded"
 PATH = "/v1/jobs"
 
 
 class Jobs:
     """The jobs of a project."""
 
-    def __init__(self, link: Link, *, parallel: int) -> None:
-        """Args: link: to the service. parallel: results fetched at once."""
-        self._link, self._parallel = link, parallel
+    def __init__(self, connection: Connection, *, parallel: int) -> None:
+        """Args: connection: to the service. parallel: number of results that are fetched at once."""
+        self._connection, self._parallel = connection, parallel
 
     def submit(self, request: JobRequest, *, token: str | None = None) -> JobView:
-        """Hand a job in.
+        """Submit a job.
 
         Args:
             request: a SolveJob, RelightJob … of service.requests.jobs.
-            token: Idempotency-Key: the same request with the same token is the same job; None: a new job.
+            token: Idempotency-Key: the same request with the same token returns the same job; None: a new job.
 
         Raises:
-            Refused: it reads what is not there or not ready, or a value cannot be.
+            Refused: a capture, environment or job that it names does not exist or is not ready, or a value is invalid.
         """
-        answer = self._link.send("POST", PATH, json=request.model_dump(mode="json", by_alias=True, exclude_defaults=True),
-                                 headers={"Idempotency-Key": token or self._link.token()})
+        answer = self._connection.send("POST", PATH, json=request.model_dump(mode="json", by_alias=True, exclude_defaults=True),
+                                       headers={"Idempotency-Key": token or self._connection.new_token()})
         return JobView.model_validate_json(answer.content)
 
     def get(self, job: str) -> JobView:
-        """One job."""
-        return JobView.model_validate_json(self._link.send("GET", self._at(job)).content)
+        """Return one job."""
+        return JobView.model_validate_json(self._connection.send("GET", self._at(job)).content)
 
     def all(self, states: Sequence[JobState] = ()) -> Iterator[JobView]:
-        """Jobs, the newest first; of these states alone, where some are given."""
+        """Iterate over the jobs of the project, the newest first; if `states` are given, over the jobs in one of them."""
         before: str | None = None
         while True:
-            answer = self._link.send("GET", PATH, params={"state": list(states)} | ({} if before is None else {"before": before}))
+            answer = self._connection.send("GET", PATH, params={"state": list(states)} | ({} if before is None else {"before": before}))
             page = JobPage.model_validate_json(answer.content)
             yield from page.jobs
             if (before := page.next) is None:
                 return
 
     def follow(self, job: str) -> Iterator[JobView]:
-        """The job as it is, then as it becomes with every change, until it has ended."""
-        return follow(self._link, self._at(job))
+        """Yield the job now, and again after every change, until it has ended."""
+        return follow(self._connection, self._at(job))
 
     def wait(self, job: str, *, progress: Progress | None = None) -> JobView:
         """Wait until a job has succeeded.
 
         Args:
             job: its identifier.
-            progress: told of its stages.
+            progress: told of the job's stages.
 
         Raises:
-            JobEnded: it has failed, or was cancelled.
+            JobEnded: it failed or was cancelled.
         """
         stage, ended = None, None
         for ended in self.follow(job):
@@ -72,68 +72,68 @@ class Jobs:
                     stage = ended.progress.stage, ended.progress.total
                     progress.stage(*stage)
                 progress.advance(ended.progress.done)
-        assert ended is not None, "there is always a first"
+        assert ended is not None, "follow yields at least one view"
         if ended.state != SUCCEEDED:
             raise JobEnded(ended)
         return ended
 
     def cancel(self, job: str) -> JobView:
-        """Stop a job; what it has made stays."""
-        return self._steer(job, "cancel")
+        """Stop a job; files that it has made stay."""
+        return self._act(job, "cancel")
 
     def retry(self, job: str) -> JobView:
-        """Begin a failed job again; what is done stays."""
-        return self._steer(job, "retry")
+        """Begin a failed job again; steps and frames that are done stay."""
+        return self._act(job, "retry")
 
     def resume(self, job: str) -> JobView:
-        """Go on with a cancelled job."""
-        return self._steer(job, "resume")
+        """Continue a cancelled job; steps and frames that are done stay."""
+        return self._act(job, "resume")
 
     def prioritise(self, job: str, priority: int) -> JobView:
-        """Give a job that has not begun another priority: higher goes first."""
-        return JobView.model_validate_json(self._link.send("PATCH", self._at(job), json={"priority": priority}).content)
+        """Change the priority of a queued job; higher priorities go first."""
+        return JobView.model_validate_json(self._connection.send("PATCH", self._at(job), json={"priority": priority}).content)
 
     def delete(self, job: str) -> None:
-        """Remove a job that has ended, and its results."""
-        self._link.send("DELETE", self._at(job), repeatable=False)
+        """Delete a job that has ended, and its results."""
+        self._connection.send("DELETE", self._at(job), repeatable=False)
 
     def results(self, job: str) -> list[ResultView]:
-        """The files that a job has made so far, by name."""
+        """Return the files that a job has made so far, by name."""
         after: str | None = None
         found: list[ResultView] = []
         while True:
-            answer = self._link.send("GET", f"{self._at(job)}/results", params={} if after is None else {"after": after})
+            answer = self._connection.send("GET", f"{self._at(job)}/results", params={} if after is None else {"after": after})
             page = ResultPage.model_validate_json(answer.content)
             found += page.results
             if (after := page.next) is None:
                 return found
 
     def download(self, job: str, folder: Path, *, names: Sequence[str] | None = None, progress: Progress | None = None) -> list[Path]:
-        """Fetch what a job has made, several files at once; what was broken off is gone on with.
+        """Download results, several files at once; a download that was interrupted is continued.
 
         Args:
             job: its identifier.
-            folder: for the files; made where there is none.
-            names: of files; None: all.
-            progress: told of `download`, in MiB.
+            folder: to write the files into; it is made if it does not exist.
+            names: of the files; None: all.
+            progress: told of the stage `download`, in MiB.
 
         Returns:
-            Where they are now, by name.
+            The paths of the files, by name.
 
         Raises:
-            FileError: a name is not among the results, or a file cannot be written.
-            ClientError: the service says no, or does not answer.
+            FileError: the job has no result of a name, or a file cannot be written.
+            ClientError: the service answers with an error, or does not answer.
         """
         found = self.results(job)
         if names is not None:
             if missing := sorted(set(names) - {file.name for file in found}):
                 raise FileError(f"{job} has no result {missing[0]}")
             found = [file for file in found if file.name in names]
-        return fetch(self._link, f"{self._at(job)}/results", [file.name for file in found], folder, parallel=self._parallel,
-                     tally=Tally(progress, "download", sum(file.size for file in found)))
+        return download_files(self._connection, f"{self._at(job)}/results", [file.name for file in found], folder,
+                              parallel=self._parallel, progress=TransferProgress(progress, "download", sum(file.size for file in found)))
 
-    def _steer(self, job: str, action: str) -> JobView:
-        return JobView.model_validate_json(self._link.send("POST", f"{self._at(job)}/{action}", repeatable=False).content)
+    def _act(self, job: str, action: str) -> JobView:
+        return JobView.model_validate_json(self._connection.send("POST", f"{self._at(job)}/{action}", repeatable=False).content)
 
     def _at(self, job: str) -> str:
-        return self._link.path(PATH, job)
+        return self._connection.path(PATH, job)

@@ -12,6 +12,7 @@ from service.server.settings import Settings, unknown_variables
 from service.server.storage.open import open_storage
 from service.server.store import jobs, keys, workers
 from service.server.store.database import Database, DatabaseError, connect, require_version
+from service.views.states import ACTIVE, ENDED
 from stage.errors import StorageError
 
 LIBRARIES = ("dbos", "fastapi", "sqlalchemy", "uvicorn", "psycopg")
@@ -72,9 +73,9 @@ def _store(settings: Settings, database: Database) -> Iterator[Finding]:
         yield Finding("keys", "none: requests without a key are let in" if settings.anonymous else
                       "none, and requests without a key are refused: relit keys create makes one", not settings.anonymous)
     counts = jobs.counts(database)
-    yield Finding("jobs", ", ".join(f"{counts[state]} {state}" for state in (*jobs.ACTIVE, *jobs.ENDED) if state in counts) or "none")
+    yield Finding("jobs", ", ".join(f"{counts[state]} {state}" for state in (*ACTIVE, *ENDED) if state in counts) or "none")
     present = workers.present(database)
-    waiting = sum(counts.get(state, 0) for state in jobs.ACTIVE)
+    waiting = sum(counts.get(state, 0) for state in ACTIVE)
     for worker in present:
         yield Finding("worker", f"{worker['id']} on {worker['device']}, {worker['state']}")
     if not present:

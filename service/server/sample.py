@@ -11,6 +11,7 @@ from service.server.api.context import DEFAULT_PROJECT
 from service.server.jobs.queue import JobQueue
 from service.server.store import intakes
 from service.server.store.database import Database
+from service.views.states import REFUSED
 
 
 def greet(address: str, database: Database, queue: JobQueue, sample: Path) -> None:
@@ -33,7 +34,7 @@ def greet(address: str, database: Database, queue: JobQueue, sample: Path) -> No
 def _registered(database: Database, queue: JobQueue, kind: str, path: Path) -> str:
     """The identifier under which it is known already, or is now."""
     for row in intakes.latest(database, DEFAULT_PROJECT, kind, limit=500):
-        if row["folder"] == str(path) and row["state"] != intakes.REFUSED:
+        if row["folder"] == str(path) and row["state"] != REFUSED:
             return str(row["id"])
     identifier = new_id(kind)
 

@@ -10,9 +10,9 @@ from fastapi.sse import KEEPALIVE_COMMENT, EventSourceResponse, format_sse_event
 from service.server.api.context import Behind, Reader
 from service.server.api.jobs import job_of
 from service.server.api.problems import responses
-from service.server.api.views import JobView
 from service.server.api.watch import Change, Watcher
-from service.server.store.jobs import ENDED
+from service.views.jobs import JobView
+from service.views.states import ENDED
 
 router = APIRouter(tags=["events"], responses=responses(401, 403, 429, 503))
 

@@ -14,12 +14,14 @@ from service.server.api.context import Behind, IdempotencyKey, Reader, Service, 
 from service.server.api.problems import ApiError, responses
 from service.server.api.space import FOR_WORK, require_space
 from service.server.api.submission import submit
-from service.server.api.views import IntakePage, IntakeView
+from service.server.api.views import intake_view
 from service.server.safe_names import shown
 from service.server.storage import layout
 from service.server.storage.parts import Part, parts_folder
 from service.server.store import intakes, jobs, uploads
 from service.server.store.keys import Caller, Scope
+from service.views import states
+from service.views.intakes import IntakePage, IntakeView
 from stage.files import resolved
 
 captures = APIRouter(prefix="/v1/captures", tags=["captures"], responses=responses(401, 403, 422, 429, 503))
@@ -86,13 +88,13 @@ def list_environments(behind: Behind, caller: Reader, limit: Limit = 100, before
 @captures.get("/{capture}", responses=responses(404), summary="Look at a capture")
 def get_capture(behind: Behind, caller: Reader, capture: CaptureId) -> IntakeView:
     """State of a capture, and what its check found."""
-    return IntakeView.of(row_of(behind, caller, capture))
+    return intake_view(row_of(behind, caller, capture))
 
 
 @environments.get("/{environment}", responses=responses(404), summary="Look at an environment")
 def get_environment(behind: Behind, caller: Reader, environment: EnvironmentId) -> IntakeView:
     """State of an environment, and what its check found."""
-    return IntakeView.of(row_of(behind, caller, environment))
+    return intake_view(row_of(behind, caller, environment))
 
 
 @captures.post("/{capture}/validate", status_code=202, responses=responses(404, 409, 507), summary="Check an uploaded capture")
@@ -157,7 +159,7 @@ def _create(behind: Service, caller: Caller, prefix: str, name: str, folder: Pat
 
     identifier, _ = once(behind, caller, token, [prefix, name, None if folder is None else str(folder)], make)
     response.headers["Location"] = f"/v1/{layout.FOLDERS[prefix]}/{identifier}"
-    return IntakeView.of(row_of(behind, caller, identifier))
+    return intake_view(row_of(behind, caller, identifier))
 
 
 def _page(behind: Service, caller: Caller, prefix: str, limit: int, before: str | None) -> IntakePage:
@@ -166,7 +168,7 @@ def _page(behind: Service, caller: Caller, prefix: str, limit: int, before: str 
         row = row_of(behind, caller, before)
         after = row["created_at"], row["id"]
     rows = intakes.latest(behind.database, caller.project, prefix, limit=limit + 1, before=after)
-    return IntakePage(items=[IntakeView.of(row) for row in rows[:limit]], next=rows[limit - 1]["id"] if len(rows) > limit else None)
+    return IntakePage(items=[intake_view(row) for row in rows[:limit]], next=rows[limit - 1]["id"] if len(rows) > limit else None)
 
 
 def _validate(behind: Service, caller: Caller, identifier: str) -> IntakeView:
@@ -182,12 +184,12 @@ def _validate(behind: Service, caller: Caller, identifier: str) -> IntakeView:
 
     if not behind.database.transact(work):
         raise ApiError("conflict", f"{identifier} is {before['state']} already")
-    return IntakeView.of(row_of(behind, caller, identifier))
+    return intake_view(row_of(behind, caller, identifier))
 
 
 def _delete(behind: Service, caller: Caller, identifier: str) -> None:
     row = row_of(behind, caller, identifier)
-    if row["state"] == intakes.CHECKING:
+    if row["state"] == states.CHECKING:
         raise ApiError("conflict", f"{identifier} is being checked")
 
     def work(connection: sa.Connection) -> list[str] | None:

@@ -15,10 +15,12 @@ from service.server.api.exact import Exact
 from service.server.api.problems import ApiError, responses
 from service.server.api.space import FOR_WORK, require_space
 from service.server.api.submission import inputs_of, require_queue, spelled_out, submit
-from service.server.api.views import JobPage, JobState, JobView
+from service.server.api.views import job_view
 from service.server.storage import layout
 from service.server.store import jobs
 from service.server.store.keys import Caller
+from service.views import states
+from service.views.jobs import JobPage, JobView
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"], responses=responses(401, 403, 422, 429, 503))
 
@@ -35,7 +37,7 @@ EXAMPLES: dict[str, Example] = {
 }
 JobName = Annotated[JobId, Path(description="Identifier of the job.")]
 Asked = Annotated[JobRequest, Exact(UserJob), Body(openapi_examples=EXAMPLES)]
-States = Annotated[Sequence[JobState], Query(description="Of these states alone; none: of all.")]
+States = Annotated[Sequence[states.JobState], Query(description="Of these states alone; none: of all.")]
 
 
 class Priority(BaseModel):
@@ -72,7 +74,7 @@ def list_jobs(behind: Behind, caller: Reader, state: States = (),
             raise ApiError("not-found", f"before: {before} is not in this project")
         after = row["created_at"], row["id"]
     rows = jobs.latest(behind.database, caller.project, states=state, limit=limit + 1, before=after)
-    return JobPage(jobs=[JobView.of(row) for row in rows[:limit]], next=rows[limit - 1]["id"] if len(rows) > limit else None)
+    return JobPage(jobs=[job_view(row) for row in rows[:limit]], next=rows[limit - 1]["id"] if len(rows) > limit else None)
 
 
 @router.get("/{job}", responses=responses(404), summary="Look at a job")
@@ -94,13 +96,13 @@ def cancel_job(behind: Behind, caller: Writer, job: JobName) -> JobView:
 @router.post("/{job}/retry", status_code=202, responses=responses(404, 409, 507), summary="Try a failed job again")
 def retry_job(behind: Behind, caller: Writer, job: JobName) -> JobView:
     """Begin a failed job again; steps and frames that are done stay."""
-    return _again(behind, caller, job, jobs.FAILED)
+    return _again(behind, caller, job, states.FAILED)
 
 
 @router.post("/{job}/resume", status_code=202, responses=responses(404, 409, 507), summary="Go on with a cancelled job")
 def resume_job(behind: Behind, caller: Writer, job: JobName) -> JobView:
     """Go on with a cancelled job; steps and frames that are done stay."""
-    return _again(behind, caller, job, jobs.CANCELLED)
+    return _again(behind, caller, job, states.CANCELLED)
 
 
 @router.patch("/{job}", responses=responses(404, 409), summary="Change the priority of a job")
@@ -151,7 +153,7 @@ def view(behind: Service, caller: Caller, job: str) -> JobView:
     row = jobs.find(behind.database, job, caller.project)
     if row is None:
         raise ApiError("not-found", f"there is no {job} in this project")
-    return JobView.of(row)
+    return job_view(row)
 
 
 def _again(behind: Service, caller: Caller, job: str, state: str) -> JobView:

@@ -16,13 +16,14 @@ from service import __version__
 from service.server.settings import Settings
 from service.server.store import jobs, workers
 from service.server.store.database import UNANSWERED, Database
+from service.views.states import ACTIVE, ENDED
 
 CONTENT_TYPE = CONTENT_TYPE_LATEST
 METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 OTHER = "other"
 """Label of methods and paths that are none of ours: whoever makes names up makes no numbers."""
 disable_created_metrics()  # type: ignore[no-untyped-call]  # a time beside every number, which nobody asks for
-STATES = (jobs.QUEUED, jobs.RUNNING, *jobs.ENDED)
+STATES = (*ACTIVE, *ENDED)
 
 
 class Metrics:

@@ -18,9 +18,10 @@ from service.server.api.context import Behind, Reader
 from service.server.api.jobs import JobName, view
 from service.server.api.problems import ApiError, responses
 from service.server.api.ranges import Span, asked_for, content_range, multipart, names
-from service.server.api.views import ResultPage, ResultView
+from service.server.api.views import result_view
 from service.server.safe_names import NameFault, check_path
 from service.server.storage import layout
+from service.views.jobs import ResultPage
 
 router = APIRouter(prefix="/v1/jobs/{job}/results", tags=["results"], responses=responses(401, 403, 404, 422, 429, 503))
 
@@ -89,7 +90,7 @@ def list_results(behind: Behind, caller: Reader, job: JobName,
     """Files by name, a page at a time; of a job that runs, those that are complete."""
     view(behind, caller, job)
     files = [file for file in behind.storage.files(layout.results(caller.project, job)) if after is None or file.name > after]
-    return ResultPage(results=[ResultView.of(job, file) for file in files[:limit]],
+    return ResultPage(results=[result_view(job, file) for file in files[:limit]],
                       next=files[limit - 1].name if len(files) > limit else None)
 
 

@@ -10,6 +10,7 @@ from service.server.api.context import Service
 from service.server.api.problems import ApiError
 from service.server.store import intakes, jobs
 from service.server.store.keys import Caller
+from service.views import states
 
 QUEUE_RETRY_S = 30
 
@@ -76,7 +77,7 @@ def _require_ready(behind: Service, project: str, field: str, identifier: str) -
     row = intakes.find(behind.database, identifier, project)
     if row is None:
         raise ApiError("not-found", f"{field}: {identifier} is not in this project")
-    if row["state"] != intakes.READY:
+    if row["state"] != states.READY:
         raise ApiError("conflict", f"{field}: {identifier} is {row['state']}, not ready")
 
 
@@ -87,5 +88,5 @@ def _require_maps(behind: Service, project: str, identifier: str, *, depth: bool
         raise ApiError("not-found", f"maps: {identifier} is not in this project")
     if row["request"]["kind"] not in kinds:
         raise ApiError("invalid", f"maps: {identifier} is a {row['request']['kind']} job: give one of {', '.join(kinds)}")
-    if row["state"] != jobs.SUCCEEDED:
+    if row["state"] != states.SUCCEEDED:
         raise ApiError("conflict", f"maps: {identifier} is {row['state']}, not succeeded")

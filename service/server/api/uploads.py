@@ -7,7 +7,6 @@ from typing import Annotated, Any
 
 import sqlalchemy as sa
 from fastapi import APIRouter, Header, Query, Request, Response
-from pydantic import BaseModel
 
 from service.requests.identifiers import ENVIRONMENT, UPLOAD, CaptureId, EnvironmentId, UploadId, new_id
 from service.server.api.context import Behind, IdempotencyKey, Reader, Service, Writer, once
@@ -36,6 +35,7 @@ from service.server.storage.parts import Part, PartLocked, parts_folder
 from service.server.store import idempotency, intakes, uploads
 from service.server.store.keys import Caller
 from service.server.store.uploads import Row
+from service.views.intakes import FilePage, FileView
 
 router = APIRouter(prefix="/v1", tags=["uploads"], responses=responses(401, 403, 404, 412, 422, 429, 503), dependencies=[Speaking])
 listings = APIRouter(prefix="/v1", tags=["uploads"], responses=responses(401, 403, 404, 422, 429, 503))
@@ -53,34 +53,6 @@ Limit = Annotated[int, Query(ge=1, le=5000)]
 After = Annotated[str | None, Query(max_length=4096, pattern=r"^[^\x00]*$")]
 CREATED: dict[int | str, dict[str, Any]] = {
     201: {"description": "Created", "headers": documented("Location", "Upload-Offset", "Upload-Expires")}, **responses(409, 413, 507)}
-
-
-class FileView(BaseModel):
-    """A file of a capture or environment."""
-
-    upload: UploadId
-    """It goes on, or is deleted, at /v1/uploads/ and this."""
-    path: str
-    length: int
-    received: int
-    """Bytes that are safe."""
-    done: bool
-    sha256: str | None
-    """As the client said it; where the file is done, also as it was found."""
-
-    @classmethod
-    def of(cls, behind: Service, row: Row) -> "FileView":
-        """From its row."""
-        return cls(upload=row["id"], path=row["path"], length=row["length"], received=received_of(behind, row), done=row["done"],
-                   sha256=row["sha256"])
-
-
-class FilePage(BaseModel):
-    """Files, in the order of their paths where upper and lower case are one."""
-
-    files: list[FileView]
-    next: str | None
-    """Give it as `after` for the page after this one; null: there is none."""
 
 
 @options.options("/uploads", status_code=204, summary="What of tus is spoken here",
@@ -239,8 +211,13 @@ def _create(behind: Service, caller: Caller, intake: str, length: int, given: Me
     return _answer(behind, row, response)
 
 
+def _file_view(behind: Service, row: Row) -> FileView:
+    return FileView(upload=row["id"], path=row["path"], length=row["length"], received=received_of(behind, row), done=row["done"],
+                    sha256=row["sha256"])
+
+
 def _answer(behind: Service, row: Row, response: Response) -> FileView:
-    view = FileView.of(behind, row)
+    view = _file_view(behind, row)
     response.headers.update({"Location": f"/v1/uploads/{view.upload}",
                              **state_headers(row, view.received, behind.settings.upload_hours)})
     return view
@@ -284,7 +261,7 @@ def _row(behind: Service, caller: Caller, upload: str) -> Row:
 def _page(behind: Service, caller: Caller, intake: str, limit: int, after: str | None) -> FilePage:
     row_of(behind, caller, intake)
     rows = uploads.listing(behind.database, intake, limit=limit + 1, after=after)
-    files = [FileView.of(behind, row) for row in rows[:limit]]
+    files = [_file_view(behind, row) for row in rows[:limit]]
     return FilePage(files=files, next=files[-1].path if len(rows) > limit else None)
 
 

@@ -8,10 +8,11 @@ import sqlalchemy as sa
 
 from service.requests.identifiers import JOB
 from service.server.api.problems import RETRY_S, ApiError
-from service.server.api.views import JobView
+from service.server.api.views import job_view
 from service.server.log import logger
 from service.server.store import jobs
 from service.server.store.database import UNANSWERED, Database, said
+from service.views.states import ENDED
 
 TICK_S = 0.25
 """Between two looks; of changes between them the last is told."""
@@ -148,7 +149,7 @@ class Watcher:
         if self._seen.get(row["id"]) == (row["project"], row["revision"]):
             listeners = {listener for listener in listeners if listener.fresh}
         if listeners:
-            change = Change(row["id"], row["revision"], row["state"] in jobs.ENDED, JobView.of(row).model_dump_json(by_alias=True))
+            change = Change(row["id"], row["revision"], row["state"] in ENDED, job_view(row).model_dump_json(by_alias=True))
             for listener in listeners:
                 listener.offer(change)
 

@@ -14,6 +14,7 @@ from service.server.log import logger
 from service.server.store import jobs, workers
 from service.server.store.database import UNANSWERED, Database, said
 from service.server.store.jobs import Claim
+from service.views.states import QUEUED
 
 GRACE_ROUNDS = 2
 """Rounds after the lock was taken anew in which nobody is given up for dead: after a restart of the database others, too, take theirs."""
@@ -106,7 +107,7 @@ class Takeover:
                    "it may need more memory than they have"
         state = self._database.transact(lambda connection: jobs.lose_worker(
             connection, Claim(job, attempt, worker), self._max_lost, sentence))
-        if state == jobs.QUEUED:
+        if state == QUEUED:
             self._queue.put_back(workflow)
         else:
             self._queue.call_off(job, attempt)

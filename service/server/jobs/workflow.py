@@ -20,6 +20,7 @@ from service.server.storage import layout
 from service.server.store import intakes, jobs
 from service.server.store.database import FIRST_PAUSE_S, LONGEST_PAUSE_S, UNANSWERED, said
 from service.server.store.jobs import Claim
+from service.views.states import FAILED, SUCCEEDED
 
 T = TypeVar("T")
 DONE, STOPPED = "done", "stopped"
@@ -82,7 +83,7 @@ class Desk:
                 outcome = step(name)
                 if outcome != DONE:
                     return outcome
-            if jobs.end(self._site.database, claim, jobs.SUCCEEDED):
+            if jobs.end(self._site.database, claim, SUCCEEDED):
                 log.info("job succeeded")
             return DONE
         except UNANSWERED as error:  # the queue could not record a step: the steps are to be gone through again, from the first
@@ -155,8 +156,8 @@ class Desk:
         error = self._site.without_folder(error)
         if job is not None and isinstance(job.request, CheckJob):
             intakes.refuse(self._site.database, job.request.intake, error)
-        jobs.end(self._site.database, claim, jobs.FAILED, error)
-        return jobs.FAILED
+        jobs.end(self._site.database, claim, FAILED, error)
+        return FAILED
 
     def _patiently(self, claim: Claim, work: Callable[[], T]) -> T:
         """Do something, and again while the database does not answer: what is done stays done, and waiting is no hanging."""

@@ -12,8 +12,7 @@ import sqlalchemy as sa
 from service.server.store.database import Database, storable
 from service.server.store.jobs import PATIENCE_S
 from service.server.store.tables import intakes, job_inputs, jobs, newest_first, uploads
-
-RECEIVING, CHECKING, READY, REFUSED = "receiving", "checking", "ready", "refused"
+from service.views.states import CHECKING, READY, RECEIVING, REFUSED
 
 
 def insert(connection: sa.Connection, *, identifier: str, project: str, kind: str, name: str, folder: str | None) -> None:

@@ -14,11 +14,10 @@ from service.requests.identifiers import JOB, new_id
 from service.requests.jobs import JobRequest
 from service.server.store.database import Database, storable
 from service.server.store.tables import intakes, job_inputs, jobs, newest_first
+from service.views.states import ACTIVE, CANCELLED, CHECKING, ENDED, FAILED, QUEUED, REFUSED, RUNNING, SUCCEEDED
 
 FRAMES = "frames"
 """The stage that counts frames."""
-QUEUED, RUNNING, SUCCEEDED, FAILED, CANCELLED = "queued", "running", "succeeded", "failed", "cancelled"
-ACTIVE, ENDED = (QUEUED, RUNNING), (SUCCEEDED, FAILED, CANCELLED)
 PATIENCE_S = 600.0
 """How long a change of a worker waits for a database that does not answer."""
 LATELY_S = 60.0
@@ -264,8 +263,8 @@ def _held(claim: Claim) -> list[sa.ColumnElement[bool]]:
 def _end_check(connection: sa.Connection, job: str, problem: str) -> None:
     """What a check was to look at is refused, so that it does not wait for ever; other jobs read nothing that is being checked."""
     connection.execute(intakes.update().where(
-        intakes.c.state == "checking", intakes.c.id.in_(sa.select(job_inputs.c.input).where(job_inputs.c.job == job))).values(
-        state="refused", problem=problem))
+        intakes.c.state == CHECKING, intakes.c.id.in_(sa.select(job_inputs.c.input).where(job_inputs.c.job == job))).values(
+        state=REFUSED, problem=problem))
 
 
 def _change(database: Database, claim: Claim, free: sa.ColumnElement[bool] | None = None, *, patience_s: float = PATIENCE_S,

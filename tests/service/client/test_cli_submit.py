@@ -166,13 +166,3 @@ def test_ctrl_c_cancels_the_job_where_that_is_asked(owl: str, sky: str):
     assert done.stderr.splitlines() == [f"relit: interrupted; {job} is cancelled"]
     with Client(os.environ["RELIT_SERVER"], os.environ["RELIT_KEY"]) as asking:
         assert asking.jobs.get(job).state == "cancelled"
-
-
-def test_what_the_client_needs_and_what_not():
-    """A pipeline's interpreter loads neither the server nor a device for it."""
-    heavy = "fastapi", "starlette", "dbos", "warp", "pxr", "typer", "uvicorn", "service.solve"
-    code = f"import sys, service.client; print([name for name in {heavy!r} if name in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
-    assert done.stdout.strip() == "[]"
-
-

@@ -1,4 +1,4 @@
-"""Files of this machine that are to be sent: which, how large, and their hashes."""
+"""Local files that are to be uploaded: their names, sizes and hashes."""
 
 import hashlib
 import os
@@ -9,26 +9,23 @@ from pathlib import Path
 from typing import NamedTuple
 
 from service.client.errors import FileError
-from service.client.tally import Tally
-
-PIECE = 1 << 20
-"""Bytes that are read at once."""
+from service.client.transfer import PIECE_BYTES, TransferProgress
 
 
 class LocalFile(NamedTuple):
-    """One file to send."""
+    """One file to upload."""
 
     path: Path
     name: str
-    """Below the folder, / between folders."""
+    """Path below the uploaded folder, with / between folders."""
     size: int
     sha256: str
     """Hexadecimal."""
 
 
 @contextmanager
-def reading(path: Path, action: str = "read") -> Iterator[None]:
-    """Turn what the file system refuses into a FileError."""
+def file_errors(path: Path, action: str = "read") -> Iterator[None]:
+    """Raise a FileError, which says that `action` failed for `path`, in place of an OSError of the body."""
     try:
         yield
     except OSError as error:
@@ -36,10 +33,12 @@ def reading(path: Path, action: str = "read") -> Iterator[None]:
 
 
 def files_of(path: Path) -> list[tuple[Path, str]]:
-    """The file, or all files of the folder by name; those with a leading dot, and of folders with one, are left out.
+    """Return the file, or all files below the folder, with their names in an upload, sorted by name.
+
+    Files and folders whose names begin with a dot are left out.
 
     Raises:
-        FileError: there is none, or a link leads to a folder.
+        FileError: there is no such file or folder, the folder has no files, or it has a link to a folder.
     """
     if path.is_file():
         return [(path, path.name)]
@@ -51,36 +50,36 @@ def files_of(path: Path) -> list[tuple[Path, str]]:
     return found
 
 
-def hashed(files: list[tuple[Path, str]], *, parallel: int, tally: Tally) -> list[LocalFile]:
-    """Sizes and hashes, several files at once.
+def hash_files(files: list[tuple[Path, str]], *, parallel: int, progress: TransferProgress) -> list[LocalFile]:
+    """Return the sizes and hashes of files, which are read in several threads.
 
     Raises:
-        FileError: one cannot be read.
+        FileError: a file cannot be read.
     """
     with ThreadPoolExecutor(parallel) as pool:
-        return list(pool.map(lambda one: _hashed(one[0], one[1], tally), files))
+        return list(pool.map(lambda one: _hash_file(one[0], one[1], progress), files))
 
 
-def manifest_hash(files: list[LocalFile]) -> str:
-    """A hash of names, sizes and contents: equal for equal folders, wherever they lie."""
+def hash_of_all(files: list[LocalFile]) -> str:
+    """Return one hash of the names, sizes and contents of files, which does not depend on the folder they are in."""
     whole = hashlib.sha256()
     for file in files:
         whole.update(f"{file.name}\0{file.size}\0{file.sha256}\n".encode())
     return whole.hexdigest()
 
 
-def _hashed(path: Path, name: str, tally: Tally) -> LocalFile:
+def _hash_file(path: Path, name: str, progress: TransferProgress) -> LocalFile:
     digest, size = hashlib.sha256(), 0
-    with reading(path), open(path, "rb", buffering=0) as file:
-        while piece := file.read(PIECE):
+    with file_errors(path), open(path, "rb", buffering=0) as file:
+        while piece := file.read(PIECE_BYTES):
             digest.update(piece)
             size += len(piece)
-            tally.add(len(piece))
+            progress.add(len(piece))
     return LocalFile(path, name, size, digest.hexdigest())
 
 
 def _below(folder: Path, before: str) -> Iterator[tuple[Path, str]]:
-    with reading(folder):
+    with file_errors(folder):
         entries = [entry for entry in os.scandir(folder) if not entry.name.startswith(".")]
     for entry in entries:
         path = Path(entry.path)

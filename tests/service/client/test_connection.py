@@ -7,7 +7,7 @@ from collections.abc import Callable
 import httpx2
 import pytest
 
-from service.client import Busy, Client, ClientError, Conflict, Faulty, Invalid, NotAllowed, NotFound, Unreachable, link
+from service.client import Busy, Client, ClientError, Conflict, Faulty, Invalid, NotAllowed, NotFound, Unreachable, connection
 from service.requests.jobs import SolveJob
 
 JOB = "job_0123456789abcdefghjk"
@@ -44,7 +44,7 @@ def view() -> httpx2.Response:
 def pauses(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """Pauses are noted and not made."""
     found: list[float] = []
-    monkeypatch.setattr(link.time, "sleep", found.append)
+    monkeypatch.setattr(connection.time, "sleep", found.append)
     return found
 
 
@@ -56,7 +56,7 @@ def test_a_busy_service_is_asked_again_when_it_says(pauses):
     played = Played(problem(429, "too-many", "slow down", **{"Retry-After": "7"}), problem(503, "unavailable", "soon"), view())
     assert client(played).jobs.get(JOB).id == JOB
     assert pauses[0] == 7
-    assert 0 < pauses[1] <= link.FIRST_PAUSE_S * 2
+    assert 0 < pauses[1] <= connection.FIRST_PAUSE_S * 2
     assert len(pauses) == 2
 
 
@@ -69,8 +69,8 @@ def test_one_that_asks_for_more_patience_than_there_is_is_not_waited_for(pauses)
 
 def test_a_time_to_come_back_may_be_a_date():
     answer = httpx2.Response(503, headers={"Retry-After": "Fri, 31 Dec 1999 23:59:59 GMT"})
-    assert link.retry_after(answer) == 0
-    assert link.retry_after(httpx2.Response(503, headers={"Retry-After": "soon"})) is None
+    assert connection.retry_after(answer) == 0
+    assert connection.retry_after(httpx2.Response(503, headers={"Retry-After": "soon"})) is None
 
 
 def test_a_job_is_handed_in_again_with_the_same_token(pauses):
@@ -102,7 +102,7 @@ def test_what_was_not_sent_is_sent_again(pauses):
 
 def test_patience_ends(pauses, monkeypatch: pytest.MonkeyPatch):
     clock = iter(range(0, 1000, 10))
-    monkeypatch.setattr(link.time, "monotonic", lambda: next(clock))
+    monkeypatch.setattr(connection.time, "monotonic", lambda: next(clock))
     played = Played(*[httpx2.ConnectError("refused")] * 100)
     with pytest.raises(Unreachable, match=r"http://service\.test does not answer: refused"):
         client(played, patience_s=50).jobs.get(JOB)

@@ -1,4 +1,4 @@
-"""The link to the service: requests that are sent again where that is safe, and answers made objects or errors."""
+"""Requests to the service: repeated where that is safe, with errors raised as `ClientError`."""
 
 import random
 import secrets
@@ -14,32 +14,32 @@ from service.client.errors import ClientError, Unreachable, refusal
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.2, 10.0
 LATER = (429, 503)
-"""Statuses with which nothing was done, and may be soon."""
+"""Statuses of a request that was not carried out, and may be if it is sent again later."""
 PROXY = (502, 504)
-"""Of a proxy that got no answer: it may have been done."""
+"""Statuses of a proxy that got no answer from the service: the request may have been carried out."""
 NOT_SENT = (httpx2.ConnectError, httpx2.ConnectTimeout, httpx2.PoolTimeout)
 
 
-class Patience:
-    """How long to go on trying, and the pauses between."""
+class Backoff:
+    """Exponential backoff with jitter: pauses between tries that grow, until a time limit."""
 
-    def __init__(self, seconds: float) -> None:
-        """Args: seconds: after which the error of the last try is raised."""
-        self._seconds = seconds
-        self.refresh()
+    def __init__(self, limit_s: float) -> None:
+        """Args: limit_s: seconds since creation or the last `reset` after which `wait` gives up."""
+        self._limit_s = limit_s
+        self.reset()
 
-    def refresh(self) -> None:
-        """Something went well: be as patient as at the beginning."""
-        self._pause, self._deadline = FIRST_PAUSE_S, time.monotonic() + self._seconds
+    def reset(self) -> None:
+        """Begin again with the first pause and the whole time limit, because there was progress."""
+        self._pause, self._deadline = FIRST_PAUSE_S, time.monotonic() + self._limit_s
 
     def wait(self, asked_s: float | None = None) -> bool:
         """Sleep before the next try.
 
         Args:
-            asked_s: how long the service asked for.
+            asked_s: the pause that the service asked for; None: it named none.
 
         Returns:
-            Whether to try again; false, at once, where the pause is longer than patience lasts.
+            Whether to try again; False, without sleeping, if the pause would exceed the time limit.
         """
         pause = self._pause * random.uniform(0.5, 1.0) if asked_s is None else asked_s  # so that clients do not come back all at once
         if time.monotonic() + pause > self._deadline:
@@ -49,12 +49,12 @@ class Patience:
         return True
 
 
-class Link:
-    """Requests to one service with one key; may be used from several threads."""
+class Connection:
+    """Sends requests to one service under one key; several threads may use one connection."""
 
     def __init__(self, server: str, key: str | None, *, patience_s: float, timeout_s: float,
                  transport: httpx2.BaseTransport | None = None) -> None:
-        """Args: as of `Client`."""
+        """Args: as for `Client`."""
         self.server, self._patience_s = server.rstrip("/").removesuffix("/v1"), patience_s
         if key is not None and not (key.isascii() and key.isprintable()):
             raise ClientError("the key has characters that no key has")
@@ -68,61 +68,67 @@ class Link:
                                   transport=transport)
 
     @staticmethod
-    def token() -> str:
-        """A new Idempotency-Key."""
+    def new_token() -> str:
+        """Return a new random value for the header Idempotency-Key."""
         return secrets.token_hex(16)
 
     @staticmethod
-    def path(*parts: str) -> str:
-        """A path of the API: the first part as it is, whatever the others hold as one part each."""
-        return "/".join([parts[0], *(quote(part, safe="") for part in parts[1:])])
+    def path(base: str, *parts: str) -> str:
+        """Return a path of the API: `base` as given, then each part escaped, so that it stays one segment."""
+        return "/".join([base, *(quote(part, safe="") for part in parts)])
 
-    def patience(self) -> Patience:
-        """A new one."""
-        return Patience(self._patience_s)
+    def backoff(self) -> Backoff:
+        """Return a new backoff with the time limit `patience_s`."""
+        return Backoff(self._patience_s)
 
     def send(self, method: str, path: str, *, repeatable: bool = True, **options: Any) -> httpx2.Response:
-        """Send a request, again where that is safe, until it is answered.
+        """Send a request, and repeat it where that is safe, until the service answers.
 
         Args:
             method, path: of the request.
-            repeatable: done twice it does what done once does; otherwise it is sent again only where it was not done.
-            options: of httpx2: json, params, headers …
+            repeatable: whether carrying the request out twice has the same effect as once; if not, it is repeated only where it is
+                certain that it was not carried out.
+            options: passed to httpx2: json, params, headers …
 
         Raises:
-            Refused: the service says no.
-            Unreachable: it does not answer.
+            Refused: the service answers with an error.
+            Unreachable: the service does not answer.
         """
-        return self._retry(lambda: self.once(method, path, **options), repeatable=repeatable)
+        return self._retry(lambda: self.send_once(method, path, **options), repeatable=repeatable)
 
-    def once(self, method: str, path: str, **options: Any) -> httpx2.Response:
-        """Send a request once; an answer that is an error is returned like any other."""
+    def send_once(self, method: str, path: str, **options: Any) -> httpx2.Response:
+        """Send a request once, and return the answer, also if it is an error."""
         return self.http.request(method, path, **options)
 
     def _retry(self, attempt: Callable[[], httpx2.Response], *, repeatable: bool) -> httpx2.Response:
-        patience = self.patience()
+        backoff = self.backoff()
         while True:
             try:
                 answer = attempt()
             except httpx2.TransportError as error:
                 again = repeatable or isinstance(error, NOT_SENT)
-                if not again or not patience.wait():
+                if not again or not backoff.wait():
                     raise self.unreachable(error, unknown=not again) from error
                 continue
             if answer.is_success:
                 return answer
-            if (answer.status_code in LATER or (repeatable and answer.status_code in PROXY)) and patience.wait(retry_after(answer)):
+            if (answer.status_code in LATER or (repeatable and answer.status_code in PROXY)) and backoff.wait(retry_after(answer)):
                 continue
-            raise refusal(answer.status_code, answer.headers.get("content-type", ""), answer.content)
+            raise refusal(answer)
 
     def unreachable(self, error: Exception, *, unknown: bool = False) -> Unreachable:
-        """The error of a service that does not answer; unknown: whether it did what it was asked."""
+        """Return the error for a service that does not answer.
+
+        Args:
+            error: of httpx2.
+            unknown: whether the request may have been carried out all the same.
+        """
         reason = " ".join(str(error).split()) or type(error).__name__
         return Unreachable(f"{self.server} does not answer{', and may have done what was asked' if unknown else ''}: {reason}")
 
 
 def retry_after(answer: httpx2.Response) -> float | None:
-    """Seconds that an answer asks to wait; None: it does not say."""
+    """Return the seconds that the header Retry-After asks to wait, or None if it is missing or malformed."""
     given = answer.headers.get("retry-after", "")
     if given.isdecimal():
         return float(given)

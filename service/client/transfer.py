@@ -1,0 +1,60 @@
+"""What uploads and downloads share: several files at once, and their bytes reported as one progress."""
+
+from collections.abc import Callable, Iterable
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from threading import Event, Lock
+from typing import TypeVar
+
+from service.reporting.progress import Progress
+
+Result = TypeVar("Result")
+MIB = 1 << 20
+PIECE_BYTES = 1 << 20
+"""Bytes of a file that are read or written at once."""
+
+
+class Stopped(Exception):
+    """Raised in a transfer because another file of the same call failed."""
+
+
+class TransferProgress:
+    """Reports transferred bytes to a `Progress` in whole MiB; several threads may add to one."""
+
+    def __init__(self, progress: Progress | None, stage: str, total: int) -> None:
+        """Args: progress: is told; None: nobody is. stage: name of the stage. total: bytes."""
+        self._progress, self._done, self._lock = progress, 0, Lock()
+        if progress is not None:
+            progress.stage(stage, max(1, -(-total // MIB)))
+
+    def add(self, count: int) -> None:
+        """Add transferred bytes; a negative count takes back bytes that have to be transferred again."""
+        with self._lock:
+            before, self._done = self._done // MIB, self._done + count
+            if self._progress is not None and self._done // MIB != before:
+                self._progress.advance(self._done // MIB)
+
+
+def transfer_all(transfers: Iterable[Callable[[Event], Result]], *, parallel: int) -> list[Result]:
+    """Run transfers in threads, and stop all of them when one fails.
+
+    Args:
+        transfers: one call for each file; it raises `Stopped` when the event that it is given is set.
+        parallel: number of threads.
+
+    Returns:
+        What each call returned, in the order of the calls.
+
+    Raises:
+        Exception: the first that a call raised.
+    """
+    stop = Event()
+    pool = ThreadPoolExecutor(parallel)
+    try:
+        futures = [pool.submit(transfer, stop) for transfer in transfers]
+        done, _ = wait(futures, return_when=FIRST_EXCEPTION)
+        for future in done:
+            future.result()
+        return [future.result() for future in futures]
+    finally:  # also after Ctrl-C
+        stop.set()
+        pool.shutdown(cancel_futures=True)

@@ -1,0 +1,14 @@
+"""The base of every view, and the type of its times."""
+
+from datetime import datetime
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Time = Annotated[datetime, Field(description="UTC.")]
+
+
+class View(BaseModel):
+    """Base of every answer; the docstring of a field is its description in the OpenAPI document."""
+
+    model_config = ConfigDict(use_attribute_docstrings=True)

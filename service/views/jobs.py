@@ -1,0 +1,66 @@
+"""Views of jobs and of the files that jobs make."""
+
+from service.requests.identifiers import JobId
+from service.requests.jobs import AnyJob
+from service.views.base import Time, View
+from service.views.states import JobState
+
+
+class ProgressView(View):
+    """How far a running job is."""
+
+    stage: str
+    """ingest, normals, frames …"""
+    done: int
+    total: int
+    rate: float | None
+    """Steps a second, since the stage began."""
+    remaining_s: float | None
+    """Of this stage, at that rate."""
+
+
+class JobView(View):
+    """A job."""
+
+    id: JobId
+    state: JobState
+    attempt: int
+    """1, and one more with every retry."""
+    revision: int
+    """Grows with every change."""
+    priority: int
+    request: AnyJob
+    created_at: Time
+    started_at: Time | None
+    finished_at: Time | None
+    progress: ProgressView | None
+    error: str | None
+    """Why it failed, in one sentence."""
+
+
+class JobPage(View):
+    """Jobs, the newest first."""
+
+    jobs: list[JobView]
+    next: JobId | None
+    """Give it as `before` for the page after this one; null: this is the last page."""
+
+
+class ResultView(View):
+    """A file that a job has made."""
+
+    name: str
+    """Path below the job's results, with / between folders."""
+    size: int
+    """Bytes."""
+    modified_at: Time
+    url: str
+    """Where it is downloaded, on this server."""
+
+
+class ResultPage(View):
+    """Files that a job has made, by name."""
+
+    results: list[ResultView]
+    next: str | None
+    """Give it as `after` for the page after this one; null: this is the last page."""
