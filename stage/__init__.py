@@ -1,1 +1,1 @@
-"""The domain: what was captured, by what, in which units. NumPy only; no Warp."""
+"""The domain: captures and their manifests, cameras and lights, pixels, and the files of results; NumPy, without Warp."""

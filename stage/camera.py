@@ -1,4 +1,4 @@
-"""The camera: projection, lens distortion, and the way between pixels and camera-frame points."""
+"""The camera of a manifest: its projection, its lens distortion, and the conversion between pixels and camera-frame points."""
 
 from typing import Literal, Self
 
@@ -9,25 +9,28 @@ from stage.frames import Transform, pixel_centres
 from stage.model import Positive, Resolution, Strict
 
 UNDISTORT_ITERATIONS = 20
-"""Fixed-point steps of the inverse distortion; lenses of ordinary strength settle to 1e-10 in about ten."""
+"""The number of fixed-point iterations that invert the distortion; ordinary lenses converge to 1e-10 in about ten."""
 
 
 class Distortion(Strict):
-    """Brown–Conrady lens distortion (Brown 1966), OpenCV's k1 k2 k3 and p1 p2, on x right, y down, z forward."""
+    """The Brown-Conrady lens distortion: OpenCV's k1 k2 k3 and p1 p2, on axes x right, y down, z forward.
+
+    Source: Brown, "Decentering distortion of lenses", Photogrammetric Engineering 32(3), 1966.
+    """
 
     model: Literal["brown_conrady"]
     k: tuple[float, float, float] = (0.0, 0.0, 0.0)
     p: tuple[float, float] = (0.0, 0.0)
 
     def apply(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Distort ideal image-plane coordinates (X/Z, Y/Z)."""
+        """Return the distorted image-plane coordinates of ideal ones, x = X/Z and y = Y/Z, arrays of one shape."""
         (k1, k2, k3), (p1, p2) = self.k, self.p
         r2 = x * x + y * y
         radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
         return (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y)
 
     def undo(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Ideal coordinates whose distortion is (x, y), by fixed-point iteration."""
+        """Return the ideal image-plane coordinates that `apply` distorts to x and y, found by fixed-point iteration."""
         ideal_x, ideal_y = x, y
         for _ in range(UNDISTORT_ITERATIONS):
             distorted_x, distorted_y = self.apply(ideal_x, ideal_y)
@@ -36,7 +39,10 @@ class Distortion(Strict):
 
 
 class Camera(Strict):
-    """One camera position. Perspective uses focal_px and principal_px; orthographic uses pixel_size_m."""
+    """A camera at one position.
+
+    A perspective camera is given by `focal_px` and `principal_px`, an orthographic camera by `pixel_size_m`.
+    """
 
     projection: Literal["perspective", "orthographic"]
     resolution: Resolution
@@ -45,7 +51,8 @@ class Camera(Strict):
     distortion: Distortion | None = None
     pixel_size_m: Positive | None = None
     surface_z_m: float | None = None
-    """Camera-frame z of the mean of the masked surface; None: 0 for orthographic, unknown scale for perspective."""
+    """The camera-frame z of the mean of the masked surface. None means 0 for an orthographic camera, and a scene of unknown scale for
+    a perspective camera."""
     world_from_camera: Transform | None = None
 
     @model_validator(mode="after")
@@ -65,31 +72,31 @@ class Camera(Strict):
 
     @property
     def width(self) -> int:
-        """Columns."""
+        """The number of columns of an image."""
         return self.resolution[0]
 
     @property
     def height(self) -> int:
-        """Rows."""
+        """The number of rows of an image."""
         return self.resolution[1]
 
     @property
     def metric(self) -> bool:
-        """Whether solved heights are in metres; otherwise they are in units of pixels."""
+        """True when solved heights are in metres; otherwise they are in units of pixels."""
         return self.pixel_size_m is not None if self.projection == "orthographic" else self.surface_z_m is not None
 
     def plane_coordinates(self) -> tuple[np.ndarray, np.ndarray]:
-        """Where each pixel's line of sight crosses the camera's reference plane.
+        """Return the point at which the line of sight of each pixel crosses the reference plane of the camera.
 
         Returns:
-            x right and y up, each [rows, cols] float64. Perspective: the point of the ray at z = -1, so that
-            (x, y, -1) is along the line of sight. Orthographic: camera-frame x and y of the line, in metres,
-            or in pixels when the capture has no scale.
+            x to the right and y upwards, each [rows, cols] float64. For a perspective camera the plane is z = -1, so that
+            (x, y, -1) points along the line of sight. For an orthographic camera x and y are the camera-frame coordinates of the
+            line of sight, in metres, or in pixels when the capture has no scale.
         """
         return self.plane_at(*pixel_centres(self.width, self.height))
 
     def plane_at(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """`plane_coordinates` at any continuous image coordinates, which may lie between pixel centres or off the image."""
+        """Return `plane_coordinates` of any image coordinates u and v, which may lie between pixel centres or outside the image."""
         cu, cv = self.principal_px or (self.width / 2, self.height / 2)
         if self.projection == "orthographic":
             pixel = self.pixel_size_m or 1.0
@@ -101,10 +108,10 @@ class Camera(Strict):
         return x, -down
 
     def points(self, height: np.ndarray) -> np.ndarray:
-        """Camera-frame points of a height map.
+        """Return the camera-frame points of a height map.
 
         Args:
-            height: [rows, cols] camera-frame z (negative in front of a perspective camera).
+            height: [rows, cols] camera-frame z, negative in front of a perspective camera.
 
         Returns:
             [rows, cols, 3] float32, in the unit of `height`.

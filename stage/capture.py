@@ -1,4 +1,4 @@
-"""A capture folder: its manifest, checked against the files that it names."""
+"""A capture folder: its manifest, and the checks of the files that the manifest names."""
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -15,30 +15,31 @@ from stage.light import DistantLight, EnvironmentLight, ExtendedLight, FullLight
 from stage.manifest import FILE_NAME, Frame, Manifest, read_manifest
 
 SOURCES = (DistantLight, PointLight, ExtendedLight, GradientLight)
-"""Light types whose frames are measurements to solve or relight from."""
+"""The types of light whose frames are measurements, from which surfaces are solved and images are relit."""
 
 HEADER_THREADS = 8
+"""The number of threads that read file headers while a capture is opened."""
 
 LightKind = TypeVar("LightKind", DistantLight, PointLight, ExtendedLight, GradientLight, EnvironmentLight, OffLight, FullLight)
 
 
 @dataclass(frozen=True)
 class Capture:
-    """One folder, one camera position."""
+    """A folder of images that one camera took from one position, with its manifest."""
 
     folder: Path
     manifest: Manifest
 
     @classmethod
     def open(cls, path: str | Path) -> "Capture":
-        """Open a capture and check every file's header.
+        """Open a capture, and check its manifest and the header of every file.
 
         Args:
-            path: the folder, or its capture.json.
+            path: the folder, or the capture.json in it.
 
         Raises:
-            ManifestError: the manifest is wrong; names the field.
-            ImageError: a file has the wrong size or cannot be an image; names the file.
+            ManifestError: the manifest is wrong; the message names the field.
+            ImageError: a file has the wrong size or is no image; the message names the file.
             StorageError: a file cannot be read.
         """
         given = Path(path)
@@ -54,16 +55,16 @@ class Capture:
 
     @property
     def camera(self) -> Camera:
-        """The camera."""
+        """The camera of the manifest."""
         return self.manifest.camera
 
     @property
     def name(self) -> str:
-        """What the capture is called."""
+        """The name of the capture."""
         return self.manifest.name
 
     def file(self, name: str) -> Path:
-        """The path of a file that the manifest names; never outside the folder.
+        """Return the path of a file that the manifest names, which always lies inside the folder.
 
         Raises:
             ManifestError: the name leads out of the folder.
@@ -73,22 +74,22 @@ class Capture:
         return self.folder / name
 
     def lit_by(self, *kinds: type[LightKind]) -> list[tuple[Frame, LightKind]]:
-        """The frames that one of these light types lit, with their lights, in manifest order."""
+        """Return the frames whose light is of one of these types, each with its light, in manifest order."""
         return [(frame, frame.light) for frame in self.manifest.frames if isinstance(frame.light, kinds)]
 
     def sources(self) -> list[Frame]:
-        """The frames whose light is a measurement: neither ambient, nor tracking, nor an environment reference.
+        """Return the frames whose light is a measurement: neither ambient light, nor a tracking frame, nor an environment.
 
-        Beside gradient frames a `full` frame is one: it is what they are compared with.
+        In a capture with gradient frames a `full` frame is a measurement too, because gradient frames are compared with it.
         """
         kinds = (*SOURCES, FullLight) if self.lit_by(GradientLight) else SOURCES
         return [frame for frame in self.manifest.frames if isinstance(frame.light, kinds)]
 
     def mask(self) -> np.ndarray:
-        """Where the object is.
+        """Read the mask of the object.
 
         Returns:
-            [rows, cols] bool; all True without a mask file.
+            [rows, cols] bool, True on the object; all True when the manifest names no mask.
 
         Raises:
             ImageError: the mask is empty or unreadable.
@@ -98,7 +99,7 @@ class Capture:
         return images.read_mask(self.file(self.manifest.mask), self.camera.resolution)
 
     def files(self) -> Iterator[tuple[str, str]]:
-        """(field, file name) of every file that the manifest names."""
+        """Yield the manifest field and the name of every file that the manifest names."""
         for field in ("mask", "dark", "flat"):
             name = getattr(self.manifest, field)
             if name is not None:

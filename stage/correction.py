@@ -1,4 +1,4 @@
-"""Recorded values → scene-linear radiance: colour space, dark, flat, exposure, ambient, saturation."""
+"""Correction of recorded values to scene-linear radiance by colour space, dark frame, flat field, exposure and ambient light."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from stage.manifest import Frame
 
 
 class Radiance(NamedTuple):
-    """One corrected image."""
+    """The corrected pixels of one image, and which of them saturate."""
 
     pixels: np.ndarray  # [rows, cols, 3] float32, scene-linear; may be below 0 by noise once dark or ambient is taken off
     saturated: np.ndarray | None  # [rows, cols] bool, any channel at or above the capture's `saturation`
@@ -22,7 +22,10 @@ class Radiance(NamedTuple):
 
 @dataclass(frozen=True)
 class Correction:
-    """radiance = (linear(recorded) - dark) / flat / exposure - ambient, flat scaled to mean 1 over the mask."""
+    """The correction of every frame of a capture.
+
+    radiance = (linear(recorded) - dark) / flat / exposure - ambient, with the flat field scaled to mean 1 over the mask.
+    """
 
     capture: Capture
     dark: np.ndarray | None  # [rows, cols, 3] float32, linear; taken at the exposure of the frames
@@ -31,10 +34,10 @@ class Correction:
 
     @classmethod
     def of(cls, capture: Capture) -> "Correction":
-        """Read the dark, flat and ambient frames of a capture.
+        """Read the dark, flat and ambient frames of a capture and return its correction.
 
         Raises:
-            ImageError: one is unreadable, holds impossible values, or the flat is dark inside the mask.
+            ImageError: a frame is unreadable or holds impossible values, or the flat field is dark inside the mask.
         """
         manifest = capture.manifest
         space = manifest.color_space
@@ -62,7 +65,7 @@ class Correction:
         """Read one frame and correct it.
 
         Raises:
-            ImageError: unreadable, or NaN, infinite or negative recorded values; names the file.
+            ImageError: the file is unreadable, or a recorded value is NaN, infinite or negative; the message names the file.
         """
         manifest = self.capture.manifest
         recorded = _recorded(self.capture, frame.image)

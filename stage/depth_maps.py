@@ -1,15 +1,15 @@
-"""Solved depth of one capture, and its file: depth.exr."""
+"""The depth of one capture with what was measured beside it, and its file, depth.exr."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
 from stage import exr
 from stage.camera import Camera
 from stage.errors import ResultError
+from stage.result_metadata import camera_and_provenance, result_metadata
 
 DEPTH_FILE = "depth.exr"
 LAYERS: dict[str, tuple[str, type[np.floating[Any]]]] = {
@@ -23,12 +23,12 @@ LAYERS: dict[str, tuple[str, type[np.floating[Any]]]] = {
     "status": ("status.Y", np.float16),
     "mask": ("mask.Y", np.float16),
 }
-"""Layer → its channel and the type that it is stored as."""
+"""The channel and the stored type of each layer."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DepthMaps:
-    """What was measured at each pixel. A layer that the method does not estimate is None."""
+    """The layers that were measured at each pixel. A layer that the method does not estimate is None."""
 
     camera: Camera
     mask: np.ndarray  # [rows, cols] bool, True where there is a depth
@@ -43,11 +43,11 @@ class DepthMaps:
     provenance: dict[str, str] = field(default_factory=dict)
 
     def layers(self) -> dict[str, np.ndarray]:
-        """The layers that exist, by name, in file order."""
+        """Return the layers that were estimated by their names, in the order of the file."""
         return {name: getattr(self, name) for name in LAYERS if getattr(self, name) is not None}
 
     def write(self, path: str | Path) -> None:
-        """Write depth.exr: temporary name, then rename; pixels outside the mask are 0 in every layer but status.
+        """Write depth.exr whole or not at all, with pixels outside the mask 0 in every layer but `status`.
 
         Raises:
             StorageError: the file cannot be written.
@@ -57,29 +57,22 @@ class DepthMaps:
             channel, dtype = LAYERS[name]
             kept = values if name == "status" else np.where(self.mask, values, 0)
             channels[channel] = kept.astype(dtype)
-        metadata = {"relit:camera": self.camera.model_dump_json(), **self.provenance}
-        exr.write(path, channels, color_space="lin_rec709_scene", metadata=metadata)
+        exr.write(path, channels, color_space="lin_rec709_scene", metadata=result_metadata(self.camera, self.provenance))
 
     @classmethod
     def read(cls, path: str | Path) -> "DepthMaps":
         """Read a depth.exr that Relit wrote.
 
         Raises:
-            ResultError: a layer that there must be is not there, or the camera is not in the metadata.
-            ImageError: not a readable EXR.
+            ResultError: the layer of the mask or of the depth is missing, or the metadata holds no camera.
+            ImageError: the file is not a readable EXR.
         """
         channels, metadata = exr.read(path)
-        if "relit:camera" not in metadata:
-            raise ResultError(f"{path}: carries no relit:camera attribute, so it is not a depth.exr of relit")
+        camera, provenance = camera_and_provenance(metadata, path, file_name=DEPTH_FILE)
         found = {name: channels[channel].astype(np.float32) for name, (channel, _) in LAYERS.items() if channel in channels}
         for name in ("mask", "depth"):
             if name not in found:
                 raise ResultError(f"{path}: has no layer {LAYERS[name][0]}")
-        try:
-            camera = Camera.model_validate_json(str(metadata["relit:camera"]))
-        except ValidationError as error:
-            raise ResultError(f"{path}: its relit:camera attribute is not a camera") from error
-        provenance = {k: v for k, v in metadata.items() if k.startswith("relit:") and k != "relit:camera"}
         status = found.pop("status", None)
         return cls(camera=camera, mask=found.pop("mask") > 0.5, provenance=provenance,
                    status=None if status is None else status.astype(np.uint8), **found)

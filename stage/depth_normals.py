@@ -1,7 +1,7 @@
-"""Normals of a depth map: at each pixel the plane that fits its neighbourhood.
+"""Normals of a depth map, from the plane that fits the neighbourhood of each pixel.
 
 Along the lines of sight (x, y, -1) of a perspective camera the inverse depth of the plane n·p = c is (n_x x + n_y y - n_z) / c: linear
-in x and y. So the plane is a least-squares fit of the inverse depth over the neighbours, exact for planes at any tilt and distance.
+in x and y. The plane is therefore a linear least-squares fit of the inverse depth over the neighbours, exact for every plane.
 """
 
 import numpy as np
@@ -9,40 +9,43 @@ import numpy as np
 from stage.camera import Camera
 
 STEEPEST = 5.67
-"""Tangent of 80°: a surface that recedes faster between two neighbouring pixels is taken to be two surfaces."""
+"""The tangent of 80°: where depth changes faster between two neighbouring pixels, they are taken to show two surfaces."""
 LEAST_NEIGHBOURS = 3
-"""Beside the pixel itself, for a plane."""
+"""The least number of neighbours, without the pixel itself, that a plane is fitted to."""
 LEAST_SPREAD = 1e-3
-"""Of the neighbours' places across their main direction, relative: on one line there is no plane."""
+"""The least relative spread of the neighbours across their main direction: points on one line determine no plane."""
 ROWS = 256
-"""Rows that are worked on at one time: bounds the memory."""
+"""The number of rows that are fitted at one time, which bounds the memory."""
 
 
-def same_surface(near: np.ndarray, far: np.ndarray, distance_px: float, camera: Camera) -> np.ndarray:
-    """Whether two depths so many pixels apart can lie on one surface that is not steeper than 80 degrees.
+def same_surface(first: np.ndarray, second: np.ndarray, distance_px: float, camera: Camera) -> np.ndarray:
+    """Return whether two depths can lie on one surface that is not steeper than 80 degrees.
 
     Args:
-        near, far: depths, metres, of one shape; their order does not matter.
-        distance_px: between their pixels.
-        camera: of either projection.
+        first, second: depths in metres, of one shape; their order does not matter.
+        distance_px: the distance between their two pixels, in pixels.
+        camera: a perspective or orthographic camera.
+
+    Returns:
+        bool in the shape of the depths.
     """
     if camera.focal_px is None:
-        return np.asarray(np.abs(near - far) <= STEEPEST * (camera.pixel_size_m or 1.0) * distance_px)
-    footprint = np.minimum(near, far) / min(camera.focal_px)
-    return np.asarray(np.abs(near - far) <= STEEPEST * footprint * distance_px)
+        return np.asarray(np.abs(first - second) <= STEEPEST * (camera.pixel_size_m or 1.0) * distance_px)
+    footprint = np.minimum(first, second) / min(camera.focal_px)
+    return np.asarray(np.abs(first - second) <= STEEPEST * footprint * distance_px)
 
 
 def depth_normals(depth: np.ndarray, mask: np.ndarray, camera: Camera, *, radius: int = 1) -> np.ndarray:
-    """Fit a plane to each pixel and its neighbours on the same surface.
+    """Return the normal of the plane through each pixel and its neighbours on the same surface.
 
     Args:
         depth: [rows, cols] metres.
-        mask: [rows, cols] bool, where there is a depth.
-        camera: perspective.
-        radius: of the neighbourhood, pixels: 1 is 3×3.
+        mask: [rows, cols] bool, True where there is a depth.
+        camera: a perspective camera.
+        radius: the radius of the neighbourhood in pixels; 1 is 3×3 pixels.
 
     Returns:
-        [rows, cols, 3] float32, unit, camera frame, towards the camera; 0 where the neighbours do not span a plane.
+        [rows, cols, 3] float32, unit, camera frame, towards the camera; 0 where the neighbours determine no plane.
     """
     x, y = camera.plane_coordinates()
     normal = np.zeros((*depth.shape, 3), dtype=np.float32)
@@ -54,7 +57,7 @@ def depth_normals(depth: np.ndarray, mask: np.ndarray, camera: Camera, *, radius
 
 
 def _fit(depth: np.ndarray, mask: np.ndarray, x: np.ndarray, y: np.ndarray, camera: Camera, radius: int) -> np.ndarray:
-    """The same for a few rows, whose outer ones lack neighbours."""
+    """Return the normals of a range of rows, the outermost of which lack neighbours."""
     depth = np.where(mask, depth, 1.0).astype(np.float64)
     inverse = 1 / depth
     count = mask.astype(np.float64)

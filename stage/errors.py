@@ -1,11 +1,11 @@
-"""Errors of the stage floor.
+"""The exceptions that stage/ raises.
 
 StageError
-├── ManifestError    capture.json (or another description) is not what it must be; names the field
-├── ImageError       a file cannot be read as the pixels it should hold; names the file
-├── CalibrationError the images do not show what is to be measured in them (no spot on the ball); names frame or ball
-├── ResultError      a result file (maps.exr, …) lacks what is asked of it; names the file
-└── StorageError     the disk refuses: no space, no permission, unreadable folder; names the path
+├── ManifestError    capture.json or another JSON description is wrong; the message names file and field
+├── ImageError       a file does not hold the pixels that it should hold; the message names the file
+├── CalibrationError images do not show what is measured in them, as a spot on a ball; the message names frame, ball or field
+├── ResultError      a result file such as maps.exr lacks a layer; the message names file and layer
+└── StorageError     the file system refuses for lack of space or permission; the message names path and reason
 """
 
 from collections.abc import Iterator
@@ -14,27 +14,27 @@ from os import PathLike, strerror
 
 
 class StageError(Exception):
-    """Base of everything that stage/ raises on purpose; its text is one plain sentence."""
+    """The base of all exceptions that stage/ raises; the message is one plain sentence."""
 
 
 class ManifestError(StageError, ValueError):
-    """A manifest or calibration file is wrong: the message names file and field."""
+    """A manifest or calibration file is wrong; the message names file and field."""
 
 
 class ImageError(StageError, ValueError):
-    """An image cannot be used: the message names the file."""
+    """An image cannot be used; the message names the file."""
 
 
 class CalibrationError(StageError, ValueError):
-    """A calibration cannot be had from these images: the message names the frame, the ball or the field."""
+    """The images do not determine a calibration; the message names the frame, the ball or the field."""
 
 
 class ResultError(StageError, ValueError):
-    """A result file cannot be used: the message names the file and the layer."""
+    """A result file cannot be used; the message names the file and the layer."""
 
 
 class StorageError(StageError, OSError):
-    """The file system refuses: the message names the path and the reason."""
+    """The file system refuses an operation; the message names the path and the reason."""
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""OpenEXR files: named channels in and out, with metadata; written whole or not at all."""
+"""Reading and writing of OpenEXR files: named channels, metadata, colour space and compression."""
 
 import os
 import struct
@@ -13,11 +13,11 @@ from stage.errors import ImageError, StorageError, storage
 from stage.files import replacing
 
 SCANLINES_PER_CHUNK = {0: 1, 1: 1, 2: 1, 3: 16, 4: 32, 5: 16, 6: 32, 7: 32, 8: 32, 9: 256}
-"""Compression code of the file format → rows per chunk (OpenEXR file layout, "Scan line blocks")."""
+"""The rows of one chunk by the compression code of the file format (OpenEXR file layout, "Scan line blocks")."""
 
 
 class Compression:
-    """Names for the compressions that relit writes."""
+    """The compressions with which relit writes."""
 
     ZIP = OpenEXR.ZIP_COMPRESSION
     PIZ = OpenEXR.PIZ_COMPRESSION
@@ -25,11 +25,11 @@ class Compression:
 
 
 DWA_LEVEL = 45.0
-"""How lossy DWAA is: the library's own default, written into the file so that it is known; 0 loses least."""
+"""The compression level of DWAA, for which 0 loses least: the default of the library, stated in the file."""
 
 
 class Header(NamedTuple):
-    """What an EXR says about itself before any pixel is read."""
+    """The header of an EXR file: its size, its channels, and its attributes."""
 
     width: int
     height: int
@@ -38,10 +38,10 @@ class Header(NamedTuple):
 
 
 def read_header(path: str | Path) -> Header:
-    """Read the header only.
+    """Read the header of an EXR file, and check from its chunk table that the file is whole.
 
     Raises:
-        ImageError: not an EXR, truncated, of several parts, or deep.
+        ImageError: the file is not an EXR, is truncated, or has several parts or deep data.
         StorageError: the file cannot be opened.
     """
     with storage("read", path), open(path, "rb") as stream:
@@ -67,13 +67,13 @@ def read_header(path: str | Path) -> Header:
 
 
 def read(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Read every channel.
+    """Read every channel of an EXR file.
 
     Returns:
-        channels: name → [rows, cols] in the type it is stored as; metadata: attribute → value.
+        The channels by name, each [rows, cols] in its stored type, and the attributes of the header by name.
 
     Raises:
-        ImageError: not a readable flat single-part EXR.
+        ImageError: the file is not a readable single-part EXR of flat data.
         StorageError: the file cannot be opened.
     """
     header = read_header(path)
@@ -87,14 +87,14 @@ def read(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 def write(path: str | Path, channels: Mapping[str, np.ndarray], *, color_space: str, metadata: Mapping[str, str],
           compression: Any = Compression.ZIP) -> None:
-    """Write one single-part EXR.
+    """Write a single-part EXR file whole or not at all.
 
     Args:
-        channels: name → [rows, cols] float16 or float32.
-        color_space: a scene-linear colour space by its interchange name; kept as `colorInteropID`, with the
-            `chromaticities` that readers without that attribute understand.
+        channels: the channels by name, each [rows, cols] float16 or float32.
+        color_space: the interchange name of a scene-linear colour space; it is written as `colorInteropID`, and as
+            `chromaticities` for readers that do not know that attribute.
         metadata: further string attributes.
-        compression: one of Compression. DWAA is lossy in the channels whose name ends in R, G, B or Y, of every layer.
+        compression: a member of Compression. DWAA is lossy in the channels whose name ends in R, G, B or Y, of every layer.
 
     Raises:
         StorageError: the file cannot be written; nothing is left behind.
@@ -119,16 +119,16 @@ def write(path: str | Path, channels: Mapping[str, np.ndarray], *, color_space: 
 
 
 PRIMARIES = ("lin_rec709_scene", "lin_ap1_scene", "lin_ap0_scene", "lin_rec2020_scene", "lin_p3d65_scene")
-"""Scene-linear spaces that `chromaticities` are compared with."""
+"""The scene-linear colour spaces with which `chromaticities` are compared."""
 PRIMARIES_TOLERANCE = 2e-3
-"""Of a coordinate: writers round them."""
+"""The largest difference of a chromaticity coordinate, because writers round the coordinates."""
 
 
 def color_space_of(metadata: Mapping[str, Any], default: str = "lin_rec709_scene") -> str:
-    """The scene-linear colour space that a header names by `colorInteropID`, or shows by `chromaticities`; else `default`.
+    """Return the scene-linear colour space that a header declares by `colorInteropID` or by `chromaticities`, else `default`.
 
     Raises:
-        ValueError: chromaticities of no known space.
+        ValueError: the chromaticities are those of no known colour space.
     """
     if (name := metadata.get("colorInteropID")) is not None:
         return str(name)
@@ -141,7 +141,7 @@ def color_space_of(metadata: Mapping[str, Any], default: str = "lin_rec709_scene
 
 
 def _missing_bytes(path: str | Path, header: Header) -> int:
-    """How many bytes a file lacks at the least, judged by its last chunk; 0 when whole (or of several levels: not judged).
+    """Return a lower bound of the bytes that a file lacks, from its last chunk; 0 for a whole file, or one with several levels.
 
     The library reports a short file only while it decodes, and then on the terminal too.
     """
@@ -166,7 +166,7 @@ def _missing_bytes(path: str | Path, header: Header) -> int:
 
 
 def _layout(header: Header) -> tuple[int, int]:
-    """Chunks of the file, and the bytes in front of a chunk's size: the row, or the tile's place and level. (0, 0): not known."""
+    """Return the count of chunks and the bytes before the size in a chunk (a row, or the position and level of a tile), or (0, 0)."""
     if header.metadata["type"] == OpenEXR.scanlineimage:
         return -(-header.height // SCANLINES_PER_CHUNK.get(int(header.metadata["compression"]), 1)), 4
     tiles = header.metadata["tiles"]
@@ -176,7 +176,7 @@ def _layout(header: Header) -> tuple[int, int]:
 
 
 def _skip_attribute(stream: Any) -> bool:
-    """Step over one header attribute; False at the end of the header."""
+    """Skip one header attribute and return True, or return False at the end of the header."""
     if not _text(stream):
         return False
     _text(stream)

@@ -1,4 +1,8 @@
-"""Lights of any extent of a capture as arrays: area sources as samples of the sphere, distant lights as one sample each."""
+"""The extended and distant lights of a capture as arrays: samples of area sources, and one sample for each distant light.
+
+Source: Nayar, Ikeuchi and Kanade, "Determining shape and reflectance of hybrid surfaces by photometric sampling", IEEE Trans.
+    Robotics and Automation 6(4), 1990.
+"""
 
 from typing import NamedTuple
 
@@ -10,27 +14,33 @@ from stage.light import DistantLight, ExtendedLight
 from stage.manifest import FILE_NAME
 
 COLOUR_TOLERANCE = 0.02
-"""Part of a source's light that may be of another colour than the whole: its samples are then shares of one spectrum."""
+"""The largest part of the light of a source that may differ in colour from the whole: each sample is then a share of one spectrum."""
 LEAST_SPREAD = 1e-3
-"""Least ratio of the smallest to the largest singular value of all samples' directions: about 0.1° out of one plane."""
+"""The least ratio of the smallest to the largest singular value of directions that determine a normal: about 0.1° out of a plane."""
 
 
 class ExtendedLights(NamedTuple):
-    """Samples of every light, and one row a frame, in manifest order, as in the stack."""
+    """The samples of all lights, and the irradiance of each light, in the order of the frames in the manifest and in the stack."""
 
     direction: np.ndarray  # [samples, 3] float64, unit, from the surface to the sample, camera frame
     solid_angle: np.ndarray  # [samples] float64, steradians; 0 for a distant light
-    light: np.ndarray  # [samples] int, row of `irradiance`
-    share: np.ndarray  # [samples] float64, of the light's irradiance; they add up to one
-    irradiance: np.ndarray  # [lights, 3] float64: Σ radiance · solid angle, every sample at normal incidence
+    light: np.ndarray  # [samples] int, the light of the sample: a row of `irradiance`
+    share: np.ndarray  # [samples] float64, part of the irradiance of its light; the parts of a light add up to one
+    irradiance: np.ndarray  # [lights, 3] float64, Σ radiance · solid angle: every sample at normal incidence
+
+
+def lie_in_one_plane(direction: np.ndarray) -> bool:
+    """Return whether directions [n, 3] lie in one plane through the origin, so that no normal can be solved from them."""
+    spread = np.linalg.svd(direction, compute_uv=False)
+    return len(spread) < 3 or bool(spread[2] < LEAST_SPREAD * spread[0])
 
 
 def extended_lights(capture: Capture) -> ExtendedLights:
-    """The lights of the capture's stack, which must be extended or distant.
+    """Return the lights of the stack of a capture, all of which must be extended or distant.
 
     Raises:
-        ManifestError: another kind of light; a source whose colour changes over it; fewer than three lights; all light from one
-            plane; a channel without light. Names the frame.
+        ManifestError: a light of another type, a source whose colour changes over its extent, fewer than three lights, light from
+            one plane only, or a channel without light; the message names the frame.
     """
     where = capture.folder / FILE_NAME
     direction, solid_angle, share, irradiance = [], [], [], []
@@ -63,8 +73,7 @@ def extended_lights(capture: Capture) -> ExtendedLights:
     lights = ExtendedLights(np.concatenate(direction), np.concatenate(solid_angle),
                             np.repeat(np.arange(count), [len(part) for part in share]), np.concatenate(share),
                             np.array(irradiance))
-    spread = np.linalg.svd(lights.direction, compute_uv=False)
-    if len(spread) < 3 or spread[2] < LEAST_SPREAD * spread[0]:
+    if lie_in_one_plane(lights.direction):
         raise ManifestError(f"{where}: frames[].light.directions: all light comes from one plane through the object: "
                             "a normal needs light from out of it")
     unlit = np.flatnonzero(~(lights.irradiance > 0).any(axis=0))

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all: a temporary name beside the target, flushed to disk, then renamed."""
+"""Writing of files whole or not at all: to a temporary file beside the target, flushed to disk, then renamed."""
 
 import os
 import tempfile
@@ -14,11 +14,11 @@ _umask_lock = threading.Lock()
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """Give a temporary path to write to; on a clean exit it takes the place of `path`, else it is removed.
+    """Yield the path of a temporary file, which replaces `path` when the block ends without an error and is removed otherwise.
 
     Convention:
-        The temporary file lies in the same folder and keeps the suffix, so that writers which choose a format by
-        suffix work. Missing parent folders are made.
+        The temporary file lies in the same folder and has the same suffix, because writers choose a format by the suffix.
+        Missing parent folders are made.
 
     Raises:
         StorageError: the folder or file cannot be written.
@@ -41,13 +41,17 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a small UTF-8 file whole or not at all."""
+    """Write a UTF-8 text file whole or not at all.
+
+    Raises:
+        StorageError: the folder or file cannot be written.
+    """
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 def resolved(path: Path) -> Path | None:
-    """Where a path leads, links followed; None where it leads nowhere: in a circle, or to a name that cannot be."""
+    """Return a path with its links followed, or None for a circle of links or an invalid name."""
     try:
         return path.resolve()
     except (OSError, RuntimeError, ValueError):

@@ -1,4 +1,4 @@
-"""Content hashes of a capture's files, remembered by size and time so that unchanged files are not read again."""
+"""Content hashes of files, remembered by size and modification time so that unchanged files are not read again."""
 
 import hashlib
 import json
@@ -9,13 +9,19 @@ from stage.errors import storage
 from stage.files import write_text
 
 BLOCK = 1 << 20
+"""The bytes of a file that are read and hashed at one time."""
 
 
 class Fingerprints:
-    """Content hashes of the files of one folder, with a small memory file."""
+    """The content hashes of the files of one folder, which are kept in a JSON file between runs."""
 
     def __init__(self, folder: Path, memory: Path) -> None:
-        """Args: folder that holds the files; memory: the JSON file to remember hashes in (it need not exist)."""
+        """Load the hashes that an earlier run has kept.
+
+        Args:
+            folder: the folder of the files.
+            memory: the JSON file of the hashes, which need not exist.
+        """
         self._folder = folder
         self._memory = memory
         self._known: dict[str, list[int | str]] = {}
@@ -23,10 +29,10 @@ class Fingerprints:
             remembered = json.loads(memory.read_text(encoding="utf-8"))
             self._known = {name: [*entry] for name, entry in remembered.items() if len(entry) == 3}
         except (OSError, ValueError, AttributeError, TypeError):
-            pass  # a cache, and a damaged one: hashed again
+            pass  # damaged hashes are computed again
 
     def of(self, names: Iterable[str]) -> dict[str, str]:
-        """Content hash of each file.
+        """Return the content hash of each file by its name.
 
         Raises:
             StorageError: a file cannot be read.
@@ -43,15 +49,15 @@ class Fingerprints:
         return result
 
     def remember(self) -> None:
-        """Write the memory file."""
+        """Write the hashes to the JSON file."""
         write_text(self._memory, json.dumps(self._known))
 
 
 def digest(path: str | Path) -> str:
-    """Content hash of one file.
+    """Return the content hash of one file: BLAKE2b with 16 bytes, in hexadecimal digits.
 
     Raises:
-        StorageError: it cannot be read.
+        StorageError: the file cannot be read.
     """
     content = hashlib.blake2b(digest_size=16)
     with storage("read", path), open(path, "rb") as stream:

@@ -1,4 +1,4 @@
-"""Frames and coordinates: a_from_b transforms, pixel centres, and the lat-long sphere.
+"""Coordinate frames: pixel centres, rigid transforms that are named a_from_b, rotations, and even directions on the sphere.
 
 Camera frame: right-handed, +x right, +y up, +z towards the viewer; the camera looks along -z. Image coordinates (u, v) are
 continuous from the top-left corner of the image, u right and v down: the centre of pixel (row r, column c) is (c + 0.5, r + 0.5).
@@ -11,11 +11,14 @@ import numpy as np
 from pydantic import AfterValidator
 
 RIGID_TOLERANCE = 1e-4
-"""How far R Rᵀ may be from the identity: matrices are typed and printed with four or more digits."""
+"""The largest difference between R Rᵀ and the identity: matrices are typed and printed with four digits or more."""
+
+OPENCV_FROM_CAMERA = np.diag([1.0, -1.0, -1.0])
+"""The rotation from the camera frame to the axes of OpenCV, x right, y down, z forward; it is its own inverse."""
 
 
 def pixel_centres(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Continuous image coordinates of every pixel centre.
+    """Return the continuous image coordinates of every pixel centre.
 
     Returns:
         u [height, width] and v [height, width], float64, pixels.
@@ -25,7 +28,7 @@ def pixel_centres(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def rigid_fault(matrix: np.ndarray) -> str | None:
-    """Why a 4×4 `a_from_b` is not a rotation and a translation, or None when it is."""
+    """Return why a 4×4 matrix is not a rotation and a translation, or None when it is."""
     if not np.isfinite(matrix).all():
         return "holds a value that is not finite"
     if not np.allclose(matrix[3], (0, 0, 0, 1)):
@@ -47,27 +50,28 @@ def _rigid(rows: tuple[tuple[float, float, float, float], ...]) -> tuple[tuple[f
 
 Row = tuple[float, float, float, float]
 Transform = Annotated[tuple[Row, Row, Row, Row], AfterValidator(_rigid)]
-"""A 4×4 `a_from_b` of a manifest, rows; a rotation and a translation."""
+"""The rows of a 4×4 `a_from_b` matrix in a manifest: a rotation and a translation."""
 
 
 def rotation_about_y(degrees: float) -> np.ndarray:
-    """Rotation about +y, positive from +z towards +x.
+    """Return the rotation about +y by an angle, positive from +z towards +x.
 
     Returns:
-        [3, 3] float64, column vectors: turned = rotation @ direction.
+        [3, 3] float64 for column vectors: rotated = rotation @ direction.
     """
     c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
 
 
 def rotation_about(axis: tuple[float, float, float], degrees: float) -> np.ndarray:
-    """Rotation about any axis through the origin, by the right-hand rule: about +y as rotation_about_y.
+    """Return the rotation about an axis through the origin by an angle, positive by the right-hand rule.
 
     Args:
-        axis: unit vector.
+        axis: a unit vector.
+        degrees: the angle.
 
     Returns:
-        [3, 3] float64, column vectors: turned = rotation @ direction.
+        [3, 3] float64 for column vectors: rotated = rotation @ direction.
 
     Source: Rodrigues' formula.
     """
@@ -77,31 +81,8 @@ def rotation_about(axis: tuple[float, float, float], degrees: float) -> np.ndarr
     return c * np.eye(3) + s * cross + (1 - c) * np.outer(axis, axis)
 
 
-def latlong_directions(width: int, height: int) -> np.ndarray:
-    """Direction from the object to each texel centre of a lat-long map.
-
-    The top row is +y, the image centre +z, a quarter from the left +x, the left edge -z (OpenEXR, UsdLux DomeLight).
-
-    Returns:
-        [height, width, 3] float64 unit vectors.
-    """
-    u, v = pixel_centres(width, height)
-    azimuth, polar = 2 * np.pi * u / width, np.pi * v / height
-    return np.stack([np.sin(azimuth) * np.sin(polar), np.cos(polar), -np.cos(azimuth) * np.sin(polar)], axis=-1)
-
-
-def latlong_solid_angles(width: int, height: int) -> np.ndarray:
-    """Solid angle of the texels of each row, steradians.
-
-    Returns:
-        [height] float64: sin(πv)·(π/H)·(2π/W).
-    """
-    v = (np.arange(height) + 0.5) / height
-    return np.sin(np.pi * v) * (np.pi / height) * (2 * np.pi / width)
-
-
 def fibonacci_sphere(count: int) -> np.ndarray:
-    """Directions spread evenly over the sphere.
+    """Return directions that are spread evenly over the sphere, a Fibonacci grid.
 
     Returns:
         [count, 3] float64 unit vectors.

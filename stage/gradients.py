@@ -1,8 +1,12 @@
-"""The spherical gradient frames of a capture as arrays, and whether they determine a normal.
+"""The spherical gradient frames of a capture as rows of a linear system, and the check that they determine a normal.
 
 Under radiance L(ω) = mean + dipole·ω a pixel's radiance is mean · M₀ + dipole · M, with M₀ its response to the full sphere and M
 its response to L = ω. A gradient (1 ± ω_a)/2 is mean 1/2 and dipole ±e_a/2; the full sphere is mean 1. So a frame is one row of
 a linear system in (M₀, M), whatever the reflectance is.
+
+Source: Ma et al., "Rapid acquisition of specular and diffuse normal maps from polarized spherical gradient illumination",
+    Eurographics Symposium on Rendering 2007, section 3; opposite gradients: Wilson et al., "Temporal upsampling of performance
+    geometry using photometric alignment", ACM Trans. Graphics 29(2), 2010.
 """
 
 from typing import NamedTuple
@@ -19,29 +23,30 @@ AXES = "xyz"
 
 
 class GradientFrames(NamedTuple):
-    """What each frame of the capture's stack measures, per polarization that the solve uses."""
+    """The row of the linear system for each frame of the stack of a capture, for each polarisation that the solver uses."""
 
-    diffuse: np.ndarray  # [frames, 4] float64, (mean, dipole x, y, z); 0 for frames that do not take part
-    parallel: np.ndarray | None  # the same of the parallel-polarised frames, or None
+    diffuse: np.ndarray  # [frames, 4] float64, (mean, dipole x, y, z); 0 for frames that are not used
+    parallel: np.ndarray | None  # [frames, 4] float64, the rows of the parallel-polarised frames, or None
     polarised: bool
-    """Whether `diffuse` are cross-polarised frames: then they hold half of the diffuse light and nothing of the highlight."""
+    """True when `diffuse` holds cross-polarised frames, which record half of the diffuse light and none of the specular light."""
     unused: tuple[str, ...]
-    """Images of gradient or full frames that the solve does not need."""
+    """The images of gradient and full frames that the solver does not use."""
 
 
 def has_gradients(capture: Capture) -> bool:
-    """Whether any frame is lit by a gradient light."""
+    """Return whether a gradient light lit any frame of a capture."""
     return bool(capture.lit_by(GradientLight))
 
 
 def gradient_frames(capture: Capture) -> GradientFrames:
-    """The gradient and full frames of a capture, in the order of its stack.
+    """Return the linear system of the gradient and full frames of a capture, in the order of its stack.
 
-    Cross-polarised frames are the diffuse ones where there are any, parallel ones add the specular; else unpolarised frames.
-    A `full` frame, which says nothing of a polariser, counts as an unpolarised gradient frame of axis `full`.
+    When there are cross-polarised frames they are the diffuse frames, and parallel-polarised frames add the specular light;
+    otherwise the unpolarised frames are used. A `full` frame, which names no polariser, counts as an unpolarised gradient frame of
+    axis `full`.
 
     Raises:
-        ManifestError: no gradient frames, or they lack what a normal needs; names it.
+        ManifestError: there are no gradient frames, or they do not determine a normal; the message names what is missing.
     """
     where = capture.folder / FILE_NAME
     if not has_gradients(capture):
@@ -76,7 +81,7 @@ def _row(light: GradientLight) -> tuple[float, float, float, float]:
 
 
 def _check(what: str, rows: np.ndarray, polarization: str) -> None:
-    """Refuse rows that leave M₀ or a component of M open."""
+    """Raise ManifestError for rows that do not determine M₀ and all components of M."""
     lack = [axis for a, axis in enumerate(AXES) if not rows[:, 1 + a].any()]
     which = "" if polarization == "none" else f" with polarization {polarization}"
     if lack:

@@ -1,4 +1,4 @@
-"""Pixels in: header first, then pixels, from EXR, PNG, TIFF, HDR, JPEG and their kin."""
+"""Reading of images (EXR, PNG, TIFF, HDR, JPEG, JPEG XL, DPX): the header first, then the recorded pixels."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -14,19 +14,19 @@ SUFFIXES = {".exr", *OIIO_SUFFIXES}
 
 
 class ImageHeader(NamedTuple):
-    """Size and kind of an image, known before any pixel is decoded."""
+    """The size and the channels of an image, which are known before any pixel is decoded."""
 
     width: int
     height: int
-    channels: int  # 1 grey, 3 RGB; alpha is not counted
-    stored: int  # all that the file holds, which are decoded together
+    channels: int  # 1 for grey, 3 for RGB; alpha is not counted
+    stored: int  # the count of all channels in the file, which are decoded together
 
 
 def read_header(path: str | Path) -> ImageHeader:
-    """Read size and channels only.
+    """Read the size and the channels of an image.
 
     Raises:
-        ImageError: not an image that relit reads; truncated (EXR, PNG); no grey or RGB channels.
+        ImageError: relit does not read such files, the file is truncated (EXR and PNG), or it has no grey or RGB channels.
         StorageError: the file cannot be opened.
     """
     suffix = Path(path).suffix.lower()
@@ -46,13 +46,13 @@ def read_header(path: str | Path) -> ImageHeader:
 
 
 def read_pixels(path: str | Path) -> np.ndarray:
-    """Read recorded values; integers become fractions of full scale, floating-point values stay as they are.
+    """Read the recorded values of an image: integers as fractions of full scale, floating-point values unchanged.
 
     Returns:
-        [rows, cols, 3] float32 (or float16 where the file holds half values); grey images repeat their one channel.
+        [rows, cols, 3] float32, or float16 when the file holds half values; grey images repeat their one channel.
 
     Raises:
-        ImageError: the file is damaged or not an image that relit reads.
+        ImageError: the file is damaged, or relit does not read such files.
         StorageError: the file cannot be opened.
     """
     suffix = Path(path).suffix.lower()
@@ -80,16 +80,17 @@ def read_pixels(path: str | Path) -> np.ndarray:
 
 
 def read_mask(path: str | Path, resolution: tuple[int, int]) -> np.ndarray:
-    """Read a mask: where the first channel is above one half.
+    """Read a mask, which is True where the first channel of an image is above one half.
 
     Args:
-        resolution: the width and height that it must have.
+        path: the image.
+        resolution: the width and height that the mask must have.
 
     Returns:
         [rows, cols] bool.
 
     Raises:
-        ImageError: wrong size, unreadable, or no pixel inside.
+        ImageError: the mask has another size, is unreadable, or is True nowhere.
     """
     check_resolution(path, resolution)
     mask = read_pixels(path)[..., 0] > 0.5
@@ -99,10 +100,10 @@ def read_mask(path: str | Path, resolution: tuple[int, int]) -> np.ndarray:
 
 
 def check_resolution(path: str | Path, resolution: tuple[int, int]) -> None:
-    """Compare the header with the size that the camera declares.
+    """Check that an image has the width and height that the camera declares.
 
     Raises:
-        ImageError: they differ.
+        ImageError: the size differs.
     """
     header = read_header(path)
     if (header.width, header.height) != resolution:
@@ -110,10 +111,10 @@ def check_resolution(path: str | Path, resolution: tuple[int, int]) -> None:
 
 
 def check_radiance(path: str | Path, pixels: np.ndarray) -> None:
-    """Refuse values that no light can have.
+    """Check that no pixel is NaN, infinite or negative.
 
     Raises:
-        ImageError: NaN, infinite or negative values; the message counts them and names the first.
+        ImageError: some pixels are; the message counts them and names the first.
     """
     finite = np.isfinite(pixels)
     for name, bad in (("not finite (NaN or infinity)", ~finite), ("negative", finite & (pixels < 0))):

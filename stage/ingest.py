@@ -1,4 +1,4 @@
-"""Ingest: the images of a capture → its stack cache, keyed by content, decoded on a thread pool, written whole or not at all."""
+"""Ingest of a capture: its images are decoded on a thread pool and written as a stack cache, which is keyed by their content."""
 
 import hashlib
 import json
@@ -25,47 +25,48 @@ from stage.motion.tracking import Tracking
 from stage.stack import CHANNELS, LIGHT_PAD, PIXEL_PAD, Stack
 
 LAYOUT = 1
-"""Raised when the layout or the arithmetic of the cache changes, so that older caches are rebuilt."""
+"""The version of the cache; a change of the layout or the arithmetic raises it, so that older caches are rebuilt."""
 CACHE_FOLDER = ".relit"
+"""The folder of the cache inside the folder of a capture."""
 ALIGNED = "aligned-"
-"""Keys of stacks whose frames were warped to one time begin with it: one such stack is kept, and one as recorded."""
+"""The prefix of the keys of motion-compensated stacks: the cache keeps one such stack, and one of the frames as recorded."""
 DECODE_BYTES = 1 << 30
-"""What the images being decoded at one time may take together."""
+"""The bytes that all images which are decoded at one time may take."""
 BYTES_PER_PIXEL, ALIGNED_BYTES_PER_PIXEL = 40, 160
-"""Of one image while it is corrected: half and float RGB, masks and the planes to write; and while it is warped."""
+"""The bytes of a pixel while its image is corrected (half and float RGB, masks, the planes to write), and while it is warped."""
 TOP_EXPONENT = 15
-"""The brightest value of a light is stored in [2^14, 2^15): below half's largest, 65504, with 29 stops of normal values."""
+"""The brightest value of a light is stored in [2^14, 2^15): below 65504, the largest half, with 29 stops of normal values."""
 
 Progress = Callable[[int, int], None]
-"""Called with (done, total)."""
+"""A function that is called with the count of decoded frames and the count of all frames."""
 
 
 @dataclass(frozen=True)
 class Ingest:
-    """The images of a capture, hashed but not decoded: what its stack depends on is known before the stack is there."""
+    """The light frames of a capture after hashing and before decoding: the key of their stack is known, the stack need not exist."""
 
     capture: Capture
     frames: list[Frame]
     tracking: Tracking | None
     folder: Path
-    """Of the cache."""
+    """The folder of the cache."""
     hint: str
-    """For messages: the option that names another folder."""
+    """What an error message says about the option that names another folder."""
     fingerprints: Fingerprints
     key: str
-    """Of the stack: a hash of all that the stored values depend on."""
+    """The key of the stack: a hash of everything that the stored values depend on."""
 
     @classmethod
     def of(cls, capture: Capture, *, cache: Path | None = None, tracking: Tracking | None = None) -> "Ingest":
-        """Hash the images of a capture's light frames.
+        """Hash the images of the light frames of a capture.
 
         Args:
             capture: an opened capture.
-            cache: folder for the cache; None: `.relit` in the capture's folder.
-            tracking: warp every frame to the time of the reference of these tracking frames; None: leave them as recorded.
+            cache: the folder for the cache; None stands for `.relit` in the folder of the capture.
+            tracking: tracking frames, to the reference of which every frame is warped; None leaves the frames as recorded.
 
         Raises:
-            ManifestError: the capture has no frame that a light lit.
+            ManifestError: no light lit any frame of the capture.
             StorageError: an image cannot be read.
         """
         frames = capture.sources()
@@ -77,14 +78,14 @@ class Ingest:
         return cls(capture, frames, tracking, folder, hint, fingerprints, _key(capture, frames, tracking, fingerprints))
 
     def stack(self, progress: Progress | None = None) -> Stack:
-        """The stack, from the cache or built now.
+        """Return the stack from the cache, and build it first when the cache does not hold it.
 
         Args:
-            progress: called after every decoded frame when the stack is built.
+            progress: called after every decoded frame.
 
         Raises:
             ManifestError: a frame lies too far outside the tracking frames.
-            ImageError: an image is unreadable or holds impossible values, or a tracking frame is dark; names the file.
+            ImageError: an image is unreadable or holds impossible values, or a tracking frame is dark; the message names the file.
             StorageError: the cache cannot be written (no space, read-only folder); nothing is left behind.
         """
         found = stacks.find(self.folder, self.key)
@@ -101,16 +102,16 @@ class Ingest:
 
 def open_stack(capture: Capture, *, cache: Path | None = None, tracking: Tracking | None = None,
                progress: Progress | None = None) -> Stack:
-    """The stack of a capture's light frames: `Ingest.of` and `Ingest.stack` in one.
+    """Return the stack of the light frames of a capture, as `Ingest.of` and `Ingest.stack` do.
 
     Raises:
-        ManifestError, ImageError, StorageError: as these two say.
+        ManifestError, ImageError, StorageError: for the reasons that these two name.
     """
     return Ingest.of(capture, cache=cache, tracking=tracking).stack(progress)
 
 
 def _key(capture: Capture, frames: list[Frame], tracking: Tracking | None, fingerprints: Fingerprints) -> str:
-    """A hash of all that the stored values depend on."""
+    """Return a hash of everything that the stored values depend on."""
     manifest = capture.manifest
     off = [frame for frame, _ in capture.lit_by(OffLight)]
     corrections = [name for name in (manifest.dark, manifest.flat) if name is not None]
@@ -198,7 +199,7 @@ def _build(capture: Capture, frames: list[Frame], alignment: Alignment | None, f
 
 
 def _to_half(radiance: Radiance) -> tuple[np.ndarray, float]:
-    """Stored half values and the radiance of a stored 1.0: a power of two, so that half images keep their bits."""
+    """Return the half values of an image and the radiance of a stored 1.0, a power of two so that half images keep their bits."""
     peak = max(float(radiance.pixels.max()), -float(radiance.pixels.min()))
     if peak == 0.0:
         return np.zeros_like(radiance.pixels, dtype=np.float16), 1.0
@@ -207,7 +208,7 @@ def _to_half(radiance: Radiance) -> tuple[np.ndarray, float]:
 
 
 def _write_all(descriptor: int, plane: np.ndarray, offset: int) -> None:
-    """pwrite a whole plane; a full disk is an error here, where a write to a mapped file would kill the process."""
+    """Write a plane with pwrite; a full disk is an error here, whereas a write to a mapped file would kill the process."""
     view = memoryview(plane.data).cast("B")
     while view:
         written = os.pwrite(descriptor, view, offset)
@@ -215,7 +216,7 @@ def _write_all(descriptor: int, plane: np.ndarray, offset: int) -> None:
 
 
 def _reserve(descriptor: int, size: int) -> None:
-    """Claim the space before the first frame is decoded, so that a full disk is known at once."""
+    """Reserve the space of the stack before the first frame is decoded, so that a full disk is known at once."""
     if hasattr(os, "posix_fallocate"):
         os.posix_fallocate(descriptor, 0, size)
     else:
@@ -223,7 +224,7 @@ def _reserve(descriptor: int, size: int) -> None:
 
 
 def _drop_others(folder: Path, key: str) -> None:
-    """Remove the stacks of earlier inputs, aligned ones or unaligned ones as this one is."""
+    """Remove older stacks from the cache: motion-compensated stacks if this stack is one, otherwise stacks of recorded frames."""
     for index in folder.glob("stack-*.json"):
         old = index.stem.removeprefix("stack-")
         if old != key and old.startswith(ALIGNED) == key.startswith(ALIGNED):
@@ -231,6 +232,6 @@ def _drop_others(folder: Path, key: str) -> None:
 
 
 def _remove(folder: Path, key: str) -> None:
-    """Remove a stack: index first, so that a half-removed one is never found."""
+    """Remove a stack from the cache, its index first, so that a partly removed stack is never found."""
     for path in (stacks.index_path(folder, key), stacks.values_path(folder, key), stacks.saturated_path(folder, key)):
         path.unlink(missing_ok=True)

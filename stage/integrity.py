@@ -1,6 +1,6 @@
-"""Whether a PNG or JPEG is whole, known from its bytes.
+"""Checks that PNG and JPEG files are whole.
 
-libpng reports damage on the terminal, and libjpeg fills what is missing with grey and calls it read.
+libpng reports damage on the terminal, and libjpeg fills missing data with grey and reports success.
 """
 
 import re
@@ -12,19 +12,22 @@ from stage.errors import ImageError, storage
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 JPEG_MARKER = re.compile(rb"\xff+([^\x00\xd0-\xd7\xff])")
-"""A marker that ends entropy-coded data: neither a stuffed byte (00) nor a restart (D0 to D7), after any fill bytes."""
+"""A marker that ends entropy-coded data: neither a stuffed byte (00) nor a restart marker (D0 to D7), after any fill bytes."""
 JPEG_START, JPEG_END, JPEG_SCAN = b"\xd8", b"\xd9", b"\xda"
 
 
 def check_png(path: str | Path, *, contents: bool) -> None:
-    """Walk the chunks up to the last one (PNG, 3rd edition, section 5).
+    """Check that the chunks of a PNG file follow each other up to the end chunk.
 
     Args:
-        contents: read every chunk and compare its checksum; otherwise only where the chunks lie is read.
+        path: the file.
+        contents: True compares the checksum of every chunk; False reads the lengths and types of the chunks only.
 
     Raises:
-        ImageError: not a PNG, truncated, or damaged.
+        ImageError: the file is not a PNG, is truncated, or is damaged.
         StorageError: the file cannot be read.
+
+    Source: W3C, "Portable Network Graphics (PNG) Specification", third edition, section 5.
     """
     with storage("read", path), open(path, "rb") as stream:
         if stream.read(8) != PNG_SIGNATURE:
@@ -46,11 +49,13 @@ def check_png(path: str | Path, *, contents: bool) -> None:
 
 
 def check_jpeg(path: str | Path) -> None:
-    """Walk the segments up to the end marker (ITU-T T.81, annex B); what lies behind it is not looked at.
+    """Check that the segments of a JPEG file follow each other up to the end marker; data after the marker is ignored.
 
     Raises:
-        ImageError: not a JPEG, or truncated.
+        ImageError: the file is not a JPEG, or is truncated.
         StorageError: the file cannot be read.
+
+    Source: ITU-T recommendation T.81, annex B.
     """
     with storage("read", path):
         data = Path(path).read_bytes()

@@ -1,4 +1,4 @@
-"""The size of a JPEG XL image, from its first bytes: the library behind OpenImageIO decodes all pixels before it tells."""
+"""The size of a JPEG XL image from its first bytes, because the library behind OpenImageIO decodes all pixels to report it."""
 
 import struct
 from pathlib import Path
@@ -8,19 +8,19 @@ from stage.errors import ImageError, storage
 CODESTREAM = b"\xff\x0a"
 CONTAINER = b"\x00\x00\x00\x0cJXL \r\n\x87\n"
 SIZE_BYTES = 16
-"""More than SizeHeader takes: 2 bytes of signature and 1 + 32 + 3 + 32 bits."""
+"""The bytes that are read, more than the signature (2 bytes) and the size header (1 + 32 + 3 + 32 bits) take."""
 SIZE_BITS = (9, 13, 18, 30)
-"""Of a dimension less one, by its selector (ISO/IEC 18181-1, table of SizeHeader)."""
+"""The bits of a dimension less one, by its selector (ISO/IEC 18181-1, table of SizeHeader)."""
 RATIOS = {1: (1, 1), 2: (12, 10), 3: (4, 3), 4: (3, 2), 5: (16, 9), 6: (5, 4), 7: (2, 1)}
-"""Width to height, where the width is not written out."""
+"""The ratios of width to height for files that do not hold the width, by their code."""
 
 
 def resolution(path: str | Path) -> tuple[int, int]:
-    """Width and height.
+    """Return the width and height of a JPEG XL image.
 
     Raises:
-        ImageError: not a JPEG XL file.
-        StorageError: it cannot be read.
+        ImageError: the file is not a JPEG XL file, or its header is damaged or truncated.
+        StorageError: the file cannot be read.
     """
     with storage("read", path), open(path, "rb") as stream:
         start = stream.read(len(CONTAINER))

@@ -1,4 +1,4 @@
-"""Point clouds of scans as LAS 1.4, for surveying and lidar tools, through laspy: `pip install 'relit[las]'`."""
+"""Writing of the point cloud of a scan as LAS 1.4 with laspy, which `pip install 'relit[las]'` installs."""
 
 import json
 from importlib.util import find_spec
@@ -12,53 +12,53 @@ from stage.files import replacing
 
 LAS_FILE = "points.las"
 POINT_FORMAT = 6
-"""Place, intensity, return of the shot, time: the plainest of LAS 1.4."""
+"""The smallest point record of LAS 1.4: position, intensity, return number, and time."""
 LEAST_SCALE_M = 1e-4
-"""Of the whole numbers that LAS holds coordinates in; grows by tens where the cloud is too large for it."""
+"""The unit of the integers in which LAS stores coordinates; it grows by factors of ten for clouds that are too large for it."""
 LARGEST_NUMBER = 2**31 - 1
 LARGEST_INTENSITY = 2**16 - 1
 RECORD_OWNER, RECORD_ID = "relit", 1
-"""Of the record that holds the scale of intensity, and provenance, as JSON."""
+"""The owner and the number of the record that holds the scale of intensity and the provenance as JSON."""
 MOST_RETURNS = 15
-"""LAS counts no more of a shot."""
+"""The most returns of a shot that LAS can number."""
 COORDINATES = ('LOCAL_CS["world of the scan",LOCAL_DATUM["world of the scan",0],UNIT["metre",1],'
                'AXIS["x",OTHER],AXIS["y",OTHER],AXIS["z",OTHER]]')
-"""LAS 1.4 wants its coordinates named: they are those of the platform's track, and no map's."""
+"""The coordinate system, which LAS 1.4 requires: coordinates are in the world frame of the track of the platform, not on a map."""
 
 
 class LasScales(NamedTuple):
-    """What the whole numbers of a LAS file stand for."""
+    """The scales and the offset that turn the integers of a LAS file into coordinates and intensities."""
 
     scale_m: float
     offset_m: tuple[float, float, float]
     intensity_scale: float
-    """Intensity is this times the file's."""
+    """The factor from an intensity in the file to the intensity of the scan."""
 
 
 def las_is_installed() -> bool:
-    """Whether laspy is at hand."""
+    """Return whether laspy is installed."""
     return find_spec("laspy") is not None
 
 
 def write_las(points: np.ndarray, intensity: np.ndarray, time_s: np.ndarray, shot: np.ndarray, range_m: np.ndarray, path: str | Path, *,
               provenance: dict[str, str] | None = None) -> LasScales:
-    """Write the points of a scan, whole or not at all.
+    """Write the points of a scan as a LAS file, whole or not at all.
 
     Args:
-        points: [n, 3] float64 metres, world: axes as they are, +y up where the track keeps it so.
-        intensity: [n], of which what is below zero becomes 0. Whole numbers that fit are kept, others scaled to the largest.
-        time_s: [n] of the shot, on the clock of the scan; stands as gps_time (GPS week time: seconds, no date).
-        shot: [n] which shot: its returns are numbered from the nearest, of those that are points.
-        range_m: [n] metres, which orders them.
-        path: of the file.
-        provenance: text, kept in a record beside the scale of intensity.
+        points: [n, 3] float64 metres, world frame; the axes are written unchanged.
+        intensity: [n]; negative values become 0. Integers up to 65535 are kept, other values are scaled to the largest.
+        time_s: [n] time of the shot of each point, on the clock of the scan; written as gps_time (GPS week time: seconds, no date).
+        shot: [n] index of the shot of each point; the points of one shot are numbered by their range, the nearest first.
+        range_m: [n] metres, the range of each point.
+        path: the file.
+        provenance: texts that are kept in a record beside the scale of intensity.
 
     Returns:
-        Scale and offset of the coordinates, and scale of intensity.
+        The scale and the offset of the coordinates, and the scale of intensity.
 
     Raises:
         ResultError: there is no point.
-        StorageError: it cannot be written.
+        StorageError: the file cannot be written.
 
     Source:
         ASPRS, "LAS Specification 1.4 - R15", 2019: point data record format 6.
@@ -96,7 +96,7 @@ def write_las(points: np.ndarray, intensity: np.ndarray, time_s: np.ndarray, sho
 
 
 def _numbered(shot: np.ndarray, range_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """[n] number of each point among those of its shot, 1 the nearest, and [n] how many these are."""
+    """Return the [n] number of each point among the points of its shot, 1 the nearest, and the [n] count of these points."""
     order = np.lexsort((range_m, shot))
     _, group, counts = np.unique(shot, return_inverse=True, return_counts=True)
     number = np.empty(len(shot), dtype=np.int64)

@@ -1,4 +1,4 @@
-"""Lights as the manifest declares them: what lit one frame."""
+"""The types of light that a manifest declares for a frame."""
 
 from typing import Annotated, Literal, Self
 
@@ -8,17 +8,20 @@ from stage.model import Direction, FirstFault, LitRgb, Positive, Rgb, Strict, Te
 
 
 class DistantLight(Strict):
-    """One far light: the same direction and irradiance at every point."""
+    """A distant light, which has the same direction and irradiance at every point."""
 
     type: Literal["distant"]
     direction: Direction
-    """Unit vector from the surface to the light, camera frame."""
+    """The unit vector from the surface to the light, in the camera frame."""
     irradiance: LitRgb
-    """At normal incidence, relative; one scale across a capture."""
+    """The irradiance at normal incidence in relative units, which are the same for all lights of a capture."""
 
 
 class PointLight(Strict):
-    """One near light: irradiance = intensity·cos^μ/d², the cosine between `axis` and the way to the surface."""
+    """A point light at a finite distance d, whose irradiance at normal incidence is intensity · cos^μ / d².
+
+    The cosine is that of the angle between `axis` and the direction from the light to the surface; μ is `anisotropy`.
+    """
 
     type: Literal["point"]
     position_m: Vector
@@ -34,13 +37,13 @@ class PointLight(Strict):
 
 
 class ExtendedLight(Strict):
-    """An area source as samples of the sphere (photometric sampling, Nayar, Ikeuchi and Kanade 1990)."""
+    """An area source, given as samples of the sphere of directions (photometric sampling, Nayar, Ikeuchi and Kanade 1990)."""
 
     type: Literal["extended"]
     directions: Annotated[tuple[Direction, ...], Field(min_length=1), FirstFault]
     radiance: Annotated[tuple[Rgb, ...], Field(min_length=1), FirstFault]
     solid_angle: Annotated[tuple[Positive, ...], Field(min_length=1), FirstFault]
-    """Steradians of each sample."""
+    """The solid angle of each sample in steradians."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -53,7 +56,7 @@ class ExtendedLight(Strict):
 
 
 class GradientLight(Strict):
-    """Spherical gradient illumination (1 ± axis)/2 (Ma et al. 2007)."""
+    """Spherical gradient illumination, whose radiance from direction ω is (1 ± ω_axis) / 2, or 1 for axis `full` (Ma et al. 2007)."""
 
     type: Literal["gradient"]
     axis: Literal["x", "y", "z", "full"]
@@ -62,20 +65,20 @@ class GradientLight(Strict):
 
 
 class EnvironmentLight(Strict):
-    """Lit by a lat-long map: a real reference for relighting."""
+    """An environment, given as a lat-long map; its frame is a photograph with which relit images are compared."""
 
     type: Literal["environment"]
     image: Text
 
 
 class OffLight(Strict):
-    """Ambient light only; subtracted from the other frames."""
+    """Ambient light alone; its frames are subtracted from the other frames."""
 
     type: Literal["off"]
 
 
 class FullLight(Strict):
-    """Every light on: a tracking frame."""
+    """All lights together, as in a tracking frame."""
 
     type: Literal["full"]
 
@@ -84,4 +87,4 @@ Light = Annotated[
     DistantLight | PointLight | ExtendedLight | GradientLight | EnvironmentLight | OffLight | FullLight,
     Field(discriminator="type"),
 ]
-"""Any of the light types, told apart by `type`."""
+"""A light of any type; the key `type` tells which."""

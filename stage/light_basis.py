@@ -1,9 +1,9 @@
-"""The coefficient images of a capture in one EXR, and the matrices that turn light weights into their coefficients in JSON beside it.
+"""The file of a light basis: its images in one EXR, and beside it, in JSON, the matrices from light weights to coefficients.
 
     frame[c] = Σₖ (Σₗ matrix[c][k][l] · weight[c][l]) · basis.k[c],     frame = Σₗ weight[l] · (captured image l)
 
-so that a browser relights with K images where the capture has L. Under an environment, weight = (∫ of its radiance over the light's
-part of the sphere) / irradiance of the light.
+With it a browser relights from K images instead of the L images of the capture. Under an environment the weight of a light is the
+integral of the radiance over its part of the sphere, divided by its irradiance.
 """
 
 import json
@@ -18,34 +18,38 @@ from stage.files import write_text
 
 SCHEMA = "relit.basis/1"
 HALF_MAX = 65504.0
+"""The largest half value."""
 HALF_RMS_MIN = 2.0**-11
-"""Least root mean square of a layer in half: an eighth of it still has all bits of a half value."""
+"""The least root mean square of a layer that is stored as half: an eighth of it still has all bits of a half value."""
 DIGITS = 9
-"""Of the numbers in JSON: a float32 comes back as it was."""
+"""The significant digits of a number in JSON, which restore every float32 exactly."""
 
 
 def layer_name(index: int) -> str:
-    """`basis.000`, …"""
+    """Return the name of a layer: `basis.000`, `basis.001` and so on."""
     return f"basis.{index:03d}"
 
 
 def layer_types(rms: np.ndarray, largest: float) -> list[type[np.floating[Any]]]:
-    """What each layer is stored as: half, or float where half would overflow or lose bits.
+    """Return the stored type of each layer: half, or float when half would overflow or lose bits.
 
     Args:
-        rms: [K, 3] root mean square of each coefficient image.
-        largest: no value of any layer is beyond.
+        rms: [K, 3] the root mean square of each basis image.
+        largest: an upper bound of the absolute values of all layers.
     """
     return [np.float16 if largest <= HALF_MAX and row.max() >= HALF_RMS_MIN else np.float32 for row in rms]
 
 
 def write_layers(path: str | Path, layers: Sequence[np.ndarray], mask: np.ndarray, *, color_space: str,
                  metadata: Mapping[str, str]) -> None:
-    """Write the coefficient images as layers `basis.NNN.{R,G,B}`, and `mask.Y`; outside the mask they are 0.
+    """Write the basis images as layers `basis.NNN.{R,G,B}`, which are 0 outside the mask, and the mask as `mask.Y`.
 
     Args:
-        layers: of each index [3, rows, cols] float16 or float32.
+        path: the EXR file.
+        layers: K images, each [3, rows, cols] float16 or float32.
         mask: [rows, cols] bool.
+        color_space: the scene-linear colour space of the images.
+        metadata: further string attributes.
 
     Raises:
         StorageError: the file cannot be written; nothing is left behind.
@@ -56,15 +60,15 @@ def write_layers(path: str | Path, layers: Sequence[np.ndarray], mask: np.ndarra
 
 
 def facts_path(path: str | Path) -> Path:
-    """The JSON beside a basis: its name and `.json`, so that files of several kinds can share a folder and a stem."""
+    """Return the path of the JSON file beside a basis: the whole file name of the basis and `.json`."""
     return Path(path).with_name(f"{Path(path).name}.json")
 
 
 def write_facts(path: str | Path, facts: Mapping[str, Any]) -> Path:
-    """Write the JSON beside a basis.
+    """Write the JSON file beside a basis.
 
     Returns:
-        Where it is.
+        The path of the JSON file.
 
     Raises:
         StorageError: the file cannot be written; nothing is left behind.
@@ -75,7 +79,7 @@ def write_facts(path: str | Path, facts: Mapping[str, Any]) -> Path:
 
 
 def numbers(value: Any) -> Any:
-    """A number, or an array as nested lists, shortened to what a float32 holds."""
+    """Return a number, or an array as nested lists, rounded to the digits of a float32."""
     if np.ndim(value) == 0:
         return float(f"{float(value):.{DIGITS}g}")
     return [numbers(row) for row in value]

@@ -1,23 +1,20 @@
-"""The lights of a capture as arrays, and whether they can determine a normal."""
+"""The lights of a capture as arrays, and the check that they determine a normal."""
 
 import numpy as np
 
 from stage.capture import SOURCES, Capture
 from stage.errors import ManifestError
-from stage.extended_lights import ExtendedLights, extended_lights
+from stage.extended_lights import ExtendedLights, extended_lights, lie_in_one_plane
 from stage.light import DistantLight, ExtendedLight, GradientLight, PointLight
 from stage.manifest import FILE_NAME
 from stage.point_lights import DistantLights, PlacedLights, place_lights
 
-MIN_SPREAD = 1e-3
-"""Least ratio of the smallest to the largest singular value of the light directions: about 0.1° out of one plane."""
-
 
 def distant_lights(capture: Capture) -> DistantLights:
-    """The lights of the capture's stack, which must all be distant.
+    """Return the lights of the stack of a capture, all of which must be distant.
 
     Raises:
-        ManifestError: a frame is lit by another kind of light, or there is none; names the frame.
+        ManifestError: a light is not distant, or there is none; the message names the frame.
     """
     where = capture.folder / FILE_NAME
     for index, frame in enumerate(capture.manifest.frames):
@@ -31,14 +28,14 @@ def distant_lights(capture: Capture) -> DistantLights:
 
 
 def check_solvable(capture: Capture) -> DistantLights | PlacedLights | ExtendedLights:
-    """Refuse a capture from which no normal can be solved.
+    """Check that a normal can be solved from a capture, and return its lights.
 
     Returns:
-        Its lights: ExtendedLights where some are extended, PlacedLights where some are near, otherwise distant ones.
+        ExtendedLights when a light is extended, PlacedLights when a light is a point light, otherwise DistantLights.
 
     Raises:
-        ManifestError: fewer than three lights, lights in one plane (near ones as seen from the object's centre), near lights
-            where none can be, an image of one pixel, a channel without light.
+        ManifestError: there are fewer than three lights, all lights lie in one plane through the centre of the object, a point
+            light stands at an impossible position, the image has one pixel, or a channel has no light.
     """
     where = capture.folder / FILE_NAME
     if capture.lit_by(ExtendedLight):
@@ -50,8 +47,7 @@ def check_solvable(capture: Capture) -> DistantLights | PlacedLights | ExtendedL
     if count < 3:
         raise ManifestError(f"{where}: frames: {count} lit by a {'distant or point' if near else 'distant'} light: "
                             "a normal needs three or more")
-    spread = np.linalg.svd(lights.direction, compute_uv=False)
-    if spread[2] < MIN_SPREAD * spread[0]:
+    if lie_in_one_plane(lights.direction):
         raise ManifestError(f"{where}: frames[].light.{'position_m' if near else 'direction'}: all {count} lights lie in one "
                             "plane through the object: a normal needs lights out of it")
     strength = lights.strength if isinstance(lights, PlacedLights) else lights.irradiance
@@ -64,10 +60,11 @@ def check_solvable(capture: Capture) -> DistantLights | PlacedLights | ExtendedL
 
 
 def lights_from_centre(capture: Capture) -> DistantLights:
-    """Every light as a distant one: near lights as the centre of the object sees them.
+    """Return every light as a distant light: a point light by its direction and irradiance at the centre of the object.
 
     Raises:
-        ManifestError: as distant_lights, but point lights are taken too; near lights where none can be.
+        ManifestError: a light is neither distant nor a point light, there is none, or a point light stands at an impossible
+            position.
     """
     if not capture.lit_by(PointLight):
         return distant_lights(capture)
@@ -76,10 +73,10 @@ def lights_from_centre(capture: Capture) -> DistantLights:
 
 
 def check_surface(capture: Capture) -> None:
-    """Refuse an image of one pixel.
+    """Check that the images have more than one pixel, because a surface needs two.
 
     Raises:
-        ManifestError: it is one.
+        ManifestError: the images have one pixel.
     """
     if capture.camera.width * capture.camera.height == 1:
         raise ManifestError(f"{capture.folder / FILE_NAME}: camera.resolution: is 1x1: a surface needs two pixels or more")

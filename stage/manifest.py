@@ -1,4 +1,4 @@
-"""capture.json: the manifest of one capture, schema relit.capture/1, checked by name before any pixel is read."""
+"""The manifest of a capture, capture.json with schema relit.capture/1, which is checked before any pixel is read."""
 
 import json
 import posixpath
@@ -21,11 +21,11 @@ SCHEMA = "relit.capture/1"
 FILE_NAME = "capture.json"
 
 FileName = Text
-"""A file of the capture, relative to its folder."""
+"""The name of a file of the capture, relative to its folder."""
 
 
 class Frame(Strict):
-    """One image and exactly one thing that lit it."""
+    """One image of a capture and what lit it: exactly one of a light, a pattern, a laser and a time-of-flight source."""
 
     image: FileName
     exposure_s: Positive | None = None
@@ -44,7 +44,7 @@ class Frame(Strict):
 
 
 class Manifest(Strict):
-    """Everything capture.json says."""
+    """The content of capture.json."""
 
     schema_: Literal["relit.capture/1"] = Field(alias="schema")
     name: Text
@@ -72,23 +72,23 @@ class Manifest(Strict):
 
 
 def read_manifest(path: str | Path) -> Manifest:
-    """Read and check capture.json.
+    """Read and check a capture.json.
 
     Args:
         path: the file.
 
     Raises:
-        StorageError: it cannot be read.
-        ManifestError: not JSON, or a field is wrong; the message names file and field.
+        StorageError: the file cannot be read.
+        ManifestError: the file is not JSON, or a field is wrong; the message names file and field.
     """
     return read_record(path, Manifest, SCHEMA)
 
 
 def write_manifest(manifest: Manifest, path: str | Path) -> None:
-    """Write capture.json, whole or not at all: `color_space` always, other keys unless they hold their default.
+    """Write a capture.json whole or not at all, with `color_space` always and other keys when they differ from their default.
 
     Raises:
-        StorageError: it cannot be written.
+        StorageError: the file cannot be written.
     """
     data = manifest.model_dump(mode="json", by_alias=True, exclude_defaults=True)
     frames = ",\n".join("    " + json.dumps(frame) for frame in data.pop("frames"))

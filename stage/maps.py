@@ -1,15 +1,15 @@
-"""Solved maps of one capture, and their file: maps.exr."""
+"""The solved surface maps of one capture, and their file, maps.exr."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
 from stage import exr
 from stage.camera import Camera
 from stage.errors import ResultError
+from stage.result_metadata import camera_and_provenance, result_metadata
 
 MAPS_FILE = "maps.exr"
 _RGB, _XYZ = ("R", "G", "B"), ("X", "Y", "Z")
@@ -24,12 +24,12 @@ LAYERS: dict[str, tuple[tuple[str, ...], type[np.floating[Any]]]] = {
     "confidence": (("Y",), np.float16),
     "mask": (("Y",), np.float16),
 }
-"""Layer name → its channels and the type it is stored as: geometry in float, the rest in half."""
+"""The channels and the stored type of each layer: geometry is stored as float, the rest as half."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SurfaceMaps:
-    """What a solver found at each pixel. A layer that the method does not estimate is None."""
+    """The layers that a solver estimated at each pixel. A layer that the method does not estimate is None."""
 
     camera: Camera
     mask: np.ndarray  # [rows, cols] bool, True where the solver has a result
@@ -45,11 +45,11 @@ class SurfaceMaps:
     provenance: dict[str, str] = field(default_factory=dict)
 
     def layers(self) -> dict[str, np.ndarray]:
-        """The layers that exist, by name, in file order."""
+        """Return the layers that were estimated by their names, in the order of the file."""
         return {name: getattr(self, name) for name in LAYERS if getattr(self, name) is not None}
 
     def write(self, path: str | Path) -> None:
-        """Write maps.exr: temporary name, then rename; pixels outside the mask are 0 in every layer.
+        """Write maps.exr whole or not at all, with pixels outside the mask 0 in every layer.
 
         Raises:
             StorageError: the file cannot be written.
@@ -60,20 +60,18 @@ class SurfaceMaps:
             masked = np.where(self.mask if values.ndim == 2 else self.mask[..., None], values, 0).astype(dtype)
             for c, suffix in enumerate(suffixes):
                 channels[f"{name}.{suffix}"] = masked if masked.ndim == 2 else masked[..., c]
-        metadata = {"relit:camera": self.camera.model_dump_json(), **self.provenance}
-        exr.write(path, channels, color_space=self.color_space, metadata=metadata)
+        exr.write(path, channels, color_space=self.color_space, metadata=result_metadata(self.camera, self.provenance))
 
     @classmethod
     def read(cls, path: str | Path) -> "SurfaceMaps":
         """Read a maps.exr that Relit wrote.
 
         Raises:
-            ResultError: a layer is incomplete or not finite, or the camera is not in the metadata.
-            ImageError: not a readable EXR.
+            ResultError: a layer is incomplete or not finite, or the metadata holds no camera.
+            ImageError: the file is not a readable EXR.
         """
         channels, metadata = exr.read(path)
-        if "relit:camera" not in metadata:
-            raise ResultError(f"{path}: carries no relit:camera attribute, so it is not a maps.exr of relit")
+        camera, provenance = camera_and_provenance(metadata, path, file_name=MAPS_FILE)
         found: dict[str, np.ndarray] = {}
         for name, (suffixes, _) in LAYERS.items():
             names = [f"{name}.{s}" for s in suffixes]
@@ -89,11 +87,6 @@ class SurfaceMaps:
         if "mask" not in found:
             raise ResultError(f"{path}: has no layer mask.Y")
         mask = found.pop("mask") > 0.5
-        provenance = {k: v for k, v in metadata.items() if k.startswith("relit:") and k != "relit:camera"}
-        try:
-            camera = Camera.model_validate_json(str(metadata["relit:camera"]))
-        except ValidationError as error:
-            raise ResultError(f"{path}: its relit:camera attribute is not a camera") from error
         if mask.shape != (camera.height, camera.width):
             raise ResultError(f"{path}: is {mask.shape[1]}x{mask.shape[0]}, its camera {camera.width}x{camera.height}")
         return cls(camera=camera, mask=mask, color_space=exr.color_space_of(metadata), provenance=provenance, **found)

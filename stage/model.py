@@ -1,4 +1,4 @@
-"""The strict base of every manifest model: unknown keys are errors, numbers are finite, values are frozen."""
+"""The base class of all models that are read from JSON, and the types of their fields."""
 
 import math
 from typing import Annotated
@@ -7,7 +7,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 
 class Strict(BaseModel):
-    """A frozen record whose unknown keys are errors that name the key."""
+    """A frozen model in which an unknown key and a number that is not finite are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -35,18 +35,19 @@ def _not_blank(text: str) -> str:
 
 
 FirstFault = Field(fail_fast=True)
-"""Of a list that may be long, the first fault is told alone: those of a million entries would fill the memory."""
+"""Marks a list that may be long: only its first fault is reported, because the faults of a million entries fill the memory."""
 Text = Annotated[str, AfterValidator(_not_blank)]
-"""A name: anything but nothing."""
+"""A text that is not blank."""
 Vector = tuple[float, float, float]
+"""The x, y and z of a point or a direction."""
 Direction = Annotated[Vector, AfterValidator(_unit)]
-"""Given with any length above zero, kept with length one."""
+"""A vector of any length above zero, which is normalised to length one."""
 NotNegative = Annotated[float, Field(ge=0)]
 Rgb = tuple[NotNegative, NotNegative, NotNegative]
-"""Red, green, blue; none negative."""
+"""Red, green and blue, none of them negative."""
 LitRgb = Annotated[Rgb, AfterValidator(_lit)]
-"""Not zero in every channel either: what a light of its own gives."""
+"""The colour of a light: red, green and blue, none of them negative and not all of them zero."""
 Positive = Annotated[float, Field(gt=0)]
 Count = Annotated[int, Field(ge=1)]
 Resolution = tuple[Count, Count]
-"""Width, height in pixels."""
+"""The width and height of an image in pixels."""

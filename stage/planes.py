@@ -1,7 +1,7 @@
-"""Frames of a capture as planes that are read in bands of rows: corrected, grey or colour, in memory or in a scratch file.
+"""Corrected frames of a depth capture as float32 planes, in memory or in a scratch file, which are read in bands of rows.
 
-Where light captures keep a stack for many solves, depth is decoded once: the planes are made anew and are gone afterwards.
-They are float32, because a ramp's ratio is the projector's column: half would round it by a pixel.
+A light capture keeps a stack on disk for many solves; depth is decoded once, so the planes are temporary. They are float32,
+because the ratio of two ramps is a projector column, which half precision would round by a pixel.
 """
 
 import os
@@ -22,28 +22,28 @@ from stage.ingest import CACHE_FOLDER
 from stage.manifest import Frame
 
 MEMORY_BYTES = 256 << 20
-"""Planes that take no more stay in memory."""
+"""The most bytes of planes that are kept in memory; larger planes lie in a scratch file."""
 BAND_BYTES = 64 << 20
-"""Of the planes that one band holds; decoders take a few times that beside it."""
+"""The bytes of the planes in one band; a decoder needs a few times that beside them."""
 DECODE_BYTES, BYTES_PER_PIXEL = 1 << 30, 56
-"""What the images being decoded at one time may take together, and each of their pixels."""
+"""The bytes that all images which are corrected at one time may take, and the bytes of each of their pixels."""
 
 Progress = Callable[[int], None]
-"""Called with how many frames are read."""
+"""A function that is called with the count of frames that have been read."""
 
 
 @dataclass(frozen=True)
 class Planes:
-    """Corrected frames, in the order that was asked for."""
+    """The corrected frames that `frame_planes` was called with, in their order."""
 
     values: np.ndarray  # [frames, rows, channels, cols] float32, linear radiance; channels 1 (grey) or 3
-    saturated: np.ndarray | None  # [frames, rows, cols] bool; None when the capture says no saturation
+    saturated: np.ndarray | None  # [frames, rows, cols] bool; None when the manifest gives no saturation
 
     def bands(self, bytes_per_pixel: int = 0) -> Iterator[slice]:
-        """Ranges of rows that cover the image, each small enough for the memory of a band.
+        """Yield ranges of rows that cover the image, each small enough for BAND_BYTES.
 
         Args:
-            bytes_per_pixel: what the caller needs beside the planes for each pixel.
+            bytes_per_pixel: the bytes that the caller needs for each pixel beside the planes.
         """
         frames, rows, channels, cols = self.values.shape
         step = max(1, BAND_BYTES // max(cols * (4 * frames * channels + bytes_per_pixel), 1))
@@ -51,7 +51,11 @@ class Planes:
             yield slice(top, min(top + step, rows))
 
     def band(self, rows: slice, frames: Sequence[int] | None = None) -> np.ndarray:
-        """Some frames of a range of rows.
+        """Return some frames of a range of rows.
+
+        Args:
+            rows: the range.
+            frames: indices of the frames; None stands for all.
 
         Returns:
             [frames, channels, pixels] float32, a copy.
@@ -64,25 +68,25 @@ class Planes:
 @contextmanager
 def frame_planes(capture: Capture, frames: Sequence[Frame], *, colour: bool, cache: Path | None = None,
                  progress: Progress | None = None) -> Iterator[Planes]:
-    """Decode and correct frames on a thread pool; the planes are valid inside the block.
+    """Decode and correct frames on a thread pool, and yield planes that exist until the block ends.
 
     Args:
         capture: an opened capture.
-        frames: of it.
-        colour: three channels, else one: the luma of GREY_WEIGHTS.
-        cache: folder for the scratch file; None: `.relit` in the capture's folder. Nothing is left in it.
-        progress: told after every frame.
+        frames: frames of the capture.
+        colour: True keeps three channels, False weighs them with GREY_WEIGHTS.
+        cache: the folder for the scratch file; None stands for `.relit` in the folder of the capture. No file is left in it.
+        progress: called after every frame.
 
     Raises:
-        ImageError: a frame is unreadable or holds impossible values; names the file.
+        ImageError: a frame is unreadable or holds impossible values; the message names the file.
         StorageError: the scratch file cannot be written.
     """
     correction = Correction.of(capture)
     width, height = capture.camera.resolution
     shape = (len(frames), height, 3 if colour else 1, width)
-    with _room(4 * int(np.prod(shape)), capture, cache) as room:
-        values = room(shape, np.float32)
-        saturated = room((len(frames), height, width), np.bool_) if capture.manifest.saturation is not None else None
+    with _allocator(4 * int(np.prod(shape)), capture, cache) as allocate:
+        values = allocate(shape, np.float32)
+        saturated = allocate((len(frames), height, width), np.bool_) if capture.manifest.saturation is not None else None
 
         def read(index: int) -> None:
             radiance = correction.apply(frames[index])
@@ -100,8 +104,8 @@ def frame_planes(capture: Capture, frames: Sequence[Frame], *, colour: bool, cac
 
 
 @contextmanager
-def _room(size: int, capture: Capture, cache: Path | None) -> Iterator[Callable[[tuple[int, ...], type[np.generic]], np.ndarray]]:
-    """A maker of arrays: in memory while they are small, else in files that have no name any more when they are used."""
+def _allocator(size: int, capture: Capture, cache: Path | None) -> Iterator[Callable[[tuple[int, ...], type[np.generic]], np.ndarray]]:
+    """Yield a function that makes arrays: in memory up to MEMORY_BYTES in all, otherwise in unnamed temporary files."""
     if size <= MEMORY_BYTES:
         yield lambda shape, dtype: np.empty(shape, dtype)
         return

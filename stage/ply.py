@@ -1,4 +1,4 @@
-"""Point clouds as PLY: binary little-endian, float32 x y z, uchar red green blue, and normals and intensity where there are any."""
+"""Point clouds as binary PLY files: float32 x y z, uchar red green blue, and normals and intensity when they are known."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -9,30 +9,30 @@ from stage.errors import ResultError, storage
 from stage.files import replacing
 
 POINTS_FILE = "points.ply"
-PLACE, NORMAL, COLOUR, INTENSITY = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue"), ("intensity",)
+POSITION, NORMAL, COLOUR, INTENSITY = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue"), ("intensity",)
 MAX_HEADER = 1 << 16
-"""Bytes in which a header must end."""
+"""The bytes within which the header of a file must end."""
 
 
 class PointCloud(NamedTuple):
-    """Points of one capture."""
+    """The points of a capture or a scan with their colours, and their normals and intensities when they are known."""
 
     points: np.ndarray  # [n, 3] float32 metres, camera frame
     colours: np.ndarray  # [n, 3] uint8, display-encoded (sRGB)
-    normals: np.ndarray | None = None  # [n, 3] float32, unit, towards the camera; 0 where the neighbours do not say
-    intensity: np.ndarray | None = None  # [n] float32, of a scan: in the unit of its shots
+    normals: np.ndarray | None = None  # [n, 3] float32, unit, towards the camera; 0 where the neighbours determine none
+    intensity: np.ndarray | None = None  # [n] float32, in the unit of the shots of a scan
 
 
 def write_ply(cloud: PointCloud, path: str | Path, *, comments: tuple[str, ...] = ()) -> None:
-    """Write a point cloud, whole or not at all.
+    """Write a point cloud as PLY whole or not at all: position, normal, colour and intensity, the last three when they are known.
 
     Args:
-        cloud: normals are written where there are any, between place and colour; intensity after it.
-        path: of the file.
-        comments: one line each.
+        cloud: the points.
+        path: the file.
+        comments: comments for the header, one line each.
 
     Raises:
-        StorageError: it cannot be written.
+        StorageError: the file cannot be written.
 
     Source:
         Turk, "The PLY Polygon File Format", 1994.
@@ -40,7 +40,7 @@ def write_ply(cloud: PointCloud, path: str | Path, *, comments: tuple[str, ...] 
     kind = _type(cloud.normals is not None, cloud.intensity is not None)
     values = np.empty(len(cloud.points), dtype=kind)
     intensity = None if cloud.intensity is None else cloud.intensity[:, None]
-    for names, columns in ((PLACE, cloud.points), (NORMAL, cloud.normals), (COLOUR, cloud.colours), (INTENSITY, intensity)):
+    for names, columns in ((POSITION, cloud.points), (NORMAL, cloud.normals), (COLOUR, cloud.colours), (INTENSITY, intensity)):
         if columns is not None:
             for column, name in enumerate(names):
                 values[name] = columns[:, column]
@@ -53,11 +53,11 @@ def write_ply(cloud: PointCloud, path: str | Path, *, comments: tuple[str, ...] 
 
 
 def read_ply(path: str | Path) -> PointCloud:
-    """Read a point cloud that Relit wrote.
+    """Read a PLY file that Relit wrote.
 
     Raises:
-        ResultError: another layout, or truncated.
-        StorageError: it cannot be read.
+        ResultError: the file has another layout, or is truncated.
+        StorageError: the file cannot be read.
     """
     with storage("read", path), open(path, "rb") as stream:
         start = stream.read(MAX_HEADER)
@@ -77,11 +77,11 @@ def read_ply(path: str | Path) -> PointCloud:
     def columns(names: tuple[str, ...]) -> np.ndarray:
         return np.stack([values[name] for name in names], axis=-1)
 
-    return PointCloud(columns(PLACE), columns(COLOUR), columns(NORMAL) if with_normals else None,
+    return PointCloud(columns(POSITION), columns(COLOUR), columns(NORMAL) if with_normals else None,
                       values[INTENSITY[0]] if with_intensity else None)
 
 
 def _type(with_normals: bool, with_intensity: bool) -> np.dtype:
-    floats = (*PLACE, *(NORMAL if with_normals else ()))
+    floats = (*POSITION, *(NORMAL if with_normals else ()))
     last = INTENSITY if with_intensity else ()
     return np.dtype([*((name, "<f4") for name in floats), *((name, "u1") for name in COLOUR), *((name, "<f4") for name in last)])

@@ -1,4 +1,4 @@
-"""Near lights of a capture as arrays: where they are, and what the centre of the object sees of them."""
+"""The point lights of a capture as arrays: their positions, and their directions and irradiances at the centre of the object."""
 
 from typing import NamedTuple
 
@@ -11,32 +11,33 @@ from stage.light import DistantLight, GradientLight, PointLight
 from stage.manifest import FILE_NAME
 
 NAMED = 4
-"""Frames that a message names; it counts the others."""
+"""The most frames that an error message names; it counts the others."""
 
 
 class DistantLights(NamedTuple):
-    """One row a frame, in manifest order, as in the stack."""
+    """Distant lights, one row for each frame, in the order of the manifest and the stack."""
 
     direction: np.ndarray  # [lights, 3] float64, unit, from the surface to the light, camera frame
     irradiance: np.ndarray  # [lights, 3] float64, relative
 
 
 class PlacedLights(NamedTuple):
-    """Distant and point lights, one row a frame, in manifest order, as in the stack."""
+    """Distant and point lights, one row for each frame, in the order of the manifest and the stack."""
 
     direction: np.ndarray  # [lights, 3] float64, unit, from the object's centre to the light, camera frame
     irradiance: np.ndarray  # [lights, 3] float64, at the object's centre, relative
-    place: np.ndarray  # [lights, 4] float64: position in metres and 1, or unit direction and 0
-    strength: np.ndarray  # [lights, 3] float64: intensity, or irradiance
-    lobe: np.ndarray  # [lights, 4] float64: unit axis and exponent μ; 0 where the light is the same all round
-    centre: np.ndarray  # [3] float64, of the object: mean of the masked pixels at its mean z
+    place: np.ndarray  # [lights, 4] float64: position in metres and 1, or unit direction and 0 for a distant light
+    strength: np.ndarray  # [lights, 3] float64: intensity, or irradiance of a distant light
+    lobe: np.ndarray  # [lights, 4] float64: unit axis and exponent μ; 0 for a light that is equal in all directions
+    centre: np.ndarray  # [3] float64, the centre of the object: mean of the masked pixels at its mean z
 
 
 def place_lights(capture: Capture) -> PlacedLights:
-    """The lights of the capture's stack, which must be distant or point lights.
+    """Return the lights of the stack of a capture, all of which must be distant or point lights.
 
     Raises:
-        ManifestError: another kind of light, or none; a camera without a scale; lights inside the object or behind it.
+        ManifestError: a light is of another type, there is none, the camera has no scale, or lights stand inside or behind the
+            object.
         ImageError: the mask is empty or unreadable.
     """
     where = capture.folder / FILE_NAME
@@ -73,13 +74,13 @@ def place_lights(capture: Capture) -> PlacedLights:
 
 
 def _check_places(frames: list[int], place: np.ndarray, camera: Camera, mask: np.ndarray, where: str) -> None:
-    """Refuse point lights inside the object, and lights of which too few stand in front of it."""
+    """Raise ManifestError for point lights inside the object, and when fewer than three lights stand in front of it."""
     mean_z = camera.surface_z_m or 0.0
     pixel = camera.pixel_size_m or -mean_z / min(camera.focal_px or (1.0,))
     x, y = camera.plane_coordinates()
     inside, front = [], 0
-    for index, (px, py, pz, near) in zip(frames, place, strict=True):
-        if not near:
+    for index, (px, py, pz, is_point) in zip(frames, place, strict=True):
+        if not is_point:
             front += pz > 0
             continue
         front += pz > mean_z

@@ -1,16 +1,17 @@
-"""The projector: a camera run backwards."""
+"""The projector of a manifest, and the projection of camera-frame points into its image."""
 
 from typing import Annotated, Self
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from stage.camera import Distortion
-from stage.frames import Transform
+from stage.frames import OPENCV_FROM_CAMERA, Transform
 from stage.model import FirstFault, NotNegative, Positive, Resolution, Rgb, Strict
 
 
 class Projector(Strict):
-    """Same intrinsics and conventions as a perspective camera; "projector column" is the continuous u."""
+    """A projector, with the intrinsics and conventions of a perspective camera; its column and row are the continuous u and v."""
 
     resolution: Resolution
     focal_px: tuple[Positive, Positive]
@@ -18,12 +19,41 @@ class Projector(Strict):
     distortion: Distortion | None = None
     camera_from_projector: Transform
     response: Annotated[tuple[NotNegative, ...], Field(min_length=2), FirstFault] | None = None
-    """Its light at so many even levels from 0 to 1, rising; None: linear. Written by `relit calibrate response`."""
+    """The light of the projector at even levels from 0 to 1, rising, as `relit calibrate response` writes it; None means linear."""
     crosstalk: tuple[Rgb, Rgb, Rgb] | None = None
-    """Rows: what the camera's red, green and blue see of the projector's red, green and blue; None: each its own."""
+    """The rows are the red, green and blue that the camera records of the red, green and blue of the projector; None: no crosstalk."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.response is not None and any(b <= a for a, b in zip(self.response, self.response[1:], strict=False)):
             raise ValueError("response must rise: each value above the one before")
         return self
+
+    def device_from_camera(self) -> np.ndarray:
+        """Return the transform from the camera frame to the frame of the projector with OpenCV's axes, x right, y down, z forward.
+
+        Returns:
+            [3, 4] float64: point_device = matrix @ (x, y, z, 1).
+        """
+        pose = np.array(self.camera_from_projector, dtype=np.float64)
+        rotation = OPENCV_FROM_CAMERA @ pose[:3, :3].T
+        return np.column_stack([rotation, -rotation @ pose[:3, 3]])
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Project camera-frame points into the image of the projector.
+
+        Args:
+            points: [..., 3] metres, camera frame.
+
+        Returns:
+            [..., 2] continuous column and row, and [...] bool: True for points in front of the projector.
+        """
+        matrix = self.device_from_camera()
+        point_device = points @ matrix[:, :3].T + matrix[:, 3]
+        ahead = point_device[..., 2] > 0
+        z = np.where(ahead, point_device[..., 2], 1.0)
+        x, y = point_device[..., 0] / z, point_device[..., 1] / z
+        if self.distortion is not None:
+            x, y = self.distortion.apply(x, y)
+        cu, cv = self.principal_px or (self.resolution[0] / 2, self.resolution[1] / 2)
+        return np.stack([cu + self.focal_px[0] * x, cv + self.focal_px[1] * y], axis=-1), ahead

@@ -1,4 +1,4 @@
-"""Laser and time-of-flight frames as the manifest declares them."""
+"""The laser and time-of-flight sources that a manifest declares for a frame."""
 
 import math
 from typing import Annotated, Literal
@@ -9,7 +9,7 @@ from stage.model import Count, Direction, Positive, Strict, Vector
 
 
 class LaserRay(Strict):
-    """One laser spot: point-based range finding."""
+    """A laser beam, which lights one spot of the scene."""
 
     type: Literal["ray"]
     origin_m: Vector
@@ -17,7 +17,7 @@ class LaserRay(Strict):
 
 
 class LaserPlane(Strict):
-    """One laser stripe: light striping."""
+    """A laser sheet, which lights one stripe of the scene (light striping)."""
 
     type: Literal["plane"]
     point_m: Vector
@@ -25,11 +25,11 @@ class LaserPlane(Strict):
 
 
 Laser = Annotated[LaserRay | LaserPlane, Field(discriminator="type")]
-"""Either laser, told apart by `type`."""
+"""A laser beam or sheet; the key `type` tells which."""
 
 
 class ContinuousWave(Strict):
-    """One correlation image: I(δ) = P + Q·cos(φ - δ) at modulation f."""
+    """The source of one correlation image of a continuous-wave camera: I(δ) = P + Q·cos(φ - δ) at modulation frequency f."""
 
     type: Literal["cw"]
     modulation_hz: Positive
@@ -37,7 +37,7 @@ class ContinuousWave(Strict):
 
 
 class Pulsed(Strict):
-    """Photon histograms, a (rows, cols, bins) array."""
+    """The source of photon histograms, an array of (rows, cols, bins)."""
 
     type: Literal["pulsed"]
     bin_s: Positive
@@ -47,4 +47,4 @@ class Pulsed(Strict):
 
 
 TimeOfFlight = Annotated[ContinuousWave | Pulsed, Field(discriminator="type")]
-"""Either kind of time of flight, told apart by `type`."""
+"""A continuous-wave or pulsed source; the key `type` tells which."""

@@ -1,4 +1,4 @@
-"""JSON files with a schema: read strictly, and every fault said as one sentence that names file and field."""
+"""Reading of JSON files by a schema, with one sentence about the first fault, which names the file and the field."""
 
 import json
 from pathlib import Path
@@ -10,20 +10,20 @@ from stage.errors import ManifestError, storage
 
 Record = TypeVar("Record", bound=BaseModel)
 MAX_KEYS = 1000
-"""Of one object: no schema has as many, and each that is not known would be told."""
+"""The most keys of a JSON object: no schema has as many, and an error is collected for each unknown key."""
 
 
 def read_record(path: str | Path, model: type[Record], schema: str) -> Record:
-    """Read and check a JSON file.
+    """Read a JSON file and check it against a model.
 
     Args:
         path: the file.
-        model: what it must hold.
-        schema: what its key `schema` must say.
+        model: the model of its content.
+        schema: the value that its key `schema` must have.
 
     Raises:
-        StorageError: it cannot be read.
-        ManifestError: not JSON, another schema, or a field is wrong; the message names file and field.
+        StorageError: the file cannot be read.
+        ManifestError: the file is not JSON, has another schema, or a field is wrong; the message names file and field.
     """
     with storage("read", path):
         text = Path(path).read_bytes()
@@ -50,9 +50,9 @@ def read_record(path: str | Path, model: type[Record], schema: str) -> Record:
 
 
 def describe(error: ValidationError) -> str:
-    """The first fault of a pydantic error as `field: what is wrong`, with a count of the others."""
+    """Return the first fault of a pydantic error as `field: what is wrong`, with the count of the other faults."""
     places = {fault["loc"][:n] for fault in error.errors() for n in range(len(fault["loc"]))}
-    faults = [fault for fault in error.errors() if fault["loc"] not in places]  # not of a list what is said of its entries
+    faults = [fault for fault in error.errors() if fault["loc"] not in places]  # a fault of an entry replaces the fault of its list
     fault = faults[0]
     where = _field(fault["loc"])
     match fault["type"]:
@@ -82,7 +82,7 @@ def describe(error: ValidationError) -> str:
 
 
 def _field(location: tuple[int | str, ...]) -> str:
-    """`frames[3].light.direction` from pydantic's location, which also names union members after their key."""
+    """Return a field such as `frames[3].light.direction` from a pydantic location, which also names union members after their key."""
     text = ""
     previous: int | str = ""
     for part in location:

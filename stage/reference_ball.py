@@ -1,4 +1,8 @@
-"""A ball of the object's material, photographed in the same rig: where each normal lies in its images."""
+"""A reference ball of the material of the object under the same lights, and the pixel at which it shows a normal.
+
+Source: Woodham, "Photometric method for determining surface orientation from multiple images", Optical Engineering 19(1),
+    1980; Hertzmann and Seitz, "Example-based photometric stereo", TPAMI 27(8), 2005.
+"""
 
 from typing import NamedTuple
 
@@ -13,21 +17,28 @@ from stage.lighting import check_surface
 from stage.manifest import FILE_NAME
 
 RIM_PX = 1.5
-"""How far inside the outline readings are taken: a pixel on it is part background."""
+"""The distance from the outline inwards within which no pixel is read, because a pixel on the outline mixes in background."""
 LEAST_RADIUS_PX = 8.0
-"""A smaller ball has normals more than 7° apart."""
+"""The least radius of a ball: neighbouring pixels of a smaller ball differ by more than 7° in their normals."""
 LEAST_LIGHTS = 3
+"""The least number of lights that determine a normal."""
 
 
 class ReferenceBall(NamedTuple):
-    """The ball, checked against the capture that it is to solve."""
+    """A reference ball and its capture, after the check against the capture that is solved with it."""
 
     capture: Capture
     ball: Ball
 
     def pixel_of(self, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where normals [n, 3] are seen: continuous column and row, the centre of pixel (0, 0) at (0, 0); the rim's RIM_PX
-        inside it."""
+        """Return the position in the image at which the ball shows each normal, at least RIM_PX inside the outline.
+
+        Args:
+            normal: [n, 3] unit, camera frame.
+
+        Returns:
+            column and row, each [n] float64, in array elements: the centre of the first pixel is (0, 0).
+        """
         camera = self.capture.camera
         across = normal[:, :2] / np.maximum(np.linalg.norm(normal[:, :2], axis=1, keepdims=True), 1e-12)
         radius = np.minimum(np.linalg.norm(normal[:, :2], axis=1), 1 - RIM_PX / self.ball.radius_px)
@@ -38,11 +49,15 @@ class ReferenceBall(NamedTuple):
 
 
 def reference_ball(capture: Capture, reference: Capture) -> ReferenceBall:
-    """Check a reference ball against the capture.
+    """Check that a capture of a reference ball fits a capture, and find the ball in it.
+
+    Args:
+        capture: the capture that is solved.
+        reference: the capture of the ball.
 
     Raises:
-        ManifestError: an image of one pixel; other lights than the capture's, or in another order; near lights; a perspective
-            camera; no mask.
+        ManifestError: an image has one pixel, the lights or their order differ, a light is a point light, a camera is
+            perspective, or the reference has no mask.
         CalibrationError: the mask shows no ball.
     """
     where = reference.folder / FILE_NAME

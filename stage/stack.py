@@ -1,9 +1,9 @@
-"""The image stack of a capture as a memory-mapped cache: half, planar, light-major, read in pixel bands.
+"""The image stack of a capture: a memory-mapped cache of half values, planar and light-major, which is read in pixel bands.
 
 Layout of `stack-<key>.npy`: [channel, light padded to a multiple of 8, pixel padded to a multiple of 64] half. Each light has
 a power-of-two scale of its own, so that half covers it from its brightest value down 29 stops: radiance = stored · scale[light].
-Beside it `stack-<key>.saturated.npy` [light / 8, pixel] uint8 (bit l % 8, least significant first) where there is no reading
-(it saturates, or alignment has none) and `stack-<key>.json`. A padded light or pixel is 0.
+Beside it lie `stack-<key>.saturated.npy`, [light / 8, pixel] uint8, whose bit l % 8 (least significant first) is set where light l
+has no usable reading (it saturates, or motion compensation has none), and the index `stack-<key>.json`. Padding is 0.
 """
 
 import json
@@ -17,47 +17,48 @@ import numpy as np
 from stage.errors import StorageError, storage
 
 CHANNELS = 3
+"""Red, green and blue."""
 LIGHT_PAD = 8
-"""Lights are padded to this multiple: matrix units want it (docs/figures.md), and one byte holds eight saturation bits."""
+"""The count of lights is padded to this multiple, which matrix units need (docs/figures.md), and eight bits make a byte."""
 PIXEL_PAD = 64
-"""Pixels are padded to this multiple, so that a band always divides into whole packs (32 on the CPU, 4 on CUDA)."""
+"""The count of pixels is padded to this multiple, so that a band divides into whole packs (32 pixels on the CPU, 4 on CUDA)."""
 BAND_BYTES = 256 << 20
-"""How much of the stack one band holds: what bounds the memory of every solver."""
+"""The bytes of the stack in one band, which bound the memory of every solver."""
 
 
 def padded(count: int, multiple: int) -> int:
-    """The next multiple."""
+    """Return the least multiple of `multiple` that is not below `count`."""
     return -(-count // multiple) * multiple
 
 
 @dataclass(frozen=True)
 class Stack:
-    """An ingested capture. Every read maps the file anew, so that the pages of a finished band leave the process."""
+    """The stack of an ingested capture. Every read maps the file again, so that the pages of a finished band leave the process."""
 
     folder: Path
     key: str
     frames: tuple[str, ...]
-    """Image name of each light, in manifest order."""
+    """The image of each light, in manifest order."""
     scale: np.ndarray  # [lights padded] float32, radiance of a stored 1.0; 0 for padding
     pixel_count: int
     motion: dict[str, Any] | None = None
-    """Of an aligned stack, how the subject moved, as the report says it."""
+    """The statistics of a motion-compensated stack for the report, or None."""
 
     @property
     def light_count(self) -> int:
-        """Lights, without padding."""
+        """The count of lights, without padding."""
         return len(self.frames)
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """[channel, light padded, pixel padded]."""
+        """The shape of the values: channels, padded count of lights, padded count of pixels."""
         return (CHANNELS, padded(self.light_count, LIGHT_PAD), padded(self.pixel_count, PIXEL_PAD))
 
     def bands(self, bytes_per_pixel: int = 0) -> Iterator[tuple[int, int]]:
-        """Pixel ranges [start, stop) that cover the padded pixel axis; each a multiple of 64 long.
+        """Yield pixel ranges [start, stop) that cover the padded pixel axis, each a multiple of 64 pixels.
 
         Args:
-            bytes_per_pixel: what the caller allocates beside the stack for each pixel; 0 for little.
+            bytes_per_pixel: the bytes that the caller allocates for each pixel beside the stack.
         """
         channels, lights, pixels = self.shape
         per_pixel = 2 * channels * lights + bytes_per_pixel
@@ -66,21 +67,21 @@ class Stack:
             yield start, min(start + step, pixels)
 
     def band(self, start: int, stop: int) -> np.ndarray:
-        """The stored values of a pixel range.
+        """Return the stored values of a pixel range.
 
         Returns:
             [3, lights padded, stop - start] float16, a view of a fresh read-only map; radiance = value · scale[light].
 
         Raises:
-            StorageError: the cache is gone or was cut short.
+            StorageError: the cache was removed or is truncated.
         """
         return self._map(values_path(self.folder, self.key), self.shape)[:, :, start:stop]
 
     def saturated(self, start: int, stop: int) -> np.ndarray:
-        """Which readings of a pixel range saturate.
+        """Return the saturation bits of a pixel range.
 
         Returns:
-            [lights padded / 8, stop - start] uint8, bit l % 8 of byte l // 8.
+            [lights padded / 8, stop - start] uint8; bit l % 8 of byte l // 8 is set where light l has no usable reading.
         """
         path = saturated_path(self.folder, self.key)
         shape = (self.shape[1] // 8, self.shape[2])
@@ -89,25 +90,25 @@ class Stack:
         return self._map(path, shape)[:, start:stop]
 
     def pick(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The stored values and saturation bits of single pixels.
+        """Return the stored values and saturation bits of single pixels.
 
         Args:
-            pixels: [n] positions, row-major.
+            pixels: [n] row-major indices.
 
         Returns:
             [3, lights padded, n] float16 and [lights padded / 8, n] uint8, copies.
         """
         channels, lights, _ = self.shape
         values = np.empty((channels, lights, len(pixels)), dtype=np.float16)
-        for channel, light in np.ndindex(channels, lights):  # a map each: scattered reads leave a page or more in the process
+        for channel, light in np.ndindex(channels, lights):  # a new map each time: scattered reads keep pages in the process
             values[channel, light] = self._map(values_path(self.folder, self.key), self.shape)[channel, light, pixels]
         return values, self.pick_saturated(pixels)
 
     def pick_saturated(self, pixels: np.ndarray) -> np.ndarray:
-        """The saturation bits of single pixels.
+        """Return the saturation bits of single pixels.
 
         Args:
-            pixels: [n] positions, row-major.
+            pixels: [n] row-major indices.
 
         Returns:
             [lights padded / 8, n] uint8, a copy.
@@ -129,27 +130,27 @@ class Stack:
 
 
 def values_path(folder: Path, key: str) -> Path:
-    """Where the half values of a stack lie."""
+    """Return the path of the half values of a stack."""
     return folder / f"stack-{key}.npy"
 
 
 def saturated_path(folder: Path, key: str) -> Path:
-    """Where its saturation bits lie; absent when no reading saturates."""
+    """Return the path of the saturation bits of a stack; the file is absent when no reading saturates."""
     return folder / f"stack-{key}.saturated.npy"
 
 
 def index_path(folder: Path, key: str) -> Path:
-    """Where its index lies, written last: a stack without an index is not there."""
+    """Return the path of the index of a stack, which is written last: a stack without an index is incomplete."""
     return folder / f"stack-{key}.json"
 
 
 def find(folder: Path, key: str) -> Stack | None:
-    """The finished stack of this key, or None."""
+    """Return the complete stack of a key, or None."""
     try:
         index = json.loads(index_path(folder, key).read_text(encoding="utf-8"))
         found = Stack(folder, key, tuple(index["frames"]), np.array(index["scale"], dtype=np.float32), int(index["pixel_count"]),
                       index.get("motion"))
-    except (OSError, ValueError, KeyError, TypeError):  # a cache, and a damaged one: built again
+    except (OSError, ValueError, KeyError, TypeError):  # a damaged cache is built again
         return None
     if not values_path(folder, key).exists():
         return None

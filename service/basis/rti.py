@@ -23,7 +23,7 @@ from stage.colour import rgb_matrix
 from stage.errors import ManifestError
 from stage.light_basis import numbers, write_facts
 from stage.rti import hsh, ptm
-from stage.rti.steps import Steps, from_bytes, steps_over, to_bytes
+from stage.rti.quantization import Quantization, dequantize, quantization_of_range, quantize
 
 DISPLAY_SPACE = "lin_rec709_scene"
 """Linear values of an sRGB display."""
@@ -85,32 +85,32 @@ def make_rti(request: BasisRequest, kind: BasisKind, source: Source, device: str
     for part in parts(source, device, bytes_per_pixel, timings, "fit"):
         inside = model.fit(model.shown(part.band))[0][:, :, part.inside]
         low, high = np.minimum(low, inside.min(axis=(1, 2))), np.maximum(high, inside.max(axis=(1, 2)))
-    steps = steps_over(low, high)
+    quantization = quantization_of_range(low, high)
     channels = 1 if kind == BasisKind.LRGB_PTM else 3
-    stored = np.tile(steps.zero.astype(np.uint8), (channels, pixels, 1))
+    stored = np.tile(quantization.zero.astype(np.uint8), (channels, pixels, 1))
     colours = np.zeros((pixels, 3), dtype=np.uint8)
     loss = np.zeros(3)  # as fitted, as stored, and without anything
     for part in parts(source, device, bytes_per_pixel, timings, "store"):
         shown = model.shown(part.band)
         fitted, colour = model.fit(shown)
-        levels = to_bytes(np.where(part.inside, fitted, 0), steps)
+        levels = quantize(np.where(part.inside, fitted, 0), quantization)
         width = part.span.stop - part.span.start
         stored[:, part.span] = np.moveaxis(levels, 0, -1)[:, :width]
         if colour is not None:
             colours[part.span] = np.where(part.inside, colour, 0).T[:width]
         loss += [model.squared_difference(shown, coefficients, colour, part.inside)
-                 for coefficients in (fitted, from_bytes(levels, steps), np.zeros_like(fitted))]
+                 for coefficients in (fitted, dequantize(levels, quantization), np.zeros_like(fitted))]
     timings.stage("write", 1)
     rows, cols = source.capture.camera.height, source.capture.camera.width
     grid = stored.reshape(channels, rows, cols, terms)
     if kind == BasisKind.HSH:
-        hsh.write(request.out, hsh.Hsh(grid, steps))
+        hsh.write(request.out, hsh.Hsh(grid, quantization))
     else:
-        ptm.write(request.out, ptm.Ptm(grid, steps, colours.reshape(rows, cols, 3) if channels == 1 else None))
+        ptm.write(request.out, ptm.Ptm(grid, quantization, colours.reshape(rows, cols, 3) if channels == 1 else None))
     readings = 3 * source.pixels * len(model.front)
     error = {"relative_rms": np.sqrt(loss[1] / loss[2]), "levels_rms": WHITE * np.sqrt(loss[1] / readings),
              "fit_relative_rms": np.sqrt(loss[0] / loss[2])}
-    facts = _write_facts(request, source, model, steps, {name: numbers(value) for name, value in error.items()})
+    facts = _write_facts(request, source, model, quantization, {name: numbers(value) for name, value in error.items()})
     timings.close()
     return BasisResult(request.out, facts, kind, terms, source.pixels, len(model.front), stack.light_count - len(model.front),
                        source.near, float(error["relative_rms"]), float(error["levels_rms"]))
@@ -169,14 +169,14 @@ def _exposure(source: Source, gains: np.ndarray, display_from_stack: np.ndarray)
     return 1 / white
 
 
-def _write_facts(request: BasisRequest, source: Source, model: Model, steps: Steps, error: dict[str, float]) -> Path:
+def _write_facts(request: BasisRequest, source: Source, model: Model, quantization: Quantization, error: dict[str, float]) -> Path:
     camera = source.capture.camera
     behind = np.setdiff1d(np.arange(source.stack.light_count), model.front)
     return write_facts(request.out, {
         "kind": model.kind, "capture": source.capture.name, "image": request.out.name, "resolution": [camera.width, camera.height],
         "count": model.terms, "color_space": "srgb_texture",
         "convention": f"display values, as under one white light of irradiance 1 times exposure; percentile {WHITE_PERCENTILE} is white",
-        "exposure": numbers(model.exposure), "step": numbers(steps.step), "zero": steps.zero.tolist(),
+        "exposure": numbers(model.exposure), "step": numbers(quantization.step), "zero": quantization.zero.tolist(),
         "lights": source.described_lights(model.front), "lights_left_out": [source.stack.frames[i] for i in behind],
         "error": {**error, "pixels": source.pixels}, "provenance": source.provenance,
     })

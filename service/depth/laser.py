@@ -18,7 +18,7 @@ from stage.errors import ManifestError
 from stage.manifest import FILE_NAME, Frame
 from stage.pattern import UniformPattern
 from stage.ranging import LaserPlane, LaserRay
-from stage.rig_check import check_perspective
+from stage.triangulation_check import check_perspective
 
 MAX_GAP = 0.02
 """Part of its distance by which the laser's ray may miss the line of sight: beyond, the spot is not that ray's."""

@@ -23,7 +23,7 @@ from stage.manifest import FILE_NAME, Frame
 from stage.patterns.collect import BinaryCode, Collected, collect
 from stage.planes import Planes, frame_planes
 from stage.projector import Projector
-from stage.rig_check import check_projector, device_from_camera, project
+from stage.triangulation_check import check_projector
 
 SCALE_PERCENTILE = 99.9
 """Of the brightest frame's pixels: full scale of images that have none of their own (floating point, no saturation given)."""
@@ -114,7 +114,7 @@ def _bands(planes: Planes, mask: np.ndarray, plans: tuple[AxisPlan | None, AxisP
     for index, (name, missing) in enumerate(guessed.items()):
         if missing.any():  # solved from the other axis alone: where the point lies in the projector
             points = capture.camera.points(-maps["depth"])[missing]
-            maps[name][missing] = project(projector, points)[0][:, index]
+            maps[name][missing] = projector.project(points)[0][:, index]
     solved = np.isin(status, SOLVED)
     facts = {}
     if columns is not None and rows is not None and solved.any():
@@ -160,7 +160,7 @@ def projector_model(projector: Projector) -> ProjectorModel:
     lens = projector.distortion
     return ProjectorModel((width, height), projector.focal_px, projector.principal_px or (width / 2, height / 2),
                           lens.k if lens is not None else (0.0, 0.0, 0.0), lens.p if lens is not None else (0.0, 0.0),
-                          device_from_camera(projector))
+                          projector.device_from_camera())
 
 
 def full_scale(planes: Planes, capture: Capture, frames: list[Frame]) -> float:

@@ -1,4 +1,4 @@
-"""Matrices from OpenCV calibration files: YAML, XML and JSON as cv2.FileStorage writes them, and JSON with plain lists."""
+"""Reading of OpenCV calibration files (YAML, XML and JSON of cv2.FileStorage, and JSON with plain lists), and their conventions."""
 
 import json
 from collections.abc import Mapping
@@ -10,21 +10,22 @@ import numpy as np
 
 from stage.camera import Distortion
 from stage.errors import ManifestError, storage
+from stage.frames import OPENCV_FROM_CAMERA
 
 SUFFIXES = (".yml", ".yaml", ".xml", ".json")
 COEFFICIENTS = 5
-"""Of Brown-Conrady: k1 k2 p1 p2 k3. OpenCV's further ones (rational, thin prism, tilt) have no place in a capture."""
+"""The count of Brown-Conrady coefficients, k1 k2 p1 p2 k3; a capture cannot hold the rational, thin prism and tilt terms."""
 
 
 def read_matrices(path: Path) -> dict[str, np.ndarray]:
-    """Every matrix or number of a file, by its name.
+    """Read every matrix and number of a file.
 
     Returns:
-        Name → float64 array of one or two dimensions.
+        The float64 arrays, of one or two dimensions, by their names.
 
     Raises:
-        ManifestError: another suffix, or the file cannot be parsed.
-        StorageError: it cannot be read.
+        ManifestError: the suffix is unknown, or the file cannot be parsed.
+        StorageError: the file cannot be read.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise ManifestError(f"{path}: is no OpenCV calibration: its suffix must be one of {', '.join(SUFFIXES)}")
@@ -68,7 +69,7 @@ def _from_json(path: Path, text: str) -> dict[str, np.ndarray]:
 
 
 def _matrix(value: Any) -> np.ndarray | None:
-    """A JSON value as an array, or None when it is something else."""
+    """Return a JSON value as an array, or None when it is no matrix."""
     try:
         if isinstance(value, dict):
             return np.array(value["data"], dtype=np.float64).reshape(int(value["rows"]), int(value["cols"]))
@@ -79,15 +80,17 @@ def _matrix(value: Any) -> np.ndarray | None:
 
 def pick(matrices: Mapping[str, np.ndarray], names: tuple[str, ...], path: Path, what: str, *,
          shape: tuple[int, ...] | None = None) -> np.ndarray:
-    """The first of several names that a file may use.
+    """Return the matrix that a file holds under the first of several names.
 
     Args:
-        names: in order of preference.
-        what: for the message.
-        shape: that it must have; None: any.
+        matrices: the matrices of the file by name.
+        names: the names in order of preference.
+        path: the file, for the message.
+        what: the name of the quantity, for the message.
+        shape: the shape that the matrix must have; None allows any.
 
     Raises:
-        ManifestError: none is there, it has another shape, or holds a value that is not finite.
+        ManifestError: the file has none of the names, or the matrix has another shape or a value that is not finite.
     """
     name = next((name for name in names if name in matrices), None)
     if name is None:
@@ -99,13 +102,34 @@ def pick(matrices: Mapping[str, np.ndarray], names: tuple[str, ...], path: Path,
 
 
 def lens(coefficients: np.ndarray, path: Path, what: str) -> Distortion:
-    """OpenCV's distortion vector k1 k2 p1 p2 [k3 …].
+    """Return the distortion of a manifest from OpenCV's vector k1 k2 p1 p2 [k3 …].
 
     Raises:
-        ManifestError: it has fewer than four, or a coefficient beyond k3 that is not zero.
+        ManifestError: the vector has fewer than four coefficients, or one beyond k3 that is not zero.
     """
     values = np.asarray(coefficients, dtype=np.float64).ravel()
     if len(values) < 4 or not np.isfinite(values).all() or np.any(values[COEFFICIENTS:]):
         raise ManifestError(f"{path}: the distortion of the {what} must be k1 k2 p1 p2 and, if any, k3; other models are not known")
-    k1, k2, p1, p2, k3 = (float(value) for value in np.append(values, 0.0)[:COEFFICIENTS])
+    return distortion_of(values)
+
+
+def distortion_of(coefficients: np.ndarray) -> Distortion:
+    """Return the distortion of a manifest from the first of OpenCV's coefficients k1 k2 p1 p2 k3, the last of which may be missing."""
+    k1, k2, p1, p2, k3 = (float(value) for value in np.append(coefficients.ravel(), 0.0)[:COEFFICIENTS])
     return Distortion(model="brown_conrady", k=(k1, k2, k3), p=(p1, p2))
+
+
+def camera_from_projector(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """Return the pose of a projector in a manifest from the result of OpenCV's stereoCalibrate with the camera first.
+
+    Args:
+        rotation: [3, 3] R, from the camera to the projector on OpenCV's axes.
+        translation: [3] T, metres.
+
+    Returns:
+        [4, 4] float64 `camera_from_projector`, metres, camera frames.
+    """
+    pose = np.eye(4)
+    pose[:3, :3] = OPENCV_FROM_CAMERA @ rotation.T @ OPENCV_FROM_CAMERA
+    pose[:3, 3] = OPENCV_FROM_CAMERA @ (-rotation.T @ translation)
+    return pose

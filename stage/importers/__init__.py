@@ -1,1 +1,1 @@
-"""Captures laid out another way → a manifest: one module a format, each with `import_folder(source, destination)`."""
+"""Import of captures in other layouts: one module for each format, with `import_folder(source, destination)`."""

@@ -1,28 +1,28 @@
-"""The DiLiGenT benchmark layout: filenames.txt, light_directions.txt, light_intensities.txt, mask.png, 16-bit PNG.
+"""Import of the DiLiGenT benchmark: filenames.txt, light_directions.txt, light_intensities.txt, mask.png, 16-bit PNG.
 
 Source: Shi et al., "A Benchmark Dataset and Evaluation for Non-Lambertian and Uncalibrated Photometric Stereo", TPAMI 2019.
-Its camera frame is ours (x right, y up, z to the camera); images are linear and are divided by the light intensities.
+Its camera frame is that of relit (x right, y up, z to the camera). Images are linear; light intensities become irradiances.
 """
 
 from pathlib import Path
 
 from stage.errors import ManifestError, storage
-from stage.importers.layout import finish, image_resolution, read_table
+from stage.importers.layout import image_resolution, read_table, write_capture
 from stage.manifest import SCHEMA
 
 
 def import_folder(source: Path, destination: Path) -> Path:
-    """Write a capture.json for a DiLiGenT object.
+    """Write a capture.json for an object of the DiLiGenT benchmark.
 
     Args:
-        source: the object's folder.
-        destination: the capture's folder; the same, or another, which gets links to (or copies of) the images.
+        source: the folder of the object.
+        destination: the folder of the capture; another folder than the source gets links to, or copies of, the images.
 
     Returns:
         The path of the manifest.
 
     Raises:
-        ManifestError: a text file is missing, has the wrong count of rows, or names an image that is not there.
+        ManifestError: a text file is missing, has the wrong count of rows, or names an image that does not exist.
     """
     with storage("read", source / "filenames.txt"):
         lines = (source / "filenames.txt").read_text(encoding="utf-8", errors="replace").splitlines()
@@ -38,7 +38,7 @@ def import_folder(source: Path, destination: Path) -> Path:
     if zero:
         raise ManifestError(f"{source / 'light_directions.txt'}: row {zero[0] + 1} has zero length: give a direction")
     mask = "mask.png" if (source / "mask.png").exists() else None
-    return finish({
+    return write_capture({
         "schema": SCHEMA,
         "name": source.resolve().name,
         "color_space": "lin_rec709_scene",

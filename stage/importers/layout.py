@@ -1,4 +1,4 @@
-"""What importers share: where images lie relative to the new manifest, tables of numbers, and writing the result."""
+"""The common parts of the importers: reading tables of numbers, placing images, and writing the manifest."""
 
 import os
 import shutil
@@ -17,13 +17,13 @@ from stage.records import describe
 
 
 def read_table(path: Path, columns: int) -> np.ndarray:
-    """Read whitespace-separated rows of numbers.
+    """Read a text file with rows of numbers that white space separates.
 
     Returns:
         [rows, columns] float64.
 
     Raises:
-        ManifestError: a row has another count of numbers, or one is not a finite number; names file and line.
+        ManifestError: a row has another count of numbers, or a number is not finite; the message names file and line.
         StorageError: the file cannot be read.
     """
     with storage("read", path):
@@ -43,18 +43,19 @@ def read_table(path: Path, columns: int) -> np.ndarray:
 
 
 def image_resolution(path: Path) -> tuple[int, int]:
-    """Width and height of an image, from its header."""
+    """Return the width and height of an image, from its header."""
     header = images.read_header(path)
     return header.width, header.height
 
 
-def place(source: Path, destination: Path, names: Sequence[str]) -> None:
-    """Put the named files of `source` into `destination`: hard links where the file system allows, else copies.
+def place_images(source: Path, destination: Path, names: Sequence[str]) -> None:
+    """Put files of `source` into `destination` as hard links when the file system allows it, otherwise as copies.
 
-    Files that are there already with the same size and time stay; other files of the same name are not overwritten.
+    Files of the same size and time that `destination` holds already stay; other files are never overwritten.
 
     Raises:
-        ManifestError: a file is missing, lies outside `source`, or another file of that name is there already; nothing is placed.
+        ManifestError: a file is missing, lies outside `source`, or differs from a file of its name in `destination`; then no file
+            is placed.
         StorageError: the file system refuses.
     """
     wanted = []
@@ -78,23 +79,27 @@ def place(source: Path, destination: Path, names: Sequence[str]) -> None:
                     shutil.copy2(origin, temporary)
 
 
-def finish(data: dict[str, Any], table: Path, destination: Path) -> Path:
-    """Check the manifest, place its images and write it last, so that a capture.json never names files that are not there.
+def write_capture(data: dict[str, Any], table: Path, destination: Path) -> Path:
+    """Check a manifest, place its images, and write it last, so that a capture.json never names files that do not exist.
 
     Args:
         data: the manifest as plain data.
-        table: the file that it was made from, beside the images; named when a value of it cannot be.
-        destination: the capture's folder.
+        table: the file that the manifest was made from, which lies beside the images; errors name it.
+        destination: the folder of the capture.
 
     Returns:
         The path of the manifest.
+
+    Raises:
+        ManifestError: a value is invalid, or `place_images` refuses a file.
+        StorageError: the file system refuses.
     """
     try:
         manifest = Manifest.model_validate(data)
     except ValidationError as error:
         raise ManifestError(f"{table}: {describe(error)}") from error
     names = [frame.image for frame in manifest.frames]
-    place(table.parent, destination, [*names, *([manifest.mask] if manifest.mask else [])])
+    place_images(table.parent, destination, [*names, *([manifest.mask] if manifest.mask else [])])
     path = destination / FILE_NAME
     write_manifest(manifest, path)
     return path

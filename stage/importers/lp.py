@@ -1,8 +1,7 @@
-"""RTI `.lp` files: a count, then one line an image: its name and the light direction x y z.
+"""Import of RTI `.lp` files: a count, then one line for each image with its name and the direction x y z of its light.
 
-The convention of RTIBuilder and its viewers: x right, y up, z towards the camera; the vector points to the light.
-Images of a camera are display-encoded, those of a linear workflow are not, and the file does not say which: 8-bit images
-are taken as sRGB and others as scene-linear, and the manifest says so.
+The convention is that of RTIBuilder and its viewers: x right, y up, z towards the camera; the vector points to the light. The file
+does not give the colour space: 8-bit images are taken as sRGB and others as scene-linear, and the manifest declares it.
 """
 
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from stage.errors import ManifestError, storage
-from stage.importers.layout import finish, image_resolution
+from stage.importers.layout import image_resolution, write_capture
 from stage.manifest import SCHEMA
 
 
@@ -19,14 +18,14 @@ def import_folder(source: Path, destination: Path) -> Path:
     """Write a capture.json for an RTI capture.
 
     Args:
-        source: the .lp file, or a folder with exactly one.
-        destination: the capture's folder; the same, or another, which gets links to (or copies of) the images.
+        source: the .lp file, or a folder with exactly one .lp file.
+        destination: the folder of the capture; another folder than the source gets links to, or copies of, the images.
 
     Returns:
         The path of the manifest.
 
     Raises:
-        ManifestError: no or several .lp files, a bad line (named), or an image that is not there.
+        ManifestError: there is no .lp file or more than one, a line is wrong, or an image does not exist.
     """
     path = _find(source)
     folder = path.parent
@@ -44,7 +43,7 @@ def import_folder(source: Path, destination: Path) -> Path:
     first = folder / frames[0]["image"]
     resolution = image_resolution(first)
     mask = "mask.png" if (folder / "mask.png").exists() else None
-    return finish({
+    return write_capture({
         "schema": SCHEMA,
         "name": path.stem,
         "color_space": "srgb_texture" if _display_encoded(first) else "lin_rec709_scene",
@@ -74,7 +73,7 @@ def _frame(path: Path, folder: Path, number: int, row: str) -> dict[str, Any]:
         raise ManifestError(f"{path}: line {number}: {row[:60]!r} is not an image name and three numbers")
     if not any(direction):
         raise ManifestError(f"{path}: line {number}: the light direction has zero length")
-    # names are often absolute or with folders of the machine that made the file: the images lie beside it
+    # names often hold folders of the machine that made the file, while the images lie beside the file
     name = parts[0].replace("\\", "/")
     relative = name if not name.startswith("/") and ":" not in name and (folder / name).is_file() else name.rsplit("/", 1)[-1]
     return {"image": relative, "light": {"type": "distant", "direction": direction, "irradiance": [1.0, 1.0, 1.0]}}

@@ -1,21 +1,19 @@
-"""Images in the order of OpenCV's GrayCodePattern, with an optional OpenCV calibration file.
+"""Import of images in the order of OpenCV's GrayCodePattern, with an optional OpenCV calibration file.
 
-The order: every bit of the columns, coarsest first, each followed by its inverse; the rows in the same way; then white and black.
-An OpenCV calibration counts pixel centres as whole numbers, so cx and cy become 0.5 larger; its frame is x right, y down, z forward,
-and R, T take points from the camera's to the projector's (stereoCalibrate with the camera first).
+The order is every bit of the columns, coarsest first, each followed by its inverse; the rows in the same way; then white and black.
+An OpenCV calibration has pixel centres at whole numbers, so cx and cy become 0.5 larger. Its axes are x right, y down, z forward,
+and R, T take points from the camera to the projector (stereoCalibrate with the camera first).
 """
 
 import re
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from stage.calibration.opencv_file import lens, pick, read_matrices
+from stage.calibration.opencv_file import camera_from_projector, lens, pick, read_matrices
 from stage.camera import Distortion
 from stage.errors import ManifestError, storage
 from stage.images import SUFFIXES
-from stage.importers.layout import finish, image_resolution
+from stage.importers.layout import image_resolution, write_capture
 from stage.manifest import SCHEMA
 
 CAMERA_MATRIX = ("cam_K", "cam_int", "camera_matrix", "cameraMatrix1", "M1", "K1", "mtx1")
@@ -23,10 +21,9 @@ CAMERA_LENS = ("cam_kc", "cam_dist", "distortion_coefficients", "distCoeffs1", "
 PROJECTOR_MATRIX = ("proj_K", "proj_int", "projector_matrix", "cameraMatrix2", "M2", "K2", "mtx2")
 PROJECTOR_LENS = ("proj_kc", "proj_dist", "projector_distortion", "distCoeffs2", "D2", "dist2")
 ROTATION, TRANSLATION = ("R", "rotation", "roatation"), ("T", "translation", "t")
+"""The names under which calibration files hold these matrices and vectors, in order of preference; one common tool misspells."""
 PIXEL_CENTRE = 0.5
-"""What OpenCV's coordinates lack to ours."""
-FLIP = np.diag([1.0, -1.0, -1.0])
-"""Between x right, y down, z forward and x right, y up, z backward; its own inverse."""
+"""The image coordinate of the centre of the first pixel, which is 0 in OpenCV."""
 
 
 def import_folder(source: Path, destination: Path, *, projector: tuple[int, int], calibration: Path | None = None,
@@ -34,17 +31,17 @@ def import_folder(source: Path, destination: Path, *, projector: tuple[int, int]
     """Write a capture.json for a Gray-code scan.
 
     Args:
-        source: folder with the images, taken in the natural order of their names: 2 before 10.
-        destination: the capture's folder; the same, or another, which gets links to (or copies of) the images.
-        projector: its width and height in pixels, which say how many bits there are.
-        calibration: OpenCV file with the intrinsics of both, R and T; None: `relit calibrate procam` finds them.
-        unit_m: metres of one unit of T.
+        source: the folder of the images, which are taken in the natural order of their names: 2 before 10.
+        destination: the folder of the capture; another folder than `source` gets links to, or copies of, the images.
+        projector: the width and height of the projector in pixels, which determine the count of bits.
+        calibration: an OpenCV file with the intrinsics of both devices, R and T; None leaves them to `relit calibrate procam`.
+        unit_m: the metres in one unit of T.
 
     Returns:
         The path of the manifest.
 
     Raises:
-        ManifestError: another count of images than the projector needs, or a calibration that lacks something.
+        ManifestError: the count of images does not fit the projector, or the calibration file lacks a matrix.
     """
     names = _images(source)
     patterns = gray_order(*projector)
@@ -60,11 +57,11 @@ def import_folder(source: Path, destination: Path, *, projector: tuple[int, int]
     if calibration is not None:
         data |= devices(calibration, resolution, projector, unit_m)
     data["frames"] = [{"image": name, "pattern": pattern} for name, pattern in zip(names, patterns, strict=True)]
-    return finish(data, source / names[0], destination)
+    return write_capture(data, source / names[0], destination)
 
 
 def gray_order(width: int, height: int) -> list[dict[str, Any]]:
-    """The manifest entries of OpenCV's images, in order."""
+    """Return the manifest entries of the patterns in the order of OpenCV's images."""
     entries: list[dict[str, Any]] = []
     for axis, size in (("column", width), ("row", height)):
         bits = max(1, (size - 1).bit_length())
@@ -74,16 +71,15 @@ def gray_order(width: int, height: int) -> list[dict[str, Any]]:
 
 
 def devices(path: Path, resolution: tuple[int, int], projector: tuple[int, int], unit_m: float) -> dict[str, Any]:
-    """The manifest's camera and projector from an OpenCV file.
+    """Return the camera and the projector of the manifest from an OpenCV calibration file.
 
     Raises:
-        ManifestError: something is missing or cannot be.
+        ManifestError: a matrix is missing or invalid.
     """
     found = read_matrices(path)
-    turn = pick(found, ROTATION, path, "rotation R", shape=(3, 3))
-    shift = pick(found, TRANSLATION, path, "translation T", shape=(3,)) * unit_m
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = FLIP @ turn.T @ FLIP, FLIP @ (-turn.T @ shift)
+    rotation = pick(found, ROTATION, path, "rotation R", shape=(3, 3))
+    translation = pick(found, TRANSLATION, path, "translation T", shape=(3,)) * unit_m
+    pose = camera_from_projector(rotation, translation)
     entries = {}
     for what, matrix, coefficients, size in (("camera", CAMERA_MATRIX, CAMERA_LENS, resolution),
                                              ("projector", PROJECTOR_MATRIX, PROJECTOR_LENS, projector)):

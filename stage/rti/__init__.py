@@ -1,1 +1,1 @@
-"""Files of the relightable-image (RTI) community: polynomial texture maps and hemispherical harmonics, in bytes."""
+"""File formats of reflectance transformation imaging (RTI): polynomial texture maps and hemispherical harmonics."""

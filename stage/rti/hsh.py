@@ -1,17 +1,18 @@
-"""Hemispherical harmonics: `.rti` files of file type 3.
+"""Reading and writing of hemispherical harmonics: `.rti` files of file type 3.
 
 Four ASCII lines, each ended by carriage return and line feed (some readers count two bytes a line end, others take either):
 
     #HSH1.2 / 3 / width height 3 / terms 2 1
 
-that is: file type 3, hemispherical harmonics; three colour channels; 4, 9 or 16 terms, each channel with its own coefficients
-(basis type 2), one byte each. Then `terms` scales and `terms` biases, little-endian float32, then bytes, rows from the top of the
-image to the bottom: at each pixel all terms of red, of green, of blue. A coefficient is byte/255 · scale + bias; the sum is a
-display value with white at 1. The terms are those of kernels/relight/hemisphere.py.
+The lines give file type 3 (hemispherical harmonics), three colour channels, and 4, 9 or 16 terms; each channel has its own
+coefficients (basis type 2), one byte each. `terms` scales and `terms` biases follow, little-endian float32, then the bytes, rows from
+the top of the image to the bottom: at each pixel all terms of red, then green, then blue. A coefficient is byte/255 · scale + bias;
+the sum is a display value with white at 1. The terms are those of kernels/relight/hemisphere.py.
 
-Source: the file format of RTIBuilder and RTIViewer (Cultural Heritage Imaging, ISTI-CNR). Its draft specification was not at hand: the
-    layout is that of several independent readers and writers, which agree. Lines beginning with # are comments to most readers, but
-    not to all: none is written. RTIViewer's older `.hsh` files have another, binary, header and are not written.
+Source: the file format of RTIBuilder and RTIViewer (Cultural Heritage Imaging, ISTI-CNR). The draft specification was not available: the
+    layout is that of several independent readers and writers, which agree. The basis: Gautron et al., "A novel hemispherical basis
+    for accurate and efficient rendering", Eurographics Symposium on Rendering 2004. No comment is written, because some readers do not
+    skip lines that begin with #. The older `.hsh` files of RTIViewer have a binary header and are not written.
 """
 
 import struct
@@ -22,7 +23,7 @@ import numpy as np
 
 from stage.errors import ImageError, storage
 from stage.files import replacing
-from stage.rti.steps import TOP, Steps
+from stage.rti.quantization import TOP, Quantization
 
 FILE_TYPE = 3
 CHANNELS, SEPARATE, ELEMENT_SIZE = 3, 2, 1
@@ -30,21 +31,21 @@ TERMS = (4, 9, 16)
 
 
 class Hsh(NamedTuple):
-    """A picture as hemispherical harmonics. Row 0 is the top of the image."""
+    """An image as quantised coefficients of hemispherical harmonics. Row 0 is the top of the image."""
 
     stored: np.ndarray  # [3, rows, cols, terms] uint8
-    steps: Steps
+    quantization: Quantization
 
 
 def write(path: str | Path, hsh: Hsh) -> None:
-    """Write a file, whole or not at all.
+    """Write an `.rti` file whole or not at all.
 
     Raises:
         StorageError: the file cannot be written; nothing is left behind.
     """
     channels, rows, cols, terms = hsh.stored.shape
     header = f"#HSH1.2\r\n{FILE_TYPE}\r\n{cols} {rows} {channels}\r\n{terms} {SEPARATE} {ELEMENT_SIZE}\r\n"
-    scale, bias = TOP * hsh.steps.step, -hsh.steps.zero * hsh.steps.step
+    scale, bias = TOP * hsh.quantization.step, -hsh.quantization.zero * hsh.quantization.step
     with replacing(path) as temporary, open(temporary, "wb") as stream:
         stream.write(header.encode("ascii"))
         stream.write(scale.astype("<f4").tobytes() + bias.astype("<f4").tobytes())
@@ -53,10 +54,10 @@ def write(path: str | Path, hsh: Hsh) -> None:
 
 
 def read(path: str | Path) -> Hsh:
-    """Read a file of three separate channels in bytes.
+    """Read an `.rti` file with separate coefficients of three channels, one byte each.
 
     Raises:
-        ImageError: not such a file, a bad header, or bytes missing.
+        ImageError: the file is of another type, its header is damaged, or it has too few or too many bytes.
         StorageError: the file cannot be read.
     """
     with storage("read", path):
@@ -83,4 +84,4 @@ def read(path: str | Path) -> Hsh:
     step = numbers[:terms] / TOP
     zero = np.rint(-numbers[terms:] / np.where(step > 0, step, 1)).astype(int)
     stored = np.frombuffer(data, dtype=np.uint8, offset=place + 8 * terms).reshape(rows, cols, channels, terms)
-    return Hsh(np.moveaxis(stored, 2, 0), Steps(step.astype(np.float32), zero))
+    return Hsh(np.moveaxis(stored, 2, 0), Quantization(step.astype(np.float32), zero))

@@ -1,15 +1,16 @@
-"""Polynomial texture maps: `.ptm` files of version 1.2, PTM_FORMAT_RGB and PTM_FORMAT_LRGB.
+"""Reading and writing of polynomial texture maps: `.ptm` files of version 1.2, PTM_FORMAT_RGB and PTM_FORMAT_LRGB.
 
 Six ASCII lines, each ended by a line feed (the specification lets width and height share a line; readers in use do not):
 
     PTM_1.2 / PTM_FORMAT_RGB or PTM_FORMAT_LRGB / width / height / six scales / six biases, whole numbers
 
-then bytes, rows from the bottom of the image to the top, nothing between them. RGB: for red, then green, then blue, six
+Bytes follow, rows from the bottom of the image to the top. RGB: for red, then green, then blue, six
 coefficients a pixel. LRGB: six coefficients of the luminance for all pixels, then red, green, blue for all pixels. A
 coefficient is scale · (byte − bias) and belongs to u², v², u·v, u, v, 1, the light at u to the right and v up; the sum is a
-display value with white at 255, in LRGB what the colour is multiplied by, over 255. There is no place for a comment.
+display value with white at 255; in LRGB, divided by 255, it multiplies the colour. The format has no comments.
 
-Source: Malzbender and Gelb, "Polynomial Texture Map (.ptm) File Format", version 1.2, Hewlett-Packard Laboratories 2001.
+Source: Malzbender, Gelb and Wolters, "Polynomial texture maps", SIGGRAPH 2001, section 3; Malzbender and Gelb, "Polynomial Texture Map
+    (.ptm) File Format", version 1.2, Hewlett-Packard Laboratories 2001.
     Checked against independent descriptions of readers: header, order of terms, blocks and rows, and 255 as white. Some viewers
     truncate coefficients to whole numbers, which changes what they show by up to 4 of 255.
 """
@@ -21,7 +22,7 @@ import numpy as np
 
 from stage.errors import ImageError, storage
 from stage.files import replacing
-from stage.rti.steps import Steps
+from stage.rti.quantization import Quantization
 
 TERMS = 6
 RGB, LRGB = "PTM_FORMAT_RGB", "PTM_FORMAT_LRGB"
@@ -29,23 +30,23 @@ HEADER_LINES = 6
 
 
 class Ptm(NamedTuple):
-    """A polynomial texture map. Row 0 is the top of the image."""
+    """A polynomial texture map with quantised coefficients. Row 0 is the top of the image."""
 
-    stored: np.ndarray  # [channels, rows, cols, 6] uint8; channels 3, or 1: the luminance
-    steps: Steps
-    colour: np.ndarray | None  # [rows, cols, 3] uint8 beside a luminance, else None
+    stored: np.ndarray  # [channels, rows, cols, 6] uint8; 3 channels, or 1 for the luminance
+    quantization: Quantization
+    colour: np.ndarray | None  # [rows, cols, 3] uint8, the colour beside a luminance, or None
 
 
 def write(path: str | Path, ptm: Ptm) -> None:
-    """Write a file, whole or not at all: RGB for three channels, LRGB for a luminance and colours.
+    """Write a `.ptm` file whole or not at all: RGB for three channels, LRGB for a luminance and colours.
 
     Raises:
         StorageError: the file cannot be written; nothing is left behind.
     """
     channels, rows, cols, _ = ptm.stored.shape
     name = RGB if channels == 3 else LRGB
-    scales = " ".join(np.format_float_positional(step, unique=True, trim="0") for step in ptm.steps.step)
-    biases = " ".join(str(int(zero)) for zero in ptm.steps.zero)
+    scales = " ".join(np.format_float_positional(step, unique=True, trim="0") for step in ptm.quantization.step)
+    biases = " ".join(str(int(zero)) for zero in ptm.quantization.zero)
     header = f"PTM_1.2\n{name}\n{cols}\n{rows}\n{scales}\n{biases}\n"
     with replacing(path) as temporary, open(temporary, "wb") as stream:
         stream.write(header.encode("ascii"))
@@ -58,10 +59,10 @@ def write(path: str | Path, ptm: Ptm) -> None:
 
 
 def read(path: str | Path) -> Ptm:
-    """Read an uncompressed RGB or LRGB file.
+    """Read an uncompressed `.ptm` file, RGB or LRGB.
 
     Raises:
-        ImageError: not such a file, a bad header (the line is named), or bytes missing.
+        ImageError: the file is of another type, its header is damaged, or it has too few or too many bytes.
         StorageError: the file cannot be read.
     """
     with storage("read", path):
@@ -86,4 +87,4 @@ def read(path: str | Path) -> Ptm:
     values = np.frombuffer(body, dtype=np.uint8)
     stored = values[: pixels * channels * TERMS].reshape(channels, rows, cols, TERMS)[:, ::-1]
     colour = values[pixels * TERMS :].reshape(rows, cols, 3)[::-1] if colours else None
-    return Ptm(stored, Steps(step, zero), colour)
+    return Ptm(stored, Quantization(step, zero), colour)

@@ -1,9 +1,9 @@
-"""Frames, transforms, pixel centres and the lat-long sphere, against their definitions in closed form."""
+"""Pixel centres, rigid transforms and rotations, against their definitions in closed form."""
 
 import numpy as np
 import pytest
 
-from stage.frames import latlong_directions, latlong_solid_angles, pixel_centres, rigid_fault, rotation_about, rotation_about_y
+from stage.frames import pixel_centres, rigid_fault, rotation_about, rotation_about_y
 
 
 def test_pixel_centre_of_row_r_column_c_is_half_past():
@@ -11,34 +11,6 @@ def test_pixel_centre_of_row_r_column_c_is_half_past():
     assert u.shape == v.shape == (2, 3)
     assert (u[1, 2], v[1, 2]) == (2.5, 1.5)
     assert (u[0, 0], v[0, 0]) == (0.5, 0.5)
-
-
-def test_latlong_axes():
-    # 4 columns: their centres lie 1/8, 3/8, 5/8, 7/8 of a turn from the left edge, which is -z; a quarter is +x, the middle +z
-    d = latlong_directions(4, 2)
-    up, half = np.cos(np.pi / 4), 0.5
-    assert np.allclose(d[0, 0], (half, up, -half))
-    assert np.allclose(d[0, 1], (half, up, half))
-    assert np.allclose(d[0, 2], (-half, up, half))
-    assert np.allclose(d[1, 3], (-half, -up, -half))
-
-
-def test_latlong_directions_are_unit_and_meet_the_contract_formula():
-    width, height = 12, 6
-    d = latlong_directions(width, height)
-    assert np.allclose(np.linalg.norm(d, axis=-1), 1)
-    for row, column in ((0, 0), (2, 7), (5, 11)):
-        u, v = (column + 0.5) / width, (row + 0.5) / height
-        expected = (np.sin(2 * np.pi * u) * np.sin(np.pi * v), np.cos(np.pi * v), -np.cos(2 * np.pi * u) * np.sin(np.pi * v))
-        assert np.allclose(d[row, column], expected)
-
-
-def test_latlong_solid_angles_sum_to_the_sphere():
-    height, width = 64, 128
-    total = latlong_solid_angles(width, height).sum() * width
-    # the midpoint rule on sin over [0, π] is π/(2H)/sin(π/(2H)) too large: 1e-4 at 64 rows
-    step = np.pi / (2 * height)
-    assert total == pytest.approx(4 * np.pi * step / np.sin(step), rel=1e-12)
 
 
 def test_rotation_about_y_is_positive_from_z_towards_x():

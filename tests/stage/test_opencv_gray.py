@@ -9,7 +9,6 @@ import pytest
 from stage.capture import Capture
 from stage.errors import ManifestError
 from stage.importers.opencv_gray import gray_order, import_folder
-from stage.rig_check import project
 from tests.captures import write_image
 
 K1, D1 = np.array([[800.0, 0, 319.5], [0, 810, 239.5], [0, 0, 1]]), np.array([-0.1, 0.02, 0.001, -0.002, 0.003])
@@ -58,7 +57,7 @@ def test_a_calibration_says_where_the_projector_is(scan, tmp_path, suffix, names
     assert manifest.camera.distortion.k == (-0.1, 0.02, 0.003) and manifest.camera.distortion.p == (0.001, -0.002)
     points = np.array([[0.1, 0.05, -1.2], [-0.2, 0.1, -0.9]])  # ours, metres
     truth = cv2.projectPoints(points * (1000, -1000, -1000), cv2.Rodrigues(R)[0], T, K2, D2)[0][:, 0] + 0.5
-    found, ahead = project(manifest.projector, points)
+    found, ahead = manifest.projector.project(points)
     assert ahead.all() and np.abs(found - truth).max() < 1e-6
 
 

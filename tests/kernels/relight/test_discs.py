@@ -6,7 +6,7 @@ import pytest
 from kernels.errors import ArrayError
 from kernels.relight.discs import disc_samples, integrate_discs
 from kernels.relight.environment import Weighting, integrate
-from stage.frames import latlong_directions, latlong_solid_angles
+from tests.reference.relight import texel_directions, texel_solid_angles
 
 AXES = np.concatenate([np.eye(3), -np.eye(3)])
 """Six lights whose cells are the faces of a cube."""
@@ -51,12 +51,12 @@ def test_a_disc_is_shared_out_as_a_map_of_it(weighting):
     lights = rng.normal(size=(20, 3))
     lights /= np.linalg.norm(lights, axis=1, keepdims=True)
     middle, angle = np.array([0.36, 0.48, 0.8]), 40.0
-    inside = latlong_directions(720, 360) @ middle > np.cos(np.radians(angle / 2))
+    inside = texel_directions(360, 720) @ middle > np.cos(np.radians(angle / 2))
     radiance = inside / (np.pi * np.sin(np.radians(angle / 2)) ** 2)
     sky = np.repeat(radiance[..., None], 3, axis=2)
     theirs = integrate(sky, lights, np.eye(3)[None], weighting=weighting, device="cpu").energy[0, :, 0]
     ours = integrate_discs(middle[None], np.array([angle]), lights, weighting=weighting)[0]
-    assert theirs.sum() == pytest.approx((radiance * latlong_solid_angles(720, 360)[:, None]).sum(), rel=1e-9)
+    assert theirs.sum() == pytest.approx((radiance * texel_solid_angles(360, 720)).sum(), rel=1e-9)
     assert np.allclose(ours, theirs, atol=0.005 * ours.sum())  # texels cut the rim in steps, samples of a degree the borders
 
 
@@ -87,3 +87,14 @@ def test_no_disc_is_no_energy():
 def test_bad_calls(middles, angles, directions, words):
     with pytest.raises(ArrayError, match=words):
         integrate_discs(middles, angles, directions, weighting=Weighting.CELLS)
+
+
+def test_the_lat_long_map_of_the_reference_has_the_axes_of_openexr():
+    # 4 columns: their centres lie 1/8, 3/8, 5/8, 7/8 of a turn from the left edge, which is -z; a quarter is +x, the middle +z
+    d = texel_directions(2, 4)
+    up, half = np.cos(np.pi / 4), 0.5
+    assert np.allclose(d[0], [(half, up, -half), (half, up, half), (-half, up, half), (-half, up, -half)])
+    assert np.allclose(d[1, 3], (-half, -up, -half))
+    # the midpoint rule on sin over [0, π] is π/(2H)/sin(π/(2H)) too large: 1e-4 at 64 rows
+    step = np.pi / (2 * 64)
+    assert texel_solid_angles(64, 128).sum() == pytest.approx(4 * np.pi * step / np.sin(step), rel=1e-12)

@@ -5,14 +5,14 @@ import pytest
 
 from stage.errors import ImageError, StorageError
 from stage.rti import hsh, ptm
-from stage.rti.steps import Steps, from_bytes, steps_over
+from stage.rti.quantization import Quantization, dequantize, quantization_of_range
 from tests.captures import files_in
 from tests.reference.light_basis import harmonics, polynomial, render_ptm, render_rti
 
 ROWS, COLS = 3, 4
 RNG = np.random.default_rng(5)
 LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [-0.48, 0.6, 0.64]])
-STEPS = steps_over(RNG.uniform(-300, 0, 6), RNG.uniform(0, 300, 6))
+QUANTIZATION = quantization_of_range(RNG.uniform(-300, 0, 6), RNG.uniform(0, 300, 6))
 
 
 def stored(channels, terms):
@@ -20,17 +20,17 @@ def stored(channels, terms):
 
 
 def make_ptm(channels):
-    return ptm.Ptm(stored(channels, 6), STEPS, RNG.integers(0, 256, (ROWS, COLS, 3), dtype=np.uint8) if channels == 1 else None)
+    return ptm.Ptm(stored(channels, 6), QUANTIZATION, RNG.integers(0, 256, (ROWS, COLS, 3), dtype=np.uint8) if channels == 1 else None)
 
 
 def make_hsh(terms):
-    return hsh.Hsh(stored(3, terms), steps_over(RNG.uniform(-1, 0, terms), RNG.uniform(0, 1, terms)))
+    return hsh.Hsh(stored(3, terms), quantization_of_range(RNG.uniform(-1, 0, terms), RNG.uniform(0, 1, terms)))
 
 
 def test_a_ptm_in_colour_byte_for_byte(tmp_path):
     bytes_of = np.arange(36, dtype=np.uint8).reshape(3, 2, 1, 6)  # two rows of one pixel
-    steps = Steps(np.array([16, 1, 0.015625, 0.5, 2, 1.25], dtype=np.float32), np.array([141, 0, 255, 3, 128, 7]))
-    ptm.write(tmp_path / "a.ptm", ptm.Ptm(bytes_of, steps, None))
+    quantization = Quantization(np.array([16, 1, 0.015625, 0.5, 2, 1.25], dtype=np.float32), np.array([141, 0, 255, 3, 128, 7]))
+    ptm.write(tmp_path / "a.ptm", ptm.Ptm(bytes_of, quantization, None))
     header = b"PTM_1.2\nPTM_FORMAT_RGB\n1\n2\n16.0 1.0 0.015625 0.5 2.0 1.25\n141 0 255 3 128 7\n"
     body = bytes([*range(6, 12), *range(6), *range(18, 24), *range(12, 18), *range(30, 36), *range(24, 30)])  # the lower row first
     assert (tmp_path / "a.ptm").read_bytes() == header + body
@@ -39,16 +39,16 @@ def test_a_ptm_in_colour_byte_for_byte(tmp_path):
 
 def test_a_ptm_of_the_luminance_byte_for_byte(tmp_path):
     bytes_of, colour = np.arange(12, dtype=np.uint8).reshape(1, 2, 1, 6), np.arange(90, 96, dtype=np.uint8).reshape(2, 1, 3)
-    steps = Steps(np.ones(6, dtype=np.float32), np.zeros(6, dtype=int))
-    ptm.write(tmp_path / "a.ptm", ptm.Ptm(bytes_of, steps, colour))
+    quantization = Quantization(np.ones(6, dtype=np.float32), np.zeros(6, dtype=int))
+    ptm.write(tmp_path / "a.ptm", ptm.Ptm(bytes_of, quantization, colour))
     header = b"PTM_1.2\nPTM_FORMAT_LRGB\n1\n2\n1.0 1.0 1.0 1.0 1.0 1.0\n0 0 0 0 0 0\n"
     assert (tmp_path / "a.ptm").read_bytes() == header + bytes([*range(6, 12), *range(6), 93, 94, 95, 90, 91, 92])
 
 
 def test_harmonics_byte_for_byte(tmp_path):
     bytes_of = np.arange(24, dtype=np.uint8).reshape(3, 2, 1, 4)
-    steps = Steps(np.array([1, 2, 4, 0.5], dtype=np.float32), np.array([0, 1, 2, 255]))
-    hsh.write(tmp_path / "a.rti", hsh.Hsh(bytes_of, steps))
+    quantization = Quantization(np.array([1, 2, 4, 0.5], dtype=np.float32), np.array([0, 1, 2, 255]))
+    hsh.write(tmp_path / "a.rti", hsh.Hsh(bytes_of, quantization))
     header = b"#HSH1.2\r\n3\r\n1 2 3\r\n4 2 1\r\n"
     numbers = np.array([255, 510, 1020, 127.5, 0, -2, -8, -127.5], dtype="<f4").tobytes()
     top, bottom = [*range(4), *range(8, 12), *range(16, 20)], [*range(4, 8), *range(12, 16), *range(20, 24)]
@@ -61,7 +61,7 @@ def test_a_ptm_comes_back(tmp_path, channels):
     ptm.write(tmp_path / "a.ptm", made)
     back = ptm.read(tmp_path / "a.ptm")
     assert np.array_equal(back.stored, made.stored)
-    assert np.array_equal(back.steps.step, made.steps.step) and np.array_equal(back.steps.zero, made.steps.zero)
+    assert np.array_equal(back.quantization.step, made.quantization.step) and np.array_equal(back.quantization.zero, made.quantization.zero)
     assert (back.colour is None) == (made.colour is None)
     assert back.colour is None or np.array_equal(back.colour, made.colour)
 
@@ -71,15 +71,15 @@ def test_harmonics_come_back(tmp_path, terms):
     made = make_hsh(terms)
     hsh.write(tmp_path / "a.rti", made)
     back = hsh.read(tmp_path / "a.rti")
-    assert np.array_equal(back.stored, made.stored) and np.array_equal(back.steps.zero, made.steps.zero)
-    assert np.allclose(back.steps.step, made.steps.step, rtol=1e-6)  # a float times 255 and back
+    assert np.array_equal(back.stored, made.stored) and np.array_equal(back.quantization.zero, made.quantization.zero)
+    assert np.allclose(back.quantization.step, made.quantization.step, rtol=1e-6)  # a float times 255 and back
 
 
 @pytest.mark.parametrize("channels", [3, 1])
 def test_a_viewer_shows_a_ptm_as_meant(tmp_path, channels):
     made = make_ptm(channels)
     ptm.write(tmp_path / "a.ptm", made)
-    coefficients = from_bytes(np.moveaxis(made.stored, -1, 0), made.steps)
+    coefficients = dequantize(np.moveaxis(made.stored, -1, 0), made.quantization)
     wanted = np.einsum("lt,tcrx->lrxc", polynomial(LIGHTS), coefficients)
     if made.colour is not None:
         wanted = wanted * made.colour / 255
@@ -90,7 +90,7 @@ def test_a_viewer_shows_a_ptm_as_meant(tmp_path, channels):
 def test_a_viewer_shows_harmonics_as_meant(tmp_path):
     made = make_hsh(9)
     hsh.write(tmp_path / "a.rti", made)
-    wanted = np.einsum("lt,tcrx->lrxc", harmonics(LIGHTS, 9), from_bytes(np.moveaxis(made.stored, -1, 0), made.steps))
+    wanted = np.einsum("lt,tcrx->lrxc", harmonics(LIGHTS, 9), dequantize(np.moveaxis(made.stored, -1, 0), made.quantization))
     assert np.allclose(render_rti((tmp_path / "a.rti").read_bytes(), LIGHTS), np.clip(wanted, 0, 1), atol=1e-5)
 
 
