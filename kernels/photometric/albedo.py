@@ -10,7 +10,7 @@ from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.packs import Band, as_packs, pack_type, scalars
 from kernels.photometric.lambert import NormalFit
-from kernels.photometric.near import Near, falloff_or_none, toward_or_none
+from kernels.photometric.near import Near, directions_in, falloff_or_none, toward_or_none
 from kernels.photometric.readings import Lights, Readings
 
 
@@ -45,13 +45,28 @@ def fit_albedo(band: Band, weights: Readings, fit: NormalFit, lights: Lights, ne
                    [band.values, weights.values, toward_or_none(near, device), falloff_or_none(near, device),
                     weights.pack_stride, weights.light_stride, as_packs(fit.normal, device),
                     wp.array(lights.direction, dtype=wp.vec3, device=device), wp.array(stored, dtype=wp.vec3, device=device)],
-                   [as_packs(albedo, device)], device=device)
+                   [albedo], device=device)
     return albedo
+
+
+@wp.func
+def add_channel(value: float, irradiance: float, weight: float, cosine: float, above: wp.ref[float], below: wp.ref[float]):
+    """Add one light's reading to one channel's weighted least squares, Σ w E cos · value and Σ w (E cos)²."""
+    w = irradiance * weight * cosine
+    above += wp.where(w > 0.0, w * value, 0.0)  # a value that is not finite has weight 0, and their product is not a number
+    below += w * irradiance * cosine
+
+
+@wp.func
+def albedo_of(above: float, below: float) -> float:
+    """Return ρ from the sums, 0 where no light counts."""
+    return wp.where(below > 0.0, wp.pi * wp.max(above, 0.0) / below, 0.0)
 
 
 @cache
 def _albedo_kernel(pack: int, near: bool = False) -> Any:
     half_pack, float_pack = pack_type(pack, wp.float16), pack_type(pack, wp.float32)
+    directions_of, step = directions_in(pack, near)
 
     @wp.kernel(enable_backward=False, module="unique")
     def albedo_kernel(first: int,
@@ -65,7 +80,7 @@ def _albedo_kernel(pack: int, near: bool = False) -> Any:
                       directions: wp.array(dtype=wp.vec3),  # [L]
                       irradiance: wp.array(dtype=wp.vec3),  # [L] in stored units
                       # outputs
-                      albedo: wp.array2d(dtype=float_pack)):  # [3, P]
+                      albedo: wp.array2d(dtype=float)):  # [3, N]
         p = first + wp.tid()
         nx, ny, nz = normal[0, p], normal[1, p], normal[2, p]
         above_r, above_g, above_b = float_pack(), float_pack(), float_pack()
@@ -75,35 +90,21 @@ def _albedo_kernel(pack: int, near: bool = False) -> Any:
             red, green, blue = values[light, p], values[lights + light, p], values[2 * lights + light, p]
             at = p * pack_stride + light * light_stride
             weight = weights[at]
+            lx, ly, lz = directions_of(directions, toward, light, at)
             if wp.static(near):
-                tx = toward[0, at]
-                ty = toward[1, at]
-                tz = toward[2, at]
                 part = falloff[at]
-            else:
-                lx, ly, lz = directions[light][0], directions[light][1], directions[light][2]
             er, eg, eb = irradiance[light][0], irradiance[light][1], irradiance[light][2]
             for k in range(pack):
+                cosine = wp.max(nx[k] * lx[step * k] + ny[k] * ly[step * k] + nz[k] * lz[step * k], 0.0)
                 if wp.static(near):
-                    lx, ly, lz = part[k] * tx[k], part[k] * ty[k], part[k] * tz[k]
-                cosine = wp.max(nx[k] * lx + ny[k] * ly + nz[k] * lz, 0.0)
-                r = er * weight[k] * cosine
-                g = eg * weight[k] * cosine
-                b = eb * weight[k] * cosine
-                # a value that is not finite has weight 0, and their product is not a number
-                above_r[k] += wp.where(r > 0.0, r * float(red[k]), 0.0)
-                above_g[k] += wp.where(g > 0.0, g * float(green[k]), 0.0)
-                above_b[k] += wp.where(b > 0.0, b * float(blue[k]), 0.0)
-                below_r[k] += r * er * cosine
-                below_g[k] += g * eg * cosine
-                below_b[k] += b * eb * cosine
-        rho_r, rho_g, rho_b = float_pack(), float_pack(), float_pack()
+                    cosine = cosine * part[k]
+                add_channel(float(red[k]), er, weight[k], cosine, above_r[k], below_r[k])
+                add_channel(float(green[k]), eg, weight[k], cosine, above_g[k], below_g[k])
+                add_channel(float(blue[k]), eb, weight[k], cosine, above_b[k], below_b[k])
         for k in range(pack):
-            rho_r[k] = wp.where(below_r[k] > 0.0, wp.pi * wp.max(above_r[k], 0.0) / below_r[k], 0.0)
-            rho_g[k] = wp.where(below_g[k] > 0.0, wp.pi * wp.max(above_g[k], 0.0) / below_g[k], 0.0)
-            rho_b[k] = wp.where(below_b[k] > 0.0, wp.pi * wp.max(above_b[k], 0.0) / below_b[k], 0.0)
-        albedo[0, p] = rho_r
-        albedo[1, p] = rho_g
-        albedo[2, p] = rho_b
+            pixel = p * pack + k
+            albedo[0, pixel] = albedo_of(above_r[k], below_r[k])
+            albedo[1, pixel] = albedo_of(above_g[k], below_g[k])
+            albedo[2, pixel] = albedo_of(above_b[k], below_b[k])
 
     return albedo_kernel

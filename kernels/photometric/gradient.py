@@ -7,13 +7,12 @@ Source: Ma et al., "Rapid Acquisition of Specular and Diffuse Normal Maps from P
 EGSR 2007, section 3.1.
 """
 
-from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import warp as wp
 
 from kernels import device as devices
-from kernels.packs import as_packs, pack_type, scalars
+from kernels.packs import scalars
 from kernels.photometric.moments import Moments
 from kernels.status import DARK, ILL_POSED, OK
 
@@ -62,71 +61,49 @@ def diffuse_normals(diffuse: Moments, grey_weights: tuple[float, float, float], 
     fit = GradientFit(scalars(pixel_count, 3, wp.float32, device), scalars(pixel_count, 3, wp.float32, device),
                       scalars(pixel_count, None, wp.float32, device), scalars(pixel_count, None, wp.float32, device),
                       scalars(pixel_count, None, wp.int32, device))
-    inputs = [as_packs(array, device) for array in diffuse]
-    devices.launch(_diffuse_kernel(devices.pack_width(device)), inputs[0].shape[1], [*inputs, wp.vec3(*grey_weights), gain],
-                   [as_packs(array, device) for array in fit], device=device)
+    devices.launch(_diffuse_kernel, pixel_count, [*diffuse, wp.vec3(*grey_weights), gain], fit, device=device)
     return fit
 
 
-@cache
-def _diffuse_kernel(pack: int) -> Any:
-    float_pack, int_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32)
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def diffuse_kernel(first: int,
-                       moments: wp.array2d(dtype=float_pack),  # [12, P]
-                       variance: wp.array(dtype=float_pack),  # [P]
-                       residual: wp.array(dtype=float_pack),  # [P]
-                       spare: wp.array(dtype=float_pack),  # [P]
-                       tilt: wp.array(dtype=float_pack),  # [P]
-                       solved: wp.array(dtype=int_pack),  # [P]
-                       grey: wp.vec3,
-                       gain: float,
-                       # outputs
-                       normal: wp.array2d(dtype=float_pack),  # [3, P]
-                       albedo: wp.array2d(dtype=float_pack),  # [3, P]
-                       confidence: wp.array(dtype=float_pack),  # [P]
-                       length: wp.array(dtype=float_pack),  # [P]
-                       status: wp.array(dtype=int_pack)):  # [P]
-        p = first + wp.tid()
-        r0, rx, ry, rz = moments[0, p], moments[1, p], moments[2, p], moments[3, p]
-        g0, gx, gy, gz = moments[4, p], moments[5, p], moments[6, p], moments[7, p]
-        b0, bx, by, bz = moments[8, p], moments[9, p], moments[10, p], moments[11, p]
-        spread, off, beyond, hidden, code = variance[p], residual[p], spare[p], tilt[p], solved[p]
-        nx, ny, nz, red, green, blue = float_pack(), float_pack(), float_pack(), float_pack(), float_pack(), float_pack()
-        sure, ratio = float_pack(), float_pack()
-        for k in range(pack):
-            m0 = grey[0] * r0[k] + grey[1] * g0[k] + grey[2] * b0[k]
-            m = (grey[0] * wp.vec3(rx[k], ry[k], rz[k]) + grey[1] * wp.vec3(gx[k], gy[k], gz[k])
-                 + grey[2] * wp.vec3(bx[k], by[k], bz[k]))
-            if code[k] == OK and m0 <= 0.0:
-                code[k] = DARK
-            if code[k] == OK:
-                size = wp.length(m) / m0
-                if 1.5 * size < MIN_LENGTH or 1.5 * size > MAX_LENGTH:
-                    code[k] = ILL_POSED
-                else:
-                    n = wp.normalize(m)
-                    nx[k] = n[0]
-                    ny[k] = n[1]
-                    nz[k] = n[2]
-                    red[k] = gain * wp.max(r0[k], 0.0)
-                    green[k] = gain * wp.max(g0[k], 0.0)
-                    blue[k] = gain * wp.max(b0[k], 0.0)
-                    ratio[k] = 1.5 * size
-                    squares = (beyond[k] + 4.0) * off[k] * off[k] + PRIOR_RESIDUAL * PRIOR_RESIDUAL
-                    noise = 2.0 * spread[k] * squares / ((beyond[k] + 1.0) * size * size)
-                    explained = wp.static(2.0 * 1.5) * wp.sqrt(spread[k]) * (ROUNDING + off[k])
-                    bent = 2.0 * wp.max(wp.abs(1.0 - 1.5 * size) - explained, 0.0)
-                    sure[k] = 1.0 / (1.0 + wp.sqrt(noise + bent + hidden[k] * hidden[k]) / CONFIDENCE_HALF)
-        normal[0, p] = nx
-        normal[1, p] = ny
-        normal[2, p] = nz
-        albedo[0, p] = red
-        albedo[1, p] = green
-        albedo[2, p] = blue
-        confidence[p] = sure
-        length[p] = ratio
-        status[p] = code
-
-    return diffuse_kernel
+@wp.kernel(enable_backward=False, module="unique")
+def _diffuse_kernel(first: int,
+                    moments: wp.array2d(dtype=float),  # [12, N]
+                    variance: wp.array(dtype=float),  # [N]
+                    residual: wp.array(dtype=float),  # [N]
+                    spare: wp.array(dtype=float),  # [N]
+                    tilt: wp.array(dtype=float),  # [N]
+                    solved: wp.array(dtype=int),  # [N]
+                    grey: wp.vec3,
+                    gain: float,
+                    # outputs
+                    normal: wp.array2d(dtype=float),  # [3, N]
+                    albedo: wp.array2d(dtype=float),  # [3, N]
+                    confidence: wp.array(dtype=float),  # [N]
+                    length: wp.array(dtype=float),  # [N]
+                    status: wp.array(dtype=int)):  # [N]
+    p = first + wp.tid()
+    status[p] = solved[p]
+    if solved[p] != OK:
+        return
+    m0 = float(0.0)
+    m = wp.vec3()
+    for c in range(3):
+        m0 += grey[c] * moments[4 * c, p]
+        m += grey[c] * wp.vec3(moments[4 * c + 1, p], moments[4 * c + 2, p], moments[4 * c + 3, p])
+    if m0 <= 0.0:
+        status[p] = DARK
+        return
+    size = wp.length(m) / m0
+    if 1.5 * size < MIN_LENGTH or 1.5 * size > MAX_LENGTH:
+        status[p] = ILL_POSED
+        return
+    n = wp.normalize(m)
+    for c in range(3):
+        normal[c, p] = n[c]
+        albedo[c, p] = gain * wp.max(moments[4 * c, p], 0.0)
+    length[p] = 1.5 * size
+    squares = (spare[p] + 4.0) * residual[p] * residual[p] + PRIOR_RESIDUAL * PRIOR_RESIDUAL
+    noise = 2.0 * variance[p] * squares / ((spare[p] + 1.0) * size * size)
+    explained = wp.static(2.0 * 1.5) * wp.sqrt(variance[p]) * (ROUNDING + residual[p])
+    bent = 2.0 * wp.max(wp.abs(1.0 - 1.5 * size) - explained, 0.0)
+    confidence[p] = 1.0 / (1.0 + wp.sqrt(noise + bent + tilt[p] * tilt[p]) / CONFIDENCE_HALF)

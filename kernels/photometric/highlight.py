@@ -11,14 +11,13 @@ al., "Estimating Specular Roughness and Anisotropy from Second Order Spherical G
 first order and for the contract's lobe.
 """
 
-from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
-from kernels.packs import as_packs, pack_type, scalars
+from kernels.packs import scalars
 from kernels.photometric.lobe_table import ANGLE_STEPS, MAX_ANGLE, MAX_ROUGHNESS, MIN_ROUGHNESS, ROUGHNESS_STEPS, lobe_table
 from kernels.photometric.separation import Separation, upload_view
 
@@ -64,9 +63,8 @@ def fit_highlights(parts: Separation, grey_weights: tuple[float, float, float], 
     found = Highlights(scalars(pixel_count, 3, wp.float32, device), scalars(pixel_count, 3, wp.float32, device),
                        scalars(pixel_count, None, wp.float32, device))
     table = wp.array(lobe_table().reshape(-1, 6), dtype=_Row, device=device)
-    inputs = [as_packs(array, device) for array in (parts.specular, parts.diffuse.values, toward)]
-    devices.launch(_highlight_kernel(devices.pack_width(device)), inputs[0].shape[1],
-                   [*inputs, table, wp.vec3(*grey_weights), gain], [as_packs(array, device) for array in found], device=device)
+    devices.launch(_highlight_kernel, pixel_count,
+                   [parts.specular, parts.diffuse.values, toward, table, wp.vec3(*grey_weights), gain], found, device=device)
     return found
 
 
@@ -90,13 +88,18 @@ def specular_normals(parts: Separation, grey_weights: tuple[float, float, float]
     """
     toward = upload_view(view, pixel_count, device)
     normal = scalars(pixel_count, 3, wp.float32, device)
-    inputs = [as_packs(array, device) for array in (parts.specular, parts.diffuse.values, toward)]
-    devices.launch(_specular_kernel(devices.pack_width(device)), inputs[0].shape[1], [*inputs, wp.vec3(*grey_weights), gain],
-                   [as_packs(normal, device)], device=device)
+    devices.launch(_specular_kernel, pixel_count, [parts.specular, parts.diffuse.values, toward, wp.vec3(*grey_weights), gain],
+                   [normal], device=device)
     return normal
 
 
 _Row = wp.types.vector(length=6, dtype=wp.float32)
+
+
+@wp.func
+def grey_level(values: wp.array2d(dtype=float), step: int, grey: wp.vec3, p: int) -> float:
+    """Return the weighted sum of three rows, those of M₀ in red, green and blue."""
+    return grey[0] * values[0, p] + grey[1] * values[step, p] + grey[2] * values[2 * step, p]
 
 
 @wp.func
@@ -153,86 +156,47 @@ def _fit_lobe(table: wp.array(dtype=_Row), s0: float, lobe: float, spread: float
     return wp.vec2(angle, roughness)
 
 
-@cache
-def _highlight_kernel(pack: int) -> Any:
-    float_pack = pack_type(pack, wp.float32)
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def highlight_kernel(first: int,
-                         specular: wp.array2d(dtype=float_pack),  # [6, P]
-                         diffuse: wp.array2d(dtype=float_pack),  # [12, P]
-                         view: wp.array2d(dtype=float_pack),  # [3, P]
-                         table: wp.array(dtype=_Row),
-                         grey: wp.vec3,
-                         gain: float,
-                         # outputs
-                         normal: wp.array2d(dtype=float_pack),  # [3, P]
-                         f0: wp.array2d(dtype=float_pack),  # [3, P]
-                         roughness: wp.array(dtype=float_pack)):  # [P]
-        p = first + wp.tid()
-        sr, sg, sb, sx, sy, sz = specular[0, p], specular[1, p], specular[2, p], specular[3, p], specular[4, p], specular[5, p]
-        dr, dg, db = diffuse[0, p], diffuse[4, p], diffuse[8, p]
-        vx, vy, vz = view[0, p], view[1, p], view[2, p]
-        nx, ny, nz, fr, fg, fb, rough = (float_pack(), float_pack(), float_pack(), float_pack(), float_pack(), float_pack(),
-                                         float_pack())
-        for k in range(pack):
-            s0 = grey[0] * sr[k] + grey[1] * sg[k] + grey[2] * sb[k]
-            s = wp.vec3(sx[k], sy[k], sz[k])
-            v = wp.vec3(vx[k], vy[k], vz[k])
-            rough[k] = 1.0
-            if is_highlight(s0, s, gain * (grey[0] * dr[k] + grey[1] * dg[k] + grey[2] * db[k])):
-                n = halfway(s, v)
-                if wp.length(n) > 0.0:
-                    side = s - wp.dot(s, v) * v
-                    fit = _fit_lobe(table, s0, wp.length(s) / s0, wp.atan2(wp.length(side), wp.dot(s, v)))
-                    n = wp.cos(fit[0]) * v + wp.sin(fit[0]) * wp.normalize(side)
-                    row = _look_up(table, fit[1], fit[0])
-                    nx[k] = n[0]
-                    ny[k] = n[1]
-                    nz[k] = n[2]
-                    fr[k] = wp.clamp((sr[k] - row[3]) / wp.max(row[0], 1.0e-6), 0.0, 1.0)  # a reflectance
-                    fg[k] = wp.clamp((sg[k] - row[3]) / wp.max(row[0], 1.0e-6), 0.0, 1.0)
-                    fb[k] = wp.clamp((sb[k] - row[3]) / wp.max(row[0], 1.0e-6), 0.0, 1.0)
-                    rough[k] = fit[1]
-        normal[0, p] = nx
-        normal[1, p] = ny
-        normal[2, p] = nz
-        f0[0, p] = fr
-        f0[1, p] = fg
-        f0[2, p] = fb
-        roughness[p] = rough
-
-    return highlight_kernel
+@wp.kernel(enable_backward=False, module="unique")
+def _highlight_kernel(first: int,
+                      specular: wp.array2d(dtype=float),  # [6, N]
+                      diffuse: wp.array2d(dtype=float),  # [12, N]
+                      view: wp.array2d(dtype=float),  # [3, N]
+                      table: wp.array(dtype=_Row),
+                      grey: wp.vec3,
+                      gain: float,
+                      # outputs
+                      normal: wp.array2d(dtype=float),  # [3, N]
+                      f0: wp.array2d(dtype=float),  # [3, N]
+                      roughness: wp.array(dtype=float)):  # [N]
+    p = first + wp.tid()
+    s0 = grey_level(specular, 1, grey, p)
+    s = wp.vec3(specular[3, p], specular[4, p], specular[5, p])
+    v = wp.vec3(view[0, p], view[1, p], view[2, p])
+    roughness[p] = 1.0
+    if not is_highlight(s0, s, gain * grey_level(diffuse, 4, grey, p)) or wp.length(halfway(s, v)) == 0.0:
+        return
+    side = s - wp.dot(s, v) * v
+    fit = _fit_lobe(table, s0, wp.length(s) / s0, wp.atan2(wp.length(side), wp.dot(s, v)))
+    n = wp.cos(fit[0]) * v + wp.sin(fit[0]) * wp.normalize(side)
+    row = _look_up(table, fit[1], fit[0])
+    for c in range(3):
+        normal[c, p] = n[c]
+        f0[c, p] = wp.clamp((specular[c, p] - row[3]) / wp.max(row[0], 1.0e-6), 0.0, 1.0)  # a reflectance
+    roughness[p] = fit[1]
 
 
-@cache
-def _specular_kernel(pack: int) -> Any:
-    float_pack = pack_type(pack, wp.float32)
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def specular_kernel(first: int,
-                        specular: wp.array2d(dtype=float_pack),  # [6, P]
-                        diffuse: wp.array2d(dtype=float_pack),  # [12, P]
-                        view: wp.array2d(dtype=float_pack),  # [3, P]
-                        grey: wp.vec3,
-                        gain: float,
-                        # outputs
-                        normal: wp.array2d(dtype=float_pack)):  # [3, P]
-        p = first + wp.tid()
-        sr, sg, sb, sx, sy, sz = specular[0, p], specular[1, p], specular[2, p], specular[3, p], specular[4, p], specular[5, p]
-        dr, dg, db = diffuse[0, p], diffuse[4, p], diffuse[8, p]
-        vx, vy, vz = view[0, p], view[1, p], view[2, p]
-        nx, ny, nz = float_pack(), float_pack(), float_pack()
-        for k in range(pack):
-            s0 = grey[0] * sr[k] + grey[1] * sg[k] + grey[2] * sb[k]
-            s = wp.vec3(sx[k], sy[k], sz[k])
-            if is_highlight(s0, s, gain * (grey[0] * dr[k] + grey[1] * dg[k] + grey[2] * db[k])):
-                n = halfway(s, wp.vec3(vx[k], vy[k], vz[k]))
-                nx[k] = n[0]
-                ny[k] = n[1]
-                nz[k] = n[2]
-        normal[0, p] = nx
-        normal[1, p] = ny
-        normal[2, p] = nz
-
-    return specular_kernel
+@wp.kernel(enable_backward=False, module="unique")
+def _specular_kernel(first: int,
+                     specular: wp.array2d(dtype=float),  # [6, N]
+                     diffuse: wp.array2d(dtype=float),  # [12, N]
+                     view: wp.array2d(dtype=float),  # [3, N]
+                     grey: wp.vec3,
+                     gain: float,
+                     # outputs
+                     normal: wp.array2d(dtype=float)):  # [3, N]
+    p = first + wp.tid()
+    s = wp.vec3(specular[3, p], specular[4, p], specular[5, p])
+    if is_highlight(grey_level(specular, 1, grey, p), s, gain * grey_level(diffuse, 4, grey, p)):
+        n = halfway(s, wp.vec3(view[0, p], view[1, p], view[2, p]))
+        for c in range(3):
+            normal[c, p] = n[c]

@@ -8,9 +8,9 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
-from kernels.packs import Band, as_packs, pack_type, scalars
-from kernels.photometric.least_squares import confidence_of, fit_pixel, symmetric
-from kernels.photometric.near import Near, toward_or_none
+from kernels.packs import Band, pack_type, scalars
+from kernels.photometric.least_squares import add_reading, confidence_of, fit_pixel, symmetric
+from kernels.photometric.near import Near, directions_in, toward_or_none
 from kernels.photometric.readings import Readings
 from kernels.status import OK
 
@@ -56,13 +56,29 @@ def run_normal_kernel(make: Any, band: Band, readings: Readings, directions: np.
     lights = wp.array(np.ascontiguousarray(directions, dtype=np.float32), dtype=wp.vec3, device=band.device)
     devices.launch(make(devices.pack_width(band.device), near is not None), band.packs,
                    [lights, toward_or_none(near, band.device), readings.pack_stride, readings.light_stride],
-                   [readings.values, *(as_packs(array, band.device) for array in fit)], device=band.device)
+                   [readings.values, *fit], device=band.device)
     return fit
+
+
+@wp.func
+def write_normal(b: wp.vec3, across: float, residual: float, count: float, code: int, pixel: int,
+                 normal: wp.array2d(dtype=float), confidence: wp.array(dtype=float), off: wp.array(dtype=float),
+                 status: wp.array(dtype=int)):
+    """Write one pixel of a NormalFit: b and `across` of its LambertFit, `residual` the sum Σ (y - b·l)² / |b|² over `count` readings."""
+    status[pixel] = code
+    if code == OK:
+        n = wp.normalize(b)
+        normal[0, pixel] = n[0]
+        normal[1, pixel] = n[1]
+        normal[2, pixel] = n[2]
+        confidence[pixel] = confidence_of(across, residual, count)
+        off[pixel] = wp.sqrt(residual / count)
 
 
 @cache
 def _lambert_kernel(pack: int, near: bool = False) -> Any:
-    float_pack, int_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32)
+    float_pack = pack_type(pack, wp.float32)
+    directions_of, step = directions_in(pack, near)
 
     @wp.kernel(enable_backward=False, module="unique")
     def lambert_kernel(first: int,
@@ -72,58 +88,27 @@ def _lambert_kernel(pack: int, near: bool = False) -> Any:
                        light_stride: int,
                        # outputs
                        readings: wp.array(dtype=float_pack),  # in: readings, out: weights
-                       normal: wp.array2d(dtype=float_pack),  # [3, P]
-                       confidence: wp.array(dtype=float_pack),  # [P]
-                       residual: wp.array(dtype=float_pack),  # [P]
-                       status: wp.array(dtype=int_pack)):  # [P]
+                       normal: wp.array2d(dtype=float),  # [3, N]
+                       confidence: wp.array(dtype=float),  # [N]
+                       residual: wp.array(dtype=float),  # [N]
+                       status: wp.array(dtype=int)):  # [N]
         p = first + wp.tid()
         xx, xy, xz, yy, yz, zz = float_pack(), float_pack(), float_pack(), float_pack(), float_pack(), float_pack()
         rx, ry, rz, squares, count = float_pack(), float_pack(), float_pack(), float_pack(), float_pack()
         for light in range(lights.shape[0]):
             at = p * pack_stride + light * light_stride
             y = readings[at]
+            lx, ly, lz = directions_of(lights, toward, light, at)
             weight = float_pack()
-            if wp.static(near):
-                tx = toward[0, at]
-                ty = toward[1, at]
-                tz = toward[2, at]
-            else:
-                lx, ly, lz = lights[light][0], lights[light][1], lights[light][2]
             for k in range(pack):
-                if wp.static(near):
-                    lx, ly, lz = tx[k], ty[k], tz[k]
-                w = wp.where(y[k] > 0.0, 1.0, 0.0)
-                weight[k] = w
-                count[k] += w
-                squares[k] += y[k] * y[k]
-                rx[k] += y[k] * lx
-                ry[k] += y[k] * ly
-                rz[k] += y[k] * lz
-                xx[k] += w * lx * lx
-                xy[k] += w * lx * ly
-                xz[k] += w * lx * lz
-                yy[k] += w * ly * ly
-                yz[k] += w * ly * lz
-                zz[k] += w * lz * lz
+                weight[k] = wp.where(y[k] > 0.0, 1.0, 0.0)
+                count[k] += weight[k]
+                add_reading(y[k], weight[k], lx[step * k], ly[step * k], lz[step * k], xx[k], xy[k], xz[k], yy[k], yz[k], zz[k],
+                            rx[k], ry[k], rz[k], squares[k])
             readings[at] = weight
-        nx, ny, nz, code = float_pack(), float_pack(), float_pack(), int_pack()
-        sure, off = float_pack(), float_pack()
         for k in range(pack):
             fit = fit_pixel(symmetric(xx[k], xy[k], xz[k], yy[k], yz[k], zz[k]), wp.vec3(rx[k], ry[k], rz[k]),
                             squares[k], int(count[k]))
-            if fit.status == OK:
-                n = wp.normalize(fit.b)
-                nx[k] = n[0]
-                ny[k] = n[1]
-                nz[k] = n[2]
-                sure[k] = confidence_of(fit.across, fit.residual, count[k])
-                off[k] = wp.sqrt(fit.residual / count[k])
-            code[k] = fit.status
-        normal[0, p] = nx
-        normal[1, p] = ny
-        normal[2, p] = nz
-        confidence[p] = sure
-        residual[p] = off
-        status[p] = code
+            write_normal(fit.b, fit.across, fit.residual, count[k], fit.status, p * pack + k, normal, confidence, residual, status)
 
     return lambert_kernel

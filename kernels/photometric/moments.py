@@ -17,7 +17,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
-from kernels.packs import Band, as_packs, pack_type, scalars
+from kernels.packs import Band, pack_type, scalars
 from kernels.status import DARK, OK, TOO_FEW_LIGHTS
 
 LARGEST_HALF = 65504.0
@@ -70,27 +70,43 @@ def fit_moments(band: Band, rows: np.ndarray, scale: np.ndarray, grey_weights: t
                    [band.values, band.saturated, wp.array(frames.astype(np.int32), dtype=wp.int32, device=device),
                     wp.array(rows[frames].astype(np.float32), dtype=wp.vec4, device=device),
                     wp.array(scale[frames].astype(np.float32), dtype=wp.float32, device=device), wp.vec3(*grey_weights)],
-                   [as_packs(array, device) for array in (fit.values, fit.variance, fit.residual, fit.spare, fit.status)],
-                   device=device)
+                   [fit.values, fit.variance, fit.residual, fit.spare, fit.status], device=device)
     return fit
 
 
-@wp.struct
-class _Solved:
-    """One channel's M₀ and M."""
-
-    m0: float
-    m: wp.vec3
+@wp.func
+def add_response(value: float, mean: float, x: float, y: float, z: float,
+                 r0: wp.ref[float], rx: wp.ref[float], ry: wp.ref[float], rz: wp.ref[float]):
+    """Add a frame's reading to the right-hand side of one channel."""
+    r0 += mean * value
+    rx += x * value
+    ry += y * value
+    rz += z * value
 
 
 @wp.func
-def _solve(pivot: float, g0: wp.vec3, gg: wp.vec3, r0: float, r: wp.vec3) -> _Solved:
-    # the axes do not share a frame: each is eliminated by itself
-    found = _Solved()
-    u = wp.cw_div(g0, gg)
-    found.m0 = (r0 - wp.dot(u, r)) / pivot
-    found.m = wp.cw_div(r - found.m0 * g0, gg)
-    return found
+def solve_channel(known: float, pivot: float, g0: wp.vec3, gg: wp.vec3,
+                  r0: wp.ref[float], rx: wp.ref[float], ry: wp.ref[float], rz: wp.ref[float]):
+    """Replace the right-hand side of one channel by its M₀ and M, or by 0 where `known` is 0.
+
+    No frame has a gradient along two axes, so that each axis is eliminated on its own.
+    """
+    r = wp.vec3(rx, ry, rz)
+    m0 = (r0 - wp.dot(wp.cw_div(g0, gg), r)) / pivot
+    m = wp.cw_div(r - m0 * g0, gg)
+    r0 = known * m0
+    rx = known * m[0]
+    ry = known * m[1]
+    rz = known * m[2]
+
+
+@wp.func
+def write_channel(moments: wp.array2d(dtype=float), channel: int, pixel: int, m0: float, x: float, y: float, z: float):
+    """Write the four responses of one channel."""
+    moments[4 * channel, pixel] = m0
+    moments[4 * channel + 1, pixel] = x
+    moments[4 * channel + 2, pixel] = y
+    moments[4 * channel + 3, pixel] = z
 
 
 @cache
@@ -107,11 +123,11 @@ def _moments_kernel(pack: int) -> Any:
                        scale: wp.array(dtype=float),  # [F]
                        grey: wp.vec3,
                        # outputs
-                       moments: wp.array2d(dtype=float_pack),  # [12, P]
-                       variance: wp.array(dtype=float_pack),  # [P]
-                       residual: wp.array(dtype=float_pack),  # [P]
-                       spare: wp.array(dtype=float_pack),  # [P]
-                       status: wp.array(dtype=int_pack)):  # [P]
+                       moments: wp.array2d(dtype=float),  # [12, N]
+                       variance: wp.array(dtype=float),  # [N]
+                       residual: wp.array(dtype=float),  # [N]
+                       spare: wp.array(dtype=float),  # [N]
+                       status: wp.array(dtype=int)):  # [N]
         p = first + wp.tid()
         lights = values.shape[0] / 3
 
@@ -134,9 +150,6 @@ def _moments_kernel(pack: int) -> Any:
                 clear = ((int(bits[k]) >> shift) & 1) == 0
                 used = clear and top <= LARGEST_HALF and total == total  # a maximum may pass over a NaN, a sum does not
                 w = wp.where(used, 1.0, 0.0)
-                vr = wp.where(used, unit * float(red[k]), 0.0)
-                vg = wp.where(used, unit * float(green[k]), 0.0)
-                vb = wp.where(used, unit * float(blue[k]), 0.0)
                 count[k] += w
                 g00[k] += w * mean * mean
                 g0x[k] += w * mean * x
@@ -145,21 +158,12 @@ def _moments_kernel(pack: int) -> Any:
                 gxx[k] += w * x * x
                 gyy[k] += w * y * y
                 gzz[k] += w * z * z
-                r0[k] += mean * vr
-                rx[k] += x * vr
-                ry[k] += y * vr
-                rz[k] += z * vr
-                s0[k] += mean * vg
-                sx[k] += x * vg
-                sy[k] += y * vg
-                sz[k] += z * vg
-                b0[k] += mean * vb
-                bx[k] += x * vb
-                by[k] += y * vb
-                bz[k] += z * vb
+                add_response(wp.where(used, unit * float(red[k]), 0.0), mean, x, y, z, r0[k], rx[k], ry[k], rz[k])
+                add_response(wp.where(used, unit * float(green[k]), 0.0), mean, x, y, z, s0[k], sx[k], sy[k], sz[k])
+                add_response(wp.where(used, unit * float(blue[k]), 0.0), mean, x, y, z, b0[k], bx[k], by[k], bz[k])
 
-        # solve; what was accumulated gives way to the solution
-        code, spread, beyond = int_pack(), float_pack(), float_pack()
+        # the solution takes the place of the right-hand sides
+        code = int_pack()
         for k in range(pack):
             g0 = wp.vec3(g0x[k], g0y[k], g0z[k])
             gg = wp.vec3(gxx[k], gyy[k], gzz[k])
@@ -169,26 +173,15 @@ def _moments_kernel(pack: int) -> Any:
             pivot = g00[k] - wp.dot(u, g0)
             known = known and pivot > MIN_PIVOT
             pivot = wp.where(known, pivot, 1.0)
-            fit_r = _solve(pivot, g0, gg, r0[k], wp.vec3(rx[k], ry[k], rz[k]))
-            fit_g = _solve(pivot, g0, gg, s0[k], wp.vec3(sx[k], sy[k], sz[k]))
-            fit_b = _solve(pivot, g0, gg, b0[k], wp.vec3(bx[k], by[k], bz[k]))
-            lit = grey[0] * fit_r.m0 + grey[1] * fit_g.m0 + grey[2] * fit_b.m0 > 0.0
+            on = wp.where(known, 1.0, 0.0)
+            solve_channel(on, pivot, g0, gg, r0[k], rx[k], ry[k], rz[k])
+            solve_channel(on, pivot, g0, gg, s0[k], sx[k], sy[k], sz[k])
+            solve_channel(on, pivot, g0, gg, b0[k], bx[k], by[k], bz[k])
+            lit = grey[0] * r0[k] + grey[1] * s0[k] + grey[2] * b0[k] > 0.0
             code[k] = wp.where(known, wp.where(lit, OK, DARK), TOO_FEW_LIGHTS)
-            on = wp.where(code[k] == OK, 1.0, 0.0)
-            spread[k] = on * (1.0 / gg[0] + 1.0 / gg[1] + 1.0 / gg[2] + wp.dot(u, u) / pivot) / 3.0
-            beyond[k] = on * (count[k] - 4.0)
-            r0[k] = on * fit_r.m0
-            rx[k] = on * fit_r.m[0]
-            ry[k] = on * fit_r.m[1]
-            rz[k] = on * fit_r.m[2]
-            s0[k] = on * fit_g.m0
-            sx[k] = on * fit_g.m[0]
-            sy[k] = on * fit_g.m[1]
-            sz[k] = on * fit_g.m[2]
-            b0[k] = on * fit_b.m0
-            bx[k] = on * fit_b.m[0]
-            by[k] = on * fit_b.m[1]
-            bz[k] = on * fit_b.m[2]
+            if code[k] == OK:
+                variance[p * pack + k] = (1.0 / gg[0] + 1.0 / gg[1] + 1.0 / gg[2] + wp.dot(u, u) / pivot) / 3.0
+                spare[p * pack + k] = count[k] - 4.0
 
         # how well the fit says what was read
         squares = float_pack()
@@ -206,26 +199,14 @@ def _moments_kernel(pack: int) -> Any:
                         + grey[2] * (mean * b0[k] + x * bx[k] + y * by[k] + z * bz[k]))
                 off = wp.where(((int(cut[k]) >> shift) & 1) == 0, read - said, 0.0)
                 squares[k] += wp.where(wp.abs(off) < wp.inf, off * off, 0.0)
-        error = float_pack()
         for k in range(pack):
+            pixel = p * pack + k
+            status[pixel] = code[k]
             if code[k] == OK:
                 level = grey[0] * r0[k] + grey[1] * s0[k] + grey[2] * b0[k]
-                error[k] = wp.min(wp.sqrt(squares[k] / count[k]) / level, LARGEST_HALF)  # of noise about black: kept as half
-        moments[0, p] = r0
-        moments[1, p] = rx
-        moments[2, p] = ry
-        moments[3, p] = rz
-        moments[4, p] = s0
-        moments[5, p] = sx
-        moments[6, p] = sy
-        moments[7, p] = sz
-        moments[8, p] = b0
-        moments[9, p] = bx
-        moments[10, p] = by
-        moments[11, p] = bz
-        variance[p] = spread
-        residual[p] = error
-        spare[p] = beyond
-        status[p] = code
+                residual[pixel] = wp.min(wp.sqrt(squares[k] / count[k]) / level, LARGEST_HALF)  # of noise about black: kept as half
+                write_channel(moments, 0, pixel, r0[k], rx[k], ry[k], rz[k])
+                write_channel(moments, 1, pixel, s0[k], sx[k], sy[k], sz[k])
+                write_channel(moments, 2, pixel, b0[k], bx[k], by[k], bz[k])
 
     return moments_kernel

@@ -111,6 +111,28 @@ def _float_pack(device: str) -> Any:
     return pack_type(devices.pack_width(device), wp.float32)
 
 
+@cache
+def directions_in(pack: int, near: bool) -> tuple[Any, int]:
+    """Return the Warp function that gives the directions to a light from the pixels of a pack, as three vectors, and the step from one
+    pixel to the next in them: 0 for distant lights, whose direction all pixels share.
+
+    Args:
+        pack: pixels of a pack.
+        near: whether the directions differ from pixel to pixel, and are read from `toward`.
+    """
+    float_pack, shared = pack_type(pack, wp.float32), pack_type(1, wp.float32)
+
+    @wp.func
+    def distant(lights: wp.array(dtype=wp.vec3), toward: wp.array2d(dtype=float_pack), light: int, at: int):
+        return shared(lights[light][0]), shared(lights[light][1]), shared(lights[light][2])
+
+    @wp.func
+    def finite(lights: wp.array(dtype=wp.vec3), toward: wp.array2d(dtype=float_pack), light: int, at: int):
+        return toward[0, at], toward[1, at], toward[2, at]
+
+    return (finite, 1) if near else (distant, 0)
+
+
 @wp.func
 def near_direction(place: wp.vec4, x: float, y: float, z: float) -> wp.vec3:
     """Unit direction from the point to a light of either kind; 0 for padding."""

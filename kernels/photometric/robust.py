@@ -16,11 +16,10 @@ import numpy as np
 import warp as wp
 
 from kernels.packs import Band, pack_type
-from kernels.photometric.lambert import NormalFit, run_normal_kernel
-from kernels.photometric.least_squares import confidence_of, fit_pixel, symmetric
-from kernels.photometric.near import Near
+from kernels.photometric.lambert import NormalFit, run_normal_kernel, write_normal
+from kernels.photometric.least_squares import add_reading, fit_pixel, symmetric
+from kernels.photometric.near import Near, directions_in
 from kernels.photometric.readings import Readings
-from kernels.status import OK
 
 BRIGHT_FRACTION = 0.1
 """The bright end of a pixel is the reading that this fraction of the lights exceed: above single highlights."""
@@ -63,14 +62,28 @@ def solve_robust(band: Band, readings: Readings, directions: np.ndarray, near: N
 
 
 @wp.func
-def _between(low: float, high: float, step: int) -> float:
-    # the geometric mean first: a highlight far above all else must not take the steps
+def middle_of(low: float, high: float, step: int) -> float:
+    """Return where step number `step` of a bisection divides the range: the geometric mean first, lest a highlight take all steps."""
     return wp.where(step < HALVINGS_OF_RATIO, wp.sqrt(low) * wp.sqrt(high), 0.5 * (low + high))
+
+
+@wp.func
+def halve(middle: float, above: bool, low: wp.ref[float], high: wp.ref[float]):
+    """Keep the part of the range above its middle, or the part below."""
+    low = wp.where(above, middle, low)
+    high = wp.where(above, high, middle)
+
+
+@wp.func
+def kept_weight(y: float, off: float, darkest: float, brightest: float) -> float:
+    """Return the Cauchy weight of a reading whose residual is `off` scales, 0 for a reading outside the kept ranks."""
+    return wp.where(y > darkest, 1.0, 0.0) * wp.where(y <= brightest, 1.0, 0.0) / (1.0 + off * off)
 
 
 @cache
 def _robust_kernel(pack: int, near: bool = False) -> Any:
     float_pack, int_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32)
+    directions_of, apart = directions_in(pack, near)
 
     @wp.kernel(enable_backward=False, module="unique")
     def robust_kernel(first: int,
@@ -80,17 +93,16 @@ def _robust_kernel(pack: int, near: bool = False) -> Any:
                       light_stride: int,
                       # outputs
                       readings: wp.array(dtype=float_pack),  # in: readings, out: weights
-                      normal: wp.array2d(dtype=float_pack),  # [3, P]
-                      confidence: wp.array(dtype=float_pack),  # [P]
-                      residual: wp.array(dtype=float_pack),  # [P]
-                      status: wp.array(dtype=int_pack)):  # [P]
+                      normal: wp.array2d(dtype=float),  # [3, N]
+                      confidence: wp.array(dtype=float),  # [N]
+                      residual: wp.array(dtype=float),  # [N]
+                      status: wp.array(dtype=int)):  # [N]
         p = first + wp.tid()
         light_count = lights.shape[0]
         start = p * pack_stride
 
         # the bright end: the value that a tenth of the readings exceed, by bisection
-        top = float_pack()
-        given = float_pack()
+        top, given = float_pack(), float_pack()
         for light in range(light_count):
             y = readings[start + light * light_stride]
             for k in range(pack):
@@ -103,27 +115,23 @@ def _robust_kernel(pack: int, near: bool = False) -> Any:
         for step in range(BISECTIONS):
             above = float_pack()
             for k in range(pack):
-                middle[k] = _between(low[k], high[k], step)
+                middle[k] = middle_of(low[k], high[k], step)
             for light in range(light_count):
                 y = readings[start + light * light_stride]
                 for k in range(pack):
                     above[k] += wp.where(y[k] > middle[k], 1.0, 0.0)
             for k in range(pack):
-                many = above[k] > wp.max(BRIGHT_FRACTION * given[k] - 0.5, 0.0)
-                low[k] = wp.where(many, middle[k], low[k])
-                high[k] = wp.where(many, high[k], middle[k])
+                halve(middle[k], above[k] > wp.max(BRIGHT_FRACTION * given[k] - 0.5, 0.0), low[k], high[k])
 
-        # of the lit lights, the values between which the kept ranks lie
-        shadow = float_pack()
-        lit = float_pack()
+        # among the lit lights, the values between which the kept ranks lie
+        shadow, lit = float_pack(), float_pack()
         for k in range(pack):
             shadow[k] = SHADOW_FRACTION * high[k]
         for light in range(light_count):
             y = readings[start + light * light_stride]
             for k in range(pack):
                 lit[k] += wp.where(y[k] > shadow[k], 1.0, 0.0)
-        keep_dark = float_pack()
-        keep_bright = float_pack()
+        keep_dark, keep_bright = float_pack(), float_pack()
         dark_low, dark_high, bright_low, bright_high = float_pack(), float_pack(), float_pack(), float_pack()
         for k in range(pack):
             spare = wp.max(lit[k] - float(KEPT_AT_LEAST), 0.0)
@@ -136,56 +144,34 @@ def _robust_kernel(pack: int, near: bool = False) -> Any:
             bright_high[k] = top[k]
         dark_middle, bright_middle = float_pack(), float_pack()
         for step in range(BISECTIONS):
-            above_dark = float_pack()
-            above_bright = float_pack()
+            above_dark, above_bright = float_pack(), float_pack()
             for k in range(pack):
-                dark_middle[k] = _between(dark_low[k], dark_high[k], step)
-                bright_middle[k] = _between(bright_low[k], bright_high[k], step)
+                dark_middle[k] = middle_of(dark_low[k], dark_high[k], step)
+                bright_middle[k] = middle_of(bright_low[k], bright_high[k], step)
             for light in range(light_count):
                 y = readings[start + light * light_stride]
                 for k in range(pack):
                     above_dark[k] += wp.where(y[k] > dark_middle[k], 1.0, 0.0)
                     above_bright[k] += wp.where(y[k] > bright_middle[k], 1.0, 0.0)
             for k in range(pack):
-                dark_low[k] = wp.where(above_dark[k] >= keep_dark[k], dark_middle[k], dark_low[k])
-                dark_high[k] = wp.where(above_dark[k] >= keep_dark[k], dark_high[k], dark_middle[k])
-                bright_low[k] = wp.where(above_bright[k] > keep_bright[k], bright_middle[k], bright_low[k])
-                bright_high[k] = wp.where(above_bright[k] > keep_bright[k], bright_high[k], bright_middle[k])
+                halve(dark_middle[k], above_dark[k] >= keep_dark[k], dark_low[k], dark_high[k])
+                halve(bright_middle[k], above_bright[k] > keep_bright[k], bright_low[k], bright_high[k])
 
         # least squares on the kept ranks, re-weighted
         bx, by, bz, across, code = float_pack(), float_pack(), float_pack(), float_pack(), int_pack()
-        reach = float_pack()  # residual at which a weight is halved; infinite in the first round
-        for k in range(pack):
-            reach[k] = 1.0e30
+        reach = float_pack(1.0e30)  # residual at which a weight is halved; infinite in the first round
         for _ in range(REWEIGHTINGS + 1):
             xx, xy, xz, yy, yz, zz = float_pack(), float_pack(), float_pack(), float_pack(), float_pack(), float_pack()
             rx, ry, rz, squares, count = float_pack(), float_pack(), float_pack(), float_pack(), float_pack()
             for light in range(light_count):
                 at = start + light * light_stride
                 y = readings[at]
-                if wp.static(near):
-                    tx = toward[0, at]
-                    ty = toward[1, at]
-                    tz = toward[2, at]
-                else:
-                    lx, ly, lz = lights[light][0], lights[light][1], lights[light][2]
+                lx, ly, lz = directions_of(lights, toward, light, at)
                 for k in range(pack):
-                    if wp.static(near):
-                        lx, ly, lz = tx[k], ty[k], tz[k]
-                    off = (y[k] - (bx[k] * lx + by[k] * ly + bz[k] * lz)) / reach[k]
-                    kept = wp.where(y[k] > dark_low[k], 1.0, 0.0) * wp.where(y[k] <= bright_high[k], 1.0, 0.0)
-                    w = kept / (1.0 + off * off)
-                    count[k] += kept
-                    squares[k] += w * y[k] * y[k]
-                    rx[k] += w * y[k] * lx
-                    ry[k] += w * y[k] * ly
-                    rz[k] += w * y[k] * lz
-                    xx[k] += w * lx * lx
-                    xy[k] += w * lx * ly
-                    xz[k] += w * lx * lz
-                    yy[k] += w * ly * ly
-                    yz[k] += w * ly * lz
-                    zz[k] += w * lz * lz
+                    off = (y[k] - (bx[k] * lx[apart * k] + by[k] * ly[apart * k] + bz[k] * lz[apart * k])) / reach[k]
+                    count[k] += kept_weight(y[k], 0.0, dark_low[k], bright_high[k])
+                    add_reading(y[k], kept_weight(y[k], off, dark_low[k], bright_high[k]), lx[apart * k], ly[apart * k], lz[apart * k],
+                                xx[k], xy[k], xz[k], yy[k], yz[k], zz[k], rx[k], ry[k], rz[k], squares[k])
             for k in range(pack):
                 fit = fit_pixel(symmetric(xx[k], xy[k], xz[k], yy[k], yz[k], zz[k]), wp.vec3(rx[k], ry[k], rz[k]),
                                 squares[k], int(count[k]))
@@ -202,36 +188,14 @@ def _robust_kernel(pack: int, near: bool = False) -> Any:
             at = start + light * light_stride
             y = readings[at]
             weight = float_pack()
-            if wp.static(near):
-                tx = toward[0, at]
-                ty = toward[1, at]
-                tz = toward[2, at]
-            else:
-                lx, ly, lz = lights[light][0], lights[light][1], lights[light][2]
+            lx, ly, lz = directions_of(lights, toward, light, at)
             for k in range(pack):
-                if wp.static(near):
-                    lx, ly, lz = tx[k], ty[k], tz[k]
-                off = (y[k] - (bx[k] * lx + by[k] * ly + bz[k] * lz)) / reach[k]
-                kept = wp.where(y[k] > dark_low[k], 1.0, 0.0) * wp.where(y[k] <= bright_high[k], 1.0, 0.0)
-                weight[k] = kept / (1.0 + off * off)
+                off = (y[k] - (bx[k] * lx[apart * k] + by[k] * ly[apart * k] + bz[k] * lz[apart * k])) / reach[k]
+                weight[k] = kept_weight(y[k], off, dark_low[k], bright_high[k])
                 misfit[k] += wp.where(y[k] > shadow[k], wp.min(off * off, wp.static(1.0 / CAUCHY_SCALE**2)), 0.0)
             readings[at] = weight
-        nx, ny, nz = float_pack(), float_pack(), float_pack()
-        sure, error = float_pack(), float_pack()
         for k in range(pack):
-            if code[k] == OK:
-                n = wp.normalize(wp.vec3(bx[k], by[k], bz[k]))
-                nx[k] = n[0]
-                ny[k] = n[1]
-                nz[k] = n[2]
-                squared = misfit[k] * wp.static(CAUCHY_SCALE**2)
-                sure[k] = confidence_of(across[k], squared, lit[k])
-                error[k] = wp.sqrt(squared / lit[k])
-        normal[0, p] = nx
-        normal[1, p] = ny
-        normal[2, p] = nz
-        confidence[p] = sure
-        residual[p] = error
-        status[p] = code
+            write_normal(wp.vec3(bx[k], by[k], bz[k]), across[k], misfit[k] * wp.static(CAUCHY_SCALE**2), lit[k], code[k],
+                         p * pack + k, normal, confidence, residual, status)
 
     return robust_kernel
