@@ -8,8 +8,9 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
+from kernels.normal_equations import add_reading, symmetric
 from kernels.packs import Band, pack_type, scalars
-from kernels.photometric.least_squares import add_reading, confidence_of, fit_pixel, symmetric
+from kernels.photometric.least_squares import confidence_of, fit_pixel
 from kernels.photometric.near import Near, directions_in, toward_or_none
 from kernels.photometric.readings import Readings
 from kernels.status import OK

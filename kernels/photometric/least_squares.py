@@ -32,33 +32,6 @@ class LambertFit:
 
 
 @wp.func
-def symmetric(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float) -> wp.mat33:
-    """The symmetric matrix with these entries."""
-    return wp.mat33(xx, xy, xz, xy, yy, yz, xz, yz, zz)
-
-
-@wp.func
-def add_reading(y: float, w: float, lx: float, ly: float, lz: float,
-                xx: wp.ref[float], xy: wp.ref[float], xz: wp.ref[float], yy: wp.ref[float], yz: wp.ref[float], zz: wp.ref[float],
-                rx: wp.ref[float], ry: wp.ref[float], rz: wp.ref[float], squares: wp.ref[float]):
-    """Add a reading y of weight w under a light l to one pixel's normal equations: G += w l lᵀ, r += w y l, Σ w y².
-
-    The sums are lanes of packs that the kernel holds, passed one by one: Warp copies a pack whenever a struct or a matrix of packs is
-    indexed, which is twenty times slower on the CPU.
-    """
-    squares += w * y * y
-    rx += w * y * lx
-    ry += w * y * ly
-    rz += w * y * lz
-    xx += w * lx * lx
-    xy += w * lx * ly
-    xz += w * lx * lz
-    yy += w * ly * ly
-    yz += w * ly * lz
-    zz += w * lz * lz
-
-
-@wp.func
 def fit_pixel(g: wp.mat33, r: wp.vec3, squares: float, count: int) -> LambertFit:
     """Solve one pixel: g, r are its normal equations, squares Σ w y², count the readings that were used."""
     fit = LambertFit()

@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from kernels.normal_equations import add_reading, symmetric
 from kernels.packs import Band, pack_type
 from kernels.photometric.lambert import NormalFit, run_normal_kernel, write_normal
-from kernels.photometric.least_squares import add_reading, fit_pixel, symmetric
+from kernels.photometric.least_squares import fit_pixel
 from kernels.photometric.near import Near, directions_in
 from kernels.photometric.readings import Readings
 

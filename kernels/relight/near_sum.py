@@ -63,7 +63,7 @@ def sum_near(band: Band, surface: Surface, visible: wp.array, sources: Sources, 
         return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
 
     position = wp.array(np.ascontiguousarray(surface.values.numpy()[12:15].reshape(3, -1)), dtype=wp.float32, device=device)
-    devices.launch(_weights_kernel(), surface.packs * pack,
+    devices.launch(_weights_kernel, surface.packs * pack,
                    [position, upload(sources.place, wp.vec4), upload(sources.energy, wp.vec3), upload(sources.axis, wp.vec4),
                     upload(inward.reshape(-1, 3).astype(np.float32), wp.vec3),
                     upload(length.reshape(-1).astype(np.float32), wp.float32),
@@ -77,52 +77,48 @@ def sum_near(band: Band, surface: Surface, visible: wp.array, sources: Sources, 
     return out
 
 
-@cache
-def _weights_kernel() -> Any:
-    @wp.kernel(enable_backward=False, module="unique")
-    def weights_kernel(first: int,
-                       position: wp.array2d(dtype=float),  # [3, pixels padded]
-                       place: wp.array(dtype=wp.vec4),  # [N]
-                       energy: wp.array(dtype=wp.vec3),  # [N]
-                       axis: wp.array(dtype=wp.vec4),  # [N]
-                       inward: wp.array(dtype=wp.vec3),  # [3 · faces] unit normals of the planes of the edges opposite to the corners
-                       length: wp.array(dtype=float),  # [3 · faces] what a corner's coordinate is weighted by
-                       neighbour: wp.array(dtype=int),  # [3 · faces] face beyond that edge
-                       corner: wp.array(dtype=int),  # [3 · faces] vertex at the corner
-                       start: wp.array(dtype=int),  # [vertices + 1] where the lights of a vertex begin; a light's own is the only one
-                       owner: wp.array(dtype=int),  # lights of the vertices
-                       part: wp.array(dtype=float),  # of a vertex's energy, that they get
-                       count: int,  # lights
-                       # outputs
-                       weights: wp.array2d(dtype=float)):  # [3 · lights, pixels padded], 0
-        pixel = first + wp.tid()
-        point = wp.vec3(position[0, pixel], position[1, pixel], position[2, pixel])
-        here = wp.int32(0)
-        for n in range(place.shape[0]):
-            source, lobe = place[n], axis[n]
-            toward = wp.vec3(source[0], source[1], source[2]) - source[3] * point
-            away2 = wp.max(wp.dot(toward, toward), 1.0e-20)
-            toward = toward / wp.sqrt(away2)
-            arriving = wp.where(source[3] > 0.0, 1.0 / away2, 1.0)
-            if lobe[3] > 0.0:
-                ahead = wp.max(-(toward[0] * lobe[0] + toward[1] * lobe[1] + toward[2] * lobe[2]), 0.0)
-                arriving = arriving * wp.pow(ahead, lobe[3])
-            here, angles = walk(toward, here, inward, neighbour)
-            a = wp.max(angles[0], 0.0) * length[3 * here]
-            b = wp.max(angles[1], 0.0) * length[3 * here + 1]
-            c = wp.max(angles[2], 0.0) * length[3 * here + 2]
-            given = energy[n] * (arriving / wp.max(a + b + c, 1.0e-20))
-            for side in range(3):
-                share = wp.where(side == 0, a, wp.where(side == 1, b, c))
-                vertex = corner[3 * here + side]
-                for i in range(start[vertex], start[vertex + 1]):
-                    light = owner[i]
-                    amount = given * (share * part[i])
-                    weights[light, pixel] = weights[light, pixel] + amount[0]
-                    weights[count + light, pixel] = weights[count + light, pixel] + amount[1]
-                    weights[2 * count + light, pixel] = weights[2 * count + light, pixel] + amount[2]
-
-    return weights_kernel
+@wp.kernel(enable_backward=False, module="unique")
+def _weights_kernel(first: int,
+                    position: wp.array2d(dtype=float),  # [3, pixels padded]
+                    place: wp.array(dtype=wp.vec4),  # [N]
+                    energy: wp.array(dtype=wp.vec3),  # [N]
+                    axis: wp.array(dtype=wp.vec4),  # [N]
+                    inward: wp.array(dtype=wp.vec3),  # [3 · faces] unit normals of the planes of the edges opposite to the corners
+                    length: wp.array(dtype=float),  # [3 · faces] what a corner's coordinate is weighted by
+                    neighbour: wp.array(dtype=int),  # [3 · faces] face beyond that edge
+                    corner: wp.array(dtype=int),  # [3 · faces] vertex at the corner
+                    start: wp.array(dtype=int),  # [vertices + 1] where the lights of a vertex begin; a light's own is the only one
+                    owner: wp.array(dtype=int),  # lights of the vertices
+                    part: wp.array(dtype=float),  # of a vertex's energy, that they get
+                    count: int,  # lights
+                    # outputs
+                    weights: wp.array2d(dtype=float)):  # [3 · lights, pixels padded], 0
+    pixel = first + wp.tid()
+    point = wp.vec3(position[0, pixel], position[1, pixel], position[2, pixel])
+    here = wp.int32(0)
+    for n in range(place.shape[0]):
+        source, lobe = place[n], axis[n]
+        toward = wp.vec3(source[0], source[1], source[2]) - source[3] * point
+        away2 = wp.max(wp.dot(toward, toward), 1.0e-20)
+        toward = toward / wp.sqrt(away2)
+        arriving = wp.where(source[3] > 0.0, 1.0 / away2, 1.0)
+        if lobe[3] > 0.0:
+            ahead = wp.max(-(toward[0] * lobe[0] + toward[1] * lobe[1] + toward[2] * lobe[2]), 0.0)
+            arriving = arriving * wp.pow(ahead, lobe[3])
+        here, angles = walk(toward, here, inward, neighbour)
+        a = wp.max(angles[0], 0.0) * length[3 * here]
+        b = wp.max(angles[1], 0.0) * length[3 * here + 1]
+        c = wp.max(angles[2], 0.0) * length[3 * here + 2]
+        given = energy[n] * (arriving / wp.max(a + b + c, 1.0e-20))
+        for side in range(3):
+            share = wp.where(side == 0, a, wp.where(side == 1, b, c))
+            vertex = corner[3 * here + side]
+            for i in range(start[vertex], start[vertex + 1]):
+                light = owner[i]
+                amount = given * (share * part[i])
+                weights[light, pixel] = weights[light, pixel] + amount[0]
+                weights[count + light, pixel] = weights[count + light, pixel] + amount[1]
+                weights[2 * count + light, pixel] = weights[2 * count + light, pixel] + amount[2]
 
 
 @cache

@@ -8,8 +8,7 @@ Source: barycentric weights of a direction as in vector base amplitude panning, 
 """
 
 from collections.abc import Iterator
-from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -85,7 +84,7 @@ def locate(grid: SampleGrid, triangles: Triangulation, rotation: np.ndarray, *, 
     inputs = [wp.array(on_rows, dtype=wp.vec2, device=device), wp.array(on_columns, dtype=wp.vec2, device=device),
               wp.array(inward, dtype=wp.vec3, device=device),
               wp.array(triangles.neighbour.reshape(-1).astype(np.int32), dtype=wp.int32, device=device), runs]
-    devices.launch(_walk_kernel(), rows * runs, inputs, [face, depth], device=device)
+    devices.launch(_walk_kernel, rows * runs, inputs, [face, depth], device=device)
     found = face.numpy().reshape(-1)
     share = np.maximum(depth.numpy().reshape(-1, 3), 0) * length[found]
     return Located(found, share / share.sum(axis=1, keepdims=True))
@@ -114,26 +113,22 @@ def walk(direction: wp.vec3, start: int, inward: wp.array(dtype=wp.vec3), neighb
     return here, wp.vec3(a, b, c)
 
 
-@cache
-def _walk_kernel() -> Any:
-    @wp.kernel(enable_backward=False, module="unique")
-    def walk_kernel(first: int,
-                    polar: wp.array(dtype=wp.vec2),  # [rows] sine and cosine of the angle from +y
-                    equator: wp.array(dtype=wp.vec2),  # [cols] x and z of a direction on the equator
-                    inward: wp.array(dtype=wp.vec3),  # [3 · faces] unit normals of the planes of the edges opposite to the corners
-                    neighbour: wp.array(dtype=int),  # [3 · faces] face beyond that edge
-                    runs: int,  # of one row
-                    # outputs
-                    face: wp.array2d(dtype=int),  # [rows, cols]
-                    depth: wp.array2d(dtype=wp.vec3)):  # [rows, cols] sine of the angle from each edge
-        thread = first + wp.tid()
-        row = thread / runs
-        begin = (thread % runs) * RUN
-        here = wp.int32(0)
-        for col in range(begin, wp.min(begin + RUN, equator.shape[0])):
-            direction = wp.vec3(polar[row][0] * equator[col][0], polar[row][1], polar[row][0] * equator[col][1])
-            here, angles = walk(direction, here, inward, neighbour)
-            face[row, col] = here
-            depth[row, col] = angles
-
-    return walk_kernel
+@wp.kernel(enable_backward=False, module="unique")
+def _walk_kernel(first: int,
+                 polar: wp.array(dtype=wp.vec2),  # [rows] sine and cosine of the angle from +y
+                 equator: wp.array(dtype=wp.vec2),  # [cols] x and z of a direction on the equator
+                 inward: wp.array(dtype=wp.vec3),  # [3 · faces] unit normals of the planes of the edges opposite to the corners
+                 neighbour: wp.array(dtype=int),  # [3 · faces] face beyond that edge
+                 runs: int,  # of one row
+                 # outputs
+                 face: wp.array2d(dtype=int),  # [rows, cols]
+                 depth: wp.array2d(dtype=wp.vec3)):  # [rows, cols] sine of the angle from each edge
+    thread = first + wp.tid()
+    row = thread / runs
+    begin = (thread % runs) * RUN
+    here = wp.int32(0)
+    for col in range(begin, wp.min(begin + RUN, equator.shape[0])):
+        direction = wp.vec3(polar[row][0] * equator[col][0], polar[row][1], polar[row][0] * equator[col][1])
+        here, angles = walk(direction, here, inward, neighbour)
+        face[row, col] = here
+        depth[row, col] = angles

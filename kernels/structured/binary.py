@@ -11,7 +11,7 @@ Veeraraghavan and Narasimhan, CVPR 2011, section 4 (XOR).
 
 from collections.abc import Sequence
 from functools import cache
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import warp as wp
@@ -20,7 +20,7 @@ from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.packs import as_packs, pack_type
 from kernels.status import OK, Status
-from kernels.structured.decoded import Decoded
+from kernels.structured.decoded import Decoded, stripe_place
 from kernels.structured.frames import Frames, NoiseModel, check_noise, check_stripes, cut_in
 
 SHADOW_SIGMAS = 5.0
@@ -35,8 +35,6 @@ MAX_SPREAD = 1
 """Stripes that the readings of a pixel with doubtful bits may lie apart."""
 MAX_BITS = 24
 """Stripes are counted in float32 at the end, exact up to here."""
-STRIPE_DEVIATION = float(1.0 / np.sqrt(12.0))
-"""Standard deviation of a place evenly distributed over a stripe of width one."""
 
 _SATURATED, _SHADOWED, _UNDECIDED, _OUT_OF_RANGE = (int(s) for s in (Status.SATURATED, Status.SHADOWED, Status.UNDECIDED,
                                                                     Status.OUT_OF_RANGE))
@@ -143,7 +141,7 @@ _NUMBERS = {"binary": number_binary, "gray": number_gray, "xor": number_xor}
 
 
 @cache
-def _stripe_kernel(pack: int, code: str = "gray", inverses: bool = True, references: bool = True) -> Any:
+def _stripe_kernel(pack: int, code: Literal["binary", "gray", "xor"] = "gray", inverses: bool = True, references: bool = True) -> Any:
     float_pack, int_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32), pack_type(pack, wp.uint8)
     number_of = _NUMBERS[code]
     cut_of = cut_in(pack)
@@ -232,10 +230,9 @@ def _stripe_kernel(pack: int, code: str = "gray", inverses: bool = True, referen
                 result[k] = wp.uint8(_OUT_OF_RANGE)
             else:
                 result[k] = wp.uint8(OK)
-                start = float(least) * stripe
-                end = wp.min((float(most) + 1.0) * stripe, extent)
-                u[k] = 0.5 * (start + end)
-                error[k] = wp.static(STRIPE_DEVIATION) * (end - start)
+                place = stripe_place(least, most, stripe, extent)
+                u[k] = place[0]
+                error[k] = place[1]
                 signal[k] = 0.5 * contrast[k]
         coordinate[p] = u
         sigma[p] = error

@@ -1,8 +1,12 @@
 """What every decoder of projected codes returns."""
 
+from math import sqrt
 from typing import NamedTuple
 
 import warp as wp
+
+STRIPE_DEVIATION = 1.0 / sqrt(12.0)
+"""Standard deviation of a place evenly distributed over a stripe of width one."""
 
 
 class Decoded(NamedTuple):
@@ -12,3 +16,11 @@ class Decoded(NamedTuple):
     sigma: wp.array  # [pixels] float32: standard deviation of the coordinate, projector pixels; 0 where not decoded
     amplitude: wp.array  # [pixels] float32: half of what the pattern changes, in the unit of the images
     status: wp.array  # [pixels] uint8, codes of kernels.status
+
+
+@wp.func
+def stripe_place(least: int, most: int, stripe: float, extent: float) -> wp.vec2:
+    """Return the middle of the stripes from `least` to `most`, each `stripe` pixels wide, and its standard deviation."""
+    start = float(least) * stripe
+    end = wp.min((float(most) + 1.0) * stripe, extent)
+    return wp.vec2(0.5 * (start + end), STRIPE_DEVIATION * (end - start))

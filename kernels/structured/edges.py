@@ -68,7 +68,7 @@ def refine_edges(decoded: Decoded, frames: Frames, bits: Sequence[int], inverses
     coordinate, sigma = (wp.clone(array) for array in decoded[:2])
     readings = wp.array(ptr=frames.values.ptr, shape=(frames.values.shape[0], number.shape[0]), dtype=wp.float32, device=device,
                         strides=(frames.values.strides[0], 4), copy=False)
-    devices.launch(_edge_kernel(), frames.pixel_count,
+    devices.launch(_edge_kernel, frames.pixel_count,
                    [readings, rows, number, decoded.status, columns, frames.pixel_count // columns, 1 if down else 0, float(stripe_px),
                     float(extent), noise.read**2, noise.gain], [coordinate, sigma], device=device, uneven=True)
     return Decoded(coordinate, sigma, decoded.amplitude, decoded.status)
@@ -141,44 +141,40 @@ def _number_kernel(pack: int) -> Any:
     return number_kernel
 
 
-@cache
-def _edge_kernel() -> Any:
-    @wp.kernel(enable_backward=False, module="unique")
-    def edge_kernel(first: int,
-                    readings: wp.array2d(dtype=float),  # [F, pixels]
-                    rows: wp.array2d(dtype=int),  # [bits, 2] frame, inverse
-                    number: wp.array(dtype=int),  # [pixels] stripe by the signs of all bits
-                    status: wp.array(dtype=wp.uint8),  # [pixels]
-                    columns: int,
-                    lines: int,
-                    down: int,
-                    stripe: float,
-                    extent: float,
-                    read_variance: float,
-                    gain: float,
-                    # outputs
-                    coordinate: wp.array(dtype=float),  # in: stripe centres
-                    sigma: wp.array(dtype=float)):
-        p = first + wp.tid()
-        if int(status[p]) != OK:
-            return
-        column = p % columns
-        line = p / columns
-        step = wp.where(down == 1, columns, 1)
-        before = wp.min(wp.where(down == 1, line, column), REACH)
-        after = wp.min(wp.where(down == 1, lines - 1 - line, columns - 1 - column), REACH)
-        low = find_edge(readings, rows, number, status, p, -step, before, stripe, read_variance, gain)
-        high = find_edge(readings, rows, number, status, p, step, after, stripe, read_variance, gain)
-        if low.found == 0 or high.found == 0 or low.place == high.place:
-            return
-        length = low.at + high.at
-        slope = (high.place - low.place) / length
-        share = low.at / length
-        u = low.place + slope * low.at
-        noise_variance = (1.0 - share) * (1.0 - share) * low.variance + share * share * high.variance
-        deviation = wp.abs(slope) * wp.sqrt(noise_variance + wp.static(EDGE_ERROR**2))
-        if u > 0.0 and u < extent and deviation < sigma[p]:  # not NaN, and better than the stripe alone
-            coordinate[p] = u
-            sigma[p] = deviation
-
-    return edge_kernel
+@wp.kernel(enable_backward=False, module="unique")
+def _edge_kernel(first: int,
+                 readings: wp.array2d(dtype=float),  # [F, pixels]
+                 rows: wp.array2d(dtype=int),  # [bits, 2] frame, inverse
+                 number: wp.array(dtype=int),  # [pixels] stripe by the signs of all bits
+                 status: wp.array(dtype=wp.uint8),  # [pixels]
+                 columns: int,
+                 lines: int,
+                 down: int,
+                 stripe: float,
+                 extent: float,
+                 read_variance: float,
+                 gain: float,
+                 # outputs
+                 coordinate: wp.array(dtype=float),  # in: stripe centres
+                 sigma: wp.array(dtype=float)):
+    p = first + wp.tid()
+    if int(status[p]) != OK:
+        return
+    column = p % columns
+    line = p / columns
+    step = wp.where(down == 1, columns, 1)
+    before = wp.min(wp.where(down == 1, line, column), REACH)
+    after = wp.min(wp.where(down == 1, lines - 1 - line, columns - 1 - column), REACH)
+    low = find_edge(readings, rows, number, status, p, -step, before, stripe, read_variance, gain)
+    high = find_edge(readings, rows, number, status, p, step, after, stripe, read_variance, gain)
+    if low.found == 0 or high.found == 0 or low.place == high.place:
+        return
+    length = low.at + high.at
+    slope = (high.place - low.place) / length
+    share = low.at / length
+    u = low.place + slope * low.at
+    noise_variance = (1.0 - share) * (1.0 - share) * low.variance + share * share * high.variance
+    deviation = wp.abs(slope) * wp.sqrt(noise_variance + wp.static(EDGE_ERROR**2))
+    if u > 0.0 and u < extent and deviation < sigma[p]:  # not NaN, and better than the stripe alone
+        coordinate[p] = u
+        sigma[p] = deviation

@@ -12,7 +12,7 @@ Vision Computing 1999 (grey levels); Caspi, Kiryati and Shamir, "Range imaging w
 
 from collections.abc import Sequence
 from functools import cache
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import warp as wp
@@ -21,7 +21,7 @@ from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.packs import as_packs, pack_type
 from kernels.status import OK, Status
-from kernels.structured.decoded import Decoded
+from kernels.structured.decoded import Decoded, stripe_place
 from kernels.structured.frames import Frames, NoiseModel, check_noise, check_stripes, cut_in
 
 SHADOW_SIGMAS = 5.0
@@ -38,8 +38,6 @@ MAX_STRIPES = 1 << 24
 """Stripes are counted in float32 at the end, exact up to here."""
 MIN_LEVEL_STEP = 1.0e-3
 """Between two levels, of white minus black: with less they are the same."""
-STRIPE_DEVIATION = float(1.0 / np.sqrt(12.0))
-"""Standard deviation of a place evenly distributed over a stripe of width one."""
 LARGEST = 1.0e15
 """A signal above this counts as infinite: it is squared in float32."""
 FAR = 1.0e30
@@ -119,8 +117,15 @@ def expected_levels(levels: np.ndarray, crosstalk: np.ndarray | None) -> np.ndar
     return given
 
 
+@wp.func
+def append_digit(digit: int, base: int, reflected: int, number: wp.ref[int], digits: wp.ref[int]):
+    """Append the next lower digit to a number; in a reflected code it runs backwards where the sum of the digits before it is odd."""
+    number = number * base + digit + reflected * (digits & 1) * (base - 1 - 2 * digit)
+    digits += digit
+
+
 @cache
-def _kary_kernel(pack: int, channels: int = 1) -> Any:
+def _kary_kernel(pack: int, channels: Literal[1, 3] = 1) -> Any:
     float_pack, int_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32), pack_type(pack, wp.uint8)
     cut_of = cut_in(pack)
 
@@ -195,18 +200,10 @@ def _kary_kernel(pack: int, channels: int = 1) -> Any:
                 d1 = nearest[k] + one * other
                 d2 = nearest[k] + two * other
                 d3 = nearest[k] + (one + two) * other
-                number0 = d0 + reflected * (sum0[k] & 1) * (base - 1 - 2 * d0)  # as it is in the plain number
-                sum0[k] = sum0[k] + d0
-                number1 = d1 + reflected * (sum1[k] & 1) * (base - 1 - 2 * d1)
-                sum1[k] = sum1[k] + d1
-                number2 = d2 + reflected * (sum2[k] & 1) * (base - 1 - 2 * d2)
-                sum2[k] = sum2[k] + d2
-                number3 = d3 + reflected * (sum3[k] & 1) * (base - 1 - 2 * d3)
-                sum3[k] = sum3[k] + d3
-                code0[k] = code0[k] * base + number0
-                code1[k] = code1[k] * base + number1
-                code2[k] = code2[k] * base + number2
-                code3[k] = code3[k] * base + number3
+                append_digit(d0, base, reflected, code0[k], sum0[k])
+                append_digit(d1, base, reflected, code1[k], sum1[k])
+                append_digit(d2, base, reflected, code2[k], sum2[k])
+                append_digit(d3, base, reflected, code3[k], sum3[k])
         u, error, result = float_pack(), float_pack(), byte_pack()
         for k in range(pack):
             least = wp.min(wp.min(code0[k], code1[k]), wp.min(code2[k], code3[k]))
@@ -221,10 +218,9 @@ def _kary_kernel(pack: int, channels: int = 1) -> Any:
                 result[k] = wp.uint8(_OUT_OF_RANGE)
             else:
                 result[k] = wp.uint8(OK)
-                start = float(least) * stripe
-                end = wp.min((float(most) + 1.0) * stripe, extent)
-                u[k] = 0.5 * (start + end)
-                error[k] = wp.static(STRIPE_DEVIATION) * (end - start)
+                place = stripe_place(least, most, stripe, extent)
+                u[k] = place[0]
+                error[k] = place[1]
             signal[k] = wp.where(int(result[k]) == OK, signal[k], 0.0)
         coordinate[p] = u
         sigma[p] = error

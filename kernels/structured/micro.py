@@ -16,12 +16,14 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
+from kernels.normal_equations import add_reading
 from kernels.packs import as_packs, pack_type
 from kernels.status import OK, Status
 from kernels.structured.angles import TURN, cosine_of_turns, sine_of_turns
 from kernels.structured.decoded import Decoded
 from kernels.structured.frames import Frames, NoiseModel, cut_in
 from kernels.structured.phase import decode_phase
+from kernels.structured.unwrap import keep_better
 
 LEVEL_ERROR = 0.02
 """Of the amplitude, by which a reading may be off beyond noise: responses, and amplitudes that are not quite alike."""
@@ -181,16 +183,13 @@ def _micro_kernel(pack: int) -> Any:
                 u = (angle[k] * wp.static(1.0 / TURN) + float(wrap - 1)) * period + shift
                 outside = wp.where(wp.abs(u - 0.5 * extent) > 0.5 * extent + BORDER_PX, FAR, 0.0)
                 cost = wp.max(squares[k] - slopes[k] * shift, 0.0) * trust[k] + outside
-                better = wp.where(cost < best[k], 1.0, 0.0)
-                second[k] = wp.min(second[k], wp.max(cost, best[k]))
-                best[k] = wp.min(cost, best[k])
-                place[k] = place[k] + better * (u - place[k])
+                keep_better(cost, u, best[k], second[k], place[k])
 
         # A, B and u from all frames, each by its variance
         information = float_pack()
         for _step in range(STEPS):
             aa, ab, au, bb, bu, uu = float_pack(), float_pack(), float_pack(), float_pack(), float_pack(), float_pack()
-            ra, rb, ru = float_pack(), float_pack(), float_pack()
+            ra, rb, ru, squares_left = float_pack(), float_pack(), float_pack(), float_pack()
             for f in range(order.shape[0]):
                 reading = values[order[f], p]
                 frequency, delta = table[f][0], table[f][1]
@@ -200,15 +199,7 @@ def _micro_kernel(pack: int) -> Any:
                     slope = -swing[k] * TURN * frequency * sine_of_turns(t)
                     w = 1.0 / (read_variance + gain * wp.max(reading[k], 0.0))
                     miss = reading[k] - mean[k] - swing[k] * c
-                    aa[k] = aa[k] + w
-                    ab[k] = ab[k] + w * c
-                    au[k] = au[k] + w * slope
-                    bb[k] = bb[k] + w * c * c
-                    bu[k] = bu[k] + w * c * slope
-                    uu[k] = uu[k] + w * slope * slope
-                    ra[k] = ra[k] + w * miss
-                    rb[k] = rb[k] + w * c * miss
-                    ru[k] = ru[k] + w * slope * miss
+                    add_reading(miss, w, 1.0, c, slope, aa[k], ab[k], au[k], bb[k], bu[k], uu[k], ra[k], rb[k], ru[k], squares_left[k])
             for k in range(pack):
                 # eliminate A, then B
                 bb1 = bb[k] - ab[k] * ab[k] / aa[k]

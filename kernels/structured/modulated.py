@@ -16,12 +16,8 @@ import warp as wp
 from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.packs import as_packs, pack_type
-from kernels.status import OK, Status
-from kernels.structured.angles import angle_of
 from kernels.structured.frames import Frames, NoiseModel, check_noise, cut_in, unwritten
-from kernels.structured.phase import MIN_MODULATION, SIGNAL_SIGMAS, WrappedPhase, weights
-
-_SATURATED, _SHADOWED, _LOW_MODULATION = int(Status.SATURATED), int(Status.SHADOWED), int(Status.LOW_MODULATION)
+from kernels.structured.phase import WrappedPhase, add_frame, phase_of, weights
 
 
 def decode_modulated(frames: Frames, numbers: Sequence[Sequence[int]], *, period_px: float, noise: NoiseModel) -> WrappedPhase:
@@ -110,35 +106,18 @@ def _modulated_kernel(pack: int) -> Any:
                     w = c * cosine[k] + s * sine[k]
                     direct[k] = direct[k] + w * reading[k]
                     variance[k] = variance[k] + w * w * (read_variance + gain * wp.max(reading[k], 0.0))
-            a, c, s = outer[step][0], outer[step][1], outer[step][2]
+            row = outer[step]
             for k in range(pack):
-                y, v = direct[k], variance[k]
-                mean[k] = mean[k] + a * y
-                along[k] = along[k] + c * y
-                across[k] = across[k] + s * y
-                vaa[k] = vaa[k] + a * a * v
-                vcc[k] = vcc[k] + c * c * v
-                vss[k] = vss[k] + s * s * v
-                vcs[k] = vcs[k] + c * s * v
+                add_frame(direct[k], variance[k], row[0], row[1], row[2],
+                          mean[k], along[k], across[k], vaa[k], vcc[k], vss[k], vcs[k])
         angle, swing, error, level, result = float_pack(), float_pack(), float_pack(), float_pack(), byte_pack()
         for k in range(pack):
-            c2, s2 = along[k] * along[k], across[k] * across[k]
-            twice = 2.0 * along[k] * across[k] * vcs[k]
-            square = c2 + s2
-            over = 1.0 / (square + 1.0e-30)
-            swing_variance = (c2 * vcc[k] + s2 * vss[k] + twice) * over
-            if cut[k] != 0:
-                result[k] = wp.uint8(_SATURATED)
-            elif not (mean[k] > wp.static(SIGNAL_SIGMAS) * wp.sqrt(vaa[k])):  # NaN too
-                result[k] = wp.uint8(_SHADOWED)
-            elif not (square > wp.max(wp.static(SIGNAL_SIGMAS**2) * swing_variance, wp.static(MIN_MODULATION**2) * mean[k] * mean[k])):
-                result[k] = wp.uint8(_LOW_MODULATION)
-            else:
-                result[k] = wp.uint8(OK)
-                angle[k] = angle_of(along[k], across[k])
-                swing[k] = wp.sqrt(square)
-                error[k] = wp.sqrt(wp.max(c2 * vss[k] + s2 * vcc[k] - twice, 0.0)) * over
-                level[k] = mean[k]
+            found = phase_of(cut[k], mean[k], along[k], across[k], vaa[k], vcc[k], vss[k], vcs[k], 0.0, 0.0)
+            angle[k] = found.phase
+            swing[k] = found.amplitude
+            level[k] = found.offset
+            error[k] = found.sigma
+            result[k] = wp.uint8(found.status)
         phase[0, p] = angle
         amplitude[0, p] = swing
         offset[0, p] = level

@@ -114,6 +114,59 @@ def weights(shifts: np.ndarray, period_px: float) -> np.ndarray:
     return np.linalg.pinv(design).T
 
 
+@wp.struct
+class PixelPhase:
+    """One period at one pixel, as in WrappedPhase."""
+
+    phase: float
+    amplitude: float
+    offset: float
+    sigma: float
+    status: int
+
+
+@wp.func
+def add_frame(y: float, v: float, a: float, c: float, s: float, mean: wp.ref[float], along: wp.ref[float], across: wp.ref[float],
+              vaa: wp.ref[float], vcc: wp.ref[float], vss: wp.ref[float], vcs: wp.ref[float]):
+    """Add a reading y of variance v, whose row of the pseudo-inverse is given, to A, C, S and to what noise leaves of them."""
+    mean += a * y
+    along += c * y
+    across += s * y
+    vaa += a * a * v
+    vcc += c * c * v
+    vss += s * s * v
+    vcs += c * s * v
+
+
+@wp.func
+def phase_of(cut: int, mean: float, along: float, across: float, vaa: float, vcc: float, vss: float, vcs: float,
+             dark: float, dark_variance: float) -> PixelPhase:
+    """Return the phase of one pixel from A, C, S and their variances; `cut` is not 0 where a frame saturates, dark the ambient light.
+
+    There is no branch in it, so that a loop over a pack becomes SIMD instructions.
+    """
+    c2, s2 = along * along, across * across
+    twice = 2.0 * along * across * vcs
+    square = c2 + s2
+    over = 1.0 / (square + 1.0e-30)
+    light = mean - dark
+    swing_variance = (c2 * vcc + s2 * vss + twice) * over
+    lit = wp.where(light > wp.static(SIGNAL_SIGMAS) * wp.sqrt(vaa + dark_variance), 1, 0)  # 0 also for NaN
+    clear = wp.where(square > wp.static(SIGNAL_SIGMAS**2) * swing_variance, 1, 0)
+    strong = wp.where(square > wp.static(MIN_MODULATION**2) * light * light, 1, 0)
+    whole = wp.where(cut == 0, 1, 0)
+    seen = lit * clear * strong
+    code = OK * seen + (1 - seen) * (lit * _LOW_MODULATION + (1 - lit) * _SHADOWED)
+    found = PixelPhase()
+    found.status = whole * code + (1 - whole) * _SATURATED
+    known = found.status == OK  # keeps NaN out of the results
+    found.phase = wp.where(known, angle_of(along, across), 0.0)
+    found.amplitude = wp.where(known, wp.sqrt(square), 0.0)
+    found.offset = wp.where(known, mean, 0.0)
+    found.sigma = wp.where(known, wp.sqrt(wp.max(c2 * vss + s2 * vcc - twice, 0.0)) * over, 0.0)
+    return found
+
+
 @cache
 def _phase_kernel(pack: int, ambient: bool = False) -> Any:
     float_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.uint8)
@@ -147,46 +200,21 @@ def _phase_kernel(pack: int, ambient: bool = False) -> Any:
             for n in range(starts[period], starts[period + 1]):
                 reading = values[order[n], p]
                 a, c, s = table[n][0], table[n][1], table[n][2]
-                aa, cc, ss, cs = a * a, c * c, s * s, c * s
                 for k in range(pack):
-                    y = reading[k]
-                    v = read_variance + gain * wp.max(y, 0.0)
-                    mean[k] = mean[k] + a * y
-                    along[k] = along[k] + c * y
-                    across[k] = across[k] + s * y
-                    vaa[k] = vaa[k] + aa * v
-                    vcc[k] = vcc[k] + cc * v
-                    vss[k] = vss[k] + ss * v
-                    vcs[k] = vcs[k] + cs * v
-            angle, swing, error, result = float_pack(), float_pack(), float_pack(), byte_pack()
+                    add_frame(reading[k], read_variance + gain * wp.max(reading[k], 0.0), a, c, s,
+                              mean[k], along[k], across[k], vaa[k], vcc[k], vss[k], vcs[k])
+            angle, swing, level, error, result = float_pack(), float_pack(), float_pack(), float_pack(), byte_pack()
             for k in range(pack):
-                c2, s2 = along[k] * along[k], across[k] * across[k]
-                twice = 2.0 * along[k] * across[k] * vcs[k]
-                square = c2 + s2
-                over = 1.0 / (square + 1.0e-30)
-                light = mean[k] - dark[k]
-                light_variance = vaa[k] + wp.static(1.0 if ambient else 0.0) * (read_variance + gain * wp.max(dark[k], 0.0))
-                angle[k] = angle_of(along[k], across[k])
-                swing[k] = wp.sqrt(square)
-                error[k] = wp.sqrt(wp.max(c2 * vss[k] + s2 * vcc[k] - twice, 0.0)) * over
-                swing_variance = (c2 * vcc[k] + s2 * vss[k] + twice) * over
-                lit = wp.where(light > wp.static(SIGNAL_SIGMAS) * wp.sqrt(light_variance), 1, 0)
-                clear = wp.where(square > wp.static(SIGNAL_SIGMAS**2) * swing_variance, 1, 0)
-                strong = wp.where(square > wp.static(MIN_MODULATION**2) * light * light, 1, 0)
-                whole = wp.where(cut[k] == 0, 1, 0)
-                seen = lit * clear * strong
-                code = OK * seen + (1 - seen) * (lit * _LOW_MODULATION + (1 - lit) * _SHADOWED)
-                code = whole * code + (1 - whole) * _SATURATED
-                result[k] = wp.uint8(code)
-            for k in range(pack):
-                if int(result[k]) != OK:  # seldom, and keeps NaN out of the results
-                    angle[k] = 0.0
-                    swing[k] = 0.0
-                    error[k] = 0.0
-                    mean[k] = 0.0
+                dark_variance = wp.static(1.0 if ambient else 0.0) * (read_variance + gain * wp.max(dark[k], 0.0))
+                found = phase_of(cut[k], mean[k], along[k], across[k], vaa[k], vcc[k], vss[k], vcs[k], dark[k], dark_variance)
+                angle[k] = found.phase
+                swing[k] = found.amplitude
+                level[k] = found.offset
+                error[k] = found.sigma
+                result[k] = wp.uint8(found.status)
             phase[period, p] = angle
             amplitude[period, p] = swing
-            offset[period, p] = mean
+            offset[period, p] = level
             sigma[period, p] = error
             status[period, p] = result
 

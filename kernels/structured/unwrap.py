@@ -133,6 +133,22 @@ def _inputs(wrapped: WrappedPhase) -> list[Any]:
     return [*rows, wp.array(frequency.astype(np.float32), dtype=wp.float32, device=wrapped.device)]
 
 
+@wp.func
+def add_period(flag: int, amplitude: float, periods: int, code: wp.ref[int], mean: wp.ref[float]):
+    """Add a period's amplitude to the mean over the periods; the first status that is not OK stays."""
+    code = wp.where(code <= OK, flag, code)
+    mean += amplitude / float(periods)
+
+
+@wp.func
+def keep_better(cost: float, candidate: float, best: wp.ref[float], second: wp.ref[float], place: wp.ref[float]):
+    """Keep a candidate in `place` where it costs less than the best so far, and the two lowest costs."""
+    better = wp.where(cost < best, 1.0, 0.0)
+    second = wp.min(second, wp.max(cost, best))
+    best = wp.min(cost, best)
+    place += better * (candidate - place)
+
+
 @cache
 def _joint_kernel(pack: int) -> Any:
     float_pack, int_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32), pack_type(pack, wp.uint8)
@@ -164,19 +180,15 @@ def _joint_kernel(pack: int) -> Any:
             trust = float_pack()
             f = frequency[q]
             for k in range(pack):
-                flag = int(flags[k])
-                code[k] = wp.where(code[k] <= OK, flag, code[k])  # the first that is not OK stays
-                mean[k] = mean[k] + height[k] / float(periods)
+                add_period(int(flags[k]), height[k], periods, code[k], mean[k])
                 trust[k] = 1.0 / (turn * turn * (spread[k] * spread[k] + wp.static(MODEL_PHASE_ERROR**2)))
                 stiffness[k] = stiffness[k] + trust[k] * f * f
             weight[q, p] = trust
 
         # every wrap of the reference, and how well the others fit there
         base = phase[reference, p]
-        best, second, place, border, inverse = float_pack(), float_pack(), float_pack(), float_pack(), float_pack()
+        best, second, place, border, inverse = float_pack(FAR), float_pack(FAR), float_pack(), float_pack(), float_pack()
         for k in range(pack):
-            best[k] = FAR
-            second[k] = FAR
             inverse[k] = 1.0 / stiffness[k]
             border[k] = wp.static(BORDER_SIGMAS) * wp.sqrt(inverse[k])
         step = 1.0 / frequency[reference]
@@ -192,13 +204,11 @@ def _joint_kernel(pack: int) -> Any:
                     squares[k] = squares[k] + trust[k] * rest * rest
                     slopes[k] = slopes[k] + trust[k] * rest * f
             for k in range(pack):
-                u = (base[k] * turn + float(wrap)) * step - slopes[k] * inverse[k]
+                middle = (base[k] * turn + float(wrap)) * step
+                u = middle - slopes[k] * inverse[k]
                 outside = wp.where(wp.abs(u - 0.5 * extent) > 0.5 * extent + border[k], FAR, 0.0)
                 cost = wp.max(squares[k] - slopes[k] * slopes[k] * inverse[k], 0.0) + outside
-                better = wp.where(cost < best[k], 1.0, 0.0)
-                second[k] = wp.min(second[k], wp.max(cost, best[k]))
-                best[k] = wp.min(cost, best[k])
-                place[k] = place[k] + better * ((base[k] * turn + float(wrap)) * step - place[k])
+                keep_better(cost, middle, best[k], second[k], place[k])
 
         # in that wrap, every phase by its own variance
         slope_sum, information = float_pack(), float_pack()
@@ -269,15 +279,13 @@ def _numbered_kernel(pack: int) -> Any:
             flags = state[q, p]
             f = frequency[q]
             for k in range(pack):
-                flag = int(flags[k])
-                code[k] = wp.where(code[k] <= OK, flag, code[k])  # the first that is not OK stays
+                add_period(int(flags[k]), height[k], periods, code[k], mean[k])
                 t = angle[k] * turn - near[k] * f
                 rest = t - wp.floor(t + 0.5)
                 trust = f * f / (turn * turn * spread[k] * spread[k] + 1.0e-20)
                 away[k] = wp.max(away[k], wp.abs(rest))
                 total[k] = total[k] + trust * rest / f
                 information[k] = information[k] + trust
-                mean[k] = mean[k] + height[k] / float(periods)
         u_out, error, result = float_pack(), float_pack(), byte_pack()
         for k in range(pack):
             u = near[k] + total[k] / information[k]

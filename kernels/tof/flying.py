@@ -1,7 +1,6 @@
 """Flying pixels: a pixel that sees the edge of one surface before another measures a range between the two. Found and taken out, no
 other pixel touched: nothing is smoothed, and smoothing is a filter of its own."""
 
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -64,11 +63,6 @@ def require_image(*arrays: wp.array, rows: int, cols: int) -> None:
     for array in arrays:
         if len(array.shape) != 1 or not 0 < rows * cols <= array.shape[0]:
             raise ArrayError(f"an array is {array.shape}, the image is {rows} x {cols}: give [rows · cols], padded or not")
-
-
-def flying_kernel(pack: int) -> Any:
-    """For tests that compile it; single pixels whatever the pack."""
-    return _flying_kernel
 
 
 @wp.func

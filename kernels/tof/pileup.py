@@ -1,6 +1,6 @@
 """Pile-up: a detector that counts only the first photon after each pulse favours early bins. Coates's correction undoes it."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -75,11 +75,6 @@ def correct_pileup(counts: wp.array, *, pulses: int) -> Exposed:
 def unhurried(counts: wp.array) -> Exposed:
     """Counts of a detector that is always awake."""
     return Exposed(counts, wp.full(counts.shape, 1.0, dtype=wp.float32, device=counts.device))
-
-
-def coates_kernel(pack: int) -> Any:
-    """For tests that compile it; single pixels whatever the pack."""
-    return _coates_kernel
 
 
 @wp.kernel(module="unique")

@@ -6,7 +6,7 @@ filter of low counts as well as of high ones; then time and strength are moved t
 What the histogram leaves open about the time is worked out in kernels.tof.times.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -98,11 +98,6 @@ def find_returns(exposed: Exposed, pulse: Pulse, *, most: int = 1, first_bin: fl
 def threshold(bins: int) -> float:
     """Evidence that chance reaches in FALSE_ALARMS of the histograms: chi-squared of two degrees of freedom, in any of the bins."""
     return float(2 * np.log(bins / FALSE_ALARMS))
-
-
-def returns_kernel(pack: int) -> Any:
-    """For tests that compile it; single pixels whatever the pack."""
-    return _returns_kernel
 
 
 @wp.func

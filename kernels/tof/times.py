@@ -10,7 +10,7 @@ over the peak of the return, its strength s at its best for each t. Where the mo
 definition, and the mean is the estimate for which it is least. With more photons it goes over into the bound.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import warp as wp
 
@@ -82,11 +82,6 @@ def return_times(exposed: Exposed, pulse: Pulse, position: wp.array, photons: wp
     devices.launch(_times_kernel, exposed.counts.shape[1], [recorded(exposed), shape(pulse, device), first_bin, last_bin, position,
                                                             photons, background], [mean, sigma], device=device, uneven=True)
     return Times(mean, sigma)
-
-
-def times_kernel(pack: int) -> Any:
-    """For tests that compile it; single pixels whatever the pack."""
-    return _times_kernel
 
 
 @wp.func

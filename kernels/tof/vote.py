@@ -1,6 +1,5 @@
 """A vote of the neighbourhood on the wraps that a pixel leaves open."""
 
-from typing import Any
 
 import warp as wp
 
@@ -48,11 +47,6 @@ def vote(weighed: Hypotheses, rows: int, cols: int) -> Hypotheses:
                        device=str(device))
         before = after
     return weighed._replace(probability=before)
-
-
-def vote_kernel(pack: int) -> Any:
-    """For tests that compile it; single pixels whatever the pack."""
-    return _vote_kernel
 
 
 @wp.func

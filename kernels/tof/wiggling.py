@@ -1,6 +1,5 @@
 """Harmonic (wiggling) correction: a light source that is no pure cosine bends the phase; a table says by how much at each phase."""
 
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -54,11 +53,6 @@ def straighten(found: Correlation, table: np.ndarray) -> Correlation:
                    [found.phase, wp.array(np.ascontiguousarray(table, dtype=np.float32), dtype=wp.float32, device=device)], [straight],
                    device=str(device))
     return found._replace(phase=straight)
-
-
-def straighten_kernel(pack: int) -> Any:
-    """For tests that compile it; single pixels whatever the pack."""
-    return _straighten_kernel
 
 
 @wp.kernel(module="unique")

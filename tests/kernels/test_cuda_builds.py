@@ -1,56 +1,111 @@
-"""The kernels as CUDA runs them go through the compiler that Warp brings along, on machines without a GPU too."""
+"""The kernels as CUDA runs them go through the compiler that Warp brings along, on machines without a GPU too.
 
+Kernels are discovered: every Warp kernel of a module of kernels/, and every kernel that a cached factory of a module returns. A factory's
+`pack` or `lanes` is what CUDA takes; its other arguments are told by their annotations, each value in turn beside the first of the others.
+"""
+
+import importlib
+import inspect
+import pkgutil
 import re
-from functools import partial
+from collections.abc import Iterator
+from functools import _lru_cache_wrapper, partial
+from typing import Any, Literal, get_args, get_origin
 
 import pytest
 import warp as wp
 
+import kernels
 from kernels import device as devices
 from kernels.device import PACK_CUDA
-from kernels.photometric import albedo, gradient, highlight, lambert, moments, near, readings, robust, separation
-from kernels.relight import basis, batch, cells, combine, display, guide, near_sum, occlusion, residual, shading, smooth
-from kernels.structured import binary, edges, kary, micro, modulated, phase, ramp, stripe, triangulate
-from kernels.structured import separation as light_parts
-from kernels.structured import unwrap as wraps
-from kernels.tof import bilateral, continuous, decide, flying, pileup, returns, times, unwrap, vote, wiggling
+from kernels.photometric.lobes import Lobes, Reflectance
+from kernels.photometric.samples import LANES_CUDA
 
 devices.names()
 OLDEST = min(wp.get_cuda_supported_archs(), default=None)
+WIDTHS = {"pack": PACK_CUDA, "lanes": LANES_CUDA}
+A_COUNT = 5
+"""What is given for a count that bounds a loop."""
+SINE_DEPOT = {"28"}
+"""Bytes of local memory that CUDA's sine takes for angles far beyond a turn, which do not occur."""
+
+
+def modules() -> list[Any]:
+    return [importlib.import_module(found.name) for found in pkgutil.walk_packages(kernels.__path__, "kernels.")]
+
+
+def factories(module: Any) -> Iterator[tuple[str, Any]]:
+    for name, value in vars(module).items():
+        if isinstance(value, _lru_cache_wrapper) and value.__module__ == module.__name__:
+            yield name, value
+
+
+def values_of(name: str, parameter: inspect.Parameter) -> list[Any]:
+    """Return what an argument of a factory can be, its default first."""
+    kind = parameter.annotation
+    if name in WIDTHS:
+        return [WIDTHS[name]]
+    if kind is bool:
+        values: list[Any] = [True, False]
+    elif get_origin(kind) is Literal:
+        values = list(get_args(kind))
+    elif kind is int:
+        values = [A_COUNT]
+    elif kind in (Lobes, Reflectance):
+        values = [make(*(values_of(n, p)[0] for n, p in inspect.signature(make).parameters.items()))
+                  for module in modules() for _, make in factories(module) if inspect.signature(make).return_annotation is kind]
+    else:
+        raise AssertionError(f"a kernel's factory takes {name}: {kind}, whose values this test does not know")
+    if parameter.default is not parameter.empty:
+        values.sort(key=lambda value: value != parameter.default)
+    return values
+
+
+def variants(make: Any) -> Iterator[dict[str, Any]]:
+    """Return arguments for a factory: the first value of each, then every other value of one beside the first of the others."""
+    choices = {name: values_of(name, parameter) for name, parameter in inspect.signature(make).parameters.items()}
+    first = {name: values[0] for name, values in choices.items()}
+    yield first
+    for name, values in choices.items():
+        for value in values[1:]:
+            yield first | {name: value}
+
+
+def discovered() -> dict[str, Any]:
+    """Return what makes each Warp module of kernels to compile, under the name of its kernel."""
+    found = {}
+    shared = set()
+    for module in modules():
+        place = module.__name__.removeprefix("kernels.")
+        for name, value in vars(module).items():
+            if isinstance(value, wp.Kernel) and value.func.__module__ == module.__name__ and value.module.name not in shared:
+                shared.add(value.module.name)  # kernels of a file that share a Warp module are compiled together
+                found[f"{place}.{name}"] = partial(lambda kernel: kernel, value)
+        for name, make in factories(module):
+            parameters = inspect.signature(make).parameters
+            if not name.endswith("_kernel") or not parameters:
+                continue
+            for number, arguments in enumerate(variants(make)):
+                found[f"{place}.{name}, {number}" if number else f"{place}.{name}"] = partial(make, **arguments)
+    return found
+
+
+KERNELS = discovered()
+
+
+def test_kernels_are_discovered():
+    assert {"photometric.lambert._lambert_kernel", "photometric.hypotheses._search_kernel", "structured.stripe._stripe_kernel",
+            "surface.multigrid._smooth_from_zero", "tof.flying._flying_kernel"} <= KERNELS.keys()
+    for module in modules():
+        source = inspect.getsource(module)
+        place = module.__name__.removeprefix("kernels.")
+        assert bool(re.search(r"wp\.kernel\b", source)) == any(name.startswith(f"{place}.") for name in KERNELS), place
 
 
 @pytest.mark.skipif(OLDEST is None, reason="this build of Warp has no CUDA compiler")
-@pytest.mark.parametrize("make", [readings._grey_kernel, lambert._lambert_kernel, robust._robust_kernel, albedo._albedo_kernel,
-                                  moments._moments_kernel, separation._difference_kernel, separation._colour_kernel,
-                                  gradient._diffuse_kernel, highlight._specular_kernel, near._near_kernel,
-                                  *(partial(module, near=True) for module in
-                                    (lambert._lambert_kernel, robust._robust_kernel, albedo._albedo_kernel)),
-                                  combine.register_kernel, batch.register_kernel, cells._nearest_kernel,
-                                  basis.gram_kernel, display.encode_kernel, residual.residual_kernel, shading._shade_kernel,
-                                  guide._compare_kernel, near_sum._sum_kernel, occlusion._see_kernel,
-                                  continuous.decode_kernel, unwrap.unwrap_kernel, vote.vote_kernel, decide.decide_kernel,
-                                  wiggling.straighten_kernel, flying.flying_kernel, bilateral.smooth_kernel, bilateral.frame_kernel,
-                                  pileup.coates_kernel, returns.returns_kernel, times.times_kernel,
-                                  *(partial(binary._stripe_kernel, code=code) for code in ("binary", "gray", "xor")),
-                                  partial(binary._stripe_kernel, inverses=False), partial(binary._stripe_kernel, references=False),
-                                  kary._kary_kernel, partial(kary._kary_kernel, channels=3), ramp._ramp_kernel,
-                                  partial(ramp._ramp_kernel, pair=False), phase._phase_kernel, partial(phase._phase_kernel, ambient=True),
-                                  wraps._joint_kernel, wraps._numbered_kernel, micro._micro_kernel, modulated._modulated_kernel,
-                                  *(partial(triangulate._kernel, with_u=u, with_v=v) for u, v in ((1, 0), (0, 1), (1, 1))),
-                                  lambda pack: stripe._stripe_kernel, light_parts._extremes_kernel, light_parts._swing_kernel,
-                                  edges._number_kernel,
-                                  lambda pack: edges._edge_kernel(),
-                                  lambda pack: smooth._walk_kernel(),
-                                  lambda pack: near_sum._weights_kernel()])
-def test_kernel_compiles_for_cuda_and_keeps_its_packs_in_registers(make, tmp_path):
-    wp.compile_aot_module(make(PACK_CUDA).module, arch=OLDEST, module_dir=tmp_path, use_ptx=True)
+@pytest.mark.parametrize("name", KERNELS)
+def test_kernel_compiles_for_cuda_and_keeps_its_packs_in_registers(name, tmp_path):
+    wp.compile_aot_module(KERNELS[name]().module, arch=OLDEST, module_dir=tmp_path, use_ptx=True)
     ptx, = (path.read_text(encoding="latin-1") for path in tmp_path.glob("*.ptx"))
-    assert ".entry" in ptx and "__local_depot" not in ptx  # an array indexed at run time would lie in local memory: slow
-
-
-@pytest.mark.skipif(OLDEST is None, reason="this build of Warp has no CUDA compiler")
-def test_kernel_with_sine_and_cosine_keeps_the_rest_in_registers(tmp_path):
-    """CUDA's sine has 28 bytes of local memory, for angles far beyond a turn, which do not occur."""
-    wp.compile_aot_module(highlight._highlight_kernel(PACK_CUDA).module, arch=OLDEST, module_dir=tmp_path, use_ptx=True)
-    ptx, = (path.read_text(encoding="latin-1") for path in tmp_path.glob("*.ptx"))
-    assert ".entry" in ptx and set(re.findall(r"__local_depot\d+\[(\d+)\]", ptx)) <= {"28"}
+    # an array indexed at run time would lie in local memory: slow
+    assert ".entry" in ptx and set(re.findall(r"__local_depot\d+\[(\d+)\]", ptx)) <= SINE_DEPOT

@@ -205,11 +205,11 @@ def test_the_layout_of_cuda_gives_the_same():
     grey = reference.grey_readings(radiance.astype(float), irradiance, GREY)
     packs, four = 16, pack_type(4, wp.float32)
     readings = wp.array(grey.astype(np.float32).reshape(-1, 4), dtype=four, device="cpu")  # [light, pack] in a row
-    out = [wp.zeros((3, packs), dtype=four, device="cpu"), wp.zeros(packs, dtype=four, device="cpu"),
-           wp.zeros(packs, dtype=four, device="cpu"), wp.zeros(packs, dtype=pack_type(4, wp.int32), device="cpu")]
+    out = [wp.zeros((3, 64), dtype=wp.float32, device="cpu"), wp.zeros(64, dtype=wp.float32, device="cpu"),
+           wp.zeros(64, dtype=wp.float32, device="cpu"), wp.zeros(64, dtype=wp.int32, device="cpu")]
     devices.launch(_robust_kernel(4), packs, [wp.array(direction.astype(np.float32), dtype=wp.vec3, device="cpu"),
                                                wp.empty((3, 0), dtype=four, device="cpu"), 1, packs],
                    [readings, *out], device="cpu")
-    np.testing.assert_array_equal(out[3].numpy().reshape(-1), expected.status)
-    np.testing.assert_allclose(out[0].numpy().reshape(3, -1).T, expected.normal, atol=1e-5)  # float32, readings of the twin
+    np.testing.assert_array_equal(out[3].numpy(), expected.status)
+    np.testing.assert_allclose(out[0].numpy().T, expected.normal, atol=1e-5)  # float32, readings of the twin
     np.testing.assert_allclose(readings.numpy().reshape(24, 64), expected.weights, atol=1e-3)
