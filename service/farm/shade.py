@@ -6,7 +6,7 @@ from service.errors import RequestError
 from service.farm.document import Plain
 from service.farm.job import JobOptions, job, picture_options, title
 from service.farm.parameters import Job, Parameters
-from service.light.frames import numbered
+from service.requests.frame_range import numbered
 from service.requests.near_lights import PointLight, RectangleLight, SphereLight
 from service.requests.shade import ShadeRequest
 

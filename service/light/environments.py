@@ -1,13 +1,15 @@
-"""Environment maps: one for all frames or one a frame, checked by their headers at once and read when their frame comes."""
+"""Environment maps: one for all frames or one for each, checked by their headers at once and read when their frame comes."""
 
 import re
 from collections.abc import Iterable
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
+from kernels.relight.environment_sources import EnvironmentSamples, sample_environment
 from service.errors import RequestError
-from service.light.frames import numbered
+from service.requests.frame_range import numbered
 from stage import exr, fingerprint, images
 from stage.colour import convert
 from stage.errors import ImageError
@@ -15,11 +17,24 @@ from stage.errors import ImageError
 SUFFIXES = {".exr", ".hdr"}
 
 
+class EnvironmentMap:
+    """A lat-long map in a working space."""
+
+    def __init__(self, radiance: np.ndarray) -> None:
+        """Args: radiance: [rows, cols, 3] float32, scene-linear."""
+        self.radiance = radiance
+
+    @cached_property
+    def samples(self) -> EnvironmentSamples:
+        """The map as samples for a model of a surface."""
+        return sample_environment(self.radiance)
+
+
 class Environments:
     """The maps of `--environment`: a file, or a sequence of files where the name has a run of #."""
 
     def __init__(self, pattern: Path) -> None:
-        """Args: pattern: as it was given.
+        """Args: pattern: the path, as it was given.
 
         Raises:
             RequestError: several runs of #, or one in the folder.
@@ -27,16 +42,16 @@ class Environments:
         self._pattern = pattern
         self._sequence = "#" in str(pattern) and not pattern.is_file()
         self._digests: dict[Path, str] = {}
-        self._last: tuple[Path, str, np.ndarray] | None = None
+        self._last: tuple[Path, str, EnvironmentMap] | None = None
         if self._sequence and (len(re.findall("#+", pattern.name)) != 1 or "#" in str(pattern.parent)):
             raise RequestError(f"--environment {pattern}: the file name of a sequence has one run of # for the frame number")
 
     def path(self, number: int) -> Path:
-        """The map of a frame."""
+        """Return the file of a frame's map."""
         return self._pattern.with_name(numbered(self._pattern.name, number)) if self._sequence else self._pattern
 
     def check(self, numbers: Iterable[int]) -> None:
-        """Look at the header of every map.
+        """Check the header of the map of every frame.
 
         Raises:
             RequestError: a map of the sequence is not there; names it and its frame.
@@ -52,35 +67,24 @@ class Environments:
             if header.width != 2 * header.height:
                 raise ImageError(f"{path}: is {header.width}x{header.height}: a lat-long map is twice as wide as high")
 
-    def read(self, path: Path, space: str) -> np.ndarray:
-        """The pixels of one map, in a working space; the last one read is kept.
-
-        Returns:
-            [rows, cols, 3] float32 scene-linear radiance.
+    def read(self, path: Path, space: str) -> EnvironmentMap:
+        """Return one map in a working space; the last one that was read is kept.
 
         Raises:
             ImageError: impossible values (counted), or a colour space that is not known.
         """
         if self._last is None or self._last[:2] != (path, space):
-            self._last = (path, space, read_environment(path, space))
+            self._last = (path, space, EnvironmentMap(_read_radiance(path, space)))
         return self._last[2]
 
     def content(self, path: Path) -> str:
-        """The content hash of a map."""
+        """Return the content hash of a map."""
         if path not in self._digests:
             self._digests[path] = fingerprint.digest(path)
         return self._digests[path]
 
 
-def read_environment(path: Path, space: str) -> np.ndarray:
-    """Read a lat-long map into a working space.
-
-    Returns:
-        [rows, cols, 3] float32 scene-linear radiance.
-
-    Raises:
-        ImageError: impossible values (counted), or a colour space that is not known.
-    """
+def _read_radiance(path: Path, space: str) -> np.ndarray:
     pixels = images.read_pixels(path).astype(np.float32)
     images.check_radiance(path, pixels)
     try:

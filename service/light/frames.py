@@ -1,26 +1,34 @@
-"""Where frames go, and which of them are there already."""
+"""The files of frames: where they go, which files they may replace, and which of them an equal request has made already."""
 
 import hashlib
 import json
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from service import __version__
 from service.errors import RequestError
-from stage import exr
+from service.light.environments import Environments
+from service.light.schedule import ScheduledFrame
+from service.light.sequence import OpenedCapture
+from service.requests.frame_range import numbered
+from service.requests.picture import Layer
+from service.requests.relight import RelightRequest
+from stage import exr, fingerprint
 from stage.errors import StageError, StorageError
 
 ARITHMETIC = 1
 """Raised when frames of the same request come out otherwise, so that older ones are made anew."""
 REQUEST_ATTRIBUTE = "relit:request"
-"""Of a frame: the hash of all that its pixels depend on."""
+"""Attribute of a frame: the hash of all that its pixels depend on."""
 
 
 def frame_path(pattern: str, number: int) -> Path:
-    """Where a frame goes.
+    """Return the file that a frame is written to.
 
     Raises:
         RequestError: no run of # in the file name, several, or a suffix other than .exr.
@@ -33,13 +41,8 @@ def frame_path(pattern: str, number: int) -> Path:
     return Path(folder) / numbered(name, number)
 
 
-def numbered(name: str, number: int) -> str:
-    """The name with its run of # replaced by the number, padded with zeros to the run's length."""
-    return re.sub(r"#+", lambda run: f"{number:0{len(run[0])}d}", name)
-
-
-def refuse_inputs(outputs: Iterable[tuple[str, Path]], inputs: Iterable[Path]) -> None:
-    """Refuse to write over what is read, and one result over another.
+def check_outputs(outputs: Sequence[tuple[str, Path]], inputs: Iterable[Path]) -> None:
+    """Refuse, before any work is done, to write over an input, two results into one file, or into a folder that cannot be written to.
 
     Args:
         outputs: (option as it was given, file) of every file that will be written.
@@ -47,6 +50,7 @@ def refuse_inputs(outputs: Iterable[tuple[str, Path]], inputs: Iterable[Path]) -
 
     Raises:
         RequestError: names the first input or result that would be replaced.
+        StorageError: names the first file whose folder cannot be written to; nothing is made.
     """
     written: dict[Path, tuple[str, Path]] = {}
     for option, path in outputs:
@@ -55,38 +59,56 @@ def refuse_inputs(outputs: Iterable[tuple[str, Path]], inputs: Iterable[Path]) -
     for read in inputs:  # which may be many, of a long sequence
         if (found := written.get(read.resolve())) is not None:
             raise RequestError(f"{found[0]}: {found[1]} is an input: choose another folder or name")
-
-
-def check_folders(paths: Iterable[Path]) -> None:
-    """Refuse files whose folder cannot be written to, before any work is done; nothing is made.
-
-    Raises:
-        StorageError: names the first file.
-    """
     folders: dict[Path, Path] = {}
-    for path in paths:
+    for _, path in outputs:
         folders.setdefault(path.parent, path)
     for folder, path in folders.items():
-        there = folder
-        while not there.exists() and there != there.parent:
-            there = there.parent
-        if not there.is_dir():
+        existing = folder
+        while not existing.exists() and existing != existing.parent:
+            existing = existing.parent
+        if not existing.is_dir():
             raise StorageError(f"cannot write {path}: not a directory")
-        if not os.access(there, os.W_OK | os.X_OK, effective_ids=os.access in os.supports_effective_ids):
+        if not os.access(existing, os.W_OK | os.X_OK, effective_ids=os.access in os.supports_effective_ids):
             raise StorageError(f"cannot write {path}: permission denied")
 
 
-def request_hash(**parts: Any) -> str:
-    """A hash of all that the pixels of a frame depend on, the version of this program among it."""
+def frame_hashes(opened: OpenedCapture, request: RelightRequest, frames: Sequence[ScheduledFrame],
+                 environments: Environments | None) -> list[str]:
+    """Return a hash for each frame of everything that its pixels depend on.
+
+    Raises:
+        StorageError: a map cannot be read.
+    """
+    mask = opened.capture.manifest.mask
+    scene = _hash(
+        stack=opened.ingest.key, direction=_digits(opened.lights.direction), irradiance=_digits(opened.lights.irradiance),
+        weights=request.weighting, color_space=request.color_space, compression=request.compression, layers=sorted(request.aov),
+        maps=None if opened.maps is None else fingerprint.digest(opened.maps),
+        mask=fingerprint.digest(opened.capture.file(mask)) if Layer.MASK in request.aov and mask is not None else None)
+    return [_hash(
+        scene=scene, stops=frame.exposure_stops, captured=frame.captured,
+        sky=None if frame.environment is None or environments is None else
+        [environments.content(frame.environment.path), frame.environment.exposure_stops, _digits(frame.environment.rotation)],
+        discs=[[_digits(disc.direction), _digits(disc.irradiance), disc.angle_degrees, disc.color_space] for disc in frame.discs],
+    ) for frame in frames]
+
+
+def is_complete(path: Path, request_hash: str) -> bool:
+    """Return whether the file is a whole frame that was made by a request of this hash."""
+    if not path.is_file():
+        return False
+    try:
+        return bool(exr.read_header(path).metadata.get(REQUEST_ATTRIBUTE) == request_hash)
+    except StageError:  # not an EXR, cut short, unreadable: made anew
+        return False
+
+
+def _hash(**parts: Any) -> str:
+    """Return a hash of these parts and of the version of this program; frames carry it, so that the names of the parts stay."""
     text = json.dumps({"arithmetic": ARITHMETIC, "version": __version__, **parts}, sort_keys=True)
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
-def is_complete(path: Path, request: str) -> bool:
-    """Whether a whole frame of this request_hash lies there."""
-    if not path.is_file():
-        return False
-    try:
-        return bool(exr.read_header(path).metadata.get(REQUEST_ATTRIBUTE) == request)
-    except StageError:  # not an EXR, cut short, unreadable: made anew
-        return False
+def _digits(values: np.ndarray) -> list[float]:
+    """Return the values with nine digits, which the last bit of another processor's arithmetic cannot change."""
+    return [float(f"{value:.9g}") + 0.0 for value in np.ravel(values)]

@@ -1,4 +1,4 @@
-"""A request → what will be made, checked as far as that is cheap: before an image of the capture is read or anything is written."""
+"""The plan of a relight: its captures and frames, checked as far as that is cheap before an image is read or anything is written."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -6,53 +6,52 @@ from typing import NamedTuple
 
 from service.errors import RequestError
 from service.light.environments import Environments
-from service.light.frames import check_folders, frame_path, refuse_inputs
+from service.light.frames import check_outputs, frame_path
 from service.light.layers import check_layers, maps_file
-from service.light.schedule import FrameLighting, schedule
+from service.light.schedule import ScheduledFrame, schedule
 from service.light.sequence import capture_files, time_steps
-from service.light.sheet import check_sheet
 from service.requests.frame_range import frame_numbers, part_of
 from service.requests.light_keys import LightKeys
 from service.requests.relight import RelightRequest
 
 
 class PlannedFrame(NamedTuple):
-    """One frame."""
+    """A frame that will be made."""
 
     path: Path
-    lighting: FrameLighting
-    place: int
-    """In the whole range, from 0."""
+    lighting: ScheduledFrame
+    position: int
+    """Its position in the whole range, from 0."""
 
 
 class Plan(NamedTuple):
-    """What will be made."""
+    """What a relight will make."""
 
     folders: tuple[Path, ...]
     """One capture, or one a time step."""
     frames: tuple[PlannedFrame, ...]
-    """That this run makes."""
+    """The frames that this run makes."""
     total: int
-    """Frames of the whole range."""
+    """Number of frames in the whole range."""
     environments: Environments | None
     keys: LightKeys | None
 
     @property
     def is_sequence(self) -> bool:
-        """Whether there are several captures, which give one frame each."""
+        """True where there are several captures, which give one frame each."""
         return len(self.folders) > 1
 
-    def steps(self) -> Iterator[tuple[Path, tuple[PlannedFrame, ...]]]:
-        """Each capture and its frames."""
+    def captures(self) -> Iterator[tuple[Path, tuple[PlannedFrame, ...]]]:
+        """Yield each capture's folder and its frames."""
         if not self.is_sequence:
             yield self.folders[0], self.frames
             return
         for frame in self.frames:
-            yield self.folders[frame.place], (frame,)
+            yield self.folders[frame.position], (frame,)
 
 
 def make_plan(request: RelightRequest) -> Plan:
-    """Check a request and lay out its frames.
+    """Check a request and return what it makes.
 
     Raises:
         RequestError: a bad frame range, a pattern without ####, options that do not fit, or an output that would replace an input.
@@ -68,25 +67,25 @@ def make_plan(request: RelightRequest) -> Plan:
     if request.sheet is not None:
         if request.only is not None:
             raise RequestError(f"--sheet {request.sheet} shows the whole range, --only {request.only} makes a part of it: give one of them")
-        check_sheet(request.sheet)
+        if request.sheet.suffix.lower() != ".png":
+            raise RequestError(f"--sheet {request.sheet}: a contact sheet is a PNG: end the name in .png")
         outputs.append((f"--sheet {request.sheet}", request.sheet))
     if request.report is not None:
         outputs.append((f"--report {request.report}", request.report))
     keys = LightKeys.read(request.keys) if request.keys is not None else None
     environments = Environments(request.environment) if request.environment is not None else None
-    lighting = schedule(request, numbers, keys, environments)
+    scheduled = schedule(request, numbers, keys, environments)
     if environments is not None:
         environments.check(made)
 
     def inputs() -> Iterator[Path]:
         yield from ([] if request.keys is None else [request.keys])
-        yield from {frame.sky.path for frame in lighting if frame.sky is not None}
+        yield from {frame.environment.path for frame in scheduled if frame.environment is not None}
         for folder in folders:
             yield from capture_files(folder)
             if request.maps is not None:
                 yield maps_file(request.maps, folder, len(folders))
 
-    refuse_inputs(outputs, inputs())
-    check_folders(path for _, path in outputs)
-    planned = (PlannedFrame(*frame) for frame in zip(paths, lighting, range(len(paths)), strict=True))
+    check_outputs(outputs, inputs())
+    planned = (PlannedFrame(*frame) for frame in zip(paths, scheduled, range(len(paths)), strict=True))
     return Plan(tuple(folders), tuple(frame for frame in planned if frame.lighting.number in made), len(numbers), environments, keys)

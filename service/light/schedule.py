@@ -1,4 +1,4 @@
-"""What lights each frame: which map, how it is turned, which discs and captured images are added, at which exposure."""
+"""What lights each frame, as options and light keys say: which map, how it is turned, which discs and captured images, which exposure."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,58 +16,59 @@ from stage.model import Vector
 UPRIGHT = (0.0, 1.0, 0.0)
 
 
-class Sky(NamedTuple):
+class TurnedEnvironment(NamedTuple):
     """The environment of one frame."""
 
     path: Path
     turn_degrees: float
     axis: tuple[float, float, float]
     rotation: np.ndarray  # [3, 3] float64: turned = rotation @ direction
-    stops: float
+    exposure_stops: float
+    """Exposure of the environment alone."""
 
 
 class Disc(NamedTuple):
     """A far disc of even radiance."""
 
-    direction: np.ndarray  # [3] float64, unit, to its middle
-    irradiance: np.ndarray  # [3] float64, on a surface that faces it, in `color_space`
+    direction: np.ndarray  # [3] float64, unit, from the surface to the middle of the disc
+    irradiance: np.ndarray  # [3] float64, on a surface that faces the disc, in `color_space`
     angle_degrees: float
     color_space: str
 
 
-class FrameLighting(NamedTuple):
+class ScheduledFrame(NamedTuple):
     """What lights one frame."""
 
     number: int
-    sky: Sky | None
+    environment: TurnedEnvironment | None
     discs: tuple[Disc, ...]
     captured: dict[str, float]
-    """Image name → how much of it is added."""
-    stops: float
+    """Image name → how much of that image is added."""
+    exposure_stops: float
     """Exposure of the whole frame."""
 
     @property
     def metadata(self) -> dict[str, str]:
         """String attributes for the frame's file."""
         found = {"relit:frame": str(self.number)}
-        if self.sky is not None:
-            found["relit:turn_degrees"] = f"{self.sky.turn_degrees:.6g}"
-            if self.sky.axis != UPRIGHT:
-                found["relit:turn_axis"] = " ".join(f"{part:.6g}" for part in self.sky.axis)
-        if self.stops:
-            found["relit:exposure_stops"] = f"{self.stops:.6g}"
+        if self.environment is not None:
+            found["relit:turn_degrees"] = f"{self.environment.turn_degrees:.6g}"
+            if self.environment.axis != UPRIGHT:
+                found["relit:turn_axis"] = " ".join(f"{part:.6g}" for part in self.environment.axis)
+        if self.exposure_stops:
+            found["relit:exposure_stops"] = f"{self.exposure_stops:.6g}"
         return found
 
 
 def schedule(request: RelightRequest, numbers: Sequence[int], keys: LightKeys | None,
-             environments: Environments | None) -> list[FrameLighting]:
-    """What lights each frame of a range.
+             environments: Environments | None) -> list[ScheduledFrame]:
+    """Return what lights each frame of a range.
 
     Args:
-        request: spin and exposure.
+        request: with spin and exposure.
         numbers: of the frames.
-        keys: of `request.keys`.
-        environments: of `request.environment`.
+        keys: the content of `request.keys`.
+        environments: the maps of `request.environment`.
 
     Raises:
         RequestError: nothing lights the frames, or two options turn the environment, or keys turn one that is not there.
@@ -82,31 +83,31 @@ def schedule(request: RelightRequest, numbers: Sequence[int], keys: LightKeys | 
         raise RequestError(f"--spin-degrees {request.spin_degrees:g} and --keys {request.keys} both turn the environment: give one")
     result = []
     for index, number in enumerate(numbers):
-        sky = None
+        environment = None
         if environments is not None and keys is not None and turned:
-            sky = _keyed_sky(environments.path(number), keys.environment, number)
+            environment = _keyed_environment(environments.path(number), keys.environment, number)
         elif environments is not None:
             turn = request.spin_degrees * index / len(numbers)
-            sky = Sky(environments.path(number), turn, UPRIGHT, rotation_about_y(turn), 0.0)
-        stops = request.exposure
+            environment = TurnedEnvironment(environments.path(number), turn, UPRIGHT, rotation_about_y(turn), 0.0)
+        exposure = request.exposure
         if keys is None:
-            result.append(FrameLighting(number, sky, (), {}, stops))
+            result.append(ScheduledFrame(number, environment, (), {}, exposure))
             continue
         if keys.exposure:
             at = key_interval(keys.exposure, number)
-            stops += float(lerp((keys.exposure[at.first].stops,), (keys.exposure[at.second].stops,), at.fraction)[0])
+            exposure += float(lerp((keys.exposure[at.first].stops,), (keys.exposure[at.second].stops,), at.fraction)[0])
         discs = tuple(_disc(track, number) for track in keys.lights)
-        result.append(FrameLighting(number, sky, discs, _captured(keys.captured, number), stops))
+        result.append(ScheduledFrame(number, environment, discs, _captured(keys.captured, number), exposure))
     return result
 
 
-def _keyed_sky(path: Path, keys: Sequence[EnvironmentKey], number: int) -> Sky:
+def _keyed_environment(path: Path, keys: Sequence[EnvironmentKey], number: int) -> TurnedEnvironment:
     at = key_interval(keys, number)
     one, other = keys[at.first], keys[at.second]
-    turn, stops = lerp((one.turn_degrees, one.exposure), (other.turn_degrees, other.exposure), at.fraction)
+    turn, exposure = lerp((one.turn_degrees, one.exposure), (other.turn_degrees, other.exposure), at.fraction)
     x, y, z = slerp(one.axis, other.axis, at.fraction)
     axis = float(x), float(y), float(z)
-    return Sky(path, float(turn), axis, rotation_about(axis, float(turn)), float(stops))
+    return TurnedEnvironment(path, float(turn), axis, rotation_about(axis, float(turn)), float(exposure))
 
 
 def _disc(track: LightTrack, number: int) -> Disc:

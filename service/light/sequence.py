@@ -1,22 +1,46 @@
-"""A capture, or a sequence of captures: one a time step, in order of name, each opened only while its frame is made."""
+"""The captures that are relit: one, or a sequence with one a time step, in order of name, each opened only while its frame is made."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from service.errors import RequestError
+from service.light.layers import maps_file
+from service.light.schedule import ScheduledFrame
+from service.requests.relight import RelightRequest
 from stage.capture import Capture
+from stage.colour_spaces import linear_space
 from stage.errors import storage
+from stage.ingest import Ingest
+from stage.light import PointLight
+from stage.lighting import lights_from_centre
 from stage.manifest import FILE_NAME, read_manifest
+from stage.motion.tracking import tracking_frames
+from stage.point_lights import DistantLights
+
+
+class OpenedCapture(NamedTuple):
+    """A capture whose frames are about to be made."""
+
+    capture: Capture
+    lights: DistantLights
+    near_lights: int
+    """Number of point lights that are taken as distant ones."""
+    ingest: Ingest
+    maps: Path | None
+    """The file of its solved maps."""
+    space: str
+    """The scene-linear space of its stack."""
 
 
 def time_steps(path: Path) -> list[Path]:
-    """The capture folders that frames are taken from.
+    """Return the capture folders that frames are made from.
 
     Args:
         path: a capture, or a folder without capture.json whose sub-folders have one.
 
     Returns:
-        The captures in order of name; the path itself where it is no sequence.
+        The captures in order of name; the path alone where it is no sequence.
 
     Raises:
         RequestError: two captures differ in resolution or colour space.
@@ -26,21 +50,21 @@ def time_steps(path: Path) -> list[Path]:
     with storage("read", path):
         if path.name == FILE_NAME or not path.is_dir() or (path / FILE_NAME).exists():
             return [path]
-        steps = sorted(folder for folder in path.iterdir() if (folder / FILE_NAME).is_file())
-    if not steps:
+        folders = sorted(folder for folder in path.iterdir() if (folder / FILE_NAME).is_file())
+    if not folders:
         return [path]
-    first = read_manifest(steps[0] / FILE_NAME)
-    for step in steps[1:]:
-        manifest = read_manifest(step / FILE_NAME)
+    first = read_manifest(folders[0] / FILE_NAME)
+    for folder in folders[1:]:
+        manifest = read_manifest(folder / FILE_NAME)
         for what, theirs, ours in (("resolution", _size(manifest.camera.resolution), _size(first.camera.resolution)),
                                    ("colour space", manifest.color_space, first.color_space)):
             if theirs != ours:
-                raise RequestError(f"{step}: is {theirs}, {steps[0].name} {ours}: the captures of a sequence share one {what}")
-    return steps
+                raise RequestError(f"{folder}: is {theirs}, {folders[0].name} {ours}: the captures of a sequence share one {what}")
+    return folders
 
 
 def capture_files(folder: Path) -> Iterator[Path]:
-    """Every file that a capture is read from; those of a bad manifest are left to whoever opens the capture.
+    """Yield every file that a capture is read from; where there is no manifest, nothing: opening the capture says so.
 
     Raises:
         ManifestError: the manifest is wrong; names the field.
@@ -51,6 +75,31 @@ def capture_files(folder: Path) -> Iterator[Path]:
         capture = Capture(manifest.parent, read_manifest(manifest))
         for _, name in capture.files():
             yield capture.file(name)
+
+
+def open_capture(folder: Path, request: RelightRequest, captures: int, frames: Sequence[ScheduledFrame]) -> OpenedCapture:
+    """Open the capture of a time step; no image is read.
+
+    Args:
+        folder: of the capture.
+        request: the whole request.
+        captures: how many there are; the caches and maps of several lie in folders named as theirs.
+        frames: that are made from this capture.
+
+    Raises:
+        StageError: bad input; names file and field.
+        RequestError: its maps are not there, or light keys name an image that it has not.
+    """
+    capture = Capture.open(folder)
+    images = {frame.image for frame in capture.sources()}
+    for image in {image: None for frame in frames for image in frame.captured}:
+        if image not in images:
+            raise RequestError(f"{request.keys}: captured: {image} is no image of {capture.folder} that a light lit")
+    tracking = tracking_frames(capture, to=request.align_to) if request.aligned else None
+    cache = request.cache / folder.name if request.cache is not None and captures > 1 else request.cache
+    maps = None if request.maps is None else maps_file(request.maps, folder, captures)
+    return OpenedCapture(capture, lights_from_centre(capture), len(capture.lit_by(PointLight)),
+                         Ingest.of(capture, cache=cache, tracking=tracking), maps, linear_space(capture.manifest.color_space))
 
 
 def _size(resolution: tuple[int, int]) -> str:

@@ -7,22 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from service.demo.preview import display, fit, read_frame, write_sheet
-from service.errors import RequestError
 
 TILE = 180
 """Height of one frame on the sheet, pixels."""
 MOST = 60
 """Frames on a sheet; of more, evenly chosen ones are shown, the first among them."""
-
-
-def check_sheet(path: Path) -> None:
-    """Refuse a sheet that is not to be a PNG.
-
-    Raises:
-        RequestError: another suffix.
-    """
-    if path.suffix.lower() != ".png":
-        raise RequestError(f"--sheet {path}: a contact sheet is a PNG: end the name in .png")
 
 
 def contact_sheet(path: Path, frames: Sequence[Path]) -> None:

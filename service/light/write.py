@@ -1,4 +1,4 @@
-"""Linear frames → half EXR files: exposure, output space, clipping, layers, metadata; on threads, beside the next chunk's product."""
+"""Linear frames become half EXR files: exposure, output space, clipping, layers and metadata; on threads, while the next are computed."""
 
 import threading
 import time
@@ -11,8 +11,9 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from kernels import device as devices
-from service.requests.picture import FrameCompression, Layer
+from service.requests.picture import FrameCompression, Layer, PictureOptions
 from stage import exr
+from stage.colour import rgb_matrix
 
 HALF_MAX = 65504.0
 COMPRESSIONS = {FrameCompression.ZIP: exr.Compression.ZIP, FrameCompression.PIZ: exr.Compression.PIZ,
@@ -24,37 +25,44 @@ class FrameFormat(NamedTuple):
 
     resolution: tuple[int, int]
     space: str
-    """Scene-linear, that they are written in."""
-    matrix: np.ndarray | None  # [3, 3] float32 to it from the space that they are computed in; None: it is the same
+    """The scene-linear space that they are written in."""
+    matrix: np.ndarray | None  # [3, 3] float32 from the space that they are computed in to `space`; None: they are the same
     compression: FrameCompression
     layers: Mapping[str, np.ndarray]  # further channels of every frame, [rows, cols] float16
-    parts: tuple[Layer, ...] = ()
-    """Layers that add up to the frame, diffuse and specular, where they are wanted."""
+    parts: tuple[Layer, ...]
+    """Those of the diffuse and specular layers, which add up to the frame, that are wanted."""
+
+    @classmethod
+    def of(cls, options: PictureOptions, resolution: tuple[int, int], space: str, layers: Mapping[str, np.ndarray]) -> "FrameFormat":
+        """Return the format of frames that are computed in a scene-linear space, with layers that all of them share."""
+        written = str(options.color_space or space)
+        return cls(resolution, written, None if written == space else rgb_matrix(space, written), options.compression, layers,
+                   tuple(layer for layer in (Layer.DIFFUSE, Layer.SPECULAR) if layer in options.aov))
 
 
 class FrameFile(NamedTuple):
-    """Where a frame goes and what is done to it on the way."""
+    """Where a frame goes, its exposure and its metadata."""
 
     path: Path
     gain: float
-    """Of its exposure."""
+    """What its exposure multiplies it by."""
     metadata: dict[str, str]
 
 
 class Written(NamedTuple):
-    """What a writer has done."""
+    """Counts of what a writer has done."""
 
     frames: int
     clipped: int
     """Pixels beyond the largest half value, stored as that value."""
     half_s: float
-    """Seconds of threads, from float to half."""
+    """Seconds that threads took from float to half."""
     file_s: float
-    """Seconds of threads, packing and writing files."""
+    """Seconds that threads took to compress and write files."""
 
 
 class FrameWriter:
-    """Writes chunks of frames; while one is being written, the next may be computed. A frame is there whole or not at all."""
+    """Writes chunks of frames while the next are computed. A file exists only when its frame is whole."""
 
     def __init__(self, done: Callable[[int], None]) -> None:
         """Args: done: called after each frame with the count so far, by one thread at a time."""
@@ -65,11 +73,11 @@ class FrameWriter:
         self.written = Written(0, 0, 0.0, 0.0)
 
     def __enter__(self) -> Self:
-        """Begin."""
+        """Return the writer."""
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        """Finish what is handed over; after an error only the frames that are being written."""
+        """Wait until all frames are written; after an error, only those that are being written."""
         try:
             if error is None:
                 self.wait()
@@ -77,21 +85,21 @@ class FrameWriter:
             self._pool.shutdown(wait=True, cancel_futures=True)
 
     def put(self, files: Sequence[FrameFile], frames: np.ndarray, form: FrameFormat, specular: np.ndarray | None = None) -> None:
-        """Hand a chunk over; waits until the chunk before is written.
+        """Wait until the chunk before is written, then begin to write this one.
 
         Args:
-            files: of each frame.
+            files: one for each frame.
             frames: [frames, 3, pixels] float32 radiance; the writer may change it.
-            form: of these frames.
-            specular: [frames, 3, pixels] float32 part of each, where such layers are wanted.
+            form: the format of these frames.
+            specular: [frames, 3, pixels] float32 specular part of each; needed where `form` has parts.
 
         Raises:
             StorageError: a frame cannot be written; those already there are whole.
         """
         self.wait()
-        shines = [None] * len(files) if specular is None else list(specular)
-        self._pending = [self._pool.submit(self._write, file, frame, shine, form)
-                         for file, frame, shine in zip(files, frames, shines, strict=True)]
+        parts = [None] * len(files) if specular is None else list(specular)
+        self._pending = [self._pool.submit(self._write, file, frame, part, form)
+                         for file, frame, part in zip(files, frames, parts, strict=True)]
 
     def wait(self) -> None:
         """Wait until everything that was handed over is written."""
@@ -99,14 +107,14 @@ class FrameWriter:
         for job in pending:
             job.result()
 
-    def _write(self, file: FrameFile, frame: np.ndarray, shine: np.ndarray | None, form: FrameFormat) -> None:
+    def _write(self, file: FrameFile, frame: np.ndarray, specular: np.ndarray | None, form: FrameFormat) -> None:
         began = time.perf_counter()
         frame = _finished(frame, file, form)
         clipped = int(((frame > HALF_MAX) | (frame < -HALF_MAX)).any(axis=0).sum())
         channels = _half(frame, form, "")
-        if shine is not None:
-            shine = _finished(shine, file, form)
-            parts = {Layer.DIFFUSE: frame - shine, Layer.SPECULAR: shine}
+        if specular is not None:
+            specular = _finished(specular, file, form)
+            parts = {Layer.DIFFUSE: frame - specular, Layer.SPECULAR: specular}
             for layer in form.parts:
                 channels |= _half(parts[layer], form, f"{layer}.")
         halved = time.perf_counter()
@@ -121,13 +129,13 @@ class FrameWriter:
 
 
 def _finished(frame: np.ndarray, file: FrameFile, form: FrameFormat) -> np.ndarray:
-    """In the output's space and exposure; [3, pixels] float32, the same memory where nothing is to be done."""
+    """Return [3, pixels] float32 in the output's space and exposure; the same memory where neither changes."""
     if form.matrix is not None:
         frame = form.matrix @ frame
     return frame * np.float32(file.gain) if file.gain != 1.0 else frame
 
 
 def _half(frame: np.ndarray, form: FrameFormat, prefix: str) -> dict[str, np.ndarray]:
-    """Channels as half, clipped."""
+    """Return the channels as half, clipped."""
     planes = np.clip(frame, -HALF_MAX, HALF_MAX).astype(np.float16).reshape(3, form.resolution[1], form.resolution[0])
     return {prefix + name: plane for name, plane in zip("RGB", planes, strict=True)}

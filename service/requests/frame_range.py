@@ -1,4 +1,4 @@
-"""Ranges of frame numbers as text: `7`, `1-24`."""
+"""Frame numbers as text: ranges such as `7` and `1-24`, and file names with a run of # for the number."""
 
 import re
 
@@ -42,6 +42,11 @@ def part_of(numbers: list[int], text: str) -> range:
     if first < numbers[0] or last > numbers[-1]:
         raise RequestError(f"--only {text}: lies outside the frames {numbers[0]}-{numbers[-1]}")
     return range(first, last + 1)
+
+
+def numbered(name: str, number: int) -> str:
+    """Return the file name with its run of # replaced by the number, padded with zeros to the run's length."""
+    return re.sub(r"#+", lambda run: f"{number:0{len(run[0])}d}", name)
 
 
 def _ends(option: str, text: str) -> tuple[int, int]:
