@@ -16,7 +16,7 @@ from kernels.structured.binary import decode_gray
 from kernels.structured.frames import NoiseModel, upload
 from kernels.structured.phase import decode_phase
 from kernels.structured.unwrap import unwrap_jointly
-from stage.patterns.draw import gray_of
+from stage.patterns.binary import gray_of
 
 PIXELS, LOOP_PIXELS, BAND = 12_000_000, 20_000, 65_536
 PERIODS, STEPS, WIDTH = (16.0, 17.0, 19.0, 23.0), 4, 1280

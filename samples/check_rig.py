@@ -95,7 +95,7 @@ def mitsuba_picture(mi, rig: Rig, shapes: dict, texture: np.ndarray) -> np.ndarr
 
 def check_mitsuba(mi, rig: Rig, shapes: dict) -> list[tuple[str, float, float]]:
     """Sums over the transport against pictures that Mitsuba renders whole."""
-    from stage.patterns.draw import draw
+    from stage.patterns.codes import draw
 
     scene = mi.load_dict({"type": "scene", **shapes, "projector": rig_scene.emitter(mi, rig.projector)})
     sums = [rig_transport.trace_pass(mi, scene, rig, 700 + i) for i in range(PASSES)]

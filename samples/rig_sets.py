@@ -11,10 +11,12 @@ import rig_transport
 from rig_scene import HEIGHT, WIDTH, Rig
 from rig_transport import Transport
 
-from stage.pattern import ModulatedPattern, Pattern
-from stage.patterns.draw import profile
-from stage.patterns.stripes import binary_patterns, kary_patterns, xor_patterns
-from stage.patterns.waves import micro_patterns, modulated_patterns, phase_patterns, ramp_patterns
+from stage.patterns.binary import binary_patterns, xor_patterns
+from stage.patterns.codes import Pattern
+from stage.patterns.kary import kary_patterns
+from stage.patterns.modulated import ModulatedPattern, modulated_patterns
+from stage.patterns.phase import micro_patterns, phase_patterns
+from stage.patterns.ramp import ramp_patterns
 
 STRIPE_SIGMA_PX = 0.9
 STRIPE_STEP_PX = 2
@@ -83,7 +85,8 @@ def light(pattern: Pattern, transport: Transport) -> np.ndarray:  # -> [pixels]
         return transport.waves @ _waves(pattern)
     of = transport.rows if getattr(pattern, "axis", "column") == "row" else transport.columns
     extent = of.shape[1]
-    return of @ profile(pattern, np.arange(extent) + 0.5, extent).astype(np.float32)
+    u = np.arange(extent) + 0.5
+    return of @ pattern.level(u, np.zeros_like(u), extent).astype(np.float32)
 
 
 def _waves(pattern: ModulatedPattern) -> np.ndarray:

@@ -12,7 +12,7 @@ from stage.colour_spaces import ColorSpaceName
 from stage.files import write_text
 from stage.light import Light
 from stage.model import FirstFault, Positive, Strict, Text
-from stage.pattern import Pattern
+from stage.patterns.codes import Pattern
 from stage.projector import Projector
 from stage.ranging import Laser, TimeOfFlight
 from stage.records import read_record

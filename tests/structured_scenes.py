@@ -3,8 +3,7 @@
 import numpy as np
 
 from kernels.structured.frames import NoiseModel, upload
-from stage.pattern import ModulatedPattern
-from stage.patterns.draw import profile
+from stage.patterns.modulated import ModulatedPattern
 
 NOISE = NoiseModel(0.004, 1.0e-4)
 BOUNCE_PX = 60.0
@@ -27,10 +26,7 @@ def view(patterns, u, extent, *, albedo=0.7, ambient=0.05, bounce=0.0, noise=Non
     rng, images = np.random.default_rng(seed), []
     for pattern in patterns:
         def light(at, pattern=pattern):
-            if isinstance(pattern, ModulatedPattern):
-                wave = (1 + np.cos(2 * np.pi * (at / pattern.period_px - pattern.step / pattern.steps))) / 2
-                return wave * (1 + np.cos(2 * np.pi * (v / pattern.carrier_period_px - pattern.carrier_step / pattern.carrier_steps))) / 2
-            return profile(pattern, at, extent)
+            return pattern.level(at, v, extent)
 
         shifts = (np.arange(10) - 4.5) / 10 * blur if blur else [0.0]
         seen = np.mean([light(np.clip(u + s, 0, extent - 1e-6)) for s in shifts], axis=0)
@@ -39,7 +35,7 @@ def view(patterns, u, extent, *, albedo=0.7, ambient=0.05, bounce=0.0, noise=Non
             if isinstance(pattern, ModulatedPattern):  # the carrier, finer than the spread, is even there
                 line = (1 + np.cos(2 * np.pi * (grid / pattern.period_px - pattern.step / pattern.steps))) / 4
             else:
-                line = profile(pattern, grid, extent)
+                line = pattern.level(grid, v, extent)
             kernel = np.exp(-0.5 * ((np.arange(-480, 481) * 0.5) / BOUNCE_PX) ** 2)
             padded = np.pad(line, 480, mode="edge")
             spread = np.convolve(padded, kernel / kernel.sum(), mode="valid")

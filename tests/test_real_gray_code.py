@@ -10,8 +10,8 @@ import pytest
 from kernels.status import Status
 from kernels.structured.binary import decode_gray
 from kernels.structured.frames import EIGHT_BIT, upload
-from stage.patterns.collect import collect
-from stage.patterns.stripes import binary_patterns
+from stage.patterns.binary import binary_patterns
+from stage.patterns.codes import collect
 
 DATA = Path(os.environ.get("RELIT_TEST_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")) / "graycode_chessboard"
 PROJECTOR = (1024, 768)
@@ -30,7 +30,7 @@ def images() -> np.ndarray:
 def test_opencvs_decode_is_ours(axis, number, images, device):
     patterns = [*binary_patterns(PROJECTOR[0], "column", references=False), *binary_patterns(PROJECTOR[1], "row")]
     found = collect(patterns)
-    code, = found.of_axis(axis)
+    code, = (code for code in found.codes if code.axis == axis)
     frames = upload(images.reshape(len(images), -1), device=device)
     decoded = decode_gray(frames, code.frames, code.inverses, white=found.white, black=found.black, extent=PROJECTOR[number],
                           noise=EIGHT_BIT)

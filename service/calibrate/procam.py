@@ -9,8 +9,8 @@ from kernels import device as devices
 from kernels.status import SOLVED
 from kernels.structured.frames import NoiseModel
 from service.calibrate.results import digits, write_results
-from service.depth.codes import PatternDevice
-from service.depth.patterns import decoded_bands, full_scale, plan_codes, scene_colour
+from service.depth.decoders import PatternDevice
+from service.depth.patterns import decoded_bands, full_scale, read_codes, scene_colour
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import ProcamRequest
 from service.requests.depth import DepthRequest
@@ -88,11 +88,12 @@ def procam(request: ProcamRequest, progress: Progress | None = None) -> ProcamRe
 def view_of(capture: Capture, size: Resolution, request: ProcamRequest, device: str) -> BoardView | str:
     """The corners of one capture in both devices, or why there are none."""
     frames = [frame for frame in capture.manifest.frames if frame.pattern is not None]
-    collected, columns, rows = plan_codes(capture, frames, PatternDevice(size))
+    codes = read_codes(capture, frames, PatternDevice(size))
+    columns, rows = codes.columns, codes.rows
     if columns is None or rows is None:
         raise ManifestError(f"{capture.folder / FILE_NAME}: frames: no {'column' if columns is None else 'row'} code: "
                             "calibration needs columns and rows")
-    scene = scene_colour(capture, frames, collected)
+    scene = scene_colour(capture, frames, codes.collected)
     if scene is None:
         raise ManifestError(f"{capture.folder / FILE_NAME}: frames: no white frame and no inverses: the board must be seen evenly lit")
     corners = find_corners(scene @ np.array(GREY_WEIGHTS, np.float32), request.board)
@@ -101,7 +102,7 @@ def view_of(capture: Capture, size: Resolution, request: ProcamRequest, device: 
     shape = (capture.camera.height, capture.camera.width)
     u, v, decoded = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, bool)
     options = DepthRequest.model_fields
-    with frame_planes(capture, frames, colour=columns.colour or rows.colour, cache=request.cache) as planes:
+    with frame_planes(capture, frames, colour=codes.colour, cache=request.cache) as planes:
         full = full_scale(planes, capture, frames)
         noise = NoiseModel(options["read_noise"].default * full, options["photon_gain"].default * full)
         for band, axes in decoded_bands(planes, (columns, rows), noise, device):

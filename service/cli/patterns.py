@@ -54,7 +54,8 @@ def patterns(
 ) -> None:
     """The images to project, and their manifest entries; or, with --plan, what each code costs."""
     from service.cli.bar import Bar
-    from service.depth.projection import BELONGS, make_patterns, make_plan
+    from service.depth.codes import CODES_OF_OPTION
+    from service.depth.projection import make_patterns, make_plan
     from service.errors import RequestError
     from service.requests.patterns import PatternsRequest, PlanRequest
 
@@ -78,7 +79,7 @@ def patterns(
             depth = "" if row.depth_sigma_m is None else f"{1000 * row.depth_sigma_m:.3g}"
             print(f"{row.name:<34} {row.minimum:>9} {row.images:>9} {row.seconds:>9.3g} {row.column_sigma_px:>12.3g} {depth:>11}")
     if writes:
-        shared = {name: value for name, value in _given(both).items() if not plan or name not in BELONGS or code in BELONGS[name]}
+        shared = {name: value for name, value in _given(both).items() if not plan or code in CODES_OF_OPTION.get(name, (code,))}
         with Bar() as bar:
             result = make_patterns(PatternsRequest(**{"code": code, "out": out, **_given(drawn), **shared}), bar)
         print(f"images   {result.images[0]} … {result.images[-1].name}")

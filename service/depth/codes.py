@@ -1,66 +1,151 @@
-"""Which decoder an axis of a capture's patterns takes, and how it is called."""
+"""The table of structured-light codes: what `relit patterns` projects for each, what it costs, and which decoder reads it.
+
+To add a code, write one module in stage/patterns/ (manifest entry, level at each place, frames put together, frames to project) and a
+row in stage/patterns/codes.py; then a row here, which names its decoder in service/depth/decoders.py. The kernel that decodes it stands
+in kernels/structured/, and the word that users type in service/requests/patterns.py.
+"""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
-
-from kernels.structured.binary import decode_binary, decode_gray, decode_xor
-from kernels.structured.decoded import Decoded
-from kernels.structured.edges import REACH, refine_edges
-from kernels.structured.frames import Frames, NoiseModel
-from kernels.structured.join import join_periods
-from kernels.structured.kary import decode_kary
-from kernels.structured.micro import decode_micro
-from kernels.structured.modulated import decode_modulated
-from kernels.structured.phase import WrappedPhase, decode_phase
-from kernels.structured.ramp import decode_ramp
-from kernels.structured.unwrap import unwrap_by_code, unwrap_jointly
+from kernels.structured.unwrap import unwrap_range
+from service.depth.decoders import (
+    AxisCodes,
+    AxisDecoder,
+    PatternDevice,
+    micro_decoder,
+    modulated_decoder,
+    phase_decoder,
+    ramp_decoder,
+    stripe_decoder,
+)
+from service.requests.patterns import PatternCode, PatternsRequest, PlanRequest
 from stage.errors import ManifestError
-from stage.model import Resolution, Rgb
-from stage.patterns.collect import BinaryCode, Code, Collected, KaryCode, ModulatedCode, PhaseCode, RampCode
-
-FULL_STEPS = 3
-"""Frames of different shifts that a phase of its own needs."""
-
-
-class PatternDevice(NamedTuple):
-    """What decoding needs to know of a projector; its lens and pose come later."""
-
-    resolution: Resolution
-    response: tuple[float, ...] | None = None
-    crosstalk: tuple[Rgb, Rgb, Rgb] | None = None
+from stage.patterns import planner
+from stage.patterns.base import Axis, digit_count
+from stage.patterns.binary import binary_patterns, xor_patterns
+from stage.patterns.codes import Collected, Pattern
+from stage.patterns.kary import kary_patterns, palette
+from stage.patterns.modulated import modulated_patterns
+from stage.patterns.phase import joint_periods, micro_patterns, phase_patterns
+from stage.patterns.planner import Cost
+from stage.patterns.ramp import ramp_patterns
 
 
-class Readings(NamedTuple):
-    """The frames of a band on the device."""
+class CodeRow(NamedTuple):
+    """Everything about one code that commands need."""
 
-    grey: Frames
-    colour: Frames | None
-    """The same with three channels, where a code has colours."""
-    columns: int
-    """Pixels of an image row: the band is whole rows."""
-
-
-@dataclass(frozen=True)
-class AxisPlan:
-    """How one axis is decoded."""
-
-    axis: str
-    name: str
-    """For the report: gray with inverses, phase numbered by gray, …"""
-    colour: bool
-    """Whether it needs colour frames."""
-    decode: Callable[[Readings, NoiseModel], Decoded]
-    halo: int = 0
-    """Rows beyond a band, above and below, that decoding looks at."""
-    unused: tuple[str, ...] = ()
-    """Codes of the axis that add nothing to this plan."""
+    decoder: Callable[[AxisCodes], AxisDecoder | None]
+    """How the frames of an axis are decoded; None if they hold no such code."""
+    patterns: Callable[[PatternsRequest, Axis, int], Sequence[Pattern]]
+    """The frames to project along an axis of so many pixels; raises ValueError for options that cannot be."""
+    options: tuple[str, ...]
+    """Options of `relit patterns` that say something about the code."""
+    cost: Callable[[PlanRequest, int], Cost] | None
+    """Its line in the planner's table for so many columns; None if another code's line counts for it too."""
 
 
-def plan_axis(collected: Collected, axis: str, projector: PatternDevice, *, refine: bool = False) -> AxisPlan | None:
-    """The most precise way to decode an axis from the codes that there are: phases, else stripes, else digits, else a ramp.
+def _phase_frames(request: PatternsRequest, axis: Axis, extent: int) -> Sequence[Pattern]:
+    periods = request.periods or joint_periods(extent)
+    frames = phase_patterns(axis, periods, request.steps)
+    covered = unwrap_range(periods, extent)
+    if covered < extent:
+        raise ValueError(f"phases of {', '.join(f'{period:g}' for period in periods)} px repeat after {covered:.4g} px, the "
+                         f"projector has {extent}: add a period, or project gray-phase")
+    return frames
+
+
+def _gray_phase_frames(request: PatternsRequest, axis: Axis, extent: int) -> Sequence[Pattern]:
+    periods = request.periods or (16.0,)
+    stripe = request.stripe or min(periods) / 2
+    if 2 * stripe > min(periods):
+        raise ValueError(f"stripes of {stripe:g} px cannot number periods of {min(periods):g} px: give half a period or less")
+    return (*binary_patterns(extent, axis, stripe_px=stripe, inverses=request.inverses), *phase_patterns(axis, periods, request.steps))
+
+
+def _binary_cost(name: str, columns: int) -> Cost:
+    return Cost(name, planner.kary_count(columns), 2 * digit_count(columns, 2) + 2, planner.stripe_sigma(1))
+
+
+def _periods(request: PlanRequest, columns: int) -> tuple[float, ...]:
+    return request.periods or joint_periods(columns)
+
+
+def _phase_cost(request: PlanRequest, columns: int) -> Cost:
+    periods = _periods(request, columns)
+    listed = ", ".join(f"{period:g}" for period in periods)
+    return Cost(f"phase, {request.steps} steps of {listed} px", planner.PHASE_COUNT, request.steps * len(periods),
+                planner.phase_sigma(periods, request.steps, request.noise))
+
+
+def _micro_cost(request: PlanRequest, columns: int) -> Cost:
+    periods, count = _periods(request, columns), request.micro_periods
+    mean = sum(periods) / len(periods)
+    return Cost(f"micro, {count} periods about {mean:g} px", count + 2, count + 2, planner.micro_sigma(mean, count, request.noise))
+
+
+CODES: dict[PatternCode, CodeRow] = {
+    PatternCode.MODULATED: CodeRow(
+        modulated_decoder,
+        lambda request, axis, extent: [
+            pattern for period in request.periods or (round(1.1 * extent, 1),)
+            for pattern in modulated_patterns(axis, period, steps=request.steps, carrier_period_px=request.carrier)],
+        ("periods", "steps", "carrier"),
+        lambda request, columns: Cost(f"modulated, {request.steps} steps over 3", 9, 3 * request.steps,
+                                      planner.modulated_sigma(columns, request.steps, 3, request.noise))),
+    PatternCode.MICRO: CodeRow(
+        micro_decoder,
+        lambda request, axis, extent: micro_patterns(extent, axis, periods=request.micro_periods, mean_period_px=request.mean_period),
+        ("micro_periods", "mean_period"),
+        _micro_cost),
+    PatternCode.PHASE: CodeRow(phase_decoder, _phase_frames, ("periods", "steps"), _phase_cost),
+    PatternCode.GRAY_PHASE: CodeRow(phase_decoder, _gray_phase_frames, ("stripe", "inverses", "periods", "steps"), None),
+    PatternCode.BINARY: CodeRow(
+        stripe_decoder,
+        lambda request, axis, extent: binary_patterns(extent, axis, code="binary", stripe_px=request.stripe or 1,
+                                                      inverses=request.inverses),
+        ("stripe", "inverses"),
+        lambda request, columns: _binary_cost("binary or gray, with inverses", columns)),
+    PatternCode.GRAY: CodeRow(
+        stripe_decoder,
+        lambda request, axis, extent: binary_patterns(extent, axis, code="gray", stripe_px=request.stripe or 1, inverses=request.inverses),
+        ("stripe", "inverses"),
+        None),
+    PatternCode.XOR: CodeRow(
+        stripe_decoder,
+        lambda request, axis, extent: xor_patterns(extent, axis, base_bit=request.base_bit, stripe_px=request.stripe or 1,
+                                                   inverses=request.inverses),
+        ("stripe", "inverses", "base_bit"),
+        lambda request, columns: _binary_cost("xor, with inverses", columns)),
+    PatternCode.KARY: CodeRow(
+        stripe_decoder,
+        lambda request, axis, extent: kary_patterns(extent, axis, base=request.base, reflected=request.reflected,
+                                                    stripe_px=request.stripe or 1),
+        ("stripe", "base", "reflected"),
+        lambda request, columns: Cost(f"kary, base {request.base}", planner.kary_count(columns, request.base),
+                                      digit_count(columns, request.base) + 2, planner.stripe_sigma(1))),
+    PatternCode.COLOR: CodeRow(
+        stripe_decoder,
+        lambda request, axis, extent: kary_patterns(extent, axis, base=request.base, reflected=request.reflected,
+                                                    stripe_px=request.stripe or 1, colors=palette(request.base)),
+        ("stripe", "base", "reflected"),
+        None),
+    PatternCode.RAMP: CodeRow(
+        ramp_decoder,
+        lambda request, axis, extent: ramp_patterns(axis),
+        (),
+        lambda request, columns: Cost("ramp", planner.RATIO_COUNT, planner.RATIO_COUNT + 2, planner.ramp_sigma(columns, request.noise))),
+}
+"""Every code, the most precise first: `choose_decoder` tries their decoders in this order."""
+
+CODES_OF_OPTION = {option: tuple(code for code in PatternCode if option in CODES[code].options)
+                   for row in CODES.values() for option in row.options}
+"""Option of `relit patterns` → the codes that it belongs to; with another code it is refused."""
+
+
+def choose_decoder(collected: Collected, axis: Axis, projector: PatternDevice, *,
+                   refine: bool = False) -> tuple[AxisDecoder | None, tuple[str, ...]]:
+    """Choose the most precise way to decode an axis from the codes of a capture: phases, else stripes, else digits, else a ramp.
 
     Args:
         collected: the codes of a capture.
@@ -69,146 +154,17 @@ def plan_axis(collected: Collected, axis: str, projector: PatternDevice, *, refi
         refine: interpolate a Gray code with inverses between the edges of its stripes.
 
     Returns:
-        None where the axis has no code.
+        The decoder, None if the axis has no code; and the names of the codes of the axis that it does not use.
 
     Raises:
-        ManifestError: a code lacks the frames of black and white that it needs, or relit has no decoder for it.
+        ManifestError: every code of the axis lacks the frames of black and white that it needs.
     """
     codes = [code for code in collected.codes if code.axis == axis]
     if not codes:
-        return None
-    extent = projector.resolution[0 if axis == "column" else 1]
-    ready = [code for code in codes if _complete(code, collected)]
-    stripes = [code for code in ready if isinstance(code, BinaryCode | KaryCode)]
-    modulated = [code for code in ready if isinstance(code, ModulatedCode)]
-    phase = next((code for code in ready if isinstance(code, PhaseCode)), None)
-    if modulated:  # direct light alone: better than the same phase without a carrier
-        numbering = _numbering(stripes, [code.period_px for code in modulated])
-        return _wave_plan(modulated, "modulated phase", numbering, collected, codes, projector, extent)
-    if phase is not None and _is_micro(phase):
-        return _micro_plan(phase, collected, codes, extent)
-    if phase is not None:
-        return _wave_plan([phase], "phase", _numbering(stripes, phase.periods_px), collected, codes, projector, extent)
-    if stripes:
-        return _stripe_plan(min(stripes, key=lambda code: (isinstance(code, KaryCode), code.stripe_px)), collected, codes, projector,
-                            extent, refine)
-    for code in ready:
-        if isinstance(code, RampCode):
-            return _ramp_plan(code, collected, codes, projector, extent)
-    raise ManifestError(_lacks(codes[0]))
-
-
-def _complete(code: Code, collected: Collected) -> bool:
-    """Whether a code has the reference frames that it needs."""
-    references = collected.white is not None and collected.black is not None
-    match code:
-        case PhaseCode() | ModulatedCode():
-            return True
-        case BinaryCode():
-            return code.inverses is not None or references
-        case KaryCode():
-            return references
-        case RampCode():
-            return (code.up is not None and code.down is not None) or collected.white is not None
-
-
-def _lacks(code: Code) -> str:
-    match code:
-        case BinaryCode():
-            return f"the {code.axis} {code.code} code has neither inverses nor a white and a black frame: give one of the two"
-        case KaryCode():
-            return f"the {code.axis} kary code needs a white and a black frame: give both"
-    return f"the {code.axis} ramp needs its opposite or a white frame: give one"
-
-
-def _numbering(stripes: list[BinaryCode | KaryCode], periods_px: Sequence[float]) -> BinaryCode | KaryCode | None:
-    """A code whose stripes are fine enough to number the periods."""
-    return next((code for code in stripes if 2 * code.stripe_px <= min(periods_px)), None)
-
-
-def _is_micro(phase: PhaseCode) -> bool:
-    """Whether one period has all its steps and others have fewer than a phase of their own needs (Gupta and Nayar 2012)."""
-    counts = [phase.periods_px.count(period) for period in dict.fromkeys(phase.periods_px)]
-    return min(counts) < FULL_STEPS <= max(counts)
-
-
-def _micro_plan(phase: PhaseCode, collected: Collected, codes: list[Code], extent: int) -> AxisPlan:
-    def decode(readings: Readings, noise: NoiseModel) -> Decoded:
-        return decode_micro(readings.grey, phase.frames, phase.periods_px, phase.shifts, black=collected.black, extent=extent, noise=noise)
-
-    return AxisPlan(phase.axis, "micro phase", False, decode, unused=_unused(codes, [phase]))
-
-
-def _wave_plan(waves: Sequence[PhaseCode | ModulatedCode], name: str, numbering: BinaryCode | KaryCode | None, collected: Collected,
-               codes: list[Code], projector: PatternDevice, extent: int) -> AxisPlan:
-    def wrapped(readings: Readings, noise: NoiseModel) -> WrappedPhase:
-        parts = [decode_modulated(readings.grey, wave.frames, period_px=wave.period_px, noise=noise) if isinstance(wave, ModulatedCode)
-                 else decode_phase(readings.grey, wave.frames, wave.periods_px, wave.shifts, black=collected.black, noise=noise)
-                 for wave in waves]
-        return parts[0] if len(parts) == 1 else join_periods(parts)
-
-    def decode(readings: Readings, noise: NoiseModel) -> Decoded:
-        phases = wrapped(readings, noise)
-        if numbering is None:
-            return unwrap_jointly(phases, extent=extent)
-        coarse = _decode_stripes(numbering, collected, projector, extent, readings, noise)
-        return unwrap_by_code(phases, coarse, stripe_px=numbering.stripe_px, extent=extent)
-
-    used: list[Code] = [*waves, *([] if numbering is None else [numbering])]
-    name = name if numbering is None else f"{name} numbered by {_name(numbering)}"
-    return AxisPlan(waves[0].axis, name, _coloured(numbering), decode, unused=_unused(codes, used))
-
-
-def _stripe_plan(code: BinaryCode | KaryCode, collected: Collected, codes: list[Code], projector: PatternDevice, extent: int,
-                 refine: bool) -> AxisPlan:
-    inverses = code.inverses if isinstance(code, BinaryCode) else None
-    edges = refine and inverses is not None and isinstance(code, BinaryCode) and code.code == "gray"
-
-    def decode(readings: Readings, noise: NoiseModel) -> Decoded:
-        found = _decode_stripes(code, collected, projector, extent, readings, noise)
-        if not edges or inverses is None:
-            return found
-        return refine_edges(found, readings.grey, code.frames, inverses, columns=readings.columns, down=code.axis == "row",
-                            extent=extent, stripe_px=code.stripe_px, noise=noise)
-
-    name = f"{_name(code)}{' with inverses' if inverses else ''}{', edges refined' if edges else ''}"
-    return AxisPlan(code.axis, name, _coloured(code), decode, REACH if edges and code.axis == "row" else 0, _unused(codes, [code]))
-
-
-def _ramp_plan(code: RampCode, collected: Collected, codes: list[Code], projector: PatternDevice, extent: int) -> AxisPlan:
-    response = None if projector.response is None else np.array(projector.response)
-
-    def decode(readings: Readings, noise: NoiseModel) -> Decoded:
-        return decode_ramp(readings.grey, up=code.up, down=code.down, white=collected.white, black=collected.black, extent=extent,
-                           response=response, noise=noise)
-
-    return AxisPlan(code.axis, "ramp", False, decode, unused=_unused(codes, [code]))
-
-
-def _decode_stripes(code: BinaryCode | KaryCode, collected: Collected, projector: PatternDevice, extent: int, readings: Readings,
-                    noise: NoiseModel) -> Decoded:
-    if isinstance(code, KaryCode):
-        assert collected.white is not None and collected.black is not None  # the plan saw to it
-        crosstalk = None if projector.crosstalk is None or code.colors is None else np.array(projector.crosstalk)
-        frames = readings.colour if code.colors is not None and readings.colour is not None else readings.grey
-        return decode_kary(frames, code.frames, white=collected.white, black=collected.black,
-                           levels=np.array(code.levels if code.levels is not None else code.colors), reflected=code.reflected,
-                           extent=extent, stripe_px=code.stripe_px, crosstalk=crosstalk, noise=noise)
-    if code.code == "xor":
-        return decode_xor(readings.grey, code.frames, code.inverses, base_bit=code.base_bit, white=collected.white,
-                          black=collected.black, extent=extent, stripe_px=code.stripe_px, noise=noise)
-    run = decode_gray if code.code == "gray" else decode_binary
-    return run(readings.grey, code.frames, code.inverses, white=collected.white, black=collected.black, extent=extent,
-               stripe_px=code.stripe_px, noise=noise)
-
-
-def _coloured(code: BinaryCode | KaryCode | None) -> bool:
-    return isinstance(code, KaryCode) and code.colors is not None
-
-
-def _name(code: Code) -> str:
-    return code.code if isinstance(code, BinaryCode) else type(code).__name__.removesuffix("Code").lower()
-
-
-def _unused(codes: list[Code], used: list[Code]) -> tuple[str, ...]:
-    return tuple(f"{code.axis} {_name(code)}" for code in codes if code not in used)
+        return None, ()
+    ready = AxisCodes.of(collected, axis, projector, refine=refine)
+    for decoder in dict.fromkeys(row.decoder for row in CODES.values()):
+        chosen = decoder(ready)
+        if chosen is not None:
+            return chosen, tuple(f"{axis} {code.name}" for code in codes if code not in chosen.used)
+    raise ManifestError(codes[0].lacks(collected.white, collected.black))

@@ -1,7 +1,11 @@
-"""Capture → depth.exr, points.ply and report.json, whatever the depth is measured with: the capture's frames decide."""
+"""Measure the depth of a capture and write depth.exr, points.ply and report.json.
+
+The way of the data: the kind of the capture's frames chooses a row of `KINDS`, whose `solve` makes a DepthSolution of them: patterns.py
+(with codes.py and decoders.py), laser.py or tof.py. points.py makes the cloud of it, and the files are written here.
+"""
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,7 +13,7 @@ import numpy as np
 
 from kernels import device as devices
 from kernels.status import Status
-from service.depth.laser import check_laser, solve_laser
+from service.depth.laser import solve_laser
 from service.depth.patterns import solve_patterns
 from service.depth.points import point_cloud
 from service.depth.solution import DepthSolution
@@ -25,7 +29,7 @@ from stage.files import write_text
 from stage.fingerprint import Fingerprints
 from stage.ingest import CACHE_FOLDER
 from stage.manifest import FILE_NAME, Frame
-from stage.pattern import UniformPattern
+from stage.patterns.base import UniformPattern
 from stage.ply import POINTS_FILE, write_ply
 
 REPORT_FILE = "report.json"
@@ -33,8 +37,31 @@ PLAUSIBLE_M = 0.005, 500.0
 """Median depths that a projector or laser measures: outside, the units of the calibration are wrong."""
 
 
+class Kind(NamedTuple):
+    """One kind of frames that depth is measured with."""
+
+    holds: Callable[[Frame], bool]
+    """Whether a frame is of this kind. Black and white frames go with any."""
+    solve: Callable[[Capture, np.ndarray, DepthRequest, str, Timings], DepthSolution]
+    """Capture, mask, request, device and timings → solution."""
+    lengths: str | None
+    """Field of the manifest whose unit is wrong if the depths are not plausible; None: depths of any size are."""
+
+
+KINDS: dict[Ranging, Kind] = {
+    Ranging.PATTERN: Kind(lambda frame: frame.pattern is not None and not isinstance(frame.pattern, UniformPattern), solve_patterns,
+                          "projector.camera_from_projector"),
+    Ranging.LASER: Kind(lambda frame: frame.laser is not None, solve_laser, "frames[].laser"),
+    Ranging.TOF: Kind(lambda frame: frame.tof is not None,
+                      lambda capture, mask, request, device, timings: solve_tof(
+                          capture, request.tof, near_m=request.near_m, far_m=request.far_m, device=device, timings=timings),
+                      None),
+}
+"""Kind of frames → how depth is measured with them."""
+
+
 class DepthResult(NamedTuple):
-    """What was made."""
+    """The files and numbers of a depth that was written."""
 
     maps: DepthMaps
     depth_path: Path
@@ -65,7 +92,7 @@ def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResul
     if request.normals and capture.camera.projection != "perspective":
         raise RequestError("--normals: needs a perspective camera, that of the capture is orthographic")
     mask = capture.mask()
-    solution = _solve(using, capture, mask, request, device, timings)
+    solution = KINDS[using].solve(capture, mask, request, device, timings)
     _check_plausible(solution, capture, using)
     timings.stage("points", 1)
     cloud = point_cloud(solution, capture.camera, color_space=capture.manifest.color_space, normals=request.normals)
@@ -74,7 +101,7 @@ def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResul
     sources = metadata(request, capture=capture.name, inputs=content, method=solution.method)
     maps = DepthMaps(camera=capture.camera, mask=solution.solved, depth=solution.depth, range=solution.range_m,
                      projector_u=solution.projector_u, projector_v=solution.projector_v, amplitude=solution.amplitude,
-                     sigma=solution.sigma, confidence=solution.sureness(), status=solution.status, provenance=sources)
+                     sigma=solution.sigma, confidence=solution.confidence_map(), status=solution.status, provenance=sources)
     depth_path, points_path, report_path = (request.out / name for name in (DEPTH_FILE, POINTS_FILE, REPORT_FILE))
     maps.write(depth_path)
     write_ply(cloud, points_path, comments=tuple(f"{key} {value}" for key, value in sources.items()))
@@ -95,58 +122,41 @@ def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResul
     return DepthResult(maps, depth_path, points_path, report_path, solution.method, len(cloud.points), counts)
 
 
-def _solve(using: Ranging, capture: Capture, mask: np.ndarray, request: DepthRequest, device: str, timings: Timings) -> DepthSolution:
-    """Each kind of frames to its own solver."""
-    near, far = request.near_m or 0.0, request.far_m or np.inf
-    if using is Ranging.TOF:
-        return solve_tof(capture, request.tof, near_m=request.near_m, far_m=request.far_m, device=device, timings=timings)
-    if using is Ranging.LASER:
-        check_laser(capture)
-        return solve_laser(capture, mask, device, near_m=near, far_m=far, timings=timings)
-    return solve_patterns(capture, mask, request, device, near_m=near, far_m=far, timings=timings)
-
-
 def _ranging(capture: Capture, wanted: Ranging | None) -> Ranging:
-    """What the frames are for. Black and white frames go with anything."""
-    found = [using for using in Ranging if any(_is(frame, using) for frame in capture.manifest.frames)]
+    """Return the kind of frames to measure with: the one that was asked for, else the only one that there is."""
+    found = [using for using, kind in KINDS.items() if any(kind.holds(frame) for frame in capture.manifest.frames)]
     where = f"{capture.folder / FILE_NAME}: frames"
+    listed = " and ".join(found)
     if not found:
         raise ManifestError(f"{where}: none has a pattern with a code, a laser or tof: relit depth needs such frames, "
                             "relit solve takes light frames")
     if wanted is not None:
         if wanted not in found:
-            raise ManifestError(f"{where}: none has a {wanted}, which --using asks for: there are {_and(found)} frames")
+            raise ManifestError(f"{where}: none has a {wanted}, which --using asks for: there are {listed} frames")
         return wanted
     if len(found) > 1:
-        raise ManifestError(f"{where}: there are {_and(found)} frames: --using says which to take")
+        raise ManifestError(f"{where}: there are {listed} frames: --using says which to take")
     return found[0]
 
 
-def _is(frame: Frame, using: Ranging) -> bool:
-    if using is Ranging.PATTERN:
-        return frame.pattern is not None and not isinstance(frame.pattern, UniformPattern)
-    return getattr(frame, using.value) is not None
-
-
-def _and(words: Iterable[str]) -> str:
-    return " and ".join(words)
-
-
 def _check_plausible(solution: DepthSolution, capture: Capture, using: Ranging) -> None:
-    """Nothing solved, or depths that no such device measures, is bad input and no result."""
+    """Refuse a solution without any depth, or with depths that no such device measures.
+
+    Raises:
+        ManifestError: says what most often is the cause.
+    """
     solved = solution.solved
     if not solved.any():
         reasons = {name: count for name, count in solution.counts(np.ones_like(solved)).items() if count and name != "unsolved"}
         text = ", ".join(f"{count} {name}" for name, count in reasons.items()) or "nothing is inside the mask"
         raise ManifestError(f"{capture.folder}: no pixel has a depth ({text}): {_advice(reasons, using)}")
-    middle = float(np.median(solution.depth[solved]))
-    if using is not Ranging.TOF and not PLAUSIBLE_M[0] <= middle <= PLAUSIBLE_M[1]:
-        field = "projector.camera_from_projector" if using is Ranging.PATTERN else "frames[].laser"
+    middle, field = float(np.median(solution.depth[solved])), KINDS[using].lengths
+    if field is not None and not PLAUSIBLE_M[0] <= middle <= PLAUSIBLE_M[1]:
         raise ManifestError(f"{capture.folder / FILE_NAME}: {field}: the median depth comes out as {middle:.3g} m: give lengths in metres")
 
 
 def _advice(reasons: dict[str, int], using: Ranging) -> str:
-    """What most often is the cause of the commonest status."""
+    """Return what most often is the cause of the commonest status."""
     most = max(reasons, key=lambda name: reasons[name], default="")
     if most == Status.ILL_POSED.name.lower():
         return "the projected coordinate does not change with depth: project columns from beside the camera, rows from above it"
@@ -158,7 +168,7 @@ def _advice(reasons: dict[str, int], using: Ranging) -> str:
 
 
 def _content(capture: Capture) -> str:
-    """Content hash of every file that the capture names, combined."""
+    """Return the content hashes of every file that the capture names, combined."""
     names = sorted({name for _, name in capture.files()})
     hashes = Fingerprints(capture.folder, capture.folder / CACHE_FOLDER / "files.json").of(names)
     combined = hashlib.blake2b(digest_size=16)
@@ -168,7 +178,7 @@ def _content(capture: Capture) -> str:
 
 
 def statistics(values: np.ndarray) -> dict[str, Any]:
-    """Median and the 5th and 95th percentile of what was measured, for the report."""
+    """Return the median and the 5th and 95th percentile of what was measured, for the report."""
     if values.size == 0:
         return {}
     low, middle, high = np.percentile(values.astype(np.float64), [5, 50, 95])

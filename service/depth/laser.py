@@ -1,4 +1,7 @@
-"""Laser frames → depth: the spot of each ray, the stripe of each plane, and all of them in one map."""
+"""Laser frames → depth: the spot of each ray, the stripe of each plane, and all of them in one map.
+
+Source: Steger, "An unbiased detector of curvilinear structures", PAMI 1998 (stripes).
+"""
 
 from collections import Counter
 from typing import NamedTuple
@@ -9,14 +12,15 @@ from kernels.status import Status
 from kernels.structured.spot import find_spot, nearest_points
 from kernels.structured.stripe import find_stripe, plane_depths
 from service.depth.solution import DepthSolution
-from service.depth.stripe_map import Samples, stripe_map
+from service.depth.stripe_map import StripeSamples, stripe_map
 from service.reporting.progress import Timings
+from service.requests.depth import DepthRequest
 from stage.camera import Camera
 from stage.capture import Capture
 from stage.correction import Correction
 from stage.errors import ManifestError
 from stage.manifest import FILE_NAME, Frame
-from stage.pattern import UniformPattern
+from stage.patterns.base import UniformPattern
 from stage.ranging import LaserPlane, LaserRay
 from stage.triangulation_check import check_perspective
 
@@ -32,7 +36,7 @@ NOISE_SAMPLE = 200_000
 
 
 class _Spot(NamedTuple):
-    """One ray's result."""
+    """The point that one laser ray lights."""
 
     point: np.ndarray  # [3] metres, camera frame
     row: int
@@ -42,24 +46,26 @@ class _Spot(NamedTuple):
     gap: float
 
 
-def solve_laser(capture: Capture, mask: np.ndarray, device: str, *, near_m: float, far_m: float, timings: Timings) -> DepthSolution:
+def solve_laser(capture: Capture, mask: np.ndarray, request: DepthRequest, device: str, timings: Timings) -> DepthSolution:
     """Measure every laser frame.
 
     Args:
         capture: with laser frames; `off` or `black` frames of it are its ambient light.
         mask: [rows, cols] bool.
-        device: where.
-        near_m, far_m: depths outside are OUT_OF_RANGE.
+        request: its span of depths; depths outside are OUT_OF_RANGE.
+        device: where to run.
         timings: told of every stage.
 
     Raises:
-        StageError: a frame is unreadable, or no frame shows a spot or stripe.
+        StageError: a laser stands where it cannot, a frame is unreadable, or no frame shows a spot or stripe.
     """
+    check_laser(capture)
+    near_m, far_m = request.near_m or 0.0, request.far_m or np.inf
     frames = [frame for frame in capture.manifest.frames if frame.laser is not None]
     correction = Correction.of(capture)
     background, source = _background(capture, correction, frames, timings)
     camera, shape = capture.camera, mask.shape
-    samples: dict[str, list[Samples]] = {"row": [], "column": []}
+    samples: dict[str, list[StripeSamples]] = {"row": [], "column": []}
     spots: list[_Spot] = []
     seen: Counter[str] = Counter()
     brightest = np.zeros(shape, np.float32)
@@ -79,7 +85,7 @@ def solve_laser(capture: Capture, mask: np.ndarray, device: str, *, near_m: floa
             found = _measure_stripe(signal, mask, frame.laser, along, camera, device, near_m, far_m)
             samples[along].append(found)
         timings.advance(number + 1)
-    kept = {along: Samples.joined(parts) for along, parts in samples.items() if parts}
+    kept = {along: StripeSamples.joined(parts) for along, parts in samples.items() if parts}
     _refuse_faint(kept)
     for part in kept.values():
         numbers = np.bincount(part.status)
@@ -92,7 +98,7 @@ def solve_laser(capture: Capture, mask: np.ndarray, device: str, *, near_m: floa
 
 
 def _background(capture: Capture, correction: Correction, frames: list[Frame], timings: Timings) -> tuple[np.ndarray, str]:
-    """[rows, cols, 3] float32 to take off each frame, and in words where it comes from."""
+    """Return the ambient light to take off each frame, [rows, cols, 3] float32, and in words where it comes from."""
     dark = [frame for frame in capture.manifest.frames if isinstance(frame.pattern, UniformPattern) and frame.pattern.code == "black"]
     shape = (capture.camera.height, capture.camera.width, 3)
     if dark:
@@ -131,7 +137,7 @@ def _measure_spot(signal: np.ndarray, laser: LaserRay, camera: Camera, near_m: f
 
 
 def _measure_stripe(signal: np.ndarray, mask: np.ndarray, laser: LaserPlane, along: str, camera: Camera, device: str,
-                    near_m: float, far_m: float) -> Samples:
+                    near_m: float, far_m: float) -> StripeSamples:
     inside = signal[mask]
     few = inside[:: max(1, len(inside) // NOISE_SAMPLE)]
     middle = float(np.median(few))
@@ -150,10 +156,10 @@ def _measure_stripe(signal: np.ndarray, mask: np.ndarray, laser: LaserPlane, alo
         near = np.isfinite(met.depth) & (met.depth >= near_m) & (met.depth <= far_m)
     status[ok & ~near] = Status.OUT_OF_RANGE
     spread = sigma * met.per_pixel / camera.focal_px[0 if along == "row" else 1]
-    return Samples(lines, centre, np.nan_to_num(met.depth), np.nan_to_num(spread), amplitude, status)
+    return StripeSamples(lines, centre, np.nan_to_num(met.depth), np.nan_to_num(spread), amplitude, status)
 
 
-def _refuse_faint(kept: dict[str, Samples]) -> None:
+def _refuse_faint(kept: dict[str, StripeSamples]) -> None:
     """Mark stripes that are too faint beside the others to be the laser's own light."""
     found = np.concatenate([part.amplitude[part.status == Status.OK] for part in kept.values()]) if kept else np.zeros(0)
     if len(found):
@@ -162,9 +168,9 @@ def _refuse_faint(kept: dict[str, Samples]) -> None:
             part.status[(part.status == Status.OK) & (part.amplitude < least)] = Status.LOW_MODULATION
 
 
-def _combine(capture: Capture, shape: tuple[int, ...], kept: dict[str, Samples], spots: list[_Spot], brightest: np.ndarray,
+def _combine(capture: Capture, shape: tuple[int, ...], kept: dict[str, StripeSamples], spots: list[_Spot], brightest: np.ndarray,
              facts: dict[str, object]) -> DepthSolution:
-    """Stripes of either direction and spots in one map: of several at one pixel the surest."""
+    """Put stripes of either direction and spots into one map: of several at one pixel the surest."""
     camera = capture.camera
     maps = [stripe_map(part, shape if along == "row" else shape[::-1], camera, along=along)
             for along, part in kept.items()]
@@ -197,7 +203,7 @@ def _words(seen: Counter[str]) -> str:
 
 
 def check_laser(capture: Capture) -> None:
-    """Refuse lasers whose place makes no sense.
+    """Refuse lasers that stand where the camera sees no depth.
 
     Raises:
         ManifestError: names the frame, or the camera when it is orthographic.

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,7 +11,8 @@ from kernels.structured.decoded import Decoded
 from kernels.structured.frames import NoiseModel, saturated_bits, upload
 from kernels.structured.join import cropped
 from kernels.structured.triangulate import ProjectorModel, triangulate
-from service.depth.codes import AxisPlan, PatternDevice, Readings, plan_axis
+from service.depth.codes import choose_decoder
+from service.depth.decoders import AxisDecoder, PatternDevice, Readings
 from service.depth.solution import DepthSolution
 from service.reporting.progress import Timings
 from service.requests.depth import DepthRequest
@@ -20,7 +22,8 @@ from stage.colour_spaces import is_linear
 from stage.correction import Correction
 from stage.errors import ManifestError
 from stage.manifest import FILE_NAME, Frame
-from stage.patterns.collect import BinaryCode, Collected, collect
+from stage.patterns.binary import BinaryCode
+from stage.patterns.codes import Collected, collect
 from stage.planes import Planes, frame_planes
 from stage.projector import Projector
 from stage.triangulation_check import check_projector
@@ -33,16 +36,29 @@ DECODE_BYTES_PER_PIXEL = 200
 """What decoding and triangulation allocate beside the planes."""
 
 
-def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, device: str, *, near_m: float, far_m: float,
-                   timings: Timings) -> DepthSolution:
+class PatternCodes(NamedTuple):
+    """The codes of a capture and the decoder of each axis; None where an axis has no code."""
+
+    collected: Collected
+    columns: AxisDecoder | None
+    rows: AxisDecoder | None
+    unused: tuple[str, ...]
+    """Codes that no decoder reads."""
+
+    @property
+    def colour(self) -> bool:
+        """Return whether a decoder needs colour frames."""
+        return any(decoder is not None and decoder.colour for decoder in (self.columns, self.rows))
+
+
+def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, device: str, timings: Timings) -> DepthSolution:
     """Decode the projector's columns, rows or both, and intersect them with the lines of sight.
 
     Args:
         capture: with a projector and pattern frames.
         mask: [rows, cols] bool.
-        request: its noise and residual.
-        device: where.
-        near_m, far_m: depths outside are OUT_OF_RANGE.
+        request: its noise, residual and span of depths; depths outside are OUT_OF_RANGE.
+        device: where to run.
         timings: told of every stage.
 
     Raises:
@@ -50,49 +66,49 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
     """
     projector = check_projector(capture)
     frames = [frame for frame in capture.manifest.frames if frame.pattern is not None]
-    collected, columns, rows = plan_codes(capture, frames, PatternDevice(projector.resolution, projector.response, projector.crosstalk),
-                                          refine=request.refine)
-    plans = (columns, rows)
-    colour = any(plan is not None and plan.colour for plan in plans)
+    codes = read_codes(capture, frames, PatternDevice(projector.resolution, projector.response, projector.crosstalk), refine=request.refine)
     timings.stage("frames", len(frames))
-    with frame_planes(capture, frames, colour=colour, cache=request.cache, progress=timings.advance) as planes:
+    with frame_planes(capture, frames, colour=codes.colour, cache=request.cache, progress=timings.advance) as planes:
         full = full_scale(planes, capture, frames)
         noise = NoiseModel(request.read_noise * full, request.photon_gain * full)
-        solution = _bands(planes, mask, plans, projector, capture, noise, device, (near_m, far_m, request.max_residual_px),
-                          timings)
-    solution.colour = scene_colour(capture, frames, collected)
+        solution = _bands(planes, mask, codes, projector, capture, noise, device, request, timings)
+    solution.colour = scene_colour(capture, frames, codes.collected)
     solution.facts |= {"full_scale": float(f"{full:.6g}"), "frames": len(frames),
-                       "codes": {plan.axis: plan.name for plan in plans if plan is not None},
-                       "unused": [name for plan in plans if plan is not None for name in plan.unused]}
+                       "codes": {decoder.axis: decoder.name for decoder in (codes.columns, codes.rows) if decoder is not None},
+                       "unused": list(codes.unused)}
     return solution
 
 
-def plan_codes(capture: Capture, frames: list[Frame], projector: PatternDevice, *,
-               refine: bool = False) -> tuple[Collected, AxisPlan | None, AxisPlan | None]:
-    """The codes of a capture and how each axis is decoded; what is missing is said with the file's name."""
+def read_codes(capture: Capture, frames: list[Frame], projector: PatternDevice, *, refine: bool = False) -> PatternCodes:
+    """Return the codes of a capture and how each axis is decoded.
+
+    Raises:
+        ManifestError: a code is incomplete; names the file.
+    """
     try:
         collect([frame.pattern for frame in capture.manifest.frames])  # so that what is wrong is said with the manifest's numbers
         collected = collect([frame.pattern for frame in frames])
-        columns, rows = (plan_axis(collected, axis, projector, refine=refine) for axis in ("column", "row"))
-        return collected, columns, rows
+        columns, unused_columns = choose_decoder(collected, "column", projector, refine=refine)
+        rows, unused_rows = choose_decoder(collected, "row", projector, refine=refine)
+        return PatternCodes(collected, columns, rows, unused_columns + unused_rows)
     except ManifestError as error:
         raise ManifestError(f"{capture.folder / FILE_NAME}: frames: {error}") from error
 
 
-def _bands(planes: Planes, mask: np.ndarray, plans: tuple[AxisPlan | None, AxisPlan | None], projector: Projector, capture: Capture,
-           noise: NoiseModel, device: str, limits: tuple[float, float, float], timings: Timings) -> DepthSolution:
+def _bands(planes: Planes, mask: np.ndarray, codes: PatternCodes, projector: Projector, capture: Capture, noise: NoiseModel, device: str,
+           request: DepthRequest, timings: Timings) -> DepthSolution:
     shape = mask.shape
-    columns, rows = plans
+    columns, rows = codes.columns, codes.rows
     model = projector_model(projector)
     x, y = capture.camera.plane_coordinates()
     maps = {name: np.zeros(shape, np.float32) for name in ("depth", "sigma", "residual", "amplitude", "u", "v")}
     status = np.zeros(shape, np.uint8)
     guessed = {name: np.zeros(shape, dtype=bool) for name in "uv"}
     timings.stage("decode", shape[0])
-    for band, decoded in decoded_bands(planes, plans, noise, device):
-        near_m, far_m, residual = limits
+    for band, decoded in decoded_bands(planes, (columns, rows), noise, device):
         found = triangulate(x[band].ravel().astype(np.float32), y[band].ravel().astype(np.float32), decoded[0], decoded[1], model,
-                            near_m=near_m, far_m=far_m, max_residual_px=residual, device=device)
+                            near_m=request.near_m or 0.0, far_m=request.far_m or np.inf, max_residual_px=request.max_residual_px,
+                            device=device)
         part = mask[band]
 
         def place(name: str, values: np.ndarray, kept: np.ndarray, band: slice = band) -> None:
@@ -120,21 +136,21 @@ def _bands(planes: Planes, mask: np.ndarray, plans: tuple[AxisPlan | None, AxisP
     if columns is not None and rows is not None and solved.any():
         low, high = np.percentile(maps["residual"][solved], [50, 95])
         facts["residual_px"] = {"median": float(f"{low:.4g}"), "p95": float(f"{high:.4g}")}
-    names = sorted({plan.name for plan in plans if plan is not None})
+    names = sorted({decoder.name for decoder in (columns, rows) if decoder is not None})
     return DepthSolution(method=", ".join(names), depth=maps["depth"], status=status, sigma=maps["sigma"],
                          projector_u=maps["u"] if columns is not None else None, projector_v=maps["v"] if rows is not None else None,
                          amplitude=maps["amplitude"], facts=facts)
 
 
-def decoded_bands(planes: Planes, plans: Sequence[AxisPlan | None], noise: NoiseModel,
+def decoded_bands(planes: Planes, decoders: Sequence[AxisDecoder | None], noise: NoiseModel,
                   device: str) -> Iterator[tuple[slice, list[Decoded | None]]]:
     """Decode the planes band by band.
 
     Yields:
-        A range of rows, and each axis decoded in it; None where an axis has no plan.
+        A range of rows, and each axis decoded in it; None where an axis has no decoder.
     """
     _, height, _, width = planes.values.shape
-    halo = max((plan.halo for plan in plans if plan is not None), default=0)
+    halo = max((decoder.halo for decoder in decoders if decoder is not None), default=0)
     for band in planes.bands(DECODE_BYTES_PER_PIXEL):
         around = slice(max(band.start - halo, 0), min(band.stop + halo, height))
         values = planes.band(around)
@@ -142,7 +158,7 @@ def decoded_bands(planes: Planes, plans: Sequence[AxisPlan | None], noise: Noise
         grey = values[:, 0] if values.shape[1] == 1 else np.tensordot(values, np.array(GREY_WEIGHTS, np.float32), ([1], [0]))
         readings = Readings(upload(np.ascontiguousarray(grey), bits, device=device),
                             upload(values, bits, device=device) if values.shape[1] > 1 else None, width)
-        decoded = [None if plan is None else plan.decode(readings, noise) for plan in plans]
+        decoded = [None if decoder is None else decoder.decode(readings, noise) for decoder in decoders]
         if around != band:
             first, count = (band.start - around.start) * width, (band.stop - band.start) * width
             decoded = [None if axis is None else cropped(axis, first, count, device=device) for axis in decoded]
@@ -150,12 +166,12 @@ def decoded_bands(planes: Planes, plans: Sequence[AxisPlan | None], noise: Noise
 
 
 def _amplitude(decoded: list[Decoded | None]) -> np.ndarray:
-    """The weaker of the axes: a pixel is as good as its worse one."""
+    """Return the amplitude of the weaker axis: a pixel is as good as its worse one."""
     return np.minimum.reduce([axis.amplitude.numpy() for axis in decoded if axis is not None])
 
 
 def projector_model(projector: Projector) -> ProjectorModel:
-    """The projector as triangulation takes it."""
+    """Return the projector as triangulation takes it."""
     width, height = projector.resolution
     lens = projector.distortion
     return ProjectorModel((width, height), projector.focal_px, projector.principal_px or (width / 2, height / 2),
@@ -164,7 +180,7 @@ def projector_model(projector: Projector) -> ProjectorModel:
 
 
 def full_scale(planes: Planes, capture: Capture, frames: list[Frame]) -> float:
-    """The largest reading there can be, in the unit of the corrected images."""
+    """Return the largest reading there can be, in the unit of the corrected images."""
     exposure = min((frame.exposure_s for frame in frames if frame.exposure_s is not None), default=1.0)
     manifest = capture.manifest
     integers = all(Path(frame.image).suffix.lower() in (".png", ".jpg", ".jpeg") for frame in frames)
@@ -177,7 +193,10 @@ def full_scale(planes: Planes, capture: Capture, frames: list[Frame]) -> float:
 
 
 def scene_colour(capture: Capture, frames: list[Frame], collected: Collected) -> np.ndarray | None:
-    """[rows, cols, 3] what the scene looks like: the white frame, else a bit and its inverse, which light it evenly together."""
+    """Return what the scene looks like, [rows, cols, 3] linear: the white frame, else a bit and its inverse, which add up to even light.
+
+    None if the capture has neither.
+    """
     numbers = [collected.white] if collected.white is not None else []
     for code in collected.codes:
         if not numbers and isinstance(code, BinaryCode) and code.inverses is not None:

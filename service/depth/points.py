@@ -1,4 +1,4 @@
-"""A solved depth → the point cloud of points.ply, with colours and normals."""
+"""The point cloud of a solved depth, with colours and normals."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ WHITE_PERCENTILE = 99.0
 
 
 def point_cloud(solution: DepthSolution, camera: Camera, *, color_space: str, normals: bool) -> PointCloud:
-    """One point a solved pixel, row by row; or the measured places between pixels, where the method has them.
+    """Return one point for each solved pixel, row by row; or the measured places between pixels, if the method has them.
 
     Args:
         solution: of the whole image.
@@ -38,13 +38,21 @@ def point_cloud(solution: DepthSolution, camera: Camera, *, color_space: str, no
 
 
 def display_colours(solution: DepthSolution, color_space: str) -> np.ndarray:
-    """[rows, cols, 3] uint8, sRGB: what the scene looks like under even light, its brightest one per cent white."""
+    """Return what the scene looks like under even light, its brightest one per cent white: [rows, cols, 3] uint8, sRGB."""
     linear = solution.colour
     if linear is None:
         grey = np.zeros(solution.depth.shape, np.float32) if solution.amplitude is None else solution.amplitude
         linear = np.repeat(grey[..., None], 3, axis=-1)
-    seen = linear[solution.solved].max(axis=-1, initial=0.0)
-    white = float(np.percentile(seen, WHITE_PERCENTILE)) if seen.size else 0.0
+    return srgb_bytes(linear, white_of(linear[solution.solved].max(axis=-1, initial=0.0)), linear_space(color_space))
+
+
+def white_of(seen: np.ndarray) -> float:
+    """Return the light that is shown as full white; 0 where nothing is seen."""
+    return float(np.percentile(seen, WHITE_PERCENTILE)) if seen.size else 0.0
+
+
+def srgb_bytes(linear: np.ndarray, white: float, color_space: str) -> np.ndarray:
+    """Return linear colours for display, [rows, cols, 3] uint8, sRGB, `white` as 255; middle grey if white is 0."""
     shown = np.clip(linear / white, 0, 1) if white > 0 else np.full_like(linear, 0.5)
-    encoded = convert(np.ascontiguousarray(shown, dtype=np.float32), linear_space(color_space), "srgb_texture")
+    encoded = convert(np.ascontiguousarray(shown, dtype=np.float32), color_space, "srgb_texture")
     return np.rint(255 * np.clip(encoded, 0, 1)).astype(np.uint8)

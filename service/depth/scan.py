@@ -1,4 +1,4 @@
-"""A scan folder → points.ply, points.usdc, points.las and report.json: shots of a platform that may move, as one cloud in the world."""
+"""Turn the shots of a scanner on a platform that may move into one cloud in the world: points.ply, .usdc, .las and report.json."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,6 +12,7 @@ from kernels.tof.pileup import correct_pileup, place, unhurried
 from kernels.tof.pulse import STEPS_PER_SIGMA
 from kernels.tof.pulse_width import estimate_pulse
 from kernels.tof.returns import find_returns
+from service.depth.points import srgb_bytes, white_of
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import metadata, report
@@ -25,11 +26,11 @@ from stage.tof.scan import FILE_NAME, Shots, place_points, read_scan
 
 USD_FILE, REPORT_FILE = "points.usdc", "report.json"
 MOST_RETURNS = 4
-WHITE_PERCENTILE = 99.0
+"""Returns that are looked for in a waveform."""
 
 
 class ScanResult(NamedTuple):
-    """What was made."""
+    """The files and numbers of a scan that was written."""
 
     cloud: PointCloud
     points_path: Path
@@ -72,10 +73,7 @@ def scan(request: ScanRequest, progress: Progress | None = None) -> ScanResult:
     shots_used = len(np.unique(index))
     counts = {"shots": len(shots.time_s), "with_points": shots_used, "points": len(points),
               "out_of_range": int((~inside).sum()), "outside_track": int((~covered).sum())}
-    white = float(np.percentile(intensity, WHITE_PERCENTILE))
-    grey = np.clip(intensity / white, 0, 1) if white > 0 else np.full(len(intensity), 0.5)
-    encoded = np.where(grey <= 0.0031308, 12.92 * grey, 1.055 * np.maximum(grey, 1e-9) ** (1 / 2.4) - 0.055)
-    colours = np.repeat(np.rint(255 * encoded).astype(np.uint8)[:, None], 3, axis=1)
+    colours = srgb_bytes(np.repeat(intensity[None, :, None], 3, axis=2), white_of(intensity), "lin_rec709_scene")[0]
     cloud = PointCloud(points.astype(np.float32), colours, intensity=intensity.astype(np.float32))
     timings.stage("write", 1)
     names = [FILE_NAME, shots.scan.shots, *(() if shots.scan.waveforms is None else (shots.scan.waveforms.file,))]
@@ -98,7 +96,7 @@ def scan(request: ScanRequest, progress: Progress | None = None) -> ScanResult:
 
 
 def _returns(shots: Shots, device: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-    """Shot, range and intensity of each return, and what was found out about them."""
+    """Return shot, range and intensity of each return, and facts about them for the report."""
     if shots.waveforms is None:
         assert shots.range_m is not None and shots.intensity is not None  # the reader gives either these or waveforms
         index = np.nonzero(np.isfinite(shots.range_m) & np.isfinite(shots.intensity))[0]

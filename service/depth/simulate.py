@@ -1,4 +1,4 @@
-"""A depth → the capture that a time-of-flight camera would make of it, to plan with: simulate, solve, compare."""
+"""Simulate the capture that a time-of-flight camera would make of a depth, to plan with: simulate, solve, compare."""
 
 from pathlib import Path
 
@@ -48,7 +48,7 @@ def simulate_tof(request: SimulateCwRequest | SimulatePulsedRequest) -> Path:
 
 
 def _scene(maps: DepthMaps, request: SimulateRequest) -> TofScene:
-    """Ranges, and cosines from the normals of the depth; pixels without a depth are black, where the normal is not known it faces."""
+    """Return ranges, and cosines from the normals of the depth; pixels without a depth are black, unknown normals face the camera."""
     range_m = np.where(maps.mask, maps.depth / z_per_range(maps.camera), 1.0)
     rays = _rays(maps.camera)
     normal = depth_normals(maps.depth, maps.mask, maps.camera).astype(np.float64)
@@ -58,7 +58,7 @@ def _scene(maps: DepthMaps, request: SimulateRequest) -> TofScene:
 
 
 def _rays(camera: Camera) -> np.ndarray:
-    """[rows, cols, 3] unit directions away from the camera."""
+    """Return unit directions away from the camera, [rows, cols, 3]."""
     x, y = camera.plane_coordinates()
     away = -np.ones_like(x)
     if camera.projection == "orthographic":

@@ -1,4 +1,4 @@
-"""What every way of measuring depth gives back."""
+"""The result of every way of measuring depth: depth, its uncertainty and status at every pixel."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -33,17 +33,17 @@ class DepthSolution:
 
     @property
     def solved(self) -> np.ndarray:
-        """[rows, cols] bool: where there is a depth."""
+        """Return where there is a depth, [rows, cols] bool."""
         return np.isin(self.status, SOLVED)
 
-    def sureness(self) -> np.ndarray | None:
-        """[rows, cols] 0…1: the method's own, or 1 / (1 + σ / (depth / 1000)) from the standard deviation."""
+    def confidence_map(self) -> np.ndarray | None:
+        """Return confidence 0…1, [rows, cols]: the method's own, or 1 / (1 + σ / (depth / 1000)) from the standard deviation."""
         if self.confidence is not None or self.sigma is None:
             return self.confidence
         relative = self.sigma / np.maximum(self.depth * HALF_SURE, 1e-12)
         return np.where(self.solved, 1 / (1 + relative), 0).astype(np.float32)
 
     def counts(self, mask: np.ndarray) -> dict[str, int]:
-        """Pixels of the mask per status, by name."""
+        """Return how many pixels of the mask have each status, by name."""
         numbers = np.bincount(self.status[mask], minlength=max(Status) + 1)
         return {status.name.lower(): int(numbers[status]) for status in Status}

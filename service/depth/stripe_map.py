@@ -20,7 +20,7 @@ JOIN_PX = 2.0
 """Pixels between two samples that are no farther apart than this are filled."""
 
 
-class Samples(NamedTuple):
+class StripeSamples(NamedTuple):
     """Stripe centres of several frames; `line` is a row and `place` a u, or a column and a v."""
 
     line: np.ndarray  # [n] int
@@ -31,8 +31,8 @@ class Samples(NamedTuple):
     status: np.ndarray  # [n] uint8, kernels.status.Status
 
     @classmethod
-    def joined(cls, parts: Sequence["Samples"]) -> "Samples":
-        """All of them."""
+    def joined(cls, parts: Sequence["StripeSamples"]) -> "StripeSamples":
+        """Return the samples of several frames together."""
         return cls(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
@@ -47,8 +47,8 @@ class StripeMap(NamedTuple):
     pixels: np.ndarray  # [n, 2] int, row and column of the pixel that holds it
 
 
-def stripe_map(samples: Samples, shape: tuple[int, ...], camera: Camera, *, along: str) -> StripeMap:
-    """Bring samples to pixel centres.
+def stripe_map(samples: StripeSamples, shape: tuple[int, ...], camera: Camera, *, along: str) -> StripeMap:
+    """Carry samples to pixel centres.
 
     Args:
         samples: those with status OK are used.
@@ -95,6 +95,6 @@ def stripe_map(samples: Samples, shape: tuple[int, ...], camera: Camera, *, alon
 
 
 def _least(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """The slope to carry a sample along: the gentler of the two, 0 where they disagree in sign or neither is known."""
+    """Return the slope to carry a sample along: the gentler of the two, 0 where they disagree in sign or neither is known."""
     b, a = np.where(np.isnan(before), after, before), np.where(np.isnan(after), before, after)
     return np.nan_to_num(np.where(a * b > 0, np.sign(a) * np.minimum(np.abs(a), np.abs(b)), 0.0))

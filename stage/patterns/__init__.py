@@ -1,1 +1,1 @@
-"""Patterns to project: their images, their manifest entries, which frames of a capture belong together, and what they cost. NumPy only."""
+"""Patterns to project: manifest entries, their images, which frames of a capture belong together, and what they cost. NumPy only."""

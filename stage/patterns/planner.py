@@ -1,7 +1,8 @@
 """Before projecting: how many images a code takes, how long that lasts, and how precise the depth will be.
 
 The counts are those of the lecture, in which code 0 (no light) is not used: N stripes need ⌈log2(N + 1)⌉ binary images. What
-is projected here numbers stripes from 0 and may add inverses and white and black; both counts are given.
+is projected here numbers stripes from 0 and may add inverses and white and black; both counts are given. The line of each code stands
+in service/depth/codes.py.
 
 Depth: a projector column is a plane; a camera beside it at baseline b, both of focal length f projector pixels, sees depth
 Z = f b / d at disparity d, so a standard deviation σ_u of the column gives σ_Z = Z² σ_u / (f b). Deviations of the column:
@@ -16,22 +17,33 @@ Source: Nayar, First Principles of Computer Vision, 3-5 (counts); error of phase
 digital phase detection", Applied Optics 1997, equation 21.
 """
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 
-from stage.patterns.stripes import digit_count
+from stage.patterns.base import digit_count
 
 
 class Rig(NamedTuple):
-    """What the precision depends on."""
+    """The geometry that the precision of a depth depends on."""
 
     baseline_m: float
     distance_m: float
     focal_px: float
     """Of the projector, in its pixels."""
-    noise: float
-    """Standard deviation of a reading over the amplitude of the pattern in it (half of white minus black)."""
+
+
+class Cost(NamedTuple):
+    """What one axis of a code costs and gives."""
+
+    name: str
+    minimum: int
+    """Images of one axis as the lecture counts."""
+    images: int
+    """Images as projected here."""
+    column_sigma_px: float
+    """Standard deviation of the column, projector pixels."""
 
 
 class Plan(NamedTuple):
@@ -41,7 +53,7 @@ class Plan(NamedTuple):
     minimum: int
     """Images of one axis as the lecture counts."""
     images: int
-    """As projected here."""
+    """Images as projected here."""
     seconds: float
     """To capture them."""
     column_sigma_px: float
@@ -50,17 +62,17 @@ class Plan(NamedTuple):
 
 
 def point_count(columns: int, rows: int) -> int:
-    """Images to light every projector pixel by itself."""
+    """Return the images that light every projector pixel alone."""
     return columns * rows
 
 
 def line_count(columns: int) -> int:
-    """Images to light every column by itself."""
+    """Return the images that light every column alone."""
     return columns
 
 
 def kary_count(columns: int, base: int = 2) -> int:
-    """⌈log_k(N + 1)⌉: images that number N stripes in base k when code 0 is not used.
+    """Return ⌈log_k(N + 1)⌉: images that number N stripes in base k when code 0 is not used.
 
     Raises:
         ValueError: no stripe, or a base under 2.
@@ -75,28 +87,31 @@ PHASE_COUNT = 3
 
 
 def stripe_sigma(stripe_px: float) -> float:
-    """Standard deviation of a place somewhere in a stripe, projector pixels."""
+    """Return the standard deviation of a place somewhere in a stripe, projector pixels."""
     return stripe_px / float(np.sqrt(12))
 
 
 def phase_sigma(periods_px: tuple[float, ...], steps: int, noise: float) -> float:
-    """Standard deviation of the column from N steps of each period, projector pixels; noise is over the amplitude."""
+    """Return the standard deviation of the column from N steps of each period, projector pixels.
+
+    `noise` is the standard deviation of a reading over the amplitude of the pattern in it (half of white minus black), here and below.
+    """
     information = sum((2 * np.pi / period) ** 2 * steps / 2 for period in periods_px) / noise**2
     return float(1 / np.sqrt(information))
 
 
 def ramp_sigma(columns: int, noise: float) -> float:
-    """Standard deviation of the column from up / (up + down), RMS over the ramp, projector pixels."""
+    """Return the standard deviation of the column from up / (up + down), RMS over the ramp, projector pixels."""
     return columns * float(np.sqrt(2 / 3)) * noise / 2
 
 
 def micro_sigma(mean_period_px: float, periods: int, noise: float) -> float:
-    """Standard deviation of the column from micro phase shifting, projector pixels."""
+    """Return the standard deviation of the column from micro phase shifting, projector pixels."""
     return phase_sigma((mean_period_px,), periods + 2, noise)
 
 
 def modulated_sigma(period_px: float, steps: int, carrier_steps: int, noise: float) -> float:
-    """Standard deviation of the column from modulated phase shifting, projector pixels.
+    """Return the standard deviation of the column from modulated phase shifting, projector pixels.
 
     The carrier's amplitude at a step is (1 + cos)/2 · B with deviation √(2/M) σ; the phase's amplitude over the steps is B/2.
     """
@@ -104,7 +119,7 @@ def modulated_sigma(period_px: float, steps: int, carrier_steps: int, noise: flo
 
 
 def depth_sigma(rig: Rig, column_sigma_px: float) -> float:
-    """σ_Z = Z² σ_u / (f b), metres.
+    """Return the standard deviation of the depth, σ_Z = Z² σ_u / (f b), metres.
 
     Raises:
         ValueError: a distance, baseline or focal length that is not above zero.
@@ -115,40 +130,18 @@ def depth_sigma(rig: Rig, column_sigma_px: float) -> float:
     return rig.distance_m**2 * column_sigma_px / (rig.focal_px * rig.baseline_m)
 
 
-def plan(columns: int, rows: int, *, frame_rate: float, noise: float = 0.02, rig: Rig | None = None, base: int = 3,
-         periods_px: tuple[float, ...] = (16, 18, 21), steps: int = 4, micro: int = 5) -> tuple[Plan, ...]:
-    """The table for one axis of a projector.
+def tabulate(costs: Iterable[Cost], *, frame_rate: float, rig: Rig | None = None) -> tuple[Plan, ...]:
+    """Return the table: what each code costs in time and, with a rig, how precise its depth is.
 
     Args:
-        columns: N, stripes to tell apart.
-        rows: M, for lighting point by point.
+        costs: of each code.
         frame_rate: images a second.
-        noise: of a reading over the amplitude; a rig brings its own.
         rig: for the depth; None: columns alone.
-        base: k of the k-ary code.
-        periods_px: of phase shifting.
-        steps: of each period.
-        micro: periods of micro phase shifting, about the mean of periods_px.
 
     Raises:
-        ValueError: a frame rate or noise that is not above zero, or what the codes refuse.
+        ValueError: a frame rate that is not above zero, or a rig without distance, baseline or focal length.
     """
     if not frame_rate > 0:
         raise ValueError(f"the frame rate is {frame_rate:g}: give images a second, more than 0")
-    noise = noise if rig is None else rig.noise
-    if not noise > 0:
-        raise ValueError(f"the noise is {noise:g}: give its standard deviation over the amplitude, more than 0")
-    bits, digits = digit_count(columns, 2), digit_count(columns, base)
-    one, mean = stripe_sigma(1), float(np.mean(periods_px))
-    listed = ", ".join(f"{period:g}" for period in periods_px)
-    rows_of = [("point", point_count(columns, rows), point_count(columns, rows), one),
-               ("line", line_count(columns), line_count(columns), one),
-               ("binary or gray, with inverses", kary_count(columns), 2 * bits + 2, one),
-               ("xor, with inverses", kary_count(columns), 2 * bits + 2, one),
-               (f"kary, base {base}", kary_count(columns, base), digits + 2, one),
-               ("ramp", RATIO_COUNT, RATIO_COUNT + 2, ramp_sigma(columns, noise)),
-               (f"phase, {steps} steps of {listed} px", PHASE_COUNT, steps * len(periods_px), phase_sigma(tuple(periods_px), steps, noise)),
-               (f"micro, {micro} periods about {mean:g} px", micro + 2, micro + 2, micro_sigma(mean, micro, noise)),
-               (f"modulated, {steps} steps over 3", 9, 3 * steps, modulated_sigma(columns, steps, 3, noise))]
-    return tuple(Plan(name, minimum, images, images / frame_rate, sigma, None if rig is None else depth_sigma(rig, sigma))
-                 for name, minimum, images, sigma in rows_of)
+    return tuple(Plan(cost.name, cost.minimum, cost.images, cost.images / frame_rate, cost.column_sigma_px,
+                      None if rig is None else depth_sigma(rig, cost.column_sigma_px)) for cost in costs)

@@ -3,7 +3,7 @@
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from stage.pattern import Pattern
+from stage.patterns.codes import Pattern
 
 
 @pytest.mark.parametrize(("data", "words"), [

@@ -8,8 +8,8 @@ from kernels.status import Status
 from kernels.structured.binary import decode_gray
 from kernels.structured.edges import refine_edges
 from kernels.structured.frames import NoiseModel, upload
-from stage.patterns.collect import collect
-from stage.patterns.stripes import binary_patterns
+from stage.patterns.binary import binary_patterns
+from stage.patterns.codes import collect
 from tests.structured_scenes import NOISE, frames_of, result, view
 
 WIDTH, ROWS, COLUMNS = 1280, 40, 300

@@ -7,8 +7,8 @@ from kernels.errors import ArrayError
 from kernels.status import Status
 from kernels.structured.frames import NoiseModel, saturated_bits, upload
 from kernels.structured.kary import decode_kary, expected_levels
-from stage.patterns.collect import collect
-from stage.patterns.stripes import kary_patterns, palette
+from stage.patterns.codes import collect
+from stage.patterns.kary import kary_patterns, palette
 from tests.reference import structured as reference
 from tests.structured_scenes import NOISE, frames_of, places, result, view
 

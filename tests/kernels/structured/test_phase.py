@@ -9,9 +9,10 @@ from kernels.structured.binary import decode_gray
 from kernels.structured.frames import NoiseModel, saturated_bits, upload
 from kernels.structured.phase import decode_phase
 from kernels.structured.unwrap import unwrap_by_code, unwrap_jointly, unwrap_range
-from stage.patterns.collect import PhaseCode, collect
-from stage.patterns.stripes import binary_patterns, uniform_patterns
-from stage.patterns.waves import phase_patterns
+from stage.patterns.base import uniform_patterns
+from stage.patterns.binary import binary_patterns
+from stage.patterns.codes import collect
+from stage.patterns.phase import PhaseCode, phase_patterns
 from tests.reference import structured as reference
 from tests.structured_scenes import NOISE, frames_of, places, result, view
 

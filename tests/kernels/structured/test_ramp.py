@@ -9,9 +9,10 @@ from kernels.structured.frames import NoiseModel, saturated_bits, upload
 from kernels.structured.phase import decode_phase
 from kernels.structured.ramp import decode_ramp
 from kernels.structured.separation import separate_extremes, separate_phase
-from stage.patterns.collect import collect
-from stage.patterns.stripes import uniform_patterns
-from stage.patterns.waves import phase_patterns, ramp_patterns
+from stage.patterns.base import uniform_patterns
+from stage.patterns.codes import collect
+from stage.patterns.phase import phase_patterns
+from stage.patterns.ramp import ramp_patterns
 from tests.reference import structured as reference
 from tests.structured_scenes import NOISE, frames_of, places, result, view
 

@@ -10,8 +10,9 @@ from kernels.structured.micro import decode_micro
 from kernels.structured.modulated import decode_modulated
 from kernels.structured.phase import decode_phase
 from kernels.structured.unwrap import unwrap_jointly
-from stage.patterns.collect import collect
-from stage.patterns.waves import micro_patterns, modulated_patterns, phase_patterns
+from stage.patterns.codes import collect
+from stage.patterns.modulated import modulated_patterns
+from stage.patterns.phase import micro_patterns, phase_patterns
 from tests.structured_scenes import NOISE, frames_of, places, result, view
 
 WIDTH = 1280

@@ -7,8 +7,8 @@ from kernels.errors import ArrayError
 from kernels.status import Status
 from kernels.structured.binary import decode_binary, decode_gray, decode_xor
 from kernels.structured.frames import NoiseModel, saturated_bits, stack, upload
-from stage.patterns.collect import collect
-from stage.patterns.stripes import binary_patterns, xor_patterns
+from stage.patterns.binary import binary_patterns, xor_patterns
+from stage.patterns.codes import collect
 from tests.reference import structured as reference
 from tests.structured_scenes import NOISE, frames_of, places, result, view
 
@@ -23,8 +23,8 @@ def patterns_of(code, **options):
 def decode(stack, patterns, device, *, saturated=None, noise=NOISE, extent=WIDTH):
     found = collect(patterns)
     code = found.codes[0]
-    options = {"base_bit": code.base_bit} if code.code == "xor" else {}
-    decoded = DECODERS[code.code](frames_of(stack, device, saturated), code.frames, code.inverses, white=found.white, black=found.black,
+    options = {"base_bit": code.base_bit} if code.name == "xor" else {}
+    decoded = DECODERS[code.name](frames_of(stack, device, saturated), code.frames, code.inverses, white=found.white, black=found.black,
                                   extent=extent, stripe_px=code.stripe_px, noise=noise, **options)
     return result(decoded, stack.shape[-1])
 

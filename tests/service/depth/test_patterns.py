@@ -6,10 +6,11 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from service.requests.patterns import PatternCode
+from service.depth.codes import CODES
+from service.depth.projection import make_patterns, make_plan
+from service.requests.patterns import PatternCode, PatternsRequest, PlanRequest
 from stage.manifest import Frame
-from stage.patterns.collect import collect
-from stage.patterns.draw import draw
+from stage.patterns.codes import collect, draw
 
 SIZE = (96, 40)
 
@@ -49,6 +50,39 @@ def test_plan_is_a_table(relit):
     assert len(next(line for line in deep.out.splitlines() if line.startswith("point")).split()) == 6
 
 
+def test_every_code_has_a_row_and_the_planner_knows_its_cost():
+    assert set(CODES) == set(PatternCode)
+    rows = make_plan(PlanRequest(projector=(1280, 800), frame_rate=30, baseline=0.2, distance=1, focal=2000))
+    assert [row.name.split(",")[0] for row in rows] == ["point", "line", "binary or gray", "xor", "kary", "ramp", "phase", "micro",
+                                                        "modulated"]
+    by_name = {row.name.split(",")[0]: row for row in rows}
+    assert by_name["binary or gray"].minimum == 11 and by_name["binary or gray"].images == 24
+    assert by_name["kary"].minimum == 7
+    assert by_name["phase"].images == 12 and by_name["phase"].seconds == pytest.approx(0.4)
+    assert all(row.images >= row.minimum and row.column_sigma_px > 0 and row.depth_sigma_m > 0 for row in rows)
+    assert make_plan(PlanRequest(projector=(1280, 800)))[0].depth_sigma_m is None
+
+
+class Told:
+    """A Progress that remembers what it was told."""
+
+    def __init__(self) -> None:
+        self.stages: list[tuple[str, int]] = []
+        self.done: list[int] = []
+
+    def stage(self, name: str, total: int) -> None:
+        self.stages.append((name, total))
+
+    def advance(self, done: int) -> None:
+        self.done.append(done)
+
+
+def test_progress_counts_the_images(tmp_path):
+    told = Told()
+    result = make_patterns(PatternsRequest(code=PatternCode.RAMP, projector=SIZE, out=tmp_path), told)
+    assert told.stages == [("draw", len(result.images))] and told.done == list(range(1, len(result.images) + 1))
+
+
 def test_plan_and_images_at_once(relit, tmp_path):
     outcome = relit("patterns", "gray", "--plan", "--projector", "96x40", "--steps", 5, "--out", tmp_path)
     assert outcome.code == 0 and "5 steps" in outcome.out and (tmp_path / "patterns.json").exists()
@@ -67,6 +101,7 @@ def test_plan_and_images_at_once(relit, tmp_path):
     (["gray-phase", "--projector", "96x40", "--out", "o", "--stripe", "9"], "stripes of 9 px cannot number periods of 16 px"),
     (["color", "--projector", "96x40", "--out", "o", "--base", "9"], "9 colours are not told apart"),
     (["xor", "--projector", "96x40", "--out", "o", "--base-bit", "9"], "base bit 9 does not exist in 7 bits"),
+    (["--plan", "--projector", "96x40", "--noise", "0"], "noise"),
     (["--plan", "--projector", "96x40", "--baseline", "1"], "needs baseline, distance and focal together"),
     (["nonsense", "--projector", "96x40", "--out", "o"], "nonsense"),
 ])

@@ -5,26 +5,29 @@ import random
 import pytest
 
 from stage.errors import ManifestError
-from stage.pattern import BinaryPattern, PhasePattern
-from stage.patterns import stripes, waves
-from stage.patterns.collect import BinaryCode, KaryCode, ModulatedCode, PhaseCode, RampCode, collect
+from stage.patterns.binary import BinaryCode, BinaryPattern, binary_patterns, xor_patterns
+from stage.patterns.codes import collect
+from stage.patterns.kary import KaryCode, kary_patterns
+from stage.patterns.modulated import ModulatedCode, modulated_patterns
+from stage.patterns.phase import PhaseCode, PhasePattern, phase_patterns
+from stage.patterns.ramp import RampCode, ramp_patterns
 
 
 def test_any_order_and_other_frames_between():
-    patterns = [*stripes.binary_patterns(64, "column"), *stripes.xor_patterns(64, "row", base_bit=1, references=False), None,
-                *stripes.kary_patterns(64, "row", base=4)[:-2], *waves.ramp_patterns("row", references=False),
-                *waves.phase_patterns("column", (16, 18), 3), *waves.modulated_patterns("row", 64)]
+    patterns = [*binary_patterns(64, "column"), *xor_patterns(64, "row", base_bit=1, references=False), None,
+                *kary_patterns(64, "row", base=4)[:-2], *ramp_patterns("row", references=False),
+                *phase_patterns("column", (16, 18), 3), *modulated_patterns("row", 64)]
     random.Random(0).shuffle(patterns)
     found = collect(patterns)
     assert patterns[found.white].code == "white" and patterns[found.black].code == "black"
-    assert {type(code) for code in found.of_axis("column")} == {BinaryCode, PhaseCode}
-    assert {type(code) for code in found.of_axis("row")} == {BinaryCode, KaryCode, RampCode, ModulatedCode}
+    assert {type(code) for code in found.codes if code.axis == "column"} == {BinaryCode, PhaseCode}
+    assert {type(code) for code in found.codes if code.axis == "row"} == {BinaryCode, KaryCode, RampCode, ModulatedCode}
     for code in found.codes:
         match code:
             case BinaryCode():
                 assert [patterns[f].bit for f in code.frames] == list(range(6)) == [patterns[f].bit for f in code.inverses]
                 assert all(patterns[f].inverse for f in code.inverses) and not any(patterns[f].inverse for f in code.frames)
-                assert code.base_bit == (1 if code.code == "xor" else 0)
+                assert code.base_bit == (1 if code.name == "xor" else 0)
             case KaryCode():
                 assert [patterns[f].digit for f in code.frames] == [0, 1, 2]
             case RampCode():
@@ -42,7 +45,7 @@ def drop(patterns, test):
     return [pattern for pattern in patterns if not test(pattern)]
 
 
-GRAY = stripes.binary_patterns(64, "column")
+GRAY = binary_patterns(64, "column")
 
 
 @pytest.mark.parametrize("patterns, words", [
@@ -50,8 +53,8 @@ GRAY = stripes.binary_patterns(64, "column")
     (drop(GRAY, lambda p: getattr(p, "bit", None) == 2 and p.inverse), "has inverses, but none of bit 2"),
     ([*GRAY, GRAY[3]], r"frames 3 and 14 show one pattern \(column gray bit 4 of 6, inverse\)"),
     ([*GRAY, BinaryPattern(code="gray", axis="column", bit=0, bits=6, stripe_px=2)], "disagree about stripe_px"),
-    (stripes.kary_patterns(64, "row", base=4)[1:], "row kary code of 3 digits has no frame of digit 2"),
-    (waves.modulated_patterns("row", 64)[:-1], "no frame of step 3, carrier step 2"),
+    (kary_patterns(64, "row", base=4)[1:], "row kary code of 3 digits has no frame of digit 2"),
+    (modulated_patterns("row", 64)[:-1], "no frame of step 3, carrier step 2"),
     ([PhasePattern(code="phase", axis="row", period_px=8, step=0, steps=3)] * 2, "row phase of 8 px, step 0 of 3"),
 ])
 def test_incomplete_codes_are_one_sentence(patterns, words):

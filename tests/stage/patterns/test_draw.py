@@ -4,9 +4,13 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
-from stage.pattern import BinaryPattern, Pattern, PhasePattern, RampPattern, UniformPattern, XorPattern
-from stage.patterns import stripes, waves
-from stage.patterns.draw import digits_of, draw, draw_all, gray_of, profile
+from stage.patterns.base import UniformPattern
+from stage.patterns.binary import BinaryPattern, XorPattern, binary_patterns, gray_of, xor_patterns
+from stage.patterns.codes import Pattern, draw
+from stage.patterns.kary import digits_of, kary_patterns, palette
+from stage.patterns.modulated import ModulatedPattern, modulated_patterns
+from stage.patterns.phase import PhasePattern, micro_patterns, phase_patterns
+from stage.patterns.ramp import RampPattern, ramp_patterns
 
 SIZE = (24, 10)
 
@@ -23,7 +27,7 @@ def test_seven_stripes_change_ten_times_in_binary_and_six_in_gray():
 
 def test_stripe_five_is_101():
     patterns = [BinaryPattern(code="binary", axis="column", bit=bit, bits=3) for bit in (2, 1, 0)]
-    assert [float(profile(pattern, np.array([5.5]), 8)[0]) for pattern in patterns] == [1, 0, 1]
+    assert [float(pattern.level(np.array([5.5]), np.zeros(1), 8)[0]) for pattern in patterns] == [1, 0, 1]
 
 
 def test_ternary_stripes_are_01_to_21():
@@ -77,25 +81,34 @@ def test_images_follow_the_contract(axis):
 
 @pytest.mark.parametrize("base_bit, widest", [(0, 2), (1, 4)])
 def test_xor_stripes_are_all_narrow(base_bit, widest):
-    patterns = stripes.xor_patterns(256, "column", base_bit=base_bit, inverses=False, references=False)
+    patterns = xor_patterns(256, "column", base_bit=base_bit, inverses=False, references=False)
     for pattern in patterns:
         edges = np.flatnonzero(np.diff(draw(pattern, (256, 1))[0]))
         assert np.diff(edges).max() <= widest, pattern
 
 
-def test_colours_repeat_grey_frames_in_three_channels():
-    patterns = stripes.kary_patterns(9, "column", base=3, colors=stripes.palette(3))
-    drawn = draw_all(patterns, (9, 2))
-    assert drawn.images.shape == (4, 2, 9, 3)
-    np.testing.assert_array_equal(drawn.images[0, 0, ::3], np.eye(3))  # the coarser digit over its three stripes
-    assert (drawn.images[2] == 1).all() and (drawn.images[3] == 0).all()
+def test_colours_have_three_channels_and_white_and_black_one():
+    coarse, fine, white, black = (draw(pattern, (9, 2)) for pattern in kary_patterns(9, "column", base=3, colors=palette(3)))
+    assert coarse.shape == fine.shape == (2, 9, 3) and white.shape == black.shape == (2, 9)
+    np.testing.assert_array_equal(coarse[0, ::3], np.eye(3))  # the coarser digit over its three stripes
+    assert (white == 1).all() and (black == 0).all()
+
+
+@pytest.mark.parametrize("axis", ["column", "row"])
+def test_modulated_patterns_vary_along_both_axes(axis):
+    pattern = ModulatedPattern(code="modulated", axis=axis, period_px=20, step=1, steps=4,
+                               carrier_period_px=8, carrier_step=2, carrier_steps=3)
+    x, y = np.arange(24) + 0.5, np.arange(10)[:, None] + 0.5
+    u, v = (x, y) if axis == "column" else (y, x)
+    expected = (1 + np.cos(2 * np.pi * u / 20 - np.pi / 2)) / 2 * (1 + np.cos(2 * np.pi * v / 8 - 4 * np.pi / 3)) / 2
+    np.testing.assert_allclose(draw(pattern, SIZE), expected, atol=1e-6)
 
 
 def test_every_generated_entry_is_one_of_the_manifest():
-    for patterns in (stripes.binary_patterns(100, "row"), stripes.xor_patterns(100, "row", base_bit=1),
-                     stripes.kary_patterns(100, "column", base=4), waves.ramp_patterns("column"),
-                     waves.phase_patterns("column", (16, 18, 21), 4), waves.micro_patterns(200, "column", periods=4),
-                     waves.modulated_patterns("row", 100)):
+    for patterns in (binary_patterns(100, "row"), xor_patterns(100, "row", base_bit=1),
+                     kary_patterns(100, "column", base=4), ramp_patterns("column"),
+                     phase_patterns("column", (16, 18, 21), 4), micro_patterns(200, "column", periods=4),
+                     modulated_patterns("row", 100)):
         for pattern in patterns:
             data = pattern.model_dump(mode="json")
             assert TypeAdapter(Pattern).validate_python(data) == pattern
@@ -103,26 +116,25 @@ def test_every_generated_entry_is_one_of_the_manifest():
 
 
 def test_micro_phase_shifting_takes_two_more_images_than_periods():
-    patterns = waves.micro_patterns(1280, "column", periods=5, mean_period_px=16)
+    patterns = micro_patterns(1280, "column", periods=5, mean_period_px=16)
     assert len(patterns) == 7
     assert all(abs(pattern.period_px / 16 - 1) <= 0.15 for pattern in patterns)
 
 
 def test_opencv_order():
-    patterns = stripes.binary_patterns(1024, "column")
+    patterns = binary_patterns(1024, "column")
     assert len(patterns) == 22
     assert [(p.bit, p.inverse) for p in patterns[:4]] == [(9, False), (9, True), (8, False), (8, True)]
     assert patterns[-2:] == (UniformPattern(code="white"), UniformPattern(code="black"))
 
 
 @pytest.mark.parametrize("call, words", [
-    (lambda: stripes.binary_patterns(8, "column", stripe_px=0), "stripes of 0 px have no width"),
-    (lambda: stripes.xor_patterns(8, "column", base_bit=3), "base bit 3 does not exist in 3 bits"),
-    (lambda: stripes.kary_patterns(8, "column", base=1), "base 1"),
-    (lambda: stripes.palette(9), "9 colours are not told apart"),
-    (lambda: waves.phase_patterns("column", (16, 16)), "periods 16, 16 are not several different ones"),
-    (lambda: waves.micro_patterns(100, "column", periods=2), "2 periods cannot tell the places apart"),
-    (lambda: draw_all([], (8, 8)), "no pattern"),
+    (lambda: binary_patterns(8, "column", stripe_px=0), "stripes of 0 px have no width"),
+    (lambda: xor_patterns(8, "column", base_bit=3), "base bit 3 does not exist in 3 bits"),
+    (lambda: kary_patterns(8, "column", base=1), "base 1"),
+    (lambda: palette(9), "9 colours are not told apart"),
+    (lambda: phase_patterns("column", (16, 16)), "periods 16, 16 are not several different ones"),
+    (lambda: micro_patterns(100, "column", periods=2), "2 periods cannot tell the places apart"),
 ])
 def test_what_cannot_be_drawn_is_one_sentence(call, words):
     with pytest.raises(ValueError, match=words):

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from stage.patterns import planner
-from stage.patterns.stripes import digit_count
+from stage.patterns.base import digit_count
+
+RIG = planner.Rig(0.2, 1.5, 2000)
 
 
 def test_the_lectures_counts():
@@ -44,27 +46,25 @@ def test_ramp_precision_is_that_of_simulated_noise():
 
 
 def test_depth_precision_is_the_derivative_of_triangulation():
-    rig = planner.Rig(0.2, 1.5, 2000, 0.02)
-    disparity = rig.focal_px * rig.baseline_m / rig.distance_m
+    disparity = RIG.focal_px * RIG.baseline_m / RIG.distance_m
     step = 1e-4
-    derivative = rig.focal_px * rig.baseline_m * (1 / (disparity - step) - 1 / disparity) / step
-    assert planner.depth_sigma(rig, 0.1) == pytest.approx(0.1 * derivative, rel=1e-5)
+    derivative = RIG.focal_px * RIG.baseline_m * (1 / (disparity - step) - 1 / disparity) / step
+    assert planner.depth_sigma(RIG, 0.1) == pytest.approx(0.1 * derivative, rel=1e-5)
 
 
-def test_the_table():
-    rows = planner.plan(1280, 800, frame_rate=30, rig=planner.Rig(0.2, 1.0, 2000, 0.02))
-    by_name = {row.name.split(",")[0]: row for row in rows}
-    assert by_name["binary or gray"].minimum == 11 and by_name["binary or gray"].images == 24
-    assert by_name["kary"].minimum == 7
-    assert by_name["phase"].images == 12 and by_name["phase"].seconds == pytest.approx(0.4)
-    assert all(row.images >= row.minimum and row.column_sigma_px > 0 and row.depth_sigma_m > 0 for row in rows)
-    assert planner.plan(1280, 800, frame_rate=30)[0].depth_sigma_m is None
+COST = planner.Cost("line", 8, 10, 0.3)
+
+
+def test_a_line_of_the_table():
+    row, = planner.tabulate([COST], frame_rate=30, rig=RIG)
+    assert row[:3] == COST[:3] and row.seconds == pytest.approx(1 / 3)
+    assert row.depth_sigma_m == planner.depth_sigma(RIG, 0.3)
+    assert planner.tabulate([COST], frame_rate=30)[0].depth_sigma_m is None
 
 
 @pytest.mark.parametrize("call, words", [
-    (lambda: planner.plan(8, 8, frame_rate=0), "the frame rate is 0"),
-    (lambda: planner.plan(8, 8, frame_rate=1, noise=0), "the noise is 0"),
-    (lambda: planner.plan(8, 8, frame_rate=1, rig=planner.Rig(0, 1, 1, 0.1)), "the baseline is 0"),
+    (lambda: planner.tabulate([COST], frame_rate=0), "the frame rate is 0"),
+    (lambda: planner.tabulate([COST], frame_rate=1, rig=planner.Rig(0, 1, 1)), "the baseline is 0"),
     (lambda: planner.kary_count(0), "0 stripes"),
 ])
 def test_what_cannot_be_planned_is_one_sentence(call, words):

@@ -1,0 +1,202 @@
+"""Decoders of structured light: which codes of a capture each one takes, and how it calls the kernels that read them.
+
+A decoder looks at the codes of one axis and returns how it would decode the axis, or None if its frames are not there. Each is named by the
+rows of the table in service/depth/codes.py.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from kernels.structured.binary import decode_binary, decode_gray, decode_xor
+from kernels.structured.decoded import Decoded
+from kernels.structured.edges import REACH, refine_edges
+from kernels.structured.frames import Frames, NoiseModel
+from kernels.structured.join import join_periods
+from kernels.structured.kary import decode_kary
+from kernels.structured.micro import decode_micro
+from kernels.structured.modulated import decode_modulated
+from kernels.structured.phase import WrappedPhase, decode_phase
+from kernels.structured.ramp import decode_ramp
+from kernels.structured.unwrap import unwrap_by_code, unwrap_jointly
+from stage.model import Resolution, Rgb
+from stage.patterns.base import Axis
+from stage.patterns.binary import BinaryCode
+from stage.patterns.codes import Code, Collected
+from stage.patterns.kary import KaryCode
+from stage.patterns.modulated import ModulatedCode
+from stage.patterns.phase import PhaseCode
+from stage.patterns.ramp import RampCode
+
+
+class PatternDevice(NamedTuple):
+    """What decoding needs to know of a projector; its lens and pose come later."""
+
+    resolution: Resolution
+    response: tuple[float, ...] | None = None
+    crosstalk: tuple[Rgb, Rgb, Rgb] | None = None
+
+
+class Readings(NamedTuple):
+    """The frames of a band on the device."""
+
+    grey: Frames
+    colour: Frames | None
+    """The same with three channels, where a code has colours."""
+    columns: int
+    """Pixels of an image row: the band is whole rows."""
+
+
+@dataclass(frozen=True)
+class AxisDecoder:
+    """How one axis is decoded."""
+
+    axis: Axis
+    name: str
+    """For the report: gray with inverses, phase numbered by gray, …"""
+    colour: bool
+    """Whether it needs colour frames."""
+    decode: Callable[[Readings, NoiseModel], Decoded]
+    used: tuple[Code, ...]
+    """Codes that it reads."""
+    halo: int = 0
+    """Rows beyond a band, above and below, that decoding looks at."""
+
+
+@dataclass(frozen=True)
+class AxisCodes:
+    """The codes of one axis whose frames are all there, and what their decoders need to know."""
+
+    axis: Axis
+    codes: tuple[Code, ...]
+    white: int | None
+    black: int | None
+    projector: PatternDevice
+    refine: bool
+    """Interpolate a Gray code with inverses between the edges of its stripes."""
+
+    @classmethod
+    def of(cls, collected: Collected, axis: Axis, projector: PatternDevice, *, refine: bool) -> "AxisCodes":
+        """Keep the codes of the axis that lack no frame."""
+        ready = tuple(code for code in collected.codes if code.axis == axis and code.lacks(collected.white, collected.black) is None)
+        return cls(axis, ready, collected.white, collected.black, projector, refine)
+
+    @property
+    def extent(self) -> int:
+        """Return the projector's pixels along the axis."""
+        return self.projector.resolution[0 if self.axis == "column" else 1]
+
+    @property
+    def stripes(self) -> list[BinaryCode | KaryCode]:
+        """Return the codes that number stripes."""
+        return [code for code in self.codes if isinstance(code, BinaryCode | KaryCode)]
+
+    @property
+    def phase(self) -> PhaseCode | None:
+        """Return the phases of the axis."""
+        return next((code for code in self.codes if isinstance(code, PhaseCode)), None)
+
+
+def modulated_decoder(axis: AxisCodes) -> AxisDecoder | None:
+    """Decode modulated phases, which hold direct light alone."""
+    waves = [code for code in axis.codes if isinstance(code, ModulatedCode)]
+
+    def wrapped(readings: Readings, noise: NoiseModel) -> WrappedPhase:
+        parts = [decode_modulated(readings.grey, wave.frames, period_px=wave.period_px, noise=noise) for wave in waves]
+        return parts[0] if len(parts) == 1 else join_periods(parts)
+
+    return _unwrapped("modulated phase", axis, waves, [wave.period_px for wave in waves], wrapped) if waves else None
+
+
+def micro_decoder(axis: AxisCodes) -> AxisDecoder | None:
+    """Decode micro phase shifting."""
+    phase = axis.phase
+    if phase is None or not phase.micro:
+        return None
+
+    def decode(readings: Readings, noise: NoiseModel) -> Decoded:
+        return decode_micro(readings.grey, phase.frames, phase.periods_px, phase.shifts, black=axis.black, extent=axis.extent, noise=noise)
+
+    return AxisDecoder(axis.axis, "micro phase", False, decode, (phase,))
+
+
+def phase_decoder(axis: AxisCodes) -> AxisDecoder | None:
+    """Decode phases of one or several periods."""
+    phase = axis.phase
+    if phase is None:
+        return None
+
+    def wrapped(readings: Readings, noise: NoiseModel) -> WrappedPhase:
+        return decode_phase(readings.grey, phase.frames, phase.periods_px, phase.shifts, black=axis.black, noise=noise)
+
+    return _unwrapped("phase", axis, [phase], phase.periods_px, wrapped)
+
+
+def stripe_decoder(axis: AxisCodes) -> AxisDecoder | None:
+    """Decode the code whose stripes are finest, binary ones before digits."""
+    code = min(axis.stripes, key=lambda code: (isinstance(code, KaryCode), code.stripe_px), default=None)
+    if code is None:
+        return None
+    inverses = code.inverses if isinstance(code, BinaryCode) else None
+    edges = axis.refine and inverses is not None and code.name == "gray"
+
+    def decode(readings: Readings, noise: NoiseModel) -> Decoded:
+        found = _decode_stripes(code, axis, readings, noise)
+        if not edges or inverses is None:
+            return found
+        return refine_edges(found, readings.grey, code.frames, inverses, columns=readings.columns, down=axis.axis == "row",
+                            extent=axis.extent, stripe_px=code.stripe_px, noise=noise)
+
+    name = f"{code.name}{' with inverses' if inverses else ''}{', edges refined' if edges else ''}"
+    return AxisDecoder(axis.axis, name, _coloured(code), decode, (code,), halo=REACH if edges and axis.axis == "row" else 0)
+
+
+def ramp_decoder(axis: AxisCodes) -> AxisDecoder | None:
+    """Decode the intensity ratio."""
+    code = next((code for code in axis.codes if isinstance(code, RampCode)), None)
+    if code is None:
+        return None
+    response = None if axis.projector.response is None else np.array(axis.projector.response)
+
+    def decode(readings: Readings, noise: NoiseModel) -> Decoded:
+        return decode_ramp(readings.grey, up=code.up, down=code.down, white=axis.white, black=axis.black, extent=axis.extent,
+                           response=response, noise=noise)
+
+    return AxisDecoder(axis.axis, "ramp", False, decode, (code,))
+
+
+def _unwrapped(name: str, axis: AxisCodes, waves: Sequence[PhaseCode | ModulatedCode], periods_px: Sequence[float],
+               wrapped: Callable[[Readings, NoiseModel], WrappedPhase]) -> AxisDecoder:
+    """Unwrap phases by a code whose stripes are fine enough to number the periods, else jointly."""
+    numbering = next((code for code in axis.stripes if 2 * code.stripe_px <= min(periods_px)), None)
+    if numbering is None:
+        return AxisDecoder(axis.axis, name, False, lambda readings, noise: unwrap_jointly(wrapped(readings, noise), extent=axis.extent),
+                           tuple(waves))
+
+    def decode(readings: Readings, noise: NoiseModel) -> Decoded:
+        return unwrap_by_code(wrapped(readings, noise), _decode_stripes(numbering, axis, readings, noise),
+                              stripe_px=numbering.stripe_px, extent=axis.extent)
+
+    return AxisDecoder(axis.axis, f"{name} numbered by {numbering.name}", _coloured(numbering), decode, (*waves, numbering))
+
+
+def _decode_stripes(code: BinaryCode | KaryCode, axis: AxisCodes, readings: Readings, noise: NoiseModel) -> Decoded:
+    if isinstance(code, KaryCode):
+        assert axis.white is not None and axis.black is not None  # else it would not be among the codes
+        crosstalk = None if axis.projector.crosstalk is None or code.colors is None else np.array(axis.projector.crosstalk)
+        frames = readings.colour if code.colors is not None and readings.colour is not None else readings.grey
+        return decode_kary(frames, code.frames, white=axis.white, black=axis.black,
+                           levels=np.array(code.levels if code.levels is not None else code.colors), reflected=code.reflected,
+                           extent=axis.extent, stripe_px=code.stripe_px, crosstalk=crosstalk, noise=noise)
+    if code.name == "xor":
+        return decode_xor(readings.grey, code.frames, code.inverses, base_bit=code.base_bit, white=axis.white, black=axis.black,
+                          extent=axis.extent, stripe_px=code.stripe_px, noise=noise)
+    run = decode_gray if code.name == "gray" else decode_binary
+    return run(readings.grey, code.frames, code.inverses, white=axis.white, black=axis.black, extent=axis.extent,
+               stripe_px=code.stripe_px, noise=noise)
+
+
+def _coloured(code: BinaryCode | KaryCode) -> bool:
+    return isinstance(code, KaryCode) and code.colors is not None
