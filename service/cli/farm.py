@@ -1,18 +1,19 @@
 """relit farm template: jobs for render farms."""
 
-import inspect
-from collections.abc import Callable
+import shlex
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.cli import relight as relight_here
-from service.cli import shade as shade_here
-from service.cli.service_options import with_parameters
+from service.cli.request_commands import Given, command
+from service.requests.base import Role
+from service.requests.relight import RelightRequest
+from service.requests.shade import ShadeRequest
 
-HERE = {"only", "overwrite", "sheet", "report", "progress"}
-"""Parameters of the commands that a farm's tasks have no use for, or that the job itself sets."""
+if TYPE_CHECKING:
+    from service.farm.template import Job
+
 CHUNK_FRAMES = 32
 """As many as one product makes (service.light.combine): with fewer the images are read more often."""
 
@@ -31,42 +32,34 @@ def register(app: typer.Typer) -> None:
     farm = typer.Typer(name="farm", no_args_is_help=True, help="Jobs for render farms; docs/farm.md.")
     kinds = typer.Typer(name="template", no_args_is_help=True,
                         help="Write an Open Job Description template whose tasks are calls of the command; options are as of it.")
-    kinds.command("relight")(_command(relight_here.relight, relight))
-    kinds.command("shade")(_command(shade_here.shade, shade))
+    command(kinds, "relight", relight, without=frozenset({Role.RUN}))
+    command(kinds, "shade", shade, without=frozenset({Role.RUN}))
     farm.add_typer(kinds)
     app.add_typer(farm)
 
 
-def relight(job: JobOption, chunk_frames: ChunkOption = CHUNK_FRAMES, gpu: GpuOption = False, **chosen: Any) -> None:
+def relight(given: Given[RelightRequest], job: JobOption, chunk_frames: ChunkOption = CHUNK_FRAMES, gpu: GpuOption = False) -> None:
     """Frames under new light, a task a chunk of them: bit by bit those of one run."""
-    from service.farm.job import JobOptions
-    from service.farm.relight import relight_job
+    from service.farm.jobs import relight_job
     from service.light.plan import make_plan
-    from service.requests.relight import RelightRequest
 
-    request = RelightRequest.model_validate({**chosen, "out": str(Path(chosen["out"]).absolute())})  # as its tasks are asked
+    request = given.build(out=str(Path(given.values["out"]).absolute()))  # as its tasks are asked
     frames = make_plan(request).frames
     spelled = request.model_copy(update={"frames": f"{frames[0].lighting.number}-{frames[-1].lighting.number}"})
-    _write(relight_job(spelled, JobOptions(gpu), chunk_frames), job)
+    _write(relight_job(spelled, chunk_frames=chunk_frames, gpu=gpu), job)
 
 
-def shade(job: JobOption, turns: TurnsOption = None, gpu: GpuOption = False, **chosen: Any) -> None:
+def shade(request: ShadeRequest, job: JobOption, turns: TurnsOption = None, gpu: GpuOption = False) -> None:
     """A picture of solved maps, or a turn of the environment in pictures, a task each."""
-    from service.farm.job import JobOptions
-    from service.farm.shade import shade_job
+    from service.farm.jobs import shade_job
     from service.light.shade import check
-    from service.requests.shade import ShadeRequest
 
-    given = {name: value if name not in ("light", "sphere", "rectangle") else value or () for name, value in chosen.items()}
-    request = ShadeRequest.model_validate(given)
     check(request)
-    _write(shade_job(request, JobOptions(gpu), turns), job)
+    _write(shade_job(request, turns=turns, gpu=gpu), job)
 
 
-def _write(made: Any, where: Path) -> None:
-    import shlex
-
-    from service.farm.write import write_job
+def _write(made: "Job", where: Path) -> None:
+    from service.farm.template import write_job
 
     written = write_job(made, where)
     print(f"template {written.template}")
@@ -75,14 +68,3 @@ def _write(made: Any, where: Path) -> None:
         print(f"submit   deadline bundle submit {shlex.quote(str(where))}")
     else:
         print(f"run      openjd run {shlex.quote(str(written.template))} -p {shlex.quote(f'file://{written.values}')}")
-
-
-def _command(here: Callable[..., None], own: Callable[..., None]) -> Callable[..., None]:
-    """A command with the options of the one that does the work here, and its own."""
-    theirs = [parameter for name, parameter in inspect.signature(here).parameters.items() if name not in HERE]
-    ours = [parameter for parameter in inspect.signature(own).parameters.values() if parameter.kind is not inspect.Parameter.VAR_KEYWORD]
-
-    def run(**given: Any) -> None:
-        own(**given)
-
-    return with_parameters(run, own, [*theirs, *ours])

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.cli.service_options import DEFAULT_SERVER, CancelOption, KeyOption, ResultsOption, ServerOption, connected
+from service.cli.service_options import CancelOption, KeyOption, ResultsOption, ServerOption, connected
 from service.cli.waiting import download, wait_for
+from service.requests.jobs import DEFAULT_SERVER
 
 if TYPE_CHECKING:
     from service.client import Client

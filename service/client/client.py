@@ -8,9 +8,7 @@ import httpx2
 from service.client.connection import Connection
 from service.client.intakes import Intakes
 from service.client.jobs import Jobs
-
-DEFAULT_SERVER = "http://127.0.0.1:8470"
-"""Where `relit serve` listens unless it is told otherwise."""
+from service.requests.jobs import DEFAULT_SERVER
 
 
 class Client:

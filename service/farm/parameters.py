@@ -6,52 +6,75 @@ through again; so no path or name, whatever is in it, is taken for anything else
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 from service.errors import RequestError
-from service.farm.document import Plain
+from service.requests.base import Request, Role
+from service.requests.options import Option, help_text, typed, values_of
 
 LONGEST = 1024
 """Characters of a value, by the specification."""
 
 
-class Job(NamedTuple):
-    """A template, and values for those of its parameters that have no default."""
-
-    template: Mapping[str, Plain]
-    values: Mapping[str, str]
-
-
 class Parameters:
-    """Parameters in the order in which they are asked for."""
+    """Parameters in the order in which they are asked for. Each method adds one and returns what stands for its value in the template."""
 
     def __init__(self) -> None:
         """None yet."""
-        self.definitions: list[Mapping[str, Plain]] = []
+        self.definitions: list[Mapping[str, Any]] = []
         self.values: dict[str, str] = {}
+        """Of the parameters that have no default."""
 
     def text(self, name: str, value: str, about: str) -> str:
-        """A text with a default; where it is filled in."""
-        self.definitions.append({"name": name, "type": "STRING", "default": _checked(value), "description": about})
-        return f"{{{{Param.{name}}}}}"
+        """Add a text with a default."""
+        return self._add(name, "STRING", about, default=_checked(value))
 
     def count(self, name: str, value: int, about: str) -> str:
-        """A number from 1 on with a default; where it is filled in."""
-        self.definitions.append({"name": name, "type": "INT", "default": value, "minValue": 1, "description": about})
-        return f"{{{{Param.{name}}}}}"
+        """Add a number from 1 on with a default."""
+        return self._add(name, "INT", about, default=value, minValue=1)
 
     def file(self, name: str, value: Path, about: str) -> str:
-        """A file that is read; where it is filled in."""
+        """Add a file that is read."""
         return self._path(name, value, "FILE", "IN", about)
 
     def folder(self, name: str, value: Path, flow: str, about: str) -> str:
-        """A folder that is read (IN), written (OUT) or neither (NONE); where it is filled in."""
+        """Add a folder that is read (IN), written (OUT) or neither (NONE)."""
         return self._path(name, value, "DIRECTORY", flow, about)
 
+    def words(self, request: Request) -> list[str]:
+        """Return the words that type the input and the choices of a request, where they are not at their default."""
+        arguments, rest = [], []
+        for option, value in values_of(request):
+            if value == option.field.default or option.role not in (Role.INPUT, Role.CHOICE):
+                continue
+            if option.spelling.argument:
+                arguments.append(self._word(option, value, request))
+            elif option.kind is bool:
+                rest.append(option.flag if value else option.off)
+            else:
+                for each in value if option.is_repeated else (value,):
+                    rest += [option.flag, self._word(option, each, request)]
+        return [*arguments, *rest]
+
+    def _word(self, option: Option, value: Any, request: Request) -> str:
+        name = option.name.title().replace("_", "")
+        about = help_text(option, type(request))
+        if option.kind is str:
+            return self.text(name, value, about)
+        if option.role is not Role.INPUT:
+            return typed(value)
+        if "#" in value.name and not value.is_file():
+            folder = self.folder(f"{name}Folder", value.parent, "IN", f"Folder of the files of {name}Name.")
+            return f"{folder}/{self.text(f'{name}Name', value.name, about)}"
+        return self.folder(name, value, "IN", about) if value.is_dir() else self.file(name, value, about)
+
     def _path(self, name: str, value: Path, kind: str, flow: str, about: str) -> str:
-        # a path has no default: the specification wants those within the template's folder
-        self.definitions.append({"name": name, "type": "PATH", "objectType": kind, "dataFlow": flow, "description": about})
         self.values[name] = _checked(str(value.absolute()))
+        # a path has no default: the specification wants those within the template's folder
+        return self._add(name, "PATH", about, objectType=kind, dataFlow=flow)
+
+    def _add(self, name: str, kind: str, about: str, **others: Any) -> str:
+        self.definitions.append({"name": name, "type": kind, **others, "description": about})
         return f"{{{{Param.{name}}}}}"
 
 

@@ -5,16 +5,12 @@ import platform
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-from pydantic import BaseModel
-
 from service import __version__
+from service.requests.base import Options, Role
+from service.requests.options import role_of
 
 REPORTED = ("relit", "warp-lang", "numpy", "OpenEXR", "OpenImageIO", "opencv-python-headless", "usd-core")
 """Distributions whose versions a report names."""
-
-UNRECORDED = {"capture", "out", "maps", "environment", "keys", "sheet", "report", "cache", "device", "overwrite",
-              "only"}
-"""Of a request: paths, and how it was carried out."""
 
 
 def versions() -> dict[str, str]:
@@ -28,7 +24,7 @@ def versions() -> dict[str, str]:
     return found
 
 
-def metadata(request: BaseModel, *, capture: str, inputs: str, method: str | None = None) -> dict[str, str]:
+def metadata(request: Options, *, capture: str, inputs: str, method: str | None = None) -> dict[str, str]:
     """String attributes for result files. Nothing in them changes between two runs on the same inputs.
 
     Args:
@@ -38,12 +34,18 @@ def metadata(request: BaseModel, *, capture: str, inputs: str, method: str | Non
         inputs: content hash of the images.
         method: the one that was used, where the request left the choice open.
     """
-    options = request.model_dump(mode="json", exclude=UNRECORDED)
-    options = {name: value for name, value in options.items() if value is not None and value is not False}
+    options = {name: value for name, value in _choices(request).items() if value is not None and value is not False}
     if method is not None:
         options["method"] = str(method)
     return {"relit:version": __version__, "relit:capture": capture, "relit:inputs": inputs,
             "relit:options": json.dumps(options, sort_keys=True)}
+
+
+def _choices(request: Options) -> dict[str, Any]:
+    """Return what a request chooses about the work, as plain data; neither paths nor how the work was carried out."""
+    plain = request.model_dump(mode="json")
+    return {name: _choices(value) if isinstance(value := getattr(request, name), Options) else plain[name]
+            for name, field in type(request).model_fields.items() if role_of(field) is Role.CHOICE}
 
 
 def report(**sections: Any) -> str:

@@ -1,20 +1,73 @@
 """The base of every request: a frozen model whose fields are the only declaration of options, their defaults and their words.
 
 An ...Options model holds what is chosen about the work; the ...Request on top of it adds where files are. A job of the service carries
-the options and names of captures, which its worker makes paths of.
+the options and names of captures, which its worker makes paths of. `service.requests.options` reads the fields.
 """
 
+from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Self
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, BeforeValidator, ConfigDict
 
 
-def split_commas(given: Any) -> Any:
-    """Return the words of a text with commas between them, and a list as a tuple, which strict validation of JSON asks for."""
+def _split_commas(given: Any) -> Any:
+    """Return the parts of a text with commas between them, and a list as a tuple, which strict validation of JSON asks for."""
     if isinstance(given, str):
         return tuple(part.strip() for part in given.split(","))
     return tuple(given) if isinstance(given, list) else given
+
+
+Commas = BeforeValidator(_split_commas)
+"""Of a tuple: several values may be given as one text with commas between."""
+
+
+class Role(StrEnum):
+    """What the value of a field is; written into `Annotated`, CHOICE where nothing is written."""
+
+    CHOICE = "choice"
+    """A choice about the work: it is recorded with the results, and a service or a farm takes it too."""
+    INPUT = "input"
+    """A file or folder that is read."""
+    OUTPUT = "output"
+    """The file or folder of the results."""
+    MACHINE = "machine"
+    """Where the work is done: the device, and the folder for caches."""
+    RUN = "run"
+    """What one run does beside or instead of the whole work: a part of the frames, all frames anew, a report."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spelling:
+    """How an option is typed, where the rule does not say it."""
+
+    flag: str | None = None
+    """In place of the field's name, such as --filter."""
+    off: str | None = None
+    """The flag that turns a switch off, in place of --no-…."""
+    metavar: str | None = None
+    """What stands for the value in the help."""
+    argument: bool = False
+    """Given by its place, without a flag."""
+
+
+class Choice(StrEnum):
+    """A closed set of values, each with the words that explain it: `ZIP = "zip", "keeps every bit"`."""
+
+    words: str
+
+    def __new__(cls, value: str, words: str = "") -> Self:
+        """Make a value with its words; none where the value says enough."""
+        member = str.__new__(cls, value)
+        member._value_ = value
+        member.words = words
+        return member
+
+    @classmethod
+    def explained(cls) -> str:
+        """Return the values that have words, with them, as one line."""
+        return "; ".join(f"{member}: {member.words}" for member in cls if member.words)
 
 
 class Options(BaseModel):
@@ -24,21 +77,21 @@ class Options(BaseModel):
 
 
 class Request(Options):
-    """Base of every request."""
+    """Base of the requests whose work needs a device."""
 
-    device: str | None = None
+    device: Annotated[str | None, Role.MACHINE] = None
     """cpu, cuda:0, …; None: the first CUDA device, else the CPU."""
-    cache: Path | None = None
-    """Folder for the stack cache; None: `.relit` in the capture's folder."""
+    cache: Annotated[Path | None, Role.MACHINE] = None
+    """Folder for the image stack; None: .relit in the capture's folder."""
 
 
 class StackOptions(Options):
     """About the images of a capture."""
 
     align: bool = False
-    """Warp the frames of a moving subject to the time of one tracking frame."""
-    align_to: str | None = None
-    """Image of that tracking frame, and so `align`; None: the middle one."""
+    """The subject moves: warp every frame to the time of the middle tracking frame (light type full). The mask belongs to that time."""
+    align_to: Annotated[str | None, Spelling(metavar="IMAGE")] = None
+    """Align, to the time of this tracking frame."""
 
     @property
     def aligned(self) -> bool:

@@ -1,42 +1,36 @@
 """What `relit depth` takes."""
 
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import BeforeValidator, Field
 
-from service.requests.base import Options, Request, split_commas
+from service.requests.base import Choice, Commas, Options, Request, Role, Spelling
 
 Above0 = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
-def _filters(given: Any) -> Any:
-    return tuple(name for name in split_commas(given) if name) if isinstance(given, str) else split_commas(given)
+def _without_blanks(given: Any) -> Any:
+    return tuple(name for name in given if name) if isinstance(given, tuple) else given
 
 
-class Ranging(StrEnum):
+class Ranging(Choice):
     """What a depth is measured with."""
 
-    PATTERN = "pattern"
-    """A projector's patterns: structured light."""
-    LASER = "laser"
-    """Spots and stripes of a laser."""
-    TOF = "tof"
-    """The time that light takes."""
+    PATTERN = "pattern", "a projector's patterns, structured light"
+    LASER = "laser", "spots and stripes of a laser"
+    TOF = "tof", "the time that light takes"
 
 
-class TofFilter(StrEnum):
+class TofFilter(Choice):
     """Filters, each asked for by name; flying pixels are taken out before anything is smoothed."""
 
-    FLYING = "flying"
-    """Takes out pixels that lie between two surfaces; changes no other."""
-    BILATERAL = "bilateral"
-    """Smooths the range within edges of the amplitude; fills nothing in."""
+    FLYING = "flying", "takes out mixed pixels, which lie between two surfaces, and changes no other"
+    BILATERAL = "bilateral", "smooths the range within edges of the amplitude, and fills nothing in"
 
 
-class WhichReturn(StrEnum):
+class WhichReturn(Choice):
     """Which of several returns is the depth."""
 
     STRONGEST = "strongest"
@@ -44,26 +38,25 @@ class WhichReturn(StrEnum):
     LAST = "last"
 
 
-class TofChoices(BaseModel):
+class TofChoices(Options):
     """How time of flight is solved."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
-
-    filters: Annotated[tuple[TofFilter, ...], BeforeValidator(_filters)] = ()
-    """As text, names with commas between."""
+    filters: Annotated[tuple[TofFilter, ...], BeforeValidator(_without_blanks), Commas, Spelling(flag="--filter")] = ()
+    """Filters of time of flight, as text with commas between."""
     vote: bool = True
-    """Let neighbours decide between wraps that a pixel leaves open (continuous wave)."""
-    which: WhichReturn = WhichReturn.STRONGEST
-    """Of several returns (pulsed)."""
+    """Time of flight, continuous wave: let neighbours decide between wraps that a pixel leaves open."""
+    which: Annotated[WhichReturn, Spelling(flag="--return")] = WhichReturn.STRONGEST
+    """Time of flight, pulsed: the return that is the depth, of several."""
     temperature_c: float | None = Field(default=None, allow_inf_nan=False)
-    """Of the camera, for a calibration with a temperature drift."""
+    """Temperature of the camera, for a time-of-flight calibration with a temperature drift."""
 
 
 class TofOptions(TofChoices):
     """The same, with the camera's calibration."""
 
-    calibration: Path | None = None
-    """A relit.tof/1 file; None: noise and pulse are estimated from the capture, nothing is corrected."""
+    calibration: Annotated[Path | None, Role.INPUT, Spelling(flag="--tof-calibration")] = None
+    """Noise, wiggling, offset, drift and pulse of a time-of-flight camera: a relit.tof/1 file; None: noise and pulse are estimated from
+    the capture, nothing is corrected."""
 
 
 class DepthOptions(Options):
@@ -72,9 +65,9 @@ class DepthOptions(Options):
     using: Ranging | None = None
     """Which frames, where a capture holds several kinds; None: those that there are."""
     near_m: Above0 | None = None
-    """Depths below are out of range."""
+    """Depths below, in metres, are out of range."""
     far_m: Above0 | None = None
-    """Depths above are out of range."""
+    """Depths above, in metres, are out of range."""
     max_residual_px: Above0 = 4.0
     """Where column and row are decoded: how far, in projector pixels, they may lie from a place that the line of sight passes."""
     refine: bool = True
@@ -82,7 +75,7 @@ class DepthOptions(Options):
     read_noise: Above0 = 0.003
     """Standard deviation of a reading in the dark, quantisation included, as a part of full scale; patterns only."""
     photon_gain: NotNegative = 1e-4
-    """Photon noise: full scale over the electrons that fill it; patterns only."""
+    """Photon noise: full scale over the electrons that fill a pixel; patterns only."""
     tof: TofChoices = TofChoices()
     """Of time of flight; `near_m` and `far_m` are ranges along the ray there."""
     normals: bool = False
@@ -90,10 +83,11 @@ class DepthOptions(Options):
 
 
 class DepthRequest(DepthOptions, Request):
-    """Depth of a capture from projected patterns, a laser, or time of flight."""
+    """Depth from projected patterns, a laser or time of flight."""
 
-    capture: Path
-    out: Path
+    capture: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="CAPTURE")]
+    """Folder with a capture.json."""
+    out: Annotated[Path, Role.OUTPUT]
     """Folder for depth.exr, points.ply and report.json."""
     tof: TofOptions = TofOptions()
     """Of time of flight, with the camera's calibration; `near_m` and `far_m` are ranges along the ray there."""

@@ -1,33 +1,33 @@
 """What `relit export` takes."""
 
-from enum import StrEnum
 from pathlib import Path
+from typing import Annotated, Literal
 
-from service.requests.base import Options
+from service.requests.base import Choice, Options, Role, Spelling
+
+AssetFormat = Literal["usdz", "usda", "usdc"]
 
 
-class Geometry(StrEnum):
+class Geometry(Choice):
     """What an asset of a depth is made of."""
 
-    MESH = "mesh"
-    """Faces between neighbouring pixels of one surface."""
-    POINTS = "points"
-    """The measured points."""
+    MESH = "mesh", "faces between neighbouring pixels of one surface"
+    POINTS = "points", "the measured points"
 
 
 class ExportOptions(Options):
     """What a USD asset is called and made of."""
 
     name: str | None = None
-    """Of the asset; None: what the maps say, else the file's stem."""
+    """Name of the asset; None: what the maps say, else the file's stem."""
     geometry: Geometry | None = None
-    """Of a depth (depth.exr in place of maps.exr); None: mesh."""
+    """What an asset of a depth (depth.exr in place of maps.exr) is made of; None: mesh."""
 
 
 class ExportRequest(ExportOptions):
-    """A USD asset from solved maps or a depth."""
+    """A USD asset: solved maps with the estimated material, a depth with its colours."""
 
-    maps: Path
-    """A folder with maps.exr or depth.exr, or the file."""
-    out: Path
-    """.usdz, .usda or .usdc."""
+    maps: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="DIR")]
+    """Folder with maps.exr or depth.exr, or the file."""
+    out: Annotated[Path, Role.OUTPUT]
+    """The asset: .usdz, .usda or .usdc."""

@@ -4,24 +4,30 @@ from typing import Annotated, Literal
 
 from pydantic import Field, TypeAdapter
 
-from service.requests.base import Options
+from service.requests.base import Options, Role, Spelling
 from service.requests.depth import DepthOptions
-from service.requests.export import ExportOptions
+from service.requests.export import AssetFormat, ExportOptions
 from service.requests.identifiers import CaptureId, EnvironmentId, JobId
 from service.requests.light_keys import LightKeys
 from service.requests.relight import RelightOptions
 from service.requests.shade import ShadeOptions
 from service.requests.solve import SolveOptions
 
-DEFAULT_PRIORITY = 50
+DEFAULT_PORT = 8470
+DEFAULT_SERVER = f"http://127.0.0.1:{DEFAULT_PORT}"
+"""Where a service is looked for that nothing else is said about."""
+
+CAPTURE = Spelling(argument=True, metavar="CAPTURE")
+MAPS = Spelling(argument=True, metavar="JOB")
+KEYS = Spelling(metavar="FILE")
 
 
 class JobRequest(Options):
     """Base of every job."""
 
-    name: Annotated[str, Field(max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")] = ""
-    """For people; nothing depends on it."""
-    priority: Annotated[int, Field(ge=0, le=100)] = DEFAULT_PRIORITY
+    name: Annotated[str, Field(max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$"), Role.RUN, Spelling(flag="--job-name", metavar="TEXT")] = ""
+    """Name of the job, for people; nothing depends on it."""
+    priority: Annotated[int, Field(ge=0, le=100), Role.RUN] = 50
     """Higher goes first; equal ones in the order they came."""
 
 
@@ -36,9 +42,10 @@ class SolveJob(JobRequest):
     """Normals, reflectance and height: maps.exr, report.json."""
 
     kind: Literal["solve"]
-    capture: CaptureId
-    reference_ball: CaptureId | None = None
-    """Capture of the ball, for the method reference."""
+    capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
+    """The capture."""
+    reference_ball: Annotated[CaptureId | None, Role.INPUT, Spelling(metavar="CAPTURE")] = None
+    """Capture of a ball of the object's material, for the method reference."""
     options: SolveOptions = SolveOptions()
 
 
@@ -46,9 +53,10 @@ class DepthJob(JobRequest):
     """Depth: depth.exr, points.ply, report.json."""
 
     kind: Literal["depth"]
-    capture: CaptureId
-    tof_calibration: str | None = None
-    """Name of a relit.tof/1 file in the capture."""
+    capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
+    """The capture."""
+    tof_calibration: Annotated[str | None, Role.INPUT, Spelling(metavar="NAME")] = None
+    """Name of a relit.tof/1 file in the capture's folder."""
     options: DepthOptions = DepthOptions()
 
 
@@ -56,10 +64,13 @@ class RelightJob(JobRequest):
     """Frames of a capture under new light: frame.####.exr."""
 
     kind: Literal["relight"]
-    capture: CaptureId
-    environment: EnvironmentId | None = None
-    keys: LightKeys | None = None
-    maps: JobId | None = None
+    capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
+    """The capture."""
+    environment: Annotated[EnvironmentId | None, Role.INPUT] = None
+    """Lat-long environment."""
+    keys: Annotated[LightKeys | None, Role.INPUT, KEYS] = None
+    """Light keys (JSON, schema relit.keys/1; docs/relight.md)."""
+    maps: Annotated[JobId | None, Role.INPUT, Spelling(metavar="JOB")] = None
     """A solve job of the capture: its maps guide the frames."""
     options: RelightOptions = RelightOptions()
 
@@ -68,9 +79,11 @@ class ShadeJob(JobRequest):
     """One picture of solved maps: picture.exr."""
 
     kind: Literal["shade"]
-    maps: JobId
-    environment: EnvironmentId | None = None
-    capture: CaptureId | None = None
+    maps: Annotated[JobId, Role.INPUT, MAPS]
+    """The job that made the maps."""
+    environment: Annotated[EnvironmentId | None, Role.INPUT] = None
+    """Lat-long environment."""
+    capture: Annotated[CaptureId | None, Role.INPUT, Spelling(metavar="CAPTURE")] = None
     """The capture of the maps: its images give what a model of the maps cannot."""
     options: ShadeOptions = ShadeOptions()
 
@@ -79,19 +92,26 @@ class ExportJob(JobRequest):
     """A USD asset of a solve or depth job: asset.usdz, .usda or .usdc."""
 
     kind: Literal["export"]
-    maps: JobId
-    format: Literal["usdz", "usda", "usdc"] = "usdz"
+    maps: Annotated[JobId, Role.INPUT, MAPS]
+    """The job that made the maps or the depth."""
+    format: AssetFormat = "usdz"
+    """Format of the asset."""
     options: ExportOptions = ExportOptions()
 
 
 class PipelineJob(JobRequest):
-    """Solve, then export, then relight: maps.exr, report.json, asset.usdz, frame.####.exr."""
+    """Solve, then export, then relight, in one job; without light for frames it ends with the asset: maps.exr, report.json, asset.usdz,
+    frame.####.exr."""
 
     kind: Literal["pipeline"]
-    capture: CaptureId
-    environment: EnvironmentId | None = None
-    keys: LightKeys | None = None
-    format: Literal["usdz", "usda", "usdc"] = "usdz"
+    capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
+    """The capture."""
+    environment: Annotated[EnvironmentId | None, Role.INPUT] = None
+    """Lat-long environment."""
+    keys: Annotated[LightKeys | None, Role.INPUT, KEYS] = None
+    """Light keys (JSON, schema relit.keys/1; docs/relight.md)."""
+    format: AssetFormat = "usdz"
+    """Format of the asset."""
     guided: bool = False
     """Guide the frames by the maps that were solved."""
     solve: SolveOptions = SolveOptions()

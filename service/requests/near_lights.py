@@ -13,7 +13,7 @@ BRIGHTEST = 1e15
 """Of any light: brighter by far than half can show, and safe from overflow."""
 
 
-class _Part(NamedTuple):
+class _Member(NamedTuple):
     name: str
     numbers: int
 
@@ -77,7 +77,7 @@ class RectangleLight(_NearLight):
         return self
 
 
-def _read(form: str, parts: tuple[_Part, ...], optional: int = 0) -> Any:
+def _read(form: str, parts: tuple[_Member, ...], optional: int = 0) -> Any:
     """Take text `a,b,c,…` apart; lists of JSON become tuples."""
     whole, least = sum(part.numbers for part in parts), sum(part.numbers for part in parts[: len(parts) - optional])
 
@@ -102,13 +102,13 @@ def _read(form: str, parts: tuple[_Part, ...], optional: int = 0) -> Any:
     return read
 
 
-POINT_FORM = "x,y,z,r,g,b or x,y,z,r,g,b,ax,ay,az,anisotropy"
+POINT_FORM = "x,y,z,r,g,b[,ax,ay,az,anisotropy]"
 SPHERE_FORM = "x,y,z,radius,r,g,b"
 RECTANGLE_FORM = "x,y,z,ux,uy,uz,vx,vy,vz,r,g,b"
 
 GivenPoint = Annotated[PointLight, BeforeValidator(_read(POINT_FORM, (
-    _Part("position_m", 3), _Part("intensity", 3), _Part("axis", 3), _Part("anisotropy", 1)), optional=2))]
+    _Member("position_m", 3), _Member("intensity", 3), _Member("axis", 3), _Member("anisotropy", 1)), optional=2))]
 GivenSphere = Annotated[SphereLight, BeforeValidator(_read(SPHERE_FORM, (
-    _Part("center_m", 3), _Part("radius_m", 1), _Part("radiance", 3))))]
+    _Member("center_m", 3), _Member("radius_m", 1), _Member("radiance", 3))))]
 GivenRectangle = Annotated[RectangleLight, BeforeValidator(_read(RECTANGLE_FORM, (
-    _Part("center_m", 3), _Part("edge_u_m", 3), _Part("edge_v_m", 3), _Part("radiance", 3))))]
+    _Member("center_m", 3), _Member("edge_u_m", 3), _Member("edge_v_m", 3), _Member("radiance", 3))))]

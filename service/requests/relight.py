@@ -1,21 +1,19 @@
 """What `relit relight` takes."""
 
-from enum import StrEnum
 from pathlib import Path
+from typing import Annotated
 
 from pydantic import Field
 
-from service.requests.base import Request, StackOptions
+from service.requests.base import Choice, Request, Role, Spelling, StackOptions
 from service.requests.picture import PictureOptions
 
 
-class LightWeights(StrEnum):
+class LightWeights(Choice):
     """How light from between the captured lights is shared out over them."""
 
-    CELLS = "cells"
-    """Whole to the nearest light."""
-    SMOOTH = "smooth"
-    """To the three lights around it."""
+    CELLS = "cells", "whole to the nearest light"
+    SMOOTH = "smooth", "to the three lights around it"
 
 
 class RelightOptions(PictureOptions, StackOptions):
@@ -26,30 +24,31 @@ class RelightOptions(PictureOptions, StackOptions):
     weights: LightWeights | None = None
     """How light from between the captured lights is shared out over them; None: cells, with maps smooth."""
     spin_degrees: float = Field(default=0.0, allow_inf_nan=False)
-    """How far the environment turns about +y over the whole range; the first frame is unturned, and a full turn closes."""
+    """How far the environment turns about +y, +z towards +x, over the whole range; the first frame is unturned, and a full turn closes."""
 
 
 class RelightRequest(RelightOptions, Request):
-    """Frames of a capture, or of a sequence of captures, under lat-long environments and animated lights."""
+    """Frames under HDR environments and animated lights."""
 
-    capture: Path
-    """A folder with a capture.json; or with such folders, one a time step: in order of name, each gives one frame."""
-    out: str
-    """Path of the frames with #### for the number."""
-    environment: Path | None = None
-    """A lat-long map; with #### in its name one a frame."""
-    keys: Path | None = None
-    """Light keys (schema relit.keys/1): animation of lights, environment, captured images and exposure."""
-    only: str | None = None
-    """Of `frames`, the part that this run makes, in the same form: what a farm gives to one of its machines. None: all."""
-    maps: Path | None = None
-    """Folder of the solved maps (of a sequence: of a folder a time step, named as its capture): frames are guided by a model of them."""
-    overwrite: bool = False
-    """Make frames anew that an equal request has made already."""
-    sheet: Path | None = None
-    """A PNG that shows the frames for review."""
-    report: Path | None = None
-    """A JSON file that says what was made, and where the time went."""
+    capture: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="CAPTURE")]
+    """Folder with a capture.json; or with such folders, one a time step: in order of name, each gives one frame."""
+    out: Annotated[str, Role.OUTPUT]
+    """Path of the frames, #### for the number."""
+    environment: Annotated[Path | None, Role.INPUT] = None
+    """Lat-long .exr or .hdr; with #### in its name one a frame."""
+    keys: Annotated[Path | None, Role.INPUT, Spelling(metavar="FILE")] = None
+    """Light keys (JSON, schema relit.keys/1): animated lights, environment, captured images and exposure; docs/relight.md."""
+    only: Annotated[str | None, Role.RUN, Spelling(metavar="FRAMES")] = None
+    """Make this part of `frames` alone, such as 9-16: what a farm gives to one machine; None: all."""
+    maps: Annotated[Path | None, Role.INPUT, Spelling(metavar="DIR")] = None
+    """Folder of the solved maps: what lies between the captured lights is taken from a model of them, as far as it proves right.
+    For a sequence with one folder a capture in it, named as the capture."""
+    overwrite: Annotated[bool, Role.RUN] = False
+    """Make every frame; else those that an equal run has made already are kept."""
+    sheet: Annotated[Path | None, Role.RUN, Spelling(metavar="FILE.png")] = None
+    """Contact sheet of the frames, for review."""
+    report: Annotated[Path | None, Role.RUN, Spelling(metavar="FILE.json")] = None
+    """A report of what was made, and where the time went."""
 
     @property
     def weighting(self) -> LightWeights:

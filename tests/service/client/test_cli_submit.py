@@ -9,18 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from service.cli import depth as depth_here
-from service.cli import relight as relight_here
-from service.cli import results as results_here
-from service.cli import service_options
-from service.cli import shade as shade_here
-from service.client import Client, client
-from service.requests.depth import DepthOptions, TofChoices
-from service.requests.export import ExportOptions
-from service.requests.jobs import DEFAULT_PRIORITY
+from service.client import Client
 from service.requests.relight import RelightOptions
-from service.requests.shade import ShadeOptions
-from service.requests.solve import SolveOptions
 from tests.captures import write_capture
 from tests.service.client.conftest import OWL, SKY
 
@@ -34,22 +24,6 @@ def environment(monkeypatch: pytest.MonkeyPatch, server, key):
 def said(out: str) -> dict[str, str]:
     """Lines of `name  value`."""
     return {line.partition(" ")[0]: line.partition(" ")[2].strip() for line in out.splitlines()}
-
-
-@pytest.mark.parametrize(("commands", "models"), [
-    ([results_here.solve], [SolveOptions]), ([relight_here.relight], [RelightOptions]), ([shade_here.shade], [ShadeOptions]),
-    ([results_here.export], [ExportOptions]), ([depth_here.depth], [DepthOptions, TofChoices]),
-    ([results_here.solve, results_here.export, relight_here.relight], [SolveOptions, ExportOptions, RelightOptions])])
-def test_what_may_be_chosen_here_may_be_chosen_there(commands, models):
-    """A field without an option could not be asked for, and an option without a field would be dropped."""
-    assert {option.name for option in service_options.options_of(*commands)} == {
-        name for model in models for name in model.model_fields if name != "tof"}
-
-
-def test_the_same_defaults_everywhere():
-    """The commands start without what would tell them."""
-    assert service_options.DEFAULT_SERVER == client.DEFAULT_SERVER
-    assert service_options.DEFAULT_PRIORITY == DEFAULT_PRIORITY
 
 
 def test_a_folder_becomes_maps_frames_and_an_asset(relit, tmp_path: Path):

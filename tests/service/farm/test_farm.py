@@ -2,7 +2,6 @@
 
 import hashlib
 import importlib.util
-import inspect
 import json
 import math
 import os
@@ -14,11 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.cli import relight as relight_here
-from service.cli import shade as shade_here
-from service.cli.farm import CHUNK_FRAMES, HERE
-from service.farm.document import yaml_text
+from service.cli.farm import CHUNK_FRAMES
+from service.farm.template import Job, write_job
 from service.light import combine
+from service.requests.base import Role
+from service.requests.options import options_of
+from service.requests.relight import RelightRequest
+from service.requests.shade import ShadeRequest
 from stage import exr
 from tests.captures import files_in, make_scene, write_capture, write_exr
 from tests.glossy_captures import dome, write_dome, write_maps
@@ -179,8 +180,8 @@ def test_yaml_says_what_was_meant(tmp_path):
              "`"]
     data = {"texts": texts, "numbers": [1, -2, 0.5, 1e-7, 1e22, math.pi],
             "inner": {"list": [{"a": "b", "c": [{"d": "e"}]}, "f"], "empty": [], "flag": True}}
-    (tmp_path / "a.yaml").write_text(yaml_text(data), encoding="utf-8")
-    assert read(tmp_path / "a.yaml") == data
+    write_job(Job(data, {"A": ODD}), tmp_path / "a.yaml")
+    assert read(tmp_path / "a.yaml") == data and read(tmp_path / "a.values.yaml") == {"A": ODD}
 
 
 def test_progress_lines_of_a_task(relit, tmp_path):
@@ -199,13 +200,15 @@ def test_progress_lines_of_a_task(relit, tmp_path):
 
 def test_the_docs_name_every_option_and_parameter(relit, tmp_path):
     text = (ROOT / "docs" / "farm.md").read_text(encoding="utf-8")
-    for command, elsewhere in (("relight", relight_here.relight), ("shade", shade_here.shade)):
+    for command, model in (("relight", RelightRequest), ("shade", ShadeRequest)):
         outcome = relit("farm", "template", command, "--help")
         own = set(re.findall(r"--[a-z-]+", outcome.out)) - set(re.findall(r"--[a-z-]+", relit(command, "--help").out))
         assert own and {option for option in own if f"`{option}" not in text} == set()
-        assert HERE & set(inspect.signature(elsewhere).parameters) <= {name for name in HERE if f"`--{name}`" in text or name == "progress"}
-    asked = {name for file in ("relight", "shade", "job") for name in re.findall(
+        assert all(f"`{option.flag}`" in text for option in options_of(model) if option.role is Role.RUN)
+    asked = {name for file in ("jobs", "template") for name in re.findall(
         r'given\.(?:text|count|file|folder)\("(\w+)"', (ROOT / "service" / "farm" / f"{file}.py").read_text(encoding="utf-8"))}
+    asked |= {option.name.title().replace("_", "") for model in (RelightRequest, ShadeRequest) for option in options_of(model)
+              if option.role is Role.INPUT or (option.role is Role.CHOICE and option.kind is str)}
     assert len(asked) > 10 and {name for name in asked if f"`{name}`" not in text} == set()
     for script in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
         compile(script, "docs/farm.md", "exec")

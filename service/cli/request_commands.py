@@ -1,0 +1,162 @@
+"""Commands made from request models: the only place that turns a model into options of the command line.
+
+A command is a function that takes a request, does the work and prints what came of it. A parameter whose annotation is a model of
+service.requests becomes the options of that model, and the function gets the model that was built from what was typed:
+
+    def _solve(request: SolveRequest) -> None:
+        from service.solve.solve import solve  # heavy imports stand inside commands
+
+        with Bar() as bar:
+            result = solve(request, bar)
+        print(f"maps     {result.maps_path}")
+
+    local_command(app, "solve", _solve)
+
+Names, defaults, limits and help are those of the model's fields; service.requests.options tells the rule. The help of the command is
+the function's docstring, or the model's where the function has none. Every other parameter of the function is an option of the command
+alone, written for Typer in the usual way. A function that takes `Given[Model]` in place of the model gets what was typed, to change or
+look at it before the model is built; several models share the options that they have in common.
+
+To add a command: write its model in service/requests, its function here in service/cli, and register it. To add an option: write
+the field. `relit submit`, `relit farm template`, the API and the records of results follow.
+"""
+
+import inspect
+from collections.abc import Callable, Mapping
+from enum import Enum
+from pathlib import Path
+from typing import Annotated, Any, Generic, Literal, get_args, get_origin
+
+import typer
+from annotated_types import Ge, Le
+from pydantic import BaseModel, BeforeValidator
+
+from service.cli.options import HostOption
+from service.requests.base import Options, Role
+from service.requests.options import Model, Option, build, help_text, options_of, typed
+
+ORDER = (Role.INPUT, Role.OUTPUT, Role.CHOICE, Role.RUN, Role.MACHINE)
+"""In which the help lists options."""
+READ_BY_TYPER = (bool, int, float, Path, Enum)
+"""Types that Typer reads; anything else is a text that the model takes apart."""
+
+
+class Given(Generic[Model]):
+    """What was typed for the options of a model; what was left out is not in it."""
+
+    def __init__(self, model: type[Model], values: Mapping[str, Any]) -> None:
+        """Args: model: the model; values: by the names of its options."""
+        self.model, self.values = model, dict(values)
+
+    def build(self, **changes: Any) -> Model:
+        """Make the model, with some values in place of those that were typed.
+
+        Raises:
+            ValidationError: a value cannot be used, or one is missing.
+        """
+        return build(self.model, {**self.values, **changes})
+
+
+def local_command(group: typer.Typer, name: str, function: Callable[..., None]) -> None:
+    """Add a command that works on this machine: where its request has no device, it takes --device all the same."""
+    command(group, name, function, device=True)
+
+
+def command(group: typer.Typer, name: str, function: Callable[..., None], *, without: frozenset[Role] = frozenset(),
+            device: bool = False, words: Callable[[Option, Any], str] = help_text) -> None:
+    """Add a command that is made from a function.
+
+    Args:
+        group: takes the command.
+        name: of the command.
+        function: as the docstring of this module says.
+        without: roles of options that the command does not have.
+        device: whether it takes --device also where no model asks for it.
+        words: gives the help of an option of a model.
+    """
+    parameters = inspect.signature(function).parameters.values()
+    models = {parameter.name: model for parameter in parameters if (model := _model(parameter.annotation)) is not None}
+    lazy = {parameter.name for parameter in parameters if get_origin(parameter.annotation) is Given}
+    own = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in parameters if parameter.name not in models]
+
+    def run(context: typer.Context, **values: Any) -> None:
+        was_typed = {name for name in values if (source := context.get_parameter_source(name)) and not source.name.startswith("DEFAULT")}
+        arguments = {parameter.name: values[parameter.name] for parameter in own}
+        for name, model in models.items():
+            given = Given(model, {option.name: values[option.name] for option in options_of(model) if option.name in was_typed})
+            arguments[name] = given if name in lazy else given.build()
+        function(**arguments)
+
+    signature = [inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context),
+                 *_parameters(list(models.values()), without, own, words)]
+    if device and "device" not in {parameter.name for parameter in signature}:
+        signature.append(inspect.Parameter("device", inspect.Parameter.KEYWORD_ONLY, annotation=HostOption, default=None))
+    run.__signature__ = inspect.Signature(signature)  # type: ignore[attr-defined]
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in signature}
+    group.command(name, help=inspect.getdoc(function) or inspect.getdoc(next(iter(models.values()))))(run)
+
+
+def _model(annotation: Any) -> type[Options] | None:
+    """Return the model of a parameter that stands for one, or None."""
+    kind = get_args(annotation)[0] if get_origin(annotation) is Given else annotation
+    return kind if isinstance(kind, type) and issubclass(kind, Options) else None
+
+
+def _parameters(models: list[type[Options]], without: frozenset[Role], own: list[inspect.Parameter],
+                words: Callable[[Option, Any], str]) -> list[inspect.Parameter]:
+    """Return the options of all models and a command's own, in the order of the help."""
+    found: dict[str, list[tuple[Option, type[Options]]]] = {}
+    for model in models:
+        for option in options_of(model):
+            if option.role not in without:
+                found.setdefault(option.name, []).append((option, model))
+    places: list[tuple[tuple[bool, bool, int], inspect.Parameter]] = []
+    for (option, model), *others in found.values():
+        required = 1 + len(others) == len(models) and all(each.field.is_required() for each, _ in [(option, model), *others])
+        place = (not option.spelling.argument, not required, ORDER.index(option.role))
+        places.append((place, _parameter(option, required, words(option, model))))
+    places += [((True, parameter.default is not inspect.Parameter.empty, ORDER.index(Role.RUN)), parameter) for parameter in own]
+    return [parameter for _, parameter in sorted(places, key=lambda entry: entry[0])]
+
+
+def _parameter(option: Option, required: bool, about: str) -> inspect.Parameter:
+    """Return an option as Typer takes it."""
+    default = inspect.Parameter.empty if required else _default(option)
+    kind = list[_typer_type(get_args(option.kind)[0])] if option.is_repeated else _typer_type(option.kind)  # type: ignore[misc]
+    has_default = default not in (inspect.Parameter.empty, None)
+    shown: dict[str, Any] = {"help": about, "metavar": option.spelling.metavar, "show_default": has_default}
+    info: Any
+    if option.spelling.argument:
+        info = typer.Argument(**shown)
+    elif kind is bool:
+        info = typer.Option(f"{option.flag}/{option.off}" if option.field.default else option.flag, **shown)
+    else:
+        info = typer.Option(option.flag, **shown, **(_limits(option) if kind is int else {}))
+    annotation = Annotated[kind if default is not None else kind | None, info]  # type: ignore[valid-type]
+    return inspect.Parameter(option.name, inspect.Parameter.KEYWORD_ONLY, annotation=annotation, default=default)
+
+
+def _default(option: Option) -> Any:
+    """Return the default of an option as the help shows it; None where nothing is shown."""
+    default = option.field.default
+    if option.field.is_required() or default in (None, "", ()):
+        return None
+    return typed(default) if isinstance(default, tuple) else default
+
+
+def _typer_type(annotation: Any) -> Any:
+    if get_origin(annotation) is Annotated:
+        kind, *constraints = get_args(annotation)
+        return str if any(isinstance(each, BeforeValidator) for each in constraints) else _typer_type(kind)
+    if get_origin(annotation) is Literal:
+        return annotation
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return Path  # a JSON file that holds it
+    return annotation if isinstance(annotation, type) and issubclass(annotation, READ_BY_TYPER) else str
+
+
+def _limits(option: Option) -> dict[str, Any]:
+    """Return the range of a whole number; other limits are told by the model."""
+    low = [limit.ge for limit in option.constraints if isinstance(limit, Ge)]
+    high = [limit.le for limit in option.constraints if isinstance(limit, Le)]
+    return {name: int(str(values[0])) for name, values in (("min", low), ("max", high)) if values}

@@ -1,0 +1,153 @@
+"""The options of a request, read from the fields of its model.
+
+A field is the only place where an option stands: its name, type, default and limits; its words, in the docstring below it; its `Role`;
+and its `Spelling`, where the rule does not give the wanted one. By the rule a field `spin_degrees` is typed `--spin-degrees`, a switch
+that is on by default `--refine/--no-refine`, a tuple with `Commas` as one text with commas between, and any other tuple by giving the
+option several times. The fields of a model within a model are options like its own.
+
+The command line, `relit submit`, the templates for farms and the provenance of results are made from this; forms can be.
+"""
+
+import re
+import types
+from collections.abc import Iterator, Mapping
+from functools import cache
+from inspect import get_annotations
+from keyword import iskeyword
+from typing import Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from service.requests.base import Choice, Commas, Options, Role, Spelling
+
+Model = TypeVar("Model", bound=Options)
+
+
+class Option(NamedTuple):
+    """One option."""
+
+    name: str
+    """Of the parameter: the field's, or what its flag says."""
+    field: FieldInfo
+    kind: Any
+    """The type of the value, without None and constraints."""
+    constraints: tuple[Any, ...]
+    """What the value must fulfil, and what reads it."""
+    role: Role
+    spelling: Spelling
+
+    @property
+    def flag(self) -> str:
+        """The flag that gives the value, or turns the switch on."""
+        return self.spelling.flag or f"--{self.name.replace('_', '-')}"
+
+    @property
+    def off(self) -> str:
+        """The flag that turns a switch off."""
+        return self.spelling.off or f"--no-{self.flag.removeprefix('--')}"
+
+    @property
+    def is_repeated(self) -> bool:
+        """Whether several values are typed by giving the option several times."""
+        return get_origin(self.kind) is tuple and get_args(self.kind)[-1] is Ellipsis and Commas not in self.constraints
+
+
+@cache
+def options_of(model: type[BaseModel]) -> tuple[Option, ...]:
+    """Return the options of a model, those that it declares before those of its bases, each name once."""
+    found: dict[str, Option] = {}
+    for name, field in _fields(model):
+        inner = nested(field)
+        options = options_of(inner) if inner is not None else () if _is_constant(field) else (_option(name, field),)
+        for option in options:
+            found.setdefault(option.name, option)
+    return tuple(found.values())
+
+
+def build(model: type[Model], given: Mapping[str, Any]) -> Model:
+    """Make a model from options by name; what is not given has its default.
+
+    Raises:
+        ValidationError: a value cannot be used, or one is missing.
+    """
+    values: dict[str, Any] = {}
+    for name, field in _fields(model):
+        inner = nested(field)
+        if inner is not None:
+            if any(option.name in given for option in options_of(inner)):
+                values[name] = build(inner, given)
+        elif _is_constant(field):
+            values[name], = get_args(field.annotation)
+        elif (option := _option(name, field)).name in given:
+            values[name] = given[option.name]
+    return model.model_validate(values)
+
+
+def values_of(request: BaseModel) -> Iterator[tuple[Option, Any]]:
+    """Return the options of a request with their values: the inverse of `build`."""
+    for name, field in _fields(type(request)):
+        value = getattr(request, name)
+        if nested(field) is not None:
+            yield from values_of(value)
+        elif not _is_constant(field):
+            yield _option(name, field), value
+
+
+def nested(field: FieldInfo) -> type[Options] | None:
+    """Return the model whose fields are options of the model around it, or None where the field is one value."""
+    kind, _ = _value_type(field)
+    return kind if isinstance(kind, type) and issubclass(kind, Options) else None
+
+
+def role_of(field: FieldInfo) -> Role:
+    """Return the role of a field."""
+    return next((data for data in field.metadata if isinstance(data, Role)), Role.CHOICE)
+
+
+def help_text(option: Option, model: type[BaseModel]) -> str:
+    """Return the words of an option for a person who types it: flags in place of names of fields, `without it` in place of `None:`."""
+    flags = {other.name: other.flag for other in options_of(model)}
+    text = " ".join((option.field.description or "").split())
+    text = re.sub(r"`(\w+)`", lambda found: flags.get(found[1], found[1]), text)
+    text = re.sub(r"(^|[.] )None: ", r"\1Without it ", text).replace("None: ", "without it ")
+    kind = get_args(option.kind)[0] if get_origin(option.kind) is tuple else option.kind
+    explained = kind.explained() if isinstance(kind, type) and issubclass(kind, Choice) else ""
+    return f"{text} {explained}." if explained else text
+
+
+def typed(value: Any) -> str:
+    """Return a value as it is typed: the inverse of what the validators of the fields take apart."""
+    if isinstance(value, BaseModel):
+        value = tuple(value.model_dump(exclude_defaults=True).values())
+    if isinstance(value, tuple):
+        return ",".join(map(typed, value))
+    return repr(value) if isinstance(value, float) else str(value)
+
+
+def _fields(model: type[BaseModel]) -> Iterator[tuple[str, FieldInfo]]:
+    names = {name: None for cls in model.__mro__ for name in get_annotations(cls)}
+    return ((name, model.model_fields[name]) for name in names if name in model.model_fields)
+
+
+def _is_constant(field: FieldInfo) -> bool:
+    return get_origin(field.annotation) is Literal and len(get_args(field.annotation)) == 1
+
+
+def _value_type(field: FieldInfo) -> tuple[Any, tuple[Any, ...]]:
+    """Return the type of a field's value without `| None`, and the constraints that stand inside and outside of that."""
+    kind = field.annotation
+    if get_origin(kind) in (Union, types.UnionType):
+        kinds = [each for each in get_args(kind) if each is not types.NoneType]
+        if len(kinds) == 1:
+            inner = FieldInfo.from_annotation(kinds[0])
+            return inner.annotation, (*field.metadata, *inner.metadata)
+    return kind, tuple(field.metadata)
+
+
+def _option(name: str, field: FieldInfo) -> Option:
+    kind, constraints = _value_type(field)
+    spelling = next((data for data in constraints if isinstance(data, Spelling)), Spelling())
+    if spelling.flag is not None:
+        name = spelling.flag.removeprefix("--").replace("-", "_")
+    return Option(f"{name}_" if iskeyword(name) else name, field, kind, constraints, role_of(field), spelling)
