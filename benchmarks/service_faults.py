@@ -20,10 +20,10 @@ from typing import NamedTuple
 import numpy as np
 
 from service.requests.identifiers import CAPTURE, ENVIRONMENT
-from service.server.store import jobs, workers
+from service.server.database import jobs, workers
 from tests.captures import make_scene, write_capture, write_exr
 from tests.service.postgres import Postgres, binaries, postgres
-from tests.service.server.jobs.yard import Yard, digests, relit_relight, yard
+from tests.service.server.jobs.harness import Harness, digests, harness, relit_relight
 
 FRAMES, SIZE, LIGHTS, CHUNK_FRAMES, WORKERS = 200, 1024, 6, 8, 3
 TAKEOVER_LIMIT_S = 10.0
@@ -64,12 +64,12 @@ def make_site(folder: Path) -> Site:
     return Site(capture, environment, relit_relight(capture, environment, FRAMES, folder / "frames"))
 
 
-def submit(made: Yard, site: Site) -> str:
+def submit(made: Harness, site: Site) -> str:
     return made.relight(made.register(site.capture, CAPTURE), made.register(site.environment, ENVIRONMENT), FRAMES,
                         chunk_frames=CHUNK_FRAMES)
 
 
-def settle(made: Yard, site: Site, job: str) -> tuple[int, int, int]:
+def settle(made: Harness, site: Site, job: str) -> tuple[int, int, int]:
     """Wait for the job: frames that were to be there, those that are as undisturbed, jobs lost."""
     row = made.ended(job, within_s=600)
     there = digests(made.results(job))
@@ -79,27 +79,27 @@ def settle(made: Yard, site: Site, job: str) -> tuple[int, int, int]:
     return FRAMES, sum(there.get(name) == digest for name, digest in site.digests.items()), int(row["state"] != jobs.SUCCEEDED)
 
 
-def tell(made: Yard, job: str, kind: str, took: float | None) -> None:
+def tell(made: Harness, job: str, kind: str, took: float | None) -> None:
     print(f"{made.frames_there(job):4d} frames  {'        ' if took is None else f'{took:6.2f} s'}  {kind}", flush=True)
 
 
-def taken_over(made: Yard, job: str, victim: str) -> float:
+def taken_over(made: Harness, job: str, victim: str) -> float:
     """Seconds until another worker has the job."""
     began = time.monotonic()
     made.holder(job, other_than=victim)
     return time.monotonic() - began
 
 
-def machine_of(made: Yard, pid: int) -> "subprocess.Popen[bytes]":
+def machine_of(made: Harness, pid: int) -> "subprocess.Popen[bytes]":
     """The `relit worker` over a worker; both are in a process group of their own."""
     return next(process for process in made.supervisors if process.pid == os.getpgid(pid))
 
 
-def kill(made: Yard, job: str, kind: str, chance: random.Random) -> float | None:
+def kill(made: Harness, job: str, kind: str, chance: random.Random) -> float | None:
     """One kill; how long it took until the job was taken over, None where it need not be."""
     holder = made.holder(job)
     if kind == IDLE:
-        others = made.until(lambda: [row for row in workers.present(made.database) if row["id"] != holder and _lives(row["pid"])],
+        others = made.until(lambda: [row for row in workers.seen_lately(made.database) if row["id"] != holder and _lives(row["pid"])],
                             "a worker that waits")
         os.kill(chance.choice(others)["pid"], signal.SIGKILL)
         return None
@@ -131,7 +131,7 @@ def kills(folder: Path, server: Postgres, site: Site, chance: random.Random) -> 
     chance.shuffle(order)
     frames = sorted(chance.randrange(FRAMES - 2 * CHUNK_FRAMES) for _ in order)
     takeovers: dict[str, list[float]] = {kind: [] for kind in KILLS}
-    with yard(folder, server.new_database(), max_lost=len(order)) as made:
+    with harness(folder, server.new_database(), max_lost=len(order)) as made:
         for _ in range(WORKERS):
             made.start()
         made.ready(WORKERS)
@@ -148,11 +148,11 @@ def kills(folder: Path, server: Postgres, site: Site, chance: random.Random) -> 
     return [*rows, Fault("**these together, in one job, in random order**", len(order), wanted, identical, dead, lost)]
 
 
-def disturbed(folder: Path, server: Postgres, site: Site, kind: str, times: int, disturb: Callable[[Yard, str], float | None], *,
+def disturbed(folder: Path, server: Postgres, site: Site, kind: str, times: int, disturb: Callable[[Harness, str], float | None], *,
               environment: dict[str, str] | None = None, **settings: float) -> Fault:
     """A job during which something happens so many times, evenly over its frames."""
     takeovers: list[float] = []
-    with yard(folder, server.new_database(), **settings) as made:
+    with harness(folder, server.new_database(), **settings) as made:
         for _ in range(WORKERS):
             made.start(**(environment or {}))
         made.ready(WORKERS)
@@ -166,23 +166,23 @@ def disturbed(folder: Path, server: Postgres, site: Site, kind: str, times: int,
         return Fault(kind, times, wanted, identical, takeovers, lost)
 
 
-def kill_all(made: Yard, job: str) -> float:
+def kill_all(made: Harness, job: str) -> float:
     holder = made.holder(job)
     for process in made.supervisors:
         if process.poll() is None:
-            for row in workers.present(made.database):
+            for row in workers.seen_lately(made.database):
                 if _lives(row["pid"]) and os.getpgid(row["pid"]) == process.pid:
                     os.kill(row["pid"], signal.SIGKILL)
     return taken_over(made, job, holder)
 
 
-def stop_one(made: Yard, job: str) -> float:
+def stop_one(made: Harness, job: str) -> float:
     holder = made.holder(job)
     os.kill(made.pid_of(holder), signal.SIGSTOP)
     return taken_over(made, job, holder)
 
 
-def ask_one_to_end(made: Yard, job: str) -> float:
+def ask_one_to_end(made: Harness, job: str) -> float:
     holder = made.holder(job)
     machine = machine_of(made, made.pid_of(holder))
     machine.send_signal(signal.SIGTERM)
@@ -193,8 +193,8 @@ def ask_one_to_end(made: Yard, job: str) -> float:
     return took
 
 
-def restarted(server: Postgres, mode: str, away_s: float) -> Callable[[Yard, str], None]:
-    def restart(made: Yard, job: str) -> None:
+def restarted(server: Postgres, mode: str, away_s: float) -> Callable[[Harness, str], None]:
+    def restart(made: Harness, job: str) -> None:
         before = made.row(job)["worker"]
         server.restart(mode, away_s=away_s)
         time.sleep(3 * made.settings.takeover_s)

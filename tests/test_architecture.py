@@ -95,7 +95,7 @@ def test_opencv_lives_where_motion_is_tracked_and_rigs_are_calibrated():
     ("service.requests", (*PRODUCTS, "service.usd", "service.reporting", "kernels")),
     ("service.usd", (*DOORS, *PRODUCTS, "kernels")),
     ("service.server.jobs", ("service.cli", "service.client", "service.server.api")),
-    ("service.server.store", ("service.server.jobs", "service.server.api", *PRODUCTS, "stage", "kernels")),
+    ("service.server.database", ("service.server.jobs", "service.server.api", *PRODUCTS, "stage", "kernels")),
     ("service.server.storage", ("service.server.jobs", "service.server.api", *PRODUCTS, "kernels")),
     ("service.server.api", ("service.cli", "service.client", *PRODUCTS, "service.usd", "kernels")),
     ("service.client", ("service.cli", "service.farm", "service.server", *PRODUCTS, "service.usd", "stage", "kernels")),

@@ -9,7 +9,7 @@ from service.cli.server import ConfigOption, DataOption, settings_of
 
 
 class ScopeName(StrEnum):
-    """What a key may do; a test compares it with service.server.store.keys.Scope, which costs time to load."""
+    """What a key may do; a test compares it with service.server.database.keys.Scope, which costs time to load."""
 
     READ = "read"
     WRITE = "write"
@@ -36,9 +36,9 @@ def create(
     """Make a key and print it: it is kept as a hash alone, and cannot be shown again."""
     import sys
 
-    from service.server.store import keys
-    from service.server.store.database import create as create_tables
-    from service.server.store.open import open_database
+    from service.server.database import keys
+    from service.server.database.engine import create as create_tables
+    from service.server.database.engine import open_database
 
     wanted = keys.NewKey(project=project, name=name, scope=keys.Scope(scope))
 
@@ -58,7 +58,7 @@ def list_(
     """Show the keys that were made, without their secrets."""
     from datetime import UTC, datetime
 
-    from service.server.store import keys
+    from service.server.database import keys
 
     def day(seconds: float) -> str:
         return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M")
@@ -78,7 +78,7 @@ def revoke(
 ) -> None:
     """Take a key back: the next request with it is refused."""
     from service.errors import RequestError
-    from service.server.store import keys
+    from service.server.database import keys
 
     if not keys.revoke(_open(settings_of(config, data=data)), key.partition(".")[0]):
         raise RequestError(f"{key.partition('.')[0]}: there is no such key that is not revoked")
@@ -88,8 +88,8 @@ def revoke(
 def _open(settings: Any) -> Any:
     """The database of a service that is there: a wrong --data makes none."""
     from service.errors import RequestError
-    from service.server.store.database import create as create_tables
-    from service.server.store.open import open_database
+    from service.server.database.engine import create as create_tables
+    from service.server.database.engine import open_database
 
     if settings.is_sqlite and not settings.sqlite_file.exists():
         raise RequestError(f"data {settings.data}: there is no service in this folder")

@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 from sqlalchemy.exc import DBAPIError
 
+from service.server.database import jobs, keys, workers
+from service.server.database.engine import Database, DatabaseError, connect, require_version
 from service.server.settings import Settings, unknown_variables
 from service.server.storage.open import open_storage
-from service.server.store import jobs, keys, workers
-from service.server.store.database import Database, DatabaseError, connect, require_version
 from service.views.states import ACTIVE, ENDED
 from stage.errors import StorageError
 
@@ -74,7 +74,7 @@ def _store(settings: Settings, database: Database) -> Iterator[Finding]:
                       "none, and requests without a key are refused: relit keys create makes one", not settings.anonymous)
     counts = jobs.counts(database)
     yield Finding("jobs", ", ".join(f"{counts[state]} {state}" for state in (*ACTIVE, *ENDED) if state in counts) or "none")
-    present = workers.present(database)
+    present = workers.seen_lately(database)
     waiting = sum(counts.get(state, 0) for state in ACTIVE)
     for worker in present:
         yield Finding("worker", f"{worker['id']} on {worker['device']}, {worker['state']}")

@@ -12,16 +12,16 @@ from pathlib import Path
 
 import sqlalchemy as sa
 
-from service.server.jobs.presence import FilePresence
+from service.server.database import idempotency, intakes, jobs, uploads, workers
+from service.server.database.engine import UNANSWERED, Database, message_of
 from service.server.jobs.queue import JobQueue
 from service.server.jobs.worker import cache_folder
+from service.server.jobs.worker_lock import FileWorkerLock
 from service.server.log import logger
 from service.server.settings import Settings
 from service.server.storage import layout
 from service.server.storage.folder import Storage, drop_folder
 from service.server.storage.parts import parts_folder
-from service.server.store import idempotency, intakes, jobs, uploads, workers
-from service.server.store.database import UNANSWERED, Database, said
 from stage.errors import StorageError
 
 EVERY_S = 600.0
@@ -68,7 +68,7 @@ class Housekeeper:
             try:
                 piece()
             except (*UNANSWERED, StorageError, OSError) as error:
-                logger.warning("housekeeping waits", piece=piece.__name__.strip("_"), error=said(error))
+                logger.warning("housekeeping waits", piece=piece.__name__.strip("_"), error=message_of(error))
 
     def _run(self) -> None:
         while True:
@@ -96,11 +96,11 @@ class Housekeeper:
         self._database.transact(lambda connection: idempotency.drop_before(connection, self._clock() - TOKEN_S))
 
     def _workers(self) -> None:
-        silent = {row["id"] for row in workers.silent(self._database, self._clock() - SILENT_S)}
+        silent = {row["id"] for row in workers.not_seen_since(self._database, self._clock() - SILENT_S)}
         for worker in silent & self._silent:
-            workers.leave(self._database, worker)
+            workers.remove(self._database, worker)
             if self._database.is_sqlite:
-                with FilePresence(self._settings.data / "locks", "").dead(worker):  # which removes the lock of one that is
+                with FileWorkerLock(self._settings.data / "locks", "").dead(worker):  # which removes the lock of one that is
                     pass
             logger.info("worker forgotten", worker=worker)
         self._silent = silent - self._silent

@@ -8,9 +8,9 @@ import sqlalchemy as sa
 from service.requests.identifiers import CAPTURE, ENVIRONMENT, new_id
 from service.requests.jobs import CheckJob
 from service.server.api.context import DEFAULT_PROJECT
+from service.server.database import intakes
+from service.server.database.engine import Database
 from service.server.jobs.queue import JobQueue
-from service.server.store import intakes
-from service.server.store.database import Database
 from service.views.states import REFUSED
 
 

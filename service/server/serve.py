@@ -22,14 +22,13 @@ from service.reporting.memory import keep_freed_blocks
 from service.server import log, telemetry
 from service.server.api.app import create_app
 from service.server.connection import Connection
+from service.server.database.engine import Database, open_database
 from service.server.housekeeping import Housekeeper
 from service.server.jobs.queue import JobQueue, prepare
 from service.server.jobs.supervisor import Supervisor
 from service.server.log import logger
 from service.server.settings import NO_WORKER, Settings, unknown_variables
 from service.server.storage.open import open_storage
-from service.server.store.database import Database
-from service.server.store.open import open_database
 
 T = TypeVar("T")
 CLOSE_S = 5

@@ -13,10 +13,10 @@ from service.server.api.context import Service
 from service.server.api.limits import Limiter
 from service.server.api.metrics import Metrics
 from service.server.api.watch import Watcher
+from service.server.database.engine import Database
 from service.server.jobs.queue import JobQueue
 from service.server.settings import Settings
 from service.server.storage.open import open_storage
-from service.server.store.database import Database
 
 DESCRIPTION = """Captures in, durable jobs, USD assets and relit frames out. docs/service.md has a walk through it."""
 

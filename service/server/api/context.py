@@ -12,19 +12,19 @@ from service.server.api.limits import Limiter
 from service.server.api.local import require_local
 from service.server.api.problems import ApiError
 from service.server.api.watch import Watcher
+from service.server.database import idempotency, keys
+from service.server.database.engine import Database
+from service.server.database.keys import Caller, Scope
 from service.server.jobs.queue import JobQueue
 from service.server.settings import Settings
 from service.server.storage.folder import Storage
-from service.server.store import idempotency, keys
-from service.server.store.database import Database
-from service.server.store.keys import Caller, Scope
 
 DEFAULT_PROJECT = "default"
 ANONYMOUS = Caller(DEFAULT_PROJECT, Scope.ADMIN, None)
 
 
 class Service(NamedTuple):
-    """Behind the app."""
+    """ServiceDep the app."""
 
     settings: Settings
     database: Database
@@ -44,22 +44,22 @@ async def service_of(request: Request) -> Service:  # what waits for nothing is 
     return found
 
 
-Behind = Annotated[Service, Depends(service_of)]
+ServiceDep = Annotated[Service, Depends(service_of)]
 bearer = HTTPBearer(auto_error=False, scheme_name="key", description="A key of `relit keys create`.")
 
 
-def caller_of(behind: Behind, request: Request, given: Annotated[HTTPAuthorizationCredentials | None, Security(bearer)]) -> Caller:
+def caller_of(service: ServiceDep, request: Request, given: Annotated[HTTPAuthorizationCredentials | None, Security(bearer)]) -> Caller:
     """Who asks, within the limits of the key."""
     caller = None
     if given is not None:
-        caller = keys.find(behind.database, given.credentials)
-    elif behind.settings.anonymous:
+        caller = keys.find(service.database, given.credentials)
+    elif service.settings.anonymous:
         require_local(request)
         caller = ANONYMOUS
     if caller is None:
         raise ApiError("unauthenticated", "give a key that is valid as Authorization: Bearer KEY", headers={"WWW-Authenticate": "Bearer"})
     request.state.caller = caller  # for the log
-    behind.limiter.take(caller.key)
+    service.limiter.take(caller.key)
     return caller
 
 
@@ -80,18 +80,18 @@ IdempotencyKey = Annotated[str | None, Header(
     description="Chosen by the client: the same request sent again with it creates nothing again.")]
 
 
-def made_before(behind: Service, caller: Caller, token: str | None, asked: Any) -> str | None:
+def made_before(service: Service, caller: Caller, token: str | None, asked: Any) -> str | None:
     """What the same request has created already: it is not looked at again whether it could be created now."""
     try:
-        return None if token is None else idempotency.made(behind.database, caller.project, token, asked)
+        return None if token is None else idempotency.created_by(service.database, caller.project, token, asked)
     except idempotency.TokenReused:
         raise _reused(token) from None
 
 
-def once(behind: Service, caller: Caller, token: str | None, asked: Any, make: Callable[[sa.Connection], str]) -> tuple[str, bool]:
-    """Create something, once for an Idempotency-Key; arguments as `idempotency.once`."""
+def once(service: Service, caller: Caller, token: str | None, asked: Any, make: Callable[[sa.Connection], str]) -> tuple[str, bool]:
+    """Create something, once for an Idempotency-Key; arguments as `idempotency.create_once`."""
     try:
-        return idempotency.once(behind.database, caller.project, token, asked, make)
+        return idempotency.create_once(service.database, caller.project, token, asked, make)
     except idempotency.TokenReused:
         raise _reused(token) from None
 

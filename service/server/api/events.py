@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Header, Response
 from fastapi.sse import KEEPALIVE_COMMENT, EventSourceResponse, format_sse_event
 
-from service.server.api.context import Behind, Reader
+from service.server.api.context import Reader, ServiceDep
 from service.server.api.jobs import job_of
 from service.server.api.problems import responses
 from service.server.api.watch import Change, Watcher
@@ -30,20 +30,20 @@ LastEvent = Annotated[str | None, Header(
 
 @router.get("/v1/jobs/{job}/events", responses={**responses(404, 422), 200: STREAM, 204: NOTHING_MORE}, response_class=Response,
             summary="Watch a job")
-async def stream_job(behind: Behind, found: Annotated[JobView, Depends(job_of)], last: LastEvent = None) -> Response:
+async def stream_job(service: ServiceDep, found: Annotated[JobView, Depends(job_of)], last: LastEvent = None) -> Response:
     """The job as it is, then as it becomes with every change; the stream ends when the job has."""
     known = int(last) if last is not None and int(last) <= found.revision else 0
     if found.state in ENDED and known == found.revision:
         return Response(status_code=204)
-    behind.watcher.require_room()
-    return EventSourceResponse(_stream(behind.watcher, found.id, known=known, to_its_end=True), headers=HEADERS)
+    service.watcher.require_room()
+    return EventSourceResponse(_stream(service.watcher, found.id, known=known, to_its_end=True), headers=HEADERS)
 
 
 @router.get("/v1/events", responses={200: STREAM}, response_class=Response, summary="Watch all jobs of the project")
-async def stream_jobs(behind: Behind, caller: Reader) -> Response:
+async def stream_jobs(service: ServiceDep, caller: Reader) -> Response:
     """The jobs that have not ended or ended a moment ago, then every job of the project as it changes; the stream does not end."""
-    behind.watcher.require_room()
-    return EventSourceResponse(_stream(behind.watcher, caller.project, to_its_end=False), headers=HEADERS)
+    service.watcher.require_room()
+    return EventSourceResponse(_stream(service.watcher, caller.project, to_its_end=False), headers=HEADERS)
 
 
 async def _stream(watcher: Watcher, topic: str, *, known: int = 0, to_its_end: bool) -> AsyncIterator[bytes]:

@@ -10,16 +10,16 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from service.requests.identifiers import CAPTURE, ENVIRONMENT, CaptureId, EnvironmentId, new_id
 from service.requests.jobs import CheckJob
-from service.server.api.context import Behind, IdempotencyKey, Reader, Service, Writer, once
+from service.server.api.context import IdempotencyKey, Reader, Service, ServiceDep, Writer, once
 from service.server.api.problems import ApiError, responses
 from service.server.api.space import FOR_WORK, require_space
 from service.server.api.submission import submit
 from service.server.api.views import intake_view
+from service.server.database import intakes, jobs, uploads
+from service.server.database.keys import Caller, Scope
 from service.server.safe_names import shown
 from service.server.storage import layout
 from service.server.storage.parts import Part, parts_folder
-from service.server.store import intakes, jobs, uploads
-from service.server.store.keys import Caller, Scope
 from service.views import states
 from service.views.intakes import IntakePage, IntakeView
 from stage.files import resolved
@@ -52,143 +52,143 @@ class NewEnvironment(BaseModel):
 
 
 @captures.post("", status_code=201, responses=responses(404, 409, 507), summary="Create a capture")
-def create_capture(behind: Behind, caller: Writer, response: Response, wanted: Annotated[NewCapture, Body(
+def create_capture(service: ServiceDep, caller: Writer, response: Response, wanted: Annotated[NewCapture, Body(
         openapi_examples={"upload": {"value": {"name": "owl"}}, "register": {"value": {"name": "owl", "folder": "/captures/owl"}}})],
                    token: IdempotencyKey = None) -> IntakeView:
     """Create a capture, and then upload its files; or register a folder of the server, which is checked at once."""
-    folder = None if wanted.folder is None else _registered(behind, caller, "folder", wanted.folder)
+    folder = None if wanted.folder is None else _registered(service, caller, "folder", wanted.folder)
     if folder is not None and not os.path.isdir(folder):
         raise ApiError("invalid", "folder: there is no such folder")
-    return _create(behind, caller, CAPTURE, wanted.name, folder, token, response)
+    return _create(service, caller, CAPTURE, wanted.name, folder, token, response)
 
 
 @environments.post("", status_code=201, responses=responses(404, 409, 507), summary="Create an environment")
-def create_environment(behind: Behind, caller: Writer, response: Response, wanted: Annotated[NewEnvironment, Body(
+def create_environment(service: ServiceDep, caller: Writer, response: Response, wanted: Annotated[NewEnvironment, Body(
         openapi_examples={"upload": {"value": {"name": "sky"}}, "register": {"value": {"name": "sky", "file": "/hdr/sky.exr"}}})],
                        token: IdempotencyKey = None) -> IntakeView:
     """Create an environment, and then upload its one lat-long image; or register a file of the server, which is checked at once."""
-    file = None if wanted.file is None else _registered(behind, caller, "file", wanted.file)
+    file = None if wanted.file is None else _registered(service, caller, "file", wanted.file)
     if file is not None and not os.path.isfile(file):
         raise ApiError("invalid", "file: there is no such file")
-    return _create(behind, caller, ENVIRONMENT, wanted.name, file, token, response)
+    return _create(service, caller, ENVIRONMENT, wanted.name, file, token, response)
 
 
 @captures.get("", responses=responses(404), summary="List captures, the newest first")
-def list_captures(behind: Behind, caller: Reader, limit: Limit = 100, before: CaptureId | None = None) -> IntakePage:
+def list_captures(service: ServiceDep, caller: Reader, limit: Limit = 100, before: CaptureId | None = None) -> IntakePage:
     """Captures of the project, a page at a time."""
-    return _page(behind, caller, CAPTURE, limit, before)
+    return _page(service, caller, CAPTURE, limit, before)
 
 
 @environments.get("", responses=responses(404), summary="List environments, the newest first")
-def list_environments(behind: Behind, caller: Reader, limit: Limit = 100, before: EnvironmentId | None = None) -> IntakePage:
+def list_environments(service: ServiceDep, caller: Reader, limit: Limit = 100, before: EnvironmentId | None = None) -> IntakePage:
     """Environments of the project, a page at a time."""
-    return _page(behind, caller, ENVIRONMENT, limit, before)
+    return _page(service, caller, ENVIRONMENT, limit, before)
 
 
 @captures.get("/{capture}", responses=responses(404), summary="Look at a capture")
-def get_capture(behind: Behind, caller: Reader, capture: CaptureId) -> IntakeView:
+def get_capture(service: ServiceDep, caller: Reader, capture: CaptureId) -> IntakeView:
     """State of a capture, and what its check found."""
-    return intake_view(row_of(behind, caller, capture))
+    return intake_view(row_of(service, caller, capture))
 
 
 @environments.get("/{environment}", responses=responses(404), summary="Look at an environment")
-def get_environment(behind: Behind, caller: Reader, environment: EnvironmentId) -> IntakeView:
+def get_environment(service: ServiceDep, caller: Reader, environment: EnvironmentId) -> IntakeView:
     """State of an environment, and what its check found."""
-    return intake_view(row_of(behind, caller, environment))
+    return intake_view(row_of(service, caller, environment))
 
 
 @captures.post("/{capture}/validate", status_code=202, responses=responses(404, 409, 507), summary="Check an uploaded capture")
-def validate_capture(behind: Behind, caller: Writer, capture: CaptureId) -> IntakeView:
+def validate_capture(service: ServiceDep, caller: Writer, capture: CaptureId) -> IntakeView:
     """Take no more files, and look at manifest, names and headers; jobs may use it once it is ready."""
-    return _validate(behind, caller, capture)
+    return _validate(service, caller, capture)
 
 
 @environments.post("/{environment}/validate", status_code=202, responses=responses(404, 409, 507), summary="Check an uploaded environment")
-def validate_environment(behind: Behind, caller: Writer, environment: EnvironmentId) -> IntakeView:
+def validate_environment(service: ServiceDep, caller: Writer, environment: EnvironmentId) -> IntakeView:
     """Take no more files, and look at the image's header; jobs may use it once it is ready."""
-    return _validate(behind, caller, environment)
+    return _validate(service, caller, environment)
 
 
 @captures.delete("/{capture}", status_code=204, responses=responses(404, 409), summary="Delete a capture")
-def delete_capture(behind: Behind, caller: Writer, capture: CaptureId) -> None:
+def delete_capture(service: ServiceDep, caller: Writer, capture: CaptureId) -> None:
     """Remove a capture that no running or waiting job reads; what was registered stays where it lies."""
-    _delete(behind, caller, capture)
+    _delete(service, caller, capture)
 
 
 @environments.delete("/{environment}", status_code=204, responses=responses(404, 409), summary="Delete an environment")
-def delete_environment(behind: Behind, caller: Writer, environment: EnvironmentId) -> None:
+def delete_environment(service: ServiceDep, caller: Writer, environment: EnvironmentId) -> None:
     """Remove an environment that no running or waiting job reads; what was registered stays where it lies."""
-    _delete(behind, caller, environment)
+    _delete(service, caller, environment)
 
 
-def row_of(behind: Service, caller: Caller, identifier: str) -> sa.RowMapping:
+def row_of(service: Service, caller: Caller, identifier: str) -> sa.RowMapping:
     """A capture or environment of the caller's project.
 
     Raises:
         ApiError: there is none.
     """
-    row = intakes.find(behind.database, identifier, caller.project)
+    row = intakes.find(service.database, identifier, caller.project)
     if row is None:
         raise ApiError("not-found", f"there is no {identifier} in this project")
     return row
 
 
-def _registered(behind: Service, caller: Caller, field: str, given: str) -> Path:
+def _registered(service: Service, caller: Caller, field: str, given: str) -> Path:
     if not caller.may(Scope.ADMIN):
         raise ApiError("forbidden", f"{field}: the key has the scope {caller.scope}, to register what lies on the server needs admin")
     path = Path(given)
     if "\0" in given or not path.is_absolute() or ".." in path.parts:
         raise ApiError("invalid", f"{field}: give an absolute path of the server, without ..")
     place = resolved(path)
-    if place is None or not any(place.is_relative_to(root) for root in behind.settings.roots):
+    if place is None or not any(place.is_relative_to(root) for root in service.settings.roots):
         raise ApiError("invalid", f"{field}: lies in none of the folders that the operator allows")
     return place
 
 
-def _create(behind: Service, caller: Caller, prefix: str, name: str, folder: Path | None, token: str | None,
+def _create(service: Service, caller: Caller, prefix: str, name: str, folder: Path | None, token: str | None,
             response: Response) -> IntakeView:
-    require_space(behind, FOR_WORK)
+    require_space(service, FOR_WORK)
 
     def make(connection: sa.Connection) -> str:
         identifier = new_id(prefix)
         intakes.insert(connection, identifier=identifier, project=caller.project, kind=prefix, name=name,
                        folder=None if folder is None else str(folder))
         if folder is not None:
-            submit(behind, caller, CheckJob(kind="check", intake=identifier), connection, [identifier])
+            submit(service, caller, CheckJob(kind="check", intake=identifier), connection, [identifier])
         return identifier
 
-    identifier, _ = once(behind, caller, token, [prefix, name, None if folder is None else str(folder)], make)
+    identifier, _ = once(service, caller, token, [prefix, name, None if folder is None else str(folder)], make)
     response.headers["Location"] = f"/v1/{layout.FOLDERS[prefix]}/{identifier}"
-    return intake_view(row_of(behind, caller, identifier))
+    return intake_view(row_of(service, caller, identifier))
 
 
-def _page(behind: Service, caller: Caller, prefix: str, limit: int, before: str | None) -> IntakePage:
+def _page(service: Service, caller: Caller, prefix: str, limit: int, before: str | None) -> IntakePage:
     after = None
     if before is not None:
-        row = row_of(behind, caller, before)
+        row = row_of(service, caller, before)
         after = row["created_at"], row["id"]
-    rows = intakes.latest(behind.database, caller.project, prefix, limit=limit + 1, before=after)
+    rows = intakes.latest(service.database, caller.project, prefix, limit=limit + 1, before=after)
     return IntakePage(items=[intake_view(row) for row in rows[:limit]], next=rows[limit - 1]["id"] if len(rows) > limit else None)
 
 
-def _validate(behind: Service, caller: Caller, identifier: str) -> IntakeView:
-    before = row_of(behind, caller, identifier)
+def _validate(service: Service, caller: Caller, identifier: str) -> IntakeView:
+    before = row_of(service, caller, identifier)
 
     def work(connection: sa.Connection) -> bool:
-        if not intakes.close(connection, identifier):
+        if not intakes.begin_check(connection, identifier):
             return False
         if (file := uploads.unfinished(connection, identifier)) is not None:
             raise ApiError("conflict", f"{identifier}: {shown(file['path'])} is not complete: go on with {file['id']}, or delete it")
-        submit(behind, caller, CheckJob(kind="check", intake=identifier), connection, [identifier])
+        submit(service, caller, CheckJob(kind="check", intake=identifier), connection, [identifier])
         return True
 
-    if not behind.database.transact(work):
+    if not service.database.transact(work):
         raise ApiError("conflict", f"{identifier} is {before['state']} already")
-    return intake_view(row_of(behind, caller, identifier))
+    return intake_view(row_of(service, caller, identifier))
 
 
-def _delete(behind: Service, caller: Caller, identifier: str) -> None:
-    row = row_of(behind, caller, identifier)
+def _delete(service: Service, caller: Caller, identifier: str) -> None:
+    row = row_of(service, caller, identifier)
     if row["state"] == states.CHECKING:
         raise ApiError("conflict", f"{identifier} is being checked")
 
@@ -197,8 +197,8 @@ def _delete(behind: Service, caller: Caller, identifier: str) -> None:
             raise ApiError("conflict", f"{identifier} is read by {users[0]}, which has not ended")
         return intakes.remove(connection, identifier)
 
-    parts = behind.database.transact(work)
+    parts = service.database.transact(work)
     if parts is not None and row["folder"] is None:
         for upload in parts:
-            Part.discard(parts_folder(behind.settings), upload)
-        behind.storage.remove(layout.intake(caller.project, identifier))
+            Part.discard(parts_folder(service.settings), upload)
+        service.storage.remove(layout.intake(caller.project, identifier))

@@ -13,9 +13,9 @@ from prometheus_client.registry import Collector
 from starlette.types import Scope
 
 from service import __version__
+from service.server.database import jobs, workers
+from service.server.database.engine import UNANSWERED, Database
 from service.server.settings import Settings
-from service.server.store import jobs, workers
-from service.server.store.database import UNANSWERED, Database
 from service.views.states import ACTIVE, ENDED
 
 CONTENT_TYPE = CONTENT_TYPE_LATEST
@@ -73,7 +73,7 @@ class _Store(Collector):
                                 value=shutil.disk_usage(self._settings.data).free)
         try:
             states, oldest, frames = jobs.counts(self._database), jobs.oldest_queued(self._database), jobs.frames(self._database)
-            present = workers.present(self._database)
+            present = workers.seen_lately(self._database)
         except UNANSWERED:
             yield GaugeMetricFamily("relit_database_up", "Whether the database answers.", value=0)
             return

@@ -8,14 +8,14 @@ from fastapi import APIRouter, Depends, Request, Response, Security
 from fastapi.security import HTTPAuthorizationCredentials
 from pydantic import BaseModel
 
-from service.server.api.context import Behind, Service, bearer, caller_of
+from service.server.api.context import Service, ServiceDep, bearer, caller_of
 from service.server.api.local import require_local
 from service.server.api.metrics import CONTENT_TYPE
 from service.server.api.problems import ApiError, responses
 from service.server.api.space import has_space
-from service.server.store import workers
-from service.server.store.database import UNANSWERED
-from service.server.store.keys import Scope
+from service.server.database import workers
+from service.server.database.engine import UNANSWERED
+from service.server.database.keys import Scope
 from stage.errors import StorageError
 
 router = APIRouter(tags=["operations"])
@@ -37,29 +37,29 @@ class Readiness:
         self._lock = threading.Lock()
         self._looked_at, self._wrong = -KEEP_S, list[str]()
 
-    def wrong(self, behind: Service) -> list[str]:
+    def wrong(self, service: Service) -> list[str]:
         """What is wrong: sentences that name nothing of the machine, for anybody may read them."""
-        if behind.draining.is_set():
+        if service.draining.is_set():
             return ["the service is ending"]
         with self._lock:
             now = time.monotonic()
             if now - self._looked_at >= KEEP_S:
-                self._looked_at, self._wrong = now, _faults(behind)
+                self._looked_at, self._wrong = now, _faults(service)
             return self._wrong
 
 
-def _faults(behind: Service) -> list[str]:
+def _faults(service: Service) -> list[str]:
     found = []
     try:
-        if not workers.present(behind.database):
+        if not workers.seen_lately(service.database):
             found.append(f"no worker was seen in the last {workers.SILENT_S:g} seconds")
     except UNANSWERED:
         found.append("the database does not answer")
     try:
-        behind.storage.check()
+        service.storage.check()
     except StorageError:
         found.append("the storage cannot be written")
-    if not has_space(behind.settings):
+    if not has_space(service.settings):
         found.append("there is less space left than min_free_bytes")
     return found
 
@@ -71,20 +71,20 @@ async def get_health() -> Health:
 
 
 @router.get("/readyz", responses=responses(503), summary="Whether the service can do its work")
-def get_readiness(behind: Behind, request: Request) -> Health:
+def get_readiness(service: ServiceDep, request: Request) -> Health:
     """Database, storage, space left and workers; 503 says what is wrong, also while the service ends. Needs no key."""
     readiness: Readiness = request.app.state.readiness
-    if wrong := readiness.wrong(behind):
+    if wrong := readiness.wrong(service):
         raise ApiError("unavailable", "; ".join(wrong), headers={"Retry-After": "5"})
     return Health()
 
 
-def operator_of(behind: Behind, request: Request,
+def operator_of(service: ServiceDep, request: Request,
                 given: Annotated[HTTPAuthorizationCredentials | None, Security(bearer)]) -> None:
     """Who may read the numbers: this machine where the service listens to it alone; else a key of scope admin."""
-    if given is None and behind.settings.loopback:
+    if given is None and service.settings.loopback:
         require_local(request)
-    elif not (caller := caller_of(behind, request, given)).may(Scope.ADMIN):
+    elif not (caller := caller_of(service, request, given)).may(Scope.ADMIN):
         raise ApiError("forbidden", f"the key has the scope {caller.scope}, this needs {Scope.ADMIN}")
 
 

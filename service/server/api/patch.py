@@ -10,12 +10,12 @@ from service.server.api.problems import ApiError
 from service.server.api.receive import RunningHashes, Writer
 from service.server.api.space import FOR_UPLOAD, require_space
 from service.server.api.tus import Checksum
+from service.server.database import uploads
+from service.server.database.uploads import Row
 from service.server.log import logger
 from service.server.safe_names import shown
 from service.server.storage import layout
 from service.server.storage.parts import Part, PartLocked, parts_folder, stored_bytes
-from service.server.store import uploads
-from service.server.store.uploads import Row
 
 BUSY_RETRY_S = 1
 
@@ -27,17 +27,17 @@ being_written: set[str] = set()
 class Patch:
     """Its part is locked from `begin` to `close`. All methods wait for the disk or the database: call them from a thread."""
 
-    def __init__(self, behind: Service, hashes: RunningHashes, upload: Row, *, offset: int, checksum: Checksum | None) -> None:
+    def __init__(self, service: Service, hashes: RunningHashes, upload: Row, *, offset: int, checksum: Checksum | None) -> None:
         """Prepare.
 
         Args:
-            behind: the service.
+            service: the service.
             hashes: of uploads that are not complete.
             upload: its row; read again when nobody else can change it.
             offset: where the client goes on.
             checksum: of the body, where the client says it.
         """
-        self._behind, self._hashes, self._row, self._offset, self._checksum = behind, hashes, upload, offset, checksum
+        self._service, self._hashes, self._row, self._offset, self._checksum = service, hashes, upload, offset, checksum
         self._part: Part | None = None
         self._digest = None if checksum is None else hashlib.new(checksum.algorithm)
         self._saved = 0
@@ -49,7 +49,7 @@ class Patch:
             ApiError: locked, gone, another offset, or no space.
         """
         try:
-            self._part = Part.open(parts_folder(self._behind.settings), self._row["id"])
+            self._part = Part.open(parts_folder(self._service.settings), self._row["id"])
         except PartLocked:
             raise ApiError("locked", f"{self._row['id']}: another request is adding to it",
                            headers={"Retry-After": str(BUSY_RETRY_S)}) from None
@@ -61,12 +61,12 @@ class Patch:
         if self._offset != start:
             raise ApiError("conflict", f"Upload-Offset: is {self._offset}, {start} bytes are here", headers={"Upload-Offset": str(start)})
         if not row["done"]:
-            require_space(self._behind, FOR_UPLOAD)
+            require_space(self._service, FOR_UPLOAD)
             self._part.cut(start)
         self._whole = None if row["sha256"] is None or row["done"] else self._hashes.take(row["id"], start)
         digests = [digest for digest in (self._digest, self._whole) if digest is not None]
         self.writer = Writer(self._part, start, row["length"], digests=digests,
-                             save=self._save if self._checksum is None else None, guard=lambda: require_space(self._behind, FOR_UPLOAD))
+                             save=self._save if self._checksum is None else None, guard=lambda: require_space(self._service, FOR_UPLOAD))
 
     def end(self, broken: str | None) -> Row:
         """Count what came.
@@ -117,21 +117,21 @@ class Patch:
 
     def _save(self, at: int) -> None:
         self._saved = at
-        if not uploads.advance(self._behind.database, self._row["id"], at):
+        if not uploads.advance(self._service.database, self._row["id"], at):
             self._gone()
 
     def _complete(self) -> None:
         assert self._part is not None
-        row, behind = self._row, self._behind
+        row, service = self._row, self._service
         if row["sha256"] is not None and self._sha256() != row["sha256"]:
             self._part.cut(0)
             self._save(0)
             raise ApiError("checksum-mismatch", f"{shown(row['path'])}: has another sha256 than was said: all its bytes are dropped")
         self._still_there()
         prefix = layout.intake(row["project"], row["intake"])
-        behind.storage.put(self._part.path, prefix, row["path"])
-        if not uploads.finish(behind.database, row["id"], row["length"]):
-            behind.storage.remove(prefix)  # nothing but its deletion takes an upload's row while the part is locked
+        service.storage.put(self._part.path, prefix, row["path"])
+        if not uploads.finish(service.database, row["id"], row["length"]):
+            service.storage.remove(prefix)  # nothing but its deletion takes an upload's row while the part is locked
             self._gone()
         logger.info("upload complete", upload=row["id"], intake=row["intake"], path=row["path"], length=row["length"])
 
@@ -144,7 +144,7 @@ class Patch:
         return str(whole.hexdigest())
 
     def _still_there(self) -> Row:
-        row = uploads.find(self._behind.database, self._row["id"], self._row["project"])
+        row = uploads.find(self._service.database, self._row["id"], self._row["project"])
         return self._gone() if row is None else row
 
     def _gone(self) -> Row:
@@ -164,16 +164,16 @@ def safe_offset(row: Row, there: int) -> int:
     return received if row["done"] or there >= received else 0
 
 
-def settled(behind: Service, row: Row) -> Row:
+def settled(service: Service, row: Row) -> Row:
     """The upload as it is: the service may have ended after a complete file was moved into its capture, and before that was noted."""
-    if row["done"] or stored_bytes(parts_folder(behind.settings), row["id"]) >= row["received"]:
+    if row["done"] or stored_bytes(parts_folder(service.settings), row["id"]) >= row["received"]:
         return row
-    moved = behind.storage.open(layout.intake(row["project"], row["intake"]), row["path"])  # one of before was deleted when this began
-    if moved is None or moved.stat().st_size != row["length"] or not uploads.finish(behind.database, row["id"], row["length"]):
+    moved = service.storage.open(layout.intake(row["project"], row["intake"]), row["path"])  # one of before was deleted when this began
+    if moved is None or moved.stat().st_size != row["length"] or not uploads.finish(service.database, row["id"], row["length"]):
         return row
     return {**row, "received": row["length"], "done": True}
 
 
-def received_of(behind: Service, row: Row) -> int:
+def received_of(service: Service, row: Row) -> int:
     """Bytes of an upload that need not be sent again."""
-    return safe_offset(row, 0 if row["done"] else stored_bytes(parts_folder(behind.settings), row["id"]))
+    return safe_offset(row, 0 if row["done"] else stored_bytes(parts_folder(service.settings), row["id"]))

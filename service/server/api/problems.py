@@ -13,8 +13,8 @@ from pydantic import BaseModel, ConfigDict
 from starlette.exceptions import HTTPException
 
 from service.errors import RequestError, sentence
+from service.server.database.engine import UNANSWERED, message_of
 from service.server.log import logger
-from service.server.store.database import UNANSWERED, said
 from stage.errors import StorageError
 
 MEDIA_TYPE = "application/problem+json"
@@ -130,7 +130,7 @@ def install(app: FastAPI) -> None:
                       headers={"Retry-After": "60"})
 
     async def unavailable(request: Request, error: Exception) -> JSONResponse:
-        logger.error("database does not answer", error=said(error))
+        logger.error("database does not answer", error=message_of(error))
         return answer(request, "unavailable", "the database does not answer: try again", headers={"Retry-After": str(RETRY_S)})
 
     for fault in UNANSWERED:

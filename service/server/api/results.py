@@ -14,7 +14,7 @@ import anyio.to_thread
 from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
-from service.server.api.context import Behind, Reader
+from service.server.api.context import Reader, ServiceDep
 from service.server.api.jobs import JobName, view
 from service.server.api.problems import ApiError, responses
 from service.server.api.ranges import Span, asked_for, content_range, multipart, names
@@ -54,13 +54,13 @@ class Opened(NamedTuple):
     modified_at: float
 
 
-def opened(behind: Behind, caller: Reader, request: Request, job: JobName, name: Name) -> Iterator[Opened]:
+def opened(service: ServiceDep, caller: Reader, request: Request, job: JobName, name: Name) -> Iterator[Opened]:
     """The file of a name, open until the answer has been sent.
 
     Raises:
         ApiError: there is none.
     """
-    view(behind, caller, job)
+    view(service, caller, job)
     nothing = ApiError("not-found", f"{job} has no such result")
     try:
         check_path(name)
@@ -68,7 +68,7 @@ def opened(behind: Behind, caller: Reader, request: Request, job: JobName, name:
         raise nothing from None
     if not request.scope["path"].endswith(f"/{name}"):  # the router leaves a line break at the end out
         raise nothing
-    path = behind.storage.open(layout.results(caller.project, job), name)
+    path = service.storage.open(layout.results(caller.project, job), name)
     if path is None:
         raise nothing
     try:
@@ -84,12 +84,12 @@ def opened(behind: Behind, caller: Reader, request: Request, job: JobName, name:
 
 
 @router.get("", summary="List what a job has made")
-def list_results(behind: Behind, caller: Reader, job: JobName,
+def list_results(service: ServiceDep, caller: Reader, job: JobName,
                  limit: Annotated[int, Query(ge=1, le=MAX_PAGE)] = MAX_PAGE,
                  after: Annotated[str | None, Query(description="`next` of the page before.")] = None) -> ResultPage:
     """Files by name, a page at a time; of a job that runs, those that are complete."""
-    view(behind, caller, job)
-    files = [file for file in behind.storage.files(layout.results(caller.project, job)) if after is None or file.name > after]
+    view(service, caller, job)
+    files = [file for file in service.storage.files(layout.results(caller.project, job)) if after is None or file.name > after]
     return ResultPage(results=[result_view(job, file) for file in files[:limit]],
                       next=files[limit - 1].name if len(files) > limit else None)
 

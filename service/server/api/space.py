@@ -16,13 +16,13 @@ def has_space(settings: Settings, length: int = 0) -> bool:
     return shutil.disk_usage(settings.data).free - length >= settings.min_free_bytes
 
 
-def require_space(behind: Service, purpose: str, length: int = 0) -> None:
+def require_space(service: Service, purpose: str, length: int = 0) -> None:
     """Refuse where they would not.
 
     Args:
-        behind: the service.
+        service: the service.
         purpose: FOR_WORK or FOR_UPLOAD.
         length: bytes that will be written, where that is known.
     """
-    if not has_space(behind.settings, length):
+    if not has_space(service.settings, length):
         raise ApiError("full", f"the service has no space left for {purpose}", headers={"Retry-After": str(RETRY_S)})

@@ -8,29 +8,29 @@ from service.requests.relight import RelightOptions
 from service.server import telemetry
 from service.server.api.context import Service
 from service.server.api.problems import ApiError
-from service.server.store import intakes, jobs
-from service.server.store.keys import Caller
+from service.server.database import intakes, jobs
+from service.server.database.keys import Caller
 from service.views import states
 
 QUEUE_RETRY_S = 30
 
 
-def submit(behind: Service, caller: Caller, request: JobRequest, connection: sa.Connection, inputs: list[str]) -> str:
+def submit(service: Service, caller: Caller, request: JobRequest, connection: sa.Connection, inputs: list[str]) -> str:
     """Queue a job in the caller's transaction; of `inputs_of` and `spelled_out`."""
-    job = behind.queue.submit(connection, project=caller.project, key=caller.key, request=request, inputs=inputs,
-                              chunk_frames=behind.settings.chunk_frames, trace=telemetry.current())
-    require_queue(behind, caller, connection)
+    job = service.queue.submit(connection, project=caller.project, key=caller.key, request=request, inputs=inputs,
+                              chunk_frames=service.settings.chunk_frames, trace=telemetry.current())
+    require_queue(service, caller, connection)
     return job
 
 
-def require_queue(behind: Service, caller: Caller, connection: sa.Connection) -> None:
+def require_queue(service: Service, caller: Caller, connection: sa.Connection) -> None:
     """Undo the transaction where the caller's key has more jobs waiting in it than it may."""
-    most = behind.settings.max_queued
+    most = service.settings.max_queued
     if jobs.count_queued(connection, caller.project, caller.key) > most:
         raise ApiError("too-many", f"{most} jobs of this key have not begun", headers={"Retry-After": str(QUEUE_RETRY_S)})
 
 
-def inputs_of(behind: Service, project: str, request: JobRequest) -> list[str]:
+def inputs_of(service: Service, project: str, request: JobRequest) -> list[str]:
     """What a job reads.
 
     Raises:
@@ -40,15 +40,15 @@ def inputs_of(behind: Service, project: str, request: JobRequest) -> list[str]:
     for field in ("capture", "environment", "reference_ball"):
         identifier = getattr(request, field, None)
         if identifier is not None:
-            _require_ready(behind, project, field, identifier)
+            _require_ready(service, project, field, identifier)
             read.append(identifier)
     if isinstance(request, RelightJob | ShadeJob | ExportJob) and request.maps is not None:
-        _require_maps(behind, project, request.maps, depth=isinstance(request, ExportJob))
+        _require_maps(service, project, request.maps, depth=isinstance(request, ExportJob))
         read.append(request.maps)
     return read
 
 
-def spelled_out(behind: Service, project: str, request: JobRequest) -> JobRequest:
+def spelled_out(service: Service, project: str, request: JobRequest) -> JobRequest:
     """The request with its frames as numbers, so that its steps are known before the capture is opened.
 
     Raises:
@@ -58,31 +58,31 @@ def spelled_out(behind: Service, project: str, request: JobRequest) -> JobReques
     if isinstance(request, RelightJob):
         if request.environment is None and request.keys is None:
             raise ApiError("invalid", "nothing lights the frames: give an environment, or keys with lights or captured images")
-        return request.model_copy(update={"options": _with_frames(behind, project, request.capture, request.options)})
+        return request.model_copy(update={"options": _with_frames(service, project, request.capture, request.options)})
     if isinstance(request, PipelineJob):
-        return request.model_copy(update={"relight": _with_frames(behind, project, request.capture, request.relight)})
+        return request.model_copy(update={"relight": _with_frames(service, project, request.capture, request.relight)})
     return request
 
 
-def _with_frames(behind: Service, project: str, capture: str, options: RelightOptions) -> RelightOptions:
-    row = intakes.find(behind.database, capture, project)
+def _with_frames(service: Service, project: str, capture: str, options: RelightOptions) -> RelightOptions:
+    row = intakes.find(service.database, capture, project)
     steps = int((row["facts"] or {}).get("captures", 1)) if row is not None else 1
     numbers = frame_numbers(options.frames, steps)
-    if len(numbers) > behind.settings.max_frames:
-        raise ApiError("invalid", f"frames {options.frames}: {len(numbers)} frames, {behind.settings.max_frames} are allowed in a job")
+    if len(numbers) > service.settings.max_frames:
+        raise ApiError("invalid", f"frames {options.frames}: {len(numbers)} frames, {service.settings.max_frames} are allowed in a job")
     return options.model_copy(update={"frames": f"{numbers[0]}-{numbers[-1]}"})
 
 
-def _require_ready(behind: Service, project: str, field: str, identifier: str) -> None:
-    row = intakes.find(behind.database, identifier, project)
+def _require_ready(service: Service, project: str, field: str, identifier: str) -> None:
+    row = intakes.find(service.database, identifier, project)
     if row is None:
         raise ApiError("not-found", f"{field}: {identifier} is not in this project")
     if row["state"] != states.READY:
         raise ApiError("conflict", f"{field}: {identifier} is {row['state']}, not ready")
 
 
-def _require_maps(behind: Service, project: str, identifier: str, *, depth: bool) -> None:
-    row = jobs.find(behind.database, identifier, project)
+def _require_maps(service: Service, project: str, identifier: str, *, depth: bool) -> None:
+    row = jobs.find(service.database, identifier, project)
     kinds = ("solve", "pipeline", "depth") if depth else ("solve", "pipeline")
     if row is None:
         raise ApiError("not-found", f"maps: {identifier} is not in this project")

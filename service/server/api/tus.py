@@ -12,7 +12,7 @@ from starlette.datastructures import MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.server.api.problems import ApiError
-from service.server.store.uploads import Row
+from service.server.database.uploads import Row
 
 VERSION = "1.0.0"
 EXTENSIONS = ("creation", "expiration", "checksum", "termination")

@@ -9,7 +9,7 @@ import sqlalchemy as sa
 from fastapi import APIRouter, Header, Query, Request, Response
 
 from service.requests.identifiers import ENVIRONMENT, UPLOAD, CaptureId, EnvironmentId, UploadId, new_id
-from service.server.api.context import Behind, IdempotencyKey, Reader, Service, Writer, once
+from service.server.api.context import IdempotencyKey, Reader, Service, ServiceDep, Writer, once
 from service.server.api.intakes import row_of
 from service.server.api.patch import Patch, being_written, received_of, settled
 from service.server.api.problems import ApiError, responses
@@ -29,12 +29,12 @@ from service.server.api.tus import (
     metadata_header,
     state_headers,
 )
+from service.server.database import idempotency, intakes, uploads
+from service.server.database.keys import Caller
+from service.server.database.uploads import Row
 from service.server.safe_names import check_path, shown
 from service.server.storage import layout
 from service.server.storage.parts import Part, PartLocked, parts_folder
-from service.server.store import idempotency, intakes, uploads
-from service.server.store.keys import Caller
-from service.server.store.uploads import Row
 from service.views.intakes import FilePage, FileView
 
 router = APIRouter(prefix="/v1", tags=["uploads"], responses=responses(401, 403, 404, 412, 422, 429, 503), dependencies=[Speaking])
@@ -60,36 +60,36 @@ CREATED: dict[int | str, dict[str, Any]] = {
 @options.options("/uploads/{upload}", status_code=204, include_in_schema=False)
 @options.options("/captures/{capture}/files", status_code=204, include_in_schema=False)
 @options.options("/environments/{environment}/files", status_code=204, include_in_schema=False)
-def abilities(behind: Behind, response: Response) -> None:
+def abilities(service: ServiceDep, response: Response) -> None:
     """Version, extensions and limits."""
     response.headers.update({"Tus-Version": VERSION, "Tus-Extension": ",".join(EXTENSIONS), "Tus-Checksum-Algorithm": ",".join(ALGORITHMS),
-                             "Tus-Max-Size": str(behind.settings.max_upload_bytes)})
+                             "Tus-Max-Size": str(service.settings.max_upload_bytes)})
 
 
 @router.post("/captures/{capture}/files", status_code=201, responses=CREATED, summary="Begin to upload a file of a capture")
-def create_capture_file(behind: Behind, caller: Writer, response: Response, capture: CaptureId, length: UploadLength,
+def create_capture_file(service: ServiceDep, caller: Writer, response: Response, capture: CaptureId, length: UploadLength,
                         metadata: UploadMetadata, token: IdempotencyKey = None) -> FileView:
     """The file takes the place of a complete one of the same path, while the capture is receiving or refused."""
-    return _create(behind, caller, capture, length, Metadata.of(metadata), token, response)
+    return _create(service, caller, capture, length, Metadata.of(metadata), token, response)
 
 
 @router.post("/environments/{environment}/files", status_code=201, responses=CREATED, summary="Begin to upload the file of an environment")
-def create_environment_file(behind: Behind, caller: Writer, response: Response, environment: EnvironmentId, length: UploadLength,
+def create_environment_file(service: ServiceDep, caller: Writer, response: Response, environment: EnvironmentId, length: UploadLength,
                             metadata: UploadMetadata, token: IdempotencyKey = None) -> FileView:
     """An environment has one file; it takes the place of a complete one of the same path."""
-    return _create(behind, caller, environment, length, Metadata.of(metadata), token, response)
+    return _create(service, caller, environment, length, Metadata.of(metadata), token, response)
 
 
 @router.head("/uploads/{upload}", response_class=Response, summary="How far an upload is", responses={
     200: {"headers": documented("Upload-Offset", "Upload-Length", "Upload-Metadata")}, **responses(410)})
-async def head_upload(behind: Behind, caller: Reader, upload: UploadId) -> Response:
+async def head_upload(service: ServiceDep, caller: Reader, upload: UploadId) -> Response:
     """Upload-Offset tells how many bytes are safe: go on there."""
     deadline = time.monotonic() + BREAK_S
     while upload in being_written and time.monotonic() < deadline:
         await asyncio.sleep(LOOK_S)
-    row = await asyncio.to_thread(_row, behind, caller, upload)
-    received = await asyncio.to_thread(received_of, behind, row)
-    return Response(headers={**state_headers(row, received, behind.settings.upload_hours),
+    row = await asyncio.to_thread(_row, service, caller, upload)
+    received = await asyncio.to_thread(received_of, service, row)
+    return Response(headers={**state_headers(row, received, service.settings.upload_hours),
                              "Upload-Length": str(row["length"]), "Upload-Metadata": metadata_header(row)})
 
 
@@ -97,7 +97,7 @@ async def head_upload(behind: Behind, caller: Reader, upload: UploadId) -> Respo
     "requestBody": {"required": True, "content": {CONTENT_TYPE: {"schema": {"type": "string", "format": "binary"}}}}},
     responses={204: {"headers": documented("Upload-Offset", "Upload-Expires")}, **responses(400, 409, 410, 413, 415, 423, 460, 507)})
 async def patch_upload(
-    behind: Behind, caller: Writer, request: Request, response: Response, upload: UploadId,
+    service: ServiceDep, caller: Writer, request: Request, response: Response, upload: UploadId,
     offset: Annotated[int, Header(alias="Upload-Offset", ge=0, description="Where the body begins: as many bytes as are there.")],
     checksum: Annotated[str | None, Header(
         alias="Upload-Checksum", json_schema_extra={"pattern": CHECKSUM_PATTERN},
@@ -108,52 +108,52 @@ async def patch_upload(
     if request.headers.get("content-type", "").partition(";")[0].strip().lower() != CONTENT_TYPE:
         raise ApiError("unsupported-media-type", f"Content-Type: give {CONTENT_TYPE}")
     expected = None if checksum is None else Checksum.of(checksum)
-    row: Row = await asyncio.to_thread(_row, behind, caller, upload)
+    row: Row = await asyncio.to_thread(_row, service, caller, upload)
     announced = request.headers.get("content-length", "0")
     if announced.isdigit() and offset + int(announced) > row["length"]:
         raise _too_long(row)
-    patch = Patch(behind, hashes, row, offset=offset, checksum=expected)
+    patch = Patch(service, hashes, row, offset=offset, checksum=expected)
     try:
         await asyncio.to_thread(patch.begin)
         row = await _take(patch, request, row)
     finally:
         patch.close()
-    response.headers.update(state_headers(row, row["received"], behind.settings.upload_hours))
+    response.headers.update(state_headers(row, row["received"], service.settings.upload_hours))
 
 
 @router.delete("/uploads/{upload}", status_code=204, responses=responses(409, 410, 423), summary="Delete an upload")
-def delete_upload(behind: Behind, caller: Writer, upload: UploadId) -> None:
+def delete_upload(service: ServiceDep, caller: Writer, upload: UploadId) -> None:
     """Give an upload up; or take a complete file out of a capture that is receiving or refused."""
-    row = _row(behind, caller, upload)
-    folder = parts_folder(behind.settings)
+    row = _row(service, caller, upload)
+    folder = parts_folder(service.settings)
     try:
         part = Part.open(folder, upload)
     except PartLocked:
         raise ApiError("locked", f"{upload}: a request is adding to it", headers={"Retry-After": "1"}) from None
     with part:
         def work(connection: sa.Connection) -> None:
-            _hold(behind, caller, connection, row["intake"])
+            _hold(service, caller, connection, row["intake"])
             if uploads.remove(connection, upload):
-                behind.storage.delete(layout.intake(row["project"], row["intake"]), row["path"])
+                service.storage.delete(layout.intake(row["project"], row["intake"]), row["path"])
 
         try:
-            behind.database.transact(work)
+            service.database.transact(work)
         finally:
-            if row["done"] or uploads.find(behind.database, upload, caller.project) is None:
+            if row["done"] or uploads.find(service.database, upload, caller.project) is None:
                 part.drop()
 
 
 @listings.get("/captures/{capture}/files", summary="List the files of a capture")
-def list_capture_files(behind: Behind, caller: Reader, capture: CaptureId, limit: Limit = 1000, after: After = None) -> FilePage:
+def list_capture_files(service: ServiceDep, caller: Reader, capture: CaptureId, limit: Limit = 1000, after: After = None) -> FilePage:
     """Files that were uploaded, complete or not; none of a capture that is registered."""
-    return _page(behind, caller, capture, limit, after)
+    return _page(service, caller, capture, limit, after)
 
 
 @listings.get("/environments/{environment}/files", summary="List the file of an environment")
-def list_environment_files(behind: Behind, caller: Reader, environment: EnvironmentId, limit: Limit = 1000,
+def list_environment_files(service: ServiceDep, caller: Reader, environment: EnvironmentId, limit: Limit = 1000,
                            after: After = None) -> FilePage:
     """The file that was uploaded, complete or not; none of an environment that is registered."""
-    return _page(behind, caller, environment, limit, after)
+    return _page(service, caller, environment, limit, after)
 
 
 async def _take(patch: Patch, request: Request, row: Row) -> Row:
@@ -171,24 +171,24 @@ async def _take(patch: Patch, request: Request, row: Row) -> Row:
     return await asyncio.to_thread(patch.end, broken)
 
 
-def _create(behind: Service, caller: Caller, intake: str, length: int, given: Metadata, token: str | None, response: Response,
+def _create(service: Service, caller: Caller, intake: str, length: int, given: Metadata, token: str | None, response: Response,
             ) -> FileView:
-    settings = behind.settings
-    row_of(behind, caller, intake)
+    settings = service.settings
+    row_of(service, caller, intake)
     check_path(given.path)
     if length > settings.max_upload_bytes:
         raise ApiError("too-large", f"Upload-Length: is {length}, a file may have {settings.max_upload_bytes} bytes")
-    require_space(behind, FOR_UPLOAD, length)
+    require_space(service, FOR_UPLOAD, length)
 
     def make(connection: sa.Connection) -> str:
-        _hold(behind, caller, connection, intake)
+        _hold(service, caller, connection, intake)
         before = uploads.at_path(connection, intake, given.path)
         if before is not None and before["done"]:
             uploads.remove(connection, before["id"])
-            behind.storage.delete(layout.intake(caller.project, intake), given.path)
+            service.storage.delete(layout.intake(caller.project, intake), given.path)
         elif before is not None:
             raise ApiError("conflict", f"path {shown(given.path)}: is being uploaded as {before['id']}: go on with it, or delete it")
-        _require_room(behind, connection, intake)
+        _require_room(service, connection, intake)
         identifier = new_id(UPLOAD)
         try:
             uploads.insert(connection, identifier=identifier, project=caller.project, intake=intake, path=given.path, length=length,
@@ -198,33 +198,33 @@ def _create(behind: Service, caller: Caller, intake: str, length: int, given: Me
         return identifier
 
     asked = ["upload", intake, given.path, length, given.sha256]
-    upload, _ = once(behind, caller, token, asked, make)
-    row = uploads.find(behind.database, upload, caller.project)
+    upload, _ = once(service, caller, token, asked, make)
+    row = uploads.find(service.database, upload, caller.project)
     if row is None and token is not None:  # what the token made was deleted or replaced since: the same request makes another
-        behind.database.transact(partial(idempotency.forget, project=caller.project, token=token, gone=upload))
-        upload, _ = once(behind, caller, token, asked, make)
-        row = uploads.find(behind.database, upload, caller.project)
+        service.database.transact(partial(idempotency.forget_token, project=caller.project, token=token, gone=upload))
+        upload, _ = once(service, caller, token, asked, make)
+        row = uploads.find(service.database, upload, caller.project)
     if row is None:
         raise ApiError("conflict", f"{upload}: was deleted at the same time")
     if length == 0 and not row["done"]:
-        return _answer(behind, _complete_empty(behind, row), response)
-    return _answer(behind, row, response)
+        return _answer(service, _complete_empty(service, row), response)
+    return _answer(service, row, response)
 
 
-def _file_view(behind: Service, row: Row) -> FileView:
-    return FileView(upload=row["id"], path=row["path"], length=row["length"], received=received_of(behind, row), done=row["done"],
+def _file_view(service: Service, row: Row) -> FileView:
+    return FileView(upload=row["id"], path=row["path"], length=row["length"], received=received_of(service, row), done=row["done"],
                     sha256=row["sha256"])
 
 
-def _answer(behind: Service, row: Row, response: Response) -> FileView:
-    view = _file_view(behind, row)
+def _answer(service: Service, row: Row, response: Response) -> FileView:
+    view = _file_view(service, row)
     response.headers.update({"Location": f"/v1/uploads/{view.upload}",
-                             **state_headers(row, view.received, behind.settings.upload_hours)})
+                             **state_headers(row, view.received, service.settings.upload_hours)})
     return view
 
 
-def _complete_empty(behind: Service, row: Row) -> Row:
-    patch = Patch(behind, hashes, row, offset=0, checksum=None)
+def _complete_empty(service: Service, row: Row) -> Row:
+    patch = Patch(service, hashes, row, offset=0, checksum=None)
     try:
         patch.begin()
         return patch.end(None)
@@ -232,36 +232,36 @@ def _complete_empty(behind: Service, row: Row) -> Row:
         patch.close()
 
 
-def _hold(behind: Service, caller: Caller, connection: sa.Connection, intake: str) -> None:
-    if intakes.hold(connection, intake, caller.project):
+def _hold(service: Service, caller: Caller, connection: sa.Connection, intake: str) -> None:
+    if intakes.lock_for_files(connection, intake, caller.project):
         return
-    row = row_of(behind, caller, intake)
+    row = row_of(service, caller, intake)
     state = "registered" if row["folder"] is not None else row["state"]
     raise ApiError("conflict", f"{intake} is {state}: its files do not change any more")
 
 
-def _require_room(behind: Service, connection: sa.Connection, intake: str) -> None:
-    count, most = uploads.count(connection, intake), behind.settings.max_capture_files
+def _require_room(service: Service, connection: sa.Connection, intake: str) -> None:
+    count, most = uploads.count(connection, intake), service.settings.max_capture_files
     if intake.startswith(ENVIRONMENT) and count > 0:
         raise ApiError("conflict", f"{intake} has its file already: delete that, or give its path to replace it")
     if count >= most:
         raise ApiError("too-large", f"{intake} has {count} files, and more than {most} are not taken")
 
 
-def _row(behind: Service, caller: Caller, upload: str) -> Row:
-    row = uploads.find(behind.database, upload, caller.project)
+def _row(service: Service, caller: Caller, upload: str) -> Row:
+    row = uploads.find(service.database, upload, caller.project)
     if row is None:
         raise ApiError("not-found", f"there is no {upload} in this project")
-    row = settled(behind, row)
-    if not row["done"] and expires_at(row, behind.settings.upload_hours) < time.time():
-        raise ApiError("gone", f"{upload}: nothing came for {behind.settings.upload_hours:g} hours: begin it again")
+    row = settled(service, row)
+    if not row["done"] and expires_at(row, service.settings.upload_hours) < time.time():
+        raise ApiError("gone", f"{upload}: nothing came for {service.settings.upload_hours:g} hours: begin it again")
     return row
 
 
-def _page(behind: Service, caller: Caller, intake: str, limit: int, after: str | None) -> FilePage:
-    row_of(behind, caller, intake)
-    rows = uploads.listing(behind.database, intake, limit=limit + 1, after=after)
-    files = [_file_view(behind, row) for row in rows[:limit]]
+def _page(service: Service, caller: Caller, intake: str, limit: int, after: str | None) -> FilePage:
+    row_of(service, caller, intake)
+    rows = uploads.listing(service.database, intake, limit=limit + 1, after=after)
+    files = [_file_view(service, row) for row in rows[:limit]]
     return FilePage(files=files, next=files[-1].path if len(rows) > limit else None)
 
 

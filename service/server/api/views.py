@@ -5,7 +5,7 @@ from urllib.parse import quote
 
 import sqlalchemy as sa
 
-from service.server.storage.folder import Stored
+from service.server.storage.folder import StoredFile
 from service.views.intakes import IntakeView
 from service.views.jobs import JobView, ProgressView, ResultView
 
@@ -28,7 +28,7 @@ def intake_view(row: sa.RowMapping) -> IntakeView:
                       facts=row["facts"], created_at=_time(row["created_at"]))
 
 
-def result_view(job: str, file: Stored) -> ResultView:
+def result_view(job: str, file: StoredFile) -> ResultView:
     """Return the view of a file that a job has made."""
     return ResultView(name=file.name, size=file.size, modified_at=_time(file.modified_at), url=f"/v1/jobs/{job}/results/{quote(file.name)}")
 

@@ -9,9 +9,9 @@ import sqlalchemy as sa
 from service.requests.identifiers import JOB
 from service.server.api.problems import RETRY_S, ApiError
 from service.server.api.views import job_view
+from service.server.database import jobs
+from service.server.database.engine import UNANSWERED, Database, message_of
 from service.server.log import logger
-from service.server.store import jobs
-from service.server.store.database import UNANSWERED, Database, said
 from service.views.states import ENDED
 
 TICK_S = 0.25
@@ -116,7 +116,7 @@ class Watcher:
                     silent = False
                 except UNANSWERED as error:
                     if not silent:
-                        logger.warning("database does not answer: events wait", error=said(error))
+                        logger.warning("database does not answer: events wait", error=message_of(error))
                     silent = True
                 await asyncio.sleep(TICK_S)
         except Exception as error:

@@ -4,10 +4,10 @@ import threading
 import time
 from collections.abc import Callable
 
+from service.server.database import jobs
+from service.server.database.engine import UNANSWERED, Database, message_of
+from service.server.database.jobs import FRAMES, Claim
 from service.server.log import logger
-from service.server.store import jobs
-from service.server.store.database import UNANSWERED, Database, said
-from service.server.store.jobs import FRAMES, Claim
 
 EVERY_S = 0.5
 """How often the store is told and asked."""
@@ -77,7 +77,7 @@ class JobProgress:
                 self._stopped = not jobs.advance(self._database, self._claim, progress)
                 self._tell_at = time.monotonic() + EVERY_S
             except UNANSWERED as error:
-                logger.warning("progress is not told", job=self._claim.job, error=said(error))
+                logger.warning("progress is not told", job=self._claim.job, error=message_of(error))
                 self._tell_at = time.monotonic() + UNTOLD_S
             if self._stopped:
                 raise Stopped

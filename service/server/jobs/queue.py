@@ -7,10 +7,10 @@ import sqlalchemy as sa
 from dbos import DBOS, DBOSClient, DBOSPortableJSONSerializer
 
 from service.requests.jobs import CheckJob, JobRequest
+from service.server.database import jobs
+from service.server.database.engine import Database, create
+from service.server.database.jobs import Claim
 from service.server.settings import Settings
-from service.server.store import jobs
-from service.server.store.database import Database, create
-from service.server.store.jobs import Claim
 
 WORK, CHECKS = "work", "checks"
 """Queues: of what takes a device, and of quick looks at what came in."""
@@ -68,7 +68,7 @@ class JobQueue:
             "priority": HIGHEST - (request.priority if priority is None else priority),
         }, job, attempt)
 
-    def call_off(self, job: str, attempt: int) -> None:
+    def cancel(self, job: str, attempt: int) -> None:
         """Take an attempt from the queue; one that runs is told by the store, and ends at its next sign of progress."""
         self._client.cancel_workflow(workflow_id(job, attempt))
 
@@ -79,15 +79,15 @@ class JobQueue:
             found.setdefault(status.executor_id or "", []).append(status.workflow_id)
         return found
 
-    def hand_back(self, workflow: str, worker: str) -> None:
+    def return_job(self, workflow: str, worker: str) -> None:
         """Queue what the caller, a worker, had begun and will not go on with."""
         job, attempt = job_of(workflow)
-        if self._database.transact(lambda connection: jobs.hand_back(connection, Claim(job, attempt, worker))):
-            self.put_back(workflow)
+        if self._database.transact(lambda connection: jobs.release(connection, Claim(job, attempt, worker))):
+            self.requeue(workflow)
         else:
-            self.call_off(job, attempt)
+            self.cancel(job, attempt)
 
-    def put_back(self, workflow: str) -> None:
+    def requeue(self, workflow: str) -> None:
         """Queue what a worker had begun; its place in the queue is the one that it had."""
         job, _ = job_of(workflow)
         row = jobs.find(self._database, job)

@@ -9,17 +9,17 @@ from service.reporting.progress import Progress
 from service.requests.frame_range import frame_numbers
 from service.requests.identifiers import CAPTURE
 from service.requests.jobs import ANY_JOB, CheckJob, DepthJob, ExportJob, JobRequest, PipelineJob, RelightJob, ShadeJob, SolveJob
+from service.server.database import intakes
+from service.server.database.engine import Database
 from service.server.storage import layout
 from service.server.storage.folder import Storage
-from service.server.store import intakes
-from service.server.store.database import Database
 from stage.files import resolved
 
 KEYS_FILE = "keys.json"
 """The light keys of a job, beside its frames."""
 
 
-class Site(NamedTuple):
+class WorkerContext(NamedTuple):
     """Where a worker works."""
 
     database: Database
@@ -36,7 +36,7 @@ class Site(NamedTuple):
         return sentence.replace(f"{self.cache.parent}/", "")
 
 
-class Step(NamedTuple):
+class JobStep(NamedTuple):
     """A piece of a job that is done whole or again."""
 
     name: str
@@ -61,146 +61,149 @@ class Job(NamedTuple):
         return cls(str(row["id"]), str(row["project"]), ANY_JOB.validate_python(row["request"]), int(str(row["chunk_frames"])))
 
 
-def steps_of(job: Job, site: Site) -> list[Step]:
+def steps_of(job: Job, context: WorkerContext) -> list[JobStep]:
     """The steps of a job: always the same for the same job."""
     request = job.request
     if isinstance(request, CheckJob):
-        return [Step("check", lambda progress: _check(job, request, site, progress))]
+        return [JobStep("check", lambda progress: _check(job, request, context, progress))]
     if isinstance(request, SolveJob):
-        return [Step("solve", lambda progress: _solve(job, request, site, progress))]
+        return [JobStep("solve", lambda progress: _solve(job, request, context, progress))]
     if isinstance(request, DepthJob):
-        return [Step("depth", lambda progress: _depth(job, request, site, progress))]
+        return [JobStep("depth", lambda progress: _depth(job, request, context, progress))]
     if isinstance(request, ShadeJob):
-        return [Step("shade", lambda progress: _shade(job, request, site, progress))]
+        return [JobStep("shade", lambda progress: _shade(job, request, context, progress))]
     if isinstance(request, ExportJob):
-        return [Step("export", lambda progress: _export(job, request, job_maps(job, request.maps, site, progress), site, progress))]
+        return [JobStep("export", lambda progress: _export(job, request, context, progress))]
     if isinstance(request, RelightJob):
-        return _frames(job, request, site)
+        return _frames(job, request, context)
     assert isinstance(request, PipelineJob), request
     solve = SolveJob(kind="solve", capture=request.capture, options=request.solve)
     export = ExportJob(kind="export", maps=job.id, format=request.format, options=request.export)
     relight = RelightJob(kind="relight", capture=request.capture, environment=request.environment, keys=request.keys,
                          maps=job.id if request.guided else None, options=request.relight)
-    return [Step("solve", lambda progress: _solve(job, solve, site, progress)),
-            Step("export", lambda progress: _export(job, export, job_maps(job, job.id, site, progress), site, progress)),
-            *(_frames(job, relight, site) if request.environment is not None or request.keys is not None else [])]
+    return [JobStep("solve", lambda progress: _solve(job, solve, context, progress)),
+            JobStep("export", lambda progress: _export(job, export, context, progress)),
+            *(_frames(job, relight, context) if request.environment is not None or request.keys is not None else [])]
 
 
-def job_maps(job: Job, maps: str, site: Site, progress: Progress) -> Path:
+def job_maps(job: Job, maps: str, context: WorkerContext, progress: Progress) -> Path:
     """The folder of the results of a job of the same project, or of this one, with what was solved."""
-    return site.storage.local(layout.results(job.project, maps), layout.SOLVED, progress)
+    return context.storage.local(layout.results(job.project, maps), layout.SOLVED, progress)
 
 
-def _frames(job: Job, request: RelightJob, site: Site) -> list[Step]:
+def _frames(job: Job, request: RelightJob, context: WorkerContext) -> list[JobStep]:
     numbers = frame_numbers(request.options.frames, 1)
     chunks = [numbers[at : at + job.chunk_frames] for at in range(0, len(numbers), job.chunk_frames)]
 
-    def step(chunk: list[int]) -> Step:
+    def step(chunk: list[int]) -> JobStep:
         only = f"{chunk[0]}-{chunk[-1]}"
-        return Step(f"frames {only}", lambda progress: _relight(job, request, only, site, progress), chunk[0] - numbers[0], len(numbers))
+        return JobStep(f"frames {only}", lambda progress: _relight(job, request, only, context, progress), chunk[0] - numbers[0],
+                       len(numbers))
 
     return [step(chunk) for chunk in chunks]
 
 
-def _check(job: Job, request: CheckJob, site: Site, progress: Progress) -> None:
+def _check(job: Job, request: CheckJob, context: WorkerContext, progress: Progress) -> None:
     from service.captures.admit import admit_capture, admit_environment
 
-    folder, _ = _place(job, request.intake, site, progress)
+    folder, _ = _place(job, request.intake, context, progress)
     try:
         if request.intake.startswith(CAPTURE):
-            facts = admit_capture(folder, max_pixels=site.max_pixels, progress=progress)
+            facts = admit_capture(folder, max_pixels=context.max_pixels, progress=progress)
         else:
-            facts = admit_environment(folder, max_pixels=site.max_pixels)
+            facts = admit_environment(folder, max_pixels=context.max_pixels)
     except USER_ERRORS as error:  # named as they were handed in, not by where the service keeps them
         raise RequestError(sentence(error).replace(f"{folder}/", "")) from error
-    intakes.accept(site.database, request.intake, facts)
+    intakes.accept(context.database, request.intake, facts)
 
 
-def _solve(job: Job, request: SolveJob, site: Site, progress: Progress) -> None:
+def _solve(job: Job, request: SolveJob, context: WorkerContext, progress: Progress) -> None:
     from service.requests.solve import SolveRequest
     from service.solve.solve import solve
 
-    ball = None if request.reference_ball is None else _intake(job, request.reference_ball, site, progress)
-    solve(SolveRequest(capture=_intake(job, request.capture, site, progress), out=_out(job, site), reference_ball=ball, device=site.device,
-                       cache=site.cache / request.capture, **dict(request.options)), progress)
+    ball = None if request.reference_ball is None else _intake(job, request.reference_ball, context, progress)
+    solve(SolveRequest(capture=_intake(job, request.capture, context, progress), out=_out(job, context), reference_ball=ball,
+                       device=context.device, cache=context.cache / request.capture, **dict(request.options)), progress)
 
 
-def _depth(job: Job, request: DepthJob, site: Site, progress: Progress) -> None:
+def _depth(job: Job, request: DepthJob, context: WorkerContext, progress: Progress) -> None:
     from service.depth.depth import depth
     from service.requests.depth import DepthRequest, TofOptions
 
-    capture = _intake(job, request.capture, site, progress)
+    capture = _intake(job, request.capture, context, progress)
     calibration = None if request.tof_calibration is None else _within(capture, request.tof_calibration)
     options = dict(request.options) | {"tof": TofOptions(calibration=calibration, **dict(request.options.tof))}
-    depth(DepthRequest(capture=capture, out=_out(job, site), device=site.device, cache=site.cache / request.capture, **options), progress)
+    depth(DepthRequest(capture=capture, out=_out(job, context), device=context.device, cache=context.cache / request.capture, **options),
+          progress)
 
 
-def _shade(job: Job, request: ShadeJob, site: Site, progress: Progress) -> None:
+def _shade(job: Job, request: ShadeJob, context: WorkerContext, progress: Progress) -> None:
     from service.light.shade import shade
     from service.requests.shade import ShadeRequest
 
     capture = request.capture
-    shade(ShadeRequest(maps=job_maps(job, request.maps, site, progress), out=_out(job, site) / layout.PICTURE,
-                       environment=_environment(job, request.environment, site, progress),
-                       capture=None if capture is None else _intake(job, capture, site, progress), device=site.device,
-                       cache=None if capture is None else site.cache / capture, **dict(request.options)), progress)
+    shade(ShadeRequest(maps=job_maps(job, request.maps, context, progress), out=_out(job, context) / layout.PICTURE,
+                       environment=_environment(job, request.environment, context, progress),
+                       capture=None if capture is None else _intake(job, capture, context, progress), device=context.device,
+                       cache=None if capture is None else context.cache / capture, **dict(request.options)), progress)
 
 
-def _export(job: Job, request: ExportJob, maps: Path, site: Site, progress: Progress) -> None:
+def _export(job: Job, request: ExportJob, context: WorkerContext, progress: Progress) -> None:
     from service.requests.export import ExportRequest
     from service.usd.export import export
 
-    export(ExportRequest(maps=maps, out=_out(job, site) / f"{layout.ASSET}.{request.format}", **dict(request.options)), progress)
+    export(ExportRequest(maps=job_maps(job, request.maps, context, progress), out=_out(job, context) / f"{layout.ASSET}.{request.format}",
+                         **dict(request.options)), progress)
 
 
-def _relight(job: Job, request: RelightJob, only: str, site: Site, progress: Progress) -> None:
+def _relight(job: Job, request: RelightJob, only: str, context: WorkerContext, progress: Progress) -> None:
     from service.light.relight import relight
     from service.requests.relight import RelightRequest
     from stage.files import write_text
 
-    out = _out(job, site)
+    out = _out(job, context)
     if request.keys is not None:
         write_text(out / KEYS_FILE, request.keys.model_dump_json(by_alias=True, indent=2, exclude_defaults=True))
-    relight(RelightRequest(capture=_intake(job, request.capture, site, progress),
-                           environment=_environment(job, request.environment, site, progress),
+    relight(RelightRequest(capture=_intake(job, request.capture, context, progress),
+                           environment=_environment(job, request.environment, context, progress),
                            keys=None if request.keys is None else out / KEYS_FILE, only=only, out=str(out / layout.FRAMES),
-                           maps=None if request.maps is None else job_maps(job, request.maps, site, progress), device=site.device,
-                           cache=site.cache / request.capture, **dict(request.options)), progress)
+                           maps=None if request.maps is None else job_maps(job, request.maps, context, progress), device=context.device,
+                           cache=context.cache / request.capture, **dict(request.options)), progress)
 
 
-def _out(job: Job, site: Site) -> Path:
-    return site.storage.workspace(layout.results(job.project, job.id))
+def _out(job: Job, context: WorkerContext) -> Path:
+    return context.storage.workspace(layout.results(job.project, job.id))
 
 
-def _intake(job: Job, identifier: str, site: Site, progress: Progress) -> Path:
+def _intake(job: Job, identifier: str, context: WorkerContext, progress: Progress) -> Path:
     """The folder of a capture or environment of the job's project, as it was admitted; a registered one may have changed since."""
     from service.captures.admit import admit_environment, recheck_capture
 
-    folder, registered = _place(job, identifier, site, progress)
+    folder, registered = _place(job, identifier, context, progress)
     if registered and identifier.startswith(CAPTURE):
-        recheck_capture(folder, max_pixels=site.max_pixels)
+        recheck_capture(folder, max_pixels=context.max_pixels)
     elif registered:
-        admit_environment(folder, max_pixels=site.max_pixels)
+        admit_environment(folder, max_pixels=context.max_pixels)
     return folder
 
 
-def _place(job: Job, identifier: str, site: Site, progress: Progress) -> tuple[Path, bool]:
+def _place(job: Job, identifier: str, context: WorkerContext, progress: Progress) -> tuple[Path, bool]:
     """The folder of a capture or environment of the job's project, or the file of an environment; and whether it was registered."""
-    row = intakes.find(site.database, identifier, job.project)
+    row = intakes.find(context.database, identifier, job.project)
     if row is None:
         raise RequestError(f"{identifier}: is not there any more")
     if row["folder"] is None:
-        return site.storage.local(layout.intake(job.project, identifier), progress=progress), False
+        return context.storage.local(layout.intake(job.project, identifier), progress=progress), False
     folder = Path(row["folder"])
-    if resolved(folder) != folder or not any(folder.is_relative_to(root) for root in site.roots):
+    if resolved(folder) != folder or not any(folder.is_relative_to(root) for root in context.roots):
         raise RequestError(f"{identifier}: lies in none of the folders that the operator allows any more")
     return folder, True
 
 
-def _environment(job: Job, identifier: str | None, site: Site, progress: Progress) -> Path | None:
+def _environment(job: Job, identifier: str | None, context: WorkerContext, progress: Progress) -> Path | None:
     from service.captures.admit import environment_file
 
-    return None if identifier is None else environment_file(_intake(job, identifier, site, progress))
+    return None if identifier is None else environment_file(_intake(job, identifier, context, progress))
 
 
 def _within(capture: Path, name: str) -> Path:

@@ -6,7 +6,7 @@ import time
 from dataclasses import dataclass, field
 from multiprocessing.context import SpawnProcess
 
-from service.server.jobs.pulse import Pulse
+from service.server.jobs.heartbeat import Heartbeat
 from service.server.jobs.worker import run_worker
 from service.server.log import logger
 from service.server.settings import Settings
@@ -25,7 +25,7 @@ class _Place:
 
     device: str
     process: SpawnProcess | None = None
-    pulse: Pulse | None = None
+    heartbeat: Heartbeat | None = None
     failures: int = 0
     """Starts in a row that came to nothing."""
     start_at: float = field(default_factory=time.monotonic)
@@ -78,20 +78,20 @@ class Supervisor:
         now = time.monotonic()
         if place.process is None:
             if now >= place.start_at:
-                pulse = Pulse()
-                process = self._spawn.Process(target=run_worker, args=(self._settings, place.device, pulse),
+                heartbeat = Heartbeat()
+                process = self._spawn.Process(target=run_worker, args=(self._settings, place.device, heartbeat),
                                               name=f"relit-worker-{place.device}")
                 process.start()
-                place.process, place.pulse = process, pulse
+                place.process, place.heartbeat = process, heartbeat
             return
-        assert place.pulse is not None, "it has been started"
+        assert place.heartbeat is not None, "it has been started"
         if not place.process.is_alive():
-            place.failures = 0 if place.pulse.was_ready else place.failures + 1
+            place.failures = 0 if place.heartbeat.was_ready else place.failures + 1
             pause = PAUSES_S[min(place.failures, len(PAUSES_S) - 1)]
             logger.warning("worker is gone", device=place.device, exit_code=place.process.exitcode, again_in_s=pause)
             place.process.close()
             place.process, place.start_at = None, now + pause
-        elif place.pulse.silent_s > self._settings.stall_s:
-            logger.error("worker hangs: it is killed", device=place.device, silent_s=round(place.pulse.silent_s))
+        elif place.heartbeat.silent_s > self._settings.stall_s:
+            logger.error("worker hangs: it is killed", device=place.device, silent_s=round(place.heartbeat.silent_s))
             place.process.kill()
             place.process.join()

@@ -1,19 +1,20 @@
 """Taking over: what a dead worker had begun goes back to the queue.
 
-The queue itself gives a worker's jobs back to a worker of the same name alone. So each worker holds a lock named after it (presence), and
-each looks every few seconds whether one that has jobs has lost its lock. Who finds it takes that lock, so that no two do this at once.
+The queue gives a worker's jobs back only to a worker of the same name. So each worker holds a lock that is named after it (worker_lock),
+and looks every few seconds whether a worker that has jobs has lost its lock. The worker that finds one takes that lock, so that no two
+take over at once.
 """
 
 import threading
 from collections import Counter
 from collections.abc import Callable
 
-from service.server.jobs.presence import Held, Presence
+from service.server.database import jobs, workers
+from service.server.database.engine import UNANSWERED, Database, message_of
+from service.server.database.jobs import Claim
 from service.server.jobs.queue import JobQueue, job_of
+from service.server.jobs.worker_lock import LockState, WorkerLock
 from service.server.log import logger
-from service.server.store import jobs, workers
-from service.server.store.database import UNANSWERED, Database, said
-from service.server.store.jobs import Claim
 from service.views.states import QUEUED
 
 GRACE_ROUNDS = 2
@@ -25,13 +26,13 @@ FORGOTTEN_ROUNDS = 3
 class Takeover:
     """Looks after dead workers, and keeps the own lock."""
 
-    def __init__(self, database: Database, queue: JobQueue, presence: Presence, worker: str, *, every_s: float, max_lost: int,
+    def __init__(self, database: Database, queue: JobQueue, lock: WorkerLock, worker: str, *, every_s: float, max_lost: int,
                  running: Callable[[], frozenset[str]], beat: Callable[[], None], deposed: Callable[[], None]) -> None:
         """Prepare.
 
         Args:
             database, queue: of the service.
-            presence: the own lock, held.
+            lock: our own, held.
             worker: who we are.
             every_s: between two looks.
             max_lost: workers that a job may lose in one step.
@@ -39,7 +40,7 @@ class Takeover:
             beat: called every round.
             deposed: called when the own lock is another's for good.
         """
-        self._database, self._queue, self._presence, self._worker = database, queue, presence, worker
+        self._database, self._queue, self._lock, self._worker = database, queue, lock, worker
         self._every_s, self._max_lost = every_s, max_lost
         self._running, self._beat, self._deposed = running, beat, deposed
         self.state = workers.READY
@@ -60,22 +61,22 @@ class Takeover:
 
     def round(self) -> None:
         """Look once."""
-        held = self._presence.hold()
-        self._refused = self._refused + 1 if held is Held.REFUSED else 0
+        held = self._lock.hold()
+        self._refused = self._refused + 1 if held is LockState.REFUSED else 0
         if self._refused > GRACE_ROUNDS:  # another only holds it while it takes over from us, who were away
             self._deposed()
-        if held is Held.REFUSED:
+        if held is LockState.REFUSED:
             return
-        if held is Held.ANEW:
+        if held is LockState.TAKEN:
             self._grace = GRACE_ROUNDS
-        workers.see(self._database, self._worker, self.state)
+        workers.record_alive(self._database, self._worker, self.state)
         taken = self._queue.taken_by()
         self._put_back_forgotten(taken.pop(self._worker, []))
         if self._grace > 0:
             self._grace -= 1
             return
         for worker in taken:
-            with self._presence.dead(worker) as dead:
+            with self._lock.dead(worker) as dead:
                 if dead:
                     self._inherit(worker)
 
@@ -85,7 +86,7 @@ class Takeover:
             try:
                 self.round()
             except UNANSWERED as error:
-                logger.warning("database does not answer", error=said(error))
+                logger.warning("database does not answer", error=message_of(error))
             except Exception as error:  # the next round may do better; without any the worker would seem dead
                 logger.error("takeover failed", exc_info=error)
             if self._ended.wait(self._every_s):
@@ -97,7 +98,7 @@ class Takeover:
             logger.warning("worker died", dead=worker, jobs=[job_of(workflow)[0] for workflow in workflows])
         for workflow in workflows:
             self._take(workflow, worker)
-        workers.leave(self._database, worker)
+        workers.remove(self._database, worker)
 
     def _take(self, workflow: str, worker: str) -> None:
         """Put a workflow of a dead worker back into the queue, or end its job where it has cost too many workers."""
@@ -105,12 +106,12 @@ class Takeover:
         row = jobs.find(self._database, job)
         sentence = f"lost {self._max_lost + 1} workers in one step ({row['stage'] or 'begin' if row else ''}): " \
                    "it may need more memory than they have"
-        state = self._database.transact(lambda connection: jobs.lose_worker(
+        state = self._database.transact(lambda connection: jobs.record_lost_worker(
             connection, Claim(job, attempt, worker), self._max_lost, sentence))
         if state == QUEUED:
-            self._queue.put_back(workflow)
+            self._queue.requeue(workflow)
         else:
-            self._queue.call_off(job, attempt)
+            self._queue.cancel(job, attempt)
 
     def _put_back_forgotten(self, workflows: list[str]) -> None:
         unknown = set(workflows) - self._running()
@@ -118,4 +119,4 @@ class Takeover:
         for workflow, rounds in self._unknown.items():
             if rounds >= FORGOTTEN_ROUNDS:
                 logger.warning("job is put back: this worker had it and did not begin", job=job_of(workflow)[0])
-                self._queue.hand_back(workflow, self._worker)
+                self._queue.return_job(workflow, self._worker)

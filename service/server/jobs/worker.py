@@ -11,17 +11,17 @@ from pathlib import Path
 from dbos import DBOS, DBOSConfig
 
 from service.server import log, telemetry
-from service.server.jobs.presence import Held, presence
-from service.server.jobs.pulse import Pulse
+from service.server.database import workers
+from service.server.database.engine import LONGEST_PAUSE_S, UNANSWERED, Database, connect, message_of
+from service.server.jobs.heartbeat import Heartbeat
 from service.server.jobs.queue import CHECKS, SERIALIZER, VERSION, WORK, JobQueue, prepare
-from service.server.jobs.steps import Site
+from service.server.jobs.runner import JobRunner
+from service.server.jobs.steps import WorkerContext
 from service.server.jobs.takeover import Takeover
-from service.server.jobs.workflow import Desk
+from service.server.jobs.worker_lock import LockState, open_worker_lock
 from service.server.log import logger
 from service.server.settings import Settings
 from service.server.storage.open import open_storage
-from service.server.store import workers
-from service.server.store.database import LONGEST_PAUSE_S, UNANSWERED, Database, connect, said
 
 POLL_S = 0.25
 """How often a queue is asked for work."""
@@ -32,13 +32,13 @@ NICENESS = 5
 """Of a worker, which fills every core for minutes: the API beside it answers first, and the worker alone on a machine is as fast."""
 
 
-def run_worker(settings: Settings, device: str, pulse: Pulse) -> None:
+def run_worker(settings: Settings, device: str, heartbeat: Heartbeat) -> None:
     """Work until SIGTERM or the end of the parent process.
 
     Args:
         settings: of the service.
         device: cpu, cuda:0, …
-        pulse: told that the worker lives, and that its steps do.
+        heartbeat: told that the worker lives, and that its steps do.
     """
     os.nice(NICENESS)
     ending = threading.Event()
@@ -51,12 +51,12 @@ def run_worker(settings: Settings, device: str, pulse: Pulse) -> None:
     _prepared(database, settings, ending)
     host = socket.gethostname()
     name = f"{host}-{device.replace(':', '')}-{os.getpid()}-{secrets.token_hex(4)}"
-    lock = presence(database, settings.data / "locks", name)
-    if lock.hold() is Held.REFUSED:
+    lock = open_worker_lock(database, settings.data / "locks", name)
+    if lock.hold() is LockState.REFUSED:
         raise RuntimeError(f"the lock of {name} is held by another")  # the name is random
     queue = JobQueue(database)
-    site = Site(database, open_storage(settings), cache_folder(settings), device, settings.max_pixels, settings.roots)
-    desk = Desk(site, queue, name, alive=pulse.step)
+    context = WorkerContext(database, open_storage(settings), cache_folder(settings), device, settings.max_pixels, settings.roots)
+    runner = JobRunner(context, queue, name, alive=heartbeat.step)
     config: DBOSConfig = {
         "name": APPLICATION, "system_database_url": settings.sqlalchemy_url, "system_database_engine": database.engine,
         "application_version": VERSION, "executor_id": name, "serializer": SERIALIZER, "log_level": "ERROR", "run_migrations": False,
@@ -64,30 +64,30 @@ def run_worker(settings: Settings, device: str, pulse: Pulse) -> None:
     }
     dbos = DBOS(config=config)
     log.adopt("dbos")
-    desk.register()
+    runner.register()
     takeover = Takeover(database, queue, lock, name, every_s=settings.takeover_s, max_lost=settings.max_lost,
-                        running=lambda: desk.running, beat=pulse.beat, deposed=_depose)
+                        running=lambda: runner.running, beat=heartbeat.beat, deposed=_depose)
     DBOS.launch()
     for waiting in (WORK, CHECKS):
         DBOS.register_queue(waiting, worker_concurrency=1, polling_interval_sec=POLL_S)
-    workers.appear(database, name, host=host, pid=os.getpid(), device=device)
+    workers.insert(database, name, host=host, pid=os.getpid(), device=device)
     takeover.start()
-    pulse.ready()
+    heartbeat.ready()
     logger.info("worker ready", worker=name, device=device)
     ending.wait()
     logger.info("worker drains", worker=name)
     for stop in dbos.background_thread_stop_events:  # takes nothing more from the queues
         stop.set()
     takeover.state = workers.DRAINING
-    if not desk.drain(settings.drain_s):
+    if not runner.drain(settings.drain_s):
         logger.warning("step is given up", worker=name, after_s=settings.drain_s)
     takeover.stop()
     try:
-        workers.leave(database, name)
+        workers.remove(database, name)
         for workflow in queue.taken_by().get(name, []):
-            queue.hand_back(workflow, name)
+            queue.return_job(workflow, name)
     except UNANSWERED as error:
-        logger.warning("jobs are left to be taken over: the database does not answer", error=said(error))
+        logger.warning("jobs are left to be taken over: the database does not answer", error=message_of(error))
     lock.close()
     telemetry.close(tracing)
     logger.info("worker ended", worker=name)
@@ -106,7 +106,7 @@ def _prepared(database: Database, settings: Settings, ending: threading.Event) -
             prepare(settings, database)
             return
         except UNANSWERED as error:
-            logger.warning("database does not answer", error=said(error))
+            logger.warning("database does not answer", error=message_of(error))
         if ending.wait(LONGEST_PAUSE_S):
             os._exit(0)
 

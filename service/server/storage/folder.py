@@ -10,7 +10,7 @@ from service.reporting.progress import Progress
 from stage.errors import storage
 
 
-class Stored(NamedTuple):
+class StoredFile(NamedTuple):
     """One file."""
 
     name: str
@@ -43,7 +43,7 @@ class Storage(Protocol):
     def delete(self, prefix: str, name: str) -> None:
         """Delete one file; nothing happens where there is none."""
 
-    def files(self, prefix: str) -> list[Stored]:
+    def files(self, prefix: str) -> list[StoredFile]:
         """The files of a prefix, by name."""
 
     def open(self, prefix: str, name: str) -> Path | None:
@@ -108,7 +108,7 @@ class FolderStorage:
             except OSError:  # there is more in it
                 return
 
-    def files(self, prefix: str) -> list[Stored]:
+    def files(self, prefix: str) -> list[StoredFile]:
         """Every complete file."""
         return sorted(stored_below(self._root / prefix))
 
@@ -174,7 +174,7 @@ def sweep(folder: Path) -> None:
             path.unlink(missing_ok=True)
 
 
-def stored_below(folder: Path, before: str = "") -> Iterator[Stored]:
+def stored_below(folder: Path, before: str = "") -> Iterator[StoredFile]:
     """Complete files below a folder; none where there is no folder."""
     if not folder.is_dir():
         return
@@ -185,4 +185,4 @@ def stored_below(folder: Path, before: str = "") -> Iterator[Stored]:
             yield from stored_below(Path(entry.path), f"{before}{entry.name}/")
         else:
             status = entry.stat()
-            yield Stored(before + entry.name, status.st_size, status.st_mtime)
+            yield StoredFile(before + entry.name, status.st_size, status.st_mtime)

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 from service.reporting.progress import Progress
 from service.server.storage.bucket import Bucket, Object
-from service.server.storage.folder import Stored, is_shown, stored_below, sweep
+from service.server.storage.folder import StoredFile, is_shown, stored_below, sweep
 from service.server.storage.scratch import Entry, Scratch
 from stage.files import replacing
 
@@ -63,7 +63,7 @@ class ObjectStorage:
             sweep(entry.files)
             new = [stored for stored in stored_below(entry.files) if entry.version(stored.name) is None]
 
-            def send(stored: Stored, moved: Callable[[], None]) -> tuple[str, str]:
+            def send(stored: StoredFile, moved: Callable[[], None]) -> tuple[str, str]:
                 return stored.name, self._bucket.send(entry.files / stored.name, f"{prefix}/{stored.name}", moved).version
 
             _transfer("upload", new, send, entry, progress)
@@ -81,9 +81,9 @@ class ObjectStorage:
         """Delete the object; copies lose it when they are brought up to date."""
         self._bucket.delete([f"{prefix}/{name}"])
 
-    def files(self, prefix: str) -> list[Stored]:
+    def files(self, prefix: str) -> list[StoredFile]:
         """Every object."""
-        return sorted(Stored(name, found.size, found.modified_at) for name, found in self._objects(prefix).items())
+        return sorted(StoredFile(name, found.size, found.modified_at) for name, found in self._objects(prefix).items())
 
     def open(self, prefix: str, name: str) -> Path | None:
         """A copy of one object, fetched if it has changed."""

@@ -15,11 +15,11 @@ import httpx2
 import pytest
 
 from service.demo.demo import sample_folder
+from service.server.database.engine import connect
+from service.server.database.keys import Scope
 from service.server.jobs.queue import JobQueue, prepare
 from service.server.sample import greet
 from service.server.settings import Settings
-from service.server.store.database import connect
-from service.server.store.keys import Scope
 
 HOME = Path(__file__).parents[3]
 TEXT = (HOME / "docs" / "service.md").read_text(encoding="utf-8")

@@ -5,12 +5,12 @@ import sqlalchemy as sa
 
 from service.requests.identifiers import CAPTURE, new_id
 from service.requests.jobs import CheckJob
+from service.server.database import keys, workers
+from service.server.database.engine import connect
+from service.server.database.keys import NewKey, Scope
+from service.server.database.tables import about
 from service.server.jobs.queue import JobQueue, prepare
 from service.server.settings import Settings
-from service.server.store import keys, workers
-from service.server.store.database import connect
-from service.server.store.keys import NewKey, Scope
-from service.server.store.tables import about
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def lines_of(outcome) -> dict[str, str]:
 
 
 def test_a_sound_service(relit, data, database, tmp_path, monkeypatch):
-    workers.appear(database, "w1", host="h", pid=1, device="cuda:1")
+    workers.insert(database, "w1", host="h", pid=1, device="cuda:1")
     monkeypatch.setenv("RELIT_ROOTS", str(tmp_path))
     outcome = relit("doctor", "--device", "cpu", "--data", data)
     assert (outcome.code, outcome.err) == (0, ""), outcome.out

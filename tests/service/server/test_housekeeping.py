@@ -8,14 +8,14 @@ import sqlalchemy as sa
 
 from service.requests.identifiers import CAPTURE, ENVIRONMENT, UPLOAD, new_id
 from service.requests.jobs import ExportJob, SolveJob
+from service.server.database import idempotency, intakes, jobs, tables, uploads, workers
+from service.server.database.engine import connect
 from service.server.housekeeping import DAY_S, HOUR_S, UNFINISHED_S, Housekeeper
 from service.server.jobs.queue import JobQueue, prepare
 from service.server.settings import Settings
 from service.server.storage import layout
 from service.server.storage.open import open_storage
 from service.server.storage.parts import Part, parts_folder
-from service.server.store import idempotency, intakes, jobs, tables, uploads, workers
-from service.server.store.database import connect
 
 DAYS = 30.0
 PROJECT = "larch"
@@ -137,7 +137,7 @@ def test_tokens_are_remembered_for_a_day(house):
         return made[-1]
 
     def ask() -> str:
-        return idempotency.once(house.database, PROJECT, "token", ["x"], make)[0]
+        return idempotency.create_once(house.database, PROJECT, "token", ["x"], make)[0]
 
     ask()
     house.now += 0.9 * DAY_S
@@ -150,7 +150,7 @@ def test_tokens_are_remembered_for_a_day(house):
 
 def test_workers_that_are_gone_are_forgotten_and_those_that_come_back_are_not(house):
     for name in ("dead", "alive"):
-        workers.appear(house.database, name, host="h", pid=1, device="cpu")
+        workers.insert(house.database, name, host="h", pid=1, device="cpu")
     locks = house.settings.data / "locks"
     locks.mkdir()
     (locks / "dead.lock").write_bytes(b"")

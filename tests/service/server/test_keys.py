@@ -3,10 +3,10 @@
 import pytest
 
 from service.cli.keys import ScopeName
+from service.server.database import keys
+from service.server.database.engine import connect
+from service.server.database.keys import Scope
 from service.server.settings import Settings
-from service.server.store import keys
-from service.server.store.database import connect
-from service.server.store.keys import Scope
 
 
 @pytest.fixture

@@ -8,11 +8,11 @@ from pathlib import Path
 
 from service.requests.identifiers import CAPTURE, ENVIRONMENT, new_id
 from service.requests.jobs import RelightJob, SolveJob
+from service.server.database import intakes, jobs, keys, tables
+from service.server.database.engine import Database, connect
 from service.server.jobs.queue import JobQueue
 from service.server.settings import Settings
 from service.server.storage import layout
-from service.server.store import intakes, jobs, keys, tables
-from service.server.store.database import Database, connect
 from tests.service.server_process import Server
 
 PROJECT = "fuzz"
@@ -97,7 +97,7 @@ def _intake(database: Database, kind: str, *, ready: bool) -> str:
     database.transact(lambda connection: intakes.insert(
         connection, identifier=identifier, project=PROJECT, kind=kind, name="owl", folder=None))
     if ready:
-        database.transact(lambda connection: intakes.close(connection, identifier))
+        database.transact(lambda connection: intakes.begin_check(connection, identifier))
         intakes.accept(database, identifier, {"captures": 1, "frames": 96, "resolution": [320, 320]})
     return identifier
 

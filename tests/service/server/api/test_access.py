@@ -9,10 +9,10 @@ import httpx2
 import pytest
 
 from service.requests.identifiers import CAPTURE, ENVIRONMENT, JOB, UPLOAD, new_id
+from service.server.database import intakes, keys
+from service.server.database.engine import Database, connect
+from service.server.database.keys import NewKey, Scope
 from service.server.settings import Settings
-from service.server.store import intakes, keys
-from service.server.store.database import Database, connect
-from service.server.store.keys import NewKey, Scope
 from tests.service.server.api.conftest import SAMPLES
 from tests.service.server_process import Server, serving
 

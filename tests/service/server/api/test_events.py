@@ -18,10 +18,10 @@ from service.server.api import events, watch
 from service.server.api.app import create_app
 from service.server.api.problems import ApiError
 from service.server.api.watch import Change, Listener, Watcher
+from service.server.database import jobs, tables
+from service.server.database.engine import Database, connect
 from service.server.jobs.queue import prepare
 from service.server.settings import Settings
-from service.server.store import jobs, tables
-from service.server.store.database import Database, connect
 from tests.service.postgres import binaries, postgres
 from tests.service.server.api.asgi import Call
 from tests.service.server_process import serving

@@ -8,10 +8,10 @@ import httpx2
 import pytest
 
 from service.requests.identifiers import new_id
+from service.server.database import idempotency, intakes, keys
+from service.server.database.engine import Database, connect, create
+from service.server.database.keys import NewKey, Scope
 from service.server.settings import Settings
-from service.server.store import idempotency, intakes, keys
-from service.server.store.database import Database, connect, create
-from service.server.store.keys import NewKey, Scope
 from tests.service.postgres import binaries, postgres
 from tests.service.server.api.conftest import SAMPLES
 from tests.service.server_process import Server, serving
@@ -168,13 +168,13 @@ def test_at_once_on_either_database(database):
 
     def ask(_: int) -> tuple[str, bool]:
         together.wait()
-        return idempotency.once(database, PROJECT, "token", ["x"], make)
+        return idempotency.create_once(database, PROJECT, "token", ["x"], make)
 
     with ThreadPoolExecutor(AT_ONCE) as pool:
         made = list(pool.map(ask, range(AT_ONCE)))
     assert len({identifier for identifier, _ in made}) == 1 and sum(new for _, new in made) == 1
     assert [row["id"] for row in intakes.latest(database, PROJECT, "cap", limit=10)] == [made[0][0]]
-    assert idempotency.made(database, PROJECT, "token", ["x"]) == made[0][0]
-    assert idempotency.made(database, PROJECT, "other", ["x"]) is None
+    assert idempotency.created_by(database, PROJECT, "token", ["x"]) == made[0][0]
+    assert idempotency.created_by(database, PROJECT, "other", ["x"]) is None
     with pytest.raises(idempotency.TokenReused):
-        idempotency.made(database, PROJECT, "token", ["y"])
+        idempotency.created_by(database, PROJECT, "token", ["y"])

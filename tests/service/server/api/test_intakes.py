@@ -4,9 +4,9 @@ import pytest
 
 from service.requests.identifiers import CAPTURE, new_id
 from service.requests.jobs import CheckJob
-from service.server.store import intakes, jobs
-from service.server.store.database import connect, create
-from service.server.store.jobs import Claim
+from service.server.database import intakes, jobs
+from service.server.database.engine import connect, create
+from service.server.database.jobs import Claim
 from tests.service.server.api.captures import write_capture
 from tests.service.server.api.conftest import SAMPLES
 
@@ -111,11 +111,11 @@ def test_a_check_that_ends_unseen_leaves_nothing_waiting(tmp_path, end):
     else:
         claim = Claim(job, 1, "worker")
         assert jobs.begin(database, claim)
-        assert database.transact(lambda connection: jobs.lose_worker(connection, claim, 0, "lost too many")) == jobs.FAILED
+        assert database.transact(lambda connection: jobs.record_lost_worker(connection, claim, 0, "lost too many")) == jobs.FAILED
     found = intakes.find(database, capture, "p")
     assert found is not None and found["state"] == "refused"
     assert ("cancelled" if end == "cancelled" else "lost too many") in found["problem"]
-    assert database.transact(lambda connection: intakes.close(connection, capture))
+    assert database.transact(lambda connection: intakes.begin_check(connection, capture))
     assert not database.transact(lambda connection: jobs.cancel(connection, job))
     found = intakes.find(database, capture, "p")
     assert found is not None and found["state"] == "checking"  # the check that ended before has no say in this one

@@ -8,7 +8,7 @@ import httpx2
 import pytest
 
 from service.requests.identifiers import new_id
-from service.server.store.database import storable
+from service.server.database.engine import storable
 from tests.service.server_process import Server
 
 ENDED = ("succeeded", "failed", "cancelled")

@@ -8,10 +8,10 @@ import pytest
 from service.server.api import limits
 from service.server.api.limits import Limiter
 from service.server.api.problems import ApiError
+from service.server.database import intakes, jobs, keys
+from service.server.database.engine import Database, connect
+from service.server.database.keys import NewKey, Scope
 from service.server.settings import Settings
-from service.server.store import intakes, jobs, keys
-from service.server.store.database import Database, connect
-from service.server.store.keys import NewKey, Scope
 from tests.service.server.api.conftest import SAMPLES
 from tests.service.server_process import Server, serving
 

@@ -22,9 +22,9 @@ from service.server.api.app import create_app
 from service.server.api.intakes import NewCapture, NewEnvironment
 from service.server.api.jobs import EXAMPLES, Priority
 from service.server.api.problems import KINDS
+from service.server.database.engine import connect
 from service.server.jobs.queue import prepare
 from service.server.settings import Settings
-from service.server.store.database import connect
 from service.views.intakes import IntakeView
 from service.views.jobs import JobView, ResultView
 from tests.service.postgres import binaries, postgres

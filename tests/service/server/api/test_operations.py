@@ -23,10 +23,10 @@ from prometheus_client.parser import text_string_to_metric_families
 from service.errors import RequestError
 from service.server import log, telemetry
 from service.server.api.app import create_app
+from service.server.database import jobs, workers
+from service.server.database.engine import connect
 from service.server.jobs.queue import prepare
 from service.server.settings import Settings
-from service.server.store import jobs, workers
-from service.server.store.database import connect
 from tests.service.postgres import binaries, postgres
 from tests.service.server.api.conftest import SAMPLES
 from tests.service.server_process import Server, serving
@@ -129,7 +129,7 @@ def test_a_worker_of_its_own_makes_the_service_ready_and_ends_clean(tmp_path):
 def test_what_was_found_is_told_again_for_a_moment(app, monkeypatch):
     """Who asks a thousand times a second costs one look."""
     looks = []
-    monkeypatch.setattr("service.server.api.operations._faults", lambda behind: looks.append(1) or [])
+    monkeypatch.setattr("service.server.api.operations._faults", lambda service: looks.append(1) or [])
     for _ in range(100):
         app.state.readiness.wrong(app.state.service)
     assert len(looks) < 100
@@ -271,7 +271,7 @@ def test_the_service_drains_and_ends_clean(busy):
     assert lines_of(server)[-1]["event"] == "service ended"
     assert not list((server.data / "locks").glob("*.lock"))
     database = connect(Settings(data=server.data).sqlalchemy_url)
-    assert jobs.find(database, job)["state"] == "queued" and workers.present(database) == []
+    assert jobs.find(database, job)["state"] == "queued" and workers.seen_lately(database) == []
     database.close()
 
 

@@ -16,10 +16,10 @@ from service.requests.identifiers import new_id
 from service.requests.jobs import SolveJob
 from service.server.api.app import create_app
 from service.server.api.ranges import MAX_RANGES, Span, asked_for, names
+from service.server.database.engine import connect
 from service.server.jobs.queue import JobQueue, prepare
 from service.server.settings import Settings
 from service.server.storage.folder import FolderStorage
-from service.server.store.database import connect
 from stage.errors import StorageError
 from tests.service.server.api.asgi import Call
 from tests.service.server_process import Server

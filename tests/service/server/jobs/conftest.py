@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.captures import make_scene, write_capture, write_exr
-from tests.service.server.jobs.yard import relit_relight, yard
+from tests.service.server.jobs.harness import harness, relit_relight
 
 FRAMES = 36
 SIZE = 256
@@ -35,9 +35,9 @@ def on_postgres(server_postgres) -> str:
 
 
 @pytest.fixture
-def still_yard(tmp_path: Path, database_url: str | None):
-    """A yard without workers."""
-    with yard(tmp_path, database_url) as made:
+def idle_harness(tmp_path: Path, database_url: str | None):
+    """A harness that has not started a worker."""
+    with harness(tmp_path, database_url) as made:
         yield made
 
 

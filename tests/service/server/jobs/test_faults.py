@@ -9,10 +9,12 @@ from pathlib import Path
 import pytest
 
 from service.requests.identifiers import CAPTURE, ENVIRONMENT
-from service.server.store import jobs, workers
-from tests.service.server.jobs.yard import digests, yard
+from service.server.database import jobs, workers
+from tests.service.server.jobs.harness import digests, harness
 
-SABOTAGE = str(Path(__file__).parent / "sabotage")
+HERE = Path(__file__).resolve().parent
+SABOTAGE = os.pathsep.join([str(HERE / "sabotage"), str(HERE.parents[3])])
+"""PYTHONPATH of a worker whose frames go wrong; it has this checkout's `service` too."""
 
 
 def begin(made, undisturbed, *, frames=None, chunk_frames=8):
@@ -26,7 +28,7 @@ def frames_there(made, job, count):
 
 @pytest.mark.long
 def test_restarts_of_postgresql_cost_nothing(tmp_path, server_postgres, on_postgres, undisturbed):
-    with yard(tmp_path, on_postgres, takeover_s=0.5) as made:
+    with harness(tmp_path, on_postgres, takeover_s=0.5) as made:
         for _ in range(2):
             made.start(PYTHONPATH=SABOTAGE, SABOTAGE="slow")
         there = {row["id"] for row in made.ready(2)}
@@ -45,7 +47,7 @@ def test_restarts_of_postgresql_cost_nothing(tmp_path, server_postgres, on_postg
 @pytest.mark.long
 @pytest.mark.parametrize("how", ["stopped", "in a step"])
 def test_a_worker_that_hangs_is_killed_and_its_job_taken_over(tmp_path, undisturbed, how):
-    with yard(tmp_path, stall_s=3, takeover_s=0.5) as made:
+    with harness(tmp_path, stall_s=3, takeover_s=0.5) as made:
         made.start(**({} if how == "stopped" else {"PYTHONPATH": SABOTAGE, "SABOTAGE": "hang"}))
         made.ready(1)
         job = begin(made, undisturbed)
@@ -62,7 +64,7 @@ def test_a_worker_that_hangs_is_killed_and_its_job_taken_over(tmp_path, undistur
 
 
 def test_a_worker_that_is_asked_to_end_finishes_its_step_and_hands_the_job_back(tmp_path, on_postgres, undisturbed):
-    with yard(tmp_path, on_postgres) as made:
+    with harness(tmp_path, on_postgres) as made:
         worker = made.start(PYTHONPATH=SABOTAGE, SABOTAGE="slow")
         made.ready(1)
         job = begin(made, undisturbed, chunk_frames=6)
@@ -73,7 +75,7 @@ def test_a_worker_that_is_asked_to_end_finishes_its_step_and_hands_the_job_back(
         assert (row["state"], row["worker"], row["lost"]) == (jobs.QUEUED, None, 0)
         assert row["finished_steps"] == ["frames 1-6", "frames 7-12"]
         assert len(digests(made.results(job))) == 12
-        assert workers.present(made.database) == []
+        assert workers.seen_lately(made.database) == []
         made.start()
         assert made.ended(job)["state"] == jobs.SUCCEEDED
         assert digests(made.results(job)) == undisturbed.digests
@@ -81,7 +83,7 @@ def test_a_worker_that_is_asked_to_end_finishes_its_step_and_hands_the_job_back(
 
 @pytest.mark.long
 def test_a_step_that_does_not_end_in_time_is_given_up(tmp_path, undisturbed):
-    with yard(tmp_path, drain_s=1) as made:
+    with harness(tmp_path, drain_s=1) as made:
         worker = made.start(PYTHONPATH=SABOTAGE, SABOTAGE="hang")
         made.ready(1)
         job = begin(made, undisturbed)
@@ -94,7 +96,7 @@ def test_a_step_that_does_not_end_in_time_is_given_up(tmp_path, undisturbed):
 
 @pytest.mark.long
 def test_a_worker_ends_with_the_process_that_looks_after_it(tmp_path, undisturbed):
-    with yard(tmp_path) as made:
+    with harness(tmp_path) as made:
         worker = made.start(PYTHONPATH=SABOTAGE, SABOTAGE="slow")
         made.ready(1)
         job = begin(made, undisturbed, chunk_frames=6)
@@ -108,7 +110,7 @@ def test_a_worker_ends_with_the_process_that_looks_after_it(tmp_path, undisturbe
 
 @pytest.mark.long
 def test_a_job_that_kills_its_workers_fails_with_a_sentence(tmp_path, undisturbed):
-    with yard(tmp_path, max_lost=1, takeover_s=0.2) as made:
+    with harness(tmp_path, max_lost=1, takeover_s=0.2) as made:
         made.start(PYTHONPATH=SABOTAGE, SABOTAGE="kill")
         job = begin(made, undisturbed)
         row = made.ended(job)
@@ -141,7 +143,7 @@ def fill(folder: Path, *, leave: int) -> Path:
 
 @pytest.mark.long
 def test_a_job_on_a_full_disk_fails_with_a_sentence_and_goes_on_when_there_is_space(small_disk, tmp_path, on_postgres, undisturbed):
-    with yard(small_disk, on_postgres) as made:
+    with harness(small_disk, on_postgres) as made:
         made.log = tmp_path / "log.txt"
         made.start()
         made.ready(1)
@@ -154,7 +156,7 @@ def test_a_job_on_a_full_disk_fails_with_a_sentence_and_goes_on_when_there_is_sp
         assert 0 < len(there) < undisturbed.frames
         assert there.items() <= undisturbed.digests.items()  # nothing half-written, hidden neither
         ballast.unlink()
-        attempt = made.database.transact(lambda connection: jobs.begin_again(connection, job, jobs.FAILED))
+        attempt = made.database.transact(lambda connection: jobs.queue_again(connection, job, jobs.FAILED))
         assert attempt == 2
         request = made.request(job)
         made.database.transact(lambda connection: made.queue.enqueue(connection, job, attempt, request))

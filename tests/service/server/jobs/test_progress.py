@@ -5,19 +5,19 @@ import sqlalchemy as sa
 from sqlalchemy.exc import OperationalError
 
 from service.requests.identifiers import CAPTURE, ENVIRONMENT, new_id
+from service.server.database import jobs
+from service.server.database.engine import Database
+from service.server.database.jobs import Claim
 from service.server.jobs import progress
 from service.server.jobs.progress import JobProgress, Stopped
-from service.server.store import jobs
-from service.server.store.database import Database
-from service.server.store.jobs import Claim
-from tests.service.server.jobs.yard import yard
+from tests.service.server.jobs.harness import harness
 
 
 @pytest.fixture
 def claim(tmp_path, monkeypatch):
     monkeypatch.setattr(progress, "EVERY_S", 0.0)
     monkeypatch.setattr(progress, "UNTOLD_S", 0.0)
-    with yard(tmp_path) as made:
+    with harness(tmp_path) as made:
         job = made.relight(new_id(CAPTURE), new_id(ENVIRONMENT), 10, chunk_frames=5)
         claim = Claim(job, 1, "one")
         jobs.begin(made.database, claim)
@@ -46,7 +46,7 @@ def test_a_database_that_does_not_answer_does_not_end_the_step(claim):
     signs = []
     gone = Database(sa.create_engine(f"sqlite:///{made.folder / 'nowhere' / 'relit.sqlite'}"))
     with pytest.raises(OperationalError):
-        jobs.is_wanted(gone, claim)
+        jobs.is_claimed(gone, claim)
     step = JobProgress(gone, claim, alive=lambda: signs.append(1), of=10)
     step.stage("frames", 10)
     step.advance(3)
@@ -61,7 +61,7 @@ def test_a_step_that_is_not_wanted_stops_and_stays_so(claim, end):
     if end == "cancel":
         made.database.transact(lambda connection: jobs.cancel(connection, claim.job))
     else:
-        made.database.transact(lambda connection: jobs.lose_worker(connection, claim, 3, ""))
+        made.database.transact(lambda connection: jobs.record_lost_worker(connection, claim, 3, ""))
         jobs.begin(made.database, Claim(claim.job, 1, "two"))
     before = dict(made.row(claim.job))
     for done in (1, 2):

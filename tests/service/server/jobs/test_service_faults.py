@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from service.server.database import jobs, workers
+from service.server.database.engine import connect
 from service.server.settings import Settings
-from service.server.store import jobs, workers
-from service.server.store.database import connect
+from tests.service.server.jobs.harness import WAIT_S, digests
 from tests.service.server.jobs.test_faults import SABOTAGE, fill, small_disk  # noqa: F401  (a fixture)
-from tests.service.server.jobs.yard import WAIT_S, digests
 from tests.service.server_process import Server, serving
 
 OPTIONS = ("--anonymous", "--device", "cpu")
@@ -82,7 +82,7 @@ def test_the_service_drains_when_it_is_asked_to_end(tmp_path, undisturbed, monke
         database = connect(Settings(data=server.data).sqlalchemy_url)
         row = jobs.find(database, job)
         assert (row["state"], row["worker"], row["finished_steps"]) == (jobs.QUEUED, None, ["frames 1-6", "frames 7-12"])
-        assert workers.present(database) == []
+        assert workers.seen_lately(database) == []
         database.close()
 
 

@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 
 from service.requests.identifiers import CAPTURE, ENVIRONMENT, JOB, new_id
+from service.server.database.jobs import FRAMES
 from service.server.jobs import progress as progresses
 from service.server.jobs.progress import JobProgress
 from service.server.jobs.steps import KEYS_FILE
@@ -12,7 +13,6 @@ from service.server.settings import Settings
 from service.server.storage import layout, objects, scratch
 from service.server.storage.open import SCRATCH
 from service.server.storage.parts import parts_folder
-from service.server.store.jobs import FRAMES
 
 TEXT = (Path(__file__).parents[4] / "docs" / "service_storage.md").read_text(encoding="utf-8")
 

@@ -33,8 +33,8 @@ class Slow:
         self._inner.advance(done)
 
 
-def slow(job, request, only, site, progress):
-    relight(job, request, only, site, Slow(progress))
+def slow(job, request, only, context, progress):
+    relight(job, request, only, context, Slow(progress))
 
 
 if "SABOTAGE" in os.environ:

@@ -11,8 +11,8 @@ import sqlalchemy as sa
 from pydantic import BaseModel, StringConstraints
 
 from service.requests.identifiers import KEY, Project, new_id
-from service.server.store.database import Database
-from service.server.store.tables import keys
+from service.server.database.engine import Database
+from service.server.database.tables import keys
 
 SECRET_BYTES = 32
 """256 random bits: no one finds them by trying, so that one round of SHA-256 is enough."""

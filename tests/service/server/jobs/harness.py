@@ -18,18 +18,18 @@ from dbos import DBOSClient
 from service.requests.identifiers import CAPTURE, ENVIRONMENT, new_id
 from service.requests.jobs import ANY_JOB, JobRequest, RelightJob
 from service.requests.relight import RelightOptions
+from service.server.database import intakes, jobs, workers
+from service.server.database.engine import connect
 from service.server.jobs.queue import JobQueue, prepare, workflow_id
 from service.server.settings import Settings
 from service.server.storage import layout
-from service.server.store import intakes, jobs, workers
-from service.server.store.database import connect
 
-PROJECT = "yard"
+PROJECT = "tests"
 WAIT_S = 120.0
 """Far beyond what anything takes here, so that a slow machine fails no test."""
 
 
-class Yard:
+class Harness:
     """Where workers work."""
 
     def __init__(self, folder: Path, database_url: str | None, **settings: Any) -> None:
@@ -102,7 +102,7 @@ class Yard:
 
     def ready(self, count: int) -> list[sa.RowMapping]:
         """The workers, when there are so many."""
-        return self.until(lambda: found if len(found := workers.present(self.database)) >= count else None, f"{count} workers ready")
+        return self.until(lambda: found if len(found := workers.seen_lately(self.database)) >= count else None, f"{count} workers ready")
 
     def pid_of(self, worker: str) -> int:
         """Of the process of a worker, which is part of its name."""
@@ -160,8 +160,8 @@ class Yard:
 
 
 @contextmanager
-def yard(folder: Path, database_url: str | None = None, **settings: Any) -> Iterator[Yard]:
-    made = Yard(folder, database_url, **settings)
+def harness(folder: Path, database_url: str | None = None, **settings: Any) -> Iterator[Harness]:
+    made = Harness(folder, database_url, **settings)
     try:
         yield made
     finally:

@@ -9,9 +9,9 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from service.server.store.database import Database, storable
-from service.server.store.jobs import PATIENCE_S
-from service.server.store.tables import intakes, job_inputs, jobs, newest_first, uploads
+from service.server.database.engine import Database, storable
+from service.server.database.jobs import PATIENCE_S
+from service.server.database.tables import intakes, job_inputs, jobs, newest_first, uploads
 from service.views.states import CHECKING, READY, RECEIVING, REFUSED
 
 
@@ -32,7 +32,7 @@ def latest(database: Database, project: str, kind: str, *, limit: int, before: t
     return database.rows(newest_first(query, intakes, limit=limit, before=before))
 
 
-def hold(connection: sa.Connection, identifier: str, project: str) -> bool:
+def lock_for_files(connection: sa.Connection, identifier: str, project: str) -> bool:
     """Keep one that takes files from being checked or deleted until the transaction ends; what was refused is being mended now.
 
     Returns:
@@ -51,7 +51,7 @@ def last_used(database: Database, identifiers: Sequence[str]) -> dict[str, float
     return {row["id"]: row["used"] for row in database.rows(query.group_by(intakes.c.id, intakes.c.created_at))}
 
 
-def close(connection: sa.Connection, identifier: str) -> bool:
+def begin_check(connection: sa.Connection, identifier: str) -> bool:
     """Take no more files, and wait for the check; false where it is checking or ready already."""
     return connection.execute(intakes.update().where(intakes.c.id == identifier, intakes.c.state.in_((RECEIVING, REFUSED))).values(
         state=CHECKING, problem=None)).rowcount == 1

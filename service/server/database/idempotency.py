@@ -9,15 +9,15 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.exc import IntegrityError
 
-from service.server.store.database import Database
-from service.server.store.tables import idempotency
+from service.server.database.engine import Database
+from service.server.database.tables import idempotency
 
 
 class TokenReused(Exception):
     """The token came with another request before."""
 
 
-def once(database: Database, project: str, token: str | None, asked: Any, make: Callable[[sa.Connection], str]) -> tuple[str, bool]:
+def create_once(database: Database, project: str, token: str | None, asked: Any, make: Callable[[sa.Connection], str]) -> tuple[str, bool]:
     """Create something, once for a token.
 
     Args:
@@ -53,13 +53,13 @@ def once(database: Database, project: str, token: str | None, asked: Any, make: 
         return database.transact(work)
 
 
-def made(database: Database, project: str, token: str, asked: Any) -> str | None:
+def created_by(database: Database, project: str, token: str, asked: Any) -> str | None:
     """What was created with a token; None: nothing. Arguments and errors as of `once`."""
     row = database.row(_by_token(project, token))
     return None if row is None else _same(row, _fingerprint(asked))
 
 
-def forget(connection: sa.Connection, project: str, token: str, gone: str) -> None:
+def forget_token(connection: sa.Connection, project: str, token: str, gone: str) -> None:
     """What a token made is gone: it may make another, unless it has already."""
     connection.execute(idempotency.delete().where(*_is(project, token), idempotency.c.made == gone))
 

@@ -3,12 +3,12 @@
 import pytest
 import sqlalchemy as sa
 
-from service.server.jobs.presence import KEEPALIVE, FilePresence, Held, SessionPresence, presence
-from tests.service.server.jobs.yard import yard
+from service.server.jobs.worker_lock import KEEPALIVE, AdvisoryWorkerLock, FileWorkerLock, LockState, open_worker_lock
+from tests.service.server.jobs.harness import harness
 
 
-def pair(yard):
-    return [presence(yard.database, yard.settings.data / "locks", name) for name in ("one", "two")]
+def pair(harness):
+    return [open_worker_lock(harness.database, harness.settings.data / "locks", name) for name in ("one", "two")]
 
 
 def is_dead(lock, worker):
@@ -16,38 +16,38 @@ def is_dead(lock, worker):
         return dead
 
 
-def test_a_worker_is_dead_when_it_lets_go(still_yard):
-    one, two = pair(still_yard)
-    assert (one.hold(), two.hold()) == (Held.ANEW, Held.ANEW)
-    assert (one.hold(), two.hold()) == (Held.KEPT, Held.KEPT)
+def test_a_worker_is_dead_when_it_lets_go(idle_harness):
+    one, two = pair(idle_harness)
+    assert (one.hold(), two.hold()) == (LockState.TAKEN, LockState.TAKEN)
+    assert (one.hold(), two.hold()) == (LockState.KEPT, LockState.KEPT)
     assert not is_dead(one, "two")
     two.close()
-    still_yard.until(lambda: is_dead(one, "two"), "seen to have let go")  # a server takes a moment to end a session
+    idle_harness.until(lambda: is_dead(one, "two"), "seen to have let go")  # a server takes a moment to end a session
     one.close()
 
 
-def test_a_worker_that_never_was_is_dead(still_yard):
-    one, _ = pair(still_yard)
+def test_a_worker_that_never_was_is_dead(idle_harness):
+    one, _ = pair(idle_harness)
     one.hold()
     assert is_dead(one, "another")
     one.close()
 
 
-def test_one_alone_takes_over_and_the_dead_does_not_come_back_meanwhile(still_yard):
-    one, two = pair(still_yard)
-    three = presence(still_yard.database, still_yard.settings.data / "locks", "three")
+def test_one_alone_takes_over_and_the_dead_does_not_come_back_meanwhile(idle_harness):
+    one, two = pair(idle_harness)
+    three = open_worker_lock(idle_harness.database, idle_harness.settings.data / "locks", "three")
     one.hold()
     two.hold()
     with one.dead("three") as dead, two.dead("three") as also:
         assert dead and not also
-        assert three.hold() is Held.REFUSED
-    assert three.hold() is Held.ANEW
+        assert three.hold() is LockState.REFUSED
+    assert three.hold() is LockState.TAKEN
     for each in (one, two, three):
         each.close()
 
 
 def test_the_locks_of_the_dead_leave_no_files(tmp_path):
-    one, two = FilePresence(tmp_path, "one"), FilePresence(tmp_path, "two")
+    one, two = FileWorkerLock(tmp_path, "one"), FileWorkerLock(tmp_path, "two")
     one.hold()
     two.hold()
     two.close()
@@ -57,32 +57,32 @@ def test_the_locks_of_the_dead_leave_no_files(tmp_path):
 
 
 def test_a_lock_whose_file_was_removed_is_taken_anew(tmp_path):
-    one, two = FilePresence(tmp_path, "one"), FilePresence(tmp_path, "two")
+    one, two = FileWorkerLock(tmp_path, "one"), FileWorkerLock(tmp_path, "two")
     one.hold()
     two.hold()
     (tmp_path / "one.lock").unlink()
-    assert one.hold() is Held.ANEW
+    assert one.hold() is LockState.TAKEN
     assert not is_dead(two, "one")
 
 
 @pytest.mark.long
 def test_a_restart_of_the_server_takes_the_locks_and_they_are_taken_anew(server_postgres, on_postgres, tmp_path):
-    with yard(tmp_path, on_postgres) as made:
+    with harness(tmp_path, on_postgres) as made:
         one, two = pair(made)
         one.hold()
         two.hold()
         server_postgres.restart("fast")
-        assert one.hold() is Held.ANEW
+        assert one.hold() is LockState.TAKEN
         assert is_dead(one, "two")  # which is why nobody is given up for dead for a while after that
-        assert two.hold() is Held.ANEW
+        assert two.hold() is LockState.TAKEN
         assert not is_dead(one, "two")
         one.close()
         two.close()
 
 
 def test_the_server_soon_ends_the_session_of_a_machine_that_is_gone(on_postgres, tmp_path):
-    with yard(tmp_path, on_postgres) as made:
-        lock = SessionPresence(made.database, "one")
+    with harness(tmp_path, on_postgres) as made:
+        lock = AdvisoryWorkerLock(made.database, "one")
         lock.hold()
         assert lock._session is not None
         told = {name: int(lock._session.execute(sa.text(f"SHOW {name}")).scalar_one()) for name in KEEPALIVE}

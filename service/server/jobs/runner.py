@@ -12,33 +12,33 @@ from dbos import DBOS
 from service.errors import USER_ERRORS, sentence
 from service.requests.jobs import CheckJob
 from service.server import telemetry
+from service.server.database import intakes, jobs
+from service.server.database.engine import FIRST_PAUSE_S, LONGEST_PAUSE_S, UNANSWERED, message_of
+from service.server.database.jobs import Claim
 from service.server.jobs.progress import JobProgress, Stopped
 from service.server.jobs.queue import WORKFLOW, JobQueue, workflow_id
-from service.server.jobs.steps import Job, Site, steps_of
+from service.server.jobs.steps import Job, WorkerContext, steps_of
 from service.server.log import logger
 from service.server.storage import layout
-from service.server.store import intakes, jobs
-from service.server.store.database import FIRST_PAUSE_S, LONGEST_PAUSE_S, UNANSWERED, said
-from service.server.store.jobs import Claim
 from service.views.states import FAILED, SUCCEEDED
 
 T = TypeVar("T")
 DONE, STOPPED = "done", "stopped"
 
 
-class Desk:
+class JobRunner:
     """Where a worker does its jobs, one step at a time on each queue."""
 
-    def __init__(self, site: Site, queue: JobQueue, worker: str, *, alive: Callable[[float], None]) -> None:
+    def __init__(self, context: WorkerContext, queue: JobQueue, worker: str, *, alive: Callable[[float], None]) -> None:
         """Prepare.
 
         Args:
-            site: where it works.
+            context: where it works.
             queue: that it gives back to what it cannot go on with.
             worker: its name.
             alive: told, at every sign of progress, the oldest last sign of the running steps (monotonic seconds); 0: none runs.
         """
-        self._site, self._queue, self._worker, self._alive = site, queue, worker, alive
+        self._context, self._queue, self._worker, self._alive = context, queue, worker, alive
         self._draining = threading.Event()
         self._changed = threading.Condition()
         self._signs: dict[str, float] = {}  # by job
@@ -83,12 +83,12 @@ class Desk:
                 outcome = step(name)
                 if outcome != DONE:
                     return outcome
-            if jobs.end(self._site.database, claim, SUCCEEDED):
+            if jobs.end(self._context.database, claim, SUCCEEDED):
                 log.info("job succeeded")
             return DONE
         except UNANSWERED as error:  # the queue could not record a step: the steps are to be gone through again, from the first
-            log.warning("job goes back to the queue: the database does not answer", error=said(error))
-            self._patiently(claim, lambda: self._queue.hand_back(workflow_id(claim.job, claim.attempt), self._worker))
+            log.warning("job goes back to the queue: the database does not answer", error=message_of(error))
+            self._patiently(claim, lambda: self._queue.return_job(workflow_id(claim.job, claim.attempt), self._worker))
             return STOPPED
         except USER_ERRORS as error:
             why = sentence(error)
@@ -99,10 +99,10 @@ class Desk:
 
     def _begin(self, claim: Claim) -> list[str] | None:
         """The steps of a job that is begun; None: it is not to be done any more, or another does it."""
-        if not jobs.begin(self._site.database, claim):
+        if not jobs.begin(self._context.database, claim):
             return None
-        row = jobs.find(self._site.database, claim.job)
-        return None if row is None else [step.name for step in steps_of(Job.of(dict(row)), self._site)]
+        row = jobs.find(self._context.database, claim.job)
+        return None if row is None else [step.name for step in steps_of(Job.of(dict(row)), self._context)]
 
     def _step(self, claim: Claim, name: str) -> str:
         if self._draining.is_set():
@@ -117,14 +117,14 @@ class Desk:
                 self._changed.notify_all()
 
     def _perform(self, claim: Claim, name: str) -> str:
-        database = self._site.database
+        database = self._context.database
         row = jobs.find(database, claim.job)
-        if row is None or not jobs.is_wanted(database, claim):
+        if row is None or not jobs.is_claimed(database, claim):
             return STOPPED
         if name in row["finished_steps"]:  # of an attempt before
             return DONE
         job = Job.of(dict(row))
-        step = next(step for step in steps_of(job, self._site) if step.name == name)
+        step = next(step for step in steps_of(job, self._context) if step.name == name)
         progress = JobProgress(database, claim, alive=lambda: self._sign(claim.job), before=step.before, of=step.of)
         log = logger.bind(job=job.id, project=job.project, step=name, attempt=claim.attempt, worker=self._worker)
         log.info("step begins")
@@ -132,10 +132,10 @@ class Desk:
             progress.stage(name.partition(" ")[0], 1)
             with telemetry.span(step.name, row["trace"], job=job.id, attempt=claim.attempt, worker=self._worker):
                 step.run(progress)
-            if not self._patiently(claim, lambda: jobs.is_wanted(database, claim)):  # another may be writing there
+            if not self._patiently(claim, lambda: jobs.is_claimed(database, claim)):  # another may be writing there
                 raise Stopped
             if not isinstance(job.request, CheckJob):
-                self._site.storage.publish(layout.results(job.project, job.id), progress)
+                self._context.storage.publish(layout.results(job.project, job.id), progress)
         except Stopped:
             log.info("step stopped")
             return STOPPED
@@ -153,10 +153,10 @@ class Desk:
 
     def _fail(self, claim: Claim, error: str, job: Job | None = None) -> str:
         logger.info("job failed", job=claim.job, attempt=claim.attempt, error=error)
-        error = self._site.without_folder(error)
+        error = self._context.without_folder(error)
         if job is not None and isinstance(job.request, CheckJob):
-            intakes.refuse(self._site.database, job.request.intake, error)
-        jobs.end(self._site.database, claim, FAILED, error)
+            intakes.refuse(self._context.database, job.request.intake, error)
+        jobs.end(self._context.database, claim, FAILED, error)
         return FAILED
 
     def _patiently(self, claim: Claim, work: Callable[[], T]) -> T:
@@ -166,7 +166,7 @@ class Desk:
             try:
                 return work()
             except UNANSWERED as error:
-                logger.warning("waiting for the database", job=claim.job, error=said(error))
+                logger.warning("waiting for the database", job=claim.job, error=message_of(error))
             time.sleep(pause)
             pause = min(2 * pause, LONGEST_PAUSE_S)
             with self._changed:

@@ -5,10 +5,12 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import sqlalchemy as sa
-from sqlalchemy.exc import InterfaceError, InternalError, OperationalError
+from sqlalchemy.exc import DBAPIError, InterfaceError, InternalError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 
-from service.server.store import tables
+from service.errors import RequestError
+from service.server.database import tables
+from service.server.settings import Settings
 
 T = TypeVar("T")
 BUSY_MS = 30_000
@@ -20,7 +22,7 @@ UNANSWERED = (OperationalError, InterfaceError, InternalError, PoolTimeoutError)
 """What a database raises that may answer another time: it restarts, its disk is full, it is locked for long."""
 
 
-def said(error: BaseException) -> str:
+def message_of(error: BaseException) -> str:
     """What the database itself said, without the statement around it."""
     return str(getattr(error, "orig", error))
 
@@ -107,6 +109,29 @@ def connect(url: str, *, connections: int = 10) -> Database:
     except (sa.exc.ArgumentError, sa.exc.NoSuchModuleError) as error:
         raise DatabaseError("database_url: is not of the form postgresql://user:password@host/name") from error
     return Database(engine)
+
+
+def open_database(settings: Settings, prepare: Callable[[Settings, Database], None]) -> Database:
+    """Open the database.
+
+    Args:
+        settings: of the service.
+        prepare: makes the tables that are needed, or looks whether they are there.
+
+    Raises:
+        RequestError: the data folder or the database cannot be used.
+    """
+    try:
+        database = connect(settings.sqlalchemy_url)
+        prepare(settings, database)
+    except DatabaseError as error:
+        raise RequestError(str(error)) from error
+    except OSError as error:
+        raise RequestError(f"data {settings.data}: the folder cannot be used ({error.strerror})") from None
+    except DBAPIError as error:
+        what = f"data {settings.data}: the database in it" if settings.is_sqlite else "database_url: the database"
+        raise RequestError(f"{what} cannot be used ({' '.join(str(error.orig).split())})") from None
+    return database
 
 
 def create(database: Database) -> None:

@@ -10,10 +10,10 @@ from typing import Any
 
 import sqlalchemy as sa
 
+from service.server.database.engine import Database
+from service.server.database.tables import uploads
 from service.server.safe_names import folded, folders_of, shown
 from service.server.storage.parts import Part, PartLocked, leftovers
-from service.server.store.database import Database
-from service.server.store.tables import uploads
 
 Row = Mapping[str, Any]
 """An upload: the columns of its table."""

@@ -12,8 +12,8 @@ import sqlalchemy as sa
 
 from service.requests.identifiers import JOB, new_id
 from service.requests.jobs import JobRequest
-from service.server.store.database import Database, storable
-from service.server.store.tables import intakes, job_inputs, jobs, newest_first
+from service.server.database.engine import Database, storable
+from service.server.database.tables import intakes, job_inputs, jobs, newest_first
 from service.views.states import ACTIVE, CANCELLED, CHECKING, ENDED, FAILED, QUEUED, REFUSED, RUNNING, SUCCEEDED
 
 FRAMES = "frames"
@@ -144,7 +144,7 @@ def begin(database: Database, claim: Claim) -> bool:
                    started_at=sa.func.coalesce(jobs.c.started_at, time.time()))
 
 
-def is_wanted(database: Database, claim: Claim) -> bool:
+def is_claimed(database: Database, claim: Claim) -> bool:
     """Whether a worker shall go on."""
     return database.row(sa.select(jobs.c.id).where(*_held(claim))) is not None
 
@@ -175,7 +175,7 @@ def end(database: Database, claim: Claim, state: str, error: str | None = None) 
     return _change(database, claim, state=state, error=None if error is None else storable(error), finished_at=time.time(), **done)
 
 
-def lose_worker(connection: sa.Connection, claim: Claim, limit: int, sentence: str) -> str | None:
+def record_lost_worker(connection: sa.Connection, claim: Claim, limit: int, sentence: str) -> str | None:
     """A worker died with this job, which waits for the next one, or has failed where it lost too many.
 
     Args:
@@ -201,7 +201,7 @@ def lose_worker(connection: sa.Connection, claim: Claim, limit: int, sentence: s
     return state if done.rowcount == 1 else None
 
 
-def hand_back(connection: sa.Connection, claim: Claim) -> bool:
+def release(connection: sa.Connection, claim: Claim) -> bool:
     """A worker gives a job back; false where it is not wanted any more."""
     mine = sa.or_(jobs.c.worker.is_(None), jobs.c.worker == claim.worker)
     return connection.execute(jobs.update().where(
@@ -219,7 +219,7 @@ def cancel(connection: sa.Connection, job: str) -> bool:
     return done.rowcount == 1
 
 
-def begin_again(connection: sa.Connection, job: str, state: str) -> int | None:
+def queue_again(connection: sa.Connection, job: str, state: str) -> int | None:
     """Queue a job that is in this state once more.
 
     Returns:
@@ -239,7 +239,7 @@ def set_priority(connection: sa.Connection, job: str, priority: int) -> int | No
     Returns:
         The number of the attempt; None where the job is not queued.
     """
-    attempt = begin_again(connection, job, QUEUED)
+    attempt = queue_again(connection, job, QUEUED)
     if attempt is not None:
         connection.execute(jobs.update().where(jobs.c.id == job).values(priority=priority))
     return attempt

@@ -10,7 +10,7 @@ from typing import Any
 READY, BEAT, STEP = range(3)
 
 
-class Pulse:
+class Heartbeat:
     """Times (monotonic seconds) of one worker process; they are those of the machine, so that both processes read them alike."""
 
     def __init__(self) -> None:

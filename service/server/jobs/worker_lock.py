@@ -15,7 +15,7 @@ import sqlalchemy as sa
 from sqlalchemy.exc import DBAPIError
 
 from service.server import file_lock
-from service.server.store.database import Database
+from service.server.database.engine import Database
 
 SPACE = 7
 """Seed of the hash of names, so that our advisory locks meet no one else's."""
@@ -23,20 +23,20 @@ KEEPALIVE = {"tcp_keepalives_idle": 3, "tcp_keepalives_interval": 1, "tcp_keepal
 """Seconds and tries after which the server ends the session of a machine that is gone; by itself it would wait for hours."""
 
 
-class Held(Enum):
+class LockState(Enum):
     """How the own lock is."""
 
     KEPT = "kept"
-    ANEW = "anew"
+    TAKEN = "taken"
     """It had been lost, or is the first."""
     REFUSED = "refused"
     """Another has it."""
 
 
-class Presence(Protocol):
+class WorkerLock(Protocol):
     """The lock of a worker, and whether others hold theirs."""
 
-    def hold(self) -> Held:
+    def hold(self) -> LockState:
         """Take the own lock, or make sure that it is still held."""
 
     def dead(self, worker: str) -> AbstractContextManager[bool]:
@@ -46,7 +46,7 @@ class Presence(Protocol):
         """Let go."""
 
 
-class FilePresence:
+class FileWorkerLock:
     """Locks on files of a folder."""
 
     def __init__(self, folder: Path, worker: str) -> None:
@@ -54,14 +54,14 @@ class FilePresence:
         self._folder, self._worker = folder, worker
         self._file: int | None = None
 
-    def hold(self) -> Held:
+    def hold(self) -> LockState:
         """A lock on a file lasts as long as the process, and is seen by others as long as the file has its name."""
         if self._file is not None:
             if file_lock.is_named(self._file, self._path(self._worker)):
-                return Held.KEPT
+                return LockState.KEPT
             os.close(self._file)
         self._file = self._take(self._worker)
-        return Held.REFUSED if self._file is None else Held.ANEW
+        return LockState.REFUSED if self._file is None else LockState.TAKEN
 
     @contextmanager
     def dead(self, worker: str) -> Iterator[bool]:
@@ -91,7 +91,7 @@ class FilePresence:
         return self._folder / f"{worker.replace('/', '_')}.lock"
 
 
-class SessionPresence:
+class AdvisoryWorkerLock:
     """Advisory locks of one PostgreSQL session."""
 
     def __init__(self, database: Database, worker: str) -> None:
@@ -99,7 +99,7 @@ class SessionPresence:
         self._engine, self._worker = database.engine, worker
         self._session: sa.Connection | None = None
 
-    def hold(self) -> Held:
+    def hold(self) -> LockState:
         """Ask the session, which after a restart of the server is a new one and has to take the lock again."""
         if self._session is not None:
             try:
@@ -107,15 +107,15 @@ class SessionPresence:
             except DBAPIError:
                 self.close()
             else:
-                return Held.KEPT
+                return LockState.KEPT
         session = self._engine.connect().execution_options(isolation_level="AUTOCOMMIT")
         try:
             for name, value in KEEPALIVE.items():
                 session.execute(sa.text(f"SET {name} = {value}"))
             if self._take(session, self._worker):
                 self._session = session
-                return Held.ANEW
-            return Held.REFUSED
+                return LockState.TAKEN
+            return LockState.REFUSED
         finally:
             if self._session is None:
                 session.close()
@@ -145,6 +145,6 @@ class SessionPresence:
                                     {"name": worker, "space": SPACE}).scalar())
 
 
-def presence(database: Database, locks: Path, worker: str) -> Presence:
+def open_worker_lock(database: Database, locks: Path, worker: str) -> WorkerLock:
     """The kind of lock that the database allows."""
-    return FilePresence(locks, worker) if database.is_sqlite else SessionPresence(database, worker)
+    return FileWorkerLock(locks, worker) if database.is_sqlite else AdvisoryWorkerLock(database, worker)

@@ -1,0 +1,102 @@
+"""How a worker does a job when the database does not answer, or something goes wrong that nobody thought of."""
+
+import pytest
+from sqlalchemy.exc import OperationalError
+
+from service.requests.identifiers import CAPTURE, ENVIRONMENT, new_id
+from service.server.database import jobs
+from service.server.database.jobs import Claim
+from service.server.jobs import runner as runner_module
+from service.server.jobs.runner import DONE, STOPPED, JobRunner
+from service.server.jobs.steps import JobStep, WorkerContext
+from service.server.storage.open import open_storage
+
+NO_ANSWER = OperationalError("SELECT 1", {}, Exception("the server is away"))
+NAMES = ["frames 1-5", "frames 6-10"]
+
+
+@pytest.fixture
+def runner(idle_harness, monkeypatch):
+    """A worker `one` that has taken a job of two steps."""
+    monkeypatch.setattr(runner_module, "FIRST_PAUSE_S", 0.0)
+    context = WorkerContext(idle_harness.database, open_storage(idle_harness.settings), idle_harness.settings.data / "cache", "cpu", 1, ())
+    made = JobRunner(context, idle_harness.queue, "one", alive=lambda oldest: None)
+    job = idle_harness.relight(new_id(CAPTURE), new_id(ENVIRONMENT), 10, chunk_frames=5)
+    idle_harness.take(job, "one")
+    return made, Claim(job, 1, "one")
+
+
+def once(error, then):
+    """A function that raises at its first call."""
+    errors = [error]
+
+    def call(*arguments, **options):
+        if errors:
+            raise errors.pop()
+        return then(*arguments, **options)
+
+    return call
+
+
+def do_nothing(monkeypatch, run=lambda progress: None):
+    monkeypatch.setattr(runner_module, "steps_of", lambda job, context: [JobStep(name, run) for name in NAMES])
+
+
+def test_a_job_is_done_step_by_step(idle_harness, runner, monkeypatch):
+    made, claim = runner
+    do_nothing(monkeypatch)
+    assert made._run(claim, lambda name: made._step(claim, name)) == DONE
+    row = idle_harness.row(claim.job)
+    assert (row["state"], row["finished_steps"]) == (jobs.SUCCEEDED, NAMES)
+
+
+@pytest.mark.parametrize("function", ["begin", "find", "is_claimed", "finish_step", "end"])
+def test_a_database_that_is_away_for_a_moment_is_waited_for(idle_harness, runner, monkeypatch, function):
+    made, claim = runner
+    do_nothing(monkeypatch)
+    monkeypatch.setattr(runner_module.jobs, function, once(NO_ANSWER, getattr(jobs, function)))
+    outcome = made._run(claim, lambda name: made._step(claim, name))
+    if function == "end":  # all is done, and whoever takes it next has only to say so
+        assert (outcome, idle_harness.row(claim.job)["state"]) == (STOPPED, jobs.QUEUED)
+    else:
+        assert (outcome, idle_harness.row(claim.job)["state"]) == (DONE, jobs.SUCCEEDED)
+    assert idle_harness.row(claim.job)["finished_steps"] == NAMES
+
+
+def test_a_job_whose_step_the_queue_could_not_record_goes_back(idle_harness, runner, monkeypatch):
+    made, claim = runner
+    do_nothing(monkeypatch)
+
+    def step(name):
+        made._step(claim, name)
+        raise NO_ANSWER
+
+    assert made._run(claim, step) == STOPPED
+    row = idle_harness.row(claim.job)
+    assert (row["state"], row["worker"], row["finished_steps"]) == (jobs.QUEUED, None, NAMES[:1])
+    assert idle_harness.in_queue(claim.job) == ("ENQUEUED", "work")
+
+
+def test_an_error_of_the_queue_ends_the_job_with_a_sentence(idle_harness, runner, monkeypatch):
+    made, claim = runner
+    do_nothing(monkeypatch)
+
+    def step(name):
+        raise RuntimeError("of another's making")
+
+    assert made._run(claim, step) == jobs.FAILED
+    row = idle_harness.row(claim.job)
+    assert (row["state"], row["error"]) == (jobs.FAILED, "an error of relit itself (RuntimeError): its log has more")
+
+
+def test_a_worker_that_was_given_up_for_dead_publishes_nothing(idle_harness, runner, monkeypatch):
+    made, claim = runner
+
+    def lose(progress):
+        idle_harness.database.transact(lambda connection: jobs.record_lost_worker(connection, claim, 3, ""))
+
+    do_nothing(monkeypatch, lose)
+    monkeypatch.setattr(made._context.storage, "publish", lambda *_: pytest.fail("another may be writing there"))
+    assert made._run(claim, lambda name: made._step(claim, name)) == STOPPED
+    row = idle_harness.row(claim.job)
+    assert (row["state"], row["worker"], row["finished_steps"]) == (jobs.QUEUED, None, [])
