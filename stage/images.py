@@ -1,4 +1,4 @@
-"""Reading of images (EXR, PNG, TIFF, HDR, JPEG, JPEG XL, DPX): the header first, then the recorded pixels."""
+"""Reading of images (EXR, PNG, TIFF, HDR, JPEG, JPEG XL, DPX), the header first and then the recorded pixels; and writing of PNG."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -97,6 +97,32 @@ def read_mask(path: str | Path, resolution: tuple[int, int]) -> np.ndarray:
     if not mask.any():
         raise ImageError(f"{path}: the mask is empty: no pixel is above one half")
     return mask
+
+
+def write_png(path: Path, codes: np.ndarray, *, srgb: bool) -> None:
+    """Write a PNG file; `replacing` makes it appear whole or not at all.
+
+    Args:
+        path: the file.
+        codes: [rows, cols] or [rows, cols, 3] uint8 or uint16.
+        srgb: True for colours that are encoded in sRGB, False for data that no reader should convert.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    pixels = np.ascontiguousarray(codes[..., None] if codes.ndim == 2 else codes)  # two dimensions would be transposed
+    rows, cols, channels = pixels.shape
+    spec = oiio.ImageSpec(cols, rows, channels, str(codes.dtype))
+    spec.attribute("oiio:ColorSpace", "srgb_rec709_scene" if srgb else "data")  # without it the file would claim to be sRGB
+    output = oiio.ImageOutput.create(str(path))
+    if output is None:
+        raise OSError(f"{path.name}: {oiio.geterror()}")
+    if not (output.open(str(path), spec) and output.write_image(pixels) and output.close()):
+        raise OSError(f"{path.name}: {output.geterror() or 'the PNG writer gave up'}")
+    try:
+        integrity.check_png(path, contents=False)
+    except ImageError as error:  # the writer reports success when the disk is full
+        raise OSError(f"{path.name}: the disk took only part of it") from error
 
 
 def check_resolution(path: str | Path, resolution: tuple[int, int]) -> None:

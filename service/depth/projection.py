@@ -10,8 +10,8 @@ from service.depth.codes import CODES, CODES_OF_OPTION
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.requests.patterns import PatternAxis, PatternCode, PatternsRequest, PlanRequest
-from service.usd.textures import write_png
 from stage.files import replacing, write_text
+from stage.images import write_png
 from stage.manifest import Frame
 from stage.patterns import planner
 from stage.patterns.base import Axis, UniformPattern, uniform_patterns

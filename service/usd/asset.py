@@ -1,24 +1,15 @@
-"""A USD asset on disk: solved maps → .usda, .usdc or .usdz. It appears whole or not at all."""
+"""Writes solved maps as a USD asset: a mesh with textures, a material and the camera, as .usda, .usdc or .usdz."""
 
 import os
-import shutil
-import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from pxr import Tf, Usd
-
-from service.usd.errors import AssetError
+from service.usd.files import check_suffix, define_layer, workshop_beside
 from service.usd.mesh import height_mesh
-from service.usd.package import pack
 from service.usd.scene import define_asset
 from service.usd.textures import FILE_NAMES, write_textures
-from stage.errors import StorageError, storage
 from stage.maps import SurfaceMaps
-
-SUFFIXES = (".usda", ".usdc", ".usdz")
 
 Progress = Callable[[str, float], None]
 """Is told what is being done now, and which part of the whole was done before it (0…1)."""
@@ -53,7 +44,7 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, progress: Pro
         StorageError: the disk refuses; what was there before is left as it was.
     """
     target = Path(path)
-    suffix = known_suffix(target)
+    packed = check_suffix(target) == ".usdz"
     tell = progress or (lambda what, done: None)
 
     tell("mesh", 0.0)
@@ -64,56 +55,21 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, progress: Pro
         textures = write_textures(maps, mesh, folder, progress=lambda layer, done: tell(
             f"texture {layer}", TEXTURES_START + (TEXTURES_END - TEXTURES_START) * done))
         tell("layer", TEXTURES_END)
-        layer = workshop / f"{target.stem}{'.usdc' if suffix == '.usdz' else suffix}"
-        usd_stage = Usd.Stage.CreateNew(str(layer))
-        define_asset(usd_stage, maps, mesh, textures, name=name, texture_folder=f"./{folder.name}")
-        usd_stage.Save()
-        del usd_stage
         files = [folder / texture.file_name for texture in textures.values()]
-        if suffix == ".usdz":
-            tell("package", 0.95)
-            package = workshop / f"{target.stem}.usdz"
-            pack(package, layer, files)
-            flush(package)
-            os.replace(package, target)
+        written = define_layer(workshop, target, lambda usd_stage: define_asset(
+            usd_stage, maps, mesh, textures, name=name, texture_folder=f"./{folder.name}"), files)
+        if packed:
+            os.replace(written, target)
             files = []
         else:
-            flush(layer, *files)
-            _install(layer, folder, target)
+            _install(written, folder, target)
     installed = tuple(target.parent / file.relative_to(workshop) for file in files)
     return AssetReport(target, installed, len(mesh.points), len(mesh.face_counts), mesh.step,
                        {layer: texture.clipped_pixels for layer, texture in textures.items()})
 
 
-def known_suffix(target: Path) -> str:
-    """The suffix of an asset, in lower case.
-
-    Raises:
-        AssetError: it is none that can be written.
-    """
-    suffix = target.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise AssetError(f"{target} cannot be written as a USD asset: its suffix must be .usda, .usdc or .usdz")
-    return suffix
-
-
-@contextmanager
-def workshop_beside(target: Path) -> Iterator[Path]:
-    """A temporary folder beside the target, gone at the end; errors inside become StorageErrors about the target."""
-    with storage("write", target):
-        target.parent.mkdir(parents=True, exist_ok=True)
-        workshop = Path(tempfile.mkdtemp(prefix=f".{target.stem}.", dir=target.parent))
-    try:
-        with storage("write", target):
-            yield workshop
-    except Tf.ErrorException as error:
-        raise StorageError(f"cannot write {target}: {_reason(error)}") from error
-    finally:
-        shutil.rmtree(workshop, ignore_errors=True)
-
-
 def _install(layer: Path, folder: Path, target: Path) -> None:
-    """Put the textures, then the layer, in place of older ones; on an error the older ones come back."""
+    """Put the textures and then the layer in place of older ones; on an error put the older ones back."""
     place, replaced = target.parent / folder.name, folder.with_name("replaced")
     if place.exists():
         os.rename(place, replaced)
@@ -130,16 +86,3 @@ def _install(layer: Path, folder: Path, target: Path) -> None:
         for file in replaced.iterdir():
             if file.name not in FILE_NAMES:
                 os.rename(file, place / file.name)
-
-
-def flush(*files: Path) -> None:
-    """See files onto the disk, before they get their names."""
-    for file in files:
-        with open(file, "rb") as written:
-            os.fsync(written.fileno())
-
-
-def _reason(error: Tf.ErrorException) -> str:
-    """The first reason that USD gives, without the place in its source."""
-    reasons = [str(getattr(cause, "commentary", cause)).strip() for cause in error.args]
-    return reasons[0].splitlines()[0].lower() if reasons and reasons[0] else "USD could not write it"

@@ -1,19 +1,17 @@
 """A measured depth as USD: a mesh between neighbouring pixels of one surface, or points; with the colours of the scene."""
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+from pxr import Sdf, Usd, UsdGeom
 
-from service.usd.asset import flush, known_suffix, workshop_beside
 from service.usd.errors import AssetError
+from service.usd.files import check_suffix, write_layer
 from service.usd.mesh import SurfaceMesh, height_mesh, without_faces
-from service.usd.package import pack
+from service.usd.points import define_points, linear_colours, set_display_color
 from service.usd.rig import define_camera
 from service.usd.scene import define_mesh, define_root, hint_extent
-from stage.colour import convert
 from stage.depth_maps import DepthMaps
 from stage.depth_normals import same_surface
 from stage.maps import SurfaceMaps
@@ -43,18 +41,11 @@ def write_depth_points(maps: DepthMaps, cloud: PointCloud | None, path: str | Pa
         raise AssetError("the depth has no point, so there is nothing to export")
     focal = min(maps.camera.focal_px) if maps.camera.focal_px is not None else None
     widths = POINT_WIDTH * (np.abs(points[:, 2]) / focal if focal else np.full(len(points), maps.camera.pixel_size_m or 1.0))
-    colours = _linear(cloud.colours) if cloud is not None else np.full((1, 3), GREY, np.float32)
+    colours = linear_colours(cloud.colours) if cloud is not None else np.full((1, 3), GREY, np.float32)
 
     def fill(usd_stage: Usd.Stage, parent: Sdf.Path) -> np.ndarray:
-        prim = UsdGeom.Points.Define(usd_stage, parent.AppendChild("Points"))
-        prim.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(points)))
-        prim.CreateWidthsAttr(Vt.FloatArray.FromNumpy(widths.astype(np.float32)))
-        prim.SetWidthsInterpolation(UsdGeom.Tokens.vertex)
-        prim.CreateExtentAttr(UsdGeom.Points.ComputeExtent(prim.GetPointsAttr().Get(), prim.GetWidthsAttr().Get()))
-        if cloud is not None and cloud.normals is not None:
-            prim.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(cloud.normals)))
-            prim.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
-        _colour(prim, colours)
+        prim = define_points(usd_stage, parent.AppendChild("Points"), points, widths, normals=None if cloud is None else cloud.normals)
+        set_display_color(prim, colours)
         return np.array(prim.GetExtentAttr().Get())
 
     _write(maps, Path(path), name, fill)
@@ -73,16 +64,16 @@ def write_depth_mesh(maps: DepthMaps, cloud: PointCloud | None, path: str | Path
         AssetError: another suffix, or no face.
         StorageError: the disk refuses; what was there before is left as it was.
     """
-    known_suffix(Path(path))
+    check_suffix(Path(path))
     mesh = depth_mesh(maps)
     colours = np.full((1, 3), GREY, np.float32)
     if cloud is not None and len(cloud.colours) == np.count_nonzero(maps.mask):  # a point a pixel, row by row
         of_pixel = np.zeros((*maps.mask.shape, 3), np.uint8)
         of_pixel[maps.mask] = cloud.colours
-        colours = _linear(of_pixel[mesh.rows, mesh.cols])
+        colours = linear_colours(of_pixel[mesh.rows, mesh.cols])
 
     def fill(usd_stage: Usd.Stage, parent: Sdf.Path) -> np.ndarray:
-        _colour(define_mesh(usd_stage, parent.AppendChild("Mesh"), mesh), colours)
+        set_display_color(define_mesh(usd_stage, parent.AppendChild("Mesh"), mesh), colours)
         return mesh.extent
 
     _write(maps, Path(path), name, fill)
@@ -108,31 +99,12 @@ def _torn(corners: np.ndarray, mesh: SurfaceMesh, maps: DepthMaps) -> np.ndarray
 
 
 def _write(maps: DepthMaps, target: Path, name: str, fill: Callable[[Usd.Stage, Sdf.Path], np.ndarray]) -> None:
-    """The asset around what `fill` puts under /Name/Geom; it gives the extent of that."""
-    suffix = known_suffix(target)
-    with workshop_beside(target) as workshop:
-        layer = workshop / f"{target.stem}{'.usdc' if suffix == '.usdz' else suffix}"
-        usd_stage = Usd.Stage.CreateNew(str(layer))
+    """Write the asset around what `fill` defines below /Name/Geom; `fill` returns the extent of that."""
+    def define(usd_stage: Usd.Stage) -> None:
         root = define_root(usd_stage, maps.camera, maps.provenance, name=name, unit_m=1.0)
-        UsdGeom.Scope.Define(usd_stage, root.GetPath().AppendChild("Geom"))
-        extent = fill(usd_stage, root.GetPath().AppendChild("Geom"))
+        geometry = UsdGeom.Scope.Define(usd_stage, root.GetPath().AppendChild("Geom"))
+        extent = fill(usd_stage, geometry.GetPath())
         define_camera(usd_stage, root.GetPath().AppendChild("Camera"), maps.camera, extent)
         hint_extent(root)
-        usd_stage.Save()
-        del usd_stage
-        if suffix == ".usdz":
-            package = workshop / f"{target.stem}.usdz"
-            pack(package, layer, [])
-            layer = package
-        flush(layer)
-        os.replace(layer, target)
 
-
-def _linear(colours: np.ndarray) -> np.ndarray:
-    """[n, 3] float32 linear of uint8 sRGB: USD's display colours are linear."""
-    return convert((colours.astype(np.float32) / 255)[None], "srgb_texture", "lin_rec709_scene")[0]
-
-
-def _colour(prim: UsdGeom.Gprim, colours: np.ndarray) -> None:
-    primvar = prim.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant if len(colours) == 1 else UsdGeom.Tokens.vertex)
-    primvar.Set(Vt.Vec3fArray([Gf.Vec3f(*map(float, colours[0]))]) if len(colours) == 1 else Vt.Vec3fArray.FromNumpy(colours))
+    write_layer(target, define)

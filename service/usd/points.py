@@ -1,4 +1,7 @@
-"""A point cloud as UsdGeom.Points, with intensity."""
+"""Point clouds as UsdGeom.Points.
+
+Source: OpenUSD, UsdGeomPoints: widths are diameters in scene units; displayColor is scene-linear.
+"""
 
 from pathlib import Path
 
@@ -6,20 +9,20 @@ import numpy as np
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
 
 from service.usd.errors import AssetError
-from stage.errors import StorageError
-from stage.files import replacing
+from service.usd.files import write_layer
+from stage.colour import convert
 from stage.ply import PointCloud
 
 SUFFIXES = (".usda", ".usdc")
 WIDTH_PART = 0.5
-"""Of the spacing that the points would have, spread evenly over the sides of their box: what a viewer draws of each."""
+"""Width of a point, as a part of the spacing that the points would have if they lay evenly on the sides of their box."""
 
 
 def write_points(cloud: PointCloud, path: str | Path, *, name: str, provenance: dict[str, str] | None = None) -> None:
     """Write a point cloud as a USD layer, whole or not at all.
 
     Args:
-        cloud: metres; `intensity`, where it has one, becomes the primvar of that name, a float a point.
+        cloud: metres; `intensity`, where it has one, becomes the primvar of that name, one float for each point.
         path: .usda or .usdc.
         name: free text; the root prim is named after it.
         provenance: goes into customLayerData.
@@ -33,44 +36,55 @@ def write_points(cloud: PointCloud, path: str | Path, *, name: str, provenance: 
         raise AssetError(f"{target} cannot be written as USD points: its suffix must be .usda or .usdc")
     if len(cloud.points) == 0:
         raise AssetError(f"{target} cannot be written as USD points: there is no point")
-    with replacing(target) as temporary:
-        temporary.unlink()
-        try:
-            usd_stage = Usd.Stage.CreateNew(str(temporary))
-            _define(usd_stage, cloud, name, provenance or {})
-            usd_stage.Save()
-            del usd_stage
-        except Tf.ErrorException as error:
-            raise StorageError(f"cannot write {target}: USD could not write it") from error
-
-
-def _define(usd_stage: Usd.Stage, cloud: PointCloud, name: str, provenance: dict[str, str]) -> None:
-    UsdGeom.SetStageUpAxis(usd_stage, UsdGeom.Tokens.y)
-    UsdGeom.SetStageMetersPerUnit(usd_stage, 1.0)
-    root = UsdGeom.Xform.Define(usd_stage, Sdf.Path.absoluteRootPath.AppendChild(Tf.MakeValidIdentifier(name)))
-    usd_stage.SetDefaultPrim(root.GetPrim())
-    Usd.ModelAPI(root.GetPrim()).SetKind("component")
-    for key, value in sorted(provenance.items()):
-        usd_stage.SetMetadataByDictKey("customLayerData", key, value)
-    prim = UsdGeom.Points.Define(usd_stage, root.GetPath().AppendChild("Points"))
-    prim.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(cloud.points, dtype=np.float32)))
     low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
     width = WIDTH_PART * float(np.linalg.norm(high - low)) / max(len(cloud.points) ** 0.5, 1.0)
-    prim.CreateWidthsAttr(Vt.FloatArray([width]))
-    prim.SetWidthsInterpolation(UsdGeom.Tokens.constant)
-    prim.CreateExtentAttr(UsdGeom.Points.ComputeExtent(prim.GetPointsAttr().Get(), prim.GetWidthsAttr().Get())
-                          or Vt.Vec3fArray([Gf.Vec3f(*low.tolist()), Gf.Vec3f(*high.tolist())]))
-    if cloud.normals is not None:
-        prim.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(cloud.normals, dtype=np.float32)))
-    variables = UsdGeom.PrimvarsAPI(prim)
-    colour = variables.CreatePrimvar("displayColor", Sdf.ValueTypeNames.Color3fArray, UsdGeom.Tokens.vertex)
-    colour.Set(Vt.Vec3fArray.FromNumpy(_linear(cloud.colours)))
-    if cloud.intensity is not None:
-        intensity = variables.CreatePrimvar("intensity", Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.vertex)
-        intensity.Set(Vt.FloatArray.FromNumpy(np.ascontiguousarray(cloud.intensity, dtype=np.float32)))
+
+    def define(usd_stage: Usd.Stage) -> None:
+        UsdGeom.SetStageUpAxis(usd_stage, UsdGeom.Tokens.y)
+        UsdGeom.SetStageMetersPerUnit(usd_stage, 1.0)
+        root = UsdGeom.Xform.Define(usd_stage, Sdf.Path.absoluteRootPath.AppendChild(Tf.MakeValidIdentifier(name)))
+        usd_stage.SetDefaultPrim(root.GetPrim())
+        Usd.ModelAPI(root.GetPrim()).SetKind("component")
+        for key, value in sorted((provenance or {}).items()):
+            usd_stage.SetMetadataByDictKey("customLayerData", key, value)
+        prim = define_points(usd_stage, root.GetPath().AppendChild("Points"), cloud.points, np.array([width]), normals=cloud.normals)
+        set_display_color(prim, linear_colours(cloud.colours))
+        if cloud.intensity is not None:
+            intensity = UsdGeom.PrimvarsAPI(prim).CreatePrimvar("intensity", Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.vertex)
+            intensity.Set(Vt.FloatArray.FromNumpy(np.ascontiguousarray(cloud.intensity, dtype=np.float32)))
+
+    write_layer(target, define)
 
 
-def _linear(colours: np.ndarray) -> np.ndarray:
-    """displayColor is scene-linear Rec.709: the sRGB decoding of 8-bit colours."""
-    value = colours.astype(np.float32) / 255
-    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
+def define_points(usd_stage: Usd.Stage, path: Sdf.Path, points: np.ndarray, widths: np.ndarray, *,
+                  normals: np.ndarray | None) -> UsdGeom.Points:
+    """Define points at `path`.
+
+    Args:
+        usd_stage: the stage.
+        path: of the prim.
+        points: [n, 3] in scene units.
+        widths: [n], or [1] for points of one width.
+        normals: [n, 3] unit vectors, or None.
+    """
+    prim = UsdGeom.Points.Define(usd_stage, path)
+    prim.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(points, dtype=np.float32)))
+    prim.CreateWidthsAttr(Vt.FloatArray.FromNumpy(np.ascontiguousarray(widths, dtype=np.float32)))
+    prim.SetWidthsInterpolation(UsdGeom.Tokens.constant if len(widths) == 1 else UsdGeom.Tokens.vertex)
+    each_width = Vt.FloatArray.FromNumpy(np.broadcast_to(widths, len(points)).astype(np.float32))
+    prim.CreateExtentAttr(UsdGeom.Points.ComputeExtent(prim.GetPointsAttr().Get(), each_width))
+    if normals is not None:
+        prim.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(normals, dtype=np.float32)))
+        prim.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    return prim
+
+
+def set_display_color(prim: UsdGeom.Gprim, colours: np.ndarray) -> None:
+    """Set the display colours [n, 3] of points or vertices, or [1, 3] of the whole prim; float32, scene-linear Rec.709."""
+    primvar = prim.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant if len(colours) == 1 else UsdGeom.Tokens.vertex)
+    primvar.Set(Vt.Vec3fArray([Gf.Vec3f(*map(float, colours[0]))]) if len(colours) == 1 else Vt.Vec3fArray.FromNumpy(colours))
+
+
+def linear_colours(codes: np.ndarray) -> np.ndarray:
+    """Return [n, 3] float32 scene-linear Rec.709 values of [n, 3] uint8 sRGB codes."""
+    return convert((codes.astype(np.float32) / 255)[None], "srgb_texture", "lin_rec709_scene")[0]

@@ -4,18 +4,17 @@ PNG is what every reader of a USDZ package must know. Values outside 0…1 canno
 counted.
 """
 
-import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import OpenImageIO as oiio
 
-from service.usd.bleed import bleed
 from service.usd.errors import AssetError
 from service.usd.mesh import SurfaceMesh
 from service.usd.tangent import tangent_frame
+from stage.colour import convert
+from stage.images import write_png
 from stage.maps import SurfaceMaps
 
 DISPLAY_SPACE = "srgb_rec709_scene"
@@ -26,6 +25,8 @@ BLEED_TEXELS = 8
 
 LAYERS = ("diffuse_albedo", "normal", "specular", "roughness")
 """Layers that a material uses, in the order they are written."""
+
+_NEIGHBOURS = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)]
 
 FILE_NAMES = tuple(f"{layer}.png" for layer in LAYERS)
 """Every file that write_textures can write."""
@@ -94,48 +95,13 @@ def quantise(values: np.ndarray, known: np.ndarray, dtype: type[np.unsignedinteg
     return np.clip(codes, 0, top).astype(dtype), int(np.count_nonzero(clipped & known))
 
 
-def write_png(path: Path, codes: np.ndarray, *, srgb: bool) -> None:
-    """Write a PNG of one or three channels, uint8 or uint16.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    pixels = np.ascontiguousarray(codes[..., None] if codes.ndim == 2 else codes)  # two dimensions would be transposed
-    rows, cols, channels = pixels.shape
-    spec = oiio.ImageSpec(cols, rows, channels, str(codes.dtype))
-    spec.attribute("oiio:ColorSpace", DISPLAY_SPACE if srgb else "data")  # without it the file would claim to be sRGB
-    output = oiio.ImageOutput.create(str(path))
-    if output is None:
-        raise OSError(f"texture {path.name}: {oiio.geterror()}")
-    if not (output.open(str(path), spec) and output.write_image(pixels) and output.close()):
-        raise OSError(f"texture {path.name}: {output.geterror() or 'the PNG writer gave up'}")
-    if not _is_whole(path):  # the writer reports success when the disk is full
-        raise OSError(f"texture {path.name}: the disk took only part of it")
-
-
-def _is_whole(path: Path) -> bool:
-    """Whether the chunks of a PNG follow each other up to its end chunk, and the file ends there."""
-    size, at = path.stat().st_size, len(b"\x89PNG\r\n\x1a\n")
-    with open(path, "rb") as stream:
-        while at < size:
-            stream.seek(at)
-            length, kind = struct.unpack(">I4s", stream.read(8).ljust(8, b"\0"))
-            at += 8 + length + 4  # length and kind, data, checksum
-            if kind == b"IEND":
-                break
-        else:
-            return False
-    return at == size
-
-
 def _to_display(values: np.ndarray, color_space: str) -> np.ndarray:
     """Colours [rows, cols, 3] of the maps, encoded for the screen; not clipped."""
-    converted = oiio.ImageBufAlgo.colorconvert(oiio.ImageBuf(np.ascontiguousarray(values)), color_space, DISPLAY_SPACE,
-                                               colorconfig="ocio://default")
-    if converted.has_error:
+    try:
+        return convert(np.ascontiguousarray(values), color_space, DISPLAY_SPACE)
+    except ValueError as error:
         raise AssetError(f"the colour space {color_space} of the maps cannot be converted to {DISPLAY_SPACE}: name one "
-                         "that OpenColorIO's default configuration knows")
-    return np.asarray(converted.get_pixels(oiio.FLOAT))
+                         "that OpenColorIO's default configuration knows") from error
 
 
 def _tangent_space(normal: np.ndarray, known: np.ndarray, mesh: SurfaceMesh) -> tuple[np.ndarray, np.ndarray]:
@@ -145,3 +111,44 @@ def _tangent_space(normal: np.ndarray, known: np.ndarray, mesh: SurfaceMesh) -> 
     known = known & frame.covered & (length > 0)
     unit = np.where(known[..., None], normal, 0) / np.where(known, length, 1)[..., None]
     return frame.express(unit) / 2 + 0.5, known
+
+
+def bleed(values: np.ndarray, known: np.ndarray, *, reach: int) -> np.ndarray:
+    """Fill unknown texels from their known neighbours, ring by ring; beyond the reach, with the mean.
+
+    Args:
+        values: [rows, cols] or [rows, cols, channels] float32.
+        known: [rows, cols] bool; known texels are returned as they are.
+        reach: how many texels far. The mean beyond it is for the coarse mip levels.
+
+    Returns:
+        As values. Zero throughout when nothing is known.
+    """
+    planes = values[..., None] if values.ndim == 2 else values
+    filled = np.pad(np.where(known[..., None], planes, 0), ((1, 1), (1, 1), (0, 0)))
+    done = np.pad(known, 1)
+    inside = np.pad(np.ones_like(known), 1)
+    ring = _around(np.argwhere(done), done, inside)
+    for _ in range(reach):
+        if len(ring) == 0:
+            break
+        total = np.zeros((len(ring), planes.shape[-1]), dtype=np.float32)
+        count = np.zeros((len(ring), 1), dtype=np.float32)
+        for r, c in _NEIGHBOURS:
+            neighbour = ring[:, 0] + r, ring[:, 1] + c
+            total += filled[neighbour]  # zero where not done
+            count += done[neighbour][:, None]
+        filled[ring[:, 0], ring[:, 1]] = total / count
+        done[ring[:, 0], ring[:, 1]] = True
+        ring = _around(ring, done, inside)
+    if known.any():
+        filled[~done] = planes[known].mean(axis=0, dtype=np.float64)
+    return filled[1:-1, 1:-1].reshape(values.shape)
+
+
+def _around(texels: np.ndarray, done: np.ndarray, inside: np.ndarray) -> np.ndarray:
+    """The texels [n, 2] of the image that touch these and are not done, each once."""
+    touched = np.zeros_like(done)
+    for r, c in _NEIGHBOURS:
+        touched[texels[:, 0] + r, texels[:, 1] + c] = True
+    return np.argwhere(touched & inside & ~done)

@@ -1,0 +1,129 @@
+"""USD files on disk: written in a temporary folder beside the target, packed as USDZ where asked, and put in place whole.
+
+Source: the USDZ File Format Specification: a zip file with the layer first, nothing compressed, and every file aligned to 64 bytes. It is
+written with Python's zip writer, because that of USD reports success when the disk is full.
+"""
+
+import os
+import shutil
+import struct
+import tempfile
+import zipfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from pxr import Tf, Usd
+
+from service.usd.errors import AssetError
+from stage.errors import StorageError, storage
+
+SUFFIXES = (".usda", ".usdc", ".usdz")
+ALIGNMENT = 64
+"""Bytes, so that readers can map the data of a file from memory (USDZ File Format Specification, "Layout")."""
+
+_LOCAL_HEADER_SIZE = 30
+_FIELD_HEADER = struct.Struct("<HH")
+_PADDING_FIELD = 0x1986
+"""Identifier of the extra field that holds the padding: any that no other program uses; USD's own writer takes this."""
+
+
+def check_suffix(target: Path) -> str:
+    """Return the suffix of an asset in lower case.
+
+    Raises:
+        AssetError: no USD file has this suffix.
+    """
+    suffix = target.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise AssetError(f"{target} cannot be written as a USD asset: its suffix must be .usda, .usdc or .usdz")
+    return suffix
+
+
+def write_layer(target: Path, define: Callable[[Usd.Stage], None]) -> None:
+    """Write a USD file that refers to no other file.
+
+    Args:
+        target: .usda, .usdc or .usdz.
+        define: fills the empty stage.
+
+    Raises:
+        AssetError: another suffix, or what `define` raises.
+        StorageError: the disk refuses; what was there before is left as it was.
+    """
+    check_suffix(target)
+    with workshop_beside(target) as workshop:
+        os.replace(define_layer(workshop, target, define), target)
+
+
+def define_layer(workshop: Path, target: Path, define: Callable[[Usd.Stage], None], files: Sequence[Path] = ()) -> Path:
+    """Write a layer into a temporary folder, packed with the files that it refers to where the target is a .usdz.
+
+    Args:
+        workshop: of workshop_beside; the files lie in it at any depth.
+        target: names the file and chooses its format.
+        define: fills the empty stage.
+        files: that the layer refers to.
+
+    Returns:
+        The file to be put in place of the target; it and, unless packed, `files` are flushed to the disk.
+    """
+    suffix = check_suffix(target)
+    layer = workshop / f"{target.stem}{'.usdc' if suffix == '.usdz' else suffix}"
+    usd_stage = Usd.Stage.CreateNew(str(layer))
+    define(usd_stage)
+    usd_stage.Save()
+    del usd_stage
+    if suffix == ".usdz":
+        package = workshop / f"{target.stem}.usdz"
+        _pack(package, layer, files)
+        layer, files = package, ()
+    for file in (layer, *files):
+        with open(file, "rb") as written:
+            os.fsync(written.fileno())
+    return layer
+
+
+@contextmanager
+def workshop_beside(target: Path) -> Iterator[Path]:
+    """Yield a temporary folder beside the target, removed at the end; errors of disk and USD become StorageErrors about the target."""
+    with storage("write", target):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        workshop = Path(tempfile.mkdtemp(prefix=f".{target.stem}.", dir=target.parent))
+    try:
+        with storage("write", target):
+            yield workshop
+    except Tf.ErrorException as error:
+        raise StorageError(f"cannot write {target}: {_reason(error)}") from error
+    finally:
+        shutil.rmtree(workshop, ignore_errors=True)
+
+
+def _pack(package: Path, layer: Path, files: Sequence[Path]) -> None:
+    """Write a package of a layer and the files that it refers to.
+
+    Args:
+        package: its folder holds the layer and, at any depth, the files; their paths relative to it are kept.
+
+    Raises:
+        AssetError: more than the 4 GiB that a package can hold.
+        OSError: it cannot be written.
+    """
+    try:
+        with open(package, "wb") as stream, zipfile.ZipFile(stream, "w", allowZip64=False) as archive:
+            for file in (layer, *files):
+                entry = zipfile.ZipInfo(file.relative_to(package.parent).as_posix())  # dated 1980: the same every time
+                entry.file_size = file.stat().st_size
+                data_starts = stream.tell() + _LOCAL_HEADER_SIZE + len(entry.filename.encode()) + _FIELD_HEADER.size
+                padding = -data_starts % ALIGNMENT
+                entry.extra = _FIELD_HEADER.pack(_PADDING_FIELD, padding) + bytes(padding)
+                with open(file, "rb") as source, archive.open(entry, "w") as member:
+                    shutil.copyfileobj(source, member)
+    except zipfile.LargeZipFile as error:
+        raise AssetError("the asset is larger than the 4 GiB that a .usdz can hold: export a .usdc") from error
+
+
+def _reason(error: Tf.ErrorException) -> str:
+    """Return the first reason that USD gives, without the place in its source."""
+    reasons = [str(getattr(cause, "commentary", cause)).strip() for cause in error.args]
+    return reasons[0].splitlines()[0].lower() if reasons and reasons[0] else "USD could not write it"
