@@ -29,7 +29,7 @@ LAYOUT = 1
 CACHE_FOLDER = ".relit"
 """The folder of the cache inside the folder of a capture."""
 ALIGNED = "aligned-"
-"""The prefix of the keys of motion-compensated stacks: the cache keeps one such stack, and one of the frames as recorded."""
+"""The prefix of the keys of aligned stacks: the cache keeps one aligned stack, and one of the frames as recorded."""
 DECODE_BYTES = 1 << 30
 """The bytes that all images which are decoded at one time may take."""
 BYTES_PER_PIXEL, ALIGNED_BYTES_PER_PIXEL = 40, 160
@@ -224,7 +224,7 @@ def _reserve(descriptor: int, size: int) -> None:
 
 
 def _drop_others(folder: Path, key: str) -> None:
-    """Remove older stacks from the cache: motion-compensated stacks if this stack is one, otherwise stacks of recorded frames."""
+    """Remove older stacks from the cache: aligned stacks if this stack is aligned, otherwise stacks of the frames as recorded."""
     for index in folder.glob("stack-*.json"):
         old = index.stem.removeprefix("stack-")
         if old != key and old.startswith(ALIGNED) == key.startswith(ALIGNED):

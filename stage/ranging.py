@@ -9,7 +9,7 @@ from stage.model import Count, Direction, Positive, Strict, Vector
 
 
 class LaserRay(Strict):
-    """A laser beam, which lights one spot of the scene."""
+    """A laser ray, which lights one spot."""
 
     type: Literal["ray"]
     origin_m: Vector
@@ -17,7 +17,7 @@ class LaserRay(Strict):
 
 
 class LaserPlane(Strict):
-    """A laser sheet, which lights one stripe of the scene (light striping)."""
+    """A laser plane, which lights one stripe (light striping)."""
 
     type: Literal["plane"]
     point_m: Vector
@@ -25,7 +25,7 @@ class LaserPlane(Strict):
 
 
 Laser = Annotated[LaserRay | LaserPlane, Field(discriminator="type")]
-"""A laser beam or sheet; the key `type` tells which."""
+"""A laser ray or plane; the key `type` tells which."""
 
 
 class ContinuousWave(Strict):

@@ -3,7 +3,7 @@
 Layout of `stack-<key>.npy`: [channel, light padded to a multiple of 8, pixel padded to a multiple of 64] half. Each light has
 a power-of-two scale of its own, so that half covers it from its brightest value down 29 stops: radiance = stored · scale[light].
 Beside it lie `stack-<key>.saturated.npy`, [light / 8, pixel] uint8, whose bit l % 8 (least significant first) is set where light l
-has no usable reading (it saturates, or motion compensation has none), and the index `stack-<key>.json`. Padding is 0.
+has no usable reading (it saturates, or alignment lost it), and the index `stack-<key>.json`. Padding is 0.
 """
 
 import json
@@ -42,7 +42,7 @@ class Stack:
     scale: np.ndarray  # [lights padded] float32, radiance of a stored 1.0; 0 for padding
     pixel_count: int
     motion: dict[str, Any] | None = None
-    """The statistics of a motion-compensated stack for the report, or None."""
+    """The statistics of an aligned stack for the report, or None."""
 
     @property
     def light_count(self) -> int:

@@ -13,7 +13,7 @@ from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import DarkRequest, FlatFieldRequest, SaturationRequest
 from stage import exr, images
 from stage.calibration.flat_field import make_flat, mean_image, recorded_values
-from stage.calibration.saturation import TopHistogram, suggest
+from stage.calibration.saturation import TopHistogram, capture_saturation
 from stage.capture import Capture
 from stage.errors import CalibrationError
 from stage.manifest import FILE_NAME
@@ -104,12 +104,12 @@ def saturation(request: SaturationRequest, progress: Progress | None = None) -> 
             top.add(recorded[..., channel])
         timings.advance(number)
     timings.close()
-    piles = [top.pile() for top in tops]
+    channels = [top.saturation() for top in tops]
     try:
-        level = suggest(piles)
+        level = capture_saturation(channels)
     except CalibrationError as error:
         raise CalibrationError(f"{capture.folder}: {error}") from error
-    counts = piles[0].readings, piles[1].readings, piles[2].readings
+    counts = channels[0].readings, channels[1].readings, channels[2].readings
     if not request.write:
         return Saturation(level, counts, None, None)
     manifest_path = capture.folder / FILE_NAME

@@ -10,7 +10,7 @@ from pydantic import BaseModel
 from service.errors import RequestError
 from service.reporting.provenance import versions
 from service.requests.calibrate import LightsRequest
-from stage.calibration.apply import LitFrame, SingleLight, lit_frames, match, with_lights
+from stage.calibration.apply import LitFrame, SingleLight, check_same_setup, lit_frames, with_lights
 from stage.capture import Capture
 from stage.errors import CalibrationError
 from stage.files import write_text
@@ -66,7 +66,7 @@ def open_captures(request: LightsRequest) -> Captures:
     target = source
     if request.apply_to is not None:
         target = Capture.open(request.apply_to)
-        match(source, target)
+        check_same_setup(source, target)
     path = target.folder / FILE_NAME if request.out is None else request.out
     if path.suffix.lower() != ".json" or path.name == REPORT_FILE or path.is_dir():
         raise RequestError(f"--out {path}: must be a .json file of its own: it takes the place of {FILE_NAME}")

@@ -15,7 +15,7 @@ from service.requests.depth import TofOptions
 from stage.capture import Capture
 from stage.tof.calibration import Harmonics, TofCalibration, fit_harmonics, fit_line, fit_temperature, write_calibration
 from stage.tof.frames import is_pulsed, read_correlations
-from stage.tof.sweep import Step, Sweep, read_sweep
+from stage.tof.sweep import Sweep, SweepDistance, read_sweep
 
 STEP_PIXELS = 400
 """Of each step, evenly chosen: more do not make the harmonics better, which the steps limit."""
@@ -83,7 +83,7 @@ def _errors(plan: Sweep, captures: list[Capture], calibration: TofCalibration | 
     return np.array(errors)
 
 
-def _true_range(step: Step, capture: Capture) -> np.ndarray:
+def _true_range(step: SweepDistance, capture: Capture) -> np.ndarray:
     """[rows, cols] along the rays to the plane of the target."""
     return step.depth_m / z_per_range(capture.camera)
 

@@ -22,7 +22,7 @@ from stage.files import write_text
 from stage.fingerprint import Fingerprints
 from stage.las import LAS_FILE, las_is_installed, write_las
 from stage.ply import POINTS_FILE, PointCloud, write_ply
-from stage.tof.scan import FILE_NAME, Shots, place_points, read_scan
+from stage.tof.scan import FILE_NAME, Shots, read_scan, world_points
 
 USD_FILE, REPORT_FILE = "points.usdc", "report.json"
 MOST_RETURNS = 4
@@ -65,7 +65,7 @@ def scan(request: ScanRequest, progress: Progress | None = None) -> ScanResult:
     near, far = request.near_m or 0.0, request.far_m or np.inf
     inside = (range_m >= near) & (range_m <= far) & (range_m > 0)
     timings.stage("place", 1)
-    points, covered = place_points(shots, index[inside], range_m[inside])
+    points, covered = world_points(shots, index[inside], range_m[inside])
     index, range_m, intensity, points = index[inside][covered], range_m[inside][covered], intensity[inside][covered], points[covered]
     if len(points) == 0:
         raise RequestError(f"{shots.folder / FILE_NAME}: no shot gives a point: {int((~covered).sum())} lie outside the track in time, "

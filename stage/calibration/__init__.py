@@ -1,1 +1,1 @@
-"""Calibration from images of balls, cards and the object itself: lights, dark frame, flat field, saturation. NumPy only."""
+"""Calibration from images of balls, cards, boards and the object: lights, dark frame, flat field, saturation, projector."""

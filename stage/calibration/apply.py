@@ -1,4 +1,4 @@
-"""Measured lights into a manifest, frame by frame; every other key stays as it is."""
+"""Replacement of the lights of a manifest by measured ones; every other key stays unchanged."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -14,16 +14,16 @@ SingleLight = DistantLight | PointLight
 
 
 class LitFrame(NamedTuple):
-    """A frame that one light of its own lit."""
+    """A frame that one distant or point light lit."""
 
     number: int
-    """Of the frame in the manifest, from 0."""
+    """The index of the frame in the manifest."""
     frame: Frame
     light: SingleLight
 
 
 def lit_frames(capture: Capture) -> list[LitFrame]:
-    """The frames whose lights can be calibrated: distant and point, in manifest order.
+    """Return the frames whose lights can be calibrated, which are distant and point lights, in manifest order.
 
     Raises:
         ManifestError: there is none.
@@ -36,11 +36,15 @@ def lit_frames(capture: Capture) -> list[LitFrame]:
     return found
 
 
-def match(source: Capture, target: Capture) -> None:
-    """Refuse to carry lights from one capture to another that was not shot in the same way.
+def check_same_setup(source: Capture, target: Capture) -> None:
+    """Check that the lights of one capture may be written into another, because both were taken in the same setup.
+
+    Args:
+        source: the capture in which the lights were measured.
+        target: the capture whose manifest gets the lights.
 
     Raises:
-        ManifestError: another count of lit frames, projection, resolution or camera position.
+        ManifestError: the count of lit frames, the projection, the resolution or the camera position differs.
     """
     where = target.folder / FILE_NAME
     measured, wanted = len(lit_frames(source)), len(lit_frames(target))
@@ -58,11 +62,11 @@ def match(source: Capture, target: Capture) -> None:
 
 
 def with_lights(target: Capture, lights: Sequence[SingleLight | None]) -> Manifest:
-    """The manifest with its distant and point lights replaced in order.
+    """Return the manifest of a capture with its distant and point lights replaced, in manifest order.
 
     Args:
-        target: as many lit frames as there are lights.
-        lights: None leaves the frame out.
+        target: a capture with as many distant and point lights.
+        lights: the new lights; None removes the frame.
     """
     by_index: Mapping[int, SingleLight | None] = dict(zip((lit.number for lit in lit_frames(target)), lights, strict=True))
     frames = []
@@ -76,14 +80,14 @@ def with_lights(target: Capture, lights: Sequence[SingleLight | None]) -> Manife
 
 
 def as_direction(light: SingleLight, direction: np.ndarray) -> DistantLight:
-    """The light from a measured direction; its irradiance stays, that of a light which was near is not known and becomes 1."""
+    """Return a distant light from a measured direction. The irradiance of a distant light stays; that of a point light becomes 1."""
     irradiance = light.irradiance if isinstance(light, DistantLight) else (1.0, 1.0, 1.0)
     x, y, z = (float(value) for value in direction)
     return DistantLight(type="distant", direction=(x, y, z), irradiance=irradiance)
 
 
 def as_position(light: SingleLight, position: np.ndarray, seen_from: np.ndarray) -> PointLight:
-    """The light at a measured position; a far light's irradiance becomes the intensity that gives it at `seen_from`."""
+    """Return a point light at a measured position; the irradiance of a distant light becomes an intensity that gives it at `seen_from`."""
     x, y, z = (float(value) for value in position)
     if isinstance(light, PointLight):
         return light.model_copy(update={"position_m": (x, y, z)})
@@ -92,6 +96,6 @@ def as_position(light: SingleLight, position: np.ndarray, seen_from: np.ndarray)
 
 
 def with_brightness(light: SingleLight, rgb: np.ndarray) -> SingleLight:
-    """The light with a measured irradiance (distant) or intensity (point)."""
+    """Return a light with a measured irradiance (distant light) or intensity (point light)."""
     r, g, b = (float(value) for value in rgb)
     return light.model_copy(update={"irradiance" if isinstance(light, DistantLight) else "intensity": (r, g, b)})

@@ -1,6 +1,7 @@
-"""A ball as a camera sees it: its place in the camera frame, and the normal and line of sight at every one of its pixels.
+"""A ball in an image: its position in the camera frame, and the normal and the line of sight at each of its pixels.
 
-A far light needs no scale: a perspective camera sees a ball only up to distance, and an orthographic one not its distance at all.
+The direction of a distant light needs no scale: a perspective camera determines a ball up to scale, and an orthographic camera does
+not determine its distance.
 """
 
 import math
@@ -12,40 +13,41 @@ from stage.camera import Camera
 from stage.errors import CalibrationError
 
 CIRCLE_POINTS = 360
-"""Points of a typed circle that stand for the outline."""
+"""The count of outline points that are taken from a circle which the user gives."""
 CIRCLE_ERROR_PX = 0.5
-"""How well a circle typed by hand lies on the outline."""
+"""The standard error of the centre of a circle which the user gives, in pixels."""
 
 
 class Ball(NamedTuple):
     """A sphere in the camera frame."""
 
-    centre: np.ndarray  # [3] float64; orthographic: its z is assumed, not seen
+    centre: np.ndarray  # [3] float64; for an orthographic camera z is an assumption
     radius: float
     metric: bool
-    """Centre and radius are in metres; otherwise pixels (orthographic) or radii of the ball (perspective, radius 1)."""
+    """True when centre and radius are in metres; otherwise they are in pixels (orthographic) or in radii of the ball (perspective)."""
     radius_px: float
-    """Of the outline, on average."""
+    """The mean radius of the outline in pixels."""
     outline_error_px: float
-    """Standard error of the centre of the outline."""
+    """The standard error of the centre of the outline in pixels."""
 
 
 class BallView(NamedTuple):
-    """What the pixels of a ball show, over a box of the image."""
+    """The normals, lines of sight and points of a ball at the pixels of a box of the image."""
 
     box: tuple[slice, slice]
-    """Rows and columns of the image that the box covers."""
-    inside: np.ndarray  # [h, w] bool, the line of sight of the pixel's centre meets the ball
+    """The rows and columns of the image that the box covers."""
+    inside: np.ndarray  # [h, w] bool, True where the line of sight of the pixel centre meets the ball
     normal: np.ndarray  # [h, w, 3] float64, unit, camera frame; 0 outside
     to_viewer: np.ndarray  # [h, w, 3] float64, unit, from the ball to the camera
-    point: np.ndarray  # [h, w, 3] float64, on the ball, in its unit; 0 outside
+    point: np.ndarray  # [h, w, 3] float64, on the ball, in the unit of the ball; 0 outside
 
 
 def lines_of_sight(camera: Camera, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where the line of sight of each image point begins and goes.
+    """Return the origin and the direction of the line of sight of each image point.
 
     Returns:
-        origin [..., 3] and direction [..., 3] unit, away from the camera; camera frame, float64. Orthographic: on z = 0.
+        origin [..., 3] and unit direction [..., 3] away from the camera, camera frame, float64. The origin is the centre of a
+        perspective camera, and lies on z = 0 for an orthographic camera.
     """
     x, y = camera.plane_at(np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64))
     zero = np.zeros_like(x)
@@ -57,17 +59,18 @@ def lines_of_sight(camera: Camera, u: np.ndarray, v: np.ndarray) -> tuple[np.nda
 
 def ball_from_circle(camera: Camera, u: float, v: float, radius_px: float, *, radius_m: float | None = None,
                      z_m: float | None = None) -> Ball:
-    """The ball whose outline is a typed circle.
+    """Return the ball whose outline is a given circle.
 
-    A perspective camera sees a ball off its axis as an ellipse; the circle is then taken as an approximation to it.
+    In a perspective image the outline of a ball off the axis is an ellipse, which the circle approximates.
 
     Args:
-        u, v: centre, continuous image coordinates.
-        radius_px: in pixels.
-        radius_m, z_m: as `ball_from_outline` takes them.
+        camera: the camera of the image.
+        u, v: the centre, continuous image coordinates.
+        radius_px: the radius in pixels.
+        radius_m, z_m: as in `ball_from_outline`.
 
     Raises:
-        CalibrationError: the circle is not wholly in the image.
+        CalibrationError: the circle is not wholly inside the image.
     """
     if not (radius_px > 1 and radius_px <= u <= camera.width - radius_px and radius_px <= v <= camera.height - radius_px):
         raise CalibrationError(f"ball {u:g},{v:g},{radius_px:g}: is not wholly inside the {camera.width}x{camera.height} image")
@@ -78,16 +81,17 @@ def ball_from_circle(camera: Camera, u: float, v: float, radius_px: float, *, ra
 
 def ball_from_outline(camera: Camera, outline: np.ndarray, *, error_px: float, radius_m: float | None = None,
                       z_m: float | None = None) -> Ball:
-    """The ball whose outline runs through image points, by linear least squares.
+    """Fit a ball to points of its outline by linear least squares.
 
-    Orthographic: a circle in the plane. Perspective: the unit rays r through the outline make a cone about the centre's
-    direction c, r·c = cos α: r·g = 1 with g = c/cos α, and the ball of radius R lies at distance R/sin α.
+    For an orthographic camera the outline is a circle in the image plane. For a perspective camera the unit rays r through the
+    outline form a cone about the direction c of the centre, r·c = cos α, and a ball of radius R lies at distance R/sin α.
 
     Args:
+        camera: the camera of the image.
         outline: [points, 2] u, v.
-        error_px: standard error of the outline's centre, kept in the result.
-        radius_m: of the ball; gives a perspective camera its distance.
-        z_m: camera-frame z of the ball's centre for an orthographic camera.
+        error_px: the standard error of the centre of the outline, which the result holds.
+        radius_m: the radius of the ball, which determines its distance from a perspective camera.
+        z_m: the camera-frame z of the centre of the ball, for an orthographic camera.
 
     Raises:
         CalibrationError: the points lie on no circle.
@@ -108,10 +112,13 @@ def ball_from_outline(camera: Camera, outline: np.ndarray, *, error_px: float, r
 
 
 def fit_circle(points: np.ndarray) -> tuple[np.ndarray, float]:
-    """Centre and radius of the circle x² + y² = 2ax + 2by + c by linear least squares (Kåsa 1976).
+    """Fit a circle x² + y² = 2ax + 2by + c to points by linear least squares (Kåsa 1976).
 
     Args:
         points: [points, 2], three or more.
+
+    Returns:
+        centre [2] and radius.
 
     Raises:
         numpy.linalg.LinAlgError: the points lie on a line.
@@ -125,13 +132,13 @@ def fit_circle(points: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def fit_cone(rays: np.ndarray) -> tuple[np.ndarray, float]:
-    """Axis and half angle of the cone through unit rays, r·g = 1 by linear least squares.
+    """Fit a cone to unit rays by linear least squares of r·g = 1, with g the axis over the cosine of the half angle.
 
     Args:
         rays: [rays, 3] unit, three or more.
 
     Returns:
-        axis [3] unit, half angle in radians.
+        axis [3], a unit vector, and the half angle in radians.
 
     Raises:
         numpy.linalg.LinAlgError: the rays lie in one plane.
@@ -151,37 +158,38 @@ def fit_cone(rays: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def view_ball(ball: Ball, camera: Camera) -> BallView:
-    """Normals, lines of sight and surface points of a ball's pixels.
+    """Return the normals, lines of sight and surface points of the pixels of a ball.
 
     Raises:
         CalibrationError: no pixel of the image shows the ball.
     """
     rows, cols = _box(ball, camera)
     u, v = np.meshgrid(np.arange(cols.start, cols.stop) + 0.5, np.arange(rows.start, rows.stop) + 0.5)
-    inside, point, direction = meet(ball, camera, u, v)
+    inside, point, direction = intersect(ball, camera, u, v)
     if not inside.any():
         raise CalibrationError(f"the ball has no pixel in the {camera.width}x{camera.height} image")
     normal = np.where(inside[..., None], (point - ball.centre) / ball.radius, 0)
     return BallView((rows, cols), inside, normal, -direction, point)
 
 
-def meet(ball: Ball, camera: Camera, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where lines of sight meet a ball first.
+def intersect(ball: Ball, camera: Camera, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Intersect the lines of sight of image points with a ball.
 
     Returns:
-        inside [...] bool, point [..., 3] on the ball (0 where it is missed), direction [..., 3] of the line, unit.
+        inside [...] bool, True where the line meets the ball; point [..., 3], the intersection nearer to the camera, 0 where there is
+        none; direction [..., 3], the unit direction of the line.
     """
     origin, direction = lines_of_sight(camera, u, v)
     to_centre = ball.centre - origin
     along = (to_centre * direction).sum(axis=-1)
     across = np.linalg.norm(to_centre - along[..., None] * direction, axis=-1)
     inside = across < ball.radius
-    near = along - np.sqrt(np.where(inside, ball.radius**2 - across**2, 0))
-    return inside, np.where(inside[..., None], origin + near[..., None] * direction, 0), direction
+    first = along - np.sqrt(np.where(inside, ball.radius**2 - across**2, 0))
+    return inside, np.where(inside[..., None], origin + first[..., None] * direction, 0), direction
 
 
 def project(camera: Camera, point: np.ndarray) -> tuple[float, float]:
-    """Image coordinates of a camera-frame point, in the camera's unit."""
+    """Return the image coordinates u and v of a camera-frame point, which is in the unit of the camera."""
     cu, cv = camera.principal_px or (camera.width / 2, camera.height / 2)
     if camera.projection == "orthographic":
         pixel = camera.pixel_size_m or 1.0
@@ -194,7 +202,7 @@ def project(camera: Camera, point: np.ndarray) -> tuple[float, float]:
 
 
 def _box(ball: Ball, camera: Camera) -> tuple[slice, slice]:
-    """Rows and columns around the outline, inside the image."""
+    """Return the rows and columns of the image that contain the outline of a ball."""
     u, v = project(camera, ball.centre)
     # the outline of a ball off the axis is an ellipse, stretched by no more than 1/cos² of its angle from the axis
     reach = ball.radius_px * 1.1 + 2

@@ -1,7 +1,7 @@
-"""White-card frames → flat.exr, dark frames → dark.exr, in the encoding and with the meaning that stage/correction.py reads.
+"""Flat field and dark frame from images of a white card and dark images, in the encoding that stage/correction.py reads.
 
-Correction takes the dark off the flat itself, so a flat keeps as much dark as the manifest's dark holds: the dark of the white
-card's own exposure is exchanged for it.
+The correction subtracts the dark frame of the manifest from the flat field. The dark frame of the exposure of the white card is
+therefore replaced by the dark frame of the manifest.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,31 +17,32 @@ from stage.colour_spaces import linear_space
 from stage.errors import CalibrationError, ImageError
 
 Progress = Callable[[int], None]
-"""Called with how many images are read."""
+"""A function that is called with the count of images that have been read."""
 
 
 class MeanImage(NamedTuple):
-    """The mean of several images of one thing."""
+    """The mean of several images of one object, and their noise."""
 
     pixels: np.ndarray  # [rows, cols, 3] float64, linear
     noise: float
-    """Root mean square of one image's difference from the mean, over all pixels; 0 for one image."""
+    """The root mean square of the difference of an image from the mean, over all pixels; 0 for one image."""
     images: int
+    """The count of images."""
 
 
 def mean_image(paths: Sequence[Path], capture: Capture, *, refuse_saturated: bool = False,
                progress: Progress | None = None) -> MeanImage:
-    """Mean of images in linear values.
+    """Return the mean of images in linear values.
 
     Args:
-        paths: image files of the capture's resolution and encoding.
-        capture: says resolution, colour space and saturation.
-        refuse_saturated: a saturated reading inside the mask is an error.
-        progress: told after every image.
+        paths: image files with the resolution and the encoding of the capture.
+        capture: the capture that gives resolution, colour space and saturation.
+        refuse_saturated: True makes a saturated reading inside the mask an error.
+        progress: called after every image.
 
     Raises:
-        CalibrationError: no image.
-        ImageError: an image has another size, impossible values, or saturated readings; names it.
+        CalibrationError: no image is given.
+        ImageError: an image has another size, impossible values, or saturated readings; the message names it.
     """
     if not paths:
         raise CalibrationError("no image is given")
@@ -69,14 +70,12 @@ def mean_image(paths: Sequence[Path], capture: Capture, *, refuse_saturated: boo
 
 
 def make_flat(white: MeanImage, white_dark: MeanImage | None, capture: Capture) -> np.ndarray:
-    """The flat field as correction reads it: white, less its own dark frame, plus the dark frame that correction takes off.
-
-    Without `white_dark` the capture's dark is taken to be that of the white card too.
+    """Return the flat field for the correction: white card minus its own dark frame, plus the dark frame of the capture.
 
     Args:
-        white: mean of the white-card frames.
-        white_dark: mean of dark frames at their exposure, or None.
-        capture: its dark frame and mask.
+        white: the mean of the images of the white card.
+        white_dark: the mean of dark images at the same exposure; None takes the dark frame of the capture for them.
+        capture: the capture that gives the dark frame and the mask.
 
     Returns:
         [rows, cols, 3] float32, linear.
@@ -98,10 +97,14 @@ def make_flat(white: MeanImage, white_dark: MeanImage | None, capture: Capture) 
 
 
 def recorded_values(linear: np.ndarray, capture: Capture) -> np.ndarray:
-    """Linear values in the capture's encoding, so that they are read as its images are.
+    """Encode linear values as the images of a capture are encoded.
 
     Args:
-        linear: [rows, cols, 3] float32.
+        linear: [rows, cols, 3] float32, scene-linear.
+        capture: the capture that gives the colour space.
+
+    Returns:
+        [rows, cols, 3] float32.
     """
     space = capture.manifest.color_space
     return convert(np.ascontiguousarray(linear, dtype=np.float32), linear_space(space), space)

@@ -1,6 +1,10 @@
-"""Grey (Lambertian) ball → the irradiance of each light, and from its shading alone the direction too.
+"""The irradiance and the direction of a light from the shading of a grey, Lambertian ball.
 
-I = ρ/π E max(0, n·l), over pixels in light, unsaturated, and without those that a robust weight takes for highlights.
+The model is Lambert's law I = ρ/π E max(0, n·l) over lit and unsaturated pixels; robust weights exclude highlights.
+
+Source: Lambert's law as in Woodham, "Photometric method for determining surface orientation from multiple images", Optical
+    Engineering 19(1), 1980, eq. 8, here for known n and unknown l; weights: Holland and Welsch, "Robust regression using
+    iteratively reweighted least-squares", Communications in Statistics A6(9), 1977.
 """
 
 import math
@@ -13,38 +17,41 @@ from stage.errors import CalibrationError
 from stage.light import DistantLight, PointLight
 
 MIN_COSINE = 0.15
-"""Of the light on the surface: below it, at the attached shadow's edge, a small error of direction is a large one of shading."""
+"""The least cosine between light and normal: near the attached shadow a small error of direction is a large error of shading."""
 MIN_FACING = 0.25
-"""Of the surface to the viewer: below it pixels mix ball and background, and the outline's error becomes the normal's."""
+"""The least cosine between viewer and normal: pixels near the outline mix in background, and their normals are inaccurate."""
 MIN_PIXELS = 50
-"""Fewer pixels than this measure nothing."""
+"""The least count of pixels from which a light is measured."""
 WEIGHT_SCALE = 2.385
-"""Cauchy weights 1/(1 + (r/(2.385 σ))²): 95 % efficient on normal noise (Holland and Welsch 1977)."""
+"""The scale of the Cauchy weights 1/(1 + (r/(2.385 σ))²), which are 95 % efficient for normal noise (Holland and Welsch 1977)."""
 ROUNDS = 20
+"""The iterations of the re-weighted least squares."""
 
 
 class Brightness(NamedTuple):
-    """What one light does to a grey ball."""
+    """The brightness of one light on a grey ball."""
 
-    scale: np.ndarray  # [3] float64, irradiance or intensity, times ρ/π of the ball
+    scale: np.ndarray  # [3] float64, irradiance or intensity, multiplied by ρ/π of the ball
     residual: float
-    """Weighted root mean square of reading/model - 1, over the three channels."""
+    """The weighted root mean square of reading / model - 1, over the three channels."""
     pixels: int
+    """The count of pixels that were used."""
 
 
 class Shading(NamedTuple):
-    """A distant light from shading alone."""
+    """The direction of a distant light from shading."""
 
     direction: np.ndarray  # [3] float64, unit
     uncertainty_degrees: float
-    """Standard error from the scatter of the readings; a ball that is not Lambertian shifts the direction by more."""
+    """The standard error from the scatter of the readings; the error of a ball that is not Lambertian is larger."""
 
 
 def received(light: DistantLight | PointLight, view: BallView) -> np.ndarray:
-    """Irradiance at every pixel of the ball for a light of irradiance or intensity 1.
+    """Return the irradiance at every pixel of a ball under a light of irradiance or intensity 1.
 
     Args:
-        light: a point light needs a view whose points are in metres.
+        light: the light; its irradiance or intensity is not used.
+        view: the pixels of the ball; a point light needs a view in metres.
 
     Returns:
         [h, w] float64; 0 in the attached shadow and outside the ball.
@@ -62,16 +69,16 @@ def received(light: DistantLight | PointLight, view: BallView) -> np.ndarray:
 
 def fit_brightness(radiance: np.ndarray, saturated: np.ndarray | None, light: DistantLight | PointLight,
                    view: BallView) -> Brightness:
-    """The brightness of one light, per channel by re-weighted least squares of reading = scale · shading.
+    """Measure the brightness of a light of known position, in each channel by re-weighted least squares of reading = scale · shading.
 
     Args:
         radiance: [h, w, 3] scene-linear, the box of `view`.
         saturated: [h, w] bool, or None.
-        light: where it is.
-        view: the ball.
+        light: the light, which gives direction or position.
+        view: the pixels of the ball.
 
     Raises:
-        CalibrationError: fewer than MIN_PIXELS lit, unsaturated readings; the message does not name the frame.
+        CalibrationError: fewer than MIN_PIXELS readings are lit and unsaturated; the message does not name the frame.
     """
     shading = received(light, view)
     incidence = view.normal @ np.array(light.direction) if isinstance(light, DistantLight) else _cosine(light, view)
@@ -93,17 +100,17 @@ def fit_brightness(radiance: np.ndarray, saturated: np.ndarray | None, light: Di
 
 
 def fit_direction(radiance: np.ndarray, saturated: np.ndarray | None, view: BallView) -> Shading:
-    """Direction of one distant light by re-weighted least squares of b·n = reading, b = ρ/π E l, on the grey ball's lit pixels.
+    """Measure the direction of a distant light by re-weighted least squares of b·n = reading, b = ρ/π E l, over the lit pixels.
 
-    Which pixels are lit follows from the fit itself, starting from the brighter ones, so that noise does not choose them.
+    The fit starts from the brighter pixels and then decides from its own result which pixels are lit, so that noise does not decide.
 
     Args:
         radiance: [h, w, 3] scene-linear, the box of `view`.
         saturated: [h, w] bool, or None.
-        view: the ball.
+        view: the pixels of the ball.
 
     Raises:
-        CalibrationError: fewer than MIN_PIXELS lit, unsaturated readings.
+        CalibrationError: fewer than MIN_PIXELS readings are lit and unsaturated, or they do not determine a direction.
     """
     usable = _usable(saturated, view)
     _check_count(int(usable.sum()))
@@ -143,7 +150,7 @@ def _check_count(count: int) -> None:
 
 
 def _cauchy(residual: np.ndarray, sample: np.ndarray | None = None) -> np.ndarray:
-    """Weights of residuals [n] or [n, channels]; their scale is the median absolute one of `sample` (of themselves)."""
+    """Return the Cauchy weights of residuals [n] or [n, channels], scaled by the median absolute value of `sample` or the residuals."""
     spread = 1.4826 * np.median(np.abs(residual if sample is None else sample), axis=0)
     floor = 1e-12 * np.abs(residual).max(axis=0) + 1e-300  # exact readings have no scatter
     return 1 / (1 + (residual / (WEIGHT_SCALE * spread + floor)) ** 2)

@@ -1,4 +1,7 @@
-"""Two or more mirror balls → where a near light is: the point nearest to the reflected lines of sight (Powell et al. 2001)."""
+"""The position of a near light from two mirror balls or more: the point nearest to the reflected lines of sight.
+
+Source: Powell, Sarkar and Goldgof, "A simple strategy for calibrating the geometry of light sources", TPAMI 23(9), 2001.
+"""
 
 import math
 from typing import NamedTuple
@@ -8,36 +11,36 @@ import numpy as np
 from stage.errors import CalibrationError
 
 MIN_CONVERGENCE_DEGREES = 1.0
-"""Rays closer to parallel than this meet nowhere in particular: one pixel of error moves the light by its own distance."""
+"""The least angle between two rays: below it an error of one pixel moves the light by as much as its distance."""
 MISS_DEGREES = 1.0
-"""Flagged: the nearest point is seen from a ball farther than this off its ray."""
+"""The angle between a ray and the direction to the nearest point, seen from the ball, above which the light is flagged."""
 
 
 class Position(NamedTuple):
-    """One near light."""
+    """The measured position of a near light."""
 
     position: np.ndarray  # [3] float64, in the unit of the balls
     residual: float
-    """Root mean square distance from the rays, same unit."""
+    """The root mean square distance from the rays, in the unit of the balls."""
     uncertainty: float
-    """Standard error of the position, same unit: the uncertainty of the rays, carried through the least squares."""
+    """The standard error of the position in the unit of the balls, propagated from the uncertainty of the rays."""
     flags: tuple[str, ...]
 
 
 def nearest_point(points: np.ndarray, directions: np.ndarray, uncertainty_degrees: np.ndarray) -> Position:
-    """The point with the least sum of squared distances from rays: Σ (I - d dᵀ)(x - p) = 0.
+    """Return the point with the least sum of squared distances from rays: Σ (I - d dᵀ)(x - p) = 0.
 
     Args:
-        points: [balls, 3] where each ray leaves its ball.
-        directions: [balls, 3] unit.
-        uncertainty_degrees: [balls] standard error of each direction.
+        points: [balls, 3] the point at which each ray leaves its ball.
+        directions: [balls, 3] unit directions of the rays.
+        uncertainty_degrees: [balls] the standard error of each direction.
 
     Raises:
         CalibrationError: the rays are nearly parallel, or meet behind a ball.
     """
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     normal = across.sum(axis=0)
-    # of two rays at an angle γ the eigenvalues are 1 - cos γ, 1 + cos γ and 2
+    # for two rays at an angle γ the eigenvalues are 1 - cos γ, 1 + cos γ and 2
     least = float(np.linalg.eigvalsh(normal)[0])
     angle = math.degrees(math.acos(np.clip(1 - 2 * least / len(points), -1, 1)))
     if angle < MIN_CONVERGENCE_DEGREES:

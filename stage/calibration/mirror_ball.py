@@ -1,6 +1,9 @@
-"""Mirror ball → where the light is: the line of sight of the bright spot, reflected at the ball.
+"""The direction of a light from a mirror ball: the line of sight of the bright spot, reflected at the ball.
 
-The normal at the spot is half way between the viewer and the light; it is not the light's direction.
+The normal at the spot bisects the directions to the viewer and to the light; it is not the direction of the light.
+
+Source: the law of reflection, r = 2(n·v)n - v; Debevec, "Rendering synthetic objects into real scenes", SIGGRAPH 1998, for
+    the mirror ball as a light probe.
 """
 
 import math
@@ -13,33 +16,33 @@ from stage.calibration.ball import Ball, BallView
 from stage.errors import CalibrationError
 
 RIM_COSINE = 0.1
-"""Pixels whose normal is flatter than this to the line of sight are not looked at: they mix ball and background."""
+"""The least cosine between normal and line of sight of a pixel that is searched: pixels at the outline mix in background."""
 MIN_COSINE = 0.2
-"""A spot flatter than this (a light more than 157° from the view axis) has an unsure direction: 1 px is 10/radius rad there."""
+"""The least such cosine of a spot, for a light 157° from the view axis: beyond it an error of 1 px is one of 10/radius_px rad."""
 NEAR_RIM_COSINE = 0.35
-"""Flagged: a light more than 139° from the view axis."""
+"""The cosine below which a spot is flagged, for a light more than 139° from the view axis."""
 MAX_SPOT_SHARE = 0.1
-"""A spot larger than this part of the ball is no spot: a light of 37° half angle, or an exposure that drowns the ball."""
+"""The largest part of the ball that a spot may cover, which a light of 37° half angle covers, or an overexposed ball."""
 PROMINENCE = 8.0
-"""How many standard deviations of the ball's other pixels the peak must rise above their median; noise alone reaches 4 or 5."""
+"""The standard deviations of the other pixels of the ball by which the peak must exceed their median; noise reaches 4 or 5."""
 MIN_CONTRAST = 2.0
-"""And how many times that median."""
+"""The least ratio of the peak to that median."""
 RIVAL_SHARE = 0.5
-"""Flagged: another spot as bright with more than this part of the found one's light."""
+"""The light of another spot, relative to the light of the found spot, above which the spot is flagged."""
 MAX_PARTS = 8
-"""Bright parts that are looked at."""
+"""The most connected bright regions that are compared."""
 SMALL_SPOT = 4
-"""Flagged: pixels under which a centroid knows little of what lies between them."""
+"""The count of pixels below which a spot is flagged, because its centroid is inaccurate."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SpotOptions:
-    """How the spot is told from the rest."""
+    """The options of the search for the spot."""
 
     level: float = 0.1
-    """The spot is what is brighter than this part of the peak, and than the noise of the ball, and connected to the peak.
+    """The level relative to the peak: pixels of the spot are brighter than it and than the noise of the ball, and connected to the peak.
 
-    Low, because a small light is a spot of few pixels, whose foot tells best what lies between them.
+    It is low, because the faint border of a spot of few pixels determines its sub-pixel position best.
     """
 
 
@@ -50,29 +53,29 @@ class Spot(NamedTuple):
     direction: np.ndarray  # [3] float64, unit, the reflected line of sight: from the ball to the light, camera frame
     point: np.ndarray  # [3] float64, on the ball at the centroid, in the ball's unit
     spot_degrees: float
-    """Root mean square angle between the light of the spot and its mean: the apparent size of the light."""
+    """The root mean square angle of the light of the spot from its mean: the apparent size of the light."""
     uncertainty_degrees: float
-    """Standard error of the direction from the pixel grid and the outline of the ball."""
+    """The standard error of the direction, from the pixel grid and the outline of the ball."""
     pixels: int
     flags: tuple[str, ...]
 
 
 def find_spot(radiance: np.ndarray, saturated: np.ndarray | None, ball: Ball, view: BallView,
               options: SpotOptions = SpotOptions()) -> Spot:
-    """The direction of one light.
+    """Find the bright spot on a mirror ball, and the direction of the light that it reflects.
 
-    Every pixel of the spot is a measurement of the light in its own reflected direction; the result is their mean, weighted
-    by how far each rises above the spot's level. On an orthographic mirror ball equal areas of the image are equal solid
-    angles, so that this is the centroid of the light itself. Saturated pixels count as the brightest.
+    Each pixel of the spot measures the light from its own reflected direction. The result is the mean of these directions, weighted
+    by the radiance above the level of the spot. In an orthographic image of a mirror ball equal areas are equal solid angles, so
+    that the mean is the centroid of the light. Saturated pixels count as the brightest.
 
     Args:
         radiance: [h, w, 3] scene-linear, the box of `view`.
         saturated: [h, w] bool, or None.
-        ball, view: the ball and what its pixels show.
-        options: how the spot is told from the rest.
+        ball, view: the ball, and the normals and lines of sight of its pixels.
+        options: the options of the search.
 
     Raises:
-        CalibrationError: there is no spot, it covers the ball, or it is at the rim; the message does not name the frame.
+        CalibrationError: there is no spot, it covers too much of the ball, or it is at the rim; the message does not name the frame.
     """
     facing = (view.normal * view.to_viewer).sum(axis=-1)
     looked_at = view.inside & (facing > RIM_COSINE)
@@ -110,21 +113,21 @@ def find_spot(radiance: np.ndarray, saturated: np.ndarray | None, ball: Ball, vi
 
 
 def reflect(to_viewer: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """The mirror direction 2(n·v)n - v of the way to the viewer, [..., 3]: the way to what the mirror shows."""
+    """Return the mirror direction 2(n·v)n - v, [..., 3]: from the ball to the object that the mirror shows at the viewer."""
     return 2 * (normal * to_viewer).sum(axis=-1, keepdims=True) * normal - to_viewer
 
 
 def _uncertainty_degrees(ball: Ball, cosine: float, count: int) -> float:
-    """Of a centroid of `count` pixels: a pixel is uniform over its width, 1/√12, and the outline has its own error.
+    """Return the uncertainty of a centroid of `count` pixels: a pixel is uniform over its width, 1/√12, and the outline has an error.
 
-    Across the ball a shift of one pixel turns the normal by 1/(radius cos) and the reflection by twice that.
+    A shift of one pixel rotates the normal by 1/(radius_px · cosine) radians, and the reflected direction by twice that.
     """
     shift_px = math.sqrt(1 / (12 * count) + ball.outline_error_px**2)
     return math.degrees(2 * shift_px / (ball.radius_px * cosine))
 
 
 def _noise_ceiling(values: np.ndarray) -> float:
-    """What the ball's noise does not reach; refuses a ball that nothing stands out of."""
+    """Return a level above the noise of the ball, and raise CalibrationError when no pixel is brighter."""
     peak, median = float(values.max()), float(np.median(values))
     spread = 1.4826 * float(np.median(np.abs(values - median)))  # the standard deviation, were it noise alone
     if peak <= 0 or peak <= median + PROMINENCE * spread or peak < MIN_CONTRAST * median:
@@ -133,7 +136,7 @@ def _noise_ceiling(values: np.ndarray) -> float:
 
 
 def _brightest(weight: np.ndarray, peak: np.ndarray) -> tuple[np.ndarray, float]:
-    """The connected part of `weight > 0` that holds a peak and most light, and the share of the next part in its light."""
+    """Return the brightest connected region of `weight > 0` with a peak, and the light of the next region relative to its light."""
     left = weight > 0
     spots: list[tuple[float, np.ndarray]] = []
     rivals = [0.0]
@@ -153,7 +156,7 @@ def _brightest(weight: np.ndarray, peak: np.ndarray) -> tuple[np.ndarray, float]
 
 
 def _connected(allowed: np.ndarray, seed: int) -> np.ndarray:
-    """The part of `allowed` that is connected to the pixel of flat index `seed`, over sides and corners."""
+    """Return the region of `allowed` that is connected to the pixel of flat index `seed`, over sides and corners."""
     rows, cols = allowed.shape
     left = np.pad(allowed, 1).reshape(-1)  # a border, so that neighbours of the edge exist
     front = np.array([(seed // cols + 1) * (cols + 2) + seed % cols + 1])

@@ -1,4 +1,7 @@
-"""A ball from a mask: its outline at sub-pixel places, without what holds the ball."""
+"""A ball from its mask: the sub-pixel outline, without a stand that the mask may contain.
+
+Source: Fischler and Bolles, "Random sample consensus", Communications of the ACM 24(6), 1981.
+"""
 
 import numpy as np
 
@@ -7,26 +10,28 @@ from stage.camera import Camera
 from stage.errors import CalibrationError
 
 LEVEL = 0.5
-"""Of the mask: the outline runs where coverage is one half."""
+"""The coverage of the mask at its outline."""
 RANSAC_ROUNDS = 300
-"""With half the outline true, three points all lie on it in one round of eight: 300 rounds miss with probability 1e-17."""
+"""The rounds of RANSAC: when half the outline is that of the ball, three points lie on it in one round of eight, and 300 rounds miss
+with a probability of 1e-17."""
 INLIER_PX = 1.0
-"""Binary masks round the outline to half a pixel either way; a stand or a second object is farther off."""
+"""The largest distance of an inlier from the circle: binary masks round the outline by half a pixel, a stand is farther away."""
 MIN_SHARE = 0.4
-"""Least part of the found circle's length that the mask's outline must cover."""
+"""The least part of the length of the circle that the outline of the mask must cover."""
 POINTS_PER_PX = 1.27
-"""Outline points a pixel of a circle's length: 4/π crossings of the rows and columns of the grid, on average."""
+"""The outline points for each pixel of the length of a circle: 4/π crossings of the rows and columns of the grid on average."""
 
 
 def ball_from_mask(camera: Camera, coverage: np.ndarray, *, radius_m: float | None = None, z_m: float | None = None) -> Ball:
-    """The ball that a mask shows.
+    """Fit a ball to the outline of a mask by RANSAC.
 
-    Three random outline points at a time propose a circle (a cone for a perspective camera); the one with most points
-    within a pixel is kept and fitted to those (RANSAC, Fischler and Bolles 1981), so that a stand or a hole does not pull it.
+    Three random outline points propose a circle (a cone for a perspective camera). The circle with most points within a pixel is
+    fitted to these points, so that a stand or a hole does not influence it.
 
     Args:
-        coverage: [rows, cols], 0 outside to 1 inside; binary or anti-aliased.
-        radius_m, z_m: as `ball_from_outline` takes them.
+        camera: the camera of the image.
+        coverage: [rows, cols], from 0 outside to 1 inside, binary or anti-aliased.
+        radius_m, z_m: as in `ball_from_outline`.
 
     Raises:
         CalibrationError: the mask is empty, or its outline is no circle.
@@ -41,9 +46,9 @@ def ball_from_mask(camera: Camera, coverage: np.ndarray, *, radius_m: float | No
             ball = ball_from_outline(camera, outline[rng.choice(len(outline), 3, replace=False)], error_px=0.0)
         except CalibrationError:
             continue
-        near = np.abs(_distance_px(ball, camera, outline)) < INLIER_PX
-        if near.sum() > best.sum():
-            best, best_ball = near, ball
+        inliers = np.abs(_distance_px(ball, camera, outline)) < INLIER_PX
+        if inliers.sum() > best.sum():
+            best, best_ball = inliers, ball
     if best_ball is None:
         raise CalibrationError("the outline of the ball's mask lies on a line")
     for _ in range(3):  # the points near the fitted circle are a few more than those near the proposal
@@ -58,7 +63,7 @@ def ball_from_mask(camera: Camera, coverage: np.ndarray, *, radius_m: float | No
 
 
 def outline_points(coverage: np.ndarray) -> np.ndarray:
-    """Where a mask crosses one half between neighbouring pixel centres, by linear interpolation.
+    """Return the points at which a mask crosses one half between neighbouring pixel centres, by linear interpolation.
 
     Args:
         coverage: [rows, cols], 0 to 1.
@@ -78,7 +83,7 @@ def outline_points(coverage: np.ndarray) -> np.ndarray:
 
 
 def _distance_px(ball: Ball, camera: Camera, outline: np.ndarray) -> np.ndarray:
-    """How far outside the ball's outline image points lie, in pixels."""
+    """Return the distance of image points from the outline of a ball in pixels, positive outside."""
     origin, direction = lines_of_sight(camera, outline[:, 0], outline[:, 1])
     if camera.projection == "orthographic":
         distance = np.linalg.norm(origin[:, :2] - ball.centre[:2], axis=1) - ball.radius

@@ -4,7 +4,7 @@ A projector records no image, but the decoded patterns give the projector coordi
 this map is a homography of the plane of the board; fitted to the decoded pixels around the corner it gives the corner in the
 projector with sub-pixel accuracy. With corners in both images, each device is calibrated by Zhang's method, then their relative pose.
 
-Source: Moreno and Taubin, "Simple, accurate, and robust projector-camera calibration", 3DIMPVT 2012, section 3 (local homographies);
+Source: Moreno and Taubin, "Simple, accurate, and robust projector-camera calibration", 3DIMPVT 2012 (local homographies);
     Zhang, "A flexible new technique for camera calibration", TPAMI 22(11), 2000, section 3.
 
 Convention: image coordinates have pixel centres at halves. OpenCV's corners have them at whole numbers and get 0.5 added once, when

@@ -1,8 +1,11 @@
-"""The projector's light at each level, from images of evenly grey projections.
+"""The response of a projector, its light at each level, from images of uniformly grey projections.
 
-A camera pixel reads ambient + s · g(level): its own ambient and scale s, and one response g for all. Relative to the darkest and the
-brightest image every pixel says g directly; the median over the pixels that see the projector well is not disturbed by the others.
-The curve is then made to rise (least squares under that condition) and put on even levels.
+A camera pixel reads ambient + s · g(level) with an ambient light and a scale s of its own and one response g for all pixels. Relative
+to the darkest and the brightest image every pixel gives g directly; the response is the median over the pixels that see the projector
+well. A monotonic least-squares fit and interpolation to even levels follow.
+
+Source: Ayer et al., "An empirical distribution function for sampling with incomplete information", Annals of Mathematical Statistics
+    26(4), 1955 (pool adjacent violators).
 """
 
 from collections.abc import Sequence
@@ -13,35 +16,35 @@ import numpy as np
 from stage.errors import CalibrationError
 
 EVEN_LEVELS = 256
-"""Of the result: as many as an eight-bit projector has."""
+"""The count of levels of the response, which is that of an eight-bit projector."""
 LEAST_PART = 0.2
-"""Of the largest difference between brightest and darkest: pixels below it see too little of the projector."""
+"""The least difference between brightest and darkest image, relative to the largest, of a pixel that sees the projector well."""
 LEAST_STEP = 1e-6
-"""By which the curve rises from level to level at the least, so that it can be inverted."""
+"""The least rise of the response from level to level, so that it can be inverted."""
 MOST_PIXELS = 200_000
-"""That take part."""
+"""The most pixels that are used."""
 
 
 class Response(NamedTuple):
-    """A projector's response."""
+    """The response of a projector, and how well it fits the pixels."""
 
-    values: np.ndarray  # [256] float64 at even levels, 0 to 1, rising
+    values: np.ndarray  # [256] float64, light from 0 to 1 at even levels, rising
     gamma: float
-    """Exponent of the power law that is nearest."""
+    """The exponent of the nearest power law."""
     spread: float
-    """Median absolute deviation of the pixels from the curve, of full scale: how well one curve fits all."""
+    """The median absolute deviation of the pixels from the response, relative to full scale."""
 
 
 def fit_response(levels: Sequence[float], images: np.ndarray, *, usable: np.ndarray | None = None) -> Response:
-    """Fit the curve.
+    """Fit the response of a projector to images of uniform levels.
 
     Args:
-        levels: of each image, 0 to 1, no two alike; the darkest and the brightest must be 0 and 1.
-        images: [levels, pixels] float32 linear readings.
-        usable: [pixels] bool: not saturated in any; None: all.
+        levels: the level of each image, from 0 to 1, all different, with 0 and 1 among them.
+        images: [levels, pixels] float32, linear readings.
+        usable: [pixels] bool, True for pixels that saturate in no image; None for all.
 
     Raises:
-        CalibrationError: levels that cannot be, or the images do not get brighter with the level.
+        CalibrationError: the levels are invalid, or the images do not become brighter with the level.
     """
     order = np.argsort(levels)
     x = np.asarray(levels, dtype=np.float64)[order]
@@ -76,7 +79,7 @@ def fit_response(levels: Sequence[float], images: np.ndarray, *, usable: np.ndar
 
 
 def _rising(values: np.ndarray) -> np.ndarray:
-    """The nearest sequence that does not fall: pool adjacent violators (Ayer et al. 1955)."""
+    """Return the nearest sequence that does not fall, by pooling adjacent violators (Ayer et al. 1955)."""
     blocks: list[list[float]] = []
     for value in values:
         blocks.append([float(value), 1.0])

@@ -1,4 +1,4 @@
-"""Where readings stop following the light: the top of the histogram, when it piles up there."""
+"""The saturation level of a camera, from readings that accumulate at the top of the histogram of a capture."""
 
 from typing import NamedTuple
 
@@ -6,52 +6,56 @@ import numpy as np
 
 from stage.errors import CalibrationError
 
-BAND = 0.01
-"""Width of the bands that are compared, as a part of the largest value."""
+BIN = 0.01
+"""The width of the compared bins, relative to the largest value."""
 MIN_COUNT = 20
-"""Readings that make a pile: fewer may be the sparkle of one highlight."""
-PILE = 3.0
-"""A pile holds this many times what the two bands below it hold on average: a smooth histogram falls off towards its end."""
+"""The least count of saturated readings: fewer may belong to one highlight."""
+EXCESS = 3.0
+"""The least ratio of the readings in the top bin to the mean of the two bins below, because a smooth histogram falls towards its end."""
 
 
-class Pile(NamedTuple):
-    """What one channel's histogram says."""
+class ChannelSaturation(NamedTuple):
+    """The saturation of one channel."""
 
     level: float | None
-    """The value at and above which readings are saturated; None: nothing piles up."""
+    """The value at and above which readings are saturated, or None when none are."""
     readings: int
-    """Readings at or above it."""
+    """The count of readings at or above the level."""
 
 
 class TopHistogram:
-    """The top of the histogram of one channel over many images; `peak` must be known first."""
+    """The three topmost bins of the histogram of one channel over many images, whose largest value must be known."""
 
     def __init__(self, peak: float) -> None:
-        """Args: peak: the largest value of the channel in any of the images."""
+        """Start with empty bins.
+
+        Args:
+            peak: the largest value of the channel in all images.
+        """
         self.peak = peak
         self._counts = np.zeros(3, dtype=np.int64)
 
     def add(self, values: np.ndarray) -> None:
-        """Count recorded values of any shape."""
+        """Count the recorded values of an image, an array of any shape."""
         if self.peak > 0:
-            edges = self.peak * (1 - BAND * np.array([3, 2, 1]))
+            edges = self.peak * (1 - BIN * np.array([3, 2, 1]))
             above = [int((values >= edge).sum()) for edge in edges]
             self._counts += [above[2], above[1] - above[2], above[0] - above[1]]
 
-    def pile(self) -> Pile:
-        """Whether the last band holds more than those below it explain."""
+    def saturation(self) -> ChannelSaturation:
+        """Return the saturation of the channel: whether the top bin holds more readings than the bins below explain."""
         top, *below = (int(count) for count in self._counts)
-        piled = top >= MIN_COUNT and top > PILE * (sum(below) / len(below) + 1)
-        return Pile(self.peak * (1 - BAND) if piled else None, top if piled else 0)
+        saturated = top >= MIN_COUNT and top > EXCESS * (sum(below) / len(below) + 1)
+        return ChannelSaturation(self.peak * (1 - BIN) if saturated else None, top if saturated else 0)
 
 
-def suggest(piles: list[Pile]) -> float:
-    """The capture's saturation: the least level of any channel, since one number stands for all.
+def capture_saturation(channels: list[ChannelSaturation]) -> float:
+    """Return the saturation of a capture, one number for all channels: the least level of a channel, to four digits.
 
     Raises:
-        CalibrationError: no channel piles up.
+        CalibrationError: no channel saturates.
     """
-    levels = [pile.level for pile in piles if pile.level is not None]
+    levels = [channel.level for channel in channels if channel.level is not None]
     if not levels:
         raise CalibrationError("no channel piles up at its largest value: nothing shows where readings saturate")
     return float(f"{min(levels):.4g}")

@@ -1,9 +1,11 @@
-"""Lights of known direction and unknown brightness, from images of the object itself ("semi-calibrated" photometric stereo).
+"""Semi-calibrated photometric stereo: the brightness of lights of known direction from images of the object.
 
-Cho, Matsushita, Tai and Kweon, "Semi-Calibrated Photometric Stereo", TPAMI 2018: readings y_lp = e_l · l·b_p of a Lambertian
-surface are linear in q_l = 1/e_l and b_p together, q_l y_lp - l·b_p = 0. Here every b_p is eliminated in closed form, which
-leaves one small symmetric eigenvalue problem in q; weights take out shadows and highlights, and the last rounds alternate
-between b and e.
+Readings y_lp = e_l · l·b_p of a Lambertian surface are linear in q_l = 1/e_l and b_p together, q_l y_lp - l·b_p = 0. Every b_p is
+eliminated in closed form, which leaves one small symmetric eigenvalue problem in q. Weights exclude shadows and highlights, and the
+last rounds alternate between b and e.
+
+Source: Cho, Matsushita, Tai and Kweon, "Photometric stereo under non-uniform light intensities and exposures", ECCV 2016, and
+    "Semi-calibrated photometric stereo", TPAMI 42(1), 2020: the linear joint estimation and the alternating one.
 """
 
 from typing import NamedTuple
@@ -13,37 +15,39 @@ import numpy as np
 from stage.errors import CalibrationError
 
 MIN_LIGHTS = 4
-"""Two equations a light against eight unknowns of the ambiguity."""
+"""The least count of lights: each gives two equations for the eight unknowns of the ambiguity."""
 MIN_PIXELS = 30
+"""The least count of pixels that must show a light."""
 MIN_DETERMINED = 1e-3
-"""Least singular value of the equations for the ambiguity, relative to the largest: below it brightness is not determined."""
+"""The least relative singular value of the equations for the ambiguity: below it the brightness is not determined."""
 SHADOW = 0.1
-"""A reading under this part of the pixel's bright end, or of |b|, is shadow or grazing light."""
+"""A reading below this part of the bright readings of the pixel, or of |b|, is in shadow or grazing light."""
 WEIGHT_SCALE = 2.385
-"""Cauchy weights, as in grey_ball."""
+"""The scale of the Cauchy weights, as in grey_ball."""
 BRIGHT_END = 0.9
-"""Quantile of a pixel's readings that stands for its brightest one."""
+"""The quantile of the readings of a pixel that stands for its brightest one."""
 ROUNDS = 60
+"""The most rounds."""
 LINEAR_ROUNDS = range(6, 12)
-"""Of the rounds, those that solve the eigenvalue problem."""
+"""The rounds that solve the eigenvalue problem."""
 CONVERGED = 1e-4
-"""Largest relative change of any light in a round: a hundredth of what real surfaces leave in doubt."""
+"""The largest relative change of a light in the last round, a hundredth of the uncertainty on real surfaces."""
 TINY = 1e-200
-"""Below any reading: against division by zero."""
+"""A number below any reading, which avoids division by zero."""
 
 
 class Intensities(NamedTuple):
-    """Brightness of each light; NaN for a light that too few pixels show, because it is behind the object or dark."""
+    """The brightness of each light; NaN for a light that too few pixels show, because it is behind the object or dark."""
 
-    irradiance: np.ndarray  # [lights, 3] float64, mean 1 over the lights that are told in every channel
+    irradiance: np.ndarray  # [lights, 3] float64, mean 1 over the measured lights in each channel
     residual: np.ndarray  # [lights, 3] float64, weighted root mean square of the residual over |b|
     uncertainty: np.ndarray  # [lights, 3] float64, standard error relative to the value, from that residual
     pixels: int
-    """Pixels that took part."""
+    """The count of pixels that were used."""
 
 
 class _UnlitError(Exception):
-    """Lights that too few pixels show."""
+    """Too few pixels show these lights."""
 
     def __init__(self, lights: np.ndarray) -> None:
         super().__init__(lights)
@@ -51,15 +55,15 @@ class _UnlitError(Exception):
 
 
 def fit_intensities(readings: np.ndarray, usable: np.ndarray, directions: np.ndarray) -> Intensities:
-    """Irradiance of every light, up to one factor a channel.
+    """Measure the irradiance of every light, up to one factor in each channel.
 
     Args:
         readings: [lights, pixels, 3] scene-linear radiance of pixels of the object.
-        usable: [lights, pixels] bool, unsaturated.
+        usable: [lights, pixels] bool, True for unsaturated readings.
         directions: [lights, 3] unit.
 
     Raises:
-        CalibrationError: too few lights or pixels, or directions that do not determine the brightness.
+        CalibrationError: there are too few lights or pixels, or the directions do not determine the brightness.
     """
     check_directions(directions)
     told = np.arange(len(directions))
@@ -78,13 +82,13 @@ def fit_intensities(readings: np.ndarray, usable: np.ndarray, directions: np.nda
 
 
 def check_directions(directions: np.ndarray) -> None:
-    """Refuse directions under which brightness and shape cannot be told apart.
+    """Check that the directions of the lights determine their brightness.
 
-    Another brightness e' explains the same images when there is a 3×3 matrix G with Gᵀ l parallel to l for every light; only
-    multiples of the identity are harmless. l × Gᵀ l = 0 is linear in G: its null space must have one dimension.
+    Another brightness explains the same images when there is a 3×3 matrix G, other than a multiple of the identity, with Gᵀ l
+    parallel to l for every light. l × Gᵀ l = 0 is linear in G, so its null space must have one dimension.
 
     Raises:
-        CalibrationError: fewer than four lights, or lights in one plane but for one.
+        CalibrationError: there are fewer than four lights, or all lights but one lie in one plane.
     """
     if len(directions) < MIN_LIGHTS:
         raise CalibrationError(f"{len(directions)} distant lights: brightness needs {MIN_LIGHTS} or more")
@@ -99,9 +103,9 @@ def check_directions(directions: np.ndarray) -> None:
 
 def _fit_channel(reading: np.ndarray, usable: np.ndarray, directions: np.ndarray,
                  name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
-    """Irradiance [lights] of one channel with its residual, its uncertainty and the count of pixels.
+    """Return the irradiance [lights] of one channel, its residual, its uncertainty, and the count of pixels.
 
-    Channels are fitted apart: under lights of different colours the grey of a coloured surface is no product of the two.
+    Each channel is fitted alone: under lights of different colours the grey of a coloured surface is no product of light and albedo.
     """
     lit = usable & (reading > 0)
     enough = lit.sum(axis=0) >= MIN_LIGHTS
@@ -110,7 +114,7 @@ def _fit_channel(reading: np.ndarray, usable: np.ndarray, directions: np.ndarray
         raise CalibrationError(f"channel {name}: {count} pixels are lit and unsaturated under {MIN_LIGHTS} or more lights: "
                                f"{MIN_PIXELS} are needed")
     reading, lit = reading[:, enough], lit[:, enough]
-    reading = reading / np.where(lit, reading, 0).max(axis=0)  # every pixel counts alike, however dark its albedo
+    reading = reading / np.where(lit, reading, 0).max(axis=0)  # so that pixels of dark albedo have the same weight
     e, weight = np.ones(len(directions)), lit.astype(np.float64)
     for step in range(ROUNDS):
         weight = _weights(reading, lit, e, directions, weight)
@@ -118,7 +122,7 @@ def _fit_channel(reading: np.ndarray, usable: np.ndarray, directions: np.ndarray
         if unlit.any():
             raise _UnlitError(np.flatnonzero(unlit))
         before = e
-        # the first rounds only alternate: they are slow to converge, but highlights cannot make them negative
+        # the first rounds alternate: they converge slowly, but highlights cannot make them negative
         e = _linear(reading, weight, directions, e) if step in LINEAR_ROUNDS else e
         b = _normals(reading / e[:, None], weight * e[:, None] ** 2, directions)
         e = _scale(reading, directions @ b, weight)
@@ -132,9 +136,9 @@ def _fit_channel(reading: np.ndarray, usable: np.ndarray, directions: np.ndarray
 
 
 def _linear(reading: np.ndarray, weight: np.ndarray, directions: np.ndarray, e: np.ndarray) -> np.ndarray:
-    """e from the least of q D Σ_p w_p y_p (I - projection on the lights) y_p D q, D each light's own (Σ w y²)^-1/2, q = 1/e.
+    """Return e = 1/q from the minimum of q D Σ_p w_p y_p (I - projection on the lights) y_p D q, with D = (Σ w y²)^-1/2 of each light.
 
-    The given `e` where the result is negative: outliers are not out yet.
+    A negative result, which outliers cause in early rounds, is replaced by the given `e`.
     """
     gram = _gram(weight, directions)
     values, vectors = np.linalg.eigh(gram)
@@ -147,7 +151,7 @@ def _linear(reading: np.ndarray, weight: np.ndarray, directions: np.ndarray, e: 
 
 
 def _weights(reading: np.ndarray, lit: np.ndarray, e: np.ndarray, directions: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Cauchy weights of the residual over |b|, from the weights before; zero in shadow, as readings and as the model say."""
+    """Return Cauchy weights of the residual over |b| from the last weights; 0 where the readings or the model show a shadow."""
     scaled = reading / e[:, None]
     top = np.quantile(np.where(lit, scaled, 0), BRIGHT_END, axis=0)
     bright = lit & (scaled > SHADOW * top)
@@ -162,18 +166,18 @@ def _weights(reading: np.ndarray, lit: np.ndarray, e: np.ndarray, directions: np
 
 
 def _normals(scaled: np.ndarray, weight: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """b of every pixel by weighted least squares, [3, pixels]."""
+    """Return b of every pixel [3, pixels] by weighted least squares."""
     gram = _gram(weight, directions)
     gram += (1e-12 * np.trace(gram, axis1=1, axis2=2) + TINY)[:, None, None] * np.eye(3)  # pixels of no weight get no b
     return np.linalg.solve(gram, ((weight * scaled).T @ directions)[:, :, None])[:, :, 0].T
 
 
 def _gram(weight: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Normal equations of every pixel, [pixels, 3, 3]."""
+    """Return the normal equations of every pixel [pixels, 3, 3]."""
     outer = (directions[:, :, None] * directions[:, None, :]).reshape(-1, 9)
     return (weight.T @ outer).reshape(-1, 3, 3)
 
 
 def _scale(reading: np.ndarray, model: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Least squares factor of each light's readings on its model, [lights]."""
+    """Return the least-squares factor [lights] between the readings of each light and the model."""
     return (weight * reading * model).sum(axis=1) / (weight * model**2).sum(axis=1)

@@ -1,1 +1,1 @@
-"""Moving subjects: tracking frames → optical flow → lit frames as they would look at one common time."""
+"""Alignment of the frames of a moving subject to one common time, by optical flow between tracking frames."""

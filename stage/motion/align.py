@@ -1,9 +1,11 @@
-"""Lit frames of a moving subject → the same frames as at the time of one tracking frame.
+"""Alignment of the lit frames of a moving subject to the time of one tracking frame, the reference.
 
-The flow from the reference tracking frame to each other one says where every point of the subject was at their times;
-between two of them it moved evenly along a straight line (Wenger et al. 2005, Performance relighting and reflectance
-transformation with time-multiplexed illumination; Guo et al. 2019, The Relightables). All of this lies on the pixels of the
-reference, so that no flow is inverted or chained.
+The optical flow from the reference to every other tracking frame gives the position of each point of the subject at their times;
+between two tracking frames a point is taken to move evenly along a straight line. Flow is defined on the pixels of the reference, so
+that no flow is inverted or chained.
+
+Source: Wenger et al., "Performance relighting and reflectance transformation with time-multiplexed illumination", SIGGRAPH 2005;
+    Guo et al., "The Relightables", SIGGRAPH Asia 2019.
 """
 
 from collections.abc import Callable, Iterator
@@ -21,22 +23,28 @@ if TYPE_CHECKING:
     from stage.motion.flow import Flow
 
 VERSION = 1
-"""Raised when the arithmetic changes, so that older caches are rebuilt."""
+"""The version of the alignment; a change of the arithmetic raises it, so that older caches are rebuilt."""
 DARKEST = 0.05
-"""Of another tracking frame's brightness: a frame below it was not lit by every light."""
+"""The least brightness of a tracking frame relative to another one: a darker frame was not lit by all lights."""
 
 Warp = Callable[[int, Radiance], Radiance]
-"""Called with a light's place in the stack and its corrected image; `saturated` of what it gives is where there is no reading."""
+"""A function from the index of a light in the stack and its corrected image to the aligned image, whose `saturated` is True where no
+reading exists."""
 
 
 class Alignment:
-    """Warps the frames of a stack, one tracking interval at a time: two flows are held, however long the capture is."""
+    """The alignment of the frames of a stack, one tracking interval at a time, so that two flows at most are in memory."""
 
     def __init__(self, capture: Capture, tracking: Tracking, frames: list[Frame]) -> None:
-        """Args: the capture, its tracking frames, and the frames of its stack.
+        """Assign the frames of a stack to the intervals between tracking frames.
+
+        Args:
+            capture: an opened capture.
+            tracking: its tracking frames.
+            frames: the frames of its stack.
 
         Raises:
-            ManifestError: a frame lies too far outside the tracking frames; names it.
+            ManifestError: a frame lies too far outside the tracking frames; the message names it.
         """
         self._tracking = tracking
         self._mask = capture.mask()
@@ -45,42 +53,42 @@ class Alignment:
         self._lost: list[int] = []
 
     def batches(self, correction: Correction) -> Iterator[tuple[tuple[int, ...], Warp]]:
-        """The lights of one interval after the other, with what warps their images; a warp may be called from several threads.
+        """Yield the lights of one interval after another with the warp of their images, which several threads may call.
 
         Args:
-            correction: of the capture; tracking frames go through it like all others.
+            correction: the correction of the capture, which tracking frames need too.
 
         Raises:
-            ImageError: a tracking frame is unreadable, or dark; names the file.
+            ImageError: a tracking frame is unreadable, or dark; the message names the file.
         """
-        from stage.motion import flow  # OpenCV takes 0.15 s to load, which a subject that stands still need not wait for
+        from stage.motion import flow  # OpenCV takes 0.15 s to load, which only aligned captures need
 
         frames, middle = self._tracking.frames, self._tracking.reference
         white: dict[int, float] = {}
 
-        def look(index: int) -> np.ndarray:
+        def tracking_image(index: int) -> np.ndarray:
             radiance = correction.apply(frames[index]).pixels
             white[index] = flow.white_level(radiance, self._mask)
             dim, bright = sorted((index, middle), key=lambda one: white[one])
             if white[dim] <= DARKEST * white[bright]:
                 path = correction.capture.file(frames[dim].image)
                 raise ImageError(f"{path}: is dark inside the mask: a tracking frame shows the subject under every light")
-            return flow.display(radiance, white[index])  # each by its own white: flashes differ
+            return flow.display(radiance, white[index])  # each frame by its own white level, because flashes differ
 
-        reference = look(middle)
+        reference = tracking_image(middle)
         still = flow.Flow(np.zeros((*self._mask.shape, 2), np.float32), np.ones(self._mask.shape, bool))
         last, later = still, True
         for interval in self._intervals:
-            if later and interval.first < middle:  # from the reference backwards now
+            if later and interval.first < middle:  # now backwards in time from the reference
                 last, later = still, False
-            guess = None if last is still else flow.carry_on(last, self._mask)
-            near, last = last, flow.match(reference, look(interval.first + later), guess)
-            begin, end = (near, last) if later else (last, near)
+            guess = None if last is still else flow.extrapolate(last, self._mask)
+            previous, last = last, flow.find_flow(reference, tracking_image(interval.first + later), guess)
+            begin, end = (previous, last) if later else (last, previous)
             self._note(interval, begin, end)
             yield interval.lights, self._warp(interval, begin, end)
 
     def statistics(self) -> dict[str, Any]:
-        """What the report says, once all batches are done."""
+        """Return the statistics for the report, when all batches are done."""
         parts = [part for interval in self._intervals for part in interval.fractions]
         return {
             "reference": self._tracking.frames[self._tracking.reference].image,

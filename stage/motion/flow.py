@@ -1,4 +1,4 @@
-"""Dense optical flow between two tracking frames, and where it can be trusted."""
+"""Dense optical flow between two tracking frames, and the pixels at which it is reliable."""
 
 from typing import Any, NamedTuple
 
@@ -9,39 +9,40 @@ from stage.colour import GREY_WEIGHTS
 from stage.motion.resample import bicubic, lookup, positions
 
 DISAGREEMENT_PX = 0.5
-"""Forward and backward flow that miss each other by more are not the same point: half a pixel is a visible smear, and seven times
+"""The largest distance between a point and its image under forward and backward flow: half a pixel is a visible blur, and seven times
 the median error on textured objects that turn by 5° (tests/stage/motion)."""
 WHITE_PERCENTILE = 99.0
-"""The brightest percent of the subject are highlights, which do not move with it; white lies a little above what they leave."""
+"""The percentile that stands for white: the brightest percent of the subject are highlights, which do not move with it."""
 HEADROOM = 1.25
+"""The radiance that is shown as 255, relative to the white level."""
 DISPLAY_GAMMA = 2.2
-"""Flow is found on display-like values: equal steps are then equally visible, so eight bits hold shade as well as light."""
+"""The exponent of the display-encoded images on which flow is found: their eight bits resolve dark and bright parts equally."""
 REFINEMENTS = 10
-"""Fixed-point iterations of the float refinement; 30 gain less than a hundredth of a pixel."""
+"""The fixed-point iterations of the variational refinement; 30 iterations gain less than a hundredth of a pixel."""
 SMOOTH_PX, FAINT = 4.0, 1e-3
-"""A guess goes on beyond the pixels it is known from by a Gaussian of half of the search's patch, and far from them as their
-median, which counts for a thousandth."""
+"""The standard deviation of the Gaussian that extrapolates a flow, half the patch of the search, and the weight of the median flow,
+which remains far from all known pixels."""
 
 
 class Flow(NamedTuple):
-    """Where the points of the reference frame lie in another frame."""
+    """The displacement of every pixel of the reference frame to another frame."""
 
     displacement: np.ndarray  # [rows, cols, 2] float32, pixels right and down
-    known: np.ndarray  # [rows, cols] bool; False where it leads out of the image or the backward flow does not lead back
+    known: np.ndarray  # [rows, cols] bool; False where it leads out of the image, or the backward flow does not return
 
 
 def white_level(radiance: np.ndarray, mask: np.ndarray) -> float:
-    """How bright the subject is, highlights aside.
+    """Return the brightness of the subject without its highlights, the WHITE_PERCENTILE of its grey values.
 
     Args:
         radiance: [rows, cols, 3] float32, linear.
-        mask: [rows, cols] bool.
+        mask: [rows, cols] bool, True on the subject.
     """
     return float(np.percentile(radiance[mask] @ np.asarray(GREY_WEIGHTS, dtype=np.float32), WHITE_PERCENTILE))
 
 
 def display(radiance: np.ndarray, white: float) -> np.ndarray:
-    """A linear image as flow is found on it: grey, `white` a little below the top, gamma-encoded.
+    """Return the image on which flow is found: grey, gamma-encoded, with `white` somewhat below 255.
 
     Returns:
         [rows, cols] float32, 0 to 255.
@@ -50,21 +51,22 @@ def display(radiance: np.ndarray, white: float) -> np.ndarray:
     return 255 * np.clip(grey / np.float32(HEADROOM * white), 0, 1) ** np.float32(1 / DISPLAY_GAMMA)
 
 
-def match(reference: np.ndarray, other: np.ndarray, guess: np.ndarray | None = None) -> Flow:
-    """Follow every point of one frame into another.
+def find_flow(reference: np.ndarray, other: np.ndarray, guess: np.ndarray | None = None) -> Flow:
+    """Find the optical flow from the reference frame to another frame.
 
-    The search shifts patches and does not turn them: with a guess the other frame is first warped by it, and what is searched is
-    the rest. So a subject may turn by any angle in small steps, and errors do not add up over them.
+    The search shifts patches and does not rotate them. With a guess the other frame is warped by it first, and the remaining
+    displacement is searched. A subject may therefore turn by any angle in small steps, and errors do not accumulate.
 
     Args:
         reference: [rows, cols] float32, from `display`.
-        other: the same of the other frame.
-        guess: [rows, cols, 2] float32, a displacement near the one sought, from `carry_on`.
+        other: the same for the other frame.
+        guess: [rows, cols, 2] float32, an approximate displacement from `extrapolate`, or None.
 
     Source:
-        Kroeger et al. 2016, Fast optical flow using dense inverse search (OpenCV's, at full resolution), then OpenCV's
-        variational refinement (Brox et al. 2004) on the float images, which are finer than the eight bits of the search.
-        Forward-backward agreement as in Sundaram et al. 2010, with a fixed bound.
+        Kroeger et al., "Fast optical flow using dense inverse search", ECCV 2016 (OpenCV's, at full resolution), then the variational
+        refinement of Brox et al., "High accuracy optical flow estimation based on a theory for warping", ECCV 2004 (OpenCV's), on
+        the float images, which are finer than the eight bits of the search. Forward-backward check: Sundaram et al., "Dense point
+        trajectories by GPU-accelerated large displacement optical flow", ECCV 2010, here with a fixed bound.
     """
     if guess is not None:
         other = bicubic(other, *positions(guess)[:2])
@@ -78,12 +80,12 @@ def match(reference: np.ndarray, other: np.ndarray, guess: np.ndarray | None = N
     return Flow(whole, known & positions(whole)[2])
 
 
-def carry_on(flow: Flow, mask: np.ndarray) -> np.ndarray:
-    """The flow to one tracking frame as a guess for the next: where it is known on the subject, and smoothly on around that.
+def extrapolate(flow: Flow, mask: np.ndarray) -> np.ndarray:
+    """Extrapolate the flow to one tracking frame from its known pixels to the whole image, as a guess for the next tracking frame.
 
     Args:
-        flow: to the frame nearer in time.
-        mask: [rows, cols] bool, where the subject is.
+        flow: the flow to the tracking frame before the next one.
+        mask: [rows, cols] bool, True on the subject.
 
     Returns:
         [rows, cols, 2] float32.

@@ -1,6 +1,6 @@
-"""Backward warping: an image read at positions between its pixels.
+"""Backward warping of images: interpolation at positions between pixels.
 
-Positions here are those of array elements, (0, 0) the centre of the first pixel.
+Positions are in array elements: (0, 0) is the centre of the first pixel.
 """
 
 import cv2
@@ -8,14 +8,13 @@ import numpy as np
 
 
 def positions(displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where a displacement leads from every pixel.
+    """Return the position to which a displacement moves every pixel.
 
     Args:
         displacement: [rows, cols, 2] float32, pixels right and down.
 
     Returns:
-        x and y, [rows, cols] float32, brought to the nearest edge where they lie outside the image; and [rows, cols] bool,
-        whether they lie inside.
+        x and y, [rows, cols] float32, clamped to the image, and [rows, cols] bool, True where they lie inside the image.
     """
     rows, cols = displacement.shape[:2]
     x = displacement[..., 0] + np.arange(cols, dtype=np.float32)
@@ -25,16 +24,16 @@ def positions(displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 
 def lookup(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Bilinear reading; OpenCV's is exact in float from version 5 on, before that it rounded positions to 1/32 pixel."""
+    """Interpolate an image bilinearly; OpenCV does so exactly in float from version 5 on, and rounded to 1/32 pixel before."""
     return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
 def bicubic(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Bicubic reading with the kernel of Catmull and Rom, the cubic one that is exact on quadratic images.
+    """Interpolate an image with the bicubic kernel of Catmull and Rom, which is exact on quadratic images.
 
-    In one dimension it is the linear reading of p less q times the linear reading of p's second difference, q = f(1 - f)/2 with f
-    the fraction of the position: so in two dimensions four bilinear readings, and no gathering of sixteen values in NumPy.
-    (OpenCV's own cubic kernel, a = -0.75, is not exact even on a ramp: it is off by up to 0.05 pixels.)
+    In one dimension the result is the linear interpolation of the image minus q times that of its second difference, with
+    q = f(1 - f)/2 and f the fraction of the position. Two dimensions take four bilinear interpolations instead of sixteen gathered
+    values in NumPy. OpenCV's cubic kernel, a = -0.75, is wrong by up to 0.05 pixels even on a ramp.
 
     Args:
         image: [rows, cols] or [rows, cols, 3] float32.
@@ -42,10 +41,10 @@ def bicubic(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         y: the same.
 
     Returns:
-        As the image.
+        The interpolated values, in the shape of the image.
 
     Source:
-        Keys 1981, Cubic convolution interpolation for digital image processing, eq. 15 (a = -1/2).
+        Keys, "Cubic convolution interpolation for digital image processing", IEEE Trans. ASSP 29(6), 1981, eq. 15 (a = -1/2).
     """
     second = np.array([[1, -2, 1]], dtype=np.float32)
     across = cv2.filter2D(image, -1, second, borderType=cv2.BORDER_REPLICATE)
@@ -57,7 +56,7 @@ def bicubic(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def touched(flags: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Whether any of the sixteen pixels that a bicubic reading may take is flagged.
+    """Return whether any of the sixteen pixels of a bicubic interpolation is flagged.
 
     Args:
         flags: [rows, cols] bool.
@@ -67,5 +66,5 @@ def touched(flags: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     Returns:
         [rows, cols] bool.
     """
-    near = cv2.dilate(flags.astype(np.uint8), np.ones((4, 4), np.uint8), anchor=(1, 1))  # one before to two behind
-    return np.asarray(near[y.astype(np.intp), x.astype(np.intp)] > 0)
+    dilated = cv2.dilate(flags.astype(np.uint8), np.ones((4, 4), np.uint8), anchor=(1, 1))  # one pixel before to two after
+    return np.asarray(dilated[y.astype(np.intp), x.astype(np.intp)] > 0)

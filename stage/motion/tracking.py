@@ -1,6 +1,6 @@
-"""Which frames follow a moving subject, and between which two of them each other frame lies.
+"""The tracking frames of a capture, and the intervals between them in which its other frames lie.
 
-Frames follow each other in time as they do in the manifest, at even steps.
+The frames of a manifest are taken to be in order of time, at equal time steps.
 """
 
 from typing import NamedTuple
@@ -11,10 +11,10 @@ from stage.light import FullLight
 from stage.manifest import FILE_NAME, Frame
 
 SIDE_MIN_PX, SIDE_MAX_PX = 16, 32766
-"""Of the image: two of the search's patches each way, and what OpenCV can address."""
+"""The least side of an image, two patches of the flow search, and the largest side, which OpenCV can address."""
 EXTRAPOLATION = 1.0
-"""How far a frame may lie before the first tracking frame or after the last, in tracking intervals: the subject is taken to move
-on as it did, which is a guess that one interval bounds."""
+"""The tracking intervals that a frame may lie before the first or after the last tracking frame: the motion of the subject is
+extrapolated there."""
 
 
 class Tracking(NamedTuple):
@@ -22,31 +22,31 @@ class Tracking(NamedTuple):
 
     frames: tuple[Frame, ...]
     times: tuple[int, ...]
-    """Of each: its place in the manifest."""
+    """The index of each tracking frame in the manifest."""
     reference: int
-    """Which of `frames` shows the common time."""
+    """The index in `frames` of the tracking frame to whose time all frames are aligned."""
 
 
 class Interval(NamedTuple):
-    """What lies between two neighbouring tracking frames."""
+    """The frames between two consecutive tracking frames."""
 
     first: int
-    """Of the two tracking frames, the earlier; the other is the next."""
+    """The index of the earlier tracking frame; the later one is the next."""
     lights: tuple[int, ...]
-    """Frames of the stack, by their place in it."""
+    """The indices of the frames in the stack."""
     fractions: tuple[float, ...]
-    """When each was taken: 0 at the first tracking frame, 1 at the next; below 0 or above 1 only outside all of them."""
+    """The time of each frame, from 0 at the earlier to 1 at the later tracking frame; outside all tracking frames below 0 or above 1."""
 
 
 def tracking_frames(capture: Capture, *, to: str | None = None) -> Tracking:
-    """The frames that every light lit.
+    """Return the tracking frames of a capture, which all lights lit.
 
     Args:
         capture: an opened capture.
-        to: image of the tracking frame that shows the common time; None: the middle one, the later of two.
+        to: the image of the tracking frame to align to; None stands for the middle one, and the later of two middle ones.
 
     Raises:
-        ManifestError: fewer than two, or `to` is none of them, or the image is too small or too large to be followed.
+        ManifestError: there are fewer than two, `to` is none of them, or the images are too small or too large for optical flow.
     """
     where = capture.folder / FILE_NAME
     times = tuple(index for index, frame in enumerate(capture.manifest.frames) if isinstance(frame.light, FullLight))
@@ -65,10 +65,10 @@ def tracking_frames(capture: Capture, *, to: str | None = None) -> Tracking:
 
 
 def intervals(capture: Capture, tracking: Tracking, frames: list[Frame]) -> list[Interval]:
-    """The frames of a stack by the interval they lie in, intervals outward from the reference: first later, then earlier ones.
+    """Return the intervals with their frames of a stack: from the reference on in time, then from the reference backwards.
 
     Raises:
-        ManifestError: a frame lies too far outside the tracking frames; names it.
+        ManifestError: a frame lies too far outside the tracking frames; the message names it.
     """
     time_of = {frame.image: time for time, frame in enumerate(capture.manifest.frames)}
     members: list[list[tuple[int, float]]] = [[] for _ in tracking.times[1:]]

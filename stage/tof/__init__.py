@@ -1,1 +1,1 @@
-"""Time of flight as files and devices give it: raw frames, calibration tables, shots and tracks, and a simulator."""
+"""Time of flight: raw frames, calibration tables, laser scans with their tracks, and a simulator of raw frames."""

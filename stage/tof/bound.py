@@ -1,4 +1,4 @@
-"""How well a photon histogram can tell range at all: the Cramér-Rao bound, to plan a pulsed camera and to judge a decoder."""
+"""The Cramér-Rao bound of the range from a photon histogram, with which a pulsed camera is planned and a decoder is judged."""
 
 from dataclasses import replace
 
@@ -8,22 +8,22 @@ from stage.tof.light_time import SPEED_OF_LIGHT
 from stage.tof.simulate import HistogramCamera, TofScene, histograms
 
 MEDIAN_PER_SIGMA = 0.674490
-"""Median of |error| over its standard deviation, of a normal error."""
+"""The median of the absolute error over its standard deviation, for a normal error."""
 
 
 def range_bound_m(scene: TofScene, camera: HistogramCamera) -> np.ndarray:
-    """The least standard deviation that an unbiased estimate of each pixel's range can have.
+    """Return the least standard deviation that an unbiased estimate of the range of each pixel can have.
 
     With λ the mean of each bin, t the time of the return and s its photons, σ² ≥ 1/(F_tt - F_ts²/F_ss), F_xy = Σ λ_x·λ_y·w over the bins;
-    w is 1/λ for Poisson counts. Without background and with fine bins that is σ ≥ (c/2)·pulse_sigma_s/√s. Of N pulses that count one
-    photon at most, those still awake are the part a, and w is a/(N·(e^(λ/N) - 1)).
+    w is 1/λ for Poisson counts. Without background and with fine bins that is σ ≥ (c/2)·pulse_sigma_s/√s. When each of N pulses
+    counts one photon at most, a is the part of the pulses without an earlier photon, and w is a/(N·(e^(λ/N) - 1)).
 
     Args:
-        scene: range, albedo, cosine; the bound is that of the first return, with a second one known.
-        camera: bins, pulse, photons, background (taken as known), pulses.
+        scene: range, albedo and cosine; the bound is that of the first return, when the second return is known.
+        camera: bins, pulse, photons, background (which is known) and pulses.
 
     Returns:
-        [rows, cols] float64 metres; infinite where no light of the return falls into the histogram.
+        [rows, cols] float64 metres; infinite where the histogram contains no light of the return.
 
     Source:
         Bar-David, "Communication under the Poisson regime", IEEE Trans. Information Theory 15(1), 1969; Kay, "Fundamentals of

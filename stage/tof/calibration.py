@@ -1,4 +1,4 @@
-"""What is known about a time-of-flight camera, schema relit.tof/1: noise, wiggling, offset, drift, pulse; and the fits that make it."""
+"""The calibration of a time-of-flight camera, schema relit.tof/1 (noise, wiggling, offset, drift, pulse), and its fits."""
 
 import json
 from pathlib import Path
@@ -15,20 +15,20 @@ from stage.tof.light_time import SPEED_OF_LIGHT
 
 SCHEMA = "relit.tof/1"
 HARMONICS = 12
-"""Highest harmonic of the wiggling that is fitted: four phases fold the third and fifth of the light into the fourth, the seventh and
-ninth into the eighth, and their products with each other into the twelfth; a third harmonic of 8 % leaves 1.5 mrad beyond."""
+"""The highest harmonic of the wiggling that is fitted: four phases alias the third and fifth harmonic of the light to the fourth, the
+seventh and ninth to the eighth, and their products to the twelfth; a third harmonic of 8 % leaves 1.5 mrad beyond."""
 SWEEP_PART = 0.5
-"""Of a turn that a sweep must cover in a frequency: a table from less is extrapolated over most of it."""
+"""The part of a period that a sweep must cover: a table from less would be extrapolated over most of the period."""
 
 
 class Harmonics(Strict):
-    """Wiggling of one frequency: measured phase less true phase is Σ cos[h]·cos hφ + sin[h]·sin hφ, φ the measured phase."""
+    """The wiggling at one frequency: the error of a measured phase φ is Σ cos[h]·cos hφ + sin[h]·sin hφ over the harmonics h."""
 
     modulation_hz: Positive
     cos: Annotated[tuple[float, ...], Field(min_length=1)]
-    """Radians, h from 0: the first is a constant offset."""
+    """The cosine terms in radians, for h from 0; the first is a constant offset."""
     sin: Annotated[tuple[float, ...], Field(min_length=1)]
-    """Radians, as many; the first has no effect."""
+    """The sine terms in radians, as many as cosine terms; the first has no effect."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -38,14 +38,14 @@ class Harmonics(Strict):
 
 
 class Temperature(Strict):
-    """Drift of the range with temperature."""
+    """The drift of the range with temperature, linear about a reference temperature."""
 
     reference_c: float
     metres_per_c: float
 
 
 class PulseShape(Strict):
-    """Samples of the pulse as the detector records it; time 0 is that of a return at no distance."""
+    """Samples of the pulse as the detector records it; time 0 is that of a return from distance 0."""
 
     time_s: Annotated[tuple[float, ...], Field(min_length=3)]
     power: Annotated[tuple[NotNegative, ...], Field(min_length=3)]
@@ -61,11 +61,11 @@ class PulseShape(Strict):
 
 
 class TofCalibration(Strict):
-    """Everything is optional: what is not given is estimated from the capture (noise, pulse) or left out."""
+    """The calibration of a time-of-flight camera. Missing noise and pulse are estimated from the capture, the rest is not corrected."""
 
     schema_: Literal["relit.tof/1"] = Field(alias="schema", default="relit.tof/1")
     electrons_per_unit: Positive | None = None
-    """Photoelectrons of a recorded value of one."""
+    """The photoelectrons of a recorded value of 1."""
     read_noise_electrons: NotNegative | None = None
     harmonics: tuple[Harmonics, ...] = ()
     scale: Positive = 1.0
@@ -73,7 +73,7 @@ class TofCalibration(Strict):
     """True range = scale · measured - offset_m - temperature drift."""
     temperature: Temperature | None = None
     pulse_sigma_s: Positive | None = None
-    """Standard deviation of a Gaussian pulse, the detector's jitter included."""
+    """The standard deviation of a Gaussian pulse, including the jitter of the detector."""
     pulse: PulseShape | None = None
 
     @model_validator(mode="after")
@@ -88,14 +88,18 @@ class TofCalibration(Strict):
         return self
 
     def of_frequency(self, modulation_hz: float) -> Harmonics | None:
-        """The wiggling at a frequency, where it is known (to a part in 10⁶)."""
+        """Return the wiggling at a frequency, which must agree to 1 part in 10⁶, or None when it is unknown."""
         return next((h for h in self.harmonics if abs(h.modulation_hz - modulation_hz) <= 1e-6 * modulation_hz), None)
 
     def correct(self, range_m: np.ndarray, temperature_c: float | None = None) -> np.ndarray:
-        """Scale, offset and drift taken out of measured ranges, metres.
+        """Return measured ranges in metres, corrected for scale, offset and drift.
+
+        Args:
+            range_m: measured ranges of any shape.
+            temperature_c: the temperature of the camera, for a calibration with drift.
 
         Raises:
-            CalibrationError: a temperature is given and the calibration has no drift, or the other way round.
+            CalibrationError: a temperature is given without drift in the calibration, or missing with it.
         """
         if (temperature_c is None) != (self.temperature is None):
             what = "no temperature drift, and a temperature was given" if self.temperature is None else "a temperature drift"
@@ -107,36 +111,36 @@ class TofCalibration(Strict):
 
 
 def read_calibration(path: str | Path) -> TofCalibration:
-    """Read a calibration.
+    """Read a relit.tof/1 file.
 
     Raises:
-        ManifestError: a field is wrong; names file and field.
-        StorageError: it cannot be read.
+        ManifestError: a field is wrong; the message names file and field.
+        StorageError: the file cannot be read.
     """
     return read_record(path, TofCalibration, SCHEMA)
 
 
 def write_calibration(calibration: TofCalibration, path: str | Path) -> None:
-    """Write a calibration, whole or not at all.
+    """Write a relit.tof/1 file whole or not at all.
 
     Raises:
-        StorageError: it cannot be written.
+        StorageError: the file cannot be written.
     """
     data = {"schema": SCHEMA, **calibration.model_dump(mode="json", exclude_defaults=True, exclude={"schema_"})}
     write_text(path, json.dumps(data, indent=2) + "\n")
 
 
 def fit_harmonics(phase_rad: np.ndarray, range_m: np.ndarray, modulation_hz: float, *, highest: int = HARMONICS) -> Harmonics:
-    """The wiggling table of a frequency from a sweep over known ranges.
+    """Fit the wiggling at one frequency to phases that were measured at known ranges.
 
     Args:
-        phase_rad: [n] measured phases.
-        range_m: [n] true ranges along the ray.
-        modulation_hz: of the sweep.
-        highest: harmonic.
+        phase_rad: [n] measured phases, radians.
+        range_m: [n] true ranges along the ray, metres.
+        modulation_hz: the modulation frequency.
+        highest: the highest harmonic.
 
     Raises:
-        CalibrationError: too few readings, or they leave too much of the turn unmeasured.
+        CalibrationError: there are too few readings, or they cover too little of a period.
 
     Source:
         Lindner, Kolb, "Lateral and depth calibration of PMD-distance sensors", ISVC 2006.
@@ -150,7 +154,7 @@ def fit_harmonics(phase_rad: np.ndarray, range_m: np.ndarray, modulation_hz: flo
         raise CalibrationError(f"the sweep covers {100 * covered:.0f} % of a turn at {modulation_hz / 1e6:g} MHz: "
                                f"go over {100 * SWEEP_PART:.0f} % or more, {SPEED_OF_LIGHT / (2 * modulation_hz):.3g} m are a whole one")
     error = phase_rad - 4 * np.pi * modulation_hz / SPEED_OF_LIGHT * range_m
-    centre = np.angle(np.exp(1j * error).mean())  # so that an offset near half a turn does not break in two
+    centre = np.angle(np.exp(1j * error).mean())  # so that an offset near half a period does not wrap
     error = centre + np.angle(np.exp(1j * (error - centre)))
     angle = phase_rad[:, None] * np.arange(highest + 1)
     matrix = np.concatenate([np.cos(angle), np.sin(angle[:, 1:])], axis=1)
@@ -159,10 +163,17 @@ def fit_harmonics(phase_rad: np.ndarray, range_m: np.ndarray, modulation_hz: flo
 
 
 def fit_line(measured_m: np.ndarray, true_m: np.ndarray) -> tuple[float, float]:
-    """(scale, offset_m) of `TofCalibration` from known ranges, by least squares.
+    """Fit scale and offset of a `TofCalibration` to known ranges by least squares.
+
+    Args:
+        measured_m: [n] measured ranges, metres.
+        true_m: [n] true ranges, metres.
+
+    Returns:
+        scale and offset_m.
 
     Raises:
-        CalibrationError: fewer than two different ranges.
+        CalibrationError: there are fewer than two different ranges.
     """
     if measured_m.shape != true_m.shape or measured_m.ndim != 1 or np.unique(true_m).size < 2 or np.ptp(measured_m) == 0:
         raise CalibrationError(f"{measured_m.size} measured and {true_m.size} true ranges give no line: "
@@ -172,10 +183,17 @@ def fit_line(measured_m: np.ndarray, true_m: np.ndarray) -> tuple[float, float]:
 
 
 def fit_temperature(error_m: np.ndarray, temperature_c: np.ndarray) -> tuple[Temperature, float]:
-    """Drift, and the offset at its reference temperature (the mean one), from the errors at several temperatures.
+    """Fit the drift with temperature to range errors, relative to the mean temperature.
+
+    Args:
+        error_m: [n] range errors, metres.
+        temperature_c: [n] temperatures.
+
+    Returns:
+        The drift, and the error at its reference temperature in metres.
 
     Raises:
-        CalibrationError: fewer than two different temperatures.
+        CalibrationError: there are fewer than two different temperatures.
     """
     if error_m.shape != temperature_c.shape or np.unique(temperature_c).size < 2:
         raise CalibrationError("drift needs errors at two different temperatures or more: give one error a temperature")

@@ -1,4 +1,4 @@
-"""Raw time-of-flight frames of a capture as arrays: correlation images, or photon histograms."""
+"""The raw time-of-flight frames of a capture as arrays: correlation images or photon histograms."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,43 +14,38 @@ from stage.manifest import FILE_NAME, Frame
 from stage.ranging import ContinuousWave, Pulsed
 
 SAME_TIME = 1e-6
-"""Relative: bins that differ by less are the same bins."""
+"""The relative difference of bin widths and starts up to which two frames have the same bins."""
 
 Kind = TypeVar("Kind", ContinuousWave, Pulsed)
 
 
 @dataclass(frozen=True)
 class CorrelationImages:
-    """Correlation images I(δ) = P + Q·cos(φ - δ), in manifest order."""
+    """The correlation images I(δ) = P + Q·cos(φ - δ) of a capture, in manifest order."""
 
-    images: np.ndarray  # [image, rows · cols] float32, recorded values
-    modulation_hz: np.ndarray  # [image] float64
-    reference_phase_rad: np.ndarray  # [image] float64
-    scale: np.ndarray  # [image] float64: what a recorded value is multiplied by, so that all have the mean exposure
+    images: np.ndarray  # [images, rows · cols] float32, recorded values
+    modulation_hz: np.ndarray  # [images] float64
+    reference_phase_rad: np.ndarray  # [images] float64
+    scale: np.ndarray  # [images] float64, factors that bring recorded values to the mean exposure
 
 
 @dataclass(frozen=True)
 class Histograms:
-    """Photon histograms."""
+    """The photon histograms of a capture, summed over its frames."""
 
     counts: np.ndarray  # [rows · cols, bins] float32
     bin_s: float
     start_s: float
-    """Time of flight at which the first bin begins."""
+    """The time of flight at which the first bin begins."""
     pulses: int | None
     first_photon_only: bool
 
 
-def has_tof(capture: Capture) -> bool:
-    """Whether the capture has time-of-flight frames."""
-    return any(frame.tof is not None for frame in capture.manifest.frames)
-
-
 def is_pulsed(capture: Capture) -> bool:
-    """Whether its time-of-flight frames are histograms.
+    """Return whether the time-of-flight frames of a capture are photon histograms.
 
     Raises:
-        ManifestError: there are none, or frames of both kinds.
+        ManifestError: the capture has no time-of-flight frames, or both correlation images and histograms.
     """
     kinds = {type(frame.tof) for frame in capture.manifest.frames if frame.tof is not None}
     if len(kinds) != 1:
@@ -60,11 +55,11 @@ def is_pulsed(capture: Capture) -> bool:
 
 
 def read_correlations(capture: Capture) -> CorrelationImages:
-    """Read every correlation image.
+    """Read the correlation images of a capture.
 
     Raises:
         ManifestError: there is none.
-        ImageError: a file is unreadable or has another size than the camera; names the file.
+        ImageError: a file is unreadable or has another size than the camera; the message names the file.
     """
     frames = _frames(capture, ContinuousWave)
     if not frames:
@@ -76,11 +71,12 @@ def read_correlations(capture: Capture) -> CorrelationImages:
 
 
 def read_histograms(capture: Capture) -> Histograms:
-    """Read the histograms; several frames with the same bins are added up.
+    """Read the photon histograms of a capture, and sum frames with the same bins.
 
     Raises:
-        ManifestError: there is none, frames have different bins, or first_photon_only stands without pulses.
-        ImageError: a file is unreadable, has another size than the camera, or holds what no detector counts; names the file.
+        ManifestError: there is none, frames have different bins, or first_photon_only is given without pulses.
+        ImageError: a file is unreadable, has another size than the camera, or holds impossible counts; the message names the
+            file.
     """
     frames = _frames(capture, Pulsed)
     manifest = capture.folder / FILE_NAME
@@ -111,7 +107,7 @@ def _frames(capture: Capture, kind: type[Kind]) -> list[tuple[Frame, Kind]]:
 
 
 def _plane(capture: Capture, frame: Frame) -> np.ndarray:
-    """[rows, cols] float32 of one correlation image: a .npy, or the first channel of an image."""
+    """Read a correlation image as [rows, cols] float32 from a .npy, or from the first channel of an image."""
     path = capture.file(frame.image)
     if path.suffix.lower() != ".npy":
         images.check_resolution(path, capture.camera.resolution)
@@ -124,7 +120,7 @@ def _plane(capture: Capture, frame: Frame) -> np.ndarray:
 
 
 def _histogram(capture: Capture, frame: Frame) -> np.ndarray:
-    """[rows · cols, bins] float32."""
+    """Read the histograms of one frame as [rows · cols, bins] float32."""
     path = capture.file(frame.image)
     if path.suffix.lower() != ".npy":
         raise ImageError(f"{path}: is no histogram: give a .npy of (rows, cols, bins)")
@@ -143,11 +139,11 @@ def _histogram(capture: Capture, frame: Frame) -> np.ndarray:
 
 
 def read_array(path: Path) -> np.ndarray:
-    """Read a .npy of numbers.
+    """Read a .npy file of real numbers.
 
     Raises:
-        ImageError: not a .npy, truncated, or not of numbers; names the file.
-        StorageError: it cannot be read.
+        ImageError: the file is no whole .npy file, or not of real numbers; the message names the file.
+        StorageError: the file cannot be read.
     """
     with storage("read", path):
         try:

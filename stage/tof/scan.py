@@ -1,4 +1,4 @@
-"""A scan: laser shots in known directions from a platform that may move; schema relit.scan/1."""
+"""A scan, schema relit.scan/1: laser shots in known directions from a platform that may move."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,10 +21,10 @@ COLUMNS = "time_s, azimuth_rad, elevation_rad"
 
 
 class Waveforms(Strict):
-    """A photon histogram of each shot, in place of its range."""
+    """The photon histograms of the shots of a scan, which replace their ranges."""
 
     file: Text
-    """A .npy of (shots, bins)."""
+    """A .npy file of (shots, bins)."""
     bin_s: Positive
     start_s: float = 0.0
     pulses: Count | None = None
@@ -38,41 +38,41 @@ class Waveforms(Strict):
 
 
 class Scan(Strict):
-    """What scan.json says."""
+    """The content of scan.json."""
 
     schema_: Literal["relit.scan/1"] = Field(alias="schema")
     name: Text
     shots: Text
-    """A .npy of (shots, 5): time_s, azimuth_rad, elevation_rad, range_m, intensity; with waveforms (shots, 3), the first three."""
+    """A .npy file of (shots, 5): time_s, azimuth_rad, elevation_rad, range_m, intensity; with waveforms (shots, 3), the first three."""
     waveforms: Waveforms | None = None
     platform_from_scanner: Transform = IDENTITY
     track: Track = Field(default=(Pose(time_s=0.0, world_from_platform=IDENTITY),))
-    """Without it the platform stands still at the origin of the world."""
+    """The poses of the platform; by default it stands still at the origin of the world."""
 
 
 @dataclass(frozen=True)
 class Shots:
-    """The shots of a scan folder."""
+    """The shots of a scan as arrays."""
 
     scan: Scan
     folder: Path
     time_s: np.ndarray  # [n] float64
-    azimuth_rad: np.ndarray  # [n] float64, to the right of straight ahead
-    elevation_rad: np.ndarray  # [n] float64, above the horizon
-    range_m: np.ndarray | None  # [n] float64; not above zero or not finite: nothing came back
+    azimuth_rad: np.ndarray  # [n] float64, positive to the right
+    elevation_rad: np.ndarray  # [n] float64, positive upwards
+    range_m: np.ndarray | None  # [n] float64 metres; a value that is not finite or not above zero means no return
     intensity: np.ndarray | None  # [n] float64
     waveforms: np.ndarray | None  # [n, bins] float32
 
 
 def read_scan(path: str | Path) -> Shots:
-    """Read a scan folder.
+    """Read a scan.
 
     Args:
-        path: the folder, or its scan.json.
+        path: the folder of the scan, or the scan.json in it.
 
     Raises:
-        ManifestError: scan.json is missing or wrong; names the field.
-        ImageError: an array is unreadable or of the wrong shape; names the file.
+        ManifestError: scan.json is missing or wrong; the message names the field.
+        ImageError: an array is unreadable or has the wrong shape; the message names the file.
         StorageError: a file cannot be read.
     """
     given = Path(path)
@@ -101,7 +101,7 @@ def read_scan(path: str | Path) -> Shots:
 
 
 def directions(azimuth_rad: np.ndarray, elevation_rad: np.ndarray) -> np.ndarray:
-    """Unit directions in the scanner's frame: a camera's, so that azimuth 0 looks along -z, +x is a quarter turn to the right, +y is up.
+    """Return the unit directions of shots in the scanner frame: -z straight ahead, +x to the right, +y upwards, as in a camera frame.
 
     Returns:
         [n, 3] float64.
@@ -110,19 +110,19 @@ def directions(azimuth_rad: np.ndarray, elevation_rad: np.ndarray) -> np.ndarray
     return np.stack([np.sin(azimuth_rad) * flat, np.sin(elevation_rad), -np.cos(azimuth_rad) * flat], axis=-1)
 
 
-def place_points(shots: Shots, index: np.ndarray, range_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Ranges of shots as points of the world, each from where the platform was at the time of its shot.
+def world_points(shots: Shots, index: np.ndarray, range_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the world points of ranges, from the pose of the platform at the time of each shot.
 
     Args:
-        shots: of the scan.
-        index: [m] shot of each range; a shot may have several.
+        shots: the shots of the scan.
+        index: [m] the shot of each range; a shot may have several ranges.
         range_m: [m] metres.
 
     Returns:
-        Points [m, 3] float64 metres, world, and covered [m] bool: False where the track does not reach to the time of the shot.
+        [m, 3] float64 metres, world frame, and [m] bool: False where the track does not cover the time of the shot.
     """
-    rotation, place, covered = poses_at(shots.scan.track, shots.time_s[index])
-    mount = np.array(shots.scan.platform_from_scanner, dtype=np.float64)
-    local = directions(shots.azimuth_rad[index], shots.elevation_rad[index]) * range_m[:, None]
-    on_platform = local @ mount[:3, :3].T + mount[:3, 3]
-    return np.einsum("nij,nj->ni", rotation, on_platform) + place, covered
+    rotation, translation, covered = poses_at(shots.scan.track, shots.time_s[index])
+    platform_from_scanner = np.array(shots.scan.platform_from_scanner, dtype=np.float64)
+    in_scanner = directions(shots.azimuth_rad[index], shots.elevation_rad[index]) * range_m[:, None]
+    on_platform = in_scanner @ platform_from_scanner[:3, :3].T + platform_from_scanner[:3, 3]
+    return np.einsum("nij,nj->ni", rotation, on_platform) + translation, covered

@@ -1,15 +1,18 @@
-"""Simulated raw time-of-flight frames: for tests, and to plan a capture before there is a camera.
+"""Simulation of raw time-of-flight frames, for tests and for the planning of captures.
 
 Forward model, at each pixel with range d, albedo ρ and cos θ between the surface normal and the ray:
 
-    signal       A = signal_electrons · ρ · cos θ / d²                         electrons (photons), one a return
+    signal       A = signal_electrons · ρ · cos θ / d²                         electrons (photons) of one return
     correlation  I(δ) = ambient · ρ + Σ_returns A·(1 + contrast · w(φ - δ)),   φ = 4πf·d/c
-                 w(ψ) = cos ψ + Σ_h harmonics[h]·cos(hψ), h from 2              wiggling: the light is no pure cosine
+                 w(ψ) = cos ψ + Σ_h harmonics[h]·cos(hψ), h from 2              wiggling: the light is not a pure cosine
     histogram    λ_i = background + Σ_returns A·(C(t_{i+1} - τ) - C(t_i - τ)),  τ = 2d/c, C the cumulative Gaussian of pulse_sigma_s
-    pile-up      of `pulses`, those still without a photon at bin i: m_i; counted there: binomial(m_i, 1 - exp(-λ_i / pulses))
+    pile-up      of `pulses`, m_i have counted no photon before bin i; bin i counts binomial(m_i, 1 - exp(-λ_i / pulses))
 
-A second return lies `second_m` behind the first with `second_part` of its signal: light that went round a corner, or a pane of glass.
-Shot noise is Poisson, read noise normal; counts above `full_well` are cut to it. Without a random generator every mean is exact.
+A second return lies `second_m` behind the first with `second_part` of its signal: light that was reflected twice, or a pane of glass.
+Shot noise is Poisson, read noise is normal, and counts are clipped to `full_well`. Without a random generator the means are returned.
+
+Source: Lange and Seitz, "Solid-state time-of-flight range camera", IEEE J. Quantum Electronics 37(3), 2001; pile-up: Coates, "The
+    correction for photon pile-up in the measurement of radiative lifetimes", J. Physics E 1(8), 1968.
 """
 
 from dataclasses import dataclass
@@ -28,17 +31,17 @@ from stage.tof.light_time import SPEED_OF_LIGHT
 
 @dataclass(frozen=True, kw_only=True)
 class TofScene:
-    """What is in front of the camera."""
+    """The scene in front of the camera: range, albedo and the angle of the surface at each pixel."""
 
-    range_m: np.ndarray  # [rows, cols] along the ray, above zero
+    range_m: np.ndarray  # [rows, cols] metres along the ray, above zero
     albedo: np.ndarray  # [rows, cols] 0…1
     cosine: np.ndarray  # [rows, cols] 0…1, between normal and ray
     second_m: float = 1.0
     second_part: float = 0.0
-    """Of the first return's signal; 0: one return only."""
+    """The signal of the second return relative to the first; 0 means one return."""
 
     def __post_init__(self) -> None:
-        """Refuse scenes that cannot be."""
+        """Raise CalibrationError for arrays of different shapes, ranges that are not above zero, and an impossible second return."""
         if not self.range_m.shape == self.albedo.shape == self.cosine.shape or self.range_m.ndim != 2:
             raise CalibrationError(f"range {self.range_m.shape}, albedo {self.albedo.shape} and cosine {self.cosine.shape} "
                                    "must be one image: give [rows, cols] each")
@@ -48,7 +51,7 @@ class TofScene:
             raise CalibrationError("the second return must lie behind the first, with no negative part of its signal")
 
     def returns(self, signal: float) -> list[tuple[np.ndarray, np.ndarray]]:
-        """(range, signal) of each return."""
+        """Return the range and the signal of each return, [rows, cols] each, for the signal of a white surface at one metre."""
         first = signal * self.albedo * self.cosine / self.range_m**2
         both = [(self.range_m, first), (self.range_m + self.second_m, self.second_part * first)]
         return both if self.second_part > 0 else both[:1]
@@ -56,44 +59,48 @@ class TofScene:
 
 @dataclass(frozen=True, kw_only=True)
 class CorrelationCamera:
-    """A continuous-wave camera."""
+    """A continuous-wave camera, which records correlation images."""
 
     modulation_hz: tuple[float, ...] = (20e6, 30e6, 80e6)
     phases: int = 4
-    """Evenly spaced reference phases of each frequency."""
+    """The count of evenly spaced reference phases of each frequency."""
     signal_electrons: float = 1e5
-    """Of a white surface facing the camera at one metre, one image."""
+    """The electrons in one image of a white surface that faces the camera at one metre."""
     contrast: float = 1.0
     ambient_electrons: float = 0.0
-    """Of a white surface."""
+    """The electrons of ambient light in one image of a white surface."""
     read_noise_electrons: float = 5.0
     harmonics: tuple[float, ...] = ()
-    """Of the correlation function, from the second on, over the first."""
+    """The harmonics of the correlation function from the second on, relative to the first."""
     full_well: float | None = None
 
     def settings(self) -> list[tuple[float, float]]:
-        """(frequency, reference phase) of each image."""
+        """Return the frequency in hertz and the reference phase in radians of each image."""
         return [(hz, 2 * np.pi * step / self.phases) for hz in self.modulation_hz for step in range(self.phases)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class HistogramCamera:
-    """A pulsed camera that counts photons."""
+    """A pulsed camera, which counts photons in a histogram for each pixel."""
 
     bins: int = 64
     bin_s: float = 1.5e-9
     start_s: float = 0.0
     pulse_sigma_s: float = 1.2e-9
     signal_photons: float = 4000.0
-    """Of a white surface facing the camera at one metre, all pulses together."""
+    """The photons of all pulses together from a white surface that faces the camera at one metre."""
     background: float = 0.5
-    """Photons a bin, all pulses together."""
+    """The background photons in a bin, of all pulses together."""
     pulses: int | None = None
-    """With a number the detector counts only the first photon after each pulse."""
+    """The count of pulses of a detector that counts only the first photon after each pulse; None for one that counts all photons."""
 
 
 def correlation_images(scene: TofScene, camera: CorrelationCamera, random: np.random.Generator | None = None) -> np.ndarray:
-    """[image, rows, cols] float64 electrons, in the order of `camera.settings()`; without `random` the means."""
+    """Return correlation images, with noise when `random` is given.
+
+    Returns:
+        [images, rows, cols] float64 electrons, in the order of `camera.settings()`.
+    """
     images = []
     for hz, delta in camera.settings():
         mean = camera.ambient_electrons * scene.albedo
@@ -110,7 +117,7 @@ def correlation_images(scene: TofScene, camera: CorrelationCamera, random: np.ra
 
 
 def histograms(scene: TofScene, camera: HistogramCamera, random: np.random.Generator | None = None) -> np.ndarray:
-    """[rows, cols, bins] float64 photons; without `random` the means."""
+    """Return photon histograms [rows, cols, bins] float64, with noise when `random` is given."""
     edges = camera.start_s + camera.bin_s * np.arange(camera.bins + 1)
     mean = np.full((*scene.range_m.shape, camera.bins), camera.background, dtype=np.float64)
     cumulative = np.vectorize(erf, otypes=[np.float64])
@@ -129,13 +136,13 @@ def histograms(scene: TofScene, camera: HistogramCamera, random: np.random.Gener
 
 
 def write_correlations(folder: str | Path, name: str, images: np.ndarray, camera: Camera, sensor: CorrelationCamera) -> Path:
-    """Write images of `correlation_images` as a capture folder.
+    """Write images of `correlation_images` as a capture.
 
     Returns:
-        The capture.json.
+        The path of its capture.json.
 
     Raises:
-        StorageError: it cannot be written.
+        StorageError: a file cannot be written.
     """
     frames = []
     for index, (image, (hz, delta)) in enumerate(zip(images, sensor.settings(), strict=True)):
@@ -145,13 +152,13 @@ def write_correlations(folder: str | Path, name: str, images: np.ndarray, camera
 
 
 def write_histograms(folder: str | Path, name: str, counts: np.ndarray, camera: Camera, sensor: HistogramCamera) -> Path:
-    """Write counts of `histograms` as a capture folder.
+    """Write counts of `histograms` as a capture.
 
     Returns:
-        The capture.json.
+        The path of its capture.json.
 
     Raises:
-        StorageError: it cannot be written.
+        StorageError: a file cannot be written.
     """
     _save(Path(folder) / "histograms.npy", counts)
     tof = Pulsed(type="pulsed", bin_s=sensor.bin_s, start_s=sensor.start_s, pulses=sensor.pulses,

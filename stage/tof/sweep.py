@@ -1,4 +1,4 @@
-"""A sweep over known distances: captures of a flat target that faces the camera; schema relit.tof-sweep/1."""
+"""A sweep, schema relit.tof-sweep/1: captures of a flat target that faces the camera at known distances."""
 
 from collections import Counter
 from pathlib import Path
@@ -12,21 +12,21 @@ from stage.records import read_record
 SCHEMA = "relit.tof-sweep/1"
 
 
-class Step(Strict):
-    """One distance."""
+class SweepDistance(Strict):
+    """The capture of the target at one distance."""
 
     capture: Text
-    """Folder of the capture, from the sweep's own folder; its mask is where the target is."""
+    """The folder of the capture, relative to the folder of the sweep; the mask of the capture is the target."""
     depth_m: Positive
-    """From the camera to the target's plane, along the optical axis."""
+    """The distance from the camera to the plane of the target along the optical axis, metres."""
     temperature_c: float | None = None
 
 
 class Sweep(Strict):
-    """The steps, in any order."""
+    """The captures of a sweep, in any order."""
 
     schema_: Literal["relit.tof-sweep/1"] = Field(alias="schema")
-    steps: Annotated[tuple[Step, ...], Field(min_length=2)]
+    steps: Annotated[tuple[SweepDistance, ...], Field(min_length=2)]
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -36,20 +36,20 @@ class Sweep(Strict):
 
     @property
     def commonest_temperature_c(self) -> float | None:
-        """At which most steps were taken: wiggling is measured there, so that drift is not mistaken for it."""
+        """The temperature of most captures, at which the wiggling is measured, so that drift is not mistaken for wiggling."""
         return Counter(step.temperature_c for step in self.steps).most_common(1)[0][0]
 
     @property
     def has_drift(self) -> bool:
-        """Whether there are several temperatures."""
+        """True when the captures have more than one temperature."""
         return len({step.temperature_c for step in self.steps}) > 1
 
 
 def read_sweep(path: str | Path) -> Sweep:
-    """Read a sweep.
+    """Read a relit.tof-sweep/1 file.
 
     Raises:
-        ManifestError: a field is wrong; names file and field.
-        StorageError: it cannot be read.
+        ManifestError: a field is wrong; the message names file and field.
+        StorageError: the file cannot be read.
     """
     return read_record(path, Sweep, SCHEMA)

@@ -1,4 +1,4 @@
-"""Where a moving platform was: poses at times, and between them."""
+"""The track of a moving platform: its poses at known times, and the interpolation between them."""
 
 from typing import Annotated
 
@@ -11,7 +11,7 @@ from stage.model import Strict
 
 
 class Pose(Strict):
-    """The platform at one time."""
+    """The pose of the platform at one time."""
 
     time_s: float
     world_from_platform: Transform
@@ -25,19 +25,19 @@ def _ascending(poses: tuple[Pose, ...]) -> tuple[Pose, ...]:
 
 
 Track = Annotated[tuple[Pose, ...], Field(min_length=1), AfterValidator(_ascending)]
-"""Poses in order of time; one alone is a platform that stands still."""
+"""Poses in order of time; a single pose means a platform that stands still."""
 
 
 def poses_at(track: tuple[Pose, ...], times_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Poses at any times: places linearly between two poses, rotations at a constant turn (slerp).
+    """Interpolate the poses of a track at given times: positions linearly, rotations by slerp.
 
     Args:
-        track: in order of time.
-        times_s: [n].
+        track: the poses in order of time.
+        times_s: [n] seconds, on the clock of the track.
 
     Returns:
-        rotation [n, 3, 3] and place [n, 3], world_from_platform; and covered [n] bool, False before the first and after the last pose
-        (there the nearest pose stands in; a single pose covers all times).
+        rotation [n, 3, 3] and translation [n, 3] of world_from_platform, and covered [n] bool, which is False before the first and after
+        the last pose. The nearest pose is returned there; a single pose covers all times.
 
     Raises:
         CalibrationError: a time is not finite.
@@ -55,20 +55,20 @@ def poses_at(track: tuple[Pose, ...], times_s: np.ndarray) -> tuple[np.ndarray, 
                 np.ones(len(times_s), dtype=bool))
     after = np.clip(np.searchsorted(known, times_s, side="right"), 1, len(known) - 1)
     part = np.clip((times_s - known[after - 1]) / (known[after] - known[after - 1]), 0, 1)[:, None]
-    place = matrices[after - 1, :3, 3] * (1 - part) + matrices[after, :3, 3] * part
+    translation = matrices[after - 1, :3, 3] * (1 - part) + matrices[after, :3, 3] * part
     one, two = turns[after - 1], turns[after]
     cosine = (one * two).sum(axis=1, keepdims=True)
     two, cosine = np.where(cosine < 0, -two, two), np.clip(np.abs(cosine), 0, 1)
     angle = np.arccos(cosine)
-    near = angle < 1e-6  # sines of nearly nothing: straight between them
-    sine = np.where(near, 1.0, np.sin(angle))
-    first = np.where(near, 1 - part, np.sin((1 - part) * angle) / sine)
-    second = np.where(near, part, np.sin(part * angle) / sine)
-    return _matrix(first * one + second * two), place, (times_s >= known[0]) & (times_s <= known[-1])
+    tiny = angle < 1e-6  # interpolated linearly, because the sines vanish
+    sine = np.where(tiny, 1.0, np.sin(angle))
+    first = np.where(tiny, 1 - part, np.sin((1 - part) * angle) / sine)
+    second = np.where(tiny, part, np.sin(part * angle) / sine)
+    return _matrix(first * one + second * two), translation, (times_s >= known[0]) & (times_s <= known[-1])
 
 
 def _quaternion(rotation: np.ndarray) -> np.ndarray:
-    """[4] w x y z of a rotation: the eigenvector of Bar-Itzhack's matrix, which no angle troubles."""
+    """Return the quaternion [4] w x y z of a rotation: an eigenvector of Bar-Itzhack's matrix, which is stable at all angles."""
     m = rotation
     k = np.array([[m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
                   [m[2, 1] - m[1, 2], m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
@@ -78,7 +78,7 @@ def _quaternion(rotation: np.ndarray) -> np.ndarray:
 
 
 def _matrix(quaternion: np.ndarray) -> np.ndarray:
-    """[n, 3, 3] of [n, 4] w x y z, of any length."""
+    """Return the rotations [n, 3, 3] of quaternions [n, 4] w x y z of any length."""
     w, x, y, z = (quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)).T
     return np.stack([
         np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], axis=-1),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stage.calibration.apply import as_direction, as_position, lit_frames, match, with_brightness, with_lights
+from stage.calibration.apply import as_direction, as_position, check_same_setup, lit_frames, with_brightness, with_lights
 from stage.capture import Capture
 from stage.errors import ManifestError
 from stage.light import DistantLight, PointLight
@@ -43,13 +43,13 @@ def test_frames_of_other_kinds_stay_and_failed_ones_go(tmp_path):
 
 def test_captures_that_do_not_belong_together(tmp_path):
     one, other = (write_capture(tmp_path / name, make_scene(4, 3)) for name in ("one", "other"))
-    match(Capture.open(one), Capture.open(other))
+    check_same_setup(Capture.open(one), Capture.open(other))
     turned = np.eye(4)
     for x, folder in ((0.0, one), (0.1, other)):
         turned[0, 3] = x
         edit_manifest(folder, camera={"projection": "orthographic", "resolution": [4, 4], "world_from_camera": turned.tolist()})
     with pytest.raises(ManifestError, match=r"world_from_camera: differs"):
-        match(Capture.open(one), Capture.open(other))
+        check_same_setup(Capture.open(one), Capture.open(other))
     edit_manifest(other, camera={"projection": "perspective", "resolution": [4, 4], "focal_px": [9, 9]})
     with pytest.raises(ManifestError, match=r"camera\.projection: differs"):
-        match(Capture.open(one), Capture.open(other))
+        check_same_setup(Capture.open(one), Capture.open(other))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stage.calibration.ball import ball_from_circle, ball_from_outline, fit_circle, fit_cone, meet, project, view_ball
+from stage.calibration.ball import ball_from_circle, ball_from_outline, fit_circle, fit_cone, intersect, project, view_ball
 from stage.calibration.outline import ball_from_mask, outline_points
 from stage.camera import Camera, Distortion
 from stage.errors import CalibrationError
@@ -112,7 +112,7 @@ def test_distortion_is_undone():
     ball = ball_from_outline(camera, outline, error_px=0, radius_m=radius)
     np.testing.assert_allclose(ball.centre, centre, atol=1e-7)
     u, v = project(camera, centre)
-    inside, point, _ = meet(ball, camera, np.array([u]), np.array([v]))
+    inside, point, _ = intersect(ball, camera, np.array([u]), np.array([v]))
     assert inside[0] and np.linalg.norm(point[0]) == pytest.approx(np.linalg.norm(centre) - radius, abs=1e-6)
 
 

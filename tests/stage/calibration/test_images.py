@@ -5,7 +5,7 @@ import pytest
 
 from stage import exr
 from stage.calibration.flat_field import make_flat, mean_image, recorded_values
-from stage.calibration.saturation import Pile, TopHistogram, suggest
+from stage.calibration.saturation import ChannelSaturation, TopHistogram, capture_saturation
 from stage.capture import Capture
 from stage.correction import Correction
 from stage.errors import CalibrationError, ImageError
@@ -84,7 +84,7 @@ def pile(values, peak=None):
     top = TopHistogram(float(values.max() if peak is None else peak))
     for part in np.array_split(values, 3):
         top.add(part)
-    return top.pile()
+    return top.saturation()
 
 
 def test_a_pile_at_the_top():
@@ -92,12 +92,12 @@ def test_a_pile_at_the_top():
     light = rng.exponential(0.4, 20_000)
     found = pile(np.minimum(light, 0.8) + 0.001 * rng.standard_normal(20_000))
     assert found.level == pytest.approx(0.8, rel=0.02) and found.readings > 2000
-    assert pile(light) == Pile(None, 0)
-    assert pile(rng.uniform(0, 1, 20_000)) == Pile(None, 0)  # a flat histogram is no pile
-    assert pile(np.zeros(100)) == Pile(None, 0)
+    assert pile(light) == ChannelSaturation(None, 0)
+    assert pile(rng.uniform(0, 1, 20_000)) == ChannelSaturation(None, 0)  # a flat histogram is no pile
+    assert pile(np.zeros(100)) == ChannelSaturation(None, 0)
 
 
 def test_the_least_level_stands_for_all_channels():
-    assert suggest([Pile(0.9, 50), Pile(None, 0), Pile(0.71234, 30)]) == 0.7123
+    assert capture_saturation([ChannelSaturation(0.9, 50), ChannelSaturation(None, 0), ChannelSaturation(0.71234, 30)]) == 0.7123
     with pytest.raises(CalibrationError, match="no channel piles up"):
-        suggest([Pile(None, 0)] * 3)
+        capture_saturation([ChannelSaturation(None, 0)] * 3)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stage.motion.flow import Flow, carry_on, display, match, white_level
+from stage.motion.flow import Flow, display, extrapolate, find_flow, white_level
 from tests.moving import Subject
 
 APART = 5
@@ -30,7 +30,7 @@ def frames(subject: Subject, noise: float = 0.0, flash: float = 1.0) -> list[np.
     (Subject(turn_degrees=1.0), 0.1, 1.0),
 ], ids=["part of a pixel", "2.7 px", "14 px", "2 degrees", "5 degrees"])
 def test_flow_of_a_textured_subject(subject, median_px, p95_px):
-    flow = match(*frames(subject))
+    flow = find_flow(*frames(subject))
     inside = subject.mask(0)
     error = np.linalg.norm(flow.displacement - subject.flow(0, APART), axis=-1)[inside]
     assert np.median(error) < median_px and np.percentile(error, 95) < p95_px
@@ -40,13 +40,13 @@ def test_flow_of_a_textured_subject(subject, median_px, p95_px):
 def test_noise_and_a_weaker_flash_are_borne():
     """Noise of 1 % of white in each channel and a flash of 80 % add little to what the search errs without them."""
     subject = Subject(shift_px=(0.43, -0.31))
-    flow = match(*frames(subject, noise=0.01, flash=0.8))
+    flow = find_flow(*frames(subject, noise=0.01, flash=0.8))
     error = np.linalg.norm(flow.displacement - subject.flow(0, APART), axis=-1)[subject.mask(0)]
     assert np.median(error) < 0.03
 
 
 def test_a_subject_that_stands_still_has_no_flow():
-    flow = match(*frames(Subject()))
+    flow = find_flow(*frames(Subject()))
     assert np.abs(flow.displacement).max() < 1e-3 and flow.known.all()
 
 
@@ -57,7 +57,7 @@ def test_a_guess_carries_the_search_over_a_long_way():
     kept = guess.copy()
     inside = subject.mask(0) & (subject.flow(0, APART)[..., 0] + np.arange(subject.size) < subject.size - 8)
     inside[:32] = False
-    error = np.linalg.norm(match(near, far, guess).displacement - subject.flow(0, APART), axis=-1)[inside]
+    error = np.linalg.norm(find_flow(near, far, guess).displacement - subject.flow(0, APART), axis=-1)[inside]
     assert np.median(error) < 0.03  # without the guess: 29 px
     assert np.array_equal(guess, kept)
 
@@ -68,8 +68,8 @@ def test_a_subject_may_turn_far_in_small_steps():
     first, inside = display(subject.full(0).astype(np.float32), 1.0), subject.mask(0)
     flow = None
     for time in (7, 14, 21, 28):
-        guess = None if flow is None else carry_on(flow, inside)
-        flow = match(first, display(subject.full(time).astype(np.float32), 1.0), guess)
+        guess = None if flow is None else extrapolate(flow, inside)
+        flow = find_flow(first, display(subject.full(time).astype(np.float32), 1.0), guess)
         error = np.linalg.norm(flow.displacement - subject.flow(0, time), axis=-1)[inside]
         assert np.median(error) < 0.13 and flow.known[inside].mean() > 0.9  # 0.09 in the first step, and it stays
 
@@ -80,10 +80,10 @@ def test_a_guess_goes_on_beyond_what_is_known():
     displacement[..., 0] = np.where(mask, 3, -20)
     known = np.ones((40, 60), bool)
     displacement[20, 20], known[20, 20] = 99, False
-    guess = carry_on(Flow(displacement, known), mask)
+    guess = extrapolate(Flow(displacement, known), mask)
     assert guess.dtype == np.float32 and np.allclose(guess, [3, 0], atol=1e-4)
     nothing = Flow(displacement, np.zeros((40, 60), bool))
-    assert np.array_equal(carry_on(nothing, mask), displacement)
+    assert np.array_equal(extrapolate(nothing, mask), displacement)
 
 
 def layers(shift: int) -> tuple[np.ndarray, np.ndarray]:
@@ -96,7 +96,7 @@ def layers(shift: int) -> tuple[np.ndarray, np.ndarray]:
 
 def test_what_is_hidden_in_the_other_frame_is_not_known():
     (first, before), (second, after) = layers(0), layers(6)
-    flow = match(first, second)
+    flow = find_flow(first, second)
     hidden = after & ~before
     assert (~flow.known[hidden]).mean() > 0.9
     assert (~flow.known[~hidden]).mean() < 0.05  # patches of 8 pixels at the square's outline
@@ -107,7 +107,7 @@ def test_what_is_hidden_in_the_other_frame_is_not_known():
 def test_what_leaves_the_image_is_not_known():
     ground = Subject(shift_px=(4.4, 0.0))
     first, second = (display(np.repeat(ground.albedo(time)[..., None], 3, axis=-1).astype(np.float32), 1.0) for time in (0, 1))
-    known = match(first, second).known
+    known = find_flow(first, second).known
     assert not known[:, 93:].any() and known[8:-8, 8:85].mean() > 0.98  # the 4.4 px at the right edge
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stage.errors import ImageError, ManifestError
-from stage.tof.scan import directions, place_points, read_scan
+from stage.tof.scan import directions, read_scan, world_points
 from stage.tof.track import Pose, poses_at
 from tests.reference.tof import LIGHT
 
@@ -73,7 +73,7 @@ def test_a_moving_scanner_sees_the_room_where_it_is(tmp_path):
     shots = np.stack([time_s, azimuth, elevation, distance, np.full(n, 7.0)], axis=1)
     track = [{"time_s": 0, "world_from_platform": start.tolist()}, {"time_s": 10, "world_from_platform": end.tolist()}]
     read = read_scan(folder_of(tmp_path, shots, track=track, platform_from_scanner=mount.tolist()))
-    points, covered = place_points(read, np.arange(n), read.range_m)
+    points, covered = world_points(read, np.arange(n), read.range_m)
     assert covered.all()
     np.testing.assert_allclose(np.abs(points / half).max(axis=1), 1, atol=1e-9)
     np.testing.assert_allclose(points, origin + ray * distance[:, None], atol=1e-9)
