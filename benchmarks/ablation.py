@@ -1,4 +1,4 @@
-"""What each part of the general solver buys: normals of the same pixels with the parts added one at a time."""
+"""The effect of each part of the general solver: normals of the same pixels with the parts added one at a time."""
 
 import tempfile
 from collections.abc import Callable
@@ -99,13 +99,13 @@ VARIANTS: dict[str, Callable[[Case], np.ndarray]] = {
     "`robust`": lambda case: case.robust,
     "hypotheses × Lambert and five GGX lobes, Cauchy weights":
         lambda case: search_normals(case.samples, case.robust, shape=Diffuse(), options=NO_SHADOW).normal,
-    "+ cast shadow as a hypothesis of its own": lambda case: search_normals(case.samples, case.robust, shape=Diffuse()).normal,
+    "+ cast shadow as a separate hypothesis": lambda case: search_normals(case.samples, case.robust, shape=Diffuse()).normal,
     "+ diffuse shape shared by the object": lambda case: search_normals(case.samples, case.robust, shape=case.shape).normal,
-    "· the same with the three channels searched apart and averaged by cost (left out)": _channels_apart,
+    "· the same with the three channels searched separately and averaged by cost (not used)": _channels_apart,
     "+ averaged over nearby shapes": lambda case: solve_svbrdf(case.samples, case.robust, shape=case.shape, single_lobe=False).normal,
     "+ a single lobe fitted jointly with the normal": lambda case: solve_svbrdf(case.samples, case.robust, shape=case.shape).normal,
-    "+ cast shadows of the height taken out": lambda case: case.whole(MaterialOptions(interreflection=False)),
-    "+ light that the object throws on itself taken off, materials shared (`svbrdf`)": lambda case: case.whole(MaterialOptions()),
+    "+ readings in cast shadows of the height left out": lambda case: case.whole(MaterialOptions(interreflection=False)),
+    "+ interreflection subtracted, materials shared (`svbrdf`)": lambda case: case.whole(MaterialOptions()),
 }
 
 

@@ -63,7 +63,7 @@ def real(given: argparse.Namespace) -> list[str] | None:
     if given.data is None:
         return None
     lines = ["DiLiGenT objects, 96 real lights; the cat at every second pixel. `lambert` leaves out readings of zero; with them "
-             "NumPy's `lstsq` gives 4.17 and 8.46.", "", HEAD]
+             "NumPy's `lstsq` has mean errors of 4.17° and 8.46°.", "", HEAD]
     for name in ("ball", "cat"):
         lines += [row(f"{name}, `{method}`", diligent_errors(given.data / f"diligent_{name}", method)) for method in DISTANT]
     return lines
@@ -73,8 +73,8 @@ def glossy(given: argparse.Namespace) -> list[str] | None:
     """Path-traced dielectric and metal."""
     if given.glossy is None:
         return None
-    lines = ["`samples/make_glossy.py`: Mitsuba's `principled`, roughness 0.3 to 0.75, 64 lights, full interreflection. Of the "
-             "metal, albedo is F0; roughness error is absolute.", "",
+    lines = ["`samples/make_glossy.py`: Mitsuba's `principled`, roughness 0.3 to 0.75, 64 lights, full interreflection. For "
+             "the metal, F0 is compared in place of albedo; the error of roughness is absolute.", "",
              "| object | mean ° | median ° | albedo or F0, median | roughness, median |", "|---|---|---|---|---|"]
     for name in ("glossy", "glossy_metal"):
         folder = given.glossy / name
@@ -145,7 +145,7 @@ def demo(_: argparse.Namespace) -> list[str]:
         cold, _ = measure("demo", "--out", str(Path(folder) / "cold"))
         warm, peak = measure("demo", "--out", str(Path(folder) / "warm"))
         del os.environ["WARP_CACHE_PATH"]
-    return [f"`relit demo` takes {cold:.0f} s the first time, when its kernels are compiled, and {warm:.0f} s after; "
+    return [f"`relit demo` takes {cold:.0f} s the first time, when its kernels are compiled, and {warm:.0f} s afterwards; "
             f"peak memory {peak:.2f} GiB."]
 
 
@@ -161,8 +161,8 @@ SECTIONS: dict[str, tuple[str, Section]] = {
     "lambert": ("Lambertian surface with cast shadows", lambert),
     "real": ("Real objects", real),
     "glossy": ("Glossy and metallic objects", glossy),
-    "materials": ("What sharing materials buys", materials),
-    "ablation": ("What each part of `svbrdf` buys", ablation),
+    "materials": ("Effect of sharing materials", materials),
+    "ablation": ("Effect of each part of `svbrdf`", ablation),
     "relighting": ("Relighting", relighting),
     "left_out": ("Real lights left out", left_out),
     "spin": ("A spin of 240 frames", spin),
@@ -174,7 +174,7 @@ SECTIONS: dict[str, tuple[str, Section]] = {
     "memory": ("Memory", memory),
 }
 INTRODUCTION = ("# Figures\n\nWritten by `make figures` (`python -m benchmarks.figures`); each section says when and where it was "
-                "measured. Times are of a shared machine: ratios travel, seconds do not.\n")
+                "measured. The times are from a machine that other work shared: ratios hold on other machines, seconds do not.\n")
 
 
 def machine() -> str:

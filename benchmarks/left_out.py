@@ -67,5 +67,5 @@ def left_out_table(data: Path) -> list[str]:
     for name in ("ball", "cat"):
         count, errors = left_out_errors(data / f"diligent_{name}")
         rows.append(f"| {name} | {count} | " + " | ".join(f"{errors[key]:.3f}" for key in ("cells", "smooth", "guided")) + " |")
-    return ["DiLiGenT objects, maps solved and frames summed without the lights left out; relative RMSE of their images.", "",
+    return ["DiLiGenT objects: maps are solved and images are summed without some lights; relative RMSE of the images of these lights.", "",
             "| | left out | `--weights cells` | `--weights smooth` | `--maps` |", "|---|---|---|---|---|", *rows]

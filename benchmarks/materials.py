@@ -1,4 +1,4 @@
-"""What sharing materials between pixels buys: albedo, F0 and roughness of the path-traced objects, with it and without."""
+"""The effect of sharing materials between pixels: albedo, F0 and roughness of the path-traced objects, with it and without."""
 
 import tempfile
 from pathlib import Path
@@ -54,10 +54,11 @@ def material_table(glossy: Path) -> list[str]:
     Args:
         glossy: folder with glossy and glossy_metal of samples/make_glossy.py.
     """
-    lines = ["Error, median / 90th percentile; albedo and a metal's F0 relative, a dielectric's F0 (0.04) and roughness absolute:",
+    lines = ["Errors, median / 90th percentile: relative for albedo and the F0 of a metal, absolute for the F0 of a dielectric "
+             "(0.04) and roughness.",
              "", "| | albedo | F0 | roughness |", "|---|---|---|---|"]
     for name in ("glossy", "glossy_metal"):
-        for what, options in (("every pixel for itself", MaterialOptions(sharing=False)),
+        for what, options in (("each pixel alone", MaterialOptions(sharing=False)),
                               ("materials shared (`svbrdf`)", MaterialOptions())):
             errors = material_errors(glossy / name, options)
             relative = {"albedo"} if name == "glossy" else {"F0"}

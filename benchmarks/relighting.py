@@ -99,8 +99,8 @@ def relighting_table(checks: Path | None) -> list[str]:
     Args:
         checks: folder with glossy and owl of samples/make_relight_checks.py; None: the shipped sample alone.
     """
-    lines = ["Relative RMSE over the object, and total energy over that of the truth. `--maps`: guided by maps that `svbrdf` solved "
-             "from the same capture.", "",
+    lines = ["Relative RMSE over the object, and total energy divided by that of the truth. `--maps`: guided by maps that `svbrdf` "
+             "solved from the same capture.", "",
              "| | `--weights cells` | `--weights smooth` | `--maps` |", "|---|---|---|---|"]
     rows = []
     with tempfile.TemporaryDirectory() as folder:
@@ -125,8 +125,9 @@ def relighting_table(checks: Path | None) -> list[str]:
 
 
 def _near_lines(checks: dict[str, Check]) -> list[str]:
-    lines = ["Near and area lights, `relit shade`, against the path tracer with all bounces, maps solved. `median`: of the relative "
-             "difference from true maps against direct light, over pixels brighter than a twentieth of the mean.", "",
+    lines = ["Near and area lights: `relit shade` with solved maps, compared with the path tracer with all bounces. In the last column "
+             "true maps are compared; its `median` is that of the relative difference from direct light alone, over pixels brighter than a "
+             "twentieth of the mean.", "",
              "| | maps alone | with `--capture` | true maps, direct light: RMSE, median |", "|---|---|---|---|"]
     for name, check in checks.items():
         truth_maps, mask = true_maps(check), check.mask

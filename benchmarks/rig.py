@@ -232,8 +232,8 @@ def limit_lines(found: Measured) -> list[str]:
         for name in ROBUST:
             if isinstance(error := found.get(name), CodeError):
                 ratio = _percentile(error.groove_column, 50) / _percentile(plain.groove_column, 50)
-                rows.append((NAMES[name], "groove: column, median, over that of phase 256", ratio, 0.5))
-    return ["| | held to | at most | measured | |", "|---|---|---|---|---|",
+                rows.append((NAMES[name], "groove: column, median, divided by that of phase 256", ratio, 0.5))
+    return ["| | quantity | limit | measured | |", "|---|---|---|---|---|",
             *(f"| {name} | {what} | {most:g} | {value:.3g} | {'' if value <= most else 'missed'} |" for name, what, value, most in rows)]
 
 
@@ -242,7 +242,7 @@ def rig_table(folder: Path) -> list[str]:
     found = measure_all(folder)
     return ["`samples/make_rig.py`: a projector and a camera of 256 × 192 pixels 0.3 m apart, path traced with interreflection (a quarter "
             "of the light in the groove), ambient light, no camera noise, images in half precision; one column is about 21 mm of depth at "
-            "1.4 m. Errors are of lit pixels that no edge of depth or shadow crosses.", "",
+            "1.4 m. Errors are those of lit pixels that no edge of depth or shadow crosses.", "",
             *code_lines(found), "", *laser_lines(found), "", *limit_lines(found)]
 
 

@@ -226,20 +226,20 @@ Measured on {datetime.now(UTC):%Y-%m-%d} on {os.cpu_count()} cores ({processor()
 
     python -m benchmarks.service_faults --write docs/service_faults.md
 
-Each row is a relight of {FRAMES} frames ({SIZE} × {SIZE}, {LIGHTS} lights, {CHUNK_FRAMES} frames a step) with {WORKERS} workers
-on a private PostgreSQL, and faults in its course; the kills come at random moments, in random order. *Identical* are
-frames whose file is, bit by bit, the one that `relit relight` makes undisturbed. The script ends with an error where a
-frame is missing or another, where there is a file besides (hidden ones too), where two workers were at one job at a
-time, where a job is lost or left over in the queue, and where a takeover from a killed worker takes {TAKEOVER_LIMIT_S:g} s or
-longer. `tests/service/server/jobs` has these faults at small size, the kills on SQLite too, and others: a job that kills its
+Each row is a relight of {FRAMES} frames ({SIZE} × {SIZE}, {LIGHTS} lights, {CHUNK_FRAMES} frames in each step) with {WORKERS} workers
+on a private PostgreSQL, during which faults happen; the kills come at random moments, in random order. A frame is
+*identical* if its file equals, bit by bit, the file that `relit relight` makes undisturbed. The script fails if a frame
+is missing or different, if there is any other file (hidden ones too), if two workers had one job at the same time, if a
+job is lost or left over in the queue, or if a takeover from a killed worker takes {TAKEOVER_LIMIT_S:g} s or longer.
+`tests/service/server/jobs` has these faults at small size, the kills on SQLite too, and others: a job that kills its
 workers, a full disk, a killed API.
 
 {chr(10).join(table(faults))}
 
-A worker that stands still is killed after `stall_s`, here {STALL_S:g} s, and its time contains that. A worker that is asked to end, or
-whose `relit worker` is killed, first finishes its step and then hands the job back, and its time contains that. A restart of PostgreSQL
-takes the job from nobody. In the run of kills `max_lost` is their number: as shipped a job that loses four workers without a frame more
-between them fails, since it may be what kills them.
+A worker that hangs is killed after `stall_s`, here {STALL_S:g} s, and its time contains that. A worker that is asked to stop, or
+whose `relit worker` is killed, first finishes its step and then returns the job to the queue, and its time contains that. When
+PostgreSQL restarts, the workers keep their jobs. In the run of kills `max_lost` is their number; with the default value, a job that loses
+four workers without a new frame between them fails, because the job may be what kills them.
 """
 
 

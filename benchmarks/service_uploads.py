@@ -117,7 +117,7 @@ def main(size_mib: int = 1024) -> None:
         peak = re.search(r"VmHWM:\s+(\d+)", Path(f"/proc/{server.process.pid}/status").read_text())
     plain, hashed = (statistics.median(times) for times in copies.values())
     print(f"{size_mib} MiB over loopback, medians of {ROUNDS} rounds; {os.cpu_count()} cores for client and service"
-          + (f"; most memory of the API {int(peak[1]) >> 10} MiB" if peak else "") + "\n")
+          + (f"; peak memory of the API {int(peak[1]) >> 10} MiB" if peak else "") + "\n")
     print("| | MiB/s | of a plain copy | of a copy with SHA-256 |\n|---|---|---|---|")
     for title, seconds in (("copy and fsync", plain), ("SHA-256, copy and fsync", hashed)):
         print(f"| {title} | {size_mib / seconds:.0f} | {100 * plain / seconds:.0f} % | {100 * hashed / seconds:.0f} % |")

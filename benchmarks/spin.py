@@ -18,8 +18,8 @@ PARTS = ("ingest", "guide", "weights", "product", "waiting for files")
 
 def spin_table() -> list[str]:
     """Lines of Markdown."""
-    lines = [f"`samples/owl`, {FRAMES} frames, 320 × 320, 96 lights, from EXR to half EXR; seconds. Files are written on threads beside "
-             "the rest; `waiting` is what of that is left.", "",
+    lines = [f"`samples/owl`, {FRAMES} frames, 320 × 320, 96 lights, from EXR to half EXR; seconds. Threads write files "
+             "meanwhile; `waiting` is the time that is spent waiting for them.", "",
              "| | decode and stack | guide | weights | product | waiting | whole | MB |", "|---|---|---|---|---|---|---|---|"]
     sample = SAMPLES / "owl"
     with tempfile.TemporaryDirectory() as folder:

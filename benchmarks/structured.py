@@ -175,7 +175,8 @@ def structured_rows(pixels: int = PIXELS) -> list[str]:
         return "–" if seconds is None else f"{seconds:.3g}" + ("" if ours is None else f" ({seconds / ours:.1f}×)")
 
     return [f"{pixels / 1e6:g} megapixels, {devices.describe('cpu')}, seconds (in brackets over Relit's). `whole`: NumPy with the same "
-            "uncertainty and status (unwrapping: without); `bare`: without. The Python loop is timed on fewer pixels and scaled.", "",
+            "uncertainty and status (unwrapping: without them); `bare`: NumPy without them. The Python loop is timed on fewer pixels and "
+            "scaled.", "",
             "| | Relit | NumPy, whole | NumPy, bare | Python loop |", "|---|---|---|---|---|",
             *(f"| {name} | {cell(ours)} | {cell(whole, ours)} | {cell(bare, ours)} | {cell(looped, ours)} |"
               for name, ours, whole, bare, looped in rows)]

@@ -50,8 +50,8 @@ def accuracy_rows() -> list[str]:
     settings = scenes.even(scenes.HZ, 4)
     megahertz = "/".join(f"{hz / 1e6:g}" for hz in scenes.HZ)
     span = f"{view.distance.min():.2g} to {view.distance.max():.3g} m"
-    lines = [f"A room of {COLS} × {ROWS} pixels, {span}, raw frames by the tests' own simulator: four phases at {megahertz} MHz, A = 10⁵ · "
-             "albedo · cos θ / d² electrons, read noise 5; histograms of 64 bins of 1.5 ns, 4000 · albedo · cos θ / d² counts.", "",
+    lines = [f"A room of {COLS} × {ROWS} pixels, {span}, raw frames by the simulator of the tests: four phases at {megahertz} MHz, A = 10⁵ "
+             "· albedo · cos θ / d² electrons, read noise 5; histograms of 64 bins of 1.5 ns, 4000 · albedo · cos θ / d² counts.", "",
              "| | light | median error, mm | wrong wraps | no depth | error over sigma, RMS |", "|---|---|---|---|---|---|"]
 
     def row(what: str, light: str, found: tuple[float, float, float, float]) -> None:

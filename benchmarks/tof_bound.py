@@ -56,8 +56,8 @@ def measured(view: scenes.View, part: float) -> Light:
 def bound_rows() -> list[str]:
     """Lines of Markdown."""
     room = scenes.room(ROWS, COLS)
-    lines = ["Histograms beside what their photons allow. Possible: median of the errors that the Cramér-Rao bound of each pixel leaves "
-             "(`stage.tof.bound`). Observed over sigma: 1.4826 · median of |error|/sigma, in fifths of the pixels from the smallest "
+    lines = ["Histograms, compared with what their photons allow. Possible: median of the errors that the Cramér-Rao bound of each pixel "
+             "allows (`stage.tof.bound`). Observed over sigma: 1.4826 · median of |error|/sigma, in fifths of the pixels from the smallest "
              "sigma to the largest; RMS of the same, clipped at 4.", "",
              "| scene | light | possible, mm | measured, mm | goal, mm | no depth | observed over sigma | RMS |",
              "|---|---|---|---|---|---|---|---|"]
