@@ -29,19 +29,24 @@ def pack_type(length: int, dtype: type) -> Any:
 
 
 class Band(NamedTuple):
-    """A pixel range of a stack on a device, as packs."""
+    """Readings of a pixel range on a device, as packs, and which of them saturate.
 
-    values: wp.array  # [channel · light, pack] half packs: stored radiance, the lights of the first channel first
-    saturated: wp.array  # [light / 8, pack] uint8 packs: bit l % 8 of byte l // 8
+    A stack of lights has its rows channel by channel, as `upload` takes it; frames of projected patterns have theirs frame by frame, as
+    `structured.frames.upload` does.
+    """
+
+    values: wp.array  # [channel · frame, pack] half packs: stored radiance, or [frame · channel, pack] float32 packs: linear readings
+    saturated: wp.array  # [⌈frame / 8⌉, pack] uint8 packs: bit f % 8 of byte f // 8
     pixel_count: int
-    light_count: int
+    frame_count: int
+    """Frames: one for each light, padding included, or one for each pattern."""
     device: str
     owner: tuple[Any, ...]
-    """What owns the memory; a band is valid while this tuple lives."""
+    """The objects that own the memory: a band is valid while this tuple lives."""
 
     @property
     def packs(self) -> int:
-        """How many packs cover the pixels."""
+        """Number of packs that cover the pixels."""
         return int(self.values.shape[1])
 
     def require_channels(self, count: int) -> None:
@@ -50,7 +55,7 @@ class Band(NamedTuple):
         Raises:
             ArrayError: naming what was got and what was expected.
         """
-        channels = self.values.shape[0] // self.light_count
+        channels = self.values.shape[0] // self.frame_count
         if channels != count:
             raise ArrayError(f"the band has {channels} channels, expected {count}: upload [{count}, light, pixel]")
 
@@ -74,27 +79,54 @@ def upload(values: np.ndarray, saturated: np.ndarray | None = None, *, device: s
     channels, lights, pixels = values.shape
     if lights == 0 or lights % 8:
         raise ArrayError(f"values have {lights} lights: pad the light axis with zeros to a multiple of 8")
-    if pixels > MAX_PIXELS:
-        raise ArrayError(f"values have {pixels} pixels: cut them into bands of at most {MAX_PIXELS}")
     if saturated is None:
         saturated = np.zeros((lights // 8, pixels), dtype=np.uint8)
     if saturated.shape != (lights // 8, pixels) or saturated.dtype != np.uint8:
         raise ArrayError(f"saturated is {saturated.dtype} {saturated.shape}: give uint8 {(lights // 8, pixels)}")
-    pack = devices.pack_width(device)
-    value_packs, value_owner = _place(values.reshape(channels * lights, pixels), pack, wp.float16, device)
-    bit_packs, bit_owner = _place(saturated, pack, wp.uint8, device)
-    return Band(value_packs, bit_packs, pixels, lights, device, (value_owner, bit_owner))
+    return band_of(values.reshape(channels * lights, pixels), saturated, frame_count=lights, device=device)
 
 
-def scalars(length: int, rows: int | None, dtype: Any, device: str) -> wp.array:
-    """An output array whose last axis is pixels, padded to whole packs so that kernels can write it as packs."""
+def band_of(rows: np.ndarray, saturated: np.ndarray, *, frame_count: int, device: str) -> Band:
+    """Return a band whose rows are laid out already; `upload` and `structured.frames.upload` check them first.
+
+    Args:
+        rows: [row, pixel] float16 or float32.
+        saturated: [⌈frame / 8⌉, pixel] uint8 bits.
+        frame_count: frames that the rows belong to.
+        device: where.
+
+    Raises:
+        ArrayError: too many pixels.
+    """
+    pixels = rows.shape[1]
+    if pixels > MAX_PIXELS:
+        raise ArrayError(f"values have {pixels} pixels: cut them into bands of at most {MAX_PIXELS}")
+    values, value_owner = place(rows, device)
+    bits, bit_owner = place(saturated, device)
+    return Band(values, bits, pixels, frame_count, device, (value_owner, bit_owner))
+
+
+def padded_count(pixels: int, device: str) -> int:
+    """Return the number of pixels after padding to whole packs."""
     pack = devices.pack_width(device)
-    whole = -(-length // pack) * pack
+    return -(-pixels // pack) * pack
+
+
+def zeros(pixels: int, dtype: Any, device: str, *, rows: int | None = None) -> wp.array:
+    """Return an output array of zeros, [pixels padded] or [rows, pixels padded], so that a kernel may leave pixels unwritten."""
+    whole = padded_count(pixels, device)
     return wp.zeros(whole if rows is None else (rows, whole), dtype=dtype, device=device)
 
 
+def unwritten(pixels: int, dtype: Any, device: str, *, rows: int | None = None) -> wp.array:
+    """Return an output array as `zeros` does, but with arbitrary values, for a kernel that writes every pixel: clearing it first would
+    take as long as writing it."""
+    whole = padded_count(pixels, device)
+    return wp.empty(whole if rows is None else (rows, whole), dtype=dtype, device=device)
+
+
 def as_packs(array: wp.array, device: str) -> wp.array:
-    """The same memory as packs: the last axis is divided by the pack width, which must divide it.
+    """Return a view of the same memory as packs: the last axis is divided by the pack width, which must divide it.
 
     The caller keeps the array: the view does not own the memory.
     """
@@ -107,8 +139,25 @@ def as_packs(array: wp.array, device: str) -> wp.array:
     return wp.array(ptr=array.ptr, shape=(*rows, length // pack), dtype=pack_type(pack, array.dtype), device=device, copy=False)
 
 
-def _place(array: np.ndarray, pack: int, dtype: Any, device: str) -> tuple[wp.array, Any]:
-    # [row, pixel] → [row, pack] and what owns its memory
+def as_pixels(packs: wp.array) -> wp.array:
+    """Return a view of [row, pack] packs as [row, pixel] scalars; it does not own the memory."""
+    kind, width = packs.dtype._wp_scalar_type_, packs.dtype._length_
+    return wp.array(ptr=packs.ptr, shape=(packs.shape[0], packs.shape[1] * width), dtype=kind,
+                    strides=(packs.strides[0], wp.types.type_size_in_bytes(kind)), device=packs.device, copy=False)
+
+
+def place(array: np.ndarray, device: str) -> tuple[wp.array, Any]:
+    """Return host rows as packs on the device, padded with zeros, and what owns their memory.
+
+    Args:
+        array: [row, pixel] float16, float32 or uint8. On the CPU it is not copied when its pixels divide into packs and its rows lie
+            evenly spaced in memory.
+        device: where.
+
+    Returns:
+        [row, pack] packs, and their owner.
+    """
+    pack, dtype = devices.pack_width(device), wp.dtype_from_numpy(array.dtype)
     short = -array.shape[1] % pack
     if device == "cpu":
         row_stride, stride = array.strides

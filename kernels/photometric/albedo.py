@@ -8,7 +8,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
-from kernels.packs import Band, as_packs, pack_type, scalars
+from kernels.packs import Band, as_packs, pack_type, zeros
 from kernels.photometric.lambert import NormalFit
 from kernels.photometric.near import Near, directions_in, falloff_or_none, toward_or_none
 from kernels.photometric.readings import Lights, Readings
@@ -31,13 +31,13 @@ def fit_albedo(band: Band, weights: Readings, fit: NormalFit, lights: Lights, ne
         ArrayError: a channel that no light reaches, or lights other than the band's.
     """
     band.require_channels(3)
-    if len(lights.direction) != band.light_count:
-        raise ArrayError(f"there are {len(lights.direction)} padded lights, the band has {band.light_count}: give its lights")
+    if len(lights.direction) != band.frame_count:
+        raise ArrayError(f"there are {len(lights.direction)} padded lights, the band has {band.frame_count}: give its lights")
     dead = [name for name, lit in zip("RGB", lights.irradiance.any(axis=0), strict=True) if not lit]
     if dead:
         raise ArrayError(f"irradiance is 0 in channel {dead[0]} of every light: its albedo cannot be known")
     device = band.device
-    albedo = scalars(band.pixel_count, 3, wp.float32, device)
+    albedo = zeros(band.pixel_count, wp.float32, device, rows=3)
     # E in stored units: radiance / scale = ρ/π · (E / scale) · n·l
     stored = np.divide(lights.irradiance, lights.scale[:, None], out=np.zeros_like(lights.irradiance),
                        where=lights.scale[:, None] > 0)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import warp as wp
 
 from kernels import device as devices
-from kernels.packs import scalars
+from kernels.packs import zeros
 from kernels.photometric.moments import Moments
 from kernels.status import DARK, ILL_POSED, OK
 
@@ -58,9 +58,9 @@ def diffuse_normals(diffuse: Moments, grey_weights: tuple[float, float, float], 
         one pseudo-observation of 1 %, and e how far (3/2)|M|/M₀ is from one, less twice what rounding and residual explain: light
         that is missing or added across the normal tilts M by δ and changes its length by δ²/2.
     """
-    fit = GradientFit(scalars(pixel_count, 3, wp.float32, device), scalars(pixel_count, 3, wp.float32, device),
-                      scalars(pixel_count, None, wp.float32, device), scalars(pixel_count, None, wp.float32, device),
-                      scalars(pixel_count, None, wp.int32, device))
+    fit = GradientFit(zeros(pixel_count, wp.float32, device, rows=3), zeros(pixel_count, wp.float32, device, rows=3),
+                      zeros(pixel_count, wp.float32, device), zeros(pixel_count, wp.float32, device),
+                      zeros(pixel_count, wp.int32, device))
     devices.launch(_diffuse_kernel, pixel_count, [*diffuse, wp.vec3(*grey_weights), gain], fit, device=device)
     return fit
 

@@ -17,7 +17,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
-from kernels.packs import scalars
+from kernels.packs import zeros
 from kernels.photometric.lobe_table import ANGLE_STEPS, MAX_ANGLE, MAX_ROUGHNESS, MIN_ROUGHNESS, ROUGHNESS_STEPS, lobe_table
 from kernels.photometric.separation import Separation, upload_view
 
@@ -60,8 +60,8 @@ def fit_highlights(parts: Separation, grey_weights: tuple[float, float, float], 
         ArrayError: view has another number of pixels.
     """
     toward = upload_view(view, pixel_count, device)
-    found = Highlights(scalars(pixel_count, 3, wp.float32, device), scalars(pixel_count, 3, wp.float32, device),
-                       scalars(pixel_count, None, wp.float32, device))
+    found = Highlights(zeros(pixel_count, wp.float32, device, rows=3), zeros(pixel_count, wp.float32, device, rows=3),
+                       zeros(pixel_count, wp.float32, device))
     table = wp.array(lobe_table().reshape(-1, 6), dtype=_Row, device=device)
     devices.launch(_highlight_kernel, pixel_count,
                    [parts.specular, parts.diffuse.values, toward, table, wp.vec3(*grey_weights), gain], found, device=device)
@@ -87,7 +87,7 @@ def specular_normals(parts: Separation, grey_weights: tuple[float, float, float]
         ArrayError: view has another number of pixels.
     """
     toward = upload_view(view, pixel_count, device)
-    normal = scalars(pixel_count, 3, wp.float32, device)
+    normal = zeros(pixel_count, wp.float32, device, rows=3)
     devices.launch(_specular_kernel, pixel_count, [parts.specular, parts.diffuse.values, toward, wp.vec3(*grey_weights), gain],
                    [normal], device=device)
     return normal
@@ -156,7 +156,7 @@ def _fit_lobe(table: wp.array(dtype=_Row), s0: float, lobe: float, spread: float
     return wp.vec2(angle, roughness)
 
 
-@wp.kernel(enable_backward=False, module="unique")
+@wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
 def _highlight_kernel(first: int,
                       specular: wp.array2d(dtype=float),  # [6, N]
                       diffuse: wp.array2d(dtype=float),  # [12, N]

@@ -9,7 +9,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.normal_equations import add_reading, symmetric
-from kernels.packs import Band, pack_type, scalars
+from kernels.packs import Band, pack_type, zeros
 from kernels.photometric.least_squares import confidence_of, fit_pixel
 from kernels.photometric.near import Near, directions_in, toward_or_none
 from kernels.photometric.readings import Readings
@@ -48,12 +48,12 @@ def solve_lambert(band: Band, readings: Readings, directions: np.ndarray, near: 
 
 def run_normal_kernel(make: Any, band: Band, readings: Readings, directions: np.ndarray, near: Near | None) -> NormalFit:
     """Launch a kernel that turns readings into normals; shared by the solvers that differ in the kernel alone."""
-    if directions.shape != (band.light_count, 3):
-        raise ArrayError(f"directions are {directions.shape}, the band has {band.light_count} lights: give a row for each")
-    fit = NormalFit(scalars(band.pixel_count, 3, wp.float32, band.device),
-                    scalars(band.pixel_count, None, wp.float32, band.device),
-                    scalars(band.pixel_count, None, wp.float32, band.device),
-                    scalars(band.pixel_count, None, wp.int32, band.device))
+    if directions.shape != (band.frame_count, 3):
+        raise ArrayError(f"directions are {directions.shape}, the band has {band.frame_count} lights: give a row for each")
+    fit = NormalFit(zeros(band.pixel_count, wp.float32, band.device, rows=3),
+                    zeros(band.pixel_count, wp.float32, band.device),
+                    zeros(band.pixel_count, wp.float32, band.device),
+                    zeros(band.pixel_count, wp.int32, band.device))
     lights = wp.array(np.ascontiguousarray(directions, dtype=np.float32), dtype=wp.vec3, device=band.device)
     devices.launch(make(devices.pack_width(band.device), near is not None), band.packs,
                    [lights, toward_or_none(near, band.device), readings.pack_stride, readings.light_stride],

@@ -17,7 +17,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
-from kernels.packs import Band, pack_type, scalars
+from kernels.packs import Band, pack_type, zeros
 from kernels.status import DARK, OK, TOO_FEW_LIGHTS
 
 LARGEST_HALF = 65504.0
@@ -56,16 +56,16 @@ def fit_moments(band: Band, rows: np.ndarray, scale: np.ndarray, grey_weights: t
         ArrayError: rows or scale do not match the band, no frame takes part, or a gradient has several axes.
     """
     band.require_channels(3)
-    if rows.shape != (band.light_count, 4) or scale.shape != (band.light_count,):
-        raise ArrayError(f"rows are {rows.shape}, scale {scale.shape}, the band has {band.light_count} lights: give one for each")
+    if rows.shape != (band.frame_count, 4) or scale.shape != (band.frame_count,):
+        raise ArrayError(f"rows are {rows.shape}, scale {scale.shape}, the band has {band.frame_count} lights: give one for each")
     if (np.count_nonzero(rows[:, 1:], axis=1) > 1).any():
         raise ArrayError("rows hold a gradient along several axes: give each frame one axis")
     frames = np.flatnonzero(rows.any(axis=1))
     if len(frames) == 0:
         raise ArrayError("rows are all zero: give the mean and dipole of the gradient frames")
     device, count = band.device, band.pixel_count
-    fit = Moments(scalars(count, 12, wp.float32, device), *(scalars(count, None, wp.float32, device) for _ in range(4)),
-                  scalars(count, None, wp.int32, device))
+    fit = Moments(zeros(count, wp.float32, device, rows=12), *(zeros(count, wp.float32, device) for _ in range(4)),
+                  zeros(count, wp.int32, device))
     devices.launch(_moments_kernel(devices.pack_width(device)), band.packs,
                    [band.values, band.saturated, wp.array(frames.astype(np.int32), dtype=wp.int32, device=device),
                     wp.array(rows[frames].astype(np.float32), dtype=wp.vec4, device=device),

@@ -82,9 +82,9 @@ def see_near(band: Band, readings: Readings, field: NearField) -> Near:
         ArrayError: lights or pixels other than the band's.
     """
     places, points = field
-    if len(places.place) != band.light_count or points.shape != (3, band.pixel_count):
+    if len(places.place) != band.frame_count or points.shape != (3, band.pixel_count):
         raise ArrayError(f"there are {len(places.place)} padded lights and {points.shape} points, the band has "
-                         f"{band.light_count} lights and {band.pixel_count} pixels")
+                         f"{band.frame_count} lights and {band.pixel_count} pixels")
     device, pack = band.device, devices.pack_width(band.device)
     float_pack = pack_type(pack, wp.float32)
     held = np.pad(np.asarray(points, dtype=np.float32), ((0, 0), (0, -band.pixel_count % pack)), mode="edge")

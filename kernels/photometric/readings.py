@@ -117,10 +117,10 @@ def grey_readings(band: Band, factors: np.ndarray) -> Readings:
         ArrayError: the band has other lights or channels, or is too large to index.
     """
     band.require_channels(3)
-    if factors.shape != (band.light_count, 3):
-        raise ArrayError(f"factors are {factors.shape}, the band has {band.light_count} lights")
+    if factors.shape != (band.frame_count, 3):
+        raise ArrayError(f"factors are {factors.shape}, the band has {band.frame_count} lights")
     pack = devices.pack_width(band.device)
-    packs, lights = band.packs, band.light_count
+    packs, lights = band.packs, band.frame_count
     if packs * lights > devices.MAX_THREADS:
         raise ArrayError(f"the band has {packs} packs of {lights} lights: cut it so that their product stays below 2**31")
     values = wp.empty(packs * lights, dtype=pack_type(pack, wp.float32), device=band.device)

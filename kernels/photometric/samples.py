@@ -8,7 +8,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
-from kernels.packs import Band, pack_type
+from kernels.packs import Band, as_pixels, pack_type
 from kernels.photometric.near import NearField, falloff, near_direction
 from kernels.photometric.readings import LARGEST, Lights
 
@@ -89,11 +89,6 @@ def gather(band: Band, pixels: np.ndarray, view: np.ndarray, lights: Lights, fac
     colour = wp.empty((3, packs * light_count), dtype=lane_type, device=device)
     toward = wp.empty((3, packs * light_count), dtype=lane_type, device=device)
     level = wp.empty(packs, dtype=lane_type, device=device)
-    width = devices.pack_width(device)
-    flat = wp.array(ptr=band.values.ptr, shape=(band.values.shape[0], band.values.shape[1] * width),
-                    strides=(band.values.strides[0], 2), dtype=wp.float16, device=device, copy=False)
-    bits = wp.array(ptr=band.saturated.ptr, shape=(band.saturated.shape[0], band.saturated.shape[1] * width),
-                    strides=(band.saturated.strides[0], 1), dtype=wp.uint8, device=device, copy=False)
     per_channel = np.divide(lights.scale[:, None], lights.irradiance, out=np.zeros_like(lights.irradiance),
                             where=lights.irradiance > 0)
     where = wp.array(pixels[order].astype(np.int32), dtype=wp.int32, device=device)
@@ -104,7 +99,7 @@ def gather(band: Band, pixels: np.ndarray, view: np.ndarray, lights: Lights, fac
                 wp.array(field.places.lobe, dtype=wp.vec4, device=device),
                 wp.array(np.ascontiguousarray(field.points[:, order], dtype=np.float32), dtype=float, device=device))
     devices.launch(_gather_kernel(lanes, field is not None), packs,
-                   [flat, bits, where, wp.array(factors, dtype=wp.vec3, device=device),
+                   [as_pixels(band.values), as_pixels(band.saturated), where, wp.array(factors, dtype=wp.vec3, device=device),
                     wp.array(per_channel.astype(np.float32), dtype=wp.vec3, device=device),
                     wp.array(lights.direction, dtype=wp.vec3, device=device), *near, light_count, pack_stride, light_stride],
                    [grey, colour, toward, level], device=device)

@@ -21,7 +21,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
-from kernels.packs import scalars
+from kernels.packs import padded_count, zeros
 from kernels.photometric.moments import Moments
 from kernels.status import OK
 
@@ -52,7 +52,7 @@ def separate_polarised(cross: Moments, parallel: Moments, grey_weights: tuple[fl
         pixel_count: pixels of the band.
         device: where the responses are.
     """
-    specular = scalars(pixel_count, 6, wp.float32, device)
+    specular = zeros(pixel_count, wp.float32, device, rows=6)
     devices.launch(_difference_kernel, pixel_count, [cross.values, cross.status, parallel.values, parallel.status,
                                                      wp.vec3(*grey_weights)], [specular], device=device)
     return Separation(cross, specular)
@@ -75,7 +75,7 @@ def separate_by_colour(mixed: Moments, view: np.ndarray, *, pixel_count: int, de
     """
     toward = upload_view(view, pixel_count, device)
     diffuse = Moments(*(wp.clone(array) for array in mixed))
-    specular = scalars(pixel_count, 6, wp.float32, device)
+    specular = zeros(pixel_count, wp.float32, device, rows=6)
     devices.launch(_colour_kernel, pixel_count, [toward, mixed.status], [diffuse.values, diffuse.variance, diffuse.tilt, specular],
                    device=device)
     return Separation(diffuse, specular)
@@ -89,8 +89,7 @@ def upload_view(view: np.ndarray, pixel_count: int, device: str) -> wp.array:
     """
     if view.shape not in ((3, pixel_count), (3, 1)):
         raise ArrayError(f"view is {view.shape}, the band has {pixel_count} pixels: give [3, {pixel_count}], or [3, 1] for all")
-    padded = -(-pixel_count // devices.pack_width(device)) * devices.pack_width(device)
-    values = np.zeros((3, padded), dtype=np.float32)
+    values = np.zeros((3, padded_count(pixel_count, device)), dtype=np.float32)
     values[:, :pixel_count] = view
     return wp.array(values, dtype=wp.float32, device=device)
 

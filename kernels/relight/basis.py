@@ -55,7 +55,7 @@ def gram(band: Band, keep: np.ndarray) -> np.ndarray:
     band.require_channels(3)
     if keep.shape != (band.pixel_count,):
         raise ArrayError(f"keep has {keep.size} pixels, the band {band.pixel_count}: give one bool a pixel")
-    pack, lights, device = devices.pack_width(band.device), band.light_count, band.device
+    pack, lights, device = devices.pack_width(band.device), band.frame_count, band.device
     counted = np.zeros(band.packs * pack, dtype=np.float32)
     counted[: keep.size] = keep
     rows, columns = np.tril_indices(lights // TILE)

@@ -37,7 +37,7 @@ def combine_batch(band: Band, weights: np.ndarray) -> wp.array:
         ArrayError: weights do not match the band, or are not finite.
     """
     band.require_channels(3)
-    check_weights(weights, (len(weights), 3, band.light_count))
+    check_weights(weights, (len(weights), 3, band.frame_count))
     device = band.device
     pack = devices.pack_width(device)
     weights = np.ascontiguousarray(weights, dtype=np.float32)
@@ -46,7 +46,7 @@ def combine_batch(band: Band, weights: np.ndarray) -> wp.array:
         _product(band, weights, frames.numpy(), pack)
         return frames
     groups = -(-len(weights) // REGISTER_FRAMES)
-    padded = np.zeros((groups * REGISTER_FRAMES, 3, band.light_count), dtype=np.float32)
+    padded = np.zeros((groups * REGISTER_FRAMES, 3, band.frame_count), dtype=np.float32)
     padded[: len(weights)] = weights
     frames = wp.empty((groups * REGISTER_FRAMES, 3, band.packs * pack), dtype=wp.float32, device=device)
     devices.launch(register_kernel(pack), groups * 3 * band.packs,
@@ -59,15 +59,15 @@ def _product(band: Band, weights: np.ndarray, frames: np.ndarray, pack: int) -> 
     groups = -(-len(weights) // GROUP)
     padded = np.zeros((groups * GROUP, *weights.shape[1:]), dtype=np.float32)
     padded[: len(weights)] = weights
-    step = max(1, BLOCK_BYTES // (4 * pack * band.light_count))
-    block = wp.empty((band.light_count, step), dtype=pack_type(pack, wp.float32), device="cpu")
-    widened = block.numpy().reshape(band.light_count, step * pack)
+    step = max(1, BLOCK_BYTES // (4 * pack * band.frame_count))
+    block = wp.empty((band.frame_count, step), dtype=pack_type(pack, wp.float32), device="cpu")
+    widened = block.numpy().reshape(band.frame_count, step * pack)
     group = np.empty((GROUP, step * pack), dtype=np.float32)
     for channel in range(3):
         per_frame = np.ascontiguousarray(padded[:, channel])
         for begin in range(0, band.packs, step):
             count = min(step, band.packs - begin)
-            devices.launch(_widen_kernel(pack), band.light_count, [band.values, channel * band.light_count, begin, count],
+            devices.launch(_widen_kernel(pack), band.frame_count, [band.values, channel * band.frame_count, begin, count],
                            [block], device="cpu")
             pixels = slice(begin * pack, (begin + count) * pack)
             for first in range(0, len(weights), GROUP):

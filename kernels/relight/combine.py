@@ -15,7 +15,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
-from kernels.packs import Band, as_packs, pack_type, scalars
+from kernels.packs import Band, as_packs, pack_type, zeros
 
 CHUNK = 1024
 """Packs of one CPU thread: 64 KiB of each light's row, so that the memory's own prefetching gets going; its sums, 128 KiB, stay in
@@ -38,10 +38,10 @@ def combine(band: Band, weights: np.ndarray) -> wp.array:
         ArrayError: weights do not match the band, or are not finite.
     """
     band.require_channels(3)
-    check_weights(weights, (3, band.light_count))
+    check_weights(weights, (3, band.frame_count))
     device = band.device
     pack = devices.pack_width(device)
-    frame = scalars(band.pixel_count, 3, wp.float32, device)
+    frame = zeros(band.pixel_count, wp.float32, device, rows=3)
     on_device = wp.array(np.ascontiguousarray(weights, dtype=np.float32), dtype=wp.float32, device=device)
     if device == "cpu":
         chunks = -(-band.packs // CHUNK)

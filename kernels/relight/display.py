@@ -13,7 +13,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
-from kernels.packs import Band, as_packs, pack_type, scalars
+from kernels.packs import Band, as_packs, pack_type, zeros
 
 
 def encode(band: Band, gains: np.ndarray, display_from_stack: np.ndarray) -> Band:
@@ -31,17 +31,17 @@ def encode(band: Band, gains: np.ndarray, display_from_stack: np.ndarray) -> Ban
         ArrayError: gains or matrix of another shape, or not finite.
     """
     band.require_channels(3)
-    for name, array, shape in (("gains", gains, (3, band.light_count)), ("display_from_stack", display_from_stack, (3, 3))):
+    for name, array, shape in (("gains", gains, (3, band.frame_count)), ("display_from_stack", display_from_stack, (3, 3))):
         if array.shape != shape or not np.isfinite(array).all():
             raise ArrayError(f"{name} are {array.shape}, expected {shape} finite values")
     device = band.device
     pack = devices.pack_width(device)
-    encoded = scalars(band.pixel_count, 3 * band.light_count, wp.float16, device)
+    encoded = zeros(band.pixel_count, wp.float16, device, rows=3 * band.frame_count)
     on_device = wp.array(np.ascontiguousarray(gains, dtype=np.float32), dtype=wp.float32, device=device)
     matrix = wp.mat33(*(float(v) for v in np.asarray(display_from_stack, dtype=np.float32).reshape(-1)))
     packed = as_packs(encoded, device)
-    devices.launch(encode_kernel(pack), band.light_count * band.packs, [band.values, on_device, matrix], [packed], device=device)
-    return Band(packed, band.saturated, band.pixel_count, band.light_count, device, (*band.owner, encoded))
+    devices.launch(encode_kernel(pack), band.frame_count * band.packs, [band.values, on_device, matrix], [packed], device=device)
+    return Band(packed, band.saturated, band.pixel_count, band.frame_count, device, (*band.owner, encoded))
 
 
 @wp.func

@@ -76,7 +76,7 @@ def compare_model(band: Band, surface: Surface, visible: wp.array, direction: np
     place = np.concatenate([direction, np.zeros((count, 1))], axis=1)
     sums = wp.empty((2, surface.packs * pack), dtype=wp.float32, device=device)
     devices.launch(_compare_kernel(pack), surface.packs,
-                   [band.values, band.light_count, surface.values, visible,
+                   [band.values, band.frame_count, surface.values, visible,
                     wp.array(place.astype(np.float32), dtype=wp.vec4, device=device),
                     wp.array(factor.astype(np.float32), dtype=wp.vec3, device=device),
                     wp.array(np.ascontiguousarray(neighbours), dtype=wp.vec3i, device=device),

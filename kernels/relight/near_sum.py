@@ -72,7 +72,7 @@ def sum_near(band: Band, surface: Surface, visible: wp.array, sources: Sources, 
                     upload(kept[owner].astype(np.int32), wp.int32), upload(part.astype(np.float32), wp.float32), count], [weights],
                    device=device)
     devices.launch(_sum_kernel(pack), surface.packs,
-                   [band.values, band.light_count, surface.values, visible, upload(place, wp.vec4), upload(factor, wp.vec3),
+                   [band.values, band.frame_count, surface.values, visible, upload(place, wp.vec4), upload(factor, wp.vec3),
                     as_packs(weights, device)], [as_packs(out, device)], device=device)
     return out
 

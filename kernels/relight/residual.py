@@ -8,7 +8,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
-from kernels.packs import Band, as_packs, pack_type, scalars
+from kernels.packs import Band, as_packs, pack_type, zeros
 
 
 def squared_residual(band: Band, gains: np.ndarray, coefficients: np.ndarray, functions: np.ndarray, *,
@@ -32,14 +32,14 @@ def squared_residual(band: Band, gains: np.ndarray, coefficients: np.ndarray, fu
     band.require_channels(3)
     pack, device = devices.pack_width(band.device), band.device
     terms, pixels = len(coefficients), band.packs * pack
-    wanted = {"gains": (gains, (3, band.light_count)), "coefficients": (coefficients, (terms, 3, pixels)),
-              "functions": (functions, (3, band.light_count, terms))}
+    wanted = {"gains": (gains, (3, band.frame_count)), "coefficients": (coefficients, (terms, 3, pixels)),
+              "functions": (functions, (3, band.frame_count, terms))}
     for name, (array, shape) in wanted.items():
         if array.shape != shape:
             raise ArrayError(f"{name} are {array.shape}, expected {shape}")
     on_device = wp.array(np.ascontiguousarray(coefficients, dtype=np.float32), dtype=wp.float32, device=device)
     small = [wp.array(np.ascontiguousarray(a, dtype=np.float32), dtype=wp.float32, device=device) for a in (gains, functions)]
-    squares = scalars(band.pixel_count, 3, wp.float32, device)
+    squares = zeros(band.pixel_count, wp.float32, device, rows=3)
     devices.launch(residual_kernel(pack), 3 * band.packs, [band.values, small[0], as_packs(on_device, device), small[1], low, high],
                    [as_packs(squares, device)], device=device)
     return squares

@@ -114,8 +114,8 @@ def require_same(band: Band, surface: Surface, visible: wp.array, count: int) ->
         ArrayError: naming what was got.
     """
     band.require_channels(3)
-    if band.packs != surface.packs or visible.shape[1] != surface.packs or min(visible.shape[0], band.light_count) < count:
-        raise ArrayError(f"band has {band.packs} packs of {band.light_count} lights, the surface {surface.packs}, visibility is "
+    if band.packs != surface.packs or visible.shape[1] != surface.packs or min(visible.shape[0], band.frame_count) < count:
+        raise ArrayError(f"band has {band.packs} packs of {band.frame_count} lights, the surface {surface.packs}, visibility is "
                          f"{visible.shape}, directions are {count}: give the same pixels and lights")
 
 

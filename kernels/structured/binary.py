@@ -18,10 +18,10 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
-from kernels.packs import as_packs, pack_type
+from kernels.packs import Band, as_packs, pack_type
 from kernels.status import OK, Status
-from kernels.structured.decoded import Decoded, stripe_place
-from kernels.structured.frames import Frames, NoiseModel, check_noise, check_stripes, cut_in
+from kernels.structured.decoded import Decoded, stripe_place, unwritten_decoded
+from kernels.structured.frames import NoiseModel, check_noise, check_stripes, cut_in, require_frames, saturation_masks
 
 SHADOW_SIGMAS = 5.0
 """Contrast (white minus black, or the largest difference of a pair) over its deviation: below, the projector does not reach the pixel."""
@@ -40,7 +40,7 @@ _SATURATED, _SHADOWED, _UNDECIDED, _OUT_OF_RANGE = (int(s) for s in (Status.SATU
                                                                     Status.OUT_OF_RANGE))
 
 
-def decode_binary(frames: Frames, bits: Sequence[int], inverses: Sequence[int] | None = None, *, white: int | None = None,
+def decode_binary(frames: Band, bits: Sequence[int], inverses: Sequence[int] | None = None, *, white: int | None = None,
                   black: int | None = None, extent: float, stripe_px: float = 1.0, noise: NoiseModel) -> Decoded:
     """Decode a plain binary code.
 
@@ -63,13 +63,13 @@ def decode_binary(frames: Frames, bits: Sequence[int], inverses: Sequence[int] |
     return _decode(_stripe_kernel, "binary", frames, bits, inverses, white, black, extent, stripe_px, noise, 0)
 
 
-def decode_gray(frames: Frames, bits: Sequence[int], inverses: Sequence[int] | None = None, *, white: int | None = None,
+def decode_gray(frames: Band, bits: Sequence[int], inverses: Sequence[int] | None = None, *, white: int | None = None,
                 black: int | None = None, extent: float, stripe_px: float = 1.0, noise: NoiseModel) -> Decoded:
     """Decode a Gray code: as decode_binary; at an edge one bit changes, so edges are decoded too."""
     return _decode(_stripe_kernel, "gray", frames, bits, inverses, white, black, extent, stripe_px, noise, 0)
 
 
-def decode_xor(frames: Frames, bits: Sequence[int], inverses: Sequence[int] | None = None, *, base_bit: int = 0,
+def decode_xor(frames: Band, bits: Sequence[int], inverses: Sequence[int] | None = None, *, base_bit: int = 0,
                white: int | None = None, black: int | None = None, extent: float, stripe_px: float = 1.0,
                noise: NoiseModel) -> Decoded:
     """Decode an XOR code: as decode_gray, after the bits above base_bit are freed of it.
@@ -82,11 +82,11 @@ def decode_xor(frames: Frames, bits: Sequence[int], inverses: Sequence[int] | No
     return _decode(_stripe_kernel, "xor", frames, bits, inverses, white, black, extent, stripe_px, noise, base_bit)
 
 
-def _decode(make: Any, code: str, frames: Frames, bits: Sequence[int], inverses: Sequence[int] | None, white: int | None,
+def _decode(make: Any, code: str, frames: Band, bits: Sequence[int], inverses: Sequence[int] | None, white: int | None,
             black: int | None, extent: float, stripe_px: float, noise: NoiseModel, base_bit: int) -> Decoded:
     check_noise(noise)
     check_stripes(extent, stripe_px)
-    frames.require(*bits, *(inverses or ()), white, black)
+    require_frames(frames, *bits, *(inverses or ()), white, black)
     if not 1 <= len(bits) <= MAX_BITS:
         raise ArrayError(f"the code has {len(bits)} bits: give 1 to {MAX_BITS}")
     if 2.0 ** len(bits) * stripe_px < extent:
@@ -97,12 +97,12 @@ def _decode(make: Any, code: str, frames: Frames, bits: Sequence[int], inverses:
     references = white is not None and black is not None
     if inverses is None and not references:
         raise ArrayError("there are neither inverses nor white and black: a bit needs one of the two as its threshold")
-    result = frames.outputs()
+    result = unwritten_decoded(frames.pixel_count, frames.device)
     rows = np.stack([bits, bits if inverses is None else inverses], axis=1).astype(np.int32)
     used = [*bits, *inverses] if inverses is not None else [*bits, white, black]
     kernel = make(devices.pack_width(frames.device), code, inverses is not None, references)
     devices.launch(kernel, frames.packs,
-                   [frames.values, frames.saturated, frames.mask_of(used), wp.array(rows, dtype=wp.int32, device=frames.device),
+                   [frames.values, frames.saturated, saturation_masks(frames, used), wp.array(rows, dtype=wp.int32, device=frames.device),
                     white if references else 0, black if references else 0, noise.read**2, noise.gain, float(stripe_px), float(extent),
                     int(base_bit), (1 << len(bits)) - (2 << base_bit)],
                    [as_packs(array, frames.device) for array in result], device=frames.device)

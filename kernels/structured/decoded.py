@@ -5,6 +5,8 @@ from typing import NamedTuple
 
 import warp as wp
 
+from kernels.packs import unwritten
+
 STRIPE_DEVIATION = 1.0 / sqrt(12.0)
 """Standard deviation of a place evenly distributed over a stripe of width one."""
 
@@ -16,6 +18,11 @@ class Decoded(NamedTuple):
     sigma: wp.array  # [pixels] float32: standard deviation of the coordinate, projector pixels; 0 where not decoded
     amplitude: wp.array  # [pixels] float32: half of what the pattern changes, in the unit of the images
     status: wp.array  # [pixels] uint8, codes of kernels.status
+
+
+def unwritten_decoded(pixels: int, device: str) -> Decoded:
+    """Return the arrays of a result, for a kernel to write."""
+    return Decoded(*(unwritten(pixels, dtype, device) for dtype in (wp.float32, wp.float32, wp.float32, wp.uint8)))
 
 
 @wp.func

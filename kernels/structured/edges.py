@@ -17,11 +17,11 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
-from kernels.packs import as_packs, pack_type
+from kernels.packs import Band, as_packs, as_pixels, pack_type, unwritten
 from kernels.status import OK
 from kernels.structured.binary import gray_to_binary
 from kernels.structured.decoded import Decoded
-from kernels.structured.frames import Frames, NoiseModel, check_noise, check_stripes, unwritten
+from kernels.structured.frames import NoiseModel, check_noise, check_stripes, require_frames
 
 REACH = 48
 """Camera pixels that are searched to either side for an edge; a stripe wider than that is not interpolated."""
@@ -30,7 +30,7 @@ EDGE_ERROR = 0.065
 Counted as the same at both edges, as it is where stripes are a whole number of pixels wide."""
 
 
-def refine_edges(decoded: Decoded, frames: Frames, bits: Sequence[int], inverses: Sequence[int], *, columns: int, down: bool,
+def refine_edges(decoded: Decoded, frames: Band, bits: Sequence[int], inverses: Sequence[int], *, columns: int, down: bool,
                  extent: float, stripe_px: float = 1.0, noise: NoiseModel) -> Decoded:
     """Interpolate a decoded Gray code between the edges of its stripes.
 
@@ -53,7 +53,7 @@ def refine_edges(decoded: Decoded, frames: Frames, bits: Sequence[int], inverses
     """
     check_noise(noise)
     check_stripes(extent, stripe_px)
-    frames.require(*bits, *inverses)
+    require_frames(frames, *bits, *inverses)
     if not bits or len(inverses) != len(bits):
         raise ArrayError(f"there are {len(bits)} bits and {len(inverses)} inverses: edges are found with one for each")
     if columns < 1 or frames.pixel_count % columns:
@@ -61,16 +61,14 @@ def refine_edges(decoded: Decoded, frames: Frames, bits: Sequence[int], inverses
     if decoded.coordinate.shape[0] != frames.packs * devices.pack_width(frames.device):
         raise ArrayError(f"the code has {decoded.coordinate.shape[0]} pixels, the frames {frames.pixel_count}: decode the same frames")
     device = frames.device
-    number = unwritten(frames.pixel_count, None, wp.int32, device)
+    number = unwritten(frames.pixel_count, wp.int32, device)
     rows = wp.array(np.stack([bits, inverses], axis=1).astype(np.int32), dtype=wp.int32, device=device)
     devices.launch(_number_kernel(devices.pack_width(device)), frames.packs, [frames.values, rows], [as_packs(number, device)],
                    device=device)
     coordinate, sigma = (wp.clone(array) for array in decoded[:2])
-    readings = wp.array(ptr=frames.values.ptr, shape=(frames.values.shape[0], number.shape[0]), dtype=wp.float32, device=device,
-                        strides=(frames.values.strides[0], 4), copy=False)
     devices.launch(_edge_kernel, frames.pixel_count,
-                   [readings, rows, number, decoded.status, columns, frames.pixel_count // columns, 1 if down else 0, float(stripe_px),
-                    float(extent), noise.read**2, noise.gain], [coordinate, sigma], device=device, uneven=True)
+                   [as_pixels(frames.values), rows, number, decoded.status, columns, frames.pixel_count // columns, 1 if down else 0,
+                    float(stripe_px), float(extent), noise.read**2, noise.gain], [coordinate, sigma], device=device, uneven=True)
     return Decoded(coordinate, sigma, decoded.amplitude, decoded.status)
 
 

@@ -7,10 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from kernels import device as devices
 from kernels.errors import ArrayError
-from kernels.packs import MAX_PIXELS, as_packs, pack_type
-from kernels.structured.decoded import Decoded
+from kernels.packs import Band, band_of, pack_type
 
 
 class NoiseModel(NamedTuple):
@@ -26,54 +24,35 @@ EIGHT_BIT = NoiseModel(0.003, 1.0e-4)
 """Of full scale 1: an ordinary camera of eight bits whose pixels hold ten thousand electrons."""
 
 
-class Frames(NamedTuple):
-    """Readings of a pixel range; frame f of channel c is row f · channels + c."""
+def require_frames(frames: Band, *numbers: int | None, channels: int = 1) -> None:
+    """Refuse frames that do not exist or are taken twice, or images of another number of channels.
 
-    values: wp.array  # [frames · channels, packs] float32 packs, linear
-    saturated: wp.array  # [⌈frames / 8⌉, packs] uint8 packs: bit f % 8 of byte f // 8
-    pixel_count: int
-    frame_count: int
-    channels: int
-    device: str
-    owner: tuple[Any, ...]
-    """What owns the memory; the frames are valid while this tuple lives."""
-
-    @property
-    def packs(self) -> int:
-        """How many packs cover the pixels."""
-        return int(self.values.shape[1])
-
-    def require(self, *numbers: int | None, channels: int = 1) -> None:
-        """Refuse frames that are not there, or are taken twice, or images of another kind.
-
-        Raises:
-            ArrayError: naming the frame or the channels.
-        """
-        if self.channels != channels:
-            raise ArrayError(f"the frames have {self.channels} channels, this decoder takes {channels}")
-        given = [number for number in numbers if number is not None]
-        for number in given:
-            if not 0 <= number < self.frame_count:
-                raise ArrayError(f"frame {number} does not exist: there are {self.frame_count} (0 to {self.frame_count - 1})")
-        if len(set(given)) < len(given):
-            twice = next(number for number in given if given.count(number) > 1)
-            raise ArrayError(f"frame {twice} is given for two patterns: every pattern has a frame of its own")
-
-    def mask_of(self, *sets: Sequence[int | None]) -> wp.array:
-        """[⌈frames / 8⌉] int32: the bits of `saturated` that belong to these frames; of several sets a row each."""
-        masks = np.zeros((len(sets), self.saturated.shape[0]), dtype=np.int32)
-        for row, numbers in zip(masks, sets, strict=True):
-            for number in numbers:
-                if number is not None:
-                    row[number // 8] |= 1 << number % 8
-        return wp.array(masks if len(sets) > 1 else masks[0], dtype=wp.int32, device=self.device)
-
-    def outputs(self) -> Decoded:
-        """Empty arrays for a result."""
-        return outputs(self.pixel_count, self.device)
+    Raises:
+        ArrayError: naming the frame or the channels.
+    """
+    have = frames.values.shape[0] // frames.frame_count
+    if have != channels:
+        raise ArrayError(f"the frames have {have} channels, this decoder takes {channels}")
+    given = [number for number in numbers if number is not None]
+    for number in given:
+        if not 0 <= number < frames.frame_count:
+            raise ArrayError(f"frame {number} does not exist: there are {frames.frame_count} (0 to {frames.frame_count - 1})")
+    if len(set(given)) < len(given):
+        twice = next(number for number in given if given.count(number) > 1)
+        raise ArrayError(f"frame {twice} is given for two patterns: every pattern has a frame of its own")
 
 
-def upload(values: np.ndarray, saturated: np.ndarray | None = None, *, device: str) -> Frames:
+def saturation_masks(frames: Band, *sets: Sequence[int | None]) -> wp.array:
+    """Return the bits of `frames.saturated` that belong to some frames: [⌈frames / 8⌉] int32, or a row for each of several sets."""
+    masks = np.zeros((len(sets), frames.saturated.shape[0]), dtype=np.int32)
+    for row, numbers in zip(masks, sets, strict=True):
+        for number in numbers:
+            if number is not None:
+                row[number // 8] |= 1 << number % 8
+    return wp.array(masks if len(sets) > 1 else masks[0], dtype=wp.int32, device=frames.device)
+
+
+def upload(values: np.ndarray, saturated: np.ndarray | None = None, *, device: str) -> Band:
     """Lay frames out on the device.
 
     Args:
@@ -90,16 +69,12 @@ def upload(values: np.ndarray, saturated: np.ndarray | None = None, *, device: s
     if values.ndim not in (2, 3) or values.dtype != np.float32 or 0 in values.shape:
         raise ArrayError(f"values are {values.dtype} {values.shape}: give [frames, pixels] or [frames, channels, pixels] float32")
     count, channels, pixels = len(values), 1 if values.ndim == 2 else values.shape[1], values.shape[-1]
-    if pixels > MAX_PIXELS:
-        raise ArrayError(f"values have {pixels} pixels: cut them into bands of at most {MAX_PIXELS}")
     groups = -(-count // 8)
     if saturated is None:
         saturated = np.zeros((groups, pixels), dtype=np.uint8)
     if saturated.shape != (groups, pixels) or saturated.dtype != np.uint8:
         raise ArrayError(f"saturated is {saturated.dtype} {saturated.shape}: give uint8 {(groups, pixels)}, a bit for each frame")
-    value_packs, value_owner = _place(values.reshape(count * channels, pixels), wp.float32, device)
-    bit_packs, bit_owner = _place(saturated, wp.uint8, device)
-    return Frames(value_packs, bit_packs, pixels, count, channels, device, (value_owner, bit_owner))
+    return band_of(values.reshape(count * channels, pixels), saturated, frame_count=count, device=device)
 
 
 def stack(images: Sequence[np.ndarray]) -> np.ndarray:
@@ -164,27 +139,3 @@ def check_stripes(extent: float, stripe_px: float) -> None:
     """
     if not (extent > 0 and stripe_px > 0):
         raise ArrayError(f"the projector has {extent:g} px, a stripe {stripe_px:g}: give both above 0")
-
-
-def outputs(pixels: int, device: str) -> Decoded:
-    """Arrays for a result, not yet written."""
-    return Decoded(*(unwritten(pixels, None, dtype, device) for dtype in (wp.float32, wp.float32, wp.float32, wp.uint8)))
-
-
-def unwritten(pixels: int, rows: int | None, dtype: Any, device: str) -> wp.array:
-    """An array padded to whole packs, all of which the kernel writes: clearing it first would take as long as writing it."""
-    pack = devices.pack_width(device)
-    whole = -(-pixels // pack) * pack
-    return wp.empty(whole if rows is None else (rows, whole), dtype=dtype, device=device)
-
-
-def _place(array: np.ndarray, dtype: Any, device: str) -> tuple[wp.array, Any]:
-    """[row, pixel] → [row, pack], and what owns its memory."""
-    short = -array.shape[1] % devices.pack_width(device)
-    if short:
-        array = np.pad(array, [(0, 0), (0, short)])
-    array = np.ascontiguousarray(array)
-    if not array.flags.writeable:
-        array = array.copy()  # Warp wants an address, and NumPy gives none of read-only memory
-    owner = wp.array(array, dtype=dtype, device=device, copy=False)
-    return as_packs(owner, device), (owner, array)

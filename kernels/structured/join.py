@@ -5,9 +5,8 @@ from collections.abc import Sequence
 import warp as wp
 
 from kernels.errors import ArrayError
-from kernels.packs import scalars
+from kernels.packs import unwritten, zeros
 from kernels.structured.decoded import Decoded
-from kernels.structured.frames import unwritten
 from kernels.structured.phase import WrappedPhase
 
 
@@ -27,7 +26,7 @@ def join_periods(parts: Sequence[WrappedPhase]) -> WrappedPhase:
     joined = []
     for field in ("phase", "amplitude", "offset", "sigma", "status"):
         rows = [getattr(part, field)[row] for part in parts for row in range(len(part.periods_px))]
-        plane = unwritten(first.pixel_count, len(periods), rows[0].dtype, first.device)
+        plane = unwritten(first.pixel_count, rows[0].dtype, first.device, rows=len(periods))
         for row, values in enumerate(rows):
             wp.copy(plane[row], values)
         joined.append(plane)
@@ -43,7 +42,7 @@ def cropped(decoded: Decoded, first: int, count: int, *, device: str) -> Decoded
     have = decoded.coordinate.shape[0]
     if first < 0 or count < 1 or first + count > have:
         raise ArrayError(f"pixels {first} to {first + count} are asked for, there are {have}")
-    parts = [scalars(count, None, array.dtype, device) for array in decoded]
+    parts = [zeros(count, array.dtype, device) for array in decoded]
     for part, array in zip(parts, decoded, strict=True):
         wp.copy(part, array, src_offset=first, count=count)
     return Decoded(*parts)

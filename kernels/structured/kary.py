@@ -19,10 +19,10 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
-from kernels.packs import as_packs, pack_type
+from kernels.packs import Band, as_packs, pack_type
 from kernels.status import OK, Status
-from kernels.structured.decoded import Decoded, stripe_place
-from kernels.structured.frames import Frames, NoiseModel, check_noise, check_stripes, cut_in
+from kernels.structured.decoded import Decoded, stripe_place, unwritten_decoded
+from kernels.structured.frames import NoiseModel, check_noise, check_stripes, cut_in, require_frames, saturation_masks
 
 SHADOW_SIGMAS = 5.0
 """White minus black over its deviation (all channels together): below, the projector does not reach the pixel."""
@@ -46,7 +46,7 @@ _SATURATED, _SHADOWED, _UNDECIDED, _OUT_OF_RANGE = (int(s) for s in (Status.SATU
                                                                     Status.OUT_OF_RANGE))
 
 
-def decode_kary(frames: Frames, digits: Sequence[int], *, white: int, black: int, levels: np.ndarray, reflected: bool,
+def decode_kary(frames: Band, digits: Sequence[int], *, white: int, black: int, levels: np.ndarray, reflected: bool,
                 extent: float, stripe_px: float = 1.0, crosstalk: np.ndarray | None = None, noise: NoiseModel) -> Decoded:
     """Decode a base-k code in grey levels or colours.
 
@@ -72,16 +72,16 @@ def decode_kary(frames: Frames, digits: Sequence[int], *, white: int, black: int
     check_stripes(extent, stripe_px)
     expected = expected_levels(levels, crosstalk)
     base, channels = expected.shape
-    frames.require(*digits, white, black, channels=channels)
+    require_frames(frames, *digits, white, black, channels=channels)
     if not digits or base ** len(digits) * stripe_px < extent:
         raise ArrayError(f"{len(digits)} digits in base {base} number {base ** len(digits) * stripe_px:g} px of stripes of "
                          f"{stripe_px:g} px, the projector has {extent:g}: a digit is missing")
     if base ** len(digits) > MAX_STRIPES:
         raise ArrayError(f"{len(digits)} digits in base {base} number more than {MAX_STRIPES} stripes: give fewer digits")
-    result = frames.outputs()
+    result = unwritten_decoded(frames.pixel_count, frames.device)
     order = np.array(digits, dtype=np.int32)
     devices.launch(_kary_kernel(devices.pack_width(frames.device), channels), frames.packs,
-                   [frames.values, frames.saturated, frames.mask_of([*digits, white, black]),
+                   [frames.values, frames.saturated, saturation_masks(frames, [*digits, white, black]),
                     wp.array(order, dtype=wp.int32, device=frames.device), white, black,
                     wp.array(expected.astype(np.float32), dtype=wp.float32, device=frames.device), 1 if reflected else 0,
                     noise.read**2, noise.gain, float(stripe_px), float(extent)],

@@ -17,11 +17,11 @@ import warp as wp
 from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.normal_equations import add_reading
-from kernels.packs import as_packs, pack_type
+from kernels.packs import Band, as_packs, pack_type
 from kernels.status import OK, Status
 from kernels.structured.angles import TURN, cosine_of_turns, sine_of_turns
-from kernels.structured.decoded import Decoded
-from kernels.structured.frames import Frames, NoiseModel, cut_in
+from kernels.structured.decoded import Decoded, unwritten_decoded
+from kernels.structured.frames import NoiseModel, cut_in, require_frames, saturation_masks
 from kernels.structured.phase import decode_phase
 from kernels.structured.unwrap import keep_better
 
@@ -45,7 +45,7 @@ _SATURATED, _UNDECIDED, _MULTIPATH, _OUT_OF_RANGE = (int(s) for s in (Status.SAT
                                                                      Status.OUT_OF_RANGE))
 
 
-def decode_micro(frames: Frames, numbers: Sequence[int], periods_px: Sequence[float], shifts: Sequence[float], *,
+def decode_micro(frames: Band, numbers: Sequence[int], periods_px: Sequence[float], shifts: Sequence[float], *,
                  black: int | None = None, extent: float, noise: NoiseModel) -> Decoded:
     """The coordinate from frames of several close periods that share offset and amplitude.
 
@@ -78,7 +78,7 @@ def decode_micro(frames: Frames, numbers: Sequence[int], periods_px: Sequence[fl
         raise ArrayError(f"all frames have the period {reference:g} px: give frames of other periods near it")
     start = decode_phase(frames, [n for n, m in zip(numbers, member, strict=True) if m], periods[member],
                          np.array(shifts)[member].tolist(), black=black, noise=noise)
-    frames.require(*numbers, black)
+    require_frames(frames, *numbers, black)
     others, device, pack = np.flatnonzero(~member), frames.device, devices.pack_width(frames.device)
     ratio = reference / periods[others]
     wraps = np.arange(-1, int(np.ceil(extent / reference)) + 1)
@@ -86,11 +86,11 @@ def decode_micro(frames: Frames, numbers: Sequence[int], periods_px: Sequence[fl
     turns = 2 * np.pi * np.outer(wraps, ratio)
     order = np.concatenate([others, np.flatnonzero(member)])
     table = np.stack([1 / periods[order], np.array(shifts)[order]], axis=1)
-    result = frames.outputs()
+    result = unwritten_decoded(frames.pixel_count, frames.device)
     scratch = wp.empty((2 * len(others), frames.packs * pack), dtype=wp.float32, device=device)
     inputs = [as_packs(array, device) for array in (start.phase, start.amplitude, start.offset, start.status)]
     devices.launch(_micro_kernel(pack), frames.packs,
-                   [frames.values, frames.saturated, frames.mask_of(list(numbers)), *inputs,
+                   [frames.values, frames.saturated, saturation_masks(frames, list(numbers)), *inputs,
                     wp.array(np.array(numbers, dtype=np.int32)[order], dtype=wp.int32, device=device),
                     wp.array(table.astype(np.float32), dtype=wp.vec2, device=device),
                     wp.array(np.stack([np.cos(turns), np.sin(turns)], axis=-1).astype(np.float32), dtype=wp.vec2, device=device),

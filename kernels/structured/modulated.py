@@ -15,12 +15,12 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
-from kernels.packs import as_packs, pack_type
-from kernels.structured.frames import Frames, NoiseModel, check_noise, cut_in, unwritten
+from kernels.packs import Band, as_packs, pack_type, unwritten
+from kernels.structured.frames import NoiseModel, check_noise, cut_in, require_frames, saturation_masks
 from kernels.structured.phase import WrappedPhase, add_frame, phase_of, weights
 
 
-def decode_modulated(frames: Frames, numbers: Sequence[Sequence[int]], *, period_px: float, noise: NoiseModel) -> WrappedPhase:
+def decode_modulated(frames: Band, numbers: Sequence[Sequence[int]], *, period_px: float, noise: NoiseModel) -> WrappedPhase:
     """Wrapped phase of one period, of direct light alone.
 
     Args:
@@ -44,12 +44,12 @@ def decode_modulated(frames: Frames, numbers: Sequence[Sequence[int]], *, period
     if not period_px > 0:
         raise ArrayError(f"the period is {period_px:g} px: give more than 0")
     order = [number for row in numbers for number in row]
-    frames.require(*order)
+    require_frames(frames, *order)
     device = frames.device
     outer, inner = (weights(np.arange(n) / n, period_px).astype(np.float32) for n in (steps, carriers))
-    rows = [unwritten(frames.pixel_count, 1, dtype, device) for dtype in (*[wp.float32] * 4, wp.uint8)]
+    rows = [unwritten(frames.pixel_count, dtype, device, rows=1) for dtype in (*[wp.float32] * 4, wp.uint8)]
     devices.launch(_modulated_kernel(devices.pack_width(device)), frames.packs,
-                   [frames.values, frames.saturated, frames.mask_of(order),
+                   [frames.values, frames.saturated, saturation_masks(frames, order),
                     wp.array(np.array(numbers, dtype=np.int32), dtype=wp.int32, device=device),
                     wp.array(outer, dtype=wp.vec3, device=device), wp.array(inner, dtype=wp.vec3, device=device),
                     noise.read**2, noise.gain],

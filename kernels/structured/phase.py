@@ -18,10 +18,10 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
-from kernels.packs import as_packs, pack_type
+from kernels.packs import Band, as_packs, pack_type, unwritten
 from kernels.status import OK, Status
 from kernels.structured.angles import angle_of
-from kernels.structured.frames import Frames, NoiseModel, check_noise, cut_in, unwritten
+from kernels.structured.frames import NoiseModel, check_noise, cut_in, require_frames, saturation_masks
 
 SIGNAL_SIGMAS = 5.0
 """Light of the projector over its deviation, below which a pixel is SHADOWED; amplitude over its deviation, below which it has
@@ -47,7 +47,7 @@ class WrappedPhase(NamedTuple):
     device: str
 
 
-def decode_phase(frames: Frames, numbers: Sequence[int], periods_px: Sequence[float], shifts: Sequence[float], *,
+def decode_phase(frames: Band, numbers: Sequence[int], periods_px: Sequence[float], shifts: Sequence[float], *,
                  black: int | None = None, noise: NoiseModel) -> WrappedPhase:
     """Wrapped phase of every period.
 
@@ -68,7 +68,7 @@ def decode_phase(frames: Frames, numbers: Sequence[int], periods_px: Sequence[fl
             different shifts.
     """
     check_noise(noise)
-    frames.require(*numbers, black)
+    require_frames(frames, *numbers, black)
     if not numbers or not len(numbers) == len(periods_px) == len(shifts):
         raise ArrayError(f"there are {len(numbers)} frames, {len(periods_px)} periods, {len(shifts)} shifts: give one of each for "
                          "every frame, and at least three")
@@ -82,8 +82,8 @@ def decode_phase(frames: Frames, numbers: Sequence[int], periods_px: Sequence[fl
         order += [numbers[index] for index in members]
         starts.append(len(order))
     device, pack = frames.device, devices.pack_width(frames.device)
-    masks = frames.mask_of(*(order[a:b] for a, b in pairwise(starts))).reshape((len(periods), -1))
-    rows = [unwritten(frames.pixel_count, len(periods), dtype, device) for dtype in (*[wp.float32] * 4, wp.uint8)]
+    masks = saturation_masks(frames, *(order[a:b] for a, b in pairwise(starts))).reshape((len(periods), -1))
+    rows = [unwritten(frames.pixel_count, dtype, device, rows=len(periods)) for dtype in (*[wp.float32] * 4, wp.uint8)]
     devices.launch(_phase_kernel(pack, black is not None), frames.packs,
                    [frames.values, frames.saturated, masks,
                     wp.array(np.array(order, dtype=np.int32), dtype=wp.int32, device=device),

@@ -14,10 +14,10 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
-from kernels.packs import as_packs, pack_type
+from kernels.packs import Band, as_packs, pack_type
 from kernels.status import OK, Status
-from kernels.structured.decoded import Decoded
-from kernels.structured.frames import Frames, NoiseModel, check_noise, cut_in
+from kernels.structured.decoded import Decoded, unwritten_decoded
+from kernels.structured.frames import NoiseModel, check_noise, cut_in, require_frames, saturation_masks
 
 SHADOW_SIGMAS = 5.0
 """Light of the projector over its deviation, below which a pixel is SHADOWED."""
@@ -34,7 +34,7 @@ MIN_STEP = 1.0e-12
 _SATURATED, _SHADOWED, _OUT_OF_RANGE = int(Status.SATURATED), int(Status.SHADOWED), int(Status.OUT_OF_RANGE)
 
 
-def decode_ramp(frames: Frames, *, up: int | None = None, down: int | None = None, white: int | None = None,
+def decode_ramp(frames: Band, *, up: int | None = None, down: int | None = None, white: int | None = None,
                 black: int | None = None, extent: float, response: np.ndarray | None = None, noise: NoiseModel) -> Decoded:
     """The coordinate from two of a rising ramp, a falling ramp and white.
 
@@ -60,11 +60,11 @@ def decode_ramp(frames: Frames, *, up: int | None = None, down: int | None = Non
     ramp, other = (up, down) if pair else (up if up is not None else down, white)
     if ramp is None or other is None:
         raise ArrayError("the ratio needs a rising and a falling ramp, or one of them and white: a frame is missing")
-    frames.require(ramp, other, black)
+    require_frames(frames, ramp, other, black)
     table = ratio_table(response, pair=pair)
-    result = frames.outputs()
+    result = unwritten_decoded(frames.pixel_count, frames.device)
     devices.launch(_ramp_kernel(devices.pack_width(frames.device), pair, black is not None), frames.packs,
-                   [frames.values, frames.saturated, frames.mask_of([ramp, other, black]), ramp, other, black or 0,
+                   [frames.values, frames.saturated, saturation_masks(frames, [ramp, other, black]), ramp, other, black or 0,
                     wp.array(table.astype(np.float32), dtype=wp.float32, device=frames.device), 0 if pair or up is not None else 1,
                     noise.read**2, noise.gain, float(extent)],
                    [as_packs(array, frames.device) for array in result], device=frames.device)

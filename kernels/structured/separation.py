@@ -17,9 +17,9 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
-from kernels.packs import as_packs, pack_type, scalars
+from kernels.packs import Band, as_packs, pack_type, unwritten, zeros
 from kernels.status import OK, Status
-from kernels.structured.frames import Frames, cut_in, unwritten
+from kernels.structured.frames import cut_in, require_frames, saturation_masks
 from kernels.structured.phase import WrappedPhase
 
 _SATURATED = int(Status.SATURATED)
@@ -33,7 +33,7 @@ class Separation(NamedTuple):
     status: wp.array  # [pixels] uint8: OK, SATURATED, or that of the phase
 
 
-def separate_extremes(frames: Frames, numbers: Sequence[int], *, black: int | None = None, leak: float = 0.0) -> Separation:
+def separate_extremes(frames: Band, numbers: Sequence[int], *, black: int | None = None, leak: float = 0.0) -> Separation:
     """From the brightest and the darkest reading under a shifted fine pattern (a checkerboard, stripes, sinusoids).
 
     Noise widens the range: with n frames of even noise σ, direct is too large by about σ √(8 ln n).
@@ -50,13 +50,13 @@ def separate_extremes(frames: Frames, numbers: Sequence[int], *, black: int | No
     Raises:
         ArrayError: fewer than two frames, one that does not exist or is given twice, or a leak that cannot be.
     """
-    frames.require(*numbers, black)
+    require_frames(frames, *numbers, black)
     if len(numbers) < 2:
         raise ArrayError(f"there are {len(numbers)} frames: a pixel must be lit in one and unlit in another, give two or more")
     _check(leak)
     result = _outputs(frames.pixel_count, frames.device)
     devices.launch(_extremes_kernel(devices.pack_width(frames.device), black is not None), frames.packs,
-                   [frames.values, frames.saturated, frames.mask_of([*numbers, black]),
+                   [frames.values, frames.saturated, saturation_masks(frames, [*numbers, black]),
                     wp.array(np.array(numbers, dtype=np.int32), dtype=wp.int32, device=frames.device), black or 0, float(leak)],
                    [as_packs(array, frames.device) for array in result], device=frames.device)
     return result
@@ -82,7 +82,7 @@ def separate_phase(wrapped: WrappedPhase, *, period: int, ambient: wp.array | No
     _check(leak)
     result = _outputs(wrapped.pixel_count, wrapped.device)
     if ambient is None:
-        ambient = scalars(wrapped.pixel_count, None, wp.float32, wrapped.device)
+        ambient = zeros(wrapped.pixel_count, wp.float32, wrapped.device)
     if ambient.shape[0] != wrapped.phase.shape[1]:
         raise ArrayError(f"ambient has {ambient.shape[0]} pixels, the phase {wrapped.phase.shape[1]}: give one for each, padded")
     given = [as_packs(array, wrapped.device) for array in (wrapped.amplitude, wrapped.offset, wrapped.status, ambient)]
@@ -97,7 +97,7 @@ def _check(leak: float) -> None:
 
 
 def _outputs(pixels: int, device: str) -> Separation:
-    return Separation(*(unwritten(pixels, None, dtype, device) for dtype in (wp.float32, wp.float32, wp.uint8)))
+    return Separation(*(unwritten(pixels, dtype, device) for dtype in (wp.float32, wp.float32, wp.uint8)))
 
 
 @cache

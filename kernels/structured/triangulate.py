@@ -15,7 +15,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
-from kernels.packs import as_packs, pack_type, scalars
+from kernels.packs import as_packs, pack_type, padded_count, zeros
 from kernels.status import OK, Status
 from kernels.structured.decoded import Decoded
 
@@ -197,19 +197,13 @@ def triangulate(x: np.ndarray, y: np.ndarray, columns: Decoded | None, rows: Dec
               for values, dtype in ((axis.coordinate, wp.float32), (axis.sigma, wp.float32), (axis.status, wp.uint8))]
     if len(axes) == 1:
         planes = planes * 2  # the kernel of one axis reads one of the two
-    result = Triangulation(*(scalars(count, None, wp.float32, device) for _ in range(3)), scalars(count, None, wp.uint8, device))
+    result = Triangulation(*(zeros(count, wp.float32, device) for _ in range(3)), zeros(count, wp.uint8, device))
     inputs = [*(as_packs(values, device) for values in (*rays, *planes)), _projection(projector), float(near_m), float(far_m),
               float(max_residual_px)]
     kernel = _kernel(devices.pack_width(device), columns is not None, rows is not None)
     devices.launch(kernel, rays[0].shape[0] // devices.pack_width(device), inputs,
                    [as_packs(array, device) for array in result], device=device)
     return result
-
-
-def padded_count(count: int, device: str) -> int:
-    """Pixels once they are padded to whole packs."""
-    pack = devices.pack_width(device)
-    return -(-count // pack) * pack
 
 
 def _padded(values: Any, count: int, dtype: Any, device: str) -> wp.array:

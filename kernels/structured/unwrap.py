@@ -20,8 +20,7 @@ from kernels.errors import ArrayError
 from kernels.packs import as_packs, pack_type
 from kernels.status import OK, Status
 from kernels.structured.angles import TURN
-from kernels.structured.decoded import Decoded
-from kernels.structured.frames import outputs
+from kernels.structured.decoded import Decoded, unwritten_decoded
 from kernels.structured.phase import WrappedPhase
 
 MODEL_PHASE_ERROR = 0.02
@@ -90,7 +89,7 @@ def unwrap_jointly(wrapped: WrappedPhase, *, extent: float) -> Decoded:
         listed = ", ".join(f"{period:g}" for period in wrapped.periods_px)
         raise ArrayError(f"phases of {listed} px repeat after {covered:.4g} px, the projector has {extent:g}: "
                          "add a period, or Gray frames that number the periods")
-    result, shape = outputs(wrapped.pixel_count, wrapped.device), wrapped.phase.shape
+    result, shape = unwritten_decoded(wrapped.pixel_count, wrapped.device), wrapped.phase.shape
     weight = wp.empty(shape, dtype=wp.float32, device=wrapped.device)
     reference = int(np.argmin(wrapped.periods_px))
     devices.launch(_joint_kernel(devices.pack_width(wrapped.device)), shape[1] // devices.pack_width(wrapped.device),
@@ -120,7 +119,7 @@ def unwrap_by_code(wrapped: WrappedPhase, coarse: Decoded, *, stripe_px: float, 
                          "give stripes of half a period or less")
     if coarse.coordinate.shape[0] != wrapped.phase.shape[1]:
         raise ArrayError(f"the code has {coarse.coordinate.shape[0]} pixels, the phase {wrapped.phase.shape[1]}: decode the same frames")
-    result = outputs(wrapped.pixel_count, wrapped.device)
+    result = unwritten_decoded(wrapped.pixel_count, wrapped.device)
     given = [as_packs(array, wrapped.device) for array in (coarse.coordinate, coarse.status)]
     devices.launch(_numbered_kernel(devices.pack_width(wrapped.device)), given[0].shape[0], [*_inputs(wrapped), *given, float(extent)],
                    [as_packs(array, wrapped.device) for array in result], device=wrapped.device)

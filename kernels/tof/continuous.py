@@ -13,7 +13,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
-from kernels.packs import as_packs, pack_type
+from kernels.packs import as_packs, pack_type, place, unwritten
 from kernels.tof.modulation import radians_per_metre
 
 LEAST_PHASES = 3
@@ -115,24 +115,16 @@ def decode(images: np.ndarray, modulation_hz: Sequence[float] | np.ndarray, refe
     delta = np.asarray(reference_phase_rad, dtype=np.float64)[order]
     factor = np.ones(len(rows)) if scale is None else np.asarray(scale, dtype=np.float64)[order]
     basis = np.stack([rows[order, 0], rows[order, 1], rows[order, 2], np.cos(delta), np.sin(delta), factor], axis=1)
-    readings, pack = padded(images, device), devices.pack_width(device)
-    shape = len(frequencies), readings.shape[1]
-    outputs = [wp.empty(shape, dtype=wp.float32, device=device) for _ in range(6)]  # the kernel writes every pixel
-    devices.launch(decode_kernel(pack), shape[0] * shape[1] // pack, [
-        as_packs(readings, device),
+    readings, _owner = place(images, device)  # the owner keeps the memory
+    outputs = [unwritten(images.shape[1], wp.float32, device, rows=len(frequencies)) for _ in range(6)]
+    devices.launch(decode_kernel(devices.pack_width(device)), len(frequencies) * readings.shape[1], [
+        readings,
         wp.array(order.astype(np.int32), dtype=wp.int32, device=device),
         wp.array(np.concatenate([[0], np.cumsum(counts)]).astype(np.int32), dtype=wp.int32, device=device),
         wp.array(basis.astype(np.float32), dtype=wp.float32, device=device),
         float(noise.shot), float(noise.read) ** 2, float("inf") if saturation is None else float(saturation),
     ], [as_packs(array, device) for array in outputs], device=device)
     return Correlation(*outputs, frequencies, counts - LEAST_PHASES)
-
-
-def padded(values: np.ndarray, device: str) -> wp.array:
-    """[row, pixel] float32 on the device, pixels padded with zeros to whole packs; on the CPU not copied when they are."""
-    short = -values.shape[1] % devices.pack_width(device)
-    whole = np.ascontiguousarray(np.pad(values, ((0, 0), (0, short))) if short else values)
-    return wp.array(whole, dtype=wp.float32, device=device, copy=False)
 
 
 @wp.func

@@ -89,7 +89,7 @@ def step_aside(ranges: wp.array(dtype=wp.float32), status: wp.array(dtype=wp.int
     return largest
 
 
-@wp.kernel(module="unique")
+@wp.kernel(module="unique", module_options={"max_unroll": 2})
 def _flying_kernel(first: int,
                    ranges: wp.array(dtype=wp.float32),
                    sigma: wp.array(dtype=wp.float32),

@@ -127,7 +127,7 @@ def _added_at(given: Recorded, pulse: Shape, t: float, b: float, p: int, found: 
     return wp.vec2f(added, s)
 
 
-@wp.kernel(module="unique")
+@wp.kernel(module="unique", module_options={"max_unroll": 0})
 def _returns_kernel(first: int,
                     given: Recorded,
                     pulse: Shape,

@@ -164,7 +164,7 @@ def _best_gain(given: Recorded, pulse: Shape, t: float, along: float, k: int, p:
     return best
 
 
-@wp.kernel(module="unique")
+@wp.kernel(module="unique", module_options={"max_unroll": 0})
 def _times_kernel(first: int,
                   given: Recorded,
                   pulse: Shape,

@@ -89,7 +89,7 @@ def _one_channel(band: packs.Band, weights: np.ndarray, device: str) -> Callable
     from kernels.relight import combine as module
 
     pack = devices.pack_width(device)
-    out = packs.scalars(band.pixel_count, 1, wp.float32, device)
+    out = packs.zeros(band.pixel_count, wp.float32, device, rows=1)
     on_device = wp.array(weights, dtype=wp.float32, device=device)
     if device == "cpu":
         chunks = -(-band.packs // module.CHUNK)

@@ -10,10 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from kernels.packs import Band
 from kernels.structured.binary import decode_binary, decode_gray, decode_xor
 from kernels.structured.decoded import Decoded
 from kernels.structured.edges import REACH, refine_edges
-from kernels.structured.frames import Frames, NoiseModel
+from kernels.structured.frames import NoiseModel
 from kernels.structured.join import join_periods
 from kernels.structured.kary import decode_kary
 from kernels.structured.micro import decode_micro
@@ -42,8 +43,8 @@ class PatternDevice(NamedTuple):
 class Readings(NamedTuple):
     """The frames of a band on the device."""
 
-    grey: Frames
-    colour: Frames | None
+    grey: Band
+    colour: Band | None
     """The same with three channels, where a code has colours."""
     columns: int
     """Pixels of an image row: the band is whole rows."""

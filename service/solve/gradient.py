@@ -125,6 +125,6 @@ def _keep(target: np.ndarray | None, here: slice, kept: np.ndarray, found: Any) 
 
 
 def _moments(band: packs.Band, rows: np.ndarray, stack: Stack) -> Moments:
-    padded = np.zeros((band.light_count, 4))
+    padded = np.zeros((band.frame_count, 4))
     padded[: len(rows)] = rows
     return fit_moments(band, padded, stack.scale, GREY_WEIGHTS)

@@ -72,8 +72,8 @@ def unpack(readings, band) -> np.ndarray:
     values = readings.values.numpy()
     pack = values.shape[1]
     if readings.light_stride == 1:
-        return values.reshape(band.packs, band.light_count, pack).transpose(1, 0, 2).reshape(band.light_count, -1)
-    return values.reshape(band.light_count, band.packs * pack)
+        return values.reshape(band.packs, band.frame_count, pack).transpose(1, 0, 2).reshape(band.frame_count, -1)
+    return values.reshape(band.frame_count, band.packs * pack)
 
 
 def angle_degrees(a: np.ndarray, b: np.ndarray) -> np.ndarray:

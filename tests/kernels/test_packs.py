@@ -24,7 +24,7 @@ def test_upload_lays_out_every_value(pixels, device):
     values = rng.random((3, 16, pixels)).astype(np.float16)
     bits = rng.integers(0, 256, (2, pixels), dtype=np.uint8)
     band = packs.upload(values, bits, device=device)
-    assert (band.pixel_count, band.light_count, band.packs) == (pixels, 16, -(-pixels // devices.pack_width(device)))
+    assert (band.pixel_count, band.frame_count, band.packs) == (pixels, 16, -(-pixels // devices.pack_width(device)))
     if pixels:
         np.testing.assert_array_equal(fetch(band)[:, :pixels], values.reshape(48, pixels))
         assert (fetch(band)[:, pixels:] == 0).all()
@@ -97,7 +97,7 @@ def test_bad_arrays_are_refused(values, saturated, message, device):
 
 def test_as_packs_is_the_same_memory(device):
     width = devices.pack_width(device)
-    array = packs.scalars(width + 1, 3, wp.float32, device)
+    array = packs.zeros(width + 1, wp.float32, device, rows=3)
     assert array.shape == (3, 2 * width)
     view = packs.as_packs(array, device)
     assert view.shape == (3, 2) and view.ptr == array.ptr

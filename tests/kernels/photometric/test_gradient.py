@@ -52,10 +52,10 @@ def upload(radiance: np.ndarray, device: str, saturated=None) -> packs.Band:
 
 
 def moments(band: packs.Band, frames, before: int = 0):
-    rows = np.zeros((band.light_count, 4))
+    rows = np.zeros((band.frame_count, 4))
     part = rows_of(frames, before)
     rows[: len(part)] = part
-    return fit_moments(band, rows, np.ones(band.light_count), GREY)
+    return fit_moments(band, rows, np.ones(band.frame_count), GREY)
 
 
 def diffuse(band: packs.Band, responses, gain: float = 1.0):

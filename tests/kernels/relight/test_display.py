@@ -19,7 +19,7 @@ HALF_STEP = 2.0**-12
 
 def values(band, pixels):
     flat = band.values.numpy().astype(np.float64)
-    return flat.reshape(3, band.light_count, -1)[:, :, :pixels]
+    return flat.reshape(3, band.frame_count, -1)[:, :, :pixels]
 
 
 def expected(stack, gains):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from kernels.errors import ArrayError
+from kernels.packs import as_pixels
 from kernels.status import Status
 from kernels.structured.frames import NoiseModel, saturated_bits, upload
 from kernels.structured.phase import decode_phase
@@ -127,8 +128,7 @@ def test_direct_and_global_light(leak, device):
     np.testing.assert_allclose(parts.direct.numpy()[:3000], direct, rtol=0.04)
     np.testing.assert_allclose(parts.indirect.numpy()[:3000], indirect, rtol=0.16)
     wrapped = decode_phase(frames, code.frames, code.periods_px, code.shifts, black=found.black, noise=NOISE)
-    ambient = upload(np.ascontiguousarray(stack[-1:], dtype=np.float32), device=device)
-    smooth = separate_phase(wrapped, period=0, ambient=ambient.owner[0][0].flatten(), leak=leak)
+    smooth = separate_phase(wrapped, period=0, ambient=as_pixels(frames.values)[len(stack) - 1], leak=leak)
     np.testing.assert_allclose(smooth.direct.numpy()[:3000], direct, rtol=2e-3)
     np.testing.assert_allclose(smooth.indirect.numpy()[:3000], indirect, rtol=1e-2)  # what the spread leaves of the fine pattern
     assert (smooth.status.numpy()[:3000] == Status.OK).all()
