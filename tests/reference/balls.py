@@ -4,6 +4,8 @@ Camera frame: x right, y up, z towards the viewer. Image coordinates: u right, v
 """
 
 from collections.abc import Callable
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,19 +23,35 @@ def rays(u, v, *, width, height, pixel_size=None, focal=None):
     return np.zeros_like(way), way / np.sqrt((way * way).sum(-1, keepdims=True))
 
 
-def render(shade: Shade, *, centre, radius, width, height, samples=8, background=0.0, **camera):
-    """Radiance [height, width] and coverage [height, width] of a ball, each pixel the mean of samples² rays."""
+class Hits(NamedTuple):
+    """Where the rays of an image meet a ball."""
+
+    hit: np.ndarray  # [rays] bool
+    point: np.ndarray  # [hits, 3]
+    normal: np.ndarray  # [hits, 3]
+    viewer: np.ndarray  # [hits, 3]
+
+
+@lru_cache(maxsize=2)  # the rays do not depend on the light, and tests look at one ball under many lights
+def cast(centre, radius, width, height, samples, camera) -> Hits:
+    """The rays through samples² places of each pixel, in rows of places."""
     steps = (np.arange(samples) + 0.5) / samples
     u, v = np.meshgrid((np.arange(width)[:, None] + steps).ravel(), (np.arange(height)[:, None] + steps).ravel())
-    origin, way = rays(u.ravel(), v.ravel(), width=width, height=height, **camera)
-    offset = origin - centre
+    origin, way = rays(u.ravel(), v.ravel(), width=width, height=height, **dict(camera))
+    offset = origin - np.array(centre)
     half_b, c = (offset * way).sum(-1), (offset * offset).sum(-1) - radius**2
     discriminant = half_b**2 - c
     hit = discriminant > 0
     distance = -half_b[hit] - np.sqrt(discriminant[hit])
     point = origin[hit] + distance[:, None] * way[hit]
-    value = np.full(len(u.ravel()), background)
-    value[hit] = shade(point, (point - centre) / radius, -way[hit])
+    return Hits(hit, point, (point - centre) / radius, -way[hit])
+
+
+def render(shade: Shade, *, centre, radius, width, height, samples=8, background=0.0, **camera):
+    """Radiance [height, width] and coverage [height, width] of a ball, each pixel the mean of samples² rays."""
+    hit, point, normal, viewer = cast(tuple(centre), radius, width, height, samples, tuple(camera.items()))
+    value = np.full(hit.shape, background)
+    value[hit] = shade(point, normal, viewer)
 
     def pooled(samples_of):
         return samples_of.reshape(height, samples, width, samples).mean(axis=(1, 3))

@@ -52,12 +52,14 @@ def test_lights_near_two_rendered_balls(projection, camera):
         {"pixel_size_m": 0.001} if projection == "orthographic" else {"focal_px": (400.0, 400.0)}))
     z, radius = (0.0, 0.05) if projection == "orthographic" else (-0.42, 0.045)
     centres = [np.array([x, 0.004, z]) for x in (-0.1, 0.1)]
+    balls = []
+    for centre in centres:
+        _, mask = render(mirror_of_near(np.ones(3)), centre=centre, radius=radius, width=width, height=height, **camera)
+        balls.append(ball_from_mask(model, mask, radius_m=radius, z_m=z))
     for position in (np.array([0.1, 0.5, z + 0.6]), np.array([-0.6, 0.1, z + 0.5])):
         points, directions, sigmas = [], [], []
-        for centre in centres:
-            image, mask = render(mirror_of_near(position, degrees=2), centre=centre, radius=radius, width=width, height=height,
-                                 **camera)
-            ball = ball_from_mask(model, mask, radius_m=radius, z_m=z)
+        for centre, ball in zip(centres, balls, strict=True):
+            image, _ = render(mirror_of_near(position, degrees=2), centre=centre, radius=radius, width=width, height=height, **camera)
             view = view_ball(ball, model)
             spot = find_spot(box(image, view), None, ball, view)
             points.append(spot.point)

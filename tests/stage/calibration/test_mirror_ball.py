@@ -36,10 +36,11 @@ def test_directions_in_front(name):
     """A 60 px ball: 1 px is 1.9° of reflection. A spot of a dozen pixels has its centroid to 0.03 px, the outline's centre
     from an anti-aliased mask is known to 0.02 px: together under 0.1°. Where the spot is half way to the rim, twice that."""
     camera, geometry = SCENES[name]
+    _, mask = seen(mirror_of_far(unit(0, 0, 1)), geometry)
+    ball = ball_from_mask(camera, mask)
+    view = view_ball(ball, camera)
     for direction in spread(8, 0.2):
-        image, mask = seen(mirror_of_far(direction), geometry)
-        ball = ball_from_mask(camera, mask)
-        view = view_ball(ball, camera)
+        image, _ = seen(mirror_of_far(direction), geometry)
         spot = find_spot(box(image, view), None, ball, view)
         assert angles_degrees(spot.direction, direction) < 0.1
         assert spot.flags == ()

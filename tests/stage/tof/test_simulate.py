@@ -40,12 +40,13 @@ def test_mean_histograms_are_those_of_the_twin(pulses):
 
 def test_noise_has_the_variance_that_the_model_says():
     flat = TofScene(range_m=np.full((200, 200), 2.0), albedo=np.full((200, 200), 0.5), cosine=np.ones((200, 200)))
+    small = TofScene(range_m=np.full((100, 100), 2.0), albedo=np.full((100, 100), 0.5), cosine=np.ones((100, 100)))
     camera = CorrelationCamera(ambient_electrons=100)
     random = np.random.default_rng(0)
     for mean, image in zip(correlation_images(flat, camera), correlation_images(flat, camera, random), strict=True):
         assert image.var() == pytest.approx(mean[0, 0] + 25, rel=0.03)
-    counts = histograms(flat, HistogramCamera(pulses=2000), random)
-    np.testing.assert_allclose(counts.mean(axis=(0, 1)), histograms(flat, HistogramCamera(pulses=2000))[0, 0], rtol=0.02, atol=0.02)
+    counts = histograms(small, HistogramCamera(pulses=2000), random)
+    np.testing.assert_allclose(counts.mean(axis=(0, 1)), histograms(small, HistogramCamera(pulses=2000))[0, 0], rtol=0.02, atol=0.02)
     assert counts.sum(axis=-1).max() <= 2000
 
 
