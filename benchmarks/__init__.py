@@ -1,1 +1,1 @@
-"""The figures that docs/figures.md shows, each measured by the code here."""
+"""The benchmarks that measure the figures of docs/figures.md, and load and fault tests of the service."""

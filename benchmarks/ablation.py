@@ -27,14 +27,14 @@ from stage.ingest import open_stack
 from stage.lighting import distant_lights
 
 PIXELS = 4000
-"""Of each object, at even steps: enough for a mean to two digits."""
+"""The pixels of each object at even steps, which determine a mean to two digits."""
 NO_SHADOW = SearchOptions(shadow_cost=30.0)
-"""A charge that no residual reaches: shadows are outliers like any other."""
+"""A cost above every residual, so that shadows are treated as outliers."""
 
 
 @dataclass
 class Case:
-    """Pixels of one object, ready to be solved."""
+    """The pixels of one object, prepared for the solver."""
 
     name: str
     truth: np.ndarray  # [n, 3] unit
@@ -50,7 +50,7 @@ class Case:
 
 
 def load_case(name: str, capture: Capture, truth: np.ndarray, cache: Path) -> Case:
-    """Read a capture of distant lights.
+    """Read a capture of distant lights, and choose its pixels.
 
     Args:
         name: for the table.
@@ -110,7 +110,7 @@ VARIANTS: dict[str, Callable[[Case], np.ndarray]] = {
 
 
 def ablation_table(data: Path | None, glossy: Path | None) -> list[str] | None:
-    """Mean and median angular error of each variant on each object that is at hand.
+    """Return the mean and median angular error of each variant of the solver on each object in the data folders.
 
     Args:
         data: folder with diligent_ball and diligent_cat.

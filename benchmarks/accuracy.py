@@ -1,4 +1,4 @@
-"""Accuracy against ground truth: the shipped samples, and DiLiGenT objects where the data is at hand."""
+"""Accuracy of solved maps against ground truth, for the shipped samples and the DiLiGenT objects in a data folder."""
 
 import tempfile
 from pathlib import Path
@@ -17,7 +17,7 @@ SAMPLES = Path(__file__).parents[1] / "samples"
 
 
 class SolveError(NamedTuple):
-    """A solved capture against its truth, over the capture's mask."""
+    """The errors of the maps of a capture over its mask."""
 
     coverage: float
     """Fraction of the mask that was solved."""
@@ -30,13 +30,13 @@ class SolveError(NamedTuple):
 
 
 def angles_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Angle between unit vectors along the last axis, degrees."""
+    """Return the angle in degrees between unit vectors along the last axis."""
     cross = np.linalg.norm(np.cross(a.astype(np.float64), b.astype(np.float64)), axis=-1)
     return np.degrees(np.arctan2(cross, (a.astype(np.float64) * b).sum(axis=-1)))
 
 
 def read_truth(path: Path) -> dict[str, np.ndarray]:
-    """Layers of a truth.exr: normal and diffuse_albedo [rows, cols, 3], height and mask [rows, cols]."""
+    """Return the layers of a truth.exr: normal and diffuse_albedo [rows, cols, 3], height and mask [rows, cols]."""
     channels, _ = exr.read(path)
     truth = {}
     for name, suffixes in (("normal", "XYZ"), ("diffuse_albedo", "RGB"), ("height", "Z"), ("mask", "Y")):
@@ -46,7 +46,7 @@ def read_truth(path: Path) -> dict[str, np.ndarray]:
 
 
 def compare(maps: SurfaceMaps, truth: dict[str, np.ndarray], mask: np.ndarray) -> SolveError:
-    """Errors of solved maps."""
+    """Return the errors of solved maps."""
     assert maps.normal is not None and maps.diffuse_albedo is not None
     solved = mask & maps.mask
     angle = angles_deg(maps.normal, truth["normal"])[solved]
@@ -62,7 +62,7 @@ def compare(maps: SurfaceMaps, truth: dict[str, np.ndarray], mask: np.ndarray) -
 
 
 def sample_errors(name: str, method: Method) -> SolveError:
-    """Solve a shipped sample and compare it with its truth."""
+    """Solve a shipped sample and return its errors."""
     with tempfile.TemporaryDirectory() as folder:
         capture = SAMPLES / name
         maps = solve(SolveRequest(capture=capture, out=Path(folder), method=method, cache=Path(folder))).maps
@@ -70,7 +70,7 @@ def sample_errors(name: str, method: Method) -> SolveError:
 
 
 def diligent_errors(source: Path, method: Method) -> SolveError:
-    """Solve a DiLiGenT object and compare it with its true normals."""
+    """Solve a DiLiGenT object and return the errors of its normals."""
     with tempfile.TemporaryDirectory() as folder:
         capture = Path(folder) / "capture"
         diligent.import_folder(source, capture)

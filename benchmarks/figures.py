@@ -44,7 +44,7 @@ Section = Callable[[argparse.Namespace], list[str] | None]
 
 
 def row(name: str, error: SolveError) -> str:
-    """One line of an accuracy table."""
+    """Return one line of an accuracy table."""
     def percent(value: float) -> str:
         return "–" if np.isnan(value) else f"{100 * value:.3g} %"
 
@@ -53,13 +53,13 @@ def row(name: str, error: SolveError) -> str:
 
 
 def lambert(_: argparse.Namespace) -> list[str]:
-    """The path-traced Lambertian sample."""
+    """Measure the path-traced Lambertian sample."""
     return ["`samples/lambert`: a bumpy ball, 32 distant lights of unequal colour and strength, direct light with cast shadows, "
             "path traced.", "", HEAD, *(row(f"`{method}`", sample_errors("lambert", method)) for method in DISTANT)]
 
 
 def real(given: argparse.Namespace) -> list[str] | None:
-    """DiLiGenT."""
+    """Measure the DiLiGenT objects."""
     if given.data is None:
         return None
     lines = ["DiLiGenT objects, 96 real lights; the cat at every second pixel. `lambert` leaves out readings of zero; with them "
@@ -70,7 +70,7 @@ def real(given: argparse.Namespace) -> list[str] | None:
 
 
 def glossy(given: argparse.Namespace) -> list[str] | None:
-    """Path-traced dielectric and metal."""
+    """Measure the path-traced dielectric and metal."""
     if given.glossy is None:
         return None
     lines = ["`samples/make_glossy.py`: Mitsuba's `principled`, roughness 0.3 to 0.75, 64 lights, full interreflection. For "
@@ -94,52 +94,52 @@ def glossy(given: argparse.Namespace) -> list[str] | None:
 
 
 def materials(given: argparse.Namespace) -> list[str] | None:
-    """Materials shared between pixels, or not."""
+    """Measure the effect of materials that pixels share."""
     return None if given.glossy is None else material_table(given.glossy)
 
 
 def ablation(given: argparse.Namespace) -> list[str] | None:
-    """Parts of the general solver, one at a time."""
+    """Measure the parts of the general solver, one at a time."""
     return ablation_table(given.data, given.glossy)
 
 
 def relighting(given: argparse.Namespace) -> list[str]:
-    """Relit and shaded pictures against the path tracer."""
+    """Compare relit and shaded images with the path tracer."""
     return relighting_table(given.relighting)
 
 
 def left_out(given: argparse.Namespace) -> list[str] | None:
-    """Real lights predicted from the others."""
+    """Measure how well real lights are predicted from others."""
     return None if given.data is None else left_out_table(given.data)
 
 
 def spin(_: argparse.Namespace) -> list[str]:
-    """Where the time of a frame range goes."""
+    """Measure the time of the parts of a frame range."""
     return spin_table()
 
 
 def rig(given: argparse.Namespace) -> list[str] | None:
-    """Depth from projected codes and lasers."""
+    """Measure depth from projected codes and lasers."""
     return None if given.rig is None else rig_table(given.rig)
 
 
 def speed(_: argparse.Namespace) -> list[str]:
-    """The table of `relit bench`, and the general solver against NumPy."""
+    """Measure the table of `relit bench`, and the general solver against NumPy."""
     return [*bench(None, 9), "", *search_rows()]
 
 
 def tof(_: argparse.Namespace) -> list[str]:
-    """Range errors of time of flight."""
+    """Measure the range errors of time of flight."""
     return [*accuracy_rows(), "", *bound_rows()]
 
 
 def depth_speed(_: argparse.Namespace) -> list[str]:
-    """Decoders of projected codes and of time of flight against NumPy."""
+    """Measure the decoders of projected codes and of time of flight against NumPy."""
     return ["Projected codes:", "", *structured_rows(), "", "Time of flight:", "", *tof_rows()]
 
 
 def demo(_: argparse.Namespace) -> list[str]:
-    """Seconds of `relit demo`, kernels compiled and not."""
+    """Measure the seconds of `relit demo`, with and without compiled kernels."""
     with tempfile.TemporaryDirectory() as folder:
         os.environ["WARP_CACHE_PATH"] = str(Path(folder) / "kernels")
         cold, _ = measure("demo", "--out", str(Path(folder) / "cold"))
@@ -150,7 +150,7 @@ def demo(_: argparse.Namespace) -> list[str]:
 
 
 def memory(given: argparse.Namespace) -> list[str] | None:
-    """Peak memory of a large capture."""
+    """Measure the peak memory of a large capture."""
     if given.large is None:
         return None
     return ["A synthetic capture of 4096 × 4096 pixels and 64 lights (6.4 GB as a stack), whole image unmasked:", "",
@@ -178,7 +178,7 @@ INTRODUCTION = ("# Figures\n\nWritten by `make figures` (`python -m benchmarks.f
 
 
 def machine() -> str:
-    """Where this runs."""
+    """Return the date and the machine of the measurement."""
     return f"{date.today()}, {os.cpu_count()} CPU cores, Python {platform.python_version()}"
 
 

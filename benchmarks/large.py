@@ -41,7 +41,7 @@ def make_capture(folder: Path, side: int, lights: int) -> None:
 
 
 def measure(*arguments: str) -> tuple[float, float]:
-    """Run relit in a process of its own.
+    """Run relit in a child process.
 
     Returns:
         Seconds, and peak resident memory in GiB.
@@ -55,7 +55,7 @@ def measure(*arguments: str) -> tuple[float, float]:
 
 
 def large_rows(folder: Path, side: int = 4096, lights: int = 64) -> list[str]:
-    """Table rows: what was done, seconds, peak memory."""
+    """Return the table rows: the command, its seconds, and its peak memory."""
     capture, out = folder / "large", folder / "large-out"
     make_capture(capture, side, lights)
     rows = []

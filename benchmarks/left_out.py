@@ -17,12 +17,12 @@ from stage.correction import Correction
 from stage.importers import diligent
 
 EVERY = 8
-"""One light of so many is left out."""
+"""Every light with an index that this number divides is left out."""
 DISC_DEGREES = 0.5
 
 
 def left_out_errors(source: Path) -> tuple[int, dict[str, float]]:
-    """Lights left out of a DiLiGenT object, and the relative RMSE of their images over the object.
+    """Predict the images of every eighth light of a DiLiGenT object from the others, and return their relative RMSE.
 
     Args:
         source: folder of the object.
@@ -58,7 +58,7 @@ def left_out_errors(source: Path) -> tuple[int, dict[str, float]]:
 
 
 def left_out_table(data: Path) -> list[str]:
-    """Lines of Markdown.
+    """Return the table as lines of Markdown.
 
     Args:
         data: folder with diligent_ball and diligent_cat.

@@ -16,7 +16,7 @@ from stage.lighting import distant_lights
 
 
 def material_errors(folder: Path, options: MaterialOptions) -> dict[str, tuple[float, float]]:
-    """Median and 90th percentile of errors over the solved pixels.
+    """Return the median and the 90th percentile of errors over the solved pixels.
 
     Args:
         folder: a capture of distant lights with a truth.exr, a dielectric, or a metal where its name ends so.
@@ -49,7 +49,7 @@ def material_errors(folder: Path, options: MaterialOptions) -> dict[str, tuple[f
 
 
 def material_table(glossy: Path) -> list[str]:
-    """Lines of Markdown.
+    """Return the table as lines of Markdown.
 
     Args:
         glossy: folder with glossy and glossy_metal of samples/make_glossy.py.

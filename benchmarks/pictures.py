@@ -20,11 +20,11 @@ TARGET = Path(__file__).parents[1] / "docs" / "errors.png"
 FULL_SCALE_DEG = 10.0
 FRAME = "012.exr"
 HEAT = np.array([[0.02, 0.02, 0.06], [0.1, 0.25, 0.65], [0.15, 0.7, 0.6], [0.95, 0.85, 0.25], [0.95, 0.3, 0.15]])
-"""Colours at 0, 2.5, 5, 7.5 and 10 degrees."""
+"""The colours of 0, 2.5, 5, 7.5 and 10 degrees."""
 
 
 def heat(error: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Degrees as colours; black outside the mask."""
+    """Return the colours of angles in degrees, black outside the mask."""
     at = np.clip(error / FULL_SCALE_DEG, 0, 1) * (len(HEAT) - 1)
     colours = np.stack([np.interp(at, np.arange(len(HEAT)), channel) for channel in HEAT.T], axis=-1)
     return np.where(mask[..., None], colours, 0)

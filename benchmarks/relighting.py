@@ -21,12 +21,12 @@ from stage.maps import MAPS_FILE, SurfaceMaps
 
 PICTURE = Path(__file__).parents[1] / "docs" / "relighting.png"
 GAIN = 4.0
-"""Differences are shown this much brighter."""
+"""The factor by which differences are shown brighter."""
 OBJECTS = ("glossy", "owl")
 
 
 class Check(NamedTuple):
-    """A capture with path-traced pictures of the same object."""
+    """A capture with path-traced reference images of the same object."""
 
     name: str
     folder: Path
@@ -37,31 +37,31 @@ class Check(NamedTuple):
 
     @property
     def mask(self) -> np.ndarray:
-        """[rows, cols] bool."""
+        """The mask of the capture, [rows, cols] bool."""
         return Capture.open(self.folder).mask()
 
 
 def rgb(path: Path) -> np.ndarray:
-    """[rows, cols, 3] float64 of a picture."""
+    """Return an image as [rows, cols, 3] float64."""
     channels, _ = exr.read(path)
     return np.stack([channels[c] for c in "RGB"], axis=-1).astype(np.float64)
 
 
 def error(ours: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> tuple[float, float]:
-    """Relative RMSE over the mask, and the ratio of the total energies."""
+    """Return the relative RMSE over the mask, and the ratio of the total energies."""
     a, b = ours[mask], truth[mask]
     return float(np.sqrt(np.mean((a - b) ** 2) / np.mean(b**2))), float(a.sum() / b.sum())
 
 
 def relit(check: Check, environment: Path, weights: LightWeights | None, maps: Path | None) -> np.ndarray:
-    """A relit picture."""
+    """Return a relit image."""
     result = relight(RelightRequest(capture=check.folder, environment=environment, weights=weights, maps=maps, cache=check.work,
                                     out=str(check.work / "frame.####.exr"), overwrite=True))
     return rgb(result.frames[0])
 
 
 def shaded(check: Check, light: dict[str, Any], *, maps: Path, guided: bool) -> np.ndarray:
-    """A picture under one near light, as references.json has it."""
+    """Return the image under one near light of references.json."""
     kinds = {"point": "light", "sphere": "sphere", "rectangle": "rectangle"}
     given = {key: value for key, value in light.items() if key not in ("type", "normal")}
     out = check.work / "shaded.exr"
@@ -71,7 +71,7 @@ def shaded(check: Check, light: dict[str, Any], *, maps: Path, guided: bool) -> 
 
 
 def true_maps(check: Check) -> Path:
-    """maps.exr of the truth."""
+    """Write a maps.exr of the truth and return its path."""
     solved = SurfaceMaps.read(check.maps / MAPS_FILE)
     channels, _ = exr.read(check.folder / "truth.exr")
 
@@ -87,14 +87,14 @@ def true_maps(check: Check) -> Path:
 
 
 def open_check(name: str, folder: Path, work: Path) -> Check:
-    """Solve a capture."""
+    """Solve a capture for the check."""
     work.mkdir(parents=True, exist_ok=True)
     solve(SolveRequest(capture=folder, out=work / "maps", method=Method.SVBRDF, cache=work))
     return Check(name, folder, work / "maps", work)
 
 
 def relighting_table(checks: Path | None) -> list[str]:
-    """Lines of Markdown, and docs/relighting.png where there are checks.
+    """Return the table as lines of Markdown, and write docs/relighting.png when there are checks.
 
     Args:
         checks: folder with glossy and owl of samples/make_relight_checks.py; None: the shipped sample alone.

@@ -24,13 +24,13 @@ from stage.ranging import LaserPlane, LaserRay
 
 TARGET = Path(__file__).parents[1] / "docs" / "depth.png"
 WRONG_PX = 4.0
-"""Columns beyond which a result is another place, not an imprecise one: a quarter of the shortest period."""
+"""The error in columns above which a decoded column is wrong and not inaccurate: a quarter of the shortest period."""
 FAR_M = 1.4
-"""Laser stripes are judged at this distance and beyond."""
+"""The least distance at which laser stripes are judged."""
 BEAM_PX = 3
-"""Camera pixels from its centre that a laser's light reaches: a place whose beam an edge crosses is not judged."""
+"""The radius of the laser beam in camera pixels: points at which an edge crosses the beam are not judged."""
 ONE_COLUMN = 1 + 1e-4
-"""Float32 of the result is no reason to fail."""
+"""One column, with a tolerance for the float32 result."""
 NAMES = {
     "gray": "Gray, inverses",
     "gray_both": "Gray, inverses, columns and rows",
@@ -46,13 +46,13 @@ NAMES = {
 }
 LASERS = {"spots": "spots", "planes": "stripes"}
 ROBUST = ("phase", "gray_phase", "micro", "modulated", "xor", "xor_phase")
-"""Codes without wide stripes or long waves in what their precision rests on."""
+"""The codes whose precision does not depend on wide stripes or long waves."""
 PICTURED = ("gray", "ramp", "long_phase", "gray_phase", "micro")
 FULL_SCALE_M = 0.01
 
 
 class Truth(NamedTuple):
-    """Ground truth of the rig, [rows, cols]."""
+    """The ground truth of the rig, [rows, cols] each."""
 
     depth: np.ndarray  # float32 metres
     u: np.ndarray  # float32 projector columns
@@ -63,7 +63,7 @@ class Truth(NamedTuple):
 
 
 class CodeError(NamedTuple):
-    """How one code does on the lit pixels that no edge crosses."""
+    """The errors of one code over the lit pixels that no edge crosses."""
 
     frames: int
     coverage: float  # of all lit pixels
@@ -77,7 +77,7 @@ class CodeError(NamedTuple):
 
 
 def read_truth(path: Path) -> Truth:
-    """truth.exr of the rig."""
+    """Read the truth.exr of the rig."""
     channels, _ = exr.read(path)
     lit, shadow, mixed, groove = (channels[f"{name}.Y"] > 0.5 for name in ("mask", "shadow", "mixed", "groove"))
     clean = lit & ~mixed
@@ -85,7 +85,7 @@ def read_truth(path: Path) -> Truth:
 
 
 def measure(folder: Path, device: str | None = None) -> CodeError:
-    """Run `relit depth` on one set and compare."""
+    """Run `relit depth` on one set and return its errors."""
     truth = read_truth(folder / "truth.exr")
     with tempfile.TemporaryDirectory() as out:
         maps = depth(DepthRequest(capture=folder, out=Path(out), cache=Path(out), device=device)).maps
@@ -106,7 +106,7 @@ def measure(folder: Path, device: str | None = None) -> CodeError:
 
 
 class LaserError(NamedTuple):
-    """How laser spots or stripes do."""
+    """The errors of laser spots or stripes."""
 
     frames: int
     depth_m: np.ndarray  # [points] absolute error at clean places
@@ -115,7 +115,7 @@ class LaserError(NamedTuple):
 
 
 def measure_laser(folder: Path, device: str | None = None) -> LaserError:
-    """Run `relit depth` on laser frames and compare each measured point with the true surface where the camera sees it."""
+    """Run `relit depth` on laser frames, and return the distances of the measured points from the true surface."""
     truth, capture = read_truth(folder / "truth.exr"), Capture.open(folder)
     camera = capture.camera
     with tempfile.TemporaryDirectory() as out:
@@ -145,7 +145,7 @@ Measured = dict[str, CodeError | LaserError]
 
 
 def measure_all(folder: Path) -> Measured:
-    """Every set that is in the folder."""
+    """Measure every set in a folder."""
     found: Measured = {name: measure(folder / name) for name in NAMES if (folder / name / "capture.json").exists()}
     found |= {name: measure_laser(folder / name) for name in LASERS if (folder / name / "capture.json").exists()}
     return found
@@ -156,7 +156,7 @@ def _percentile(values: np.ndarray, percent: float) -> float:
 
 
 def code_lines(found: Measured) -> list[str]:
-    """The table of the codes."""
+    """Return the table of the codes."""
     lines = ["| code | images | lit pixels decoded | shadow let through | column, median | 99 % | over one column | another place "
              "| depth, median mm | groove: column, median | 95 % | decoded |", "|---|" + "---|" * 11]
     for name, error in found.items():
@@ -171,7 +171,7 @@ def code_lines(found: Measured) -> list[str]:
 
 
 def laser_lines(found: Measured) -> list[str]:
-    """The table of the lasers."""
+    """Return the table of the lasers."""
     lines = ["| laser | frames | points | depth, median mm | 90 % | 99 % | largest "
              "| median at 1.4 m and beyond | points in the groove | median |",
              "|---|" + "---|" * 9]
@@ -187,7 +187,7 @@ def laser_lines(found: Measured) -> list[str]:
 
 
 class Limit(NamedTuple):
-    """What a set is held to."""
+    """The limit that the errors of a set must not exceed."""
 
     name: str
     what: str
@@ -196,7 +196,7 @@ class Limit(NamedTuple):
 
 
 STRIPE_MEDIAN_PX = 0.27
-"""Of an error spread evenly over half a stripe of one column the median is 0.25; this is with what edges add."""
+"""The limit of a median error: 0.25 columns for errors that are uniform over half a column, and what edges add."""
 
 
 def _over_one(error: CodeError) -> float:
@@ -219,7 +219,7 @@ LIMITS = (
 
 
 def limit_lines(found: Measured) -> list[str]:
-    """What is held to and what is measured."""
+    """Return the table of limits and measured errors."""
     rows = [(NAMES[limit.name], limit.what, limit.value(error), limit.most)
             for limit in LIMITS if isinstance(error := found.get(limit.name), CodeError)]
     spots, planes, plain = found.get("spots"), found.get("planes"), found.get("long_phase")
@@ -238,7 +238,7 @@ def limit_lines(found: Measured) -> list[str]:
 
 
 def rig_table(folder: Path) -> list[str]:
-    """Every set in a folder as lines of Markdown."""
+    """Return the tables of every set in a folder as lines of Markdown."""
     found = measure_all(folder)
     return ["`samples/make_rig.py`: a projector and a camera of 256 × 192 pixels 0.3 m apart, path traced with interreflection (a quarter "
             "of the light in the groove), ambient light, no camera noise, images in half precision; one column is about 21 mm of depth at "
@@ -247,7 +247,7 @@ def rig_table(folder: Path) -> list[str]:
 
 
 def picture(folder: Path, target: Path = TARGET) -> None:
-    """Depth and its error under some codes, side by side."""
+    """Draw depth and its error under some codes side by side."""
     names = [name for name in PICTURED if (folder / name / "capture.json").exists()]
     truth = read_truth(folder / names[0] / "truth.exr")
     low, high = np.percentile(truth.depth, [0, 100])

@@ -24,7 +24,7 @@ LAMBERTIAN, GLOSSY, MIRROR, MIXTURE = 1, 2, 3, 4
 
 
 class Material(NamedTuple):
-    """What a ball is made of, half by half."""
+    """The materials of the two halves of a ball."""
 
     radiance: Callable[[np.ndarray, np.ndarray], np.ndarray]
     """(normals, centres) → [n, lights]"""
@@ -71,7 +71,7 @@ MATERIALS = {
 
 
 def run(name: str, noise: float, folder: Path, scene: Ball, centres: np.ndarray, lights: list[dict]) -> str:
-    """One row of the table."""
+    """Solve one ball and return its row of the table."""
     material, normals = MATERIALS[name], scene.normal[scene.mask]
     radiance = material.radiance(normals, centres)[..., None] * COLOUR
     radiance = radiance * (1 + noise * np.random.default_rng(0).normal(size=radiance.shape))

@@ -1,10 +1,10 @@
 """The general solver against least squares, and its search against the same arithmetic in vectorised NumPy, in one run."""
 
-import time
 from collections.abc import Callable
 
 import numpy as np
 
+from benchmarks.timing import run_seconds
 from kernels import packs
 from kernels.photometric.hypotheses import Diffuse, rings, search_normals
 from kernels.photometric.lambert import solve_lambert
@@ -19,18 +19,12 @@ RINGS = ((5.0, 10.0), 12)
 
 
 def median_seconds(work: Callable[[], object], repeats: int = 5) -> float:
-    """Median of several runs after one that compiles."""
-    work()
-    seconds = []
-    for _ in range(repeats):
-        began = time.perf_counter()
-        work()
-        seconds.append(time.perf_counter() - began)
-    return float(np.median(seconds))
+    """Return the median seconds of several runs."""
+    return float(np.median(run_seconds(work, repeats)))
 
 
 def search_rows() -> list[str]:
-    """Lines of Markdown."""
+    """Return the table as lines of Markdown."""
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(LIGHTS, 3))
     directions[:, 2] = np.abs(directions[:, 2]) + 0.3

@@ -17,7 +17,7 @@ PARTS = ("ingest", "guide", "weights", "product", "waiting for files")
 
 
 def spin_table() -> list[str]:
-    """Lines of Markdown."""
+    """Return the table as lines of Markdown."""
     lines = [f"`samples/owl`, {FRAMES} frames, 320 × 320, 96 lights, from EXR to half EXR; seconds. Threads write files "
              "meanwhile; `waiting` is the time that is spent waiting for them.", "",
              "| | decode and stack | guide | weights | product | waiting | whole | MB |", "|---|---|---|---|---|---|---|---|"]

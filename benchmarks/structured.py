@@ -6,11 +6,11 @@ in Python come to.
 """
 
 import sys
-import time
 from collections.abc import Callable
 
 import numpy as np
 
+from benchmarks.timing import run_seconds
 from kernels import device as devices
 from kernels.structured.binary import decode_gray
 from kernels.structured.frames import NoiseModel, upload
@@ -25,25 +25,19 @@ BITS = 11
 
 
 def least_seconds(work: Callable[[], object], repeats: int = 5) -> float:
-    """The least disturbed of several runs after one that compiles."""
-    work()
-    seconds = []
-    for _ in range(repeats):
-        began = time.perf_counter()
-        work()
-        seconds.append(time.perf_counter() - began)
-    return min(seconds)
+    """Return the seconds of the fastest of several runs, which other processes disturbed least."""
+    return min(run_seconds(work, repeats))
 
 
 def phase_frames(pixels: int) -> np.ndarray:
-    """[16, pixels] float32."""
+    """Return phase-shift frames [16, pixels] float32."""
     u = np.random.default_rng(0).uniform(0, WIDTH, pixels).astype(np.float32)
     return np.stack([0.45 + 0.35 * np.cos(2 * np.pi * (u / period - step / STEPS)) for period in PERIODS for step in range(STEPS)]
                     ).astype(np.float32)
 
 
 def gray_frames(pixels: int) -> np.ndarray:
-    """[24, pixels] float32: bits, inverses, white, black."""
+    """Return Gray-code frames [24, pixels] float32: bits, inverses, white, black."""
     code = gray_of(np.random.default_rng(0).integers(0, WIDTH, pixels))
     bits = np.stack([(code >> bit & 1) for bit in range(BITS)]).astype(np.float32)
     return np.concatenate([0.05 + 0.7 * bits, 0.75 - 0.7 * bits, np.full((1, pixels), 0.75, np.float32),
@@ -128,7 +122,7 @@ def numpy_gray(frames: np.ndarray, whole: bool) -> np.ndarray:
 
 
 def number_of(gray: np.ndarray) -> np.ndarray:
-    """Of a Gray code of up to sixteen bits."""
+    """Return the number of a Gray code of up to sixteen bits."""
     for shift in (1, 2, 4, 8):
         gray = gray ^ gray >> shift
     return gray
@@ -147,7 +141,7 @@ def loop_gray(frames: np.ndarray) -> list[int]:
 
 
 def structured_rows(pixels: int = PIXELS) -> list[str]:
-    """Lines of Markdown."""
+    """Return the table as lines of Markdown."""
     stack = phase_frames(pixels)
     frames = upload(stack, device="cpu")
     numbers, periods = range(len(stack)), [period for period in PERIODS for _ in range(STEPS)]

@@ -21,11 +21,11 @@ HZ = (16e6, 80e6, 120e6)
 RADIUS, SPATIAL = 2, 1.5
 REPEATS = 15
 SETTLE_S = 0.1
-"""After NumPy, before the kernels: the threads of its BLAS keep a core busy for 40 ms more, which would count as the kernels' time."""
+"""The seconds between NumPy and the kernels: BLAS threads keep a core busy for 40 ms more, which would count as time of the kernels."""
 
 
 def kernels_work(images: np.ndarray, hz: np.ndarray, delta: np.ndarray) -> np.ndarray:
-    """Range by the kernels, without the vote, which the other side lacks too."""
+    """Compute the range by the kernels, without the vote, which the NumPy side lacks too."""
     far = common_range_m(hz)
     found = decode(images, hz, delta, noise=Noise(1.0, 5.0), device="cpu")
     ranges = decide(found, unwrap(found, nearest_m=0.0, farthest_m=far))
@@ -34,7 +34,7 @@ def kernels_work(images: np.ndarray, hz: np.ndarray, delta: np.ndarray) -> np.nd
 
 
 def numpy_work(images: np.ndarray, hz: np.ndarray, delta: np.ndarray) -> np.ndarray:
-    """The same arithmetic in NumPy, float32 throughout, each step over the whole image."""
+    """Compute the same range in NumPy, in float32, with each step over the whole image."""
     f32 = np.float32
     frequencies = np.unique(hz)
     phase, sigma, amplitude, evidence = [], [], [], []
@@ -79,7 +79,7 @@ def numpy_work(images: np.ndarray, hz: np.ndarray, delta: np.ndarray) -> np.ndar
 
 
 def numpy_bilateral(d: np.ndarray, sigma: np.ndarray, guide: np.ndarray, ok: np.ndarray) -> np.ndarray:
-    """A weighted plane in each window, one shift of the whole image at a time."""
+    """Fit a weighted plane in each window, one shift of the whole image at a time."""
     f32 = np.float32
     v = np.where(ok, sigma * sigma + f32(LEAST_VARIANCE), f32(np.inf))
     pad = RADIUS
@@ -119,7 +119,7 @@ def _pair(*arguments: np.ndarray) -> tuple[float, float]:
 
 
 def rows() -> list[str]:
-    """Lines of Markdown."""
+    """Return the table as lines of Markdown."""
     view = scenes.room(ROWS, COLS)
     settings = scenes.even(HZ, 3)
     images = scenes.correlations(view, 1e5, settings, seed=0).reshape(len(settings), -1).astype(np.float32)

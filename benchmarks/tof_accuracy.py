@@ -15,12 +15,12 @@ from tests.reference import tof as scenes
 ROWS, COLS = 96, 128
 FOCAL_PX = 110.0
 WRONG_M = 0.9
-"""Half of what one wrap of 80 MHz is."""
+"""The error in metres above which a range is wrong: half the range of one period at 80 MHz."""
 SEED = 11
 
 
 def solved_maps(frames: list[tuple[np.ndarray, dict[str, Any]]], vote: bool = True) -> DepthMaps:
-    """What `relit depth` makes of raw frames."""
+    """Run `relit depth` on raw frames and return its maps."""
     with tempfile.TemporaryDirectory() as name:
         folder, entries = Path(name), []
         for index, (values, light) in enumerate(frames):
@@ -34,7 +34,7 @@ def solved_maps(frames: list[tuple[np.ndarray, dict[str, Any]]], vote: bool = Tr
 
 
 def measured(frames: list[tuple[np.ndarray, dict[str, Any]]], view: scenes.View, vote: bool = True) -> tuple[float, float, float, float]:
-    """Median error in mm, parts of the pixels wrong and unsolved, RMS of error over sigma."""
+    """Return the median error in mm, the parts of the pixels that are wrong and unsolved, and the RMS of error over sigma."""
     maps = solved_maps(frames, vote)
     assert maps.range is not None and maps.sigma is not None
     error = (maps.range - view.distance)[maps.mask]
@@ -45,7 +45,7 @@ def measured(frames: list[tuple[np.ndarray, dict[str, Any]]], view: scenes.View,
 
 
 def accuracy_rows() -> list[str]:
-    """Lines of Markdown."""
+    """Return the table as lines of Markdown."""
     view = scenes.room(ROWS, COLS)
     settings = scenes.even(scenes.HZ, 4)
     megahertz = "/".join(f"{hz / 1e6:g}" for hz in scenes.HZ)

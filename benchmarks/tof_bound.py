@@ -11,15 +11,15 @@ from tests.reference import tof as scenes
 
 BACKGROUND = 0.02
 FAR_M = (11.3, 11.7)
-"""Nearest and farthest of the far wall: over two bins, as a histogram of five photons errs otherwise at each place within its bin."""
+"""The least and largest range of the far wall: over two bins, because the error from five photons depends on the position in the bin."""
 GOALS_MM = {1.0: 20, 0.2: 46}
-"""Of issue 6, by part of the light."""
+"""The goals for the median error in mm, by part of the full light."""
 FIFTHS = 5
 MAD_TO_SIGMA = 1.4826
 
 
 class Light(NamedTuple):
-    """Histograms of one scene at one part of the light."""
+    """The histograms of one scene at a part of the full light."""
 
     possible_mm: float  # least median error
     median_mm: float
@@ -29,18 +29,18 @@ class Light(NamedTuple):
 
 
 def far_wall(albedo: np.ndarray, cosine: float) -> scenes.View:
-    """A wall that goes from FAR_M[0] on the left to FAR_M[1]."""
+    """Return a scene of a wall whose range goes from FAR_M[0] on the left to FAR_M[1]."""
     return scenes.View(np.linspace(*FAR_M, albedo.shape[1]) * np.ones(albedo.shape), albedo, np.full(albedo.shape, cosine))
 
 
 def least_median_m(sigma_m: np.ndarray) -> float:
-    """Median of |error| over pixels whose errors are normal with these deviations."""
+    """Return the median of |error| over pixels with normal errors of the given standard deviations."""
     random = np.abs(np.random.default_rng(0).standard_normal((200, sigma_m.size)))
     return float(np.median(random * sigma_m.reshape(-1)))
 
 
 def measured(view: scenes.View, part: float) -> Light:
-    """Solve one scene and compare."""
+    """Solve one scene and return its errors."""
     counts = scenes.histogram(view, 4000 * part, background=BACKGROUND, seed=SEED)
     maps = solved_maps([(counts, {"type": "pulsed", "bin_s": 1.5e-9, "start_s": 0.0})])
     scene = TofScene(range_m=view.distance, albedo=view.albedo, cosine=view.cosine)
@@ -54,7 +54,7 @@ def measured(view: scenes.View, part: float) -> Light:
 
 
 def bound_rows() -> list[str]:
-    """Lines of Markdown."""
+    """Return the table as lines of Markdown."""
     room = scenes.room(ROWS, COLS)
     lines = ["Histograms, compared with what their photons allow. Possible: median of the errors that the Cramér-Rao bound of each pixel "
              "allows (`stage.tof.bound`). Observed over sigma: 1.4826 · median of |error|/sigma, in fifths of the pixels from the smallest "

@@ -16,6 +16,7 @@ from service.reporting.progress import Timings
 from service.requests.depth import TofOptions
 from stage.camera import Camera
 from stage.capture import Capture
+from stage.tof.light_time import SPEED_OF_LIGHT
 from stage.tof.simulate import (
     CorrelationCamera,
     HistogramCamera,
@@ -67,7 +68,7 @@ def main() -> None:
             codes = np.zeros((ROWS, COLS, 3))
             for code, colour in STATUS_COLOURS.items():
                 codes[status == code] = colour
-            wraps = np.where(ok, np.floor(range_m / (299792458 / 2 / 60e6)), 0)
+            wraps = np.where(ok, np.floor(range_m / (SPEED_OF_LIGHT / 2 / 60e6)), 0)
             rows.append([(title, shown(range_m, FARTHEST_M)), (f"error, 0 to {1000 * ERROR_M:.0f} mm", shown(error, ERROR_M)),
                          ("confidence", np.repeat(confidence[..., None], 3, axis=-1)),
                          ("wraps of 60 MHz" if folder is first else "range in steps of 2.5 m", shown(wraps, 5)), ("status", codes)])

@@ -1,4 +1,4 @@
-"""Check that the samples' camera, lights, environment and BRDF are the contract's, against closed forms.
+"""Check that the samples' camera, lights, environment and BRDF are those of relit, against closed forms.
 
     python samples/check_conventions.py
 
@@ -18,7 +18,7 @@ RESOLUTION, PIXEL_SIZE_M, RADIUS_M, ALBEDO = 64, 0.003, 0.08, 0.6
 
 
 def sphere_normals() -> tuple[np.ndarray, np.ndarray]:  # -> [H, W, 3], [H, W] bool
-    """Normals of the sphere at pixel centres, straight from the contract, and where they are far from the rim."""
+    """Normals of the sphere at pixel centres, from the definition of the camera frame, and where they are far from the rim."""
     row, column = np.mgrid[:RESOLUTION, :RESOLUTION]
     x = (column + 0.5 - RESOLUTION / 2) * PIXEL_SIZE_M / RADIUS_M
     y = (RESOLUTION / 2 - row - 0.5) * PIXEL_SIZE_M / RADIUS_M
@@ -26,7 +26,7 @@ def sphere_normals() -> tuple[np.ndarray, np.ndarray]:  # -> [H, W, 3], [H, W] b
     return np.stack([x, y, z], -1), z > 0.35
 
 
-def contract_brdf(normal, to_light, to_eye, *, albedo: float, f0: float, roughness: float) -> np.ndarray:
+def lambert_ggx_brdf(normal, to_light, to_eye, *, albedo: float, f0: float, roughness: float) -> np.ndarray:
     """Lambert + GGX written out in float64, directions [..., 3]."""
     alpha_sq = roughness**4
     half = to_light + to_eye
@@ -61,7 +61,7 @@ def check_brdf(mi) -> float:
         si.wi = mi.Vector3f(w[0].T)
         value = np.array(bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(w[1].T)))[0]
         normal = np.broadcast_to([0.0, 0.0, 1.0], w[0].shape)
-        expected = contract_brdf(normal, w[1], w[0], albedo=0.3, f0=0.05, roughness=roughness) * w[1, :, 2]
+        expected = lambert_ggx_brdf(normal, w[1], w[0], albedo=0.3, f0=0.05, roughness=roughness) * w[1, :, 2]
         worst = max(worst, np.abs(value / expected - 1).max())
 
         count = 1_000_000  # reflectance by the plug-in's sampling against a uniform hemisphere

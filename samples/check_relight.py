@@ -2,7 +2,7 @@
 
     python samples/check_relight.py checks/glossy
 
-Superposition for the five lights, cells of the sphere for the environments, and for the near lights the contract's BRDF summed
+Superposition for the five lights, cells of the sphere for the environments, and for the near lights relit's BRDF summed
 over points of the lamp in float64. Mitsuba only casts rays. Exits 1 if one fails.
 """
 
@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 import rendering
-from check_conventions import contract_brdf
+from check_conventions import lambert_ggx_brdf
 from make_relight_checks import OBJECTS
 
 from kernels.relight.environment import integrate_cells, light_weights
@@ -77,7 +77,7 @@ def direct(mi, scene, points: Points, light: dict) -> np.ndarray:  # -> [N, 3]
         lit = ((points.normal * way).sum(1) > 0) & (points.normal[:, 2] > 0) & (cosine > 0) & ~np.array(scene.ray_test(ray))
         irradiance = (points.normal[lit] * way[lit]).sum(1) * cosine[lit] / distance[lit, 0] ** 2
         for c in range(3):
-            brdf = contract_brdf(points.normal[lit], way[lit], eye[lit], albedo=points.albedo[lit, c], f0=points.f0[lit],
+            brdf = lambert_ggx_brdf(points.normal[lit], way[lit], eye[lit], albedo=points.albedo[lit, c], f0=points.f0[lit],
                                  roughness=points.roughness[lit])  # fmt: skip
             total[lit, c] += brdf * irradiance * intensity[c]
     return total

@@ -87,15 +87,6 @@ def principled_mesh(mi, surface: Surface, *, metal: bool):
     return copy
 
 
-def light_directions() -> np.ndarray:  # -> [N, 3] unit
-    """Fibonacci lattice on the cap within LARGEST_ANGLE_DEGREES of +z."""
-    i = np.arange(LIGHT_COUNT) + 0.5
-    z = 1 - (1 - np.cos(np.radians(LARGEST_ANGLE_DEGREES))) * i / LIGHT_COUNT
-    azimuth = np.pi * (1 + 5**0.5) * i
-    ring = np.sqrt(1 - z * z)
-    return np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z], axis=1)
-
-
 def main() -> None:
     """Render one capture."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
@@ -119,7 +110,7 @@ def main() -> None:
                             note="ground truth at pixel centres; of a metal, diffuse_albedo holds its F0")
     capture_files.write_mask(args.out / "mask.png", truth.mask)
     tracer = rendering.Tracer(mi, shapes, sensor, max_depth=args.max_depth)
-    directions, irradiance = light_directions(), np.full((LIGHT_COUNT, 3), np.pi)
+    directions, irradiance = rendering.fibonacci_cap(LIGHT_COUNT, LARGEST_ANGLE_DEGREES), np.full((LIGHT_COUNT, 3), np.pi)
     for i in range(LIGHT_COUNT):
         image = tracer.light(direction=directions[i], irradiance=irradiance[i], spp=args.spp, seed=i + 1)
         capture_files.write_exr(args.out / f"{i:03d}.exr", {"RGB": (image * truth.mask[..., None]).astype(np.float16)},

@@ -74,15 +74,6 @@ def build(*, detail: float = 0.02) -> Surface:
     return Surface(points * 0.01, faces, normals, albedo, np.zeros(n), np.ones(n))
 
 
-def light_directions() -> np.ndarray:  # -> [N, 3] unit
-    """Fibonacci lattice on the cap within LARGEST_ANGLE_DEGREES of +z."""
-    i = np.arange(LIGHT_COUNT) + 0.5
-    z = 1 - (1 - np.cos(np.radians(LARGEST_ANGLE_DEGREES))) * i / LIGHT_COUNT
-    azimuth = np.pi * (1 + 5**0.5) * i
-    ring = np.sqrt(1 - z * z)
-    return np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z], axis=1)
-
-
 def footprint_truth(mi, shapes: dict, *, resolution: int, pixel_size_m: float) -> capture_files.Truth:
     """Truth as a box filter sees it: the mean normal of a pixel, and the albedo that goes with it.
 
@@ -137,7 +128,7 @@ def main() -> None:
     shapes = {"object": rendering.mesh(mi, "object", build(detail=args.detail), lambertian=True)}
     truth = footprint_truth(mi, shapes, resolution=args.resolution, pixel_size_m=pixel_size_m)
     tracer = rendering.Tracer(mi, shapes, sensor, max_depth=args.max_depth)
-    directions = light_directions()
+    directions = rendering.fibonacci_cap(LIGHT_COUNT, LARGEST_ANGLE_DEGREES)
     irradiance = np.random.default_rng(7).uniform(*IRRADIANCE_RANGE, (LIGHT_COUNT, 3)).round(3)
 
     note = "ground truth, mean over each pixel's footprint; height at pixel centres"

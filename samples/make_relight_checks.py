@@ -55,7 +55,7 @@ OBJECTS = {
 def parse_arguments() -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    what = "owl: that of samples/owl; glossy: that of make_glossy.py, with the contract's BRDF"
+    what = "owl: that of samples/owl; glossy: that of make_glossy.py, with relit's BRDF"
     parser.add_argument("object", choices=list(OBJECTS), help=what)
     parser.add_argument("--out", type=Path, required=True, help="folder to write")
     parser.add_argument("--size", type=int, default=128, help="pixels a side (default 128)")

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import rendering
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the contract's camera and encoders: stage
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # relit's camera and encoders: stage
 
 import capture_files
 import rig_scene

@@ -1,4 +1,4 @@
-"""The BRDF of docs/contracts (UsdPreviewSurface, specular workflow) as a Mitsuba 3 plug-in.
+"""The BRDF of docs/methods.md (UsdPreviewSurface, specular workflow) as a Mitsuba 3 plug-in.
 
 Mitsuba's `principled` has a retro-reflective diffuse lobe and `roughplastic` a Fresnel-filtered one, so
 neither has an albedo that a Lambert + GGX fit could be judged against. This one is exactly

@@ -1,4 +1,4 @@
-"""What the sample scripts share: Mitsuba set up to the contract's camera and lights, and ray-cast ground truth.
+"""What the sample scripts share: Mitsuba set up to relit's camera and lights, and ray-cast ground truth.
 
 Mitsuba is a development dependency: `import_mitsuba` is the only place that imports it.
 """
@@ -19,7 +19,7 @@ COVERAGE_SUBSAMPLES = 17  # rays per pixel side, edges included, that must all h
 
 
 def import_mitsuba() -> Any:
-    """Return the mitsuba module with the llvm variant set and the contract's BRDF registered.
+    """Return the mitsuba module with the llvm variant set and relit's BRDF registered.
 
     Raises:
         SystemExit: in one sentence, when mitsuba or a usable LLVM is missing.
@@ -45,7 +45,10 @@ def import_mitsuba() -> Any:
 
 
 def fibonacci_sphere(count: int) -> np.ndarray:  # -> [N, 3] float64, unit
-    """Directions spread evenly over the sphere, from +y to -y.
+    """Return directions that are spread evenly over the sphere, from +y to -y.
+
+    The committed captures were rendered from these directions, so `stage.frames.fibonacci_sphere`, which runs from +z to -z, must
+    not replace them.
 
     Source: Gonzalez 2010, "Measurement of areas on a sphere using Fibonacci and latitude-longitude lattices".
     """
@@ -54,6 +57,15 @@ def fibonacci_sphere(count: int) -> np.ndarray:  # -> [N, 3] float64, unit
     azimuth = np.pi * (1 + 5**0.5) * i
     ring = np.sqrt(1 - y**2)
     return np.stack([ring * np.sin(azimuth), y, ring * np.cos(azimuth)], axis=1)
+
+
+def fibonacci_cap(count: int, largest_angle_degrees: float) -> np.ndarray:  # -> [N, 3] float64, unit
+    """Return directions that are spread evenly over the cap of the sphere within an angle of +z."""
+    i = np.arange(count) + 0.5
+    z = 1 - (1 - np.cos(np.radians(largest_angle_degrees))) * i / count
+    azimuth = np.pi * (1 + 5**0.5) * i
+    ring = np.sqrt(1 - z * z)
+    return np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z], axis=1)
 
 
 def camera(mi, *, resolution: int, pixel_size_m: float) -> dict:

@@ -17,7 +17,7 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
 def directions(width: int, height: int) -> np.ndarray:  # -> [H, W, 3] unit, from the object
-    """Pixel-centre directions of a lat-long map (CONTRACTS, Environment maps)."""
+    """Return the pixel-centre directions of a lat-long map: +y at the top, +z at the image centre, +x a quarter from the left."""
     u = (np.arange(width) + 0.5) / width * 2 * np.pi
     v = (np.arange(height) + 0.5) / height * np.pi
     ring = np.sin(v)[:, None]
@@ -87,9 +87,9 @@ def make_sky(width: int = 256, height: int = 128) -> np.ndarray:  # -> [H, W, 3]
 
 
 def as_mitsuba_envmap(mi, environment: np.ndarray, *, upsample: int = 8) -> dict:
-    """Emitter that shows every pixel of a contract lat-long map [H, W, 3] as a constant patch.
+    """Emitter that shows every pixel of a lat-long map [H, W, 3] as a constant patch.
 
-    Convention: Mitsuba's `envmap` has the contract's axes (its centre looks along +z) and pixel-centred columns, but
+    Convention: Mitsuba's `envmap` has these axes (its centre looks along +z) and pixel-centred columns, but
     puts its first and last rows on the poles, and it interpolates. So rows are resampled to theta = pi j / (rows - 1)
     by nearest pixel on a grid fine enough for the interpolation not to matter.
     """
