@@ -23,6 +23,7 @@ from service.cli import (
     relight,
     results,
     scan,
+    separate,
     server,
     shade,
     simulate,
@@ -31,8 +32,8 @@ from service.cli import (
 
 app = typer.Typer(name="relit", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
                   help="Active-illumination captures to normals, materials, depth, USD assets and relit frames.")
-for module in (demo, capture, calibrate, results, depth, scan, simulate, patterns, relight, shade, basis, doctor, measure, server, submit,
-               jobs, keys, farm):
+for module in (demo, capture, calibrate, results, depth, separate, scan, simulate, patterns, relight, shade, basis, doctor, measure,
+               server, submit, jobs, keys, farm):
     module.register(app)
 
 BAD_INPUT, INTERRUPTED = 2, 130

@@ -1,20 +1,25 @@
 """relit bench: the speed table, measured here and now."""
 
+from typing import Annotated
+
 import typer
 
-from service.cli.bar import Bar
-from service.cli.request_commands import local_command
-from service.requests.demo import BenchRequest
+from service.cli.options import DeviceOption
 
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
-    local_command(app, "bench", _bench)
+    app.command("bench")(bench)
 
 
-def _bench(request: BenchRequest) -> None:
-    from service.demo.bench import bench
+def bench(
+    device: DeviceOption = None,
+    repeats: Annotated[int, typer.Option("--repeats", min=3, help="Timed runs of each; medians are shown.")] = 9,
+) -> None:
+    """Speed of the kernels against NumPy and against a plain copy, in the same run."""
+    from service.cli.bar import Bar
+    from service.demo.bench import bench as run
 
     with Bar() as bar:
-        lines = bench(request.device, request.repeats, bar)
+        lines = run(device, repeats, bar)
     print("\n".join(lines))

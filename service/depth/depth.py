@@ -97,7 +97,7 @@ def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResul
     timings.stage("points", 1)
     cloud = point_cloud(solution, capture.camera, color_space=capture.manifest.color_space, normals=request.normals)
     timings.stage("write", 1)
-    content = _content(capture)
+    content = content_of(capture)
     sources = metadata(request, capture=capture.name, inputs=content, method=solution.method)
     maps = DepthMaps(camera=capture.camera, mask=solution.solved, depth=solution.depth, range=solution.range_m,
                      projector_u=solution.projector_u, projector_v=solution.projector_v, amplitude=solution.amplitude,
@@ -167,7 +167,7 @@ def _advice(reasons: dict[str, int], using: Ranging) -> str:
     return f"check the {using} frames"
 
 
-def _content(capture: Capture) -> str:
+def content_of(capture: Capture) -> str:
     """Return the content hashes of every file that the capture names, combined."""
     names = sorted({name for _, name in capture.files()})
     hashes = Fingerprints(capture.folder, capture.folder / CACHE_FOLDER / "files.json").of(names)

@@ -1,23 +1,22 @@
-"""What `relit scan` takes."""
+"""What can be asked of `relit scan`: one frozen model."""
 
 from pathlib import Path
-from typing import Annotated
 
 from pydantic import Field
 
-from service.requests.base import DeviceRequest, Role, Spelling
+from service.requests.base import Request
 
 
-class ScanRequest(DeviceRequest):
-    """Shots of a scanning laser, from a platform that may move, as one point cloud."""
+class ScanRequest(Request):
+    """The point cloud of a scan."""
 
-    scan: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="SCAN")]
+    scan: Path
     """A folder with a scan.json, or the file."""
-    out: Annotated[Path, Role.OUTPUT]
+    out: Path
     """Folder for points.ply, points.usdc, points.las where it is asked for, and report.json."""
     near_m: float | None = Field(default=None, gt=0, allow_inf_nan=False)
-    """Nearer returns, in metres, are left out."""
+    """Nearer returns are left out."""
     far_m: float | None = Field(default=None, gt=0, allow_inf_nan=False)
-    """Farther returns, in metres, are left out."""
+    """Farther returns are left out."""
     las: bool = False
-    """Write points.las (LAS 1.4) too; needs laspy: pip install 'relit[las]'."""
+    """Write points.las too (LAS 1.4)."""

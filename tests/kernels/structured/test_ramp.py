@@ -4,15 +4,9 @@ import numpy as np
 import pytest
 
 from kernels.errors import ArrayError
-from kernels.packs import as_pixels
 from kernels.status import Status
 from kernels.structured.frames import NoiseModel, saturated_bits, upload
-from kernels.structured.phase import decode_phase
 from kernels.structured.ramp import decode_ramp
-from kernels.structured.separation import separate_extremes, separate_phase
-from stage.patterns.base import uniform_patterns
-from stage.patterns.codes import collect
-from stage.patterns.phase import phase_patterns
 from stage.patterns.ramp import ramp_patterns
 from tests.reference import structured as reference
 from tests.structured_scenes import NOISE, frames_of, places, result, view
@@ -103,44 +97,3 @@ def test_nothing_is_nan_whatever_the_input(device):
 def test_what_cannot_be_decoded_is_one_sentence(options, words, device):
     with pytest.raises(ArrayError, match=words):
         decode_ramp(upload(np.zeros((4, 4), dtype=np.float32), device=device), **{"extent": 8, "noise": NOISE, **options})
-
-
-FINE = (*phase_patterns("column", (12.0,), 12), *uniform_patterns())
-
-
-def bounced(leak=0.0, bounce=0.5):
-    """Readings under fine sinusoids, their direct part, and their global part under white."""
-    u = WIDTH / 4 + places(3000, WIDTH / 2)  # away from the border, where the spread pattern is not even
-    stack = view(FINE, u, WIDTH, albedo=0.5, ambient=0.0, bounce=bounce)
-    white = 0.5 * (1 + bounce)
-    return 0.05 + leak * white + (1 - leak) * stack, 0.5, 0.5 * bounce
-
-
-@pytest.mark.parametrize("leak", [0.0, 0.05])
-def test_direct_and_global_light(leak, device):
-    stack, direct, indirect = bounced(leak)
-    stack[-1] = 0.05  # the lamp off
-    found = collect(FINE)
-    code = found.codes[0]
-    frames = frames_of(stack, device)
-    parts = separate_extremes(frames, code.frames, black=found.black, leak=leak)
-    # twelve steps come within a 24th of a turn of the extremes: cos 15° = 0.966 of the amplitude
-    np.testing.assert_allclose(parts.direct.numpy()[:3000], direct, rtol=0.04)
-    np.testing.assert_allclose(parts.indirect.numpy()[:3000], indirect, rtol=0.16)
-    wrapped = decode_phase(frames, code.frames, code.periods_px, code.shifts, black=found.black, noise=NOISE)
-    smooth = separate_phase(wrapped, period=0, ambient=as_pixels(frames.values)[len(stack) - 1], leak=leak)
-    np.testing.assert_allclose(smooth.direct.numpy()[:3000], direct, rtol=2e-3)
-    np.testing.assert_allclose(smooth.indirect.numpy()[:3000], indirect, rtol=1e-2)  # what the spread leaves of the fine pattern
-    assert (smooth.status.numpy()[:3000] == Status.OK).all()
-
-
-def test_separation_refuses(device):
-    frames = upload(np.zeros((14, 4), dtype=np.float32), device=device)
-    with pytest.raises(ArrayError, match="there are 1 frames"):
-        separate_extremes(frames, [0])
-    with pytest.raises(ArrayError, match="the leak is 1"):
-        separate_extremes(frames, [0, 1], leak=1.0)
-    wrapped = decode_phase(frames, range(3), [8.0] * 3, [0, 0.3, 0.6], noise=NOISE)
-    with pytest.raises(ArrayError, match="period 1 does not exist"):
-        separate_phase(wrapped, period=1)
-    assert (separate_phase(wrapped, period=0).status.numpy()[:4] == Status.SHADOWED).all()

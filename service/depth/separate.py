@@ -1,0 +1,223 @@
+"""Separate the direct from the global light of a capture and write separation.exr and report.json.
+
+The way of the data: the frames of one sinusoid in each axis (`choose_sinusoids`) → kernels/structured/separation.py, band by band, which
+holds the equations and their source → the mean over the axes → a check against the white frame → the files.
+"""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from kernels import device as devices
+from kernels.status import OK, Status
+from kernels.structured.frames import saturated_bits, upload
+from kernels.structured.separation import separate as separate_band
+from service.depth.depth import REPORT_FILE, content_of, statistics
+from service.errors import RequestError
+from service.reporting.progress import Progress, Timings
+from service.reporting.provenance import metadata, report
+from service.requests.separate import SeparateRequest
+from stage import exr
+from stage.capture import Capture
+from stage.colour_spaces import linear_space
+from stage.correction import Correction
+from stage.errors import ManifestError
+from stage.files import write_text
+from stage.light import OffLight
+from stage.manifest import FILE_NAME
+from stage.patterns.base import Axis
+from stage.patterns.codes import Collected, collect
+from stage.patterns.phase import FULL_STEPS, PhaseCode
+from stage.planes import frame_planes
+from stage.result_metadata import result_metadata
+
+SEPARATION_FILE = "separation.exr"
+METHOD = "separation"
+LONGEST_PX = 64.0
+"""Longest period that is taken unasked, about a twentieth of a projector's width: light between surfaces follows longer ones, and would
+count as direct."""
+SUM_TOLERANCE = 0.1
+"""Part by which direct and global light together may differ from the white frame. The mean of a sinusoid is half of white if the
+projector and the camera are linear; a projector of gamma 2.2 without correction differs by 0.3."""
+LIT_PART = 0.05
+"""Of the light of the brightest pixels (99th percentile): at darker pixels noise decides which part the light is."""
+BYTES_PER_PIXEL = 80
+"""What the separation of a band allocates beside the planes."""
+
+
+class Sinusoid(NamedTuple):
+    """The frames of one period along one axis."""
+
+    axis: Axis
+    frames: tuple[int, ...]
+    """Indices into the capture's frames."""
+    shifts: tuple[float, ...]
+    """Of each frame, turns."""
+
+
+class LightParts(NamedTuple):
+    """Both parts of the light under the projector full on; 0 where the status is not OK."""
+
+    direct: np.ndarray  # [rows, cols, 3] float32 linear
+    indirect: np.ndarray  # [rows, cols, 3] float32 linear, the global part
+    status: np.ndarray  # [rows, cols] uint8: UNSOLVED outside the mask, OK, SATURATED
+
+
+class SeparationResult(NamedTuple):
+    """The files and numbers of a separation that was written."""
+
+    separation_path: Path
+    report_path: Path
+    period_px: float
+    global_share: dict[str, float]
+    """Global light over all light at the lit pixels: 5th percentile, median and 95th; empty if none is lit."""
+    counts: dict[str, int]
+    """Pixels of the mask per status."""
+
+
+def separate(request: SeparateRequest, progress: Progress | None = None) -> SeparationResult:
+    """Separate direct from global light.
+
+    Args:
+        request: what to separate and where to put it.
+        progress: told of every stage.
+
+    Raises:
+        StageError, KernelError: the capture has no frames for it, or they are not what they must be; nothing is written.
+        RequestError: a period that the capture does not have, or a black level beside a black frame.
+        StorageError: the results cannot be written.
+    """
+    timings = Timings(progress)
+    device = devices.resolve(request.device)
+    timings.stage("open", 1)
+    capture = Capture.open(request.capture)
+    frames = capture.manifest.frames
+    try:
+        collected = collect([frame.pattern for frame in frames])
+        period_px, sinusoids = choose_sinusoids(collected, request.period_px)
+    except ManifestError as error:
+        raise ManifestError(f"{capture.folder / FILE_NAME}: frames: {error}") from error
+    if request.black_level and collected.black is not None:
+        raise RequestError(f"--black-level {request.black_level:g}: the capture has a black frame, which holds that light already: "
+                           "leave the option out")
+    light = _separate_frames(capture, collected, sinusoids, period_px, request, device, timings)
+    mask, solved = capture.mask(), light.status == OK
+    counts = {name: int((light.status[mask] == code).sum()) for name, code in (("ok", OK), ("saturated", Status.SATURATED))}
+    if not solved.any():
+        raise ManifestError(f"{capture.folder}: no pixel is separated ({counts['saturated']} saturated): expose the phase frames for less")
+    total = (light.direct + light.indirect).sum(axis=-1)
+    ratio = _sum_over_white(capture, collected, total, solved)
+    if ratio is not None and abs(ratio - 1) > SUM_TOLERANCE:
+        raise ManifestError(f"{capture.folder}: direct and global light add up to {ratio:.2f} of the white frame: the patterns must be "
+                            "linear in light (relit patterns --gamma, color_space), and ambient light needs a black or an off frame")
+    timings.stage("write", 1)
+    content = content_of(capture)
+    path, report_path = request.out / SEPARATION_FILE, request.out / REPORT_FILE
+    channels = {f"{name}.{channel}": values[..., c] for name, values in (("direct", light.direct), ("global", light.indirect))
+                for c, channel in enumerate("RGB")}
+    exr.write(path, {**channels, "mask.Y": solved.astype(np.float16), "status.Y": light.status.astype(np.float16)},
+              color_space=linear_space(capture.manifest.color_space),
+              metadata=result_metadata(capture.camera, metadata(request, capture=capture.name, inputs=content, method=METHOD)))
+    lit = _lit(total, solved)
+    share = statistics(light.indirect.sum(axis=-1)[lit] / total[lit])
+    write_text(report_path, report(
+        inputs={"capture": str(request.capture), "name": capture.name, "content": content, "frames": len(capture.manifest.frames),
+                "resolution": list(capture.camera.resolution), "color_space": capture.manifest.color_space},
+        method=METHOD,
+        options={"period_px": request.period_px, "black_level": request.black_level},
+        found={"period_px": period_px, "axes": [sinusoid.axis for sinusoid in sinusoids],
+               "frames": sum(len(sinusoid.frames) for sinusoid in sinusoids), "ambient": _ambient(capture, collected),
+               "sum_over_white": None if ratio is None else float(f"{ratio:.5g}")},
+        device=devices.describe(device),
+        timings_s=timings.close(),
+        pixels={"mask": int(mask.sum()), **counts},
+        global_share=share,
+        global_below_0=int((light.indirect[solved] < 0).any(axis=-1).sum()),
+    ))
+    return SeparationResult(path, report_path, period_px, share, counts)
+
+
+def choose_sinusoids(collected: Collected, wanted_px: float | None) -> tuple[float, tuple[Sinusoid, ...]]:
+    """Choose the period to separate with, and return its frames along each axis.
+
+    Args:
+        collected: the codes of a capture.
+        wanted_px: the period that was asked for; None: the shortest.
+
+    Raises:
+        ManifestError: no period has three shifts, or the shortest is longer than LONGEST_PX.
+        RequestError: no such period.
+    """
+    found: dict[float, list[Sinusoid]] = {}
+    for code in (code for code in collected.codes if isinstance(code, PhaseCode)):
+        for period in dict.fromkeys(code.periods_px):
+            at = [index for index, other in enumerate(code.periods_px) if other == period]
+            shifts = tuple(code.shifts[index] for index in at)
+            if len(set(shifts)) >= FULL_STEPS:
+                found.setdefault(period, []).append(Sinusoid(code.axis, tuple(code.frames[index] for index in at), shifts))
+    if not found:
+        raise ManifestError("no period of a phase pattern has three shifts or more: relit separate needs such frames "
+                            "(relit patterns phase, or gray-phase)")
+    if wanted_px is not None and wanted_px not in found:
+        raise RequestError(f"--period-px {wanted_px:g}: the phase frames have periods of {', '.join(f'{px:g}' for px in sorted(found))} px")
+    period_px = min(found) if wanted_px is None else wanted_px
+    if wanted_px is None and period_px > LONGEST_PX:
+        raise ManifestError(f"the shortest period is {period_px:g} px, which light between surfaces follows: project one of "
+                            f"{LONGEST_PX:g} px or less, or name it with --period-px")
+    return period_px, tuple(found[period_px])
+
+
+def _separate_frames(capture: Capture, collected: Collected, sinusoids: tuple[Sinusoid, ...], period_px: float, request: SeparateRequest,
+                     device: str, timings: Timings) -> LightParts:
+    """Read the frames and separate them band by band; the parts are the mean over the axes."""
+    black = () if collected.black is None else (collected.black,)
+    used = [*(number for sinusoid in sinusoids for number in sinusoid.frames), *black]
+    place = {number: index for index, number in enumerate(used)}
+    mask = capture.mask()
+    light = LightParts(np.zeros((*mask.shape, 3), np.float32), np.zeros((*mask.shape, 3), np.float32), np.zeros(mask.shape, np.uint8))
+    timings.stage("frames", len(used))
+    with frame_planes(capture, [capture.manifest.frames[number] for number in used], colour=True, cache=request.cache,
+                      progress=timings.advance) as planes:
+        timings.stage("separate", len(mask))
+        for band in planes.bands(BYTES_PER_PIXEL):
+            bits = None if planes.saturated is None else saturated_bits(planes.saturated[:, band].reshape(len(used), -1))
+            readings = upload(planes.band(band), bits, device=device)
+            parts = [separate_band(readings, [place[number] for number in sinusoid.frames], sinusoid.shifts, period_px=period_px,
+                                   black=place[black[0]] if black else None, leak=request.black_level) for sinusoid in sinusoids]
+            shape = mask[band].shape
+            pixels = mask[band].size
+            worst = np.maximum.reduce([part.status.numpy()[:pixels] for part in parts]).reshape(shape)
+            light.status[band] = np.where(mask[band], worst, int(Status.UNSOLVED))
+            for whole, arrays in ((light.direct, [part.direct for part in parts]), (light.indirect, [part.indirect for part in parts])):
+                mean = np.mean([array.numpy()[:, :pixels] for array in arrays], axis=0).reshape(3, *shape)
+                whole[band] = np.where((light.status[band] == OK)[..., None], np.moveaxis(mean, 0, -1), 0)
+            timings.advance(band.stop)
+    return light
+
+
+def _sum_over_white(capture: Capture, collected: Collected, total: np.ndarray, solved: np.ndarray) -> float | None:
+    """Return the median of direct and global light together over the white frame; None without one, or if nothing is lit."""
+    if collected.white is None:
+        return None
+    correction = Correction.of(capture)
+    white = correction.apply(capture.manifest.frames[collected.white])
+    light = white.pixels
+    if collected.black is not None:
+        light = light - correction.apply(capture.manifest.frames[collected.black]).pixels
+    lit = _lit(light.sum(axis=-1), solved if white.saturated is None else solved & ~white.saturated)
+    return float(np.median(total[lit] / light.sum(axis=-1)[lit])) if lit.any() else None
+
+
+def _lit(light: np.ndarray, usable: np.ndarray) -> np.ndarray:
+    """Return which pixels are lit well enough to compare parts of their light, [rows, cols] bool."""
+    if not usable.any():
+        return usable
+    return usable & (light > max(LIT_PART * float(np.percentile(light[usable], 99.0)), 0.0))
+
+
+def _ambient(capture: Capture, collected: Collected) -> str:
+    """Return where the ambient light is known from, in words."""
+    if collected.black is not None:
+        return "black frame"
+    return "off frames" if capture.lit_by(OffLight) else "none"

@@ -1,0 +1,204 @@
+"""relit separate: known direct and global light come back, what cannot be separated is one sentence, and the path-traced rig agrees."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service.depth.separate import separate
+from service.requests.separate import SeparateRequest
+from stage import exr
+from stage.capture import Capture
+from stage.depth_normals import depth_normals
+from tests.captures import edit_manifest, files_in, write_exr, write_image, write_manifest
+
+RIG = Path(__file__).parents[3] / "samples" / "rig"
+ROWS, COLS = 12, 20
+BLACK, WHITE = {"code": "black"}, {"code": "white"}
+
+
+def known() -> tuple[np.ndarray, np.ndarray]:
+    """[rows, cols, 3] direct and global light; the left columns see no direct light."""
+    rng = np.random.default_rng(0)
+    direct, indirect = rng.uniform(0.1, 0.5, (ROWS, COLS, 3)), rng.uniform(0.05, 0.3, (ROWS, COLS, 3))
+    direct[:, :4] = 0
+    return direct, indirect
+
+
+def phases(period: float = 16, *, axis: str = "column", steps: int = 4) -> list[dict]:
+    return [{"code": "phase", "axis": axis, "period_px": period, "step": step, "steps": steps} for step in range(steps)]
+
+
+def write(folder: Path, patterns: list[dict], *, leak: float = 0.0, ambient: float = 0.0, gamma: float = 1.0, **changes) -> Path:
+    """A capture whose pixels see places spread over the projector, in EXR."""
+    direct, indirect = known()
+    place = np.random.default_rng(1).uniform(100, 900, (2, ROWS, COLS))
+    frames = []
+    for number, pattern in enumerate(patterns):
+        if pattern["code"] == "phase":
+            turns = place[int(pattern["axis"] == "row")] / pattern["period_px"] - pattern["step"] / pattern["steps"]
+            level = ((1 + np.cos(2 * np.pi * turns[..., None])) / 2) ** gamma
+            mean = (((1 + np.cos(np.arange(400) / 200 * np.pi)) / 2) ** gamma).mean()
+        else:
+            level = mean = float(pattern["code"] == "white")
+        image = ambient + direct * (leak + (1 - leak) * level) + indirect * (leak + (1 - leak) * mean)
+        write_exr(folder / f"{number}.exr", image)
+        frames.append({"image": f"{number}.exr", "pattern": pattern})
+    camera = {"projection": "orthographic", "resolution": [COLS, ROWS]}
+    write_manifest(folder, {"schema": "relit.capture/1", "name": "wax", "camera": camera, "frames": frames, **changes})
+    return folder
+
+
+def solve(relit, folder: Path, *arguments):
+    """Direct, global, status and the report of a run."""
+    outcome = relit("separate", folder, "--out", folder / "out", "--device", "cpu", *arguments)
+    assert (outcome.code, outcome.err) == (0, "")
+    channels, metadata = exr.read(folder / "out" / "separation.exr")
+    direct, indirect = (np.stack([channels[f"{name}.{c}"] for c in "RGB"], axis=-1) for name in ("direct", "global"))
+    return direct, indirect, channels, metadata, json.loads((folder / "out" / "report.json").read_text())
+
+
+@pytest.mark.parametrize("patterns", [[*phases(), BLACK, WHITE], [*phases(), *phases(axis="row"), BLACK],
+                                      [WHITE, *phases(40), *phases(11.5, steps=3), BLACK]], ids=["one", "both axes", "two periods"])
+def test_known_light_comes_back(relit, tmp_path, patterns):
+    write(tmp_path, patterns, leak=0.04, ambient=0.1)
+    direct, indirect, channels, _, report = solve(relit, tmp_path)
+    truth = known()
+    np.testing.assert_allclose(direct, 0.96 * truth[0], atol=2e-6)  # of white minus black
+    np.testing.assert_allclose(indirect, 0.96 * truth[1], atol=2e-6)
+    assert (channels["mask.Y"] == 1).all() and (channels["status.Y"] == 1).all()
+    assert report["found"]["period_px"] == (11.5 if patterns[0] == WHITE else 16)
+    assert report["found"]["ambient"] == "black frame" and report["pixels"] == {"mask": ROWS * COLS, "ok": ROWS * COLS, "saturated": 0}
+    if WHITE in patterns:
+        assert report["found"]["sum_over_white"] == pytest.approx(1, abs=1e-5)
+
+
+def test_the_black_level_of_the_paper(relit, tmp_path):
+    write(tmp_path, phases(), leak=0.04)
+    direct, indirect, _, _, report = solve(relit, tmp_path, "--black-level", 0.04)
+    truth = known()
+    np.testing.assert_allclose(direct, truth[0], atol=2e-6)
+    np.testing.assert_allclose(indirect, truth[1], atol=4e-6)
+    assert report["found"]["ambient"] == "none" and report["found"]["sum_over_white"] is None
+    assert report["options"] == {"period_px": None, "black_level": 0.04}
+
+
+def test_off_frames_are_ambient_light_and_a_period_is_chosen(relit, tmp_path):
+    write(tmp_path, [*phases(), *phases(200)], ambient=0.2)
+    write_exr(tmp_path / "off.exr", np.full((ROWS, COLS, 3), 0.2))
+    frames = json.loads((tmp_path / "capture.json").read_text())["frames"]
+    edit_manifest(tmp_path, frames=[*frames, {"image": "off.exr", "light": {"type": "off"}}])
+    direct, indirect, _, _, report = solve(relit, tmp_path, "--period-px", 200)
+    np.testing.assert_allclose(direct, known()[0], atol=2e-6)
+    np.testing.assert_allclose(indirect, known()[1], atol=2e-6)
+    assert report["found"]["ambient"] == "off frames" and report["found"]["period_px"] == 200
+
+
+def test_mask_saturation_and_provenance(relit, tmp_path):
+    write(tmp_path, [*phases(), BLACK], mask="mask.png", saturation=0.6)
+    mask = np.zeros((ROWS, COLS), np.uint8)
+    mask[2:] = 255
+    write_image(tmp_path / "mask.png", mask)
+    direct, indirect, channels, metadata, report = solve(relit, tmp_path)
+    recorded = np.stack([exr.read(tmp_path / f"{n}.exr")[0][c] for n in range(4) for c in "RGB"])
+    cut = (recorded >= 0.6).any(axis=0)
+    assert cut[2:].any() and not cut.all()
+    np.testing.assert_array_equal(channels["status.Y"], np.where(mask == 0, 0, np.where(cut, 6, 1)))
+    np.testing.assert_array_equal(channels["mask.Y"] > 0, (mask > 0) & ~cut)
+    assert (direct[channels["mask.Y"] == 0] == 0).all() and (indirect[channels["mask.Y"] == 0] == 0).all()
+    assert metadata["relit:capture"] == "wax" and json.loads(metadata["relit:options"]) == {"black_level": 0.0, "method": "separation"}
+    assert metadata["relit:inputs"] == report["inputs"]["content"] and "relit:camera" in metadata
+
+
+def fails(relit, folder: Path, words: str, *arguments):
+    outcome = relit("separate", folder, "--out", folder / "out", *arguments)
+    assert outcome.code == 2 and len(outcome.err.splitlines()) == 1 and words in outcome.err, outcome.err
+    assert files_in(folder / "out") == set()
+
+
+@pytest.mark.parametrize("patterns, options, words", [
+    ([WHITE, BLACK], [], "frames: no period of a phase pattern has three shifts or more"),
+    ([*phases()[:2], BLACK], [], "frames: no period of a phase pattern has three shifts or more"),
+    (phases(256), [], "frames: the shortest period is 256 px, which light between surfaces follows"),
+    ([*phases(16), *phases(18)], ["--period-px", 20], "--period-px 20: the phase frames have periods of 16, 18 px"),
+    ([*phases(), BLACK], ["--black-level", 0.1], "--black-level 0.1: the capture has a black frame"),
+    (phases(), ["--black-level", 1], "black_level"),
+    ([*phases(), phases()[0]], [], "frames 0 and 4 show one pattern"),
+])
+def test_what_cannot_be_separated_is_one_sentence(relit, tmp_path, patterns, options, words):
+    fails(relit, write(tmp_path, patterns), words, *options)
+
+
+def test_a_projector_that_is_not_linear_is_found_by_the_white_frame(relit, tmp_path):
+    fails(relit, write(tmp_path, [*phases(), BLACK, WHITE], gamma=2.2), "of the white frame: the patterns must be linear in light")
+
+
+def test_ambient_light_without_a_frame_of_it_is_found_too(relit, tmp_path):
+    fails(relit, write(tmp_path, [*phases(), WHITE], ambient=0.2), "ambient light needs a black or an off frame")
+
+
+def test_saturated_captures_are_said(relit, tmp_path):
+    fails(relit, write(tmp_path, [*phases(), BLACK], saturation=0.01), f"no pixel is separated ({ROWS * COLS} saturated)")
+
+
+class Told:
+    """A Progress that remembers what it was told."""
+
+    def __init__(self) -> None:
+        self.stages: dict[str, int] = {}
+        self.last: dict[str, int] = {}
+
+    def stage(self, name: str, total: int) -> None:
+        self.stages[name] = total
+        self.name = name
+
+    def advance(self, done: int) -> None:
+        self.last[self.name] = done
+
+
+def test_progress_reaches_its_totals(tmp_path):
+    told = Told()
+    separate(SeparateRequest(capture=write(tmp_path, [*phases(), BLACK]), out=tmp_path / "out", device="cpu"), told)
+    assert told.stages == {"open": 1, "frames": 5, "separate": ROWS, "write": 1}
+    assert told.last == {"frames": 5, "separate": ROWS}
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory):
+    """Direct and white light of the rig, [rows, cols], with its truth and what the projector gives each surface (irradiance over π)."""
+    out = tmp_path_factory.mktemp("separation")
+    separate(SeparateRequest(capture=RIG, out=out, cache=out, device="cpu"))
+    channels, _ = exr.read(out / "separation.exr")
+    direct, indirect = channels["direct.R"], channels["global.R"]
+    truth = {name: plane > 0.5 if name.endswith(".Y") else plane.astype(np.float64)
+             for name, plane in exr.read(RIG / "truth.exr")[0].items()}
+    capture = Capture.open(RIG)
+    clean = truth["mask.Y"] & ~truth["mixed.Y"]
+    x, y = capture.camera.plane_coordinates()
+    points = np.stack([x, y, -np.ones_like(x)], axis=-1) * truth["depth.Z"][..., None]
+    normal = depth_normals(truth["depth.Z"].astype(np.float32), clean, capture.camera)
+    pose = np.array(capture.manifest.projector.camera_from_projector)
+    to_light = pose[:3, 3] - points
+    given = (normal * to_light).sum(axis=-1) / (to_light @ pose[:3, 2]) ** 3  # planes that face it are evenly lit, 1 at 1 m
+    known = clean & (np.linalg.norm(normal, axis=-1) > 0.5)
+    return direct, indirect, truth, given, known
+
+
+def test_the_groove_has_its_albedo_in_direct_light_alone(rig):
+    """Its walls, of albedo 0.78 ± 0.05, light each other: white light makes them look brighter than any paint."""
+    direct, indirect, truth, given, known = rig
+    groove = known & truth["groove.Y"]
+    albedo, under_white = direct[groove] / given[groove], (direct + indirect)[groove] / given[groove]
+    assert np.median(albedo) == pytest.approx(0.78, abs=0.03)
+    assert np.percentile(albedo, [5, 95]) == pytest.approx([0.73, 0.83], abs=0.06)
+    assert np.median(under_white) > 0.95
+
+
+def test_open_ground_has_little_global_light_and_shadow_no_direct(rig):
+    direct, indirect, truth, _, known = rig
+    share = indirect / np.maximum(direct + indirect, 1e-6)
+    assert np.median(share[known & ~truth["groove.Y"]]) < 0.04  # of which 1.6 % are the pixels of projector and camera, which blur 16 px
+    assert 0.2 < np.median(share[known & truth["groove.Y"]]) < 0.3
+    shadow = truth["shadow.Y"]
+    assert np.median(direct[shadow]) < 0.002 < np.median(indirect[shadow])
