@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.accuracy import angles_deg, read_truth
-from service.demo.preview import write_sheet
+from service.light.sheet import write_sheet
 from service.requests.solve import Method, SolveRequest
 from service.solve.solve import solve
 from stage import exr

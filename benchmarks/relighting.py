@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.accuracy import SAMPLES
-from service.demo.preview import display, write_sheet
 from service.light.relight import relight
 from service.light.shade import shade
+from service.light.sheet import display, write_sheet
 from service.requests.relight import LightWeights, RelightRequest
 from service.requests.shade import ShadeRequest
 from service.requests.solve import Method, SolveRequest

@@ -13,8 +13,8 @@ import numpy as np
 from scipy.ndimage import binary_erosion
 
 from benchmarks.pictures import FULL_SCALE_DEG, heat
-from service.demo.preview import write_sheet
 from service.depth.depth import depth
+from service.light.sheet import write_sheet
 from service.requests.depth import DepthRequest
 from stage import exr
 from stage.capture import Capture

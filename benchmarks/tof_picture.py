@@ -10,8 +10,8 @@ import numpy as np
 
 from benchmarks.pictures import heat
 from kernels.status import Status
-from service.demo.preview import write_sheet
 from service.depth.tof import solve_tof
+from service.light.sheet import write_sheet
 from service.reporting.progress import Timings
 from service.requests.depth import TofOptions
 from stage.camera import Camera

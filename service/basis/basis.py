@@ -1,21 +1,21 @@
-"""Capture → a few coefficient images: for a browser (svd), or for viewers of relightable images (ptm, lrgb-ptm, hsh)."""
+"""Reduce a capture to a few coefficient images: for a browser (svd), or for viewers of relightable images (ptm, lrgb-ptm, hsh)."""
 
 from pathlib import Path
 
 from kernels import device as devices
-from service.basis.layers import make_layers
+from service.basis.capture import BasisResult, open_capture
 from service.basis.rti import make_rti
-from service.basis.source import BasisResult, open_source
+from service.basis.svd import make_svd
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.requests.basis import BasisKind, BasisRequest
 
 SUFFIXES = {BasisKind.SVD: ".exr", BasisKind.PTM: ".ptm", BasisKind.LRGB_PTM: ".ptm", BasisKind.HSH: ".rti"}
-"""Of the file of each kind; the first kind with a suffix is made where none is named."""
+"""The suffix of each kind's file; where no kind is named, the first one with the suffix is made."""
 
 
 def make_basis(request: BasisRequest, progress: Progress | None = None) -> BasisResult:
-    """Reduce a capture.
+    """Reduce a capture to a basis and write it.
 
     Args:
         request: capture, kind, how many coefficients, and where to put them.
@@ -29,17 +29,17 @@ def make_basis(request: BasisRequest, progress: Progress | None = None) -> Basis
     kind = resolve_kind(request.kind, request.out)
     device = devices.resolve(request.device)
     timings = Timings(progress)
-    source = open_source(request, timings)
+    source = open_capture(request, timings)
     if kind == BasisKind.SVD:
-        return make_layers(request, source, device, timings)
+        return make_svd(request, source, device, timings)
     return make_rti(request, kind, source, device, timings)
 
 
 def resolve_kind(kind: BasisKind | None, out: Path) -> BasisKind:
-    """The kind to make.
+    """Return the kind that is asked for, by name or by the suffix of the file.
 
     Raises:
-        RequestError: the suffix is not that of the kind, or of none.
+        RequestError: the suffix is not that of the kind, or no kind has it.
     """
     suffix = out.suffix.lower()
     if kind is None:

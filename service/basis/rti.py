@@ -1,6 +1,9 @@
-"""The stack as a polynomial texture map or as hemispherical harmonics, fitted to display values as a viewer shows them.
+"""The captured images as a polynomial texture map or as hemispherical harmonics, fitted to display values as a viewer shows them.
 
 Coefficients are fitted twice, once for their ranges and once to be stored, so that only bytes are kept of the whole image.
+
+Source: Malzbender, Gelb and Wolters, "Polynomial texture maps", SIGGRAPH 2001, section 3; Gautron et al., "A novel hemispherical basis for
+accurate and efficient rendering", Eurographics Symposium on Rendering 2004 (kernels.relight.hemisphere has the equations).
 """
 
 from pathlib import Path
@@ -15,7 +18,7 @@ from kernels.relight.display import encode
 from kernels.relight.hemisphere import HSH_TERMS, PTM_TERMS, biquadratic, fit_weights, hemispherical_harmonics
 from kernels.relight.luminance import WHITE, separate
 from kernels.relight.residual import squared_residual
-from service.basis.source import BasisResult, Source, parts
+from service.basis.capture import BasisCapture, BasisResult, stack_bands
 from service.errors import RequestError
 from service.reporting.progress import Timings
 from service.requests.basis import BasisKind, BasisRequest
@@ -26,16 +29,16 @@ from stage.rti import hsh, ptm
 from stage.rti.quantization import Quantization, dequantize, quantization_of_range, quantize
 
 DISPLAY_SPACE = "lin_rec709_scene"
-"""Linear values of an sRGB display."""
+"""The linear space of an sRGB display."""
 WHITE_PERCENTILE = 99.9
 EXPOSURE_PIXELS = 1 << 16
-"""Pixels that the exposure is measured on, evenly spread where the mask has more."""
+"""Most pixels that the exposure is measured on; of more, evenly spread ones are taken."""
 LIGHTS_PER_TERM = 2
-"""Without --count hemispherical harmonics get so many lights a term: with fewer they swing between the lights."""
+"""Least lights for each term of hemispherical harmonics where no count is given: with fewer, values oscillate between the lights."""
 
 
 class Model(NamedTuple):
-    """What is fitted to which lights."""
+    """The functions that are fitted, and the display values that they are fitted to."""
 
     kind: BasisKind
     front: np.ndarray  # indices of the lights with z > 0
@@ -47,15 +50,15 @@ class Model(NamedTuple):
 
     @property
     def terms(self) -> int:
-        """Coefficients of each channel."""
+        """The number of coefficients of each channel."""
         return int(self.functions.shape[1])
 
     def shown(self, band: Band) -> Band:
-        """The display values."""
+        """Return the display values of a band."""
         return encode(band, self.gains, self.display_from_stack)
 
     def fit(self, shown: Band) -> tuple[np.ndarray, np.ndarray | None]:
-        """Coefficients [terms, 3 or 1, pixels padded] float32, and of a luminance its colour [3, pixels padded] uint8."""
+        """Return coefficients [terms, 3 or 1, pixels padded] float32, and for a luminance its colour [3, pixels padded] uint8."""
         fitted = combine_batch(shown, self.weights).numpy()
         if self.kind != BasisKind.LRGB_PTM:
             return fitted, None
@@ -63,15 +66,15 @@ class Model(NamedTuple):
         return luminance.coefficients[:, None], luminance.colour
 
     def squared_difference(self, shown: Band, coefficients: np.ndarray, colour: np.ndarray | None, inside: np.ndarray) -> float:
-        """Σ (what a viewer shows − display value)² over channels, lights and the pixels inside."""
+        """Return Σ (what a viewer shows − display value)² over channels, lights and the pixels inside."""
         in_colour = coefficients if colour is None else coefficients * (colour / np.float32(WHITE))
         functions = np.broadcast_to(self.functions, (3, *self.functions.shape))
         squares = squared_residual(shown, (self.gains > 0).astype(np.float32), in_colour, functions, low=0.0, high=1.0).numpy()
         return float(squares[:, inside].sum(dtype=np.float64))
 
 
-def make_rti(request: BasisRequest, kind: BasisKind, source: Source, device: str, timings: Timings) -> BasisResult:
-    """A `.ptm` or `.rti` file, and exposure, lights and errors in JSON beside it.
+def make_rti(request: BasisRequest, kind: BasisKind, source: BasisCapture, device: str, timings: Timings) -> BasisResult:
+    """Write a `.ptm` or `.rti` file, and exposure, lights and errors as JSON beside it.
 
     Raises:
         RequestError: a count that the kind does not have.
@@ -82,23 +85,23 @@ def make_rti(request: BasisRequest, kind: BasisKind, source: Source, device: str
     terms, pixels = model.terms, stack.pixel_count
     bytes_per_pixel = (6 + 4) * stack.shape[1] + 8 * 12 * terms  # display values, luminances, and coefficients in their stages
     low, high = np.zeros(terms), np.zeros(terms)
-    for part in parts(source, device, bytes_per_pixel, timings, "fit"):
-        inside = model.fit(model.shown(part.band))[0][:, :, part.inside]
+    for each in stack_bands(source, device, bytes_per_pixel, timings, "fit"):
+        inside = model.fit(model.shown(each.band))[0][:, :, each.inside]
         low, high = np.minimum(low, inside.min(axis=(1, 2))), np.maximum(high, inside.max(axis=(1, 2)))
     quantization = quantization_of_range(low, high)
     channels = 1 if kind == BasisKind.LRGB_PTM else 3
     stored = np.tile(quantization.zero.astype(np.uint8), (channels, pixels, 1))
     colours = np.zeros((pixels, 3), dtype=np.uint8)
     loss = np.zeros(3)  # as fitted, as stored, and without anything
-    for part in parts(source, device, bytes_per_pixel, timings, "store"):
-        shown = model.shown(part.band)
+    for each in stack_bands(source, device, bytes_per_pixel, timings, "store"):
+        shown = model.shown(each.band)
         fitted, colour = model.fit(shown)
-        levels = quantize(np.where(part.inside, fitted, 0), quantization)
-        width = part.span.stop - part.span.start
-        stored[:, part.span] = np.moveaxis(levels, 0, -1)[:, :width]
+        levels = quantize(np.where(each.inside, fitted, 0), quantization)
+        width = each.span.stop - each.span.start
+        stored[:, each.span] = np.moveaxis(levels, 0, -1)[:, :width]
         if colour is not None:
-            colours[part.span] = np.where(part.inside, colour, 0).T[:width]
-        loss += [model.squared_difference(shown, coefficients, colour, part.inside)
+            colours[each.span] = np.where(each.inside, colour, 0).T[:width]
+        loss += [model.squared_difference(shown, coefficients, colour, each.inside)
                  for coefficients in (fitted, dequantize(levels, quantization), np.zeros_like(fitted))]
     timings.stage("write", 1)
     rows, cols = source.capture.camera.height, source.capture.camera.width
@@ -116,7 +119,7 @@ def make_rti(request: BasisRequest, kind: BasisKind, source: Source, device: str
                        source.near, float(error["relative_rms"]), float(error["levels_rms"]))
 
 
-def _model(request: BasisRequest, kind: BasisKind, source: Source) -> Model:
+def _model(request: BasisRequest, kind: BasisKind, source: BasisCapture) -> Model:
     directions, irradiance = source.lights
     front = np.flatnonzero(directions[:, 2] > 0)
     terms = _terms(request.count, kind, len(front))
@@ -157,8 +160,8 @@ def _terms(count: int | None, kind: BasisKind, lights: int) -> int:
     return count
 
 
-def _exposure(source: Source, gains: np.ndarray, display_from_stack: np.ndarray) -> float:
-    """What radiance under a light of irradiance 1 is multiplied by: WHITE_PERCENTILE of the display-linear values becomes 1."""
+def _exposure(source: BasisCapture, gains: np.ndarray, display_from_stack: np.ndarray) -> float:
+    """Return the factor of radiance under a light of irradiance 1 that makes WHITE_PERCENTILE of the display-linear values 1."""
     pixels = np.flatnonzero(source.inside)
     values, _ = source.stack.pick(pixels[:: -(-len(pixels) // EXPOSURE_PIXELS)])
     lit = gains[0] > 0
@@ -169,7 +172,7 @@ def _exposure(source: Source, gains: np.ndarray, display_from_stack: np.ndarray)
     return 1 / white
 
 
-def _write_facts(request: BasisRequest, source: Source, model: Model, quantization: Quantization, error: dict[str, float]) -> Path:
+def _write_facts(request: BasisRequest, source: BasisCapture, model: Model, quantization: Quantization, error: dict[str, float]) -> Path:
     camera = source.capture.camera
     behind = np.setdiff1d(np.arange(source.stack.light_count), model.front)
     return write_facts(request.out, {

@@ -1,4 +1,4 @@
-"""Weights → linear frames: the product of the frames' weights and the stack, every frame of a chunk in one pass over the images."""
+"""Linear frames as weighted sums of the captured images; all frames of a chunk are computed in one pass over the images."""
 
 from collections.abc import Sequence
 
@@ -10,26 +10,26 @@ from kernels.relight.combine import combine
 from stage.stack import Stack
 
 CHUNK_BYTES = 256 << 20
-"""Of linear frames in float32. Two chunks are held at one time: while one is computed, the one before is being written."""
+"""Most bytes of linear frames, in float32, in a chunk. Two chunks are held at one time: one is computed while the one before is written."""
 CHUNK_FRAMES = 32
-"""At most: from here on the product costs no less a frame, and writing could begin later only."""
+"""Most frames in a chunk: with more the product takes no less time for each frame, and writing begins later."""
 
 
 def chunk_frames(stack: Stack) -> int:
-    """How many frames a chunk holds."""
+    """Return how many frames a chunk holds."""
     channels, _, pixels = stack.shape
     return max(1, min(CHUNK_FRAMES, CHUNK_BYTES // (4 * channels * pixels)))
 
 
 def linear_frames(stack: Stack, weights: np.ndarray, places: Sequence[int] | None, *, device: str) -> np.ndarray:
-    """The frames of one chunk.
+    """Return the frames of one chunk.
 
     Args:
         stack: the images.
         weights: [frames, 3, lights padded] float32.
-        places: of the frames in their chunk of chunk_frames, the same whichever of them are made: BLAS may sum in another order in
-            another row, and a range that was interrupted shall end as if it had not been, to the last bit. None: a single frame that
-            is the whole job, which is quicker by itself.
+        places: the position of each frame in its chunk of chunk_frames, the same whichever of them are made: BLAS may sum in another
+            order in another row, and frames that are made later must be the same to the last bit. None: a single frame that is the
+            whole job, for which a faster product is used.
         device: where.
 
     Returns:

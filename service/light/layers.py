@@ -1,4 +1,4 @@
-"""The layers of a frame beside the relit image that stay the same under any light, from the solved maps or the capture."""
+"""The layers of frames that stay the same under any light: mask, normal and confidence, from the solved maps or the capture."""
 
 from collections.abc import Collection
 from pathlib import Path
@@ -17,7 +17,7 @@ NEED_MAPS = (Layer.NORMAL, Layer.CONFIDENCE, Layer.DIFFUSE, Layer.SPECULAR)
 
 
 def check_layers(layers: Collection[Layer], maps: Path | None) -> None:
-    """Refuse layers that cannot be had.
+    """Refuse layers that need maps where none are given.
 
     Raises:
         RequestError: names the layer.
@@ -27,20 +27,20 @@ def check_layers(layers: Collection[Layer], maps: Path | None) -> None:
             raise RequestError(f"--aov {layer} needs --maps DIR")
 
 
-def maps_file(folder: Path, capture: Path, steps: int) -> Path:
-    """Where the maps of a capture are: in the folder itself, or of a sequence in its folder of the capture's name.
+def maps_file(folder: Path, capture: Path, captures: int) -> Path:
+    """Return the file of a capture's maps: in the folder, or for a sequence in its sub-folder of the capture's name.
 
     Raises:
         RequestError: they are not there.
     """
-    path = (folder / capture.name if steps > 1 else folder) / MAPS_FILE
+    path = (folder / capture.name if captures > 1 else folder) / MAPS_FILE
     if not path.is_file():
         raise RequestError(f"--maps {folder}: {path} is not there: run `relit solve` first")
     return path
 
 
 def read_maps(path: Path, capture: Capture) -> SurfaceMaps:
-    """The solved maps of a capture.
+    """Read the solved maps of a capture.
 
     Raises:
         ResultError: not a maps.exr, or of another size.
@@ -54,12 +54,12 @@ def read_maps(path: Path, capture: Capture) -> SurfaceMaps:
 
 
 def still_layers(layers: Collection[Layer], capture: Capture | None, maps: SurfaceMaps | None, where: Path | None) -> dict[str, np.ndarray]:
-    """The layers that every frame of a capture shares.
+    """Return the layers that every frame of a capture shares.
 
     Args:
-        layers: which.
-        capture: whose mask is taken where there are no maps.
-        maps: solved maps.
+        layers: the wanted layers; those that depend on the light are passed over.
+        capture: gives the mask where there are no maps.
+        maps: solved maps, or None.
         where: the file of the maps, for messages.
 
     Returns:

@@ -119,9 +119,8 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
     if not plan.is_sequence:
         timings.stage("frames", len(plan.frames))
     form = FrameFormat.of(request, opened.capture.camera.resolution, opened.space, layers)
-    provenance = metadata(request.model_copy(update={"weights": request.weighting}), capture=opened.capture.name, inputs=stack.key)
-    if opened.near_lights:
-        provenance["relit:lights"] = f"{opened.near_lights} near lights taken as distant, as the object's centre sees them"
+    provenance = metadata(request.model_copy(update={"weights": request.weighting}), capture=opened.capture.name, inputs=stack.key,
+                          near_lights=opened.near_lights)
     if plan.keys is not None and plan.keys.frames_per_second is not None:
         provenance["relit:frames_per_second"] = f"{plan.keys.frames_per_second:g}"
     lighting = CaptureLighting(opened.lights, stack, plan.environments, opened.space, weighting=Weighting(request.weighting),

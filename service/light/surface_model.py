@@ -1,4 +1,7 @@
-"""Solved maps as a surface that can be lit: its pixels in batches on a device, and what they see over its height."""
+"""Solved maps as a surface that can be lit: its pixels in batches on a device, and which lights they see over its height.
+
+The surface reflects by the contract's model, Lambert and GGX (kernels.relight.shading cites its equations).
+"""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,11 +18,11 @@ from stage.errors import ResultError
 from stage.maps import SurfaceMaps
 
 BATCH_PIXELS = 1 << 17
-"""Pixels that are lit at one time: 8 MB of maps, and a byte each for every light that shadows are kept of."""
+"""Pixels that are lit at one time: 8 MB of maps, and a byte for each pixel and light whose visibility is kept."""
 
 
 class ModelBatch(NamedTuple):
-    """Some pixels of the surface."""
+    """Some pixels of the surface on the device."""
 
     pixels: np.ndarray  # [n] row-major positions in the image
     surface: Surface
@@ -29,7 +32,7 @@ class SurfaceModel:
     """A surface that can be lit."""
 
     def __init__(self, maps: SurfaceMaps, where: Path, device: str) -> None:
-        """Take solved maps.
+        """Keep solved maps for lighting.
 
         Args:
             maps: with normal, diffuse albedo and height; without specular and roughness there is no specular lobe.
@@ -58,7 +61,7 @@ class SurfaceModel:
         self._projection = projection_of(maps.camera)
 
     def batches(self) -> Iterator[ModelBatch]:
-        """The pixels, some at a time."""
+        """Yield the solved pixels in batches."""
         maps = self.maps
         assert maps.normal is not None and maps.diffuse_albedo is not None
         for start in range(0, len(self.pixels), BATCH_PIXELS):
@@ -75,7 +78,7 @@ class SurfaceModel:
                 self._points[pixels], device=self.device))
 
     def see(self, place: np.ndarray, pixels: np.ndarray) -> wp.array:
-        """Which of these pixels see which of these lights: [n, P] uint8 packs, 255 or 0.
+        """Return which pixels see which lights, as [n, P] uint8 packs of 255 or 0.
 
         Args:
             place: [n, 4] direction and 0, or position and 1.

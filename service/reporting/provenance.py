@@ -24,7 +24,7 @@ def versions() -> dict[str, str]:
     return found
 
 
-def metadata(request: Options, *, capture: str, inputs: str, method: str | None = None) -> dict[str, str]:
+def metadata(request: Options, *, capture: str, inputs: str, method: str | None = None, near_lights: int = 0) -> dict[str, str]:
     """String attributes for result files. Nothing in them changes between two runs on the same inputs.
 
     Args:
@@ -33,12 +33,16 @@ def metadata(request: Options, *, capture: str, inputs: str, method: str | None 
         capture: its name.
         inputs: content hash of the images.
         method: the one that was used, where the request left the choice open.
+        near_lights: how many point lights were taken as distant ones.
     """
     options = {name: value for name, value in _choices(request).items() if value is not None and value is not False}
     if method is not None:
         options["method"] = str(method)
-    return {"relit:version": __version__, "relit:capture": capture, "relit:inputs": inputs,
-            "relit:options": json.dumps(options, sort_keys=True)}
+    found = {"relit:version": __version__, "relit:capture": capture, "relit:inputs": inputs,
+             "relit:options": json.dumps(options, sort_keys=True)}
+    if near_lights:
+        found["relit:lights"] = f"{near_lights} near lights taken as distant, as the object's centre sees them"
+    return found
 
 
 def _choices(request: Options) -> dict[str, Any]:

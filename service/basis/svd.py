@@ -1,11 +1,15 @@
-"""The stack reduced to K coefficient images by a singular value decomposition of each channel."""
+"""The captured images reduced to K coefficient images by a singular value decomposition of each channel.
+
+Source: the first K singular vectors give the sum of K images with the least squared error, Eckart and Young, "The approximation of one
+matrix by another of lower rank", Psychometrika 1, 1936 (kernels.relight.basis).
+"""
 
 import numpy as np
 
 from kernels.relight.basis import gram, principal, projection
 from kernels.relight.batch import combine_batch
 from kernels.relight.residual import squared_residual
-from service.basis.source import BasisResult, Source, parts
+from service.basis.capture import BasisCapture, BasisResult, stack_bands
 from service.errors import RequestError
 from service.reporting.progress import Timings
 from service.requests.basis import BasisKind, BasisRequest
@@ -15,8 +19,8 @@ from stage.light_basis import layer_name, layer_types, numbers, write_facts, wri
 DEFAULT_COUNT = 16
 
 
-def make_layers(request: BasisRequest, source: Source, device: str, timings: Timings) -> BasisResult:
-    """Coefficient images in an EXR, matrices and errors in JSON beside it.
+def make_svd(request: BasisRequest, source: BasisCapture, device: str, timings: Timings) -> BasisResult:
+    """Write coefficient images as an EXR, and matrices and errors as JSON beside it.
 
     Raises:
         RequestError: more coefficients than lights.
@@ -28,26 +32,26 @@ def make_layers(request: BasisRequest, source: Source, device: str, timings: Tim
         raise RequestError(f"--count {count}: {source.where} has {lights} lights: give 1 to {lights}")
     scale = stack.scale[:lights].astype(np.float64)
     products = np.zeros((3, lights, lights))
-    for part in parts(source, device, 0, timings, "products"):
-        products += gram(part.band, part.inside)[:, :lights, :lights]
+    for each in stack_bands(source, device, 0, timings, "products"):
+        products += gram(each.band, each.inside)[:, :lights, :lights]
     products *= scale[:, None] * scale  # from stored values to radiance
     basis = principal(products, count)
     rms = basis.singular_values[:, :count].T / np.sqrt(source.pixels)
-    bound = float(np.linalg.norm(2.0**TOP_EXPONENT * scale))  # of a pixel's radiance over all lights, and so of its coefficients
+    bound = float(np.linalg.norm(2.0**TOP_EXPONENT * scale))  # no pixel's radiance over all lights, nor any coefficient, is larger
     layers = [np.zeros((3, stack.pixel_count), dtype=dtype) for dtype in layer_types(rms, bound)]
     weights = projection(basis, stack.scale)
     gains = np.broadcast_to(stack.scale, (3, stack.shape[1]))
     functions = np.zeros((3, stack.shape[1], count))
     functions[:, :lights] = np.swapaxes(basis.matrix, 1, 2)
     left = np.zeros(3)
-    for part in parts(source, device, 3 * 12 * count, timings, "layers"):
-        coefficients = combine_batch(part.band, weights).numpy()
-        width = part.span.stop - part.span.start
+    for each in stack_bands(source, device, 3 * 12 * count, timings, "layers"):
+        coefficients = combine_batch(each.band, weights).numpy()
+        width = each.span.stop - each.span.start
         for k, layer in enumerate(layers):
-            layer[:, part.span] = np.where(part.inside, coefficients[k], 0)[:, :width]
-            coefficients[k, :, :width] = layer[:, part.span]  # rounded as it is stored: what is left is what the file leaves
-        squares = squared_residual(part.band, gains, coefficients, functions).numpy()
-        left += squares[:, part.inside].sum(axis=1, dtype=np.float64)
+            layer[:, each.span] = np.where(each.inside, coefficients[k], 0)[:, :width]
+            coefficients[k, :, :width] = layer[:, each.span]  # rounded as it is stored: what is left is what the file leaves
+        squares = squared_residual(each.band, gains, coefficients, functions).numpy()
+        left += squares[:, each.inside].sum(axis=1, dtype=np.float64)
     timings.stage("write", 1)
     rows, cols = source.capture.camera.height, source.capture.camera.width
     whole = np.trace(products, axis1=1, axis2=2)

@@ -1,4 +1,4 @@
-"""What every kind of basis begins with: the capture, its stack and lights, and the pixels that count."""
+"""The opened capture that every kind of basis is made from, its bands on the device, and the result."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,56 +23,56 @@ from stage.point_lights import DistantLights
 from stage.stack import Stack
 
 
-class Source(NamedTuple):
-    """A capture, opened."""
+class BasisCapture(NamedTuple):
+    """An opened capture."""
 
     capture: Capture
     stack: Stack
     lights: DistantLights
     near: int
-    """Point lights among them, taken as distant ones."""
-    inside: np.ndarray  # [pixels padded] bool, of the mask
+    """Number of point lights among them, which are taken as distant ones."""
+    inside: np.ndarray  # [pixels padded] bool: which pixels are inside the mask
     space: str
-    """Scene-linear colour space of the stack."""
+    """The scene-linear colour space of the stack."""
     provenance: dict[str, str]
 
     @property
     def where(self) -> str:
-        """The manifest, for messages."""
+        """The path of the manifest, for messages."""
         return str(self.capture.folder / FILE_NAME)
 
     @property
     def pixels(self) -> int:
-        """How many count."""
+        """The number of pixels inside the mask."""
         return int(self.inside.sum())
 
     def described_lights(self, chosen: np.ndarray) -> list[dict[str, Any]]:
-        """Image, direction and irradiance of some lights, for JSON."""
+        """Return image, direction and irradiance of the chosen lights, for JSON."""
         return [{"image": self.stack.frames[i], "direction": numbers(self.lights.direction[i]),
                  "irradiance": numbers(self.lights.irradiance[i])} for i in chosen]
 
 
 class BasisResult(NamedTuple):
-    """What was made, and what it loses."""
+    """The files of a basis, and how much is lost."""
 
     path: Path
     facts_path: Path
-    """JSON beside it."""
+    """The JSON file beside it."""
     kind: BasisKind
     terms: int
-    """Coefficients of each channel."""
+    """The number of coefficients of each channel."""
     pixels: int
     lights: int
     left_out: int
-    """Lights that are not in front of the object, and so not in an RTI file."""
+    """Number of lights that are not in front of the object, and so not in an RTI file."""
     near_lights: int
     relative_rms: float
-    """Root mean square of (image as the file gives it − image), over that of the images."""
+    """Root mean square of (image as the file gives it − image), divided by that of the images."""
     levels_rms: float | None
     """The same in steps of an 8-bit display, where the file holds display values."""
 
 
-def open_source(request: BasisRequest, timings: Timings) -> Source:
+def open_capture(request: BasisRequest, timings: Timings) -> BasisCapture:
     """Open the capture of a request.
 
     Raises:
@@ -93,35 +93,33 @@ def open_source(request: BasisRequest, timings: Timings) -> Source:
     inside = np.zeros(stack.shape[2], dtype=bool)
     inside[: stack.pixel_count] = mask.reshape(-1)
     near = len(capture.lit_by(PointLight))
-    provenance = metadata(request, capture=capture.name, inputs=stack.key)
-    if near:
-        provenance["relit:lights"] = f"{near} near lights taken as distant, as the object's centre sees them"
-    return Source(capture, stack, lights, near, inside, linear_space(capture.manifest.color_space), provenance)
+    provenance = metadata(request, capture=capture.name, inputs=stack.key, near_lights=near)
+    return BasisCapture(capture, stack, lights, near, inside, linear_space(capture.manifest.color_space), provenance)
 
 
-class Part(NamedTuple):
-    """A band of the stack in which some pixel counts."""
+class StackBand(NamedTuple):
+    """A band of the stack with some pixel inside the mask."""
 
     span: slice
-    """Of the image, without padding."""
+    """Its pixels in the image, without padding."""
     band: packs.Band
     inside: np.ndarray  # [pixels of the band] bool
 
 
-def parts(source: Source, device: str, bytes_per_pixel: int, timings: Timings, stage: str) -> Iterator[Part]:
-    """The bands of the stack on the device, one after another; bands without a pixel of the mask are left out.
+def stack_bands(source: BasisCapture, device: str, bytes_per_pixel: int, timings: Timings, stage: str) -> Iterator[StackBand]:
+    """Yield the bands of the stack on the device, without those that have no pixel inside the mask.
 
     Args:
         source: the capture.
         device: where.
         bytes_per_pixel: what the caller allocates beside the stack for each pixel.
-        timings: told of the bands as one stage.
-        stage: its name.
+        timings: told of the bands as one stage of the work.
+        stage: the name of that stage.
     """
     ranges = list(source.stack.bands(bytes_per_pixel))
     timings.stage(stage, len(ranges))
     for done, (start, stop) in enumerate(ranges, start=1):
         if source.inside[start:stop].any():
             band = packs.upload(source.stack.band(start, stop), device=device)
-            yield Part(slice(start, min(stop, source.stack.pixel_count)), band, source.inside[start:stop])
+            yield StackBand(slice(start, min(stop, source.stack.pixel_count)), band, source.inside[start:stop])
         timings.advance(done)
