@@ -45,7 +45,7 @@ def gray_frames(pixels: int) -> np.ndarray:
 
 
 def numpy_phase(frames: np.ndarray, whole: bool) -> np.ndarray:
-    """Phase and amplitude by least squares of even steps; whole: offset, uncertainty and status too, as the kernel gives them."""
+    """Compute phase and amplitude by least squares of even steps; `whole` adds offset, uncertainty and status, as the kernel gives them."""
     angles = 2 * np.pi * np.arange(STEPS) / STEPS
     rows = np.stack([np.full(STEPS, 0.5), np.cos(angles), np.sin(angles)]).astype(np.float32) * np.float32(2 / STEPS)
     squares = np.stack([rows[0] ** 2, rows[1] ** 2, rows[2] ** 2, rows[1] * rows[2]])
@@ -72,7 +72,7 @@ def numpy_phase(frames: np.ndarray, whole: bool) -> np.ndarray:
 
 
 def numpy_unwrap(phases: np.ndarray) -> np.ndarray:
-    """The wrap of the shortest period under which the others miss least; nothing of weights and status."""
+    """Return the wrap of the shortest period with the least errors of the others, without weights and status."""
     out = np.empty(phases.shape[1], np.float32)
     turns = phases[::2] / np.float32(2 * np.pi)
     for start in range(0, phases.shape[1], BAND):
@@ -92,7 +92,7 @@ def numpy_unwrap(phases: np.ndarray) -> np.ndarray:
 
 
 def numpy_gray(frames: np.ndarray, whole: bool) -> np.ndarray:
-    """Stripe numbers where every difference is above a threshold; whole: judged by noise, doubtful bits both ways, as the kernel does."""
+    """Return stripe numbers where every difference is above a threshold; `whole` weighs noise and tries doubtful bits both ways."""
     out = np.empty(frames.shape[1], np.float32)
     for start in range(0, frames.shape[1], BAND):
         part = frames[:, start:start + BAND]
@@ -129,7 +129,7 @@ def number_of(gray: np.ndarray) -> np.ndarray:
 
 
 def loop_gray(frames: np.ndarray) -> list[int]:
-    """What OpenCV's Gray-code class leaves to its caller: a call a pixel (here the arithmetic of that call)."""
+    """Decode pixel by pixel in Python, as the callers of OpenCV's Gray-code class do (here with the arithmetic of its call)."""
     numbers = []
     for pixel in frames.T:
         number, bit = 0, False

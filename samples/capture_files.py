@@ -71,7 +71,7 @@ def write_mask(path: Path, mask: np.ndarray) -> None:
 
 
 def _lines(value) -> str:
-    """JSON of a value; a list of objects takes a line for each."""
+    """Return the JSON text of a value, with a line for each object of a list."""
     if isinstance(value, list) and value and isinstance(value[0], dict):
         return "[\n" + ",\n".join(f"  {json.dumps(v)}" for v in value) + "\n ]"
     return json.dumps(value)
@@ -86,7 +86,7 @@ def write_json(path: Path, value: dict) -> None:
 
 
 def truth_layers(truth: Truth, *, specular: bool, dtype: type = np.float16) -> dict[str, np.ndarray]:
-    """Channels of truth.exr as `dtype`, but height float32 (half would quantise it to 0.03 mm)."""
+    """Return the channels of truth.exr as `dtype`, but height as float32 (half would quantise it to 0.03 mm)."""
     layers = {f"normal.{axis}": truth.normal[..., i].astype(dtype) for i, axis in enumerate("XYZ")}
     layers |= {f"diffuse_albedo.{c}": truth.diffuse_albedo[..., i].astype(dtype) for i, c in enumerate("RGB")}
     if specular:
@@ -98,7 +98,7 @@ def truth_layers(truth: Truth, *, specular: bool, dtype: type = np.float16) -> d
 def manifest(
     *, name: str, truth: Truth, pixel_size_m: float, directions: np.ndarray, irradiance: np.ndarray, image_pattern: str
 ) -> dict:
-    """capture.json of relit.capture/1 for an orthographic OLAT capture."""
+    """Return the capture.json of an orthographic capture with one light a frame."""
     height, width = truth.mask.shape
     return {
         "schema": "relit.capture/1",

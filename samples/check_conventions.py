@@ -18,7 +18,7 @@ RESOLUTION, PIXEL_SIZE_M, RADIUS_M, ALBEDO = 64, 0.003, 0.08, 0.6
 
 
 def sphere_normals() -> tuple[np.ndarray, np.ndarray]:  # -> [H, W, 3], [H, W] bool
-    """Normals of the sphere at pixel centres, from the definition of the camera frame, and where they are far from the rim."""
+    """Return the normals of a sphere at pixel centres by the definition of the camera frame, and where they are far from the outline."""
     row, column = np.mgrid[:RESOLUTION, :RESOLUTION]
     x = (column + 0.5 - RESOLUTION / 2) * PIXEL_SIZE_M / RADIUS_M
     y = (RESOLUTION / 2 - row - 0.5) * PIXEL_SIZE_M / RADIUS_M
@@ -27,7 +27,7 @@ def sphere_normals() -> tuple[np.ndarray, np.ndarray]:  # -> [H, W, 3], [H, W] b
 
 
 def lambert_ggx_brdf(normal, to_light, to_eye, *, albedo: float, f0: float, roughness: float) -> np.ndarray:
-    """Lambert + GGX written out in float64, directions [..., 3]."""
+    """Return relit's BRDF, Lambert and GGX, in float64 for directions [..., 3]."""
     alpha_sq = roughness**4
     half = to_light + to_eye
     half = half / np.linalg.norm(half, axis=-1, keepdims=True)
@@ -39,7 +39,7 @@ def lambert_ggx_brdf(normal, to_light, to_eye, *, albedo: float, f0: float, roug
 
 
 def check_brdf(mi) -> float:
-    """Largest relative error of the plug-in, and of its sampling against its own value."""
+    """Return the largest relative error of the plug-in, and of its sampling against its own value."""
     import drjit as dr
 
     rng = np.random.default_rng(1)

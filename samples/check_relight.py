@@ -40,13 +40,13 @@ class Points(NamedTuple):
 
 
 def read_rgb(path: Path) -> np.ndarray:  # -> [H, W, 3] float64
-    """Channels R, G and B."""
+    """Read the channels R, G and B of an image."""
     channels, _ = exr.read(path)
     return np.stack([channels[c] for c in "RGB"], axis=-1).astype(np.float64)
 
 
 def lamp_samples(light: dict) -> list[tuple[np.ndarray, np.ndarray | None, np.ndarray]]:
-    """Points of a lamp: position, normal (None: it shines all around) and intensity [3] along the normal."""
+    """Return points of a lamp: position, normal (None: it shines in all directions) and intensity [3] along the normal."""
     if light["type"] == "point":
         return [(np.array(light["position_m"]), None, np.array(light["intensity"]))]
     i = np.arange(LAMP_POINTS)
@@ -64,7 +64,7 @@ def lamp_samples(light: dict) -> list[tuple[np.ndarray, np.ndarray | None, np.nd
 
 
 def direct(mi, scene, points: Points, light: dict) -> np.ndarray:  # -> [N, 3]
-    """Radiance towards the camera by direct light with shadows, in float64."""
+    """Return the radiance towards the camera by direct light with shadows, in float64."""
     total = np.zeros_like(points.position)
     eye = np.broadcast_to([0.0, 0.0, 1.0], points.position.shape)
     for position, facing, intensity in lamp_samples(light):
@@ -84,7 +84,7 @@ def direct(mi, scene, points: Points, light: dict) -> np.ndarray:  # -> [N, 3]
 
 
 def cast_points(mi, scene, u: np.ndarray, v: np.ndarray, *, size: int, pixel_size_m: float) -> Points:
-    """The surface at continuous image coordinates [N], as it is modelled."""
+    """Return the modelled surface at continuous image coordinates [N]."""
     si = rendering.cast(mi, scene, u, v, resolution=size, pixel_size_m=pixel_size_m)
     hit = si.is_valid()
 
@@ -97,7 +97,7 @@ def cast_points(mi, scene, u: np.ndarray, v: np.ndarray, *, size: int, pixel_siz
 
 
 def truth_points(folder: Path, mask: np.ndarray, *, pixel_size_m: float) -> Points:
-    """The surface at pixel centres, from truth.exr and the pixel grid alone."""
+    """Return the surface at pixel centres, from truth.exr and the pixel grid alone."""
     channels, _ = exr.read(folder / "truth.exr")
     layer = {name: plane.astype(np.float64)[mask] for name, plane in channels.items()}
     row, column = np.nonzero(mask)
@@ -112,7 +112,7 @@ def truth_points(folder: Path, mask: np.ndarray, *, pixel_size_m: float) -> Poin
 
 
 def rmse(image: np.ndarray, reference: np.ndarray) -> float:
-    """Relative to the reference's root mean square."""
+    """Return the root mean square error relative to the root mean square of the reference."""
     return float(np.sqrt(((image - reference) ** 2).mean() / (reference**2).mean()))
 
 

@@ -27,7 +27,7 @@ COMPARED_SPP = 1024
 
 
 def facing_plane(mi, rig: Rig):
-    """A wide plane that faces the projector."""
+    """Return a wide plane that faces the projector."""
     pose = np.array(rig.projector.camera_from_projector, dtype=np.float64)
     corner, right, up = (pose[:3, :3] @ np.array(x) for x in ((-3.0, -3.0, -PLANE_M), (6.0, 0, 0), (0, 6.0, 0)))
     material = {"type": "diffuse", "reflectance": {"type": "rgb", "value": PLANE_ALBEDO}}
@@ -35,7 +35,7 @@ def facing_plane(mi, rig: Rig):
 
 
 def direct_light(mi, shapes: dict, rig: Rig, passes: int) -> tuple[np.ndarray, np.ndarray]:  # [rows, cols, WIDTH], [rows, cols, HEIGHT]
-    """Radiance through each column and row, without interreflection."""
+    """Return the radiance through each column and row, without interreflection."""
     scene = mi.load_dict({"type": "scene", **shapes, "projector": rig_scene.emitter(mi, rig.projector)})
     sums = [rig_transport.trace_pass(mi, scene, rig, 500 + i, max_depth=2) for i in range(passes)]
     scale = 1 / (passes * rig_transport.STRATA**2)
@@ -45,12 +45,12 @@ def direct_light(mi, shapes: dict, rig: Rig, passes: int) -> tuple[np.ndarray, n
 
 
 def _clean(truth: rig_truth.Truth) -> np.ndarray:
-    """Lit and unmixed, but for the panel's outermost pixels: beyond them there is none to blend with."""
+    """Return the lit and unmixed pixels, without those of the outermost projector pixels, which have no neighbour to interpolate with."""
     return truth.lit & ~truth.mixed & (truth.u > 1) & (truth.u < WIDTH - 1) & (truth.v > 1) & (truth.v < HEIGHT - 1)
 
 
 def check_plane(mi, rig: Rig) -> list[tuple[str, float, float]]:
-    """A plane that faces the projector has radiance albedo · irradiance / distance² all over."""
+    """Check that a plane facing the projector has the radiance albedo · irradiance / distance² everywhere."""
     shapes = {"plane": facing_plane(mi, rig)}
     columns, rows = direct_light(mi, shapes, rig, 1)
     truth = rig_truth.trace_truth(mi, shapes, rig)
@@ -62,7 +62,7 @@ def check_plane(mi, rig: Rig) -> list[tuple[str, float, float]]:
 
 
 def check_place(mi, rig: Rig, shapes: dict, name: str) -> list[tuple[str, float, float]]:
-    """A ramp over a picture in direct light says where on the projector the light came from."""
+    """Check that a ramp over a uniform image in direct light gives the true projector coordinates."""
     columns, rows = direct_light(mi, shapes, rig, PASSES)
     truth = rig_truth.trace_truth(mi, shapes, rig)
     clean, found = _clean(truth), []
@@ -75,7 +75,7 @@ def check_place(mi, rig: Rig, shapes: dict, name: str) -> list[tuple[str, float,
 
 
 def mitsuba_picture(mi, rig: Rig, shapes: dict, texture: np.ndarray) -> np.ndarray:  # [rows, cols] projector levels
-    """Mitsuba's path integrator under its projector that shows a picture, through its perspective camera."""
+    """Render the scene under a projected image with Mitsuba's own path integrator, projector and camera."""
     camera = rig.camera
     (cu, cv), (fx, _) = camera.principal_px, camera.focal_px
     sensor = mi.load_dict({
@@ -94,7 +94,7 @@ def mitsuba_picture(mi, rig: Rig, shapes: dict, texture: np.ndarray) -> np.ndarr
 
 
 def check_mitsuba(mi, rig: Rig, shapes: dict) -> list[tuple[str, float, float]]:
-    """Sums over the transport against pictures that Mitsuba renders whole."""
+    """Compare sums over the light transport with images that Mitsuba renders directly."""
     from stage.patterns.codes import draw
 
     scene = mi.load_dict({"type": "scene", **shapes, "projector": rig_scene.emitter(mi, rig.projector)})
@@ -115,7 +115,7 @@ def check_mitsuba(mi, rig: Rig, shapes: dict) -> list[tuple[str, float, float]]:
 
 
 def check_groove(mi, rig: Rig, shapes: dict, work: Path) -> list[tuple[str, float, float]]:
-    """How much of the light in the groove, and elsewhere, came over another surface: printed, and a quarter within a tenth."""
+    """Check that about a quarter of the light in the groove came from another surface; print that part there and elsewhere."""
     transport = rig_transport.render_transport(mi, shapes, rig, work / "transport.npz", passes=1)
     truth = rig_truth.trace_truth(mi, shapes, rig)
     total, direct = (x.reshape(truth.lit.shape) for x in (transport.columns.sum(axis=1), transport.direct))
@@ -127,7 +127,7 @@ def check_groove(mi, rig: Rig, shapes: dict, work: Path) -> list[tuple[str, floa
 
 
 def main() -> None:
-    """Print every figure with its limit."""
+    """Run the checks and print each with its limit."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--work", type=Path, help="folder with the transport of make_rig.py")
     work = parser.parse_args().work

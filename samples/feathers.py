@@ -17,7 +17,7 @@ class Feathers(NamedTuple):
 
 
 def smoothstep(low: float, high: float, x: np.ndarray) -> np.ndarray:
-    """0 below `low`, 1 above `high`, cubic between (`low` may exceed `high`)."""
+    """Return 0 below `low`, 1 above `high`, and a cubic between them (`low` may exceed `high`)."""
     t = np.clip((x - low) / (high - low), 0, 1)
     return t * t * (3 - 2 * t)
 
@@ -30,7 +30,7 @@ def mix(a, b, weight: np.ndarray) -> np.ndarray:
 
 
 def hash01(*keys: np.ndarray) -> np.ndarray:
-    """A repeatable random number in 0..1 from integer keys."""
+    """Return a repeatable random number in 0..1 for integer keys."""
     mixed = sum(k * f for k, f in zip(keys, (12.9898, 78.233, 37.719), strict=False))
     return np.mod(np.sin(mixed) * 43758.5453, 1.0)
 
@@ -49,7 +49,7 @@ def noise(points: np.ndarray, wavelength: float, *, seed: int = 0, waves: int = 
 
 
 def lay(u: np.ndarray, v: np.ndarray, *, reach: float = 2.2, taper: float = 0.35, width: float = 1.25) -> Feathers:
-    """Shingle a surface with feathers, upper rows over lower ones.
+    """Cover a surface with feathers, upper rows over lower ones.
 
     Args:
         u: [N] across, in feather spacings.
@@ -78,7 +78,7 @@ def lay(u: np.ndarray, v: np.ndarray, *, reach: float = 2.2, taper: float = 0.35
 
 
 def relief(feathers: Feathers, *, thickness: float, barbs: float = 0.06, barb_count: float = 9.0) -> np.ndarray:
-    """Height of the feather surface above the skin, in the unit of `thickness`."""
+    """Return the height of the feathers above the skin, in the unit of `thickness`."""
     t, s = feathers.along, feathers.across
     lift = 0.25 + 0.75 * t**1.3
     edge = 1 - 0.55 * smoothstep(0.86, 1.0, t)

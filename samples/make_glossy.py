@@ -31,7 +31,7 @@ BRASS, STEEL = np.array([0.90, 0.72, 0.38]), np.array([0.66, 0.62, 0.58])
 
 
 def distance(p: np.ndarray) -> np.ndarray:
-    """Bumpy ball with a half-sunk ring, knob and horn, in centimetres."""
+    """Return the signed distance to a bumpy ball with a half-sunk ring, knob and horn, in centimetres."""
 
     def join(a, b, k):
         h = np.maximum(k - np.abs(a - b), 0) / k
@@ -53,7 +53,7 @@ def distance(p: np.ndarray) -> np.ndarray:
 
 
 def build(*, metal: bool, detail: float = 0.03) -> Surface:
-    """The object in metres, camera frame; colour and roughness blend smoothly and independently."""
+    """Build the object in metres, camera frame; colour and roughness vary smoothly and independently."""
     points, faces = surface_nets(distance, [-4.9] * 3, [4.9, 4.9, 5.6], 4 * detail)
     for _ in range(2):
         points, faces = subdivide(project(distance, points, step=0.01), faces)
@@ -67,7 +67,7 @@ def build(*, metal: bool, detail: float = 0.03) -> Surface:
 
 
 def principled_mesh(mi, surface: Surface, *, metal: bool):
-    """The surface with the `principled` BSDF."""
+    """Return the Mitsuba mesh of a surface with the `principled` BSDF."""
     shape = rendering.mesh(mi, "object", surface)
     props = mi.Properties()
     props["bsdf"] = mi.load_dict({

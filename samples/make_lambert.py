@@ -35,7 +35,7 @@ HILL_HEIGHT_CM, HILL_WIDTH = (0.8, 1.15), (0.15, 0.2)  # the width is an angle i
 
 
 def hills() -> list[tuple[np.ndarray, float, float]]:
-    """Direction, height and angular half-width of each hill: a Fibonacci lattice on a cap, sizes in turn."""
+    """Return the direction, height and angular half-width of each hill: a Fibonacci lattice on a cap, with the sizes in rotation."""
     i = np.arange(HILL_COUNT) + 0.5
     z = 1 - (1 - np.cos(np.radians(HILL_SPREAD_DEGREES))) * i / HILL_COUNT
     azimuth, ring = np.pi * (1 + 5**0.5) * i, np.sqrt(1 - z * z)
@@ -47,7 +47,7 @@ def hills() -> list[tuple[np.ndarray, float, float]]:
 
 
 def distance(p: np.ndarray) -> np.ndarray:
-    """Bumpy ball with hills that throw shadows and yet hide nothing from the camera, in centimetres.
+    """Return the signed distance in centimetres to a bumpy ball with hills that cast shadows and hide nothing from the camera.
 
     Nothing is hidden, because normals cannot tell the depth of what stands before a hidden part.
     """
@@ -61,7 +61,7 @@ def distance(p: np.ndarray) -> np.ndarray:
 
 
 def build(*, detail: float = 0.02) -> Surface:
-    """The object in metres, camera frame, with two albedos blending smoothly; `detail` in centimetres."""
+    """Build the object in metres, camera frame, with two albedos that blend smoothly; `detail` is in centimetres."""
     points, faces = surface_nets(distance, [-4.9] * 3, [4.9, 4.9, 6.0], 4 * detail)
     for _ in range(2):
         points, faces = subdivide(project(distance, points, step=0.01), faces)
@@ -75,7 +75,7 @@ def build(*, detail: float = 0.02) -> Surface:
 
 
 def footprint_truth(mi, shapes: dict, *, resolution: int, pixel_size_m: float) -> capture_files.Truth:
-    """Truth as a box filter sees it: the mean normal of a pixel, and the albedo that goes with it.
+    """Return the truth of a box filter: the mean normal of each pixel, and the albedo that belongs to it.
 
     A pixel lit all over has radiance E/pi * mean(rho n) . l, so its normal is mean(n) renormalised and its albedo
     the part of mean(rho n) along it: a little less than mean(rho) where the surface curves within the pixel.

@@ -67,7 +67,7 @@ def parse_arguments() -> argparse.Namespace:
 
 
 def references(near: dict[str, dict], *, reference_spp: int, environment_spp: int) -> list[dict]:
-    """Entries of references.json: which light, how many segments, how many paths."""
+    """Return the entries of references.json: the light, the segments of a path, and the paths a pixel."""
     sun = {"sun_direction": relight_lights.numbers(sky.SUN_DIRECTION), "sun_diameter_degrees": sky.SUN_DIAMETER_DEGREES}
     patches = {
         "patches": [
@@ -112,11 +112,11 @@ class Record:
                 raise SystemExit(f"{path.parent} was rendered with {before['render']}, not {facts['render']}: give another --out.")
 
     def complete(self, entry: dict) -> bool:
-        """Whether this very picture is there."""
+        """Return whether the image of an entry is complete."""
         return self.done.get(entry["file"]) == entry and (self.path.parent / entry["file"]).exists()
 
     def add(self, *entries: dict) -> None:
-        """Say that pictures are complete."""
+        """Record that images are complete."""
         self.done |= {entry["file"]: entry for entry in entries}
         capture_files.write_json(self.path, self.facts | {"references": list(self.done.values())})
 

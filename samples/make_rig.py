@@ -47,7 +47,7 @@ def parse_arguments() -> argparse.Namespace:
 
 
 def with_noise(radiance: np.ndarray, *, full_well: float | None, read_noise: float, seed: int) -> np.ndarray:
-    """What a linear camera records of radiance: Poisson shot noise and Gaussian read noise, none without a full well."""
+    """Return the radiance that a linear camera records, with Poisson shot noise and Gaussian read noise; without a full well, no noise."""
     if full_well is None:
         return radiance
     random = np.random.default_rng(seed)

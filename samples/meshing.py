@@ -73,7 +73,7 @@ def subdivide(points: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def gradient(distance: Distance, points: np.ndarray, *, step: float) -> np.ndarray:
-    """Unit gradient of a distance, central differences."""
+    """Return the unit gradient of a distance by central differences."""
     slope = np.stack([distance(points + step * e) - distance(points - step * e) for e in np.eye(3)], axis=-1)
     return slope / np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-12)
 
@@ -86,7 +86,7 @@ def project(distance: Distance, points: np.ndarray, *, step: float, rounds: int 
 
 
 def vertex_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Area-weighted mean of the face normals around each vertex."""
+    """Return the area-weighted mean of the face normals around each vertex."""
     a, b, c = (points[faces[:, i]] for i in range(3))
     face_normal = np.cross(b - a, c - a)
     total = np.stack([np.bincount(faces.ravel(), np.repeat(face_normal[:, i], 3), len(points)) for i in range(3)], axis=1)
@@ -94,7 +94,7 @@ def vertex_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def grid_faces(rows: int, columns: int) -> np.ndarray:
-    """Faces of a rows x columns vertex grid that wraps in columns; outside is right of increasing rows."""
+    """Return the faces of a rows x columns vertex grid that wraps in columns; outside is to the right of increasing rows."""
     r, c = np.mgrid[: rows - 1, :columns]
     a, b = r * columns + c, r * columns + (c + 1) % columns
     d, e = a + columns, b + columns
@@ -102,7 +102,7 @@ def grid_faces(rows: int, columns: int) -> np.ndarray:
 
 
 def sphere(center, radius: float, *, rows: int = 160, columns: int = 240) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """UV sphere whose pole looks along +z; returns points, faces and unit directions from the centre."""
+    """Return the points, faces and unit directions from the centre of a UV sphere with its pole along +z."""
     polar, azimuth = np.meshgrid(
         np.linspace(1e-3, np.pi - 1e-3, rows), np.linspace(0, 2 * np.pi, columns, endpoint=False), indexing="ij"
     )
@@ -132,7 +132,7 @@ def tube(path: np.ndarray, radius: np.ndarray, *, flatten: float = 1.0, columns:
 
 
 def bezier(control: np.ndarray, count: int) -> np.ndarray:  # [K, 3] -> [count, 3]
-    """Points of a Bezier curve (de Casteljau)."""
+    """Return points of a Bezier curve, by de Casteljau's algorithm."""
     t = np.linspace(0, 1, count)[:, None, None]
     points = np.broadcast_to(np.asarray(control, float), (count, len(control), 3))
     while points.shape[1] > 1:

@@ -22,7 +22,7 @@ DISC_CENTER, DISC_RADIUS = np.array([1.90, 5.10]), 2.35
 
 
 def rotation(axis: int, degrees: float) -> np.ndarray:  # -> [3, 3], a_from_b
-    """Right-handed rotation about a coordinate axis."""
+    """Return the right-handed rotation about a coordinate axis."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     matrix = np.eye(3)
     i, j = (axis + 1) % 3, (axis + 2) % 3
@@ -35,31 +35,31 @@ HEAD_PIVOT = np.array([0.0, 4.0, 0.0])
 
 
 def to_head(p: np.ndarray) -> np.ndarray:
-    """Owl frame to head frame."""
+    """Return points of the owl frame in the head frame."""
     return (p - HEAD_PIVOT) @ OWL_FROM_HEAD + HEAD_PIVOT
 
 
 def from_head(p: np.ndarray) -> np.ndarray:
-    """Head frame to owl frame."""
+    """Return points of the head frame in the owl frame."""
     return (p - HEAD_PIVOT) @ OWL_FROM_HEAD.T + HEAD_PIVOT
 
 
 def ellipsoid(p: np.ndarray, center, radii) -> np.ndarray:
-    """Approximate distance to an ellipsoid, exact to first order at its surface."""
+    """Return the approximate distance to an ellipsoid, exact to first order at its surface."""
     q = (p - center) / radii
     k0, k1 = np.linalg.norm(q, axis=-1), np.linalg.norm(q / radii, axis=-1)
     return k0 * (k0 - 1) / np.maximum(k1, 1e-9)
 
 
 def cone(p: np.ndarray, start, end, r0: float, r1: float) -> np.ndarray:
-    """Distance to a segment whose radius runs from r0 to r1."""
+    """Return the distance to a segment whose radius runs from r0 to r1."""
     start, axis = np.asarray(start, float), np.subtract(end, start)
     t = np.clip((p - start) @ axis / (axis @ axis), 0, 1)
     return np.linalg.norm(p - start - t[..., None] * axis, axis=-1) - (r0 + (r1 - r0) * t)
 
 
 def join(a: np.ndarray, b: np.ndarray, k: float) -> np.ndarray:
-    """Smooth union with a fillet of about k."""
+    """Return the smooth union of two distances with a fillet of about k."""
     h = np.maximum(k - np.abs(a - b), 0) / k
     return np.minimum(a, b) - 0.25 * k * h * h
 
@@ -70,13 +70,13 @@ def mirrored(p: np.ndarray) -> np.ndarray:
 
 
 def body(p: np.ndarray) -> np.ndarray:
-    """Torso and tail."""
+    """Return the distance to torso and tail."""
     d = join(ellipsoid(p, [0, -3.0, 0.2], [4.3, 4.9, 4.0]), ellipsoid(p, [0, 0.6, 0.5], [4.25, 4.3, 3.8]), 1.6)
     return join(d, ellipsoid(p, [0, -6.4, -3.4], [2.4, 3.0, 1.0]), 0.8)
 
 
 def head(p: np.ndarray) -> np.ndarray:
-    """Skull, brows and ear tufts."""
+    """Return the distance to skull, brows and ear tufts."""
     q = mirrored(to_head(p))
     d = join(ellipsoid(q, [0, 5.0, 0.2], [4.6, 3.5, 3.9]), ellipsoid(q, [0, 4.2, 1.2], [3.8, 2.6, 3.2]), 1.0)
     d = join(d, cone(q, [0.1, 5.3, 4.0], [3.6, 7.7, 2.2], 0.45, 0.42), 0.7)
@@ -84,18 +84,18 @@ def head(p: np.ndarray) -> np.ndarray:
 
 
 def wing(p: np.ndarray) -> np.ndarray:
-    """Both folded wings: their tips reach back and inwards."""
+    """Return the distance to both folded wings, whose tips reach back and inwards."""
     q = (mirrored(p) - [4.15, -1.3, -0.3]) @ rotation(2, 9).T @ rotation(0, -14).T
     return ellipsoid(q, [0, 0, 0], [1.15, 5.6, 3.1])
 
 
 def plumage(p: np.ndarray) -> np.ndarray:
-    """Everything feathered."""
+    """Return the distance to everything that is feathered."""
     return join(join(body(p), head(p), 1.1), wing(p), 0.3)
 
 
 def _coat(p: np.ndarray):
-    """Relief (cm), albedo [N, 3] and roughness at points of the plumage."""
+    """Return relief (cm), albedo [N, 3] and roughness at points of the plumage."""
     on_wing = fe.smoothstep(-0.12, 0.12, np.minimum(body(p), head(p)) - wing(p))
     on_head = fe.smoothstep(-0.35, 0.35, join(body(p), wing(p), 0.3) - head(p))
     lift, albedo, rough = _torso(p)
@@ -107,7 +107,7 @@ def _coat(p: np.ndarray):
 
 
 def _torso(p: np.ndarray):
-    """Cream breast with dark drops, brown flanks and back."""
+    """Return the coat of the torso: cream breast with dark drops, brown flanks and back."""
     angle = np.arctan2(p[:, 0], p[:, 2])
     f = fe.lay(angle * 4.2 / 0.95, (5.0 - p[:, 1]) / 0.85)
     front = 1 - fe.smoothstep(0.85, 1.35, np.abs(angle) + 0.10 * fe.noise(p, 1.6, seed=3))
@@ -121,7 +121,7 @@ def _torso(p: np.ndarray):
 
 
 def _wings(p: np.ndarray):
-    """Small coverts at the shoulder, growing into long barred flight feathers; satin glaze."""
+    """Return the coat of the wings: small coverts at the shoulder, long barred flight feathers, satin glaze."""
     q = mirrored(p)
     down = np.clip(4.4 - p[:, 1], 0, None)
     v = 7.0 * (1 - np.exp(-down / 5.4))  # rows 0.8 cm apart at the shoulder, 4 times that at the tip
@@ -137,7 +137,7 @@ def _wings(p: np.ndarray):
 
 
 def _face(p: np.ndarray):
-    """Facial discs with a dark ruff, pale brows, speckled crown, dark tufts."""
+    """Return the coat of the face: facial discs with a dark ruff, pale brows, speckled crown, dark tufts."""
     h = to_head(p)
     q = mirrored(h)
     f = fe.lay(np.arctan2(h[:, 0], h[:, 2] + 0.5) * 3.9 / 0.72, (10.5 - h[:, 1]) / 0.62, reach=2.0)
@@ -167,7 +167,7 @@ def _face(p: np.ndarray):
 
 
 def plumage_surface(detail: float) -> Surface:
-    """The feathered mesh; `detail` is its final edge length in centimetres."""
+    """Build the feathered mesh; `detail` is its final edge length in centimetres."""
     coarse = 4 * detail
     points, faces = surface_nets(plumage, [-6.6, -10.5, -6.2], [6.6, 11.6, 6.4], coarse)
     for _ in range(2):

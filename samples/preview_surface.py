@@ -24,7 +24,7 @@ def register(mi) -> None:
     import drjit as dr
 
     def lobes(ggx, f0, wi, wo):
-        """GGX lobe times cosine, its half vector and the lobe's sampling density for one pair of directions."""
+        """Return the GGX lobe times cosine, its half vector and its sampling density for one pair of directions."""
         half = dr.normalize(wi + wo)
         alpha_sq = dr.square(ggx.alpha_u())
         cos_i, cos_o = mi.Frame3f.cos_theta(wi), mi.Frame3f.cos_theta(wo)
@@ -52,7 +52,7 @@ def register(mi) -> None:
                 cb.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
 
         def _surface(self, si, active):
-            """Albedo, F0, GGX distribution and the chance of sampling the lobe at a hit."""
+            """Return albedo, F0, GGX distribution and the probability of sampling the lobe at a hit."""
             albedo = self.diffuse_albedo.eval(si, active)
             f0 = self.f0.eval_1(si, active)
             alpha = dr.square(self.roughness.eval_1(si, active))

@@ -30,7 +30,7 @@ NEAR_COLOR, SPHERE_COLOR, RECTANGLE_COLOR = (1.0, 0.9, 0.8), (1.0, 0.75, 0.5), (
 
 
 def make_patches(width: int = ENVIRONMENT_WIDTH // 2) -> np.ndarray:  # -> [H, W, 3] half, linear Rec.709 radiance
-    """Lat-long map of three soft Gaussian patches on a dim ground: smooth at the pitch of the captured lights."""
+    """Return a lat-long map of three soft Gaussian patches on a dim ground, smooth at the spacing of the captured lights."""
     towards = sky.directions(width, width // 2)
     picture = np.broadcast_to(np.array(PATCHES_GROUND), towards.shape).copy()
     for direction, sigma_degrees, radiance in PATCHES:
@@ -40,18 +40,18 @@ def make_patches(width: int = ENVIRONMENT_WIDTH // 2) -> np.ndarray:  # -> [H, W
 
 
 def unit(direction) -> np.ndarray:  # -> [3]
-    """The direction at length one."""
+    """Return the direction at length one."""
     return np.array(direction, float) / np.linalg.norm(direction)
 
 
 def bounding_sphere(points: np.ndarray) -> tuple[np.ndarray, float]:  # [N, 3] -> [3], m
-    """Sphere about the centre of the bounding box."""
+    """Return the bounding sphere about the centre of the bounding box."""
     center = (0.5 * (points.min(axis=0) + points.max(axis=0))).round(6)
     return center, round(float(np.linalg.norm(points - center, axis=1).max()), 6)
 
 
 def near_lights(center: np.ndarray, radius_m: float) -> dict[str, dict]:
-    """The point, sphere and rectangle light around an object, as references.json describes them."""
+    """Return the point, sphere and rectangle light around an object, as references.json describes them."""
     near_m, area_m = NEAR_RADII * radius_m, AREA_RADII * radius_m
     sphere_m, (width, height) = SPHERE_RADII * radius_m, (side * radius_m for side in RECTANGLE_RADII)
     outward = unit(RECTANGLE_DIRECTION)
@@ -80,12 +80,12 @@ def near_lights(center: np.ndarray, radius_m: float) -> dict[str, dict]:
 
 
 def numbers(values) -> list[float]:
-    """Floats short enough for JSON, and exactly what is rendered."""
+    """Return floats with few digits for JSON, which are exactly the numbers that are rendered."""
     return [round(float(value), 8) for value in values]
 
 
 def emitters(mi: Any, light: dict, *, folder: Path, directions: np.ndarray, irradiance: np.ndarray) -> dict:
-    """Mitsuba's emitters for one description.
+    """Return Mitsuba's emitters for one description.
 
     Args:
         light: description, as in references.json.

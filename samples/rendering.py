@@ -1,4 +1,4 @@
-"""What the sample scripts share: Mitsuba set up to relit's camera and lights, and ray-cast ground truth.
+"""Common parts of the sample scripts: Mitsuba with relit's camera and lights, and ray-cast ground truth.
 
 Mitsuba is a development dependency: `import_mitsuba` is the only place that imports it.
 """
@@ -69,7 +69,7 @@ def fibonacci_cap(count: int, largest_angle_degrees: float) -> np.ndarray:  # ->
 
 
 def camera(mi, *, resolution: int, pixel_size_m: float) -> dict:
-    """Orthographic sensor at +z looking along -z, +x right and +y up, box filter.
+    """Return an orthographic sensor at +z that looks along -z, +x right and +y up, with a box filter.
 
     Convention: Mitsuba's local camera x points left in the picture, which look_at already turns round;
     `make_owl.py --check` measures that it does.
@@ -120,7 +120,7 @@ def mesh(mi, name: str, surface, *, lambertian: bool = False) -> Any:
 
 
 def distant_light(mi, *, direction: np.ndarray, irradiance) -> dict:
-    """Emitter from `direction` (towards the light); a surface facing it receives `irradiance` [3]."""
+    """Return an emitter from `direction` (towards the light); a surface that faces it receives `irradiance` [3]."""
     return {
         "type": "directional",
         "direction": [-float(d) for d in direction],
@@ -143,7 +143,7 @@ class Tracer:
         return self.mi.load_dict({"type": "scene", "integrator": self.integrator, **self.shapes, **emitters})
 
     def light(self, *, direction: np.ndarray, irradiance, spp: int, seed: int, passes: int = 1) -> np.ndarray:
-        """Radiance [H, W, 3] under one distant light (see `distant_light`)."""
+        """Render the radiance [H, W, 3] under one distant light (see `distant_light`)."""
         emitter = distant_light(self.mi, direction=direction, irradiance=irradiance)
         if self.one_light is None:
             self.one_light = self._scene({"light": emitter})
@@ -154,11 +154,11 @@ class Tracer:
         return self._trace(self.one_light, spp, seed, passes)
 
     def emitters(self, emitters: dict, *, spp: int, seed: int, passes: int = 1) -> np.ndarray:
-        """Radiance [H, W, 3] under any emitters, given as Mitsuba dictionaries."""
+        """Render the radiance [H, W, 3] under any emitters, given as Mitsuba dictionaries."""
         return self._trace(self._scene(emitters), spp, seed, passes)
 
     def _trace(self, scene, spp: int, seed: int, passes: int) -> np.ndarray:
-        """Mean of `passes` independent renders of `spp`, so that memory stays bounded; float32 linear radiance."""
+        """Return the mean of `passes` independent renders of `spp` paths, which bounds the memory; float32 linear radiance."""
         total = 0.0
         for i in range(passes):
             image = self.mi.render(scene, sensor=self.sensor, spp=spp, seed=seed * 4096 + i)
@@ -167,7 +167,7 @@ class Tracer:
 
 
 def cast(mi, scene, u: np.ndarray, v: np.ndarray, *, resolution: int, pixel_size_m: float):
-    """Shoot camera rays through continuous image coordinates (u, v); returns Mitsuba's interaction."""
+    """Cast camera rays through continuous image coordinates (u, v) and return Mitsuba's interaction."""
     x = (u - 0.5 * resolution) * pixel_size_m
     y = (0.5 * resolution - v) * pixel_size_m
     origin = mi.Point3f(mi.Float(x.ravel()), mi.Float(y.ravel()), CAMERA_DISTANCE_M)
@@ -175,7 +175,7 @@ def cast(mi, scene, u: np.ndarray, v: np.ndarray, *, resolution: int, pixel_size
 
 
 def trace_truth(mi, shapes: dict, *, resolution: int, pixel_size_m: float) -> Truth:
-    """Ray-cast normal, material and height at pixel centres, and coverage over whole pixels."""
+    """Return normal, material and height at pixel centres, and coverage over whole pixels, by ray casting."""
     scene = mi.load_dict({"type": "scene", **shapes})
     row, column = np.mgrid[:resolution, :resolution]
     covered = np.ones((resolution, resolution), bool)

@@ -42,7 +42,7 @@ class Rig(NamedTuple):
 
 
 def make_rig(*, distorted: bool = False) -> Rig:
-    """The rig, with or without lens distortion of both devices."""
+    """Return the rig, with or without lens distortion of both devices."""
     camera = Camera(
         projection="perspective",
         resolution=(WIDTH, HEIGHT),
@@ -64,7 +64,7 @@ def make_rig(*, distorted: bool = False) -> Rig:
 
 
 def panel_at(projector: Projector, x: Any, down: Any) -> tuple[Any, Any]:
-    """Continuous projector coordinates (u, v) of ideal image-plane coordinates X/Z right and Y/Z down, NumPy's or Dr.Jit's."""
+    """Return the continuous projector coordinates (u, v) of ideal image-plane coordinates X/Z right and Y/Z down, NumPy's or Dr.Jit's."""
     if projector.distortion is not None:
         x, down = projector.distortion.apply(x, down)
     (fx, fy), (cu, cv) = projector.focal_px, projector.principal_px or (0.0, 0.0)
@@ -72,7 +72,7 @@ def panel_at(projector: Projector, x: Any, down: Any) -> tuple[Any, Any]:
 
 
 def project(projector: Projector, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # [..., 3] camera frame, metres
-    """Continuous projector coordinates (u, v) that light reaches points from; NaN behind the projector."""
+    """Return the continuous projector coordinates (u, v) from which light reaches points; NaN behind the projector."""
     pose = np.array(projector.camera_from_projector, dtype=np.float64)
     local = (points - pose[:3, 3]) @ pose[:3, :3]
     depth = np.where(local[..., 2] < 0, -local[..., 2], np.nan)
@@ -80,7 +80,7 @@ def project(projector: Projector, points: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def projector_ray(projector: Projector, u: float, v: float) -> tuple[np.ndarray, np.ndarray]:
-    """Where a projector pixel's light starts and its unit direction, camera frame."""
+    """Return the origin and the unit direction of the light of a projector pixel, camera frame."""
     (fx, fy), (cu, cv) = projector.focal_px, projector.principal_px or (0.0, 0.0)
     x, down = np.array((u - cu) / fx), np.array((v - cv) / fy)
     if projector.distortion is not None:
@@ -91,7 +91,7 @@ def projector_ray(projector: Projector, u: float, v: float) -> tuple[np.ndarray,
 
 
 def emitter(mi, projector: Projector, texture: np.ndarray | None = None) -> dict:
-    """Mitsuba's projector, for a pattern [HEIGHT, WIDTH] float in 0…1 or, without one, white over the whole window.
+    """Return Mitsuba's projector for a pattern [HEIGHT, WIDTH] float in 0…1, or for white over the whole image.
 
     Patterns blend linearly from pixel centre to pixel centre, as in a projector that is slightly out of focus.
     """
@@ -120,7 +120,7 @@ def emitter(mi, projector: Projector, texture: np.ndarray | None = None) -> dict
 
 
 def _albedo(mi, seed: int, *, mean: float, swing: float, cycles: int = 5) -> dict:
-    """A Lambertian material whose albedo waves slowly: mean ± swing."""
+    """Return a Lambertian material whose albedo varies slowly by mean ± swing."""
     random = np.random.default_rng(seed)
     v, u = (np.mgrid[:TEXTURE_SIZE, :TEXTURE_SIZE] + 0.5) / TEXTURE_SIZE
     waves = sum(
@@ -133,7 +133,7 @@ def _albedo(mi, seed: int, *, mean: float, swing: float, cycles: int = 5) -> dic
 
 
 def _rectangle(mi, bsdf: dict, corner, edge_u, edge_v) -> dict:
-    """A parallelogram from one corner along two edges; its lit side is that of edge_u × edge_v."""
+    """Return a parallelogram from one corner along two edges; its lit side is that of edge_u × edge_v."""
     corner, edge_u, edge_v = (np.asarray(x, dtype=np.float64) for x in (corner, edge_u, edge_v))
     pose = np.eye(4)
     pose[:3, 0], pose[:3, 1] = edge_u / 2, edge_v / 2
@@ -143,7 +143,7 @@ def _rectangle(mi, bsdf: dict, corner, edge_u, edge_v) -> dict:
 
 
 def shapes(mi) -> dict[str, Any]:
-    """The objects by name, loaded; the walls of the groove are `groove_left` and `groove_right`."""
+    """Load the objects and return them by name; the walls of the groove are `groove_left` and `groove_right`."""
     back = _rectangle(mi, _albedo(mi, 1, mean=0.6, swing=0.22), (-1.2, -0.9, -BACK_M), (2.4, 0, 0), (0, 1.8, 0))
     (x, z), (to_x, to_z), (low, high) = GROOVE_LINE_M, GROOVE_FACES_M, GROOVE_Y_M
     facing = np.arctan2(to_x - x, to_z - z)  # from +z towards +x

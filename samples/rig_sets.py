@@ -54,7 +54,7 @@ SETS = (*PATTERNS, *LASERS)
 
 
 def make_frames(name: str, rig: Rig, transport: Transport) -> list[RigFrame]:
-    """The frames of one set.
+    """Return the frames of one set.
 
     Raises:
         ValueError: laser planes of a projector whose columns are bent by distortion.
@@ -80,7 +80,7 @@ def make_frames(name: str, rig: Rig, transport: Transport) -> list[RigFrame]:
 
 
 def light(pattern: Pattern, transport: Transport) -> np.ndarray:  # -> [pixels]
-    """What the projector adds to the ambient light."""
+    """Return the radiance that the projector adds to the ambient light."""
     if isinstance(pattern, ModulatedPattern):
         return transport.waves @ _waves(pattern)
     of = transport.rows if getattr(pattern, "axis", "column") == "row" else transport.columns
@@ -90,7 +90,7 @@ def light(pattern: Pattern, transport: Transport) -> np.ndarray:  # -> [pixels]
 
 
 def _waves(pattern: ModulatedPattern) -> np.ndarray:
-    """Weights of Transport.waves."""
+    """Return the weights of Transport.waves."""
     if (pattern.period_px, pattern.carrier_period_px) != (rig_transport.WAVE_PERIOD_PX, rig_transport.CARRIER_PERIOD_PX):
         raise ValueError("the transport holds the waves of one modulated pattern only")
 

@@ -38,14 +38,14 @@ class Transport(NamedTuple):
 
 
 def spot_positions() -> np.ndarray:  # -> [spots, 2] projector pixels
-    """Where the laser spots go through the panel."""
+    """Return the projector coordinates of the laser spots."""
     across, down = SPOT_GRID
     j, i = np.mgrid[:down, :across]
     return np.stack([SPOT_START_PX[0] + SPOT_STEP_PX[0] * i, SPOT_START_PX[1] + SPOT_STEP_PX[1] * j], -1).reshape(-1, 2)
 
 
 def camera_rays(mi, rig: Rig, u: np.ndarray | Any, v: np.ndarray | Any) -> Any:
-    """Mitsuba rays through continuous image coordinates."""
+    """Return Mitsuba rays through continuous image coordinates."""
     import drjit as dr
 
     x, y = rig.camera.plane_at(u, v)  # arithmetic only: Dr.Jit's numbers pass through
@@ -79,7 +79,7 @@ def vertices(mi, scene, ray, random, *, max_depth: int = MAX_DEPTH) -> Iterator[
 
 
 def _primary(mi, rig: Rig, seed: int) -> tuple[Any, Any, Any]:
-    """Pixel numbers, rays spread evenly over each pixel, and random numbers."""
+    """Return pixel numbers, rays spread evenly over each pixel, and random numbers."""
     import drjit as dr
 
     count = STRATA * STRATA
@@ -92,7 +92,7 @@ def _primary(mi, rig: Rig, seed: int) -> tuple[Any, Any, Any]:
 
 
 def trace_pass(mi, scene, rig: Rig, seed: int, *, max_depth: int = MAX_DEPTH) -> dict[str, np.ndarray]:
-    """Sums of one pass over STRATA² paths a pixel: Transport but for its ambient, not divided yet."""
+    """Return the sums of one pass over STRATA² paths a pixel: an undivided Transport without ambient light."""
     import drjit as dr
 
     pixels, (width, height) = rig.camera.width * rig.camera.height, rig.projector.resolution
@@ -103,7 +103,7 @@ def trace_pass(mi, scene, rig: Rig, seed: int, *, max_depth: int = MAX_DEPTH) ->
     (fx, fy), (wide, high) = rig.projector.focal_px, rig_scene.EMITTER_RESOLUTION
 
     def nearest(at: Any, count: int) -> list[tuple[Any, Any]]:
-        """The two projector pixels whose centres are nearest and their weights: bilinear patterns."""
+        """Return the two projector pixels with the nearest centres and their weights, for bilinear patterns."""
         first = dr.floor(at - 0.5)
         share = at - 0.5 - first
         cells = [mi.UInt32(dr.clip(mi.Int32(first) + offset, 0, count - 1)) for offset in (0, 1)]
@@ -134,7 +134,7 @@ def trace_pass(mi, scene, rig: Rig, seed: int, *, max_depth: int = MAX_DEPTH) ->
 
 
 def trace_ambient(mi, shapes: dict, rig: Rig, *, seed: int) -> np.ndarray:
-    """Radiance [pixels] under the ambient light alone."""
+    """Return the radiance [pixels] under the ambient light alone."""
     import drjit as dr
 
     scene = mi.load_dict({"type": "scene", **shapes, "sky": {"type": "constant", "radiance": rig_scene.AMBIENT_RADIANCE}})

@@ -17,7 +17,7 @@ OBLIQUE_COLUMNS = 3.0  # a pixel that spans more of the projector has no one col
 
 
 class Truth(NamedTuple):
-    """What there is to find, [rows, cols]."""
+    """The ground truth of the rig, [rows, cols] each."""
 
     depth: np.ndarray  # float64 metres, z-depth at the pixel centre
     u: np.ndarray  # float64, continuous projector column at the pixel centre, whether light gets there or not
@@ -38,7 +38,7 @@ class _Hits(NamedTuple):
 
 
 def _cast(mi, scene, rig: Rig, shapes: dict, u: np.ndarray, v: np.ndarray) -> _Hits:
-    """What rays through continuous image coordinates hit."""
+    """Return the surface that rays through continuous image coordinates hit."""
     import drjit as dr
 
     grid = u.shape
@@ -61,7 +61,7 @@ def _cast(mi, scene, rig: Rig, shapes: dict, u: np.ndarray, v: np.ndarray) -> _H
 
 
 def trace_truth(mi, shapes: dict[str, Any], rig: Rig) -> Truth:
-    """Ray-cast the truth at pixel centres and the edges over whole pixels."""
+    """Trace the truth at pixel centres, and the edges over whole pixels."""
     scene = mi.load_dict({"type": "scene", **shapes})
     rows, cols = rig.camera.height, rig.camera.width
     row, column = np.mgrid[:rows, :cols]

@@ -27,7 +27,7 @@ EYE_CENTER, EYE_RADIUS = np.array([1.78, 5.30, 3.00]), 1.38
 
 
 def eye_surfaces() -> list[Surface]:
-    """Glazed eyes: black pupil, streaked amber iris, dark rim."""
+    """Build the glazed eyes: black pupil, streaked amber iris, dark rim."""
     surfaces = []
     for side in (-1, 1):
         unit_points, faces, unit = sphere([0, 0, 0], EYE_RADIUS)
@@ -45,7 +45,7 @@ def eye_surfaces() -> list[Surface]:
 
 
 def _tube_surface(path, radius, albedo_of, *, f0=0.045, roughness=0.28, flatten=1.0, bump=None, head_frame=False) -> Surface:
-    """A swept part; `albedo_of` and `bump` are functions of (along, around)."""
+    """Build a swept part; `albedo_of` and `bump` are functions of (along, around)."""
     points, faces, along, around = tube(path, radius, flatten=flatten)
     if bump is not None:
         points = points + bump(along, around)[:, None] * vertex_normals(points, faces)
@@ -56,7 +56,7 @@ def _tube_surface(path, radius, albedo_of, *, f0=0.045, roughness=0.28, flatten=
 
 
 def beak_and_feet() -> list[Surface]:
-    """Hooked beak, three toes on each foot, claws over the edge of the stump."""
+    """Build the hooked beak, three toes on each foot, and the claws over the edge of the stump."""
 
     def beak_albedo(along, around):
         return fe.mix(fe.mix(HORN * 0.8, HORN, 0.5 + 0.5 * np.cos(around)), DARK, fe.smoothstep(0.45, 0.85, along))
@@ -95,7 +95,7 @@ def beak_and_feet() -> list[Surface]:
 
 
 def stump_distance(p: np.ndarray) -> np.ndarray:
-    """A slightly flared tree stump with rounded edges."""
+    """Return the distance to a slightly flared tree stump with rounded edges."""
     low = fe.smoothstep(-8.2, -10.2, p[..., 1])
     radial = np.linalg.norm(p[..., [0, 2]] * [0.98, 1.0], axis=-1) - 4.75 - 0.35 * low
     q = np.stack([radial, np.abs(p[..., 1] + 9.0) - 1.55], axis=-1)
@@ -103,7 +103,7 @@ def stump_distance(p: np.ndarray) -> np.ndarray:
 
 
 def stump_surface(detail: float) -> Surface:
-    """The stump: furrowed bark, pale rings on top, moss."""
+    """Build the stump: furrowed bark, pale rings on top, moss."""
     points, faces = surface_nets(stump_distance, [-6, -11.4, -6], [6, -6.6, 6], 4 * detail)
     for _ in range(2):
         points, faces = subdivide(project(stump_distance, points, step=0.02), faces)
@@ -128,7 +128,7 @@ def stump_surface(detail: float) -> Surface:
 
 
 def build(*, detail: float = 0.03) -> dict[str, Surface]:
-    """All parts in the camera frame, in metres; `detail` is the mesh edge in centimetres."""
+    """Build all parts in the camera frame, in metres; `detail` is the mesh edge in centimetres."""
     parts = {"plumage": plumage_surface(detail), "stump": stump_surface(2 * detail)}
     parts |= {f"eye_{i}": s for i, s in enumerate(eye_surfaces())}
     parts |= {f"part_{i}": s for i, s in enumerate(beak_and_feet())}

@@ -26,13 +26,13 @@ def directions(width: int, height: int) -> np.ndarray:  # -> [H, W, 3] unit, fro
 
 
 def solid_angles(width: int, height: int) -> np.ndarray:  # -> [H, 1] steradians
-    """Solid angle of a pixel in each row: sin(pi v) (pi / H) (2 pi / W)."""
+    """Return the solid angle of a pixel in each row: sin(pi v) (pi / H) (2 pi / W)."""
     v = (np.arange(height) + 0.5) / height * np.pi
     return (np.sin(v) * (np.pi / height) * (2 * np.pi / width))[:, None]
 
 
 def _scenery(d: np.ndarray) -> np.ndarray:  # [N, 3] -> [N, 3]
-    """Sky, hills, ground and softbox, without the sun."""
+    """Return sky, hills, ground and softbox, without the sun."""
     up, to_sun = d[:, 1], d @ SUN_DIRECTION
     level = smoothstep(0.0, 0.55, up)[:, None]
     sunward = (0.5 + 0.5 * to_sun)[:, None]
@@ -87,7 +87,7 @@ def make_sky(width: int = 256, height: int = 128) -> np.ndarray:  # -> [H, W, 3]
 
 
 def as_mitsuba_envmap(mi, environment: np.ndarray, *, upsample: int = 8) -> dict:
-    """Emitter that shows every pixel of a lat-long map [H, W, 3] as a constant patch.
+    """Return an emitter that shows every pixel of a lat-long map [H, W, 3] as a constant patch.
 
     Convention: Mitsuba's `envmap` has these axes (its centre looks along +z) and pixel-centred columns, but
     puts its first and last rows on the poles, and it interpolates. So rows are resampled to theta = pi j / (rows - 1)

@@ -37,8 +37,8 @@ BYTES_PER_PIXEL, ALIGNED_BYTES_PER_PIXEL = 40, 160
 TOP_EXPONENT = 15
 """The brightest value of a light is stored in [2^14, 2^15): below 65504, the largest half, with 29 stops of normal values."""
 
-Progress = Callable[[int, int], None]
-"""A function that is called with the count of decoded frames and the count of all frames."""
+FrameProgress = Callable[[int, int], None]
+"""A function that is called after every frame with the count of decoded frames and the count of all frames."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Ingest:
         hint = "" if cache is not None else " (--cache names another folder for it)"
         return cls(capture, frames, tracking, folder, hint, fingerprints, _key(capture, frames, tracking, fingerprints))
 
-    def stack(self, progress: Progress | None = None) -> Stack:
+    def stack(self, progress: FrameProgress | None = None) -> Stack:
         """Return the stack from the cache, and build it first when the cache does not hold it.
 
         Args:
@@ -101,7 +101,7 @@ class Ingest:
 
 
 def open_stack(capture: Capture, *, cache: Path | None = None, tracking: Tracking | None = None,
-               progress: Progress | None = None) -> Stack:
+               progress: FrameProgress | None = None) -> Stack:
     """Return the stack of the light frames of a capture, as `Ingest.of` and `Ingest.stack` do.
 
     Raises:
@@ -138,7 +138,7 @@ def _key(capture: Capture, frames: list[Frame], tracking: Tracking | None, finge
 
 
 def _build(capture: Capture, frames: list[Frame], alignment: Alignment | None, folder: Path, key: str,
-           progress: Progress | None) -> Stack:
+           progress: FrameProgress | None) -> Stack:
     pixel_count = capture.camera.width * capture.camera.height
     lights, pixels = stacks.padded(len(frames), LIGHT_PAD), stacks.padded(pixel_count, PIXEL_PAD)
     scale = np.zeros(lights, dtype=np.float32)

@@ -28,9 +28,6 @@ BAND_BYTES = 64 << 20
 DECODE_BYTES, BYTES_PER_PIXEL = 1 << 30, 56
 """The bytes that all images which are corrected at one time may take, and the bytes of each of their pixels."""
 
-Progress = Callable[[int], None]
-"""A function that is called with the count of frames that have been read."""
-
 
 @dataclass(frozen=True)
 class Planes:
@@ -67,7 +64,7 @@ class Planes:
 
 @contextmanager
 def frame_planes(capture: Capture, frames: Sequence[Frame], *, colour: bool, cache: Path | None = None,
-                 progress: Progress | None = None) -> Iterator[Planes]:
+                 progress: Callable[[int], None] | None = None) -> Iterator[Planes]:
     """Decode and correct frames on a thread pool, and yield planes that exist until the block ends.
 
     Args:
@@ -75,7 +72,7 @@ def frame_planes(capture: Capture, frames: Sequence[Frame], *, colour: bool, cac
         frames: frames of the capture.
         colour: True keeps three channels, False weighs them with GREY_WEIGHTS.
         cache: the folder for the scratch file; None stands for `.relit` in the folder of the capture. No file is left in it.
-        progress: called after every frame.
+        progress: called after every frame with the count of frames that have been read.
 
     Raises:
         ImageError: a frame is unreadable or holds impossible values; the message names the file.

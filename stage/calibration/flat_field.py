@@ -16,9 +16,6 @@ from stage.colour import convert, linearise
 from stage.colour_spaces import linear_space
 from stage.errors import CalibrationError, ImageError
 
-Progress = Callable[[int], None]
-"""A function that is called with the count of images that have been read."""
-
 
 class MeanImage(NamedTuple):
     """The mean of several images of one object, and their noise."""
@@ -31,14 +28,14 @@ class MeanImage(NamedTuple):
 
 
 def mean_image(paths: Sequence[Path], capture: Capture, *, refuse_saturated: bool = False,
-               progress: Progress | None = None) -> MeanImage:
+               progress: Callable[[int], None] | None = None) -> MeanImage:
     """Return the mean of images in linear values.
 
     Args:
         paths: image files with the resolution and the encoding of the capture.
         capture: the capture that gives resolution, colour space and saturation.
         refuse_saturated: True makes a saturated reading inside the mask an error.
-        progress: called after every image.
+        progress: called after every image with the count of images that have been read.
 
     Raises:
         CalibrationError: no image is given.
