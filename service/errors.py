@@ -22,5 +22,9 @@ USER_ERRORS: tuple[type[Exception], ...] = (RequestError, ValidationError, Stage
 
 def sentence(error: BaseException) -> str:
     """The one line to show: names of files and fields come into it as others wrote them, so what is not plain text is escaped."""
-    text = describe(error) if isinstance(error, ValidationError) else " ".join(str(error).split())
+    if isinstance(error, ValidationError):
+        raised = (fault.get("ctx", {}).get("error") for fault in error.errors())
+        text = next((str(found) for found in raised if isinstance(found, RequestError)), None) or describe(error)
+    else:
+        text = " ".join(str(error).split())
     return "".join(character if character.isprintable() else ascii(character)[1:-1] for character in text)

@@ -5,39 +5,37 @@ from typing import Annotated
 
 import typer
 
-from service.cli.options import DeviceOption
+from service.cli.bar import Bar
+from service.cli.request_commands import local_command
+from service.requests.demo import DemoRequest
 
 SERVICE = "service"
 """Folder of the service, in that of the demo."""
 
+ServeOption = Annotated[bool, typer.Option("--serve", help="Then open the service on it, for this machine alone.")]
+
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
-    app.command("demo")(demo)
+    local_command(app, "demo", _demo)
 
 
-def demo(
-    out: Annotated[Path, typer.Option("--out", help="Folder for the results.")] = Path("relit-demo"),
-    device: DeviceOption = None,
-    serve: Annotated[bool, typer.Option("--serve", help="Then open the service on it, for this machine alone.")] = False,
-) -> None:
-    """The main job on the shipped sample: solve, export, relight."""
-    from service.cli.bar import Bar
-    from service.demo.demo import demo as run
+def _demo(request: DemoRequest, serve: ServeOption = False) -> None:
+    from service.demo.demo import demo
 
     with Bar() as bar:
-        result = run(out, device=device, progress=bar)
+        result = demo(request.out, device=request.device, progress=bar)
     print(f"maps     {result.solved.maps_path}")
     print(f"report   {result.solved.report_path}")
     print(f"asset    {result.asset}")
     print(f"frames   {result.frames[0]} … {result.frames[-1].name}")
     print(f"picture  {result.preview}")
     if serve:
-        open_service(out / SERVICE, device)
+        open_service(request.out / SERVICE, request.device)
 
 
 def open_service(data: Path, device: str | None) -> None:
-    """A service for this machine alone, with the sample in it."""
+    """Run a service for this machine alone, with the sample in it."""
     from service.cli.server import settings_of
     from service.demo.demo import sample_folder
     from service.server.sample import greet

@@ -1,46 +1,29 @@
 """relit keys: who may use the service."""
 
-from enum import StrEnum
 from typing import Annotated, Any
 
 import typer
 
+from service.cli.request_commands import command
 from service.cli.server import ConfigOption, DataOption, settings_of
-
-
-class ScopeName(StrEnum):
-    """What a key may do; a test compares it with service.server.database.keys.Scope, which costs time to load."""
-
-    READ = "read"
-    WRITE = "write"
-    ADMIN = "admin"
+from service.requests.keys import NewKey
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     group = typer.Typer(name="keys", no_args_is_help=True, help="Make, list and revoke the keys of the service.")
-    group.command("create")(create)
+    command(group, "create", _create)
     group.command("list")(list_)
     group.command("revoke")(revoke)
     app.add_typer(group)
 
 
-def create(
-    project: Annotated[str, typer.Option("--project", help="Whose captures, jobs and results it opens: a-z, 0-9 and -.")],
-    name: Annotated[str, typer.Option("--name", help="Who holds it: a person or a program.")],
-    scope: Annotated[ScopeName, typer.Option("--scope", help="read: see; write: also upload and run jobs; admin: also register "
-                                                             "folders of the server, and /metrics.")],
-    data: DataOption = None,
-    config: ConfigOption = None,
-) -> None:
-    """Make a key and print it: it is kept as a hash alone, and cannot be shown again."""
+def _create(wanted: NewKey, data: DataOption = None, config: ConfigOption = None) -> None:
     import sys
 
     from service.server.database import keys
     from service.server.database.engine import create as create_tables
     from service.server.database.engine import open_database
-
-    wanted = keys.NewKey(project=project, name=name, scope=keys.Scope(scope))
 
     def prepare(settings: Any, database: Any) -> None:
         settings.data.mkdir(parents=True, exist_ok=True)

@@ -1,25 +1,20 @@
 """relit bench: the speed table, measured here and now."""
 
-from typing import Annotated
-
 import typer
 
-from service.cli.options import DeviceOption
+from service.cli.bar import Bar
+from service.cli.request_commands import local_command
+from service.requests.demo import BenchRequest
 
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
-    app.command("bench")(bench)
+    local_command(app, "bench", _bench)
 
 
-def bench(
-    device: DeviceOption = None,
-    repeats: Annotated[int, typer.Option("--repeats", min=3, help="Timed runs of each; medians are shown.")] = 9,
-) -> None:
-    """Speed of the kernels against NumPy and against a plain copy, in the same run."""
-    from service.cli.bar import Bar
-    from service.demo.bench import bench as run
+def _bench(request: BenchRequest) -> None:
+    from service.demo.bench import bench
 
     with Bar() as bar:
-        lines = run(device, repeats, bar)
+        lines = bench(request.device, request.repeats, bar)
     print("\n".join(lines))

@@ -12,10 +12,10 @@ service.requests becomes the options of that model, and the function gets the mo
 
     local_command(app, "solve", _solve)
 
-Names, defaults, limits and help are those of the model's fields; service.requests.options tells the rule. The help of the command is
-the function's docstring, or the model's where the function has none. Every other parameter of the function is an option of the command
-alone, written for Typer in the usual way. A function that takes `Given[Model]` in place of the model gets what was typed, to change or
-look at it before the model is built; several models share the options that they have in common.
+Names, defaults and help are those of the model's fields; service.requests.options tells the rule, and the model checks the limits. The
+help of the command is the function's docstring, or the model's where the function has none. Every other parameter of the function is an
+option of the command alone, written for Typer in the usual way. A function that takes `Given[Model]` in place of the model gets what
+was typed, to change or look at it before the model is built; several models share the options that they have in common.
 
 To add a command: write its model in service/requests, its function here in service/cli, and register it. To add an option: write
 the field. `relit submit`, `relit farm template`, the API and the records of results follow.
@@ -28,7 +28,6 @@ from pathlib import Path
 from typing import Annotated, Any, Generic, Literal, get_args, get_origin
 
 import typer
-from annotated_types import Ge, Le
 from pydantic import BaseModel, BeforeValidator
 
 from service.cli.options import HostOption
@@ -113,7 +112,7 @@ def _parameters(models: list[type[Options]], without: frozenset[Role], own: list
     places: list[tuple[tuple[bool, bool, int], inspect.Parameter]] = []
     for (option, model), *others in found.values():
         required = 1 + len(others) == len(models) and all(each.field.is_required() for each, _ in [(option, model), *others])
-        place = (not option.spelling.argument, not required, ORDER.index(option.role))
+        place = (False, False, 0) if option.spelling.argument else (True, not required, ORDER.index(option.role))
         places.append((place, _parameter(option, required, words(option, model))))
     places += [((True, parameter.default is not inspect.Parameter.empty, ORDER.index(Role.RUN)), parameter) for parameter in own]
     return [parameter for _, parameter in sorted(places, key=lambda entry: entry[0])]
@@ -131,7 +130,7 @@ def _parameter(option: Option, required: bool, about: str) -> inspect.Parameter:
     elif kind is bool:
         info = typer.Option(f"{option.flag}/{option.off}" if option.field.default else option.flag, **shown)
     else:
-        info = typer.Option(option.flag, **shown, **(_limits(option) if kind is int else {}))
+        info = typer.Option(option.flag, **shown)
     annotation = Annotated[kind if default is not None else kind | None, info]  # type: ignore[valid-type]
     return inspect.Parameter(option.name, inspect.Parameter.KEYWORD_ONLY, annotation=annotation, default=default)
 
@@ -154,9 +153,3 @@ def _typer_type(annotation: Any) -> Any:
         return Path  # a JSON file that holds it
     return annotation if isinstance(annotation, type) and issubclass(annotation, READ_BY_TYPER) else str
 
-
-def _limits(option: Option) -> dict[str, Any]:
-    """Return the range of a whole number; other limits are told by the model."""
-    low = [limit.ge for limit in option.constraints if isinstance(limit, Ge)]
-    high = [limit.le for limit in option.constraints if isinstance(limit, Le)]
-    return {name: int(str(values[0])) for name, values in (("min", low), ("max", high)) if values}

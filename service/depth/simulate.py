@@ -35,7 +35,7 @@ def simulate_tof(request: SimulateCwRequest | SimulatePulsedRequest) -> Path:
     """
     maps = DepthMaps.read(request.depth / DEPTH_FILE if request.depth.is_dir() else request.depth)
     scene, camera = _scene(maps, request), maps.camera
-    random = None if request.seed is None else np.random.default_rng(request.seed)
+    random = np.random.default_rng(request.seed) if request.noise else None
     name = maps.provenance.get("relit:capture", request.depth.stem)
     if isinstance(request, SimulateCwRequest):
         sensor = CorrelationCamera(modulation_hz=request.modulation_hz, phases=request.phases, signal_electrons=request.signal_electrons,

@@ -19,8 +19,20 @@ def _split_commas(given: Any) -> Any:
     return tuple(given) if isinstance(given, list) else given
 
 
+def _sides(given: Any) -> Any:
+    """Return the two numbers of a text such as 1280x800."""
+    if not isinstance(given, str):
+        return given
+    sides = given.lower().replace("×", "x").split("x")
+    if len(sides) != 2 or not all(side.strip().isdigit() for side in sides):
+        raise ValueError(f"is {given}: give width x height in pixels, as in 1280x800")
+    return tuple(int(side) for side in sides)
+
+
 Commas = BeforeValidator(_split_commas)
 """Of a tuple: several values may be given as one text with commas between."""
+WidthHeight = BeforeValidator(_sides)
+"""Of two numbers: they may be given as one text with an x between."""
 
 
 class Role(StrEnum):
@@ -76,11 +88,16 @@ class Options(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
 
-class Request(Options):
-    """Base of the requests whose work needs a device."""
+class DeviceRequest(Options):
+    """Base of the requests whose work is done on a device."""
 
     device: Annotated[str | None, Role.MACHINE] = None
     """cpu, cuda:0, …; None: the first CUDA device, else the CPU."""
+
+
+class Request(DeviceRequest):
+    """Base of the requests that read images through a stack, which is cached."""
+
     cache: Annotated[Path | None, Role.MACHINE] = None
     """Folder for the image stack; None: .relit in the capture's folder."""
 

@@ -1,35 +1,80 @@
-"""What can be asked of `relit calibrate`: one frozen model a kind."""
+"""What `relit calibrate` takes: one frozen model a kind."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BeforeValidator, Field
+
+from service.errors import RequestError
+from service.requests.base import Commas, DeviceRequest, Options, Request, Role, Spelling, WidthHeight
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Above0 = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=1)]
+Corners = Annotated[int, Field(ge=3)]
+CAPTURE = Spelling(argument=True, metavar="CAPTURE")
+IMAGES = Spelling(argument=True, metavar="IMAGE...")
 
 
-class Circle(BaseModel):
+class Circle(Options):
     """The outline of a ball, typed."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     u: Finite
     v: Finite
     radius_px: Above0
 
 
-class LightsRequest(BaseModel):
+def _numbers(text: str) -> list[float]:
+    """Return the finite numbers of a text with commas between them; none where it holds anything else."""
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        return []
+    return values if all(abs(value) < float("inf") for value in values) else []
+
+
+def _circle(given: Any) -> Any:
+    if not isinstance(given, str):
+        return given
+    values = _numbers(given)
+    if len(values) != 3:
+        raise RequestError(f"--ball {given}: give centre and radius in pixels, such as 812.5,604,230")
+    return dict(zip(Circle.model_fields, values, strict=True))
+
+
+def _albedo(given: Any) -> Any:
+    if not isinstance(given, str):
+        return given
+    values = _numbers(given)
+    if len(values) not in (1, 3):
+        raise RequestError(f"--albedo {given}: give one number or three, such as 0.18")
+    return tuple(values * 3 if len(values) == 1 else values)
+
+
+def _board(given: Any) -> Any:
+    if not isinstance(given, str):
+        return given
+    parts = given.lower().split("x")
+    if len(parts) != 2 or not all(part.isdecimal() for part in parts):
+        raise RequestError(f"--board {given}: give two whole numbers with an x between, as 9x6")
+    return tuple(map(int, parts))
+
+
+def _levels(given: Any) -> Any:
+    if isinstance(given, tuple) and given and not _numbers(text := ",".join(map(str, given))):
+        raise RequestError(f"--levels {text}: give numbers from 0 to 1 with commas between")
+    return given
+
+
+class LightsRequest(Options):
     """Base of the kinds that measure lights."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    capture: Path
-    """The capture with the calibration images; its distant and point lights may be placeholders."""
-    apply_to: Path | None = None
+    capture: Annotated[Path, Role.INPUT, CAPTURE]
+    """Folder of the capture with the calibration images; its distant and point lights may be placeholders."""
+    apply_to: Annotated[Path | None, Role.INPUT, Spelling(metavar="CAPTURE")] = None
     """Another capture under the same lights in the same order, whose manifest is written; None: the capture itself."""
-    out: Path | None = None
-    """Where the manifest is written; None: over the target's capture.json."""
+    out: Annotated[Path | None, Role.OUTPUT] = None
+    """Manifest to write; None: the target's own capture.json."""
     drop_failed: bool = False
     """Leave out frames whose light cannot be measured, in place of refusing the capture."""
 
@@ -37,8 +82,10 @@ class LightsRequest(BaseModel):
 class BallRequest(LightsRequest):
     """Base of the kinds that look at balls: circles first, then masks."""
 
-    circles: tuple[Circle, ...] = ()
-    masks: tuple[Path, ...] = ()
+    circles: Annotated[tuple[Annotated[Circle, BeforeValidator(_circle)], ...], Role.INPUT, Spelling(flag="--ball", metavar="U,V,R")] = ()
+    """Outline of a ball: centre and radius in pixels. Once for each ball."""
+    masks: Annotated[tuple[Path, ...], Role.INPUT, Spelling(flag="--ball-mask")] = ()
+    """Mask image of a ball, in place of `ball`; better for a perspective camera. Once for each ball."""
 
 
 class MirrorBallRequest(BallRequest):
@@ -52,89 +99,92 @@ class LightPositionsRequest(MirrorBallRequest):
     """Positions of near lights from two or more mirror balls."""
 
     ball_radius_m: tuple[Above0, ...] = ()
-    """Of every ball, or one for each; an orthographic camera with pixel_size_m needs none."""
+    """Radius in metres, of every ball or once for each; an orthographic camera with pixel_size_m needs none."""
     ball_z_m: tuple[Finite, ...] = ()
-    """Camera-frame z of the centres, for an orthographic camera; empty: surface_z_m, or 0."""
+    """Camera-frame z of the centres in metres, for an orthographic camera; empty: surface_z_m, or 0."""
 
 
 class GreyBallRequest(BallRequest):
     """Brightness of each light from one grey ball."""
 
-    albedo: tuple[Above0, Above0, Above0] | None = None
-    """Of the ball; None: irradiance is relative, mean 1."""
+    albedo: Annotated[tuple[Above0, Above0, Above0] | None, BeforeValidator(_albedo), Spelling(metavar="R,G,B")] = None
+    """Albedo of the ball, one number or three; None: irradiance is relative, mean 1."""
     refine_direction: bool = False
     """Take the direction of distant lights from the shading, in place of the manifest."""
     ball_radius_m: Above0 | None = None
-    """For point lights and a perspective camera."""
+    """Radius of the ball in metres, for point lights and a perspective camera."""
     ball_z_m: Finite | None = None
-    """For point lights and an orthographic camera; None: surface_z_m, or 0."""
+    """Camera-frame z of the ball's centre in metres, for point lights and an orthographic camera; None: surface_z_m, or 0."""
 
 
 class IntensityRequest(LightsRequest):
-    """Brightness of each light from images of the object itself."""
+    """Brightness of lights of known direction from images of the object itself."""
 
     pixels: Annotated[int, Field(ge=100, le=100_000)] = 2000
-    """Of the mask, drawn at random, that take part."""
+    """Pixels of the mask, drawn at random, that take part: 100 to 100000."""
 
 
-class FramesRequest(BaseModel):
+class FramesRequest(Options):
     """Base of the kinds that average images."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    capture: Path
-    images: tuple[Path, ...]
-    """Image files, of the capture's resolution and encoding."""
+    capture: Annotated[Path, Role.INPUT, CAPTURE]
+    """Folder with a capture.json."""
+    images: Annotated[tuple[Path, ...], Role.INPUT, IMAGES]
+    """Images to average, of the capture's resolution and encoding."""
 
 
 class DarkRequest(FramesRequest):
-    """dark.exr from images with the lens covered, at the exposure of the frames."""
+    """The capture's dark.exr: mean of images with the lens covered, at the exposure of the frames."""
 
 
 class FlatFieldRequest(FramesRequest):
-    """flat.exr from images of an evenly lit white card."""
+    """The capture's flat.exr: mean of images of an evenly lit white card."""
 
-    dark_images: tuple[Path, ...] = ()
-    """Dark images at the exposure of the white card; empty: the capture's dark is also that of the card."""
+    dark_images: Annotated[tuple[Path, ...], Role.INPUT, Spelling(flag="--dark")] = ()
+    """A dark image at the exposure of the white card; may be repeated. Without one the capture's dark is also that of the card."""
 
 
-class SaturationRequest(BaseModel):
-    """The capture's saturation from where its histogram piles up."""
+class SaturationRequest(Options):
+    """Where the readings of the frames pile up at the top of the histogram."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    capture: Path
+    capture: Annotated[Path, Role.INPUT, CAPTURE]
+    """Folder with a capture.json."""
     write: bool = False
     """Set `saturation` in the manifest, in place of only saying it."""
 
 
-class ProcamRequest(BaseModel):
-    """Camera, projector and their pose from a chessboard under projected light, one capture a pose of the board."""
+class ProcamRequest(Request):
+    """Camera, projector and their pose from a chessboard under projected columns and rows."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    captures: Annotated[tuple[Path, ...], Field(min_length=1)]
-    board: tuple[Annotated[int, Field(ge=3)], Annotated[int, Field(ge=3)]]
-    """Inner corners across and down."""
+    captures: Annotated[tuple[Path, ...], Field(min_length=1), Role.INPUT, Spelling(argument=True, metavar="CAPTURE...")]
+    """Folders with a capture.json, one a pose of the board."""
+    board: Annotated[tuple[Corners, Corners], BeforeValidator(_board), Spelling(metavar="9x6")]
+    """Inner corners of the chessboard, across and down."""
     square_m: Above0
-    """Side of a square."""
-    projector: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] | None = None
-    """Width and height of the projector; None: what the captures say."""
-    apply_to: tuple[Path, ...] = ()
-    """Other captures of the same rig, whose manifests are written too."""
+    """Side of a square in metres."""
+    projector: Annotated[tuple[Count, Count] | None, WidthHeight, Spelling(metavar="1280x800")] = None
+    """Width and height of the projector in pixels; None: what the captures say."""
+    apply_to: Annotated[tuple[Path, ...], Role.INPUT, Spelling(metavar="CAPTURE")] = ()
+    """Another capture of the same rig, whose manifest is written too; may be repeated."""
     drop_outliers: bool = False
     """Leave out views whose error stands out, and fit again."""
-    device: str | None = None
-    cache: Path | None = None
 
 
-class ResponseRequest(BaseModel):
-    """The light of a projector at each level, from images of evenly grey projections."""
+class ResponseRequest(Options):
+    """The projector's light at each level (its gamma), for ramps, from images of evenly grey projections."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    capture: Annotated[Path, Role.INPUT, CAPTURE]
+    """Folder with a capture.json: its camera took the images, its projector gets the response."""
+    images: Annotated[tuple[Path, ...], Field(min_length=3), Role.INPUT, IMAGES]
+    """Images of evenly grey projections."""
+    levels: Annotated[tuple[Annotated[float, Field(ge=0, le=1)], ...], BeforeValidator(_levels), Commas, Spelling(metavar="0,0.25,…")] = ()
+    """Level of each image, 0 to 1; empty: even steps from 0 to 1 in the order of the images."""
 
-    capture: Path
-    """Its camera is the one that took the images; its projector gets the response."""
-    images: Annotated[tuple[Path, ...], Field(min_length=3)]
-    levels: tuple[Annotated[float, Field(ge=0, le=1)], ...] = ()
-    """Of each image, 0 to 1; empty: even steps from 0 to 1 in the order of the images."""
+
+class TofCalibrationRequest(DeviceRequest):
+    """Wiggling, scale, offset and drift of a time-of-flight camera from captures of a flat target at known distances."""
+
+    sweep: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="SWEEP")]
+    """A relit.tof-sweep/1 file: captures and their distances."""
+    out: Annotated[Path, Role.OUTPUT]
+    """The relit.tof/1 file to write."""

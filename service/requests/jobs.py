@@ -28,7 +28,7 @@ class JobRequest(Options):
     name: Annotated[str, Field(max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$"), Role.RUN, Spelling(flag="--job-name", metavar="TEXT")] = ""
     """Name of the job, for people; nothing depends on it."""
     priority: Annotated[int, Field(ge=0, le=100), Role.RUN] = 50
-    """Higher goes first; equal ones in the order they came."""
+    """0 to 100: higher goes first; equal ones in the order they came."""
 
 
 class CheckJob(JobRequest):

@@ -122,7 +122,10 @@ def typed(value: Any) -> str:
         value = tuple(value.model_dump(exclude_defaults=True).values())
     if isinstance(value, tuple):
         return ",".join(map(typed, value))
-    return repr(value) if isinstance(value, float) else str(value)
+    if isinstance(value, float):
+        short = f"{value:g}"
+        return short if float(short) == value else repr(value)
+    return str(value)
 
 
 def _fields(model: type[BaseModel]) -> Iterator[tuple[str, FieldInfo]]:

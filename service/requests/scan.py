@@ -1,22 +1,23 @@
-"""What can be asked of `relit scan`: one frozen model."""
+"""What `relit scan` takes."""
 
 from pathlib import Path
+from typing import Annotated
 
 from pydantic import Field
 
-from service.requests.base import Request
+from service.requests.base import DeviceRequest, Role, Spelling
 
 
-class ScanRequest(Request):
-    """The point cloud of a scan."""
+class ScanRequest(DeviceRequest):
+    """Shots of a scanning laser, from a platform that may move, as one point cloud."""
 
-    scan: Path
+    scan: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="SCAN")]
     """A folder with a scan.json, or the file."""
-    out: Path
+    out: Annotated[Path, Role.OUTPUT]
     """Folder for points.ply, points.usdc, points.las where it is asked for, and report.json."""
     near_m: float | None = Field(default=None, gt=0, allow_inf_nan=False)
-    """Nearer returns are left out."""
+    """Nearer returns, in metres, are left out."""
     far_m: float | None = Field(default=None, gt=0, allow_inf_nan=False)
-    """Farther returns are left out."""
+    """Farther returns, in metres, are left out."""
     las: bool = False
-    """Write points.las too (LAS 1.4)."""
+    """Write points.las (LAS 1.4) too; needs laspy: pip install 'relit[las]'."""

@@ -1,55 +1,60 @@
-"""What can be asked of `relit simulate`: one frozen model a kind of camera."""
+"""What `relit simulate` takes: one frozen model a kind of camera."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import Field
+
+from service.requests.base import Commas, Options, Role, Spelling
 
 Above0 = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotBelow0 = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
-def _numbers(given: Any) -> Any:
-    return tuple(part.strip() for part in given.split(",")) if isinstance(given, str) else given
-
-
-class SimulateRequest(BaseModel):
+class SimulateRequest(Options):
     """Base: the scene, and where to put the capture."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    depth: Path
+    depth: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="DEPTH")]
     """A depth.exr, or its folder: the scene and its camera."""
-    out: Path
+    out: Annotated[Path, Role.OUTPUT]
     """Folder of the capture."""
     albedo: Annotated[float, Field(gt=0, le=1)] = 0.5
-    """Of every surface."""
-    seed: int | None = 0
-    """Of the noise; None: no noise."""
+    """Albedo of every surface."""
+    seed: int = 0
+    """Seed of the noise."""
+    noise: bool = True
+    """Shot and read noise."""
 
 
 class SimulateCwRequest(SimulateRequest):
-    """Correlation images."""
+    """Correlation images of a continuous-wave camera."""
 
-    modulation_hz: Annotated[tuple[Above0, ...], BeforeValidator(_numbers), Field(min_length=1)] = (20e6, 30e6, 80e6)
-    """As text, numbers with commas between."""
+    modulation_hz: Annotated[tuple[Above0, ...], Commas, Field(min_length=1)] = (20e6, 30e6, 80e6)
+    """Frequencies, as text with commas between."""
     phases: Annotated[int, Field(ge=3)] = 4
+    """Images a frequency, evenly spaced in phase."""
     signal_electrons: Above0 = 1e5
-    """Of a white surface that faces the camera at one metre, in one image."""
+    """Electrons of a white surface that faces the camera at one metre, in one image."""
     ambient_electrons: NotBelow0 = 0.0
+    """Electrons of ambient light on a white surface, in one image."""
     read_noise_electrons: NotBelow0 = 5.0
+    """Standard deviation of the read noise, in electrons."""
     full_well: Above0 | None = None
+    """Electrons at which a reading saturates; None: none does."""
 
 
 class SimulatePulsedRequest(SimulateRequest):
-    """Photon histograms."""
+    """Photon histograms of a pulsed camera."""
 
     bins: Annotated[int, Field(ge=3)] = 64
+    """Bins of a histogram."""
     bin_s: Above0 = 1.5e-9
+    """Seconds a bin."""
     pulse_sigma_s: Above0 = 1.2e-9
+    """Standard deviation of the pulse, in seconds."""
     signal_photons: Above0 = 4000.0
-    """Of a white surface that faces the camera at one metre, all pulses together."""
+    """Photons of a white surface that faces the camera at one metre, all pulses together."""
     background: NotBelow0 = 0.5
-    """Photons a bin."""
+    """Photons of ambient light a bin, all pulses together."""
     pulses: Annotated[int, Field(ge=1)] | None = None
-    """With it, only the first photon after each pulse is counted."""
+    """Number of pulses; with it, only the first photon after each pulse is counted."""

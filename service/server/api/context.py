@@ -8,13 +8,14 @@ import sqlalchemy as sa
 from fastapi import Depends, Header, Request, Security
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
+from service.requests.keys import Scope
 from service.server.api.limits import Limiter
 from service.server.api.local import require_local
 from service.server.api.problems import ApiError
 from service.server.api.watch import Watcher
 from service.server.database import idempotency, keys
 from service.server.database.engine import Database
-from service.server.database.keys import Caller, Scope
+from service.server.database.keys import Caller
 from service.server.jobs.queue import JobQueue
 from service.server.settings import Settings
 from service.server.storage.folder import Storage

@@ -10,13 +10,14 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from service.requests.identifiers import CAPTURE, ENVIRONMENT, CaptureId, EnvironmentId, new_id
 from service.requests.jobs import CheckJob
+from service.requests.keys import Scope
 from service.server.api.context import IdempotencyKey, Reader, Service, ServiceDep, Writer, once
 from service.server.api.problems import ApiError, responses
 from service.server.api.space import FOR_WORK, require_space
 from service.server.api.submission import submit
 from service.server.api.views import intake_view
 from service.server.database import intakes, jobs, uploads
-from service.server.database.keys import Caller, Scope
+from service.server.database.keys import Caller
 from service.server.safe_names import shown
 from service.server.storage import layout
 from service.server.storage.parts import Part, parts_folder

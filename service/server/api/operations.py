@@ -8,6 +8,7 @@ from fastapi import APIRouter, Depends, Request, Response, Security
 from fastapi.security import HTTPAuthorizationCredentials
 from pydantic import BaseModel
 
+from service.requests.keys import Scope
 from service.server.api.context import Service, ServiceDep, bearer, caller_of
 from service.server.api.local import require_local
 from service.server.api.metrics import CONTENT_TYPE
@@ -15,7 +16,6 @@ from service.server.api.problems import ApiError, responses
 from service.server.api.space import has_space
 from service.server.database import workers
 from service.server.database.engine import UNANSWERED
-from service.server.database.keys import Scope
 from stage.errors import StorageError
 
 router = APIRouter(tags=["operations"])

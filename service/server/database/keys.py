@@ -4,13 +4,12 @@ import hashlib
 import hmac
 import secrets
 import time
-from enum import StrEnum
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import sqlalchemy as sa
-from pydantic import BaseModel, StringConstraints
 
-from service.requests.identifiers import KEY, Project, new_id
+from service.requests.identifiers import KEY, new_id
+from service.requests.keys import NewKey, Scope
 from service.server.database.engine import Database
 from service.server.database.tables import keys
 
@@ -18,26 +17,7 @@ SECRET_BYTES = 32
 """256 random bits: no one finds them by trying, so that one round of SHA-256 is enough."""
 
 
-class Scope(StrEnum):
-    """What a key allows; each allows what those before it do."""
-
-    READ = "read"
-    """See captures, jobs and results."""
-    WRITE = "write"
-    """Upload, hand in jobs, cancel them, delete what is the project's."""
-    ADMIN = "admin"
-    """Register folders of the server."""
-
-
 ORDER = list(Scope)
-
-
-class NewKey(BaseModel):
-    """A key that is to be made."""
-
-    project: Project
-    name: Annotated[str, StringConstraints(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]+$")]
-    scope: Scope
 
 
 class Caller(NamedTuple):

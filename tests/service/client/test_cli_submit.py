@@ -97,7 +97,7 @@ def test_a_job_that_fails_is_one_sentence_and_exit_code_1(relit, owl: str):
     (["relight", str(OWL), "--weights", "other"], "'--weights'"),
     (["relight", str(OWL), "--frames", "9-1"], "runs backwards"),
     (["relight", str(OWL)], "nothing lights the frames"),
-    (["solve", str(OWL), "--priority", "101"], "'--priority'"),
+    (["solve", str(OWL), "--priority", "101"], "priority: is 101: input should be less than or equal to 100"),
     (["solve", str(OWL), "--job-name", "two\nlines"], "name: "),
     (["solve", str(OWL), "--server", "nowhere"], "nowhere: is no URL of a service"),
     (["solve", str(OWL), "--out", f"{SKY}/out"], "cannot make "),

@@ -15,8 +15,8 @@ import httpx2
 import pytest
 
 from service.demo.demo import sample_folder
+from service.requests.keys import Scope
 from service.server.database.engine import connect
-from service.server.database.keys import Scope
 from service.server.jobs.queue import JobQueue, prepare
 from service.server.sample import greet
 from service.server.settings import Settings

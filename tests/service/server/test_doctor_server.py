@@ -5,9 +5,9 @@ import sqlalchemy as sa
 
 from service.requests.identifiers import CAPTURE, new_id
 from service.requests.jobs import CheckJob
+from service.requests.keys import NewKey, Scope
 from service.server.database import keys, workers
 from service.server.database.engine import connect
-from service.server.database.keys import NewKey, Scope
 from service.server.database.tables import about
 from service.server.jobs.queue import JobQueue, prepare
 from service.server.settings import Settings

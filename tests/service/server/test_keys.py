@@ -2,10 +2,9 @@
 
 import pytest
 
-from service.cli.keys import ScopeName
+from service.requests.keys import Scope
 from service.server.database import keys
 from service.server.database.engine import connect
-from service.server.database.keys import Scope
 from service.server.settings import Settings
 
 
@@ -23,10 +22,6 @@ def made(relit, data):
         return outcome.out.removesuffix("\n")
 
     return make
-
-
-def test_the_scopes_are_those_of_the_store():
-    assert {scope.name: scope.value for scope in ScopeName} == {scope.name: scope.value for scope in Scope}
 
 
 def test_a_key_is_printed_alone_and_opens_its_project(made, data):

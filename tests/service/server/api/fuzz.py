@@ -8,6 +8,7 @@ from pathlib import Path
 
 from service.requests.identifiers import CAPTURE, ENVIRONMENT, new_id
 from service.requests.jobs import RelightJob, SolveJob
+from service.requests.keys import NewKey, Scope
 from service.server.database import intakes, jobs, keys, tables
 from service.server.database.engine import Database, connect
 from service.server.jobs.queue import JobQueue
@@ -57,7 +58,7 @@ def seed(settings: Settings) -> tuple[str, dict[str, list[str]]]:
     """A key, and captures, environments and jobs in several states; no worker is needed."""
     database = connect(settings.sqlalchemy_url)
     queue = JobQueue(database)
-    key = keys.create(database, keys.NewKey(project=PROJECT, name="fuzz", scope=keys.Scope.ADMIN))
+    key = keys.create(database, NewKey(project=PROJECT, name="fuzz", scope=Scope.ADMIN))
     captures = [_intake(database, CAPTURE, ready=state) for state in (True, True, False)]
     environments = [_intake(database, ENVIRONMENT, ready=state) for state in (True, False)]
     solve = SolveJob(kind="solve", capture=captures[0])

@@ -8,9 +8,9 @@ import httpx2
 import pytest
 
 from service.requests.identifiers import new_id
+from service.requests.keys import NewKey, Scope
 from service.server.database import idempotency, intakes, keys
 from service.server.database.engine import Database, connect, create
-from service.server.database.keys import NewKey, Scope
 from service.server.settings import Settings
 from tests.service.postgres import binaries, postgres
 from tests.service.server.api.conftest import SAMPLES

@@ -5,12 +5,12 @@ from collections.abc import Iterator
 import httpx2
 import pytest
 
+from service.requests.keys import NewKey, Scope
 from service.server.api import limits
 from service.server.api.limits import Limiter
 from service.server.api.problems import ApiError
 from service.server.database import intakes, jobs, keys
 from service.server.database.engine import Database, connect
-from service.server.database.keys import NewKey, Scope
 from service.server.settings import Settings
 from tests.service.server.api.conftest import SAMPLES
 from tests.service.server_process import Server, serving

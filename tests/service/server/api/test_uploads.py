@@ -15,10 +15,10 @@ from pathlib import Path
 import pytest
 
 from service.requests.identifiers import CAPTURE, new_id
+from service.requests.keys import NewKey, Scope
 from service.server.database import keys, uploads
 from service.server.database.engine import connect, create
 from service.server.database.intakes import insert as insert_intake
-from service.server.database.keys import NewKey, Scope
 from service.server.storage.parts import Part, PartLocked
 from tests.service.postgres import binaries, postgres
 from tests.service.server.api.conftest import SAMPLES

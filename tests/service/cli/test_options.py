@@ -1,0 +1,158 @@
+"""Every option stands once, in the field of a request model: whatever is made from it says the same."""
+
+import re
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+from pydantic import BaseModel
+from typer.main import get_command
+
+from service.cli.main import app
+from service.requests import (
+    basis,
+    calibrate,
+    captures,
+    demo,
+    depth,
+    export,
+    jobs,
+    keys,
+    patterns,
+    relight,
+    scan,
+    shade,
+    simulate,
+    solve,
+)
+from service.requests.base import Choice, Options, Role
+from service.requests.options import build, options_of, typed, values_of
+
+COMMANDS: dict[str, list[type[Options]]] = {
+    "solve": [solve.SolveRequest], "export": [export.ExportRequest], "depth": [depth.DepthRequest], "scan": [scan.ScanRequest],
+    "simulate cw": [simulate.SimulateCwRequest], "simulate pulsed": [simulate.SimulatePulsedRequest],
+    "patterns": [patterns.PatternsRequest, patterns.PlanRequest], "relight": [relight.RelightRequest], "shade": [shade.ShadeRequest],
+    "basis": [basis.BasisRequest], "import": [captures.ImportRequest], "demo": [demo.DemoRequest], "bench": [demo.BenchRequest],
+    "keys create": [keys.NewKey], "calibrate mirror-ball": [calibrate.MirrorBallRequest],
+    "calibrate light-positions": [calibrate.LightPositionsRequest], "calibrate grey-ball": [calibrate.GreyBallRequest],
+    "calibrate intensity": [calibrate.IntensityRequest], "calibrate dark": [calibrate.DarkRequest],
+    "calibrate flat-field": [calibrate.FlatFieldRequest], "calibrate saturation": [calibrate.SaturationRequest],
+    "calibrate procam": [calibrate.ProcamRequest], "calibrate response": [calibrate.ResponseRequest],
+    "calibrate tof": [calibrate.TofCalibrationRequest],
+    "submit solve": [jobs.SolveJob], "submit depth": [jobs.DepthJob], "submit relight": [jobs.RelightJob], "submit shade": [jobs.ShadeJob],
+    "submit export": [jobs.ExportJob], "submit pipeline": [jobs.PipelineJob],
+    "farm template relight": [relight.RelightRequest], "farm template shade": [shade.ShadeRequest],
+}
+OWN = {
+    "relight": {"progress"}, "shade": {"progress"}, "patterns": {"plan"}, "demo": {"serve"}, "keys create": {"data", "config"},
+    **{name: {"server", "key", "wait", "out", "cancel_on_interrupt"} for name in COMMANDS if name.startswith("submit")},
+    "farm template relight": {"job", "chunk_frames", "gpu"}, "farm template shade": {"job", "turns", "gpu"},
+}
+"""Options that a command has beside those of its models."""
+KINDS = {"solve": jobs.SolveJob, "depth": jobs.DepthJob, "relight": jobs.RelightJob, "shade": jobs.ShadeJob, "export": jobs.ExportJob}
+
+
+class Shown(NamedTuple):
+    """What a command says about an option."""
+
+    flags: tuple[str, ...]
+    default: Any
+    help: str
+
+
+def parameters(name: str) -> dict[str, Any]:
+    command: Any = get_command(app)
+    for word in name.split():
+        command = command.commands[word]
+    return {parameter.name: parameter for parameter in command.params}
+
+
+def shown(name: str) -> dict[str, Shown]:
+    return {key: Shown((*found.opts, *found.secondary_opts), found.default, found.help) for key, found in parameters(name).items()}
+
+
+def in_schema(model: type[BaseModel]) -> dict[str, dict[str, Any]]:
+    """The properties of a model's JSON schema and of those within it, by name."""
+    document = model.model_json_schema()
+    found: dict[str, dict[str, Any]] = {}
+
+    def visit(schema: dict[str, Any]) -> None:
+        for name, property in schema["properties"].items():
+            inner = document["$defs"].get(property.get("$ref", "").rpartition("/")[2], {})
+            if "properties" in inner and name in ("options", "tof"):
+                visit(inner)
+            else:
+                found[name] = property
+
+    visit(document)
+    return found
+
+
+def plain(text: str) -> str:
+    """Words alone, as they are in a schema and in a help."""
+    text = re.sub(r"\bnone: ", "without it ", text.lower())
+    return re.sub(r"[^a-z0-9]+", " ", text.replace("_", " ")).strip()
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_command_has_the_options_of_its_models_and_its_own(name):
+    models, left_out = COMMANDS[name], {Role.RUN} if name.startswith("farm") else set()
+    found = parameters(name)
+    options = {option.name: option for model in reversed(models) for option in options_of(model) if option.role not in left_out}
+    extra = OWN.get(name, set()) | ({"device"} if not name.startswith(("submit", "farm", "keys")) else set())
+    assert found.keys() == options.keys() | extra
+    for option in options.values():
+        parameter = found[option.name]
+        wanted = option.field.get_default() if not option.field.is_required() else None
+        assert parameter.default == (typed(wanted) or None if isinstance(wanted, tuple) else wanted or (wanted if wanted == 0 else None))
+        if parameter.param_type_name == "option":
+            assert option.flag in parameter.opts
+        assert plain(parameter.help).startswith(plain(option.field.description)) and len(option.field.description) > 3
+        assert parameter.required == (option.field.is_required() and all(option.name in {o.name for o in options_of(m)} for m in models))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_choice_is_the_same_here_there_and_in_the_schema(kind):
+    """Compared without service.requests.options: names, flags, defaults and words."""
+    here, there, schema = shown(kind), shown(f"submit {kind}"), in_schema(KINDS[kind])
+    names = {option.field.alias or option.name for option in options_of(COMMANDS[kind][0]) if option.role is Role.CHOICE}
+    assert names and names <= there.keys()
+    others = {option.name for option in options_of(KINDS[kind]) if option.role is not Role.CHOICE} | {"format"}
+    assert there.keys() - names - OWN[f"submit {kind}"] <= others
+    farm = shown(f"farm template {kind}") if f"farm template {kind}" in COMMANDS else here
+    for name in names:
+        assert here[name] == there[name] == farm[name]
+        field = {"return_": "which", "filter": "filters"}.get(name, name)
+        assert plain(here[name].help).startswith(plain(schema[field]["description"]))
+        default = schema[field].get("default")
+        assert default in ([], "") or here[name].default == (",".join(default) if isinstance(default, list) else default)
+
+
+def test_the_options_of_a_pipeline_are_those_of_its_parts():
+    found = shown("submit pipeline")
+    for kind in ("solve", "export", "relight"):
+        there = shown(f"submit {kind}")
+        for option in options_of(KINDS[kind]):
+            if option.role is Role.CHOICE:
+                assert found[option.name] == there[option.name]
+
+
+def test_what_is_typed_builds_the_request_and_back():
+    given = {"capture": Path("c"), "out": "o.#.exr", "aov": "beauty,mask", "exposure": 1.5, "align": True}
+    request = build(relight.RelightRequest, given)
+    assert request == relight.RelightRequest(capture=Path("c"), out="o.#.exr", aov=("beauty", "mask"), exposure=1.5, align=True)
+    values = {option.name: value for option, value in values_of(request)}
+    assert values.keys() == {option.name for option in options_of(relight.RelightRequest)}
+    assert {name: typed(values[name]) for name in given} == {name: str(value) for name, value in given.items()}
+    inner = build(depth.DepthRequest, {"capture": Path("c"), "out": Path("o"), "filter": "flying", "return_": "first"})
+    assert inner.tof == depth.TofOptions(filters=("flying",), which="first")
+    pipeline = build(jobs.PipelineJob, {"capture": f"cap_{'0' * 20}", "align": True, "name": "owl", "job_name": "night"})
+    assert (pipeline.kind, pipeline.solve.align, pipeline.relight.align) == ("pipeline", True, True)
+    assert (pipeline.name, pipeline.export.name) == ("night", "owl")
+
+
+def test_every_choice_is_explained_once():
+    """In help as in the schema; the words stand beside the value."""
+    for option in options_of(solve.SolveRequest):
+        if isinstance(option.kind, type) and issubclass(option.kind, Choice):
+            assert all(f"{value}: {value.words}" in shown("solve")[option.name].help for value in option.kind)
