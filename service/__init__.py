@@ -1,4 +1,4 @@
-"""The roof: one folder a product, where stage and kernels meet; and the doors that people use."""
+"""The products of Relit, one folder each, in which stage and kernels meet, and the ways to use them."""
 
 from importlib.metadata import PackageNotFoundError, version
 

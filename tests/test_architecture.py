@@ -64,7 +64,7 @@ def test_the_imports_are_read():
     """If this fails, the others prove nothing."""
     assert len(FILES) > 60
     assert Import("service.solve.solve", "stage.capture.Capture", False) in IMPORTS
-    assert Import("service.cli.results", "service.solve.solve.solve", True) in IMPORTS
+    assert Import("service.cli.solve", "service.solve.solve.solve", True) in IMPORTS
     assert any(i.importer == "kernels.device" and i.target == "warp" for i in IMPORTS)
 
 
@@ -120,7 +120,7 @@ def test_the_command_line_knows_kernels_and_warp_lightly():
     may, when they are called."""
     knowing = {i for i in IMPORTS if under(i.importer, "service.cli") and top(i.target) in ("kernels", "warp")}
     assert all(i.lazy for i in knowing)
-    assert {i.importer for i in knowing} <= {"service.cli.doctor", "service.cli.options"}
+    assert {i.importer for i in knowing} <= {"service.cli.doctor", "service.cli.request_commands"}
 
 
 def test_the_roof_outside_the_products_knows_no_warp():

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from service.cli.bar import Bar
+from service.cli.progress import ProgressBar
 from service.cli.request_commands import local_command
 from service.requests.calibrate import (
     DarkRequest,
@@ -44,7 +44,7 @@ def register(app: typer.Typer) -> None:
 def _mirror_ball(request: MirrorBallRequest) -> None:
     from service.calibrate.lights import mirror_ball
 
-    with Bar() as bar:
+    with ProgressBar() as bar:
         result = mirror_ball(request, bar)
     _print_lights(result)
 
@@ -52,7 +52,7 @@ def _mirror_ball(request: MirrorBallRequest) -> None:
 def _light_positions(request: LightPositionsRequest) -> None:
     from service.calibrate.lights import light_positions
 
-    with Bar() as bar:
+    with ProgressBar() as bar:
         result = light_positions(request, bar)
     _print_lights(result)
 
@@ -60,7 +60,7 @@ def _light_positions(request: LightPositionsRequest) -> None:
 def _grey_ball(request: GreyBallRequest) -> None:
     from service.calibrate.lights import grey_ball
 
-    with Bar() as bar:
+    with ProgressBar() as bar:
         result = grey_ball(request, bar)
     _print_lights(result)
 
@@ -68,7 +68,7 @@ def _grey_ball(request: GreyBallRequest) -> None:
 def _intensity(request: IntensityRequest) -> None:
     from service.calibrate.object import intensity
 
-    with Bar() as bar:
+    with ProgressBar() as bar:
         result = intensity(request, bar)
     _print_lights(result)
 
@@ -76,7 +76,7 @@ def _intensity(request: IntensityRequest) -> None:
 def _dark(request: DarkRequest) -> None:
     from service.calibrate.images import dark
 
-    with Bar() as bar:
+    with ProgressBar() as bar:
         result = dark(request, bar)
     _print_image("dark", result)
 
@@ -84,7 +84,7 @@ def _dark(request: DarkRequest) -> None:
 def _flat_field(request: FlatFieldRequest) -> None:
     from service.calibrate.images import flat_field
 
-    with Bar() as bar:
+    with ProgressBar() as bar:
         result = flat_field(request, bar)
     _print_image("flat", result)
 
@@ -92,7 +92,7 @@ def _flat_field(request: FlatFieldRequest) -> None:
 def _saturation(request: SaturationRequest) -> None:
     from service.calibrate.images import saturation
 
-    with Bar() as bar:
+    with ProgressBar() as bar:
         result = saturation(request, bar)
     print(f"level    {result.level:g}")
     print("readings " + ", ".join(f"{count} {name}" for count, name in zip(result.counts, ("red", "green", "blue"), strict=True)))
@@ -104,7 +104,7 @@ def _saturation(request: SaturationRequest) -> None:
 def _procam(request: ProcamRequest) -> None:
     from service.calibrate.procam import procam
 
-    with Bar() as bar:
+    with ProgressBar() as bar:
         result = procam(request, bar)
     for path in result.manifest_paths:
         print(f"capture  {path}")
@@ -117,7 +117,7 @@ def _procam(request: ProcamRequest) -> None:
 def _response(request: ResponseRequest) -> None:
     from service.calibrate.response import response
 
-    with Bar() as bar:
+    with ProgressBar() as bar:
         result = response(request, bar)
     print(f"capture  {result.manifest_path}")
     print(f"report   {result.report_path}")
@@ -127,7 +127,7 @@ def _response(request: ResponseRequest) -> None:
 def _tof(request: TofCalibrationRequest) -> None:
     from service.calibrate.tof import calibrate_tof
 
-    with Bar() as bar:
+    with ProgressBar() as bar:
         result = calibrate_tof(request.sweep, request.out, device=request.device, progress=bar)
     print(f"file     {result.path}")
     drift = result.calibration.temperature

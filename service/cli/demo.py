@@ -1,13 +1,13 @@
-"""relit demo."""
+"""relit demo, relit bench: the main job on the shipped sample, and the speed table, measured here and now."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from service.cli.bar import Bar
+from service.cli.progress import ProgressBar
 from service.cli.request_commands import local_command
-from service.requests.demo import DemoRequest
+from service.requests.demo import BenchRequest, DemoRequest
 
 SERVICE = "service"
 """Folder of the service, in that of the demo."""
@@ -16,14 +16,15 @@ ServeOption = Annotated[bool, typer.Option("--serve", help="Then open the servic
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Add the commands."""
     local_command(app, "demo", _demo)
+    local_command(app, "bench", _bench)
 
 
 def _demo(request: DemoRequest, serve: ServeOption = False) -> None:
     from service.demo.demo import demo
 
-    with Bar() as bar:
+    with ProgressBar() as bar:
         result = demo(request.out, device=request.device, progress=bar)
     print(f"maps     {result.solved.maps_path}")
     print(f"report   {result.solved.report_path}")
@@ -44,3 +45,11 @@ def open_service(data: Path, device: str | None) -> None:
     sample = sample_folder()
     serve(settings_of(None, data=data, host="127.0.0.1", anonymous=True, roots=(sample,), devices=(device,) if device else None),
           greet=lambda address, database, queue: greet(address, database, queue, sample))
+
+
+def _bench(request: BenchRequest) -> None:
+    from service.demo.bench import bench
+
+    with ProgressBar() as bar:
+        lines = bench(request.device, request.repeats, bar)
+    print("\n".join(lines))

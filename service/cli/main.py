@@ -8,32 +8,11 @@ from typing import Annotated
 import typer
 from typer.exceptions import TyperException
 
-from service.cli import (
-    basis,
-    calibrate,
-    capture,
-    demo,
-    depth,
-    doctor,
-    farm,
-    jobs,
-    keys,
-    measure,
-    patterns,
-    relight,
-    results,
-    scan,
-    separate,
-    server,
-    shade,
-    simulate,
-    submit,
-)
+from service.cli import calibrate, captures, demo, depth, doctor, farm, jobs, keys, light, server, solve, submit
 
 app = typer.Typer(name="relit", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
                   help="Active-illumination captures to normals, materials, depth, USD assets and relit frames.")
-for module in (demo, capture, calibrate, results, depth, separate, scan, simulate, patterns, relight, shade, basis, doctor, measure,
-               server, submit, jobs, keys, farm):
+for module in (demo, captures, calibrate, solve, depth, light, doctor, server, submit, jobs, keys, farm):
     module.register(app)
 
 BAD_INPUT, INTERRUPTED = 2, 130

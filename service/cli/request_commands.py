@@ -6,7 +6,7 @@ service.requests becomes the options of that model, and the function gets the mo
     def _solve(request: SolveRequest) -> None:
         from service.solve.solve import solve  # heavy imports stand inside commands
 
-        with Bar() as bar:
+        with ProgressBar() as bar:
             result = solve(request, bar)
         print(f"maps     {result.maps_path}")
 
@@ -30,7 +30,6 @@ from typing import Annotated, Any, Generic, Literal, get_args, get_origin
 import typer
 from pydantic import BaseModel, BeforeValidator
 
-from service.cli.options import HostOption
 from service.requests.base import Options, Role
 from service.requests.options import Model, Option, build, help_text, options_of, typed
 
@@ -38,6 +37,20 @@ ORDER = (Role.INPUT, Role.OUTPUT, Role.CHOICE, Role.RUN, Role.MACHINE)
 """In which the help lists options."""
 READ_BY_TYPER = (bool, int, float, Path, Enum)
 """Types that Typer reads; anything else is a text that the model takes apart."""
+
+
+def _known(name: str | None) -> str | None:
+    """Refuse a device that is not on this machine, also where the work is done on the CPU in any case."""
+    if name is not None:
+        from kernels.device import resolve
+
+        resolve(name)
+    return name
+
+
+HostOption = Annotated[str | None, typer.Option(
+    "--device", callback=_known, show_default=False,
+    help="Taken by every command, so that scripts can name it once; this one works on the CPU in any case.")]
 
 
 class Given(Generic[Model]):

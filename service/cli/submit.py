@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from service.cli.bar import Bar
+from service.cli.progress import ProgressBar
 from service.cli.request_commands import Given, command
 from service.cli.service_options import CancelOption, KeyOption, ResultsOption, ServerOption, WaitOption, connected
 from service.cli.waiting import make_folder, wait_for
@@ -79,7 +79,7 @@ def _send(client: "Client", prefix: str, given: str) -> str:
     elif not path.exists() and re.fullmatch(pattern(prefix), given):
         return given
     else:
-        with Bar() as bar:
+        with ProgressBar() as bar:
             found = intakes.upload(path, progress=bar)
     print(f"{what:<11} {found.id}", flush=True)
     return found.id

@@ -24,11 +24,11 @@ def wait_for(client: "Client", job: str, *, out: Path | None, cancel_on_interrup
     Raises:
         typer.Exit: with code 1: it did not succeed.
     """
-    from service.cli.bar import Bar
+    from service.cli.progress import ProgressBar
     from service.client import JobEnded
 
     try:
-        with Bar() as bar:
+        with ProgressBar() as bar:
             ended = client.jobs.wait(job, progress=bar)
     except JobEnded as error:
         print(f"relit: {error}", file=sys.stderr)
@@ -60,9 +60,9 @@ def make_folder(out: Path) -> None:
 
 def download(client: "Client", job: str, out: Path) -> None:
     """Fetch what a job has made."""
-    from service.cli.bar import Bar
+    from service.cli.progress import ProgressBar
 
-    with Bar() as bar:
+    with ProgressBar() as bar:
         found = client.jobs.download(job, out, progress=bar)
     last = f" … {found[-1].name}" if len(found) > 1 else ""
     print(f"results     {found[0]}{last}" if found else "results     none")

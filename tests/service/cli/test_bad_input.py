@@ -214,7 +214,7 @@ def test_results_that_cannot_be_written(relit, tmp_path):
 
 AS_NOBODY = """
 import os, sys
-import service.cli.main, service.errors, service.cli.bar, service.captures.inspect, service.solve.solve
+import service.cli.main, service.errors, service.cli.progress, service.captures.inspect, service.solve.solve
 service.solve.solve.devices.names()  # what starting Warp writes is not the matter here
 if os.geteuid() == 0:
     os.seteuid(65534)

@@ -21,6 +21,7 @@ from service.requests import (
     patterns,
     relight,
     scan,
+    separate,
     shade,
     simulate,
     solve,
@@ -30,6 +31,7 @@ from service.requests.options import build, options_of, typed, values_of
 
 COMMANDS: dict[str, list[type[Options]]] = {
     "solve": [solve.SolveRequest], "export": [export.ExportRequest], "depth": [depth.DepthRequest], "scan": [scan.ScanRequest],
+    "separate": [separate.SeparateRequest],
     "simulate cw": [simulate.SimulateCwRequest], "simulate pulsed": [simulate.SimulatePulsedRequest],
     "patterns": [patterns.PatternsRequest, patterns.PlanRequest], "relight": [relight.RelightRequest], "shade": [shade.ShadeRequest],
     "basis": [basis.BasisRequest], "import": [captures.ImportRequest], "demo": [demo.DemoRequest], "bench": [demo.BenchRequest],

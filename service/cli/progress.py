@@ -1,9 +1,12 @@
-"""Progress on a terminal; silence where the output is not one; lines for the worker of a farm where they are asked for."""
+"""Progress of a command: a bar on a terminal, nothing where the output is none, or lines for the worker of a farm."""
 
 import sys
-from enum import StrEnum
 from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Annotated, Self
+
+import typer
+
+from service.requests.base import Choice
 
 if TYPE_CHECKING:
     from rich.progress import Progress as RichProgress
@@ -11,28 +14,29 @@ if TYPE_CHECKING:
 
 
 COUNTED = ("frames", "shade")
-"""Stages that a farm's percentage counts: the others are short, or come once."""
+"""Stages that the percentage of a farm counts: the others are short, or come once."""
 
 
-class ProgressStyle(StrEnum):
+class ProgressStyle(Choice):
     """How progress is shown."""
 
-    BAR = "bar"
-    """On a terminal, else not at all."""
-    OPENJD = "openjd"
-    """Lines that a worker of a farm reads (Open Job Description)."""
+    BAR = "bar", "on a terminal, else not at all"
+    OPENJD = "openjd", "lines that a farm's worker reads (docs/farm.md)"
 
 
-def show(style: ProgressStyle) -> "Bar | FarmLines":
-    """Progress in a style."""
-    return FarmLines() if style is ProgressStyle.OPENJD else Bar()
+ProgressOption = Annotated[ProgressStyle, typer.Option("--progress", help=f"{ProgressStyle.explained()}.")]
 
 
-class Bar:
-    """A service.reporting.progress.Progress that draws one line a stage on standard error."""
+def progress_in(style: ProgressStyle) -> "ProgressBar | OpenJdProgress":
+    """Return what shows progress in a style."""
+    return OpenJdProgress() if style is ProgressStyle.OPENJD else ProgressBar()
+
+
+class ProgressBar:
+    """A service.reporting.progress.Progress that draws one line for each stage on standard error."""
 
     def __init__(self) -> None:
-        """Nothing is drawn before the first stage, and nothing at all when standard error is not a terminal."""
+        """Draw nothing before the first stage, and nothing at all where standard error is not a terminal."""
         self._task: TaskID | None = None
         self._bar: RichProgress | None = None
         if sys.stderr.isatty():
@@ -73,32 +77,32 @@ class Bar:
             self._bar.update(self._task, completed=task.total)
 
 
-class FarmLines:
-    """A service.reporting.progress.Progress that says on standard output what the task does, and how much of it is done.
+class OpenJdProgress:
+    """A service.reporting.progress.Progress that prints on standard output what the task does, and how much of it is done.
 
     Source: Open Job Description, How Jobs Are Run, Stdout/Stderr Messages.
     """
 
     def __init__(self) -> None:
-        """Nothing is said before the first stage."""
+        """Print nothing before the first stage."""
         self._stage, self._total, self._told = "", 0, -1
 
     def __enter__(self) -> Self:
-        """Nothing is to be begun."""
+        """Return the object: there is nothing to begin."""
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        """All of it is done, unless an error ended it."""
+        """Print that all is done, unless an error ended it."""
         if error is None:
             print("openjd_progress: 100", flush=True)
 
     def stage(self, name: str, total: int) -> None:
-        """Say what begins."""
+        """Print the name of the stage that begins."""
         self._stage, self._total = name, total
         print(f"openjd_status: {name}", flush=True)
 
     def advance(self, done: int) -> None:
-        """Say each whole percentage once."""
+        """Print each whole percentage once."""
         percent = 100 * done // max(self._total, 1)
         if self._stage in COUNTED and self._told < percent < 100:
             self._told = percent

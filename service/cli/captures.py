@@ -1,11 +1,15 @@
 """relit import, relit info: captures in."""
 
+from pathlib import Path
+from typing import Annotated
+
 import typer
 
-from service.cli.bar import Bar
-from service.cli.options import CaptureArgument, HostOption
-from service.cli.request_commands import local_command
+from service.cli.progress import ProgressBar
+from service.cli.request_commands import HostOption, local_command
 from service.requests.captures import ImportFormat, ImportRequest
+
+CaptureArgument = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder with a capture.json.", show_default=False)]
 
 
 def register(app: typer.Typer) -> None:
@@ -32,7 +36,7 @@ def info(capture: CaptureArgument, device: HostOption = None) -> None:
     from service.captures.inspect import inspect
     from stage.errors import StageError
 
-    with Bar() as bar:
+    with ProgressBar() as bar:
         found = inspect(capture, bar)
     for name, value in found.facts:
         print(f"{name:<12} {value}")

@@ -1,9 +1,10 @@
-"""relit solve, relit export: results out."""
+"""relit solve, relit basis, relit export: from a capture to maps or coefficient images, and from results to an asset."""
 
 import typer
 
-from service.cli.bar import Bar
+from service.cli.progress import ProgressBar
 from service.cli.request_commands import local_command
+from service.requests.basis import BasisRequest
 from service.requests.export import ExportRequest
 from service.requests.solve import SolveRequest
 
@@ -12,12 +13,13 @@ def register(app: typer.Typer) -> None:
     """Add the commands."""
     local_command(app, "solve", _solve)
     local_command(app, "export", _export)
+    local_command(app, "basis", _basis)
 
 
 def _solve(request: SolveRequest) -> None:
     from service.solve.solve import solve
 
-    with Bar() as bar:
+    with ProgressBar() as bar:
         result = solve(request, bar)
     print(f"maps     {result.maps_path}")
     print(f"report   {result.report_path}")
@@ -31,5 +33,21 @@ def _solve(request: SolveRequest) -> None:
 def _export(request: ExportRequest) -> None:
     from service.usd.export import export
 
-    with Bar() as bar:
+    with ProgressBar() as bar:
         print(f"asset    {export(request, bar)}")
+
+
+def _basis(request: BasisRequest) -> None:
+    from service.basis.basis import make_basis
+
+    with ProgressBar() as bar:
+        result = make_basis(request, bar)
+    print(f"basis    {result.path}")
+    print(f"facts    {result.facts_path}")
+    shown = "" if result.levels_rms is None else f" of what is shown, {result.levels_rms:.1f} of 255"
+    print(f"error    {100 * result.relative_rms:.3g} % RMS{shown}: {result.terms} coefficients a channel, {result.lights} lights, "
+          f"{result.pixels} pixels")
+    if result.left_out:
+        print(f"lights   {result.left_out} are not in front of the object and are left out")
+    if result.near_lights:
+        print(f"lights   {result.near_lights} near lights are taken as distant, as the object's centre sees them")

@@ -1,22 +1,23 @@
-"""relit relight: frames of a capture, or of a sequence of captures, under new light."""
+"""relit relight, relit shade: new light on captures and on solved maps."""
 
 import typer
 
-from service.cli.bar import ProgressStyle, show
-from service.cli.options import ProgressOption
+from service.cli.progress import ProgressOption, ProgressStyle, progress_in
 from service.cli.request_commands import local_command
 from service.requests.relight import RelightRequest
+from service.requests.shade import ShadeRequest
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
+    """Add the commands."""
     local_command(app, "relight", _relight)
+    local_command(app, "shade", _shade)
 
 
 def _relight(request: RelightRequest, progress: ProgressOption = ProgressStyle.BAR) -> None:
     from service.light.relight import relight
 
-    with show(progress) as bar:
+    with progress_in(progress) as bar:
         result = relight(request, bar)
     last = f" … {result.frames[-1].name}" if len(result.frames) > 1 else ""
     print(f"frames   {result.frames[0]}{last}")
@@ -31,5 +32,17 @@ def _relight(request: RelightRequest, progress: ProgressOption = ProgressStyle.B
         print(f"report   {request.report}")
     if result.near_lights:
         print(f"lights   {result.near_lights} near lights are taken as distant, as the object's centre sees them")
+    if result.clipped:
+        print(f"clipped  {result.clipped} pixels are brighter than half can hold and stand at its largest value")
+
+
+def _shade(request: ShadeRequest, progress: ProgressOption = ProgressStyle.BAR) -> None:
+    from service.light.shade import shade
+
+    with progress_in(progress) as bar:
+        result = shade(request, bar)
+    print(f"picture  {result.path}")
+    if not result.metric:
+        print("scale    the maps have none: places of lights are taken in pixels")
     if result.clipped:
         print(f"clipped  {result.clipped} pixels are brighter than half can hold and stand at its largest value")
