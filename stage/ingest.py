@@ -81,7 +81,7 @@ class Ingest:
         """Return the stack from the cache, and build it first when the cache does not hold it.
 
         Args:
-            progress: called after every decoded frame.
+            progress: called after every decoded frame, or once with all frames when the cache holds the stack.
 
         Raises:
             ManifestError: a frame lies too far outside the tracking frames.
@@ -90,6 +90,8 @@ class Ingest:
         """
         found = stacks.find(self.folder, self.key)
         if found is not None:
+            if progress is not None:
+                progress(len(self.frames), len(self.frames))
             return found
         alignment = None if self.tracking is None else Alignment(self.capture, self.tracking, self.frames)
         with storage(f"make the stack cache{self.hint} in", self.folder):

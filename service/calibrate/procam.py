@@ -48,7 +48,7 @@ def procam(request: ProcamRequest, progress: Progress | None = None) -> ProcamRe
     """
     timings = Timings(progress)
     device = devices.resolve(request.device)
-    timings.stage("open", len(request.captures) + len(request.apply_to))
+    timings.stage("open", 1)
     captures = [Capture.open(path) for path in request.captures]
     others = [Capture.open(path) for path in request.apply_to]
     size = _projector_size(captures, request)

@@ -44,7 +44,8 @@ def inspect(path: Path, progress: Progress | None = None) -> Inspection:
     timings.stage("open", 1)
     capture = Capture.open(path)
     frames = [frame for frame in capture.manifest.frames if Path(frame.image).suffix.lower() != ".npy"]
-    timings.stage("frames", len(frames))
+    if frames:
+        timings.stage("frames", len(frames))
     levels = []
     with ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="relit-inspect") as pool:
         for level in pool.map(lambda frame: _level(capture, frame), frames):

@@ -24,14 +24,19 @@ class TransferProgress:
         """Args: progress: is told; None: nobody is. stage: name of the stage. total: bytes."""
         self._progress, self._done, self._lock = progress, 0, Lock()
         if progress is not None:
-            progress.stage(stage, max(1, -(-total // MIB)))
+            progress.stage(stage, max(1, _whole_mib(total)))
 
     def add(self, count: int) -> None:
         """Add transferred bytes; a negative count takes back bytes that have to be transferred again."""
         with self._lock:
-            before, self._done = self._done // MIB, self._done + count
-            if self._progress is not None and self._done // MIB != before:
-                self._progress.advance(self._done // MIB)
+            before, self._done = _whole_mib(self._done), self._done + count
+            if self._progress is not None and _whole_mib(self._done) != before:
+                self._progress.advance(_whole_mib(self._done))
+
+
+def _whole_mib(count: int) -> int:
+    """Return the MiB that bytes fill or begin."""
+    return -(-count // MIB)
 
 
 def transfer_all(transfers: Iterable[Callable[[Event], Result]], *, parallel: int) -> list[Result]:

@@ -244,7 +244,7 @@ def _depth_of(found: RangeImage, options: TofOptions, calibration: TofCalibratio
     sigma = (found.sigma_m * calibration.scale).astype(np.float32)
     status = np.where(mask.reshape(-1), found.status, int(Status.UNSOLVED)).astype(np.int32)
     if options.filters:
-        timings.stage("filter", len(options.filters))
+        timings.stage("filter", 1)
         range_m, sigma, status = _filter(range_m, sigma, found.amplitude, status, rows, cols, options.filters, device)
     solved = np.isin(status, SOLVED)
     z = z_per_range(camera).reshape(-1)

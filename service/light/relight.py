@@ -80,6 +80,8 @@ def relight(request: RelightRequest, progress: Progress | None = None) -> Religh
                 _relight_capture(opened, todo, request, plan, writer, device, timings)
         with timings.part("waiting for files"):
             writer.wait()
+        if plan.is_sequence:
+            timings.advance(skipped + writer.written.frames)
     paths = tuple(frame.path for frame in plan.frames)
     if request.sheet is not None:
         timings.stage("sheet", 1)

@@ -1,4 +1,4 @@
-"""How a pipeline says where it is; the doors decide how to show it."""
+"""How a command or a job tells how far its work is, and how long each stage of it took."""
 
 import time
 from collections.abc import Iterator
@@ -7,41 +7,47 @@ from typing import Protocol
 
 
 class Progress(Protocol):
-    """Told of every stage and step. Implementations must be cheap: they are called up to a few hundred times a second."""
+    """Receives the stages of a work and the steps of each: the bar of the command line and the worker of a job implement it.
+
+    An implementation must be cheap, because it is called up to a few hundred times a second.
+    """
 
     def stage(self, name: str, total: int) -> None:
-        """A stage of `total` steps begins; the one before it is done."""
+        """Begin a stage of `total` steps, one or more; the stage before it is finished.
+
+        Work that cannot be counted is a stage of one step, which ends without a call of `advance`.
+        """
 
     def advance(self, done: int) -> None:
-        """`done` steps of the current stage are finished."""
+        """Take note that `done` steps of the current stage are finished; the number never falls, and ends at the stage's total."""
 
 
 class Timings:
-    """A Progress that passes everything on and keeps the seconds of each stage, for reports."""
+    """A Progress that measures the seconds of each stage for reports, and passes every call on."""
 
     def __init__(self, inner: Progress | None = None) -> None:
-        """Args: inner: told of everything too; None: nobody."""
+        """Args: inner: receives every call too; None: there is no other."""
         self._inner = inner
         self._started: tuple[str, float] | None = None
         self.seconds: dict[str, float] = {}
         self.parts: dict[str, float] = {}
-        """Seconds of named parts of stages."""
+        """Seconds of the named parts of stages."""
 
     def stage(self, name: str, total: int) -> None:
-        """Begin a stage."""
+        """Begin a stage, and end the one before it."""
         self.close()
         self._started = (name, time.perf_counter())
         if self._inner is not None:
             self._inner.stage(name, total)
 
     def advance(self, done: int) -> None:
-        """Pass on."""
+        """Pass the finished steps on."""
         if self._inner is not None:
             self._inner.advance(done)
 
     @contextmanager
     def part(self, name: str) -> Iterator[None]:
-        """Time a part of the current stage that comes again and again: it has seconds of its own, but no line on the terminal."""
+        """Time a part of the current stage that recurs: it has seconds of its own, but no line on the terminal."""
         began = time.perf_counter()
         try:
             yield
@@ -49,10 +55,10 @@ class Timings:
             self.parts[name] = round(self.parts.get(name, 0.0) + time.perf_counter() - began, 6)
 
     def close(self) -> dict[str, float]:
-        """End the last stage.
+        """End the last stage, and return the seconds of every stage.
 
         Returns:
-            Seconds by stage so far, rounded to milliseconds.
+            Seconds by the name of the stage, rounded to milliseconds.
         """
         if self._started is not None:
             name, began = self._started

@@ -117,8 +117,8 @@ def solve_material(given: SolveInput, lights: Lights, field: NearField | None = 
         result.facts = {"diffuse_roughness": None if shape.rough < 0 else shape.rough, "diffuse_slope": shape.slope,
                         "shapes_tried": len(tried)}
 
-    def batches(phase: str) -> Iterator[Batch]:
-        timings.stage(phase, len(solvable))
+    def batches(stage: str) -> Iterator[Batch]:
+        timings.stage(stage, len(solvable))
         done = 0
         for batch in pixel_batches(given, lights, view, solvable, lobes=MIXTURE + GEOMETRY, field=field):
             yield batch
@@ -133,7 +133,7 @@ def solve_material(given: SolveInput, lights: Lights, field: NearField | None = 
             first = fit_tinted(samples, normal, shape=shape)
             result.albedo[:, pixels], result.roughness[pixels] = first.diffuse_albedo.T, first.roughness
     solved = (result.status == Status.OK).reshape(given.mask.shape)
-    surface = integrate(given, result.normal, solved, phase="surface")
+    surface = integrate(given, result.normal, solved, stage="surface")
     on_device = wp.array(solved.astype(np.uint8), dtype=wp.uint8, device=given.device)
     projection, arriving = projection_of(given.camera), None
     if interreflection and surface is not None:

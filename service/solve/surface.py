@@ -16,26 +16,32 @@ RINGS = 8
 """Unsolved pixels this near to solved ones are filled from their neighbours; farther ones, which few solves have, by blocks."""
 
 
-def integrate(given: SolveInput, normal: np.ndarray, solved: np.ndarray, *, phase: str = "height") -> Integration | None:
+def integrate(given: SolveInput, normal: np.ndarray, solved: np.ndarray, *, stage: str = "height") -> Integration | None:
     """Integrate the normals of the solved pixels.
 
     Args:
         given: the camera and the device.
         normal: [3, pixels] float32.
         solved: [rows, cols] bool.
-        phase: what the progress calls this work.
+        stage: what the progress calls this work.
 
     Returns:
         The height on the device, or None when no pixel is solved.
     """
-    given.timings.stage(phase, 100)
     if not solved.any():
         return None
-    camera = given.camera
+    given.timings.stage(stage, 100)
+    camera, told = given.camera, 0
+
+    def tell(part: float) -> None:
+        nonlocal told
+        told = max(told, round(100 * part))  # the residual of conjugate gradients also grows for a few iterations
+        given.timings.advance(told)
+
     x, y = camera.plane_coordinates()
     return integrate_normals(normal.reshape(3, *solved.shape), solved, x.astype(np.float32), y.astype(np.float32),
                              perspective=camera.projection == "perspective", mean_z=mean_height(camera), options=OPTIONS,
-                             device=given.device, progress=lambda part: given.timings.advance(round(100 * part)))
+                             device=given.device, progress=tell)
 
 
 def mean_height(camera: Camera) -> float:

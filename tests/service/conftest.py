@@ -6,8 +6,10 @@ from typing import NamedTuple
 
 import pytest
 
+from service.cli.bar import Bar
 from service.cli.main import main
 from tests.service.postgres import binaries, postgres
+from tests.service.recording import Recording
 
 
 class Outcome(NamedTuple):
@@ -20,14 +22,21 @@ class Outcome(NamedTuple):
 
 @pytest.fixture
 def relit(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Callable[..., Outcome]:
-    """Run `relit ARGS`; what C libraries write on the terminal is caught too."""
+    """Run `relit ARGS`; what C libraries write on the terminal is caught too.
+
+    Every run that succeeds is held to its progress: each stage comes to its total. Only what a service does is seen now and then.
+    """
 
     def run(*arguments: object) -> Outcome:
+        recording = Recording()
+        monkeypatch.setattr(Bar, "stage", lambda _, name, total: recording.stage(name, total))
+        monkeypatch.setattr(Bar, "advance", lambda _, done: recording.advance(done))
         monkeypatch.setattr(sys, "argv", ["relit", *map(str, arguments)])
         capfd.readouterr()
         with pytest.raises(SystemExit) as ended:
             main()
         out, err = capfd.readouterr()
+        assert ended.value.code or arguments[0] in ("submit", "jobs") or not recording.faults
         return Outcome(int(ended.value.code or 0), out, err)
 
     return run
