@@ -1,0 +1,105 @@
+"""What is looked at before a capture or an environment is worked on: places, headers and sizes, and no pixel."""
+
+import os
+
+import numpy as np
+import pytest
+
+from service.captures.admit import admit_capture, admit_environment, environment_file, recheck_capture
+from stage.errors import ImageError, ManifestError
+from tests.captures import edit_manifest, make_scene, write_capture, write_exr, write_manifest
+from tests.service.recording import Recording
+
+SCENE = make_scene(size=16, lights=4)
+PIXELS = 16 * 16
+HISTOGRAM = {"schema": "relit.capture/1", "name": "room", "frames": [
+    {"image": "00.npy", "tof": {"type": "pulsed", "bin_s": 1e-9, "start_s": 0.0}}],
+    "camera": {"projection": "perspective", "resolution": [6, 4], "focal_px": [5, 5]}}
+
+
+def test_a_capture_is_described_without_its_pixels(tmp_path):
+    write_capture(tmp_path, SCENE)
+    recording = Recording()
+    assert admit_capture(tmp_path, max_pixels=PIXELS, progress=recording) == {
+        "captures": 1, "frames": 4, "resolution": [16, 16], "color_space": "lin_rec709_scene", "name": "cap"}
+    assert recording.stages == [("check", 1, [1])]
+    recheck_capture(tmp_path, max_pixels=PIXELS)
+
+
+def test_a_sequence_is_counted(tmp_path):
+    for step in ("t0", "t1", "t2"):
+        write_capture(tmp_path / step, SCENE)
+    recording = Recording()
+    found = admit_capture(tmp_path, max_pixels=PIXELS, progress=recording)
+    assert (found["captures"], found["frames"]) == (3, 12) and recording.faults == []
+
+
+@pytest.mark.parametrize("check", [admit_capture, recheck_capture])
+def test_places_and_sizes_are_refused(check, tmp_path):
+    folder = write_capture(tmp_path / "cap", SCENE)
+    with pytest.raises(ImageError, match="16x16 is more than 255 pixels"):
+        check(folder, max_pixels=PIXELS - 1)
+    write_exr(tmp_path / "secret.exr", SCENE.images[0])
+    (folder / "001.exr").unlink()
+    (folder / "001.exr").symlink_to(tmp_path / "secret.exr")
+    with pytest.raises(ManifestError, match=r"frames\[1\].image: 001\.exr leads out of the capture's folder"):
+        check(folder, max_pixels=PIXELS)
+    (folder / "001.exr").unlink()
+    os.mkfifo(folder / "001.exr")  # to open it would wait for ever
+    with pytest.raises(ManifestError, match="is no file"):
+        check(folder, max_pixels=PIXELS)
+    (folder / "001.exr").unlink()
+    write_exr(folder / "001.exr", np.zeros((64, 64, 3)))
+    with pytest.raises(ImageError, match=r"001\.exr: has 64x64 pixels, 256 are allowed"):
+        check(folder, max_pixels=PIXELS)
+
+
+@pytest.mark.parametrize(("array", "words"), [
+    (np.ones((4, 6, 8), np.complex64), "is not an array of real numbers"), (np.ones(6), r"has the shape \(6,\)"),
+    (np.ones((40, 6)), "has 6x40 pixels, 24 are allowed"),
+])
+def test_headers_of_arrays(array, words, tmp_path):
+    np.save(tmp_path / "00.npy", array)
+    write_manifest(tmp_path, HISTOGRAM)
+    with pytest.raises(ImageError, match=words):
+        admit_capture(tmp_path, max_pixels=24)
+
+
+def test_an_array_that_is_cut_short(tmp_path):
+    np.save(tmp_path / "00.npy", np.ones((4, 6, 8), np.float32))
+    write_manifest(tmp_path, HISTOGRAM)
+    admit_capture(tmp_path, max_pixels=24)
+    whole = (tmp_path / "00.npy").read_bytes()
+    (tmp_path / "00.npy").write_bytes(whole[:-4])
+    with pytest.raises(ImageError, match="it has 764 bytes of 768"):
+        admit_capture(tmp_path, max_pixels=24)
+
+
+def test_a_manifest_that_is_wrong_is_named(tmp_path):
+    write_capture(tmp_path, SCENE)
+    edit_manifest(tmp_path, colour="red")
+    with pytest.raises(ManifestError, match="colour: is not a known key"):
+        admit_capture(tmp_path, max_pixels=PIXELS)
+
+
+def test_an_environment_is_one_lat_long_image(tmp_path):
+    folder = tmp_path / "sky"
+    folder.mkdir()
+    with pytest.raises(ImageError, match="has 0 files"):
+        admit_environment(folder, max_pixels=1000)
+    path = write_exr(folder / "sky.exr", np.ones((8, 16, 3)))
+    (folder / ".notes").write_text("")
+    assert admit_environment(folder, max_pixels=128) == {"file": "sky.exr", "resolution": [16, 8]}
+    assert environment_file(folder) == environment_file(path) == path
+    with pytest.raises(ImageError, match="has 16x8 pixels, 100 are allowed"):
+        admit_environment(folder, max_pixels=100)
+    write_exr(folder / "b.exr", np.ones((8, 16, 3)))
+    with pytest.raises(ImageError, match="has 2 files"):
+        admit_environment(folder, max_pixels=1000)
+    (folder / "b.exr").unlink()
+    write_exr(path, np.ones((8, 8, 3)))
+    with pytest.raises(ImageError, match="is 8x8: a lat-long map is twice as wide as it is high"):
+        admit_environment(folder, max_pixels=1000)
+    path.rename(folder / "sky.png")
+    with pytest.raises(ImageError, match=r"\.exr or \.hdr"):
+        admit_environment(folder, max_pixels=1000)
