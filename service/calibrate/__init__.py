@@ -1,1 +1,1 @@
-"""Images of targets to calibrated captures."""
+"""Calibration of captures from images of targets: lights, sensor, projector, time-of-flight camera."""

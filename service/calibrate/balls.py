@@ -1,4 +1,4 @@
-"""The balls of a request: typed circles and masks, with what is known of their size."""
+"""The balls that a request names by circles and masks, with what is known of their size and place."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,16 +16,24 @@ from stage.errors import CalibrationError, ManifestError
 from stage.manifest import FILE_NAME
 
 RADIUS_TOLERANCE = 0.05
-"""How far a ball's radius in metres may be from its radius in pixels × pixel_size_m before one of them must be wrong."""
+"""Relative difference of a ball's radius in metres from its radius in pixels × pixel_size_m, above which one of them must be wrong."""
 
 
 def balls_of(request: BallRequest, camera: Camera, *, exactly: int | None = None, at_least: int = 1,
            radii: Sequence[float] = (), heights: Sequence[float] = ()) -> list[Ball]:
-    """The balls that a request names.
+    """Return the balls that a request names: those of its circles, then those of its masks.
+
+    Args:
+        request: circles and masks.
+        camera: the camera that took the images.
+        exactly: how many balls there must be; None: `at_least` says it.
+        at_least: how many balls there must be at least.
+        radii: metres, one for all balls or one for each; empty: not known.
+        heights: camera-frame z of the centres, one for all balls or one for each; empty: surface_z_m.
 
     Raises:
-        RequestError: another count than is needed.
-        StageError: a ball outside the image, or a mask that shows none.
+        RequestError: the number of balls, radii or heights is not what is needed.
+        StageError: a ball lies outside the image, or a mask shows none.
     """
     count = len(request.circles) + len(request.masks)
     if count < at_least or exactly not in (None, count):
@@ -48,7 +56,12 @@ def balls_of(request: BallRequest, camera: Camera, *, exactly: int | None = None
 
 
 def check_metric(capture: Capture, balls: Sequence[Ball], radii: Sequence[float]) -> None:
-    """Refuse balls whose size in metres is not known, or is known twice and differently."""
+    """Check that the size of each ball in metres is known, and that two sources of it agree.
+
+    Raises:
+        RequestError: a perspective camera needs --ball-radius-m.
+        ManifestError: camera.pixel_size_m is missing, or differs from --ball-radius-m.
+    """
     if capture.camera.projection == "perspective":
         if not radii:
             raise RequestError("--ball-radius-m: is missing: a perspective camera sees the size of a ball, not its distance")
@@ -65,7 +78,7 @@ def check_metric(capture: Capture, balls: Sequence[Ball], radii: Sequence[float]
 
 
 def ball_entry(ball: Ball) -> dict[str, Any]:
-    """A ball for the report."""
+    """Return a ball as the report holds it."""
     unit = "m" if ball.metric else "px or radii"
     return {"centre": digits(ball.centre), "radius": float(f"{ball.radius:.6g}"), "unit": unit,
             "radius_px": round(ball.radius_px, 3), "outline_error_px": round(ball.outline_error_px, 4)}

@@ -1,4 +1,5 @@
-"""Images of the dark, of a white card, of anything bright → dark.exr, flat.exr and the saturation of a capture."""
+"""Calibration of the sensor: dark.exr, flat.exr and the saturation of a capture, from images with the lens covered, of a white card,
+and of anything bright."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,17 +23,17 @@ DARK_FILE, FLAT_FILE = "dark.exr", "flat.exr"
 
 
 class ImageCalibration(NamedTuple):
-    """What was written."""
+    """The files that a calibration image wrote."""
 
     manifest_path: Path
     report_path: Path
     image_path: Path
     noise: float
-    """Of one input, linear; 0 for one image."""
+    """Standard deviation of one input image, linear; 0 when there is only one."""
 
 
 class Saturation(NamedTuple):
-    """What the histogram shows."""
+    """The level at which readings pile up."""
 
     level: float
     counts: tuple[int, int, int]
@@ -42,10 +43,10 @@ class Saturation(NamedTuple):
 
 
 def dark(request: DarkRequest, progress: Progress | None = None) -> ImageCalibration:
-    """Mean of dark images → dark.exr, named by the manifest.
+    """Write the mean of dark images as dark.exr, and name it in the manifest.
 
     Raises:
-        StageError, RequestError: bad input; nothing is written.
+        StageError, RequestError: the input is wrong; nothing is written.
     """
     timings = Timings(progress)
     timings.stage("open", 1)
@@ -59,10 +60,10 @@ def dark(request: DarkRequest, progress: Progress | None = None) -> ImageCalibra
 
 
 def flat_field(request: FlatFieldRequest, progress: Progress | None = None) -> ImageCalibration:
-    """Mean of white-card images, with the dark that correction takes off → flat.exr, named by the manifest.
+    """Write the mean of white-card images, less their dark, as flat.exr, and name it in the manifest.
 
     Raises:
-        StageError, RequestError: bad input; nothing is written.
+        StageError, RequestError: the input is wrong; nothing is written.
     """
     timings = Timings(progress)
     timings.stage("open", 1)
@@ -82,10 +83,10 @@ def flat_field(request: FlatFieldRequest, progress: Progress | None = None) -> I
 
 
 def saturation(request: SaturationRequest, progress: Progress | None = None) -> Saturation:
-    """Where the readings of a capture's frames pile up at the top of the histogram.
+    """Find the level at which the readings of a capture's frames pile up, and write it to the manifest if the request says so.
 
     Raises:
-        StageError: bad input, or nothing piles up; nothing is written.
+        StageError: the input is wrong, or nothing piles up; nothing is written.
     """
     timings = Timings(progress)
     timings.stage("open", 1)
@@ -132,7 +133,7 @@ def _refuse_overwrite(inputs: Sequence[Path], target: Path) -> None:
 
 def _write(name: str, field: str, request: DarkRequest | FlatFieldRequest, capture: Capture, linear: np.ndarray,
            section: dict[str, Any]) -> ImageCalibration:
-    """The image first, then the report and the manifest that names it."""
+    """Write the image, then the report, and last the manifest that names the image."""
     recorded = recorded_values(linear, capture)
     channels = {channel: recorded[..., index] for index, channel in enumerate("RGB")}
     kind = "flat-field" if field == "flat" else field

@@ -1,4 +1,4 @@
-"""Images of balls → the lights of a manifest, with residuals."""
+"""Calibration of lights from images of balls: directions, positions and brightness, with residuals."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -22,21 +22,21 @@ from stage.light import DistantLight, PointLight
 from stage.manifest import FILE_NAME
 
 READERS = 4
-"""Images that are decoded at one time: bounds the memory."""
+"""Images that are decoded at the same time: bounds the memory."""
 
 
 class Patch(NamedTuple):
-    """What one frame shows of a ball's box."""
+    """The pixels of one frame in the box around a ball."""
 
     radiance: np.ndarray  # [h, w, 3] float32
     saturated: np.ndarray | None  # [h, w] bool
 
 
 def mirror_ball(request: MirrorBallRequest, progress: Progress | None = None) -> Calibration:
-    """Directions of far lights from the bright spot on one mirror ball.
+    """Measure the directions of distant lights from the bright spot on one mirror ball.
 
     Raises:
-        StageError, RequestError: bad input, or a light that cannot be measured; nothing is written.
+        StageError, RequestError: the input is wrong, or a light cannot be measured; nothing is written.
     """
     timings = Timings(progress)
     timings.stage("open", 1)
@@ -64,10 +64,10 @@ def mirror_ball(request: MirrorBallRequest, progress: Progress | None = None) ->
 
 
 def light_positions(request: LightPositionsRequest, progress: Progress | None = None) -> Calibration:
-    """Positions of near lights from the bright spots on two or more mirror balls.
+    """Measure the positions of near lights from the bright spots on two or more mirror balls.
 
     Raises:
-        StageError, RequestError: bad input, or a light that cannot be measured; nothing is written.
+        StageError, RequestError: the input is wrong, or a light cannot be measured; nothing is written.
     """
     timings = Timings(progress)
     timings.stage("open", 1)
@@ -102,10 +102,10 @@ def light_positions(request: LightPositionsRequest, progress: Progress | None = 
 
 
 def grey_ball(request: GreyBallRequest, progress: Progress | None = None) -> Calibration:
-    """Irradiance or intensity of each light from the shading of one grey ball.
+    """Measure the irradiance or intensity of each light from the shading of one grey ball.
 
     Raises:
-        StageError, RequestError: bad input, or a light that cannot be measured; nothing is written.
+        StageError, RequestError: the input is wrong, or a light cannot be measured; nothing is written.
     """
     timings = Timings(progress)
     timings.stage("open", 1)
@@ -142,7 +142,7 @@ def grey_ball(request: GreyBallRequest, progress: Progress | None = None) -> Cal
 
 def _each(captures: Captures, views: Sequence[BallView], measure: Callable[[LitFrame, Sequence[Patch]], Measured],
           timings: Timings) -> list[Measured | CalibrationError]:
-    """Measure every lit frame; a light that cannot be measured is its error in place of a result."""
+    """Measure the light of every lit frame, and return its error in place of a result where it cannot be measured."""
     correction = Correction.of(captures.source)
 
     def one(lit: LitFrame) -> Measured | CalibrationError:
@@ -164,12 +164,12 @@ def _each(captures: Captures, views: Sequence[BallView], measure: Callable[[LitF
 
 
 def _targets(captures: Captures) -> dict[int, SingleLight]:
-    """What the target says now of the light of each measured frame, by the frame's number in the source."""
+    """Return the light of each measured frame as the target's manifest has it now, by the frame's number in the source."""
     return {lit.number: own.light for lit, own in zip(captures.lit, lit_frames(captures.target), strict=True)}
 
 
 def _scaled(results: Sequence[Measured], albedo: tuple[float, float, float] | None) -> list[Measured]:
-    """Irradiance from ρ/π · irradiance: by the ball's albedo, or so that the mean over lights and channels is 1."""
+    """Divide ρ/π · irradiance by the ball's albedo / π, or scale it so that the mean over lights and channels is 1."""
     scales = np.array([result.entry["scale"] for result in results if result.light is not None])
     factor = np.full(3, 1 / scales.mean()) if albedo is None else np.pi / np.array(albedo)
     scaled = []

@@ -1,4 +1,4 @@
-"""Poses of a chessboard under projected light → camera, projector and pose in the manifests, with the error of each view."""
+"""Calibration of a projector-camera pair from poses of a chessboard under projected patterns, with the error of each view."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,11 +25,11 @@ from stage.planes import frame_planes
 from stage.projector import Projector
 
 LEAST_CORNERS = 0.5
-"""Part of the board's corners that must be had in both devices, for a view to count."""
+"""Part of the board's corners that must be found in both devices, for a view to count."""
 
 
 class ProcamResult(NamedTuple):
-    """What was written."""
+    """The files that were written, and the errors of the views."""
 
     manifest_paths: tuple[Path, ...]
     report_path: Path
@@ -41,10 +41,10 @@ class ProcamResult(NamedTuple):
 
 
 def procam(request: ProcamRequest, progress: Progress | None = None) -> ProcamResult:
-    """Calibrate a projector-camera pair.
+    """Calibrate a projector-camera pair, and write both devices and their pose to the manifests.
 
     Raises:
-        StageError, KernelError: bad input, or too few views show the board; nothing is written.
+        StageError, KernelError: the input is wrong, or too few views show the board; nothing is written.
     """
     timings = Timings(progress)
     device = devices.resolve(request.device)
@@ -86,7 +86,7 @@ def procam(request: ProcamRequest, progress: Progress | None = None) -> ProcamRe
 
 
 def view_of(capture: Capture, size: Resolution, request: ProcamRequest, device: str) -> BoardView | str:
-    """The corners of one capture in both devices, or why there are none."""
+    """Return the corners of the board in both devices, or a sentence that says why there are none."""
     frames = [frame for frame in capture.manifest.frames if frame.pattern is not None]
     codes = read_codes(capture, frames, PatternDevice(size))
     columns, rows = codes.columns, codes.rows
@@ -153,7 +153,7 @@ def _write(request: ProcamRequest, targets: list[Capture], found: ProCam, views:
 
 
 def _updated(manifest: Manifest, found: ProCam, size: Resolution) -> Manifest:
-    """The manifest with both devices; the camera's place in the world, and the projector's radiometry, stay."""
+    """Return the manifest with both devices; the camera's place in the world and the projector's radiometry stay."""
     old = manifest.camera
     surface = old.surface_z_m if old.projection == "perspective" else None
     camera = Camera(projection="perspective", resolution=old.resolution, focal_px=found.camera.focal,

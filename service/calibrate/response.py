@@ -1,4 +1,4 @@
-"""Images of evenly grey projections → the projector's response in a manifest."""
+"""Calibration of a projector's response (its gamma) from images of evenly grey projections."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -18,19 +18,21 @@ from stage.manifest import FILE_NAME
 
 
 class ResponseResult(NamedTuple):
-    """What was written."""
+    """The files that were written, and the fit."""
 
     manifest_path: Path
     report_path: Path
     gamma: float
+    """Exponent of the power of the level that is nearest to the response."""
     spread: float
+    """Median deviation of a pixel from the response, as a part of full scale."""
 
 
 def response(request: ResponseRequest, progress: Progress | None = None) -> ResponseResult:
-    """Fit the response of a capture's projector.
+    """Fit the response of a capture's projector, and write it to the manifest.
 
     Raises:
-        StageError, RequestError: bad input; nothing is written.
+        StageError, RequestError: the input is wrong; nothing is written.
     """
     timings = Timings(progress)
     timings.stage("open", 1)

@@ -1,4 +1,4 @@
-"""What the kinds of `relit calibrate` share: the captures they read and write, and calibration.json."""
+"""What the commands of `relit calibrate` share: the captures that they read and write, and calibration.json."""
 
 import json
 from collections.abc import Iterable, Sequence
@@ -21,45 +21,45 @@ SCHEMA = "relit.calibration/1"
 
 
 class Calibration(NamedTuple):
-    """What a calibration wrote, and its table."""
+    """The files that a calibration of lights wrote, and its table."""
 
     manifest_path: Path
     report_path: Path
     headings: tuple[str, ...]
     rows: list[tuple[str, ...]]
-    """One a measured light, the least sure first."""
+    """One row for each measured light, the least certain first."""
     summary: str
 
 
 class Captures(NamedTuple):
-    """Where lights are measured, and where they go."""
+    """The capture in which lights are measured, and the capture that they are written to."""
 
     source: Capture
     target: Capture
     manifest_path: Path
     lit: list[LitFrame]
-    """Of the source."""
+    """Lit frames of the source."""
 
 
 class Measured(NamedTuple):
-    """One light's result."""
+    """The result of one light."""
 
     light: SingleLight | None
-    """To write; None: the frame is left out."""
+    """The light to write; None: its frame is left out."""
     entry: dict[str, Any]
-    """For the report; `flags` name what to look at."""
+    """What the report says; `flags` name what to look at."""
     row: tuple[str, ...] = ()
-    """For the table."""
+    """The cells of the table."""
     doubt: float = 0.0
-    """What the table is sorted by."""
+    """Uncertainty or residual, by which the table is sorted."""
 
 
 def open_captures(request: LightsRequest) -> Captures:
-    """Open what a request names.
+    """Open the captures that a request names.
 
     Raises:
         RequestError: --out is not a .json file of its own.
-        StageError: a capture is wrong, or the two do not match.
+        StageError: a capture is wrong, or the two captures do not match.
     """
     source = Capture.open(request.capture)
     lit = lit_frames(source)
@@ -74,10 +74,10 @@ def open_captures(request: LightsRequest) -> Captures:
 
 
 def kept(captures: Captures, results: Sequence[Measured | CalibrationError], *, drop_failed: bool) -> list[Measured]:
-    """The results with failures as frames to leave out.
+    """Return the results with each failure as a frame that is left out.
 
     Raises:
-        CalibrationError: a light failed and `drop_failed` is not asked, or every one failed; names the first frame.
+        CalibrationError: a light failed without `drop_failed`, or every light failed; names the first frame.
     """
     failed = [(lit, result) for lit, result in zip(captures.lit, results, strict=True) if isinstance(result, CalibrationError)]
     if failed and (not drop_failed or len(failed) == len(results)):
@@ -91,7 +91,7 @@ def kept(captures: Captures, results: Sequence[Measured | CalibrationError], *, 
 
 def finish(kind: str, request: BaseModel, captures: Captures, results: Sequence[Measured], *, headings: tuple[str, ...],
            summary: dict[str, Any]) -> Calibration:
-    """Write the report, then the manifest, each whole or not at all."""
+    """Write the report, then the manifest, each whole or not at all, and return what was written."""
     manifest = with_lights(captures.target, [result.light for result in results])
     lights = [{"frame": lit.number, "image": lit.frame.image, **result.entry,
                "was": lit.light.model_dump(mode="json", exclude_none=True)}
@@ -110,7 +110,7 @@ def finish(kind: str, request: BaseModel, captures: Captures, results: Sequence[
 
 
 def write_results(kind: str, request: BaseModel, manifest: Manifest, manifest_path: Path, section: dict[str, Any]) -> Path:
-    """Write calibration.json beside the manifest, keeping what other kinds put there, then the manifest itself.
+    """Write calibration.json beside the manifest, with the sections of other commands that it held, then the manifest.
 
     Returns:
         The path of the report.
@@ -124,17 +124,17 @@ def write_results(kind: str, request: BaseModel, manifest: Manifest, manifest_pa
 
 
 def digits(values: Iterable[float]) -> list[float]:
-    """Numbers for the report, with the six digits that a measurement may have."""
+    """Return numbers for the report, rounded to the six digits that a measurement may have."""
     return [float(f"{value:.6g}") for value in values]
 
 
 def triple(values: Iterable[float]) -> str:
-    """Three numbers for the table."""
+    """Return three numbers as a cell of the table."""
     return " ".join(f"{value:7.3f}" for value in values)
 
 
 def _earlier(path: Path) -> dict[str, Any]:
-    """The other kinds' sections of a report that is there; nothing of a file that is something else."""
+    """Return the sections of an existing report; nothing of a file that is something else."""
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):

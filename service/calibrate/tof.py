@@ -1,4 +1,4 @@
-"""A sweep over known distances → the calibration of a time-of-flight camera: wiggling, scale, offset, drift, noise, pulse."""
+"""Calibration of a time-of-flight camera from a sweep over known distances: wiggling, scale, offset and drift."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,34 +18,34 @@ from stage.tof.frames import is_pulsed, read_correlations
 from stage.tof.sweep import Sweep, SweepDistance, read_sweep
 
 STEP_PIXELS = 400
-"""Of each step, evenly chosen: more do not make the harmonics better, which the steps limit."""
+"""Pixels of each step, evenly chosen: more do not improve the harmonics, which the number of steps limits."""
 SHARPEST_RAD = 0.3
-"""Phases with a larger standard deviation are not taken."""
+"""Largest standard deviation of a phase that takes part in the fit, radians."""
 
 
 class TofCalibrationResult(NamedTuple):
-    """What was found."""
+    """What a sweep calibrated."""
 
     calibration: TofCalibration
     path: Path
     before_m: float
     """RMS of the steps' median errors without the calibration."""
     after_m: float
-    """And with it, on the steps that it was made from."""
+    """RMS of the same errors with the calibration that was made from them."""
     steps: int
 
 
 def calibrate_tof(sweep: Path, out: Path, *, device: str | None = None, progress: Progress | None = None) -> TofCalibrationResult:
-    """Calibrate a time-of-flight camera.
+    """Calibrate a time-of-flight camera, and write the calibration.
 
     Args:
         sweep: a relit.tof-sweep/1 file.
         out: the relit.tof/1 file to write.
         device: where to solve.
-        progress: told of every stage.
+        progress: told how far the work is.
 
     Raises:
-        StageError, KernelError: a capture or the sweep cannot be used, or says too little; nothing is written.
+        StageError, KernelError: a capture or the sweep cannot be used, or does not determine the calibration; nothing is written.
         RequestError: steps of both kinds, or a step without a solved pixel.
     """
     timings = Timings(progress)
@@ -73,7 +73,7 @@ def calibrate_tof(sweep: Path, out: Path, *, device: str | None = None, progress
 
 
 def _errors(plan: Sweep, captures: list[Capture], calibration: TofCalibration | None, device: str, timings: Timings) -> np.ndarray:
-    """[step] median of measured less true range, metres."""
+    """Return [steps] the median of measured less true range, metres."""
     errors = []
     for step, capture in zip(plan.steps, captures, strict=True):
         solved = solve_tof(capture, TofOptions(), calibration=calibration, device=device, timings=timings)
@@ -84,12 +84,12 @@ def _errors(plan: Sweep, captures: list[Capture], calibration: TofCalibration | 
 
 
 def _true_range(step: SweepDistance, capture: Capture) -> np.ndarray:
-    """[rows, cols] along the rays to the plane of the target."""
+    """Return [rows, cols] the range along each ray to the plane of the target."""
     return step.depth_m / z_per_range(capture.camera)
 
 
 def _line(plan: Sweep, captures: list[Capture], errors: np.ndarray) -> dict[str, Any]:
-    """Scale and offset, from the middle ranges of the steps."""
+    """Return scale and offset, fitted to the median ranges of the steps."""
     true = np.array([float(np.median(_true_range(step, capture)[capture.mask()]))
                      for step, capture in zip(plan.steps, captures, strict=True)])
     scale, offset = fit_line(true + errors, true)
@@ -97,7 +97,7 @@ def _line(plan: Sweep, captures: list[Capture], errors: np.ndarray) -> dict[str,
 
 
 def _wiggling(plan: Sweep, captures: list[Capture], device: str, timings: Timings) -> dict[str, Any]:
-    """Harmonics of each frequency from the steps at the commonest temperature."""
+    """Return the harmonics of each frequency, fitted to the steps at the commonest temperature."""
     chosen = [(step, capture) for step, capture in zip(plan.steps, captures, strict=True)
               if step.temperature_c == plan.commonest_temperature_c]
     timings.stage("wiggling", len(chosen))

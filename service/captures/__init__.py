@@ -1,1 +1,1 @@
-"""Captures looked at before they are worked on."""
+"""Checks of captures before they are worked on: admission of uploads, and relit info."""

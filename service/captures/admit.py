@@ -1,4 +1,4 @@
-"""Whether what was handed in can be worked on: names, headers and sizes, before a pixel is decoded and in little memory."""
+"""Admission of uploaded captures and environments: places of files, headers and sizes, in little memory and without decoding a pixel."""
 
 import math
 from pathlib import Path
@@ -17,25 +17,25 @@ from stage.files import resolved
 from stage.manifest import FILE_NAME, Manifest, read_manifest
 
 MAX_MANIFEST_BYTES = 16 << 20
-"""Of one capture.json: 20 000 frames have a quarter of it. Read, it takes up to 40 times as much memory."""
+"""Largest capture.json: 20 000 frames have a quarter of it. Read, it takes up to 40 times as much memory."""
 MAX_CHANNELS = 4
-"""Of an image that has as many pixels as are allowed; a smaller one may have more, as its channels are decoded together."""
+"""Channels of an image that has as many pixels as are allowed; a smaller one may have more, as its channels are decoded together."""
 
 
 def admit_capture(folder: Path, *, max_pixels: int, progress: Progress | None = None) -> dict[str, Any]:
-    """Look at the manifest of a capture, or of a sequence of captures, and the header of every file that it names.
+    """Check the manifest of a capture, or of a sequence of captures, and the header of every file that it names.
 
     Args:
-        folder: of the capture.
-        max_pixels: of an image.
+        folder: folder of the capture or of the sequence.
+        max_pixels: most pixels of an image.
         progress: told of every capture.
 
     Returns:
-        What it is: captures, frames, resolution, colour space.
+        A description: number of captures and frames, resolution, colour space, name.
 
     Raises:
         ManifestError: the manifest is wrong, or a file lies outside the folder; names the field.
-        ImageError: a file is no image, is cut short, or has more pixels than are allowed; names the file.
+        ImageError: a file is not an image, is cut short, or has more pixels than are allowed; names the file.
         StorageError: a file cannot be read.
     """
     timings = Timings(progress)
@@ -50,18 +50,18 @@ def admit_capture(folder: Path, *, max_pixels: int, progress: Progress | None = 
         frames += len(manifest.frames)
         timings.advance(done)
     timings.close()
-    assert manifest is not None, "time_steps gives one at the least"
+    assert manifest is not None, "time_steps gives at least one"
     return {"captures": len(steps), "frames": frames, "resolution": list(manifest.camera.resolution), "color_space": manifest.color_space,
             "name": manifest.name}
 
 
 def recheck_capture(folder: Path, *, max_pixels: int) -> None:
-    """Look again at what may have changed since a capture was admitted: where its files lie, and their sizes.
+    """Check again what may have changed since a capture was admitted: where its files lie, and their sizes.
 
-    Who opens it then looks at everything else. A file that is changed between the two is not noticed.
+    Opening the capture then checks everything else. A file that is changed between the two checks is not noticed.
 
     Raises:
-        ManifestError, ImageError, StorageError: as `admit_capture`.
+        ManifestError, ImageError, StorageError: for the reasons that `admit_capture` names.
     """
     _check_manifest_files(folder)
     for step in time_steps(folder):
@@ -70,17 +70,17 @@ def recheck_capture(folder: Path, *, max_pixels: int) -> None:
 
 
 def admit_environment(folder: Path, *, max_pixels: int) -> dict[str, Any]:
-    """Look at the header of an environment.
+    """Check the header of an environment map.
 
     Args:
-        folder: which holds one image.
-        max_pixels: that it may have.
+        folder: a folder that holds one image.
+        max_pixels: most pixels of the image.
 
     Returns:
-        What it is: its file and resolution.
+        A description: file and resolution.
 
     Raises:
-        ImageError: not one image, or one of too many pixels.
+        ImageError: there is not exactly one image, it is not a lat-long map, or it has too many pixels.
         StorageError: it cannot be read.
     """
     path = environment_file(folder)
@@ -93,13 +93,13 @@ def admit_environment(folder: Path, *, max_pixels: int) -> dict[str, Any]:
 
 
 def environment_file(folder: Path) -> Path:
-    """The one image of an environment.
+    """Return the image of an environment.
 
     Args:
-        folder: which holds it; or the file itself, of one that was registered.
+        folder: a folder that holds one file, or that file, as for a registered environment.
 
     Raises:
-        ImageError: there is none, or there are several.
+        ImageError: the folder holds no file, or several.
     """
     if folder.is_file():
         return folder
@@ -111,7 +111,7 @@ def environment_file(folder: Path) -> Path:
 
 
 def _check_manifest_files(folder: Path) -> None:
-    """Every manifest is a file of the folder, and not so large that to read it fills the memory."""
+    """Check that every manifest lies in the folder and is small enough to be read into memory."""
     with storage("read", folder):
         first = folder / FILE_NAME
         found = [first] if first.exists() or first.is_symlink() or not folder.is_dir() else sorted(folder.glob(f"*/{FILE_NAME}"))
@@ -124,7 +124,7 @@ def _check_manifest_files(folder: Path) -> None:
 
 
 def _check_places(step: Path, manifest: Manifest, folder: Path, max_pixels: int) -> None:
-    """Every file lies in the folder, links followed, and is not too large."""
+    """Check that every file that the manifest names lies in the folder, links followed, and is not too large."""
     width, height = manifest.camera.resolution
     if width * height > max_pixels:
         raise ImageError(f"{step / FILE_NAME}: camera.resolution: {width}x{height} is more than {max_pixels} pixels")
@@ -167,7 +167,7 @@ def _check_size(path: Path, width: int, height: int, channels: int, max_pixels: 
 
 
 def _check_array(path: Path, max_pixels: int) -> None:
-    """The header of a .npy: real numbers, in two or three dimensions, and as many as its bytes."""
+    """Check the header of a .npy file: real numbers, in two or three dimensions, as many as its bytes hold."""
     with storage("read", path), open(path, "rb") as stream:
         try:
             version = np.lib.format.read_magic(stream)

@@ -1,4 +1,4 @@
-"""What a capture holds, and everything that is wrong with it: every frame is decoded and checked."""
+"""Inspection of a capture for relit info: its facts, and every fault of it; every frame is decoded and checked."""
 
 import os
 from collections import Counter
@@ -22,23 +22,25 @@ from stage.point_lights import PlacedLights
 
 
 class Inspection(NamedTuple):
-    """Facts to print, and faults; a capture without faults can be solved."""
+    """Facts of a capture by name, and sentences about its faults; a capture without faults can be solved."""
 
     facts: list[tuple[str, str]]
     faults: list[str]
 
 
 class _Level(NamedTuple):
+    """The readings of one frame."""
+
     peak: float
     saturated: int
     fault: str | None
 
 
 def inspect(path: Path, progress: Progress | None = None) -> Inspection:
-    """Look at every frame of a capture.
+    """Decode and check every frame of a capture.
 
     Raises:
-        StageError: the capture cannot be opened at all.
+        StageError: the capture cannot be opened.
     """
     timings = Timings(progress)
     timings.stage("open", 1)
@@ -104,7 +106,7 @@ def _facts(capture: Capture) -> Iterator[tuple[str, str]]:
 
 
 def _near(lights: PlacedLights) -> str:
-    """How many there are, and how far away."""
+    """Return how many near lights there are, and how far away."""
     near = lights.place[:, 3] == 1
     distance = np.linalg.norm(lights.place[near, :3] - lights.centre, axis=1)
     return f"{int(near.sum())}, {distance.min():.3g} to {distance.max():.3g} m from the object's centre"
@@ -119,7 +121,7 @@ def _kind(frame: Frame) -> str:
 
 
 def _level(capture: Capture, frame: Frame) -> _Level:
-    """Brightest value and saturated readings of one frame, or what is wrong with it."""
+    """Return the brightest value and the saturated readings of one frame, or its fault."""
     path = capture.file(frame.image)
     try:
         pixels = images.read_pixels(path)

@@ -66,7 +66,7 @@ def _grey_ball(request: GreyBallRequest) -> None:
 
 
 def _intensity(request: IntensityRequest) -> None:
-    from service.calibrate.object import intensity
+    from service.calibrate.intensity import intensity
 
     with ProgressBar() as bar:
         result = intensity(request, bar)

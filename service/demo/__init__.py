@@ -1,1 +1,1 @@
-"""The shipped sample, worked on and shown; and the speed of this machine."""
+"""relit demo on the shipped sample, its preview image, and relit bench."""

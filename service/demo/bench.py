@@ -1,4 +1,4 @@
-"""Speed of the kernels as ratios, each against a peer or a ceiling measured in the same run."""
+"""Speed of the kernels, each as a ratio to NumPy or to a copy of the same data, measured in the same run."""
 
 import time
 from collections.abc import Callable
@@ -22,10 +22,15 @@ LIGHTS, SIDE, FRAMES = 64, 512, 24
 
 
 def bench(device: str | None, repeats: int, progress: Progress | None = None) -> list[str]:
-    """Measure.
+    """Measure the speed of the kernels on this machine.
+
+    Args:
+        device: cpu, cuda:0, …; None: the first CUDA device, else the CPU.
+        repeats: runs of each kernel, of which the median is taken.
+        progress: told how far the work is.
 
     Returns:
-        Lines of a Markdown table: what, milliseconds (median), pixels per second, against what, ratio (above 1: faster).
+        Lines of a Markdown table: what, milliseconds, pixels per second, against what, its milliseconds, ratio (above 1: faster).
     """
     timings = Timings(progress)
     name = devices.resolve(device)
@@ -85,7 +90,7 @@ def bench(device: str | None, repeats: int, progress: Progress | None = None) ->
 
 
 def _one_channel(band: packs.Band, weights: np.ndarray, device: str) -> Callable[[], object]:
-    """The combine kernel on a stack of one channel."""
+    """Return a launch of the combine kernel on a stack of one channel."""
     from kernels.relight import combine as module
 
     pack = devices.pack_width(device)
@@ -100,6 +105,6 @@ def _one_channel(band: packs.Band, weights: np.ndarray, device: str) -> Callable
 
 
 def _copy(band: packs.Band) -> Callable[[], object]:
-    """Copy as many bytes as one relit frame reads."""
+    """Return a copy of as many bytes as one relit frame reads."""
     target = wp.empty_like(band.values)
     return lambda: wp.copy(target, band.values)

@@ -1,4 +1,4 @@
-"""The main job on the shipped sample: solve, export, relight, and one picture of it all."""
+"""relit demo: solve, export and relight the shipped sample, and show the results in one image."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -20,11 +20,11 @@ from stage.lighting import distant_lights
 SAMPLE = "owl"
 FRAMES = "1-24"
 KEY_LIGHT = (0.45, 0.5, 0.74)
-"""The captured image nearest to this direction, above right of the camera, is the one that the picture shows."""
+"""The preview shows the captured image whose light is nearest to this direction, above right of the camera."""
 
 
 class DemoResult(NamedTuple):
-    """What the demo made."""
+    """The results of the demo."""
 
     solved: SolveResult
     asset: Path
@@ -33,10 +33,10 @@ class DemoResult(NamedTuple):
 
 
 def sample_folder() -> Path:
-    """Where the shipped sample lies: inside the installed package, or in the checkout.
+    """Return the folder of the shipped sample, inside the installed package or in the checkout.
 
     Raises:
-        RequestError: it is in neither.
+        RequestError: the sample is in neither.
     """
     package = Path(service.__file__).parent
     for folder in (package / "samples" / SAMPLE, package.parent / "samples" / SAMPLE):
@@ -46,12 +46,12 @@ def sample_folder() -> Path:
 
 
 def demo(out: Path, *, device: str | None = None, progress: Progress | None = None) -> DemoResult:
-    """Solve, export and relight the sample.
+    """Solve, export and relight the sample, and write a preview.
 
     Args:
-        out: folder for the results; its `.relit` holds the stack cache, so that the sample itself is never written to.
+        out: folder for the results; its `.relit` holds the stack cache, so that nothing is written into the sample.
         device: cpu, cuda:0, …; None: the first CUDA device, else the CPU.
-        progress: told of every stage.
+        progress: told how far the work is.
     """
     sample = sample_folder()
     cache = out / ".relit"

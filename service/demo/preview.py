@@ -1,4 +1,4 @@
-"""One picture of what was made: captured, normals, albedo, height, and the relit frames, side by side."""
+"""The preview of a solve: captured, normals, albedo, roughness, height and relit frames, in one image."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,12 +10,12 @@ from stage.colour import convert
 from stage.maps import SurfaceMaps
 
 EXPOSURE_PERCENTILE = 99.0
-"""Of the object's luminance: this reading becomes EXPOSURE_TARGET before the display transform."""
+"""This percentile of the object's luminance becomes EXPOSURE_TARGET before the display transform."""
 EXPOSURE_TARGET = 0.8
 
 
 def write_preview(path: Path, maps: SurfaceMaps, captured: np.ndarray, frames: Sequence[Path]) -> None:
-    """Write preview.png.
+    """Write the preview of a solve.
 
     Args:
         path: the PNG.
@@ -24,7 +24,7 @@ def write_preview(path: Path, maps: SurfaceMaps, captured: np.ndarray, frames: S
         frames: relit EXR frames; two rows of them, evenly chosen, are shown.
 
     Raises:
-        StorageError: the picture cannot be written.
+        StorageError: the image cannot be written.
     """
     mask = maps.mask
     top = [("captured, one light", display(captured * _exposure(captured[None], mask), maps.color_space))]
@@ -53,7 +53,7 @@ def _exposure(images: np.ndarray, mask: np.ndarray) -> float:
 
 
 def _relief(height: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Height as grey, near bright."""
+    """Return the height as grey, bright where it is near the camera."""
     low, high = np.percentile(height[mask], [0.5, 99.5])
     grey = np.clip((height - low) / max(high - low, 1e-12), 0, 1)
     return np.where(mask[..., None], np.repeat((0.12 + 0.83 * grey)[..., None], 3, axis=-1), BACKGROUND)

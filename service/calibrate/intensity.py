@@ -1,4 +1,4 @@
-"""Images of the object itself → the brightness of its lights, when their directions are known."""
+"""Calibration of the brightness of lights of known direction, from images of the object."""
 
 import numpy as np
 
@@ -13,14 +13,14 @@ from stage.light import DistantLight
 from stage.manifest import FILE_NAME
 
 BEHIND_Z = -0.2
-"""Flagged: a light more than 101° from the view axis, which the object shows at grazing angles only."""
+"""A light with z below this, more than 101° from the view axis, is flagged: the object shows it at grazing angles only."""
 
 
 def intensity(request: IntensityRequest, progress: Progress | None = None) -> Calibration:
-    """Irradiance of each light of known direction from images of a mostly Lambertian object, mean 1.
+    """Measure the irradiance of each light of known direction from images of a mostly Lambertian object; the mean is 1.
 
     Raises:
-        StageError, RequestError: bad input, or lights whose brightness cannot be told; nothing is written.
+        StageError, RequestError: the input is wrong, or the images do not determine the brightness; nothing is written.
     """
     timings = Timings(progress)
     timings.stage("open", 1)
