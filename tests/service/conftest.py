@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import pytest
 
-from service.cli.bar import Bar
 from service.cli.main import main
+from service.cli.progress import ProgressBar
 from tests.service.postgres import binaries, postgres
 from tests.service.recording import Recording
 
@@ -29,8 +29,8 @@ def relit(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) ->
 
     def run(*arguments: object) -> Outcome:
         recording = Recording()
-        monkeypatch.setattr(Bar, "stage", lambda _, name, total: recording.stage(name, total))
-        monkeypatch.setattr(Bar, "advance", lambda _, done: recording.advance(done))
+        monkeypatch.setattr(ProgressBar, "stage", lambda _, name, total: recording.stage(name, total))
+        monkeypatch.setattr(ProgressBar, "advance", lambda _, done: recording.advance(done))
         monkeypatch.setattr(sys, "argv", ["relit", *map(str, arguments)])
         capfd.readouterr()
         with pytest.raises(SystemExit) as ended:
