@@ -114,12 +114,11 @@ def change_priority(service: ServiceDep, caller: Writer, job: JobName,
     def work(connection: sa.Connection) -> bool:
         attempt = jobs.set_priority(connection, job, wanted.priority)
         if attempt is not None:
-            service.queue.enqueue(connection, job, attempt, before.request, wanted.priority)
+            service.queue.set_priority(connection, job, attempt, wanted.priority)
         return attempt is not None
 
     if not service.database.transact(work):
         raise ApiError("conflict", f"{job} is {before.state}: only a queued job has a priority to change")
-    service.queue.cancel(job, before.attempt)
     return view(service, caller, job)
 
 

@@ -1,7 +1,7 @@
-"""Jobs: what was asked, how far it is, how it ended.
+"""Jobs: the request of each, its progress, and how it ended.
 
-queued → running → succeeded | failed | cancelled; failed and cancelled → queued again, as the next attempt. Every change of a worker
-names the worker and the attempt (a Claim), so that one which was cancelled or given up for dead changes nothing any more.
+queued → running → succeeded | failed | cancelled; failed and cancelled → queued again, as the next attempt. Every change by a worker
+names the worker and the attempt (a Claim). So a worker whose job was cancelled or taken over changes nothing any more.
 """
 
 import time
@@ -19,43 +19,43 @@ from service.views.states import ACTIVE, CANCELLED, CHECKING, ENDED, FAILED, QUE
 FRAMES = "frames"
 """The stage that counts frames."""
 PATIENCE_S = 600.0
-"""How long a change of a worker waits for a database that does not answer."""
+"""How long a change by a worker waits for a database that does not answer."""
 LATELY_S = 60.0
-"""How long a job that has ended is still news; clocks of workers may differ by this much."""
+"""How long `watched` returns a job after it ended; the clocks of workers may differ by this much."""
 
 
 class Claim(NamedTuple):
-    """That a worker works on an attempt of a job."""
+    """The right of a worker to change a job: the worker has this attempt of it."""
 
     job: str
     attempt: int
     worker: str
 
 
-class Progress(NamedTuple):
-    """Where a job is."""
+class StageProgress(NamedTuple):
+    """How far a job is in its stage."""
 
     stage: str
     done: int
     total: int
     rate: float | None
-    """Steps a second."""
+    """Counts a second."""
 
 
 def insert(connection: sa.Connection, *, project: str, key: str | None, request: JobRequest, chunk_frames: int,
            inputs: Iterable[str], trace: str | None = None) -> str:
-    """Write down a new job in the caller's transaction.
+    """Insert a new job in the caller's transaction.
 
     Args:
         connection: of the transaction.
-        project, key: whose it is.
-        request: what is asked.
-        chunk_frames: frames of a step; kept, so that the steps of a job stay the same whatever the settings become.
-        inputs: identifiers of what it reads.
-        trace: traceparent of the request, so that the spans of its steps are found with it.
+        project, key: to which the job belongs.
+        request: of the user.
+        chunk_frames: frames of one step.
+        inputs: identifiers of the captures, environments and jobs that it reads.
+        trace: traceparent of the HTTP request, so that the spans of the job's steps belong to its trace.
 
     Returns:
-        Its identifier.
+        The identifier of the job.
     """
     identifier, now = new_id(JOB), time.time()
     connection.execute(jobs.insert().values(
@@ -68,21 +68,21 @@ def insert(connection: sa.Connection, *, project: str, key: str | None, request:
 
 
 def find(database: Database, job: str, project: str | None = None) -> sa.RowMapping | None:
-    """One job; of a project, where one is named."""
+    """Return a job, or None; with `project`, only if it belongs to that project."""
     query = sa.select(jobs).where(jobs.c.id == job)
     return database.row(query if project is None else query.where(jobs.c.project == project))
 
 
 def latest(database: Database, project: str, *, states: Sequence[str] = (), limit: int, before: tuple[float, str] | None = None,
            ) -> list[sa.RowMapping]:
-    """Jobs of a project, the newest first.
+    """Return a page of the jobs of a project, the newest first.
 
     Args:
-        database: where they are.
-        project: whose.
-        states: of these alone; none: of all.
-        limit: how many at most.
-        before: creation time and identifier of the last one of the page before.
+        database: of the service.
+        project: of the jobs.
+        states: only jobs in these states; empty: all jobs.
+        limit: number of jobs at most.
+        before: creation time and identifier of the last job of the previous page.
     """
     query = sa.select(jobs).where(jobs.c.project == project)
     if states:
@@ -91,46 +91,51 @@ def latest(database: Database, project: str, *, states: Sequence[str] = (), limi
 
 
 def watched(database: Database, topics: Sequence[str]) -> list[sa.RowMapping]:
-    """Identifier, project and revision of jobs, and of all jobs of projects that have not ended or ended lately."""
+    """Return identifier, project and revision of jobs.
+
+    Args:
+        database: of the service.
+        topics: identifiers of jobs, and projects: of a project, the jobs that have not ended or ended lately.
+    """
     lately = jobs.c.state.in_(ACTIVE) | (jobs.c.updated_at > time.time() - LATELY_S)
     return database.rows(sa.select(jobs.c.id, jobs.c.project, jobs.c.revision).where(
         jobs.c.id.in_(topics) | (jobs.c.project.in_(topics) & lately)))
 
 
 def revisions(database: Database, identifiers: Sequence[str]) -> dict[str, sa.RowMapping]:
-    """Jobs by identifier, for those who watch them."""
+    """Return jobs by their identifiers."""
     return {row["id"]: row for row in database.rows(sa.select(jobs).where(jobs.c.id.in_(identifiers)))}
 
 
 def count_queued(connection: sa.Connection, project: str, key: str | None) -> int:
-    """Jobs of a key that have not begun."""
+    """Return how many jobs of a key are queued."""
     query = sa.select(sa.func.count()).where(jobs.c.project == project, jobs.c.state == QUEUED,
                                              jobs.c.key.is_(None) if key is None else jobs.c.key == key)
     return int(connection.execute(query).scalar_one())
 
 
 def counts(database: Database) -> dict[str, int]:
-    """Jobs by state."""
+    """Return how many jobs are in each state."""
     return {row["state"]: row["count"] for row in database.rows(
         sa.select(jobs.c.state, sa.func.count().label("count")).group_by(jobs.c.state))}
 
 
 def oldest_queued(database: Database) -> float | None:
-    """When the job that has waited for longest began to wait."""
+    """Return when the job that has waited longest was queued; None if none is queued."""
     row = database.row(sa.select(sa.func.min(jobs.c.updated_at).label("since")).where(jobs.c.state == QUEUED))
     return None if row is None else row["since"]
 
 
 def frames(database: Database) -> int:
-    """Frames that all jobs together have made."""
+    """Return how many frames all jobs together have made."""
     row = database.row(sa.select(sa.func.sum(jobs.c.done).label("frames")).where(jobs.c.stage == FRAMES))
     return int((row and row["frames"]) or 0)
 
 
 def users_of(connection: sa.Connection, input_id: str, *, active: bool) -> list[str]:
-    """Identifiers of jobs that read something; active: of those alone which have not ended.
+    """Return the identifiers of the jobs that read a capture, an environment or a job; with `active`, of those that have not ended.
 
-    Checks are left out: the state of what they check tells, and changes a moment before they have ended.
+    Checks are left out: the state of the intake tells whether it is being checked.
     """
     query = sa.select(jobs.c.id).join(job_inputs, job_inputs.c.job == jobs.c.id).where(
         job_inputs.c.input == input_id, jobs.c.request["kind"].as_string() != "check")
@@ -138,24 +143,24 @@ def users_of(connection: sa.Connection, input_id: str, *, active: bool) -> list[
 
 
 def begin(database: Database, claim: Claim) -> bool:
-    """A worker takes a job up; false where it is not to be done any more, or is another worker's."""
+    """Let a worker begin a job; return False if the job was cancelled or another worker has it."""
     free = sa.or_(jobs.c.worker.is_(None), jobs.c.worker == claim.worker)
     return _change(database, claim, free, state=RUNNING, worker=claim.worker,
                    started_at=sa.func.coalesce(jobs.c.started_at, time.time()))
 
 
 def is_claimed(database: Database, claim: Claim) -> bool:
-    """Whether a worker shall go on."""
+    """Return whether the worker still has the job."""
     return database.row(sa.select(jobs.c.id).where(*_held(claim))) is not None
 
 
-def advance(database: Database, claim: Claim, progress: Progress) -> bool:
-    """Note where a running job is.
+def advance(database: Database, claim: Claim, progress: StageProgress) -> bool:
+    """Record the progress of a running job; return False if the worker no longer has it.
 
-    More frames than it ever had count as a finished step does: a job that comes further is not one that kills its workers.
+    More frames than the attempt ever had set `lost` to 0, as a finished step does: a job that makes progress does not kill its workers.
 
     Raises:
-        DBAPIError: the database does not answer at once.
+        DBAPIError: the database does not answer; it is not asked again.
     """
     reached: dict[str, Any] = {}
     if progress.stage == FRAMES:
@@ -165,33 +170,33 @@ def advance(database: Database, claim: Claim, progress: Progress) -> bool:
 
 
 def finish_step(database: Database, claim: Claim, steps: Sequence[str]) -> bool:
-    """Note the steps that are finished: all of them, this one too."""
+    """Record the names of all finished steps; return False if the worker no longer has the job."""
     return _change(database, claim, finished_steps=list(steps), lost=0)
 
 
 def end(database: Database, claim: Claim, state: str, error: str | None = None) -> bool:
-    """A worker ends a job."""
-    done: dict[str, Any] = {"done": jobs.c.total} if state == SUCCEEDED else {}  # what was told last may lie half a second back
+    """End a job; return False if the worker no longer has it."""
+    done: dict[str, Any] = {"done": jobs.c.total} if state == SUCCEEDED else {}  # the last recorded progress may be half a second old
     return _change(database, claim, state=state, error=None if error is None else storable(error), finished_at=time.time(), **done)
 
 
 def record_lost_worker(connection: sa.Connection, claim: Claim, limit: int, sentence: str) -> str | None:
-    """A worker died with this job, which waits for the next one, or has failed where it lost too many.
+    """Record that a worker died while it had a job: the job is queued again, or fails if it has lost too many workers.
 
     Args:
         connection: of the caller's transaction.
-        claim: of the dead.
-        limit: workers that a job may lose in one step.
-        sentence: the error of a job that lost more.
+        claim: of the dead worker.
+        limit: number of workers that a job may lose in one step.
+        sentence: error of a job that has lost more.
 
     Returns:
-        The job's state; None where it had ended.
+        The new state of the job; None if it had ended.
     """
     active = [jobs.c.id == claim.job, jobs.c.attempt == claim.attempt, jobs.c.state.in_(ACTIVE)]
     row = connection.execute(sa.select(jobs.c.lost, jobs.c.worker).where(*active).with_for_update()).one_or_none()
     if row is None:
         return None
-    lost = row.lost + (row.worker == claim.worker)  # not one that died before it began, and none twice
+    lost = row.lost + (row.worker == claim.worker)  # a worker that died before it began does not count, and none counts twice
     state, now = FAILED if lost > limit else QUEUED, time.time()
     done = connection.execute(jobs.update().where(*active).values(
         state=state, lost=lost, worker=None, updated_at=now, revision=jobs.c.revision + 1,
@@ -202,7 +207,7 @@ def record_lost_worker(connection: sa.Connection, claim: Claim, limit: int, sent
 
 
 def release(connection: sa.Connection, claim: Claim) -> bool:
-    """A worker gives a job back; false where it is not wanted any more."""
+    """Queue a job again that the worker had taken; return False if it was cancelled or another worker has it."""
     mine = sa.or_(jobs.c.worker.is_(None), jobs.c.worker == claim.worker)
     return connection.execute(jobs.update().where(
         jobs.c.id == claim.job, jobs.c.attempt == claim.attempt, jobs.c.state.in_(ACTIVE), mine).values(
@@ -210,7 +215,7 @@ def release(connection: sa.Connection, claim: Claim) -> bool:
 
 
 def cancel(connection: sa.Connection, job: str) -> bool:
-    """Cancel a job that has not ended."""
+    """Cancel a job; return False if it has ended."""
     now = time.time()
     done = connection.execute(jobs.update().where(jobs.c.id == job, jobs.c.state.in_(ACTIVE)).values(
         state=CANCELLED, finished_at=now, updated_at=now, revision=jobs.c.revision + 1))
@@ -220,10 +225,10 @@ def cancel(connection: sa.Connection, job: str) -> bool:
 
 
 def queue_again(connection: sa.Connection, job: str, state: str) -> int | None:
-    """Queue a job that is in this state once more.
+    """Queue a job again that has ended in `state`.
 
     Returns:
-        The number of the attempt; None where the job is in another state.
+        The number of the new attempt; None if the job is in another state.
     """
     done = connection.execute(jobs.update().where(jobs.c.id == job, jobs.c.state == state).values(
         state=QUEUED, attempt=jobs.c.attempt + 1, revision=jobs.c.revision + 1, updated_at=time.time(), finished_at=None,
@@ -234,25 +239,23 @@ def queue_again(connection: sa.Connection, job: str, state: str) -> int | None:
 
 
 def set_priority(connection: sa.Connection, job: str, priority: int) -> int | None:
-    """Give a queued job another priority, as another attempt.
+    """Change the priority of a queued job.
 
     Returns:
-        The number of the attempt; None where the job is not queued.
+        The number of its attempt, whose place in the queue is to change; None if the job is not queued.
     """
-    attempt = queue_again(connection, job, QUEUED)
-    if attempt is not None:
-        connection.execute(jobs.update().where(jobs.c.id == job).values(priority=priority))
-    return attempt
+    return connection.execute(jobs.update().where(jobs.c.id == job, jobs.c.state == QUEUED).values(
+        priority=priority, updated_at=time.time(), revision=jobs.c.revision + 1).returning(jobs.c.attempt)).scalar()
 
 
 def remove(connection: sa.Connection, job: str) -> bool:
-    """Forget a job that has ended."""
+    """Delete a job; return False if it has not ended."""
     connection.execute(job_inputs.delete().where(job_inputs.c.job == job))
     return connection.execute(jobs.delete().where(jobs.c.id == job, jobs.c.state.in_(ENDED))).rowcount == 1
 
 
 def ended_before(database: Database, when: float) -> list[sa.RowMapping]:
-    """Jobs that ended before a time."""
+    """Return the jobs that ended before a time."""
     return database.rows(sa.select(jobs.c.id, jobs.c.project, jobs.c.attempt).where(jobs.c.state.in_(ENDED), jobs.c.finished_at < when))
 
 
@@ -261,7 +264,7 @@ def _held(claim: Claim) -> list[sa.ColumnElement[bool]]:
 
 
 def _end_check(connection: sa.Connection, job: str, problem: str) -> None:
-    """What a check was to look at is refused, so that it does not wait for ever; other jobs read nothing that is being checked."""
+    """Refuse the intake that a check had to look at, so that it does not stay in checking; no other job reads one that is being checked."""
     connection.execute(intakes.update().where(
         intakes.c.state == CHECKING, intakes.c.id.in_(sa.select(job_inputs.c.input).where(job_inputs.c.job == job))).values(
         state=REFUSED, problem=problem))
@@ -269,7 +272,7 @@ def _end_check(connection: sa.Connection, job: str, problem: str) -> None:
 
 def _change(database: Database, claim: Claim, free: sa.ColumnElement[bool] | None = None, *, patience_s: float = PATIENCE_S,
             **values: Any) -> bool:
-    """Change what a worker holds, or what is free for it to take."""
+    """Change a job that the worker has or, with the condition `free`, may take."""
     found = _held(claim) if free is None else [jobs.c.id == claim.job, jobs.c.attempt == claim.attempt, jobs.c.state.in_(ACTIVE), free]
     statement = jobs.update().where(*found).values(updated_at=time.time(), revision=jobs.c.revision + 1, **values)
     return database.transact(lambda connection: connection.execute(statement).rowcount == 1, patience_s=patience_s)

@@ -1,15 +1,15 @@
-"""The tables. They lie beside those of the job queue, so that one transaction can write both."""
+"""The tables of the service. They are in the same database as those of DBOS, so that one transaction can write both."""
 
 from typing import Any
 
 import sqlalchemy as sa
 
 SCHEMA_VERSION = 1
-"""Raised with every change of a table; a database of another version is refused."""
+"""Increased with every change of a table; the program refuses a database of another version."""
 
 metadata = sa.MetaData()
 Bytewise = sa.Text().with_variant(sa.Text(collation="C"), "postgresql")
-"""Text in the order of its bytes, as SQLite has it anyway."""
+"""Text that is ordered by its bytes; SQLite orders all text so."""
 
 
 def _id() -> "sa.Column[str]":
@@ -34,7 +34,7 @@ intakes = sa.Table(  # captures and environments
     "relit_intakes", metadata, _id(), _project(),
     sa.Column("kind", sa.String(16), nullable=False),
     sa.Column("name", sa.String(200), nullable=False),
-    sa.Column("folder", sa.Text),  # registered, where it is on the server; NULL: uploaded
+    sa.Column("folder", sa.Text),  # where a registered one lies on the server; NULL: it was uploaded
     sa.Column("state", sa.String(16), nullable=False),
     sa.Column("problem", sa.Text),  # why it was refused
     sa.Column("facts", sa.JSON),  # what the check found
@@ -45,32 +45,47 @@ uploads = sa.Table(
     "relit_uploads", metadata, _id(), _project(),
     sa.Column("intake", sa.String(32), sa.ForeignKey("relit_intakes.id"), nullable=False),
     sa.Column("path", sa.Text, nullable=False),  # within the capture
-    sa.Column("folded", Bytewise, nullable=False),  # the path where upper and lower case are one
+    sa.Column("folded", Bytewise, nullable=False),  # the path without the difference of upper and lower case
     sa.Column("length", sa.BigInteger, nullable=False),
-    sa.Column("received", sa.BigInteger, nullable=False),  # bytes that are safe on disk
-    sa.Column("sha256", sa.String(64)),  # of the whole file, hexadecimal, where the client said it
+    sa.Column("received", sa.BigInteger, nullable=False),  # bytes that are on the disk for certain
+    sa.Column("sha256", sa.String(64)),  # of the whole file, hexadecimal; NULL: the client did not say it
     sa.Column("touched_at", sa.Float, nullable=False),
     sa.Column("done", sa.Boolean, nullable=False),
     sa.UniqueConstraint("intake", "folded", name="relit_uploads_of_path"))
 
 jobs = sa.Table(
+    # DBOS records a workflow for each attempt of a job: its queue, the worker that took it, its priority and whether it has ended. A fact
+    # is here although DBOS has one like it for the reason beside it; the tests named are in tests/service/server.
     "relit_jobs", metadata, _id(), _project(),
-    sa.Column("key", sa.String(32)),  # who asked; NULL: anonymous, or the service itself
-    sa.Column("request", sa.JSON, nullable=False),  # service.requests.jobs
-    sa.Column("trace", sa.String(64)),  # traceparent of the request that made it, where traces are made
-    sa.Column("chunk_frames", sa.Integer, nullable=False),
+    sa.Column("key", sa.String(32)),  # identifier of the API key that submitted it; NULL: anonymous, or the service
+    sa.Column("request", sa.JSON, nullable=False),  # of service.requests.jobs
+    sa.Column("trace", sa.String(64)),  # traceparent of the HTTP request that submitted it; NULL: it was not traced
+    sa.Column("chunk_frames", sa.Integer, nullable=False),  # frames of a step: the steps stay the same when the setting changes
+    # as the API shows it, also after the workflows of the job are deleted; JobQueue.set_priority writes both in one transaction
+    # (test_a_changed_priority_is_that_of_the_queue)
     sa.Column("priority", sa.Integer, nullable=False),
+    # of the job over all attempts. DBOS changes the status of a workflow in transactions of its own, and `revision` has to grow in the
+    # same transaction as the state, or a stream of events misses the change (test_a_job_that_is_cancelled_and_resumed_is_told)
     sa.Column("state", sa.String(16), nullable=False),
-    sa.Column("attempt", sa.Integer, nullable=False),  # begins at 1; a retry is the next
+    # number of the workflow, from 1. A retry is a new workflow: DBOS does not resume one that has ended, and a worker that has not yet
+    # noticed the end of the old one must change nothing in the new one (test_a_worker_that_was_given_up_for_dead_changes_nothing_any_more)
+    sa.Column("attempt", sa.Integer, nullable=False),
     sa.Column("revision", sa.BigInteger, nullable=False),  # grows with every change
     sa.Column("created_at", sa.Float, nullable=False),
     sa.Column("updated_at", sa.Float, nullable=False),
-    sa.Column("started_at", sa.Float),
+    sa.Column("started_at", sa.Float),  # of the first attempt; DBOS has that of the latest start
     sa.Column("finished_at", sa.Float),
+    # the worker that may change the row; DBOS has it as executor_id of the workflow. It has to stand in the row that is changed: an
+    # UPDATE that waits for a takeover reads this row again, but not another (test_a_change_that_waits_for_the_takeover_changes_nothing)
     sa.Column("worker", sa.String(200)),
-    sa.Column("lost", sa.Integer, nullable=False),  # workers that died since the job last came further
-    sa.Column("reached", sa.Integer, nullable=False),  # the most frames that it had in this attempt
-    sa.Column("finished_steps", sa.JSON, nullable=False),  # names, of all attempts
+    # workers that died since the job last made progress, and the most frames that this attempt had. DBOS counts every start of a
+    # workflow, also those after a drain or a restart of the database (test_more_frames_than_ever_before_count_as_a_finished_step)
+    sa.Column("lost", sa.Integer, nullable=False),
+    sa.Column("reached", sa.Integer, nullable=False),
+    # names, of all attempts. DBOS could record the steps of one workflow. To keep them for a retry the workflow would have to be forked,
+    # which DBOS does not do in a transaction of ours, and which drops the priority; and it records Python names, so that a renamed
+    # function would end the jobs that are under way (test_a_job_that_was_given_back_goes_on_with_the_steps_that_are_left)
+    sa.Column("finished_steps", sa.JSON, nullable=False),
     sa.Column("stage", sa.String(100)),
     sa.Column("done", sa.Integer),
     sa.Column("total", sa.Integer),
@@ -79,7 +94,7 @@ jobs = sa.Table(
     sa.Index("relit_jobs_of_project", "project", "created_at"),
     sa.Index("relit_jobs_of_state", "state", "updated_at"))
 
-job_inputs = sa.Table(  # captures, environments and jobs that a job reads
+job_inputs = sa.Table(  # the captures, environments and jobs that a job reads
     "relit_job_inputs", metadata,
     sa.Column("job", sa.String(32), sa.ForeignKey("relit_jobs.id", ondelete="CASCADE"), primary_key=True),
     sa.Column("input", sa.String(32), primary_key=True, index=True))
@@ -92,7 +107,7 @@ idempotency = sa.Table(
     sa.Column("created_at", sa.Float, nullable=False),
     sa.PrimaryKeyConstraint("project", "token"))
 
-workers = sa.Table(
+workers = sa.Table(  # for operators: DBOS keeps no list of them, and the locks that tell who lives have no device (see worker_lock)
     "relit_workers", metadata, sa.Column("id", sa.String(200), primary_key=True),
     sa.Column("host", sa.String(200), nullable=False),
     sa.Column("pid", sa.Integer, nullable=False),
@@ -103,13 +118,13 @@ workers = sa.Table(
 
 
 def newest_first(query: "sa.Select[Any]", table: sa.Table, *, limit: int, before: tuple[float, str] | None) -> "sa.Select[Any]":
-    """A page of rows, by the time of their creation.
+    """Return the query of one page of rows, the newest first.
 
     Args:
-        query: of rows of the table.
+        query: selects rows of the table.
         table: jobs or intakes.
-        limit: how many at most.
-        before: creation time and identifier of the last row of the page before; None: the first page.
+        limit: number of rows at most.
+        before: creation time and identifier of the last row of the previous page; None: the first page.
     """
     if before is not None:
         query = query.where(sa.tuple_(table.c.created_at, table.c.id) < sa.tuple_(*before))

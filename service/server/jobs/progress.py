@@ -1,4 +1,4 @@
-"""What a running step tells the store, and how it learns that it is to stop."""
+"""The progress of a running step: recorded in the database, which also tells whether the step is to stop."""
 
 import threading
 import time
@@ -10,43 +10,43 @@ from service.server.database.jobs import FRAMES, Claim
 from service.server.log import logger
 
 EVERY_S = 0.5
-"""How often the store is told and asked."""
-UNTOLD_S = 5.0
-"""Until it is told again after it did not answer: each try may take long, and the step waits for it."""
+"""Seconds between two records of the progress."""
+UNANSWERED_S = 5.0
+"""Seconds until the next record after the database did not answer: each try may take long, and the step waits for it."""
 
 
 class Stopped(Exception):
-    """The job was cancelled, or is another worker's now."""
+    """The job was cancelled, or another worker has it now."""
 
 
 class JobProgress:
-    """A Progress of one step: tells the store, renews the deadline, and stops the step where the job is not wanted any more.
+    """A Progress of one step, which stops the step if the worker no longer has the job.
 
-    While the database does not answer nothing is told, and the step goes on.
+    While the database does not answer, the step continues and nothing is recorded.
     """
 
     def __init__(self, database: Database, claim: Claim, *, alive: Callable[[], None], before: int = 0, of: int | None = None) -> None:
-        """Prepare.
+        """Create the progress of a step.
 
         Args:
-            database: the store's.
-            claim: what is worked on.
+            database: of the service.
+            claim: of the worker.
             alive: called at every sign of progress.
-            before: frames of steps before this one.
-            of: frames of the whole job; None: it makes none.
+            before: frames of the steps before this one.
+            of: frames of the whole job; None: it makes no frames.
         """
         self._database, self._claim = database, claim
         self._alive, self._before, self._of = alive, before, of
-        self._lock = threading.Lock()  # several threads of a pipeline may report
-        self._tell_at = 0.0
+        self._lock = threading.Lock()  # several threads of a step may report
+        self._record_at = 0.0
         self._stage, self._offset, self._total, self._began = "begin", 0, 0, time.monotonic()
         self._counted = 0
         self._opening = self._stopped = False
 
     def stage(self, name: str, total: int) -> None:
-        """Begin a stage."""
+        """Begin a stage of the step."""
         with self._lock:
-            self._began, self._tell_at = time.monotonic(), 0.0
+            self._began, self._record_at = time.monotonic(), 0.0
             if self._stage == FRAMES and name != FRAMES:  # the frames of this step are made
                 self._before += self._counted
             self._opening = self._of is not None and name != FRAMES and self._before > 0
@@ -57,10 +57,10 @@ class JobProgress:
         self.advance(0)
 
     def advance(self, done: int) -> None:
-        """Tell the store, at most twice a second.
+        """Record the progress, at most every EVERY_S.
 
         Raises:
-            Stopped: the job is not wanted any more.
+            Stopped: the job was cancelled, or another worker has it.
         """
         self._alive()
         with self._lock:
@@ -68,16 +68,17 @@ class JobProgress:
                 raise Stopped
             self._counted = 0 if self._opening else done
             now = time.monotonic()
-            if now < self._tell_at:
+            if now < self._record_at:
                 return
             spent = now - self._began
             counted = self._counted
-            progress = jobs.Progress(self._stage, self._offset + counted, self._total, counted / spent if counted and spent > 0 else None)
+            rate = counted / spent if counted and spent > 0 else None
+            progress = jobs.StageProgress(self._stage, self._offset + counted, self._total, rate)
             try:
                 self._stopped = not jobs.advance(self._database, self._claim, progress)
-                self._tell_at = time.monotonic() + EVERY_S
+                self._record_at = time.monotonic() + EVERY_S
             except UNANSWERED as error:
                 logger.warning("progress is not told", job=self._claim.job, error=message_of(error))
-                self._tell_at = time.monotonic() + UNTOLD_S
+                self._record_at = time.monotonic() + UNANSWERED_S
             if self._stopped:
                 raise Stopped

@@ -1,10 +1,13 @@
-"""The door to the queue: for those who hand jobs in, and not for those who do them.
+"""The queue, for those who submit and cancel jobs.
 
-A job of the store is a workflow an attempt. Both are written in one transaction, so that there is never one without the other.
+DBOS keeps the queue: a workflow for each attempt of a job. The row of the job and its workflow are written in one transaction, so that
+neither exists without the other.
 """
 
 import sqlalchemy as sa
 from dbos import DBOS, DBOSClient, DBOSPortableJSONSerializer
+from dbos._schemas import SCHEMA_PLACEHOLDER
+from dbos._schemas.system_database import SystemSchema
 
 from service.requests.jobs import CheckJob, JobRequest
 from service.server.database import jobs
@@ -13,20 +16,22 @@ from service.server.database.jobs import Claim
 from service.server.settings import Settings
 
 WORK, CHECKS = "work", "checks"
-"""Queues: of what takes a device, and of quick looks at what came in."""
+"""The queues: jobs that need a device, and quick checks of captures and environments."""
 WORKFLOW = "relit.job"
 VERSION = "1"
-"""Of the steps of workflows: a job is finished by a worker of the version that began it."""
+"""Version of the workflow: a worker takes only jobs that were queued by the same version."""
 SERIALIZER = DBOSPortableJSONSerializer()
 HIGHEST = 101
-"""The queue counts priorities from 1, the first to go; requests from 0 to 100, the last to go."""
+"""DBOS starts the lowest priority first and counts from 1; a request's highest priority, 100, goes first."""
+POSTGRES_SCHEMA = "dbos"
+"""Where DBOS has its tables on PostgreSQL; SQLite has no schemas."""
 
 
 def prepare(settings: Settings, database: Database) -> None:
-    """Make the tables of the service and of the queue where there are none.
+    """Make the data folder, and the tables of the service and of the queue, if they do not exist.
 
     Raises:
-        DatabaseError: they are those of another version.
+        DatabaseError: the tables are those of another version.
     """
     settings.data.mkdir(parents=True, exist_ok=True)
     create(database)
@@ -34,53 +39,62 @@ def prepare(settings: Settings, database: Database) -> None:
 
 
 def workflow_id(job: str, attempt: int) -> str:
-    """Name of the workflow of an attempt."""
+    """Return the name of the workflow of an attempt."""
     return f"{job}.{attempt}"
 
 
 def job_of(workflow: str) -> tuple[str, int]:
-    """The job and the attempt that a workflow is."""
+    """Return the job and the attempt of a workflow."""
     job, _, attempt = workflow.rpartition(".")
     return job, int(attempt)
 
 
 class JobQueue:
-    """Hands jobs in and calls them off."""
+    """Submits, cancels and returns jobs."""
 
     def __init__(self, database: Database) -> None:
-        """Args: database: of the store; must be prepared."""
+        """Args: database: of the service, prepared."""
         self._database = database
         self._client = DBOSClient(system_database_engine=database.engine, serializer=SERIALIZER, lazy=True, retry_connection_errors=False)
+        self._schema = {SCHEMA_PLACEHOLDER: None if database.is_sqlite else POSTGRES_SCHEMA}
 
     def submit(self, connection: sa.Connection, *, project: str, key: str | None, request: JobRequest, chunk_frames: int,
                inputs: list[str], trace: str | None = None) -> str:
-        """Write down a new job and queue it, in the caller's transaction; arguments as `jobs.insert`."""
+        """Record a new job and queue it in the caller's transaction; the arguments are those of `jobs.insert`."""
         job = jobs.insert(connection, project=project, key=key, request=request, chunk_frames=chunk_frames, inputs=inputs,
                           trace=trace)
-        self.enqueue(connection, job, 1, request)
+        self.enqueue(connection, job, 1, request, request.priority)
         return job
 
-    def enqueue(self, connection: sa.Connection, job: str, attempt: int, request: JobRequest, priority: int | None = None) -> None:
-        """Queue an attempt, in the caller's transaction."""
+    def enqueue(self, connection: sa.Connection, job: str, attempt: int, request: JobRequest, priority: int) -> None:
+        """Queue an attempt of a job in the caller's transaction."""
         self._client.enqueue_in_transaction(connection, {
-            "workflow_name": WORKFLOW, "queue_name": CHECKS if isinstance(request, CheckJob) else WORK,
-            "workflow_id": workflow_id(job, attempt), "app_version": VERSION,
-            "priority": HIGHEST - (request.priority if priority is None else priority),
-        }, job, attempt)
+            "workflow_name": WORKFLOW, "queue_name": _queue(isinstance(request, CheckJob)), "workflow_id": workflow_id(job, attempt),
+            "app_version": VERSION, "priority": HIGHEST - priority}, job, attempt)
+
+    def set_priority(self, connection: sa.Connection, job: str, attempt: int, priority: int) -> None:
+        """Change the priority of a queued attempt in the caller's transaction; its place among equal priorities stays.
+
+        DBOS 3.4 sets a priority only when it queues, and a new attempt would lose the place. So this writes the column by which DBOS
+        orders its queues; `test_the_highest_priority_goes_first` fails if a later version orders them otherwise.
+        """
+        workflows = SystemSchema.workflow_status
+        connection.execute(workflows.update().where(workflows.c.workflow_uuid == workflow_id(job, attempt)).values(
+            priority=HIGHEST - priority).execution_options(schema_translate_map=self._schema))
 
     def cancel(self, job: str, attempt: int) -> None:
-        """Take an attempt from the queue; one that runs is told by the store, and ends at its next sign of progress."""
+        """Take an attempt out of the queue; a worker that runs it learns so from the job's row at its next sign of progress."""
         self._client.cancel_workflow(workflow_id(job, attempt))
 
     def taken_by(self) -> dict[str, list[str]]:
-        """Workflows that have begun and not ended, by the worker that has them."""
+        """Return the workflows that have begun and not ended, by the worker that has them."""
         found: dict[str, list[str]] = {}
         for status in self._client.list_workflows(status="PENDING", app_version=VERSION, load_input=False, load_output=False):
             found.setdefault(status.executor_id or "", []).append(status.workflow_id)
         return found
 
     def return_job(self, workflow: str, worker: str) -> None:
-        """Queue what the caller, a worker, had begun and will not go on with."""
+        """Queue a workflow again that the calling worker had taken and does not finish."""
         job, attempt = job_of(workflow)
         if self._database.transact(lambda connection: jobs.release(connection, Claim(job, attempt, worker))):
             self.requeue(workflow)
@@ -88,12 +102,16 @@ class JobQueue:
             self.cancel(job, attempt)
 
     def requeue(self, workflow: str) -> None:
-        """Queue what a worker had begun; its place in the queue is the one that it had."""
+        """Queue a workflow again that a worker had taken; its place in the queue is the one that it had."""
         job, _ = job_of(workflow)
         row = jobs.find(self._database, job)
         if row is not None:
-            self._client.resume_workflow(workflow, queue_name=CHECKS if row["request"]["kind"] == "check" else WORK)
+            self._client.resume_workflow(workflow, queue_name=_queue(row["request"]["kind"] == "check"))
 
     def forget(self, job: str, attempts: int) -> None:
-        """Remove the workflows of a job."""
+        """Delete the workflows of a job."""
         self._client.delete_workflows([workflow_id(job, attempt) for attempt in range(1, attempts + 1)])
+
+
+def _queue(is_check: bool) -> str:
+    return CHECKS if is_check else WORK

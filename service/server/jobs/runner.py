@@ -1,10 +1,14 @@
-"""The workflow of a job: its steps one after the other, each recorded when it is done."""
+"""The workflow of a job: its steps, one after the other.
+
+DBOS starts the workflow, and starts it again from its beginning when the job goes to another worker. Steps that are finished are then
+skipped: `finished_steps` in service.server.database.tables says why that list is ours. So no step is a step of DBOS, which would record
+it a second time, under the name of a Python function.
+"""
 
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import TypeVar
 
 from dbos import DBOS
@@ -16,7 +20,7 @@ from service.server.database import intakes, jobs
 from service.server.database.engine import FIRST_PAUSE_S, LONGEST_PAUSE_S, UNANSWERED, message_of
 from service.server.database.jobs import Claim
 from service.server.jobs.progress import JobProgress, Stopped
-from service.server.jobs.queue import WORKFLOW, JobQueue, workflow_id
+from service.server.jobs.queue import WORKFLOW, workflow_id
 from service.server.jobs.steps import Job, WorkerContext, steps_of
 from service.server.log import logger
 from service.server.storage import layout
@@ -27,69 +31,67 @@ DONE, STOPPED = "done", "stopped"
 
 
 class JobRunner:
-    """Where a worker does its jobs, one step at a time on each queue."""
+    """Does the jobs that the queues give to a worker."""
 
-    def __init__(self, context: WorkerContext, queue: JobQueue, worker: str, *, alive: Callable[[float], None]) -> None:
-        """Prepare.
+    def __init__(self, context: WorkerContext, worker: str, *, alive: Callable[[float], None]) -> None:
+        """Create a runner.
 
         Args:
-            context: where it works.
-            queue: that it gives back to what it cannot go on with.
-            worker: its name.
-            alive: told, at every sign of progress, the oldest last sign of the running steps (monotonic seconds); 0: none runs.
+            context: what the steps need.
+            worker: name of the worker.
+            alive: called at every sign of progress with the time (monotonic seconds) of the oldest last sign of the running steps; with 0
+                when no step runs.
         """
-        self._context, self._queue, self._worker, self._alive = context, queue, worker, alive
+        self._context, self._worker, self._alive = context, worker, alive
         self._draining = threading.Event()
         self._changed = threading.Condition()
-        self._signs: dict[str, float] = {}  # by job
+        self._signs: dict[Claim, float] = {}  # last sign of progress of each running step; two attempts of a job may overlap
         self._running: set[str] = set()
 
     @property
     def running(self) -> frozenset[str]:
-        """Workflows that this process goes on with."""
+        """The workflows that run in this process."""
         with self._changed:
             return frozenset(self._running)
 
     def register(self) -> None:
-        """Make the workflow known to the queue; before it is launched."""
-        @DBOS.step()
-        def step(job: str, attempt: int, name: str) -> str:
-            return self._step(Claim(job, attempt, self._worker), name)
-
+        """Register the workflow with DBOS; call this before DBOS is launched."""
         @DBOS.workflow(name=WORKFLOW, max_recovery_attempts=None)
         def run(job: str, attempt: int) -> str:
-            with self._runs(workflow_id(job, attempt)):
-                return self._run(Claim(job, attempt, self._worker), lambda name: step(job, attempt, name))
+            return self.run(Claim(job, attempt, self._worker))
+
+    def run(self, claim: Claim) -> str:
+        """Do a job and return its outcome: DONE, STOPPED, or the state in which it ended."""
+        if self._draining.is_set():
+            _wait_for_the_end()
+        workflow = workflow_id(claim.job, claim.attempt)
+        with self._changed:
+            self._running.add(workflow)
+        try:
+            return self._run(claim)
+        finally:
+            with self._changed:
+                self._running.discard(workflow)
 
     def drain(self, within_s: float) -> bool:
-        """Begin no further step, and wait for the one that is running.
-
-        Returns:
-            Whether all are done in time.
-        """
+        """Start no further step and wait for the running ones; return whether they ended in time."""
         self._draining.set()
         with self._changed:
             return self._changed.wait_for(lambda: not self._signs, timeout=within_s)
 
-    def _run(self, claim: Claim, step: Callable[[str], str]) -> str:
-        if self._draining.is_set():
-            _wait_for_the_end()
+    def _run(self, claim: Claim) -> str:
         log = logger.bind(job=claim.job, attempt=claim.attempt)
         try:
             names = self._patiently(claim, lambda: self._begin(claim))
             if names is None:
                 return STOPPED
             for name in names:
-                outcome = step(name)
+                outcome = self._step(claim, name)
                 if outcome != DONE:
                     return outcome
-            if jobs.end(self._context.database, claim, SUCCEEDED):
+            if self._patiently(claim, lambda: jobs.end(self._context.database, claim, SUCCEEDED)):
                 log.info("job succeeded")
             return DONE
-        except UNANSWERED as error:  # the queue could not record a step: the steps are to be gone through again, from the first
-            log.warning("job goes back to the queue: the database does not answer", error=message_of(error))
-            self._patiently(claim, lambda: self._queue.return_job(workflow_id(claim.job, claim.attempt), self._worker))
-            return STOPPED
         except USER_ERRORS as error:
             why = sentence(error)
         except Exception as error:
@@ -98,7 +100,7 @@ class JobRunner:
         return self._patiently(claim, lambda: self._fail(claim, why))
 
     def _begin(self, claim: Claim) -> list[str] | None:
-        """The steps of a job that is begun; None: it is not to be done any more, or another does it."""
+        """Return the names of the job's steps; None if the job was cancelled or another worker has it."""
         if not jobs.begin(self._context.database, claim):
             return None
         row = jobs.find(self._context.database, claim.job)
@@ -107,12 +109,12 @@ class JobRunner:
     def _step(self, claim: Claim, name: str) -> str:
         if self._draining.is_set():
             _wait_for_the_end()
-        self._sign(claim.job)
+        self._sign(claim)
         try:
             return self._patiently(claim, lambda: self._perform(claim, name))
         finally:
             with self._changed:
-                del self._signs[claim.job]
+                del self._signs[claim]
                 self._alive(min(self._signs.values(), default=0.0))
                 self._changed.notify_all()
 
@@ -121,18 +123,18 @@ class JobRunner:
         row = jobs.find(database, claim.job)
         if row is None or not jobs.is_claimed(database, claim):
             return STOPPED
-        if name in row["finished_steps"]:  # of an attempt before
+        if name in row["finished_steps"]:
             return DONE
         job = Job.of(dict(row))
         step = next(step for step in steps_of(job, self._context) if step.name == name)
-        progress = JobProgress(database, claim, alive=lambda: self._sign(claim.job), before=step.before, of=step.of)
+        progress = JobProgress(database, claim, alive=lambda: self._sign(claim), before=step.before, of=step.of)
         log = logger.bind(job=job.id, project=job.project, step=name, attempt=claim.attempt, worker=self._worker)
         log.info("step begins")
         try:
             progress.stage(name.partition(" ")[0], 1)
             with telemetry.span(step.name, row["trace"], job=job.id, attempt=claim.attempt, worker=self._worker):
                 step.run(progress)
-            if not self._patiently(claim, lambda: jobs.is_claimed(database, claim)):  # another may be writing there
+            if not self._patiently(claim, lambda: jobs.is_claimed(database, claim)):  # another worker may be writing the same files
                 raise Stopped
             if not isinstance(job.request, CheckJob):
                 self._context.storage.publish(layout.results(job.project, job.id), progress)
@@ -160,7 +162,7 @@ class JobRunner:
         return FAILED
 
     def _patiently(self, claim: Claim, work: Callable[[], T]) -> T:
-        """Do something, and again while the database does not answer: what is done stays done, and waiting is no hanging."""
+        """Call `work` again and again until the database answers; meanwhile give signs of life, so that the worker is not killed."""
         pause = FIRST_PAUSE_S
         while True:
             try:
@@ -170,25 +172,15 @@ class JobRunner:
             time.sleep(pause)
             pause = min(2 * pause, LONGEST_PAUSE_S)
             with self._changed:
-                if claim.job in self._signs:
-                    self._sign(claim.job)
+                if claim in self._signs:
+                    self._sign(claim)
 
-    def _sign(self, job: str) -> None:
+    def _sign(self, claim: Claim) -> None:
         with self._changed:
-            self._signs[job] = time.monotonic()
+            self._signs[claim] = time.monotonic()
             self._alive(min(self._signs.values()))
-
-    @contextmanager
-    def _runs(self, workflow: str) -> Iterator[None]:
-        with self._changed:
-            self._running.add(workflow)
-        try:
-            yield
-        finally:
-            with self._changed:
-                self._running.discard(workflow)
 
 
 def _wait_for_the_end() -> None:
-    """The process ends, and another goes on from here."""
+    """Block this thread: the process ends soon, and another worker continues from here."""
     threading.Event().wait()

@@ -1,4 +1,4 @@
-"""A job → the steps that do it: names in place of paths made paths again, and the pipelines called."""
+"""The steps of a job: each finds the files of the captures, environments and jobs that the request names, and calls a product."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -16,39 +16,39 @@ from service.server.storage.folder import Storage
 from stage.files import resolved
 
 KEYS_FILE = "keys.json"
-"""The light keys of a job, beside its frames."""
+"""Name of the file with the light keys of a job, which lies beside its frames."""
 
 
 class WorkerContext(NamedTuple):
-    """Where a worker works."""
+    """What the steps of a worker need."""
 
     database: Database
     storage: Storage
     cache: Path
-    """Folder for stack caches, one a capture."""
+    """Folder of the image stacks, one for each capture."""
     device: str
     max_pixels: int
     roots: tuple[Path, ...]
-    """That registered captures and environments lie under."""
+    """Folders below which registered captures and environments lie."""
 
     def without_folder(self, sentence: str) -> str:
-        """A sentence for those who use the service: files by their names below its folder, which is nobody else's business."""
+        """Return a sentence for users, in which files are named below the data folder, whose place is not theirs to know."""
         return sentence.replace(f"{self.cache.parent}/", "")
 
 
 class JobStep(NamedTuple):
-    """A piece of a job that is done whole or again."""
+    """A part of a job that is done as a whole or again."""
 
     name: str
     run: Callable[[Progress], None]
     before: int = 0
-    """Frames of the job before its own."""
+    """Frames of the job before those of this step."""
     of: int | None = None
-    """Frames of the job; None: the step makes none."""
+    """Frames of the whole job; None: the step makes no frames."""
 
 
 class Job(NamedTuple):
-    """What a worker knows of a job."""
+    """The parts of a job's row that its steps need."""
 
     id: str
     project: str
@@ -57,12 +57,12 @@ class Job(NamedTuple):
 
     @classmethod
     def of(cls, row: "dict[str, object]") -> "Job":
-        """From its row in the store."""
+        """Read a row of the jobs table."""
         return cls(str(row["id"]), str(row["project"]), ANY_JOB.validate_python(row["request"]), int(str(row["chunk_frames"])))
 
 
 def steps_of(job: Job, context: WorkerContext) -> list[JobStep]:
-    """The steps of a job: always the same for the same job."""
+    """Return the steps of a job, which are always the same for the same job."""
     request = job.request
     if isinstance(request, CheckJob):
         return [JobStep("check", lambda progress: _check(job, request, context, progress))]
@@ -87,7 +87,7 @@ def steps_of(job: Job, context: WorkerContext) -> list[JobStep]:
 
 
 def job_maps(job: Job, maps: str, context: WorkerContext, progress: Progress) -> Path:
-    """The folder of the results of a job of the same project, or of this one, with what was solved."""
+    """Return the folder with the maps of `maps`, a job of the same project or this job."""
     return context.storage.local(layout.results(job.project, maps), layout.SOLVED, progress)
 
 
@@ -112,7 +112,7 @@ def _check(job: Job, request: CheckJob, context: WorkerContext, progress: Progre
             facts = admit_capture(folder, max_pixels=context.max_pixels, progress=progress)
         else:
             facts = admit_environment(folder, max_pixels=context.max_pixels)
-    except USER_ERRORS as error:  # named as they were handed in, not by where the service keeps them
+    except USER_ERRORS as error:  # the user knows the files by the names given, not by their place on the server
         raise RequestError(sentence(error).replace(f"{folder}/", "")) from error
     intakes.accept(context.database, request.intake, facts)
 
@@ -176,7 +176,7 @@ def _out(job: Job, context: WorkerContext) -> Path:
 
 
 def _intake(job: Job, identifier: str, context: WorkerContext, progress: Progress) -> Path:
-    """The folder of a capture or environment of the job's project, as it was admitted; a registered one may have changed since."""
+    """Return the folder of a capture or environment of the job's project; a registered one is checked again, as it may have changed."""
     from service.captures.admit import admit_environment, recheck_capture
 
     folder, registered = _place(job, identifier, context, progress)
@@ -188,7 +188,7 @@ def _intake(job: Job, identifier: str, context: WorkerContext, progress: Progres
 
 
 def _place(job: Job, identifier: str, context: WorkerContext, progress: Progress) -> tuple[Path, bool]:
-    """The folder of a capture or environment of the job's project, or the file of an environment; and whether it was registered."""
+    """Return the folder (or the file of an environment) of an intake of the job's project, and whether it was registered."""
     row = intakes.find(context.database, identifier, job.project)
     if row is None:
         raise RequestError(f"{identifier}: is not there any more")

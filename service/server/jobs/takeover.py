@@ -1,8 +1,8 @@
-"""Taking over: what a dead worker had begun goes back to the queue.
+"""Takeover: the jobs of a worker that died go back to the queue.
 
-The queue gives a worker's jobs back only to a worker of the same name. So each worker holds a lock that is named after it (worker_lock),
-and looks every few seconds whether a worker that has jobs has lost its lock. The worker that finds one takes that lock, so that no two
-take over at once.
+DBOS gives a worker's jobs back only to a worker of the same name. So each worker holds a lock that is named after it (worker_lock), and
+looks every few seconds whether a worker that has jobs has lost its lock. The worker that finds one holds that lock meanwhile, so that no
+two take over the same jobs.
 """
 
 import threading
@@ -18,52 +18,53 @@ from service.server.log import logger
 from service.views.states import QUEUED
 
 GRACE_ROUNDS = 2
-"""Rounds after the lock was taken anew in which nobody is given up for dead: after a restart of the database others, too, take theirs."""
+"""Rounds without a takeover after this worker took its lock anew: a restart of the database took the locks of the others as well."""
 FORGOTTEN_ROUNDS = 3
-"""Rounds after which what we have by the queue's account, and know nothing of, is put back: the database died between its answer and us."""
+"""Rounds after which a workflow goes back that DBOS says this worker has and that does not run here: the database stopped after it had
+given the workflow and before this worker got the answer."""
 
 
 class Takeover:
-    """Looks after dead workers, and keeps the own lock."""
+    """A thread that keeps the worker's own lock and takes over from workers that died."""
 
     def __init__(self, database: Database, queue: JobQueue, lock: WorkerLock, worker: str, *, every_s: float, max_lost: int,
                  running: Callable[[], frozenset[str]], beat: Callable[[], None], deposed: Callable[[], None]) -> None:
-        """Prepare.
+        """Create the thread; `start` starts it.
 
         Args:
             database, queue: of the service.
-            lock: our own, held.
-            worker: who we are.
-            every_s: between two looks.
+            lock: of this worker, held.
+            worker: name of this worker.
+            every_s: seconds between two rounds.
             max_lost: workers that a job may lose in one step.
-            running: the workflows that we go on with.
+            running: returns the workflows that run in this process.
             beat: called every round.
-            deposed: called when the own lock is another's for good.
+            deposed: called when another process has this worker's lock for good.
         """
         self._database, self._queue, self._lock, self._worker = database, queue, lock, worker
         self._every_s, self._max_lost = every_s, max_lost
         self._running, self._beat, self._deposed = running, beat, deposed
         self.state = workers.READY
-        """What others are told of us."""
+        """State of this worker for the table of workers."""
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name="relit-takeover", daemon=True)
         self._grace = self._refused = 0
         self._unknown: Counter[str] = Counter()
 
     def start(self) -> None:
-        """Begin to look."""
+        """Start the thread."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Look no more."""
+        """End the thread and wait for it."""
         self._ended.set()
         self._thread.join()
 
     def round(self) -> None:
-        """Look once."""
+        """Renew the lock, then look at the other workers once."""
         held = self._lock.hold()
         self._refused = self._refused + 1 if held is LockState.REFUSED else 0
-        if self._refused > GRACE_ROUNDS:  # another only holds it while it takes over from us, who were away
+        if self._refused > GRACE_ROUNDS:  # a worker that takes over from this one holds the lock for a moment only
             self._deposed()
         if held is LockState.REFUSED:
             return
@@ -71,14 +72,14 @@ class Takeover:
             self._grace = GRACE_ROUNDS
         workers.record_alive(self._database, self._worker, self.state)
         taken = self._queue.taken_by()
-        self._put_back_forgotten(taken.pop(self._worker, []))
+        self._return_forgotten(taken.pop(self._worker, []))
         if self._grace > 0:
             self._grace -= 1
             return
         for worker in taken:
             with self._lock.dead(worker) as dead:
                 if dead:
-                    self._inherit(worker)
+                    self._take_over(worker)
 
     def _run(self) -> None:
         while True:
@@ -87,13 +88,13 @@ class Takeover:
                 self.round()
             except UNANSWERED as error:
                 logger.warning("database does not answer", error=message_of(error))
-            except Exception as error:  # the next round may do better; without any the worker would seem dead
+            except Exception as error:  # the next round may succeed; a worker without rounds would seem dead
                 logger.error("takeover failed", exc_info=error)
             if self._ended.wait(self._every_s):
                 return
 
-    def _inherit(self, worker: str) -> None:
-        workflows = self._queue.taken_by().get(worker, [])  # under its lock: another may have been quicker
+    def _take_over(self, worker: str) -> None:
+        workflows = self._queue.taken_by().get(worker, [])  # read again under the worker's lock: another may have been faster
         if workflows:
             logger.warning("worker died", dead=worker, jobs=[job_of(workflow)[0] for workflow in workflows])
         for workflow in workflows:
@@ -101,7 +102,7 @@ class Takeover:
         workers.remove(self._database, worker)
 
     def _take(self, workflow: str, worker: str) -> None:
-        """Put a workflow of a dead worker back into the queue, or end its job where it has cost too many workers."""
+        """Queue a workflow of a dead worker again, or end its job if it has lost too many workers."""
         job, attempt = job_of(workflow)
         row = jobs.find(self._database, job)
         sentence = f"lost {self._max_lost + 1} workers in one step ({row['stage'] or 'begin' if row else ''}): " \
@@ -113,7 +114,7 @@ class Takeover:
         else:
             self._queue.cancel(job, attempt)
 
-    def _put_back_forgotten(self, workflows: list[str]) -> None:
+    def _return_forgotten(self, workflows: list[str]) -> None:
         unknown = set(workflows) - self._running()
         self._unknown = Counter({workflow: self._unknown[workflow] + 1 for workflow in unknown})
         for workflow, rounds in self._unknown.items():

@@ -1,4 +1,4 @@
-"""A worker: one process, one device, one job at a time; ended by a signal it finishes its step and hands the job back."""
+"""A worker: one process on one device that does one job at a time. When it is asked to end it finishes its step and returns the job."""
 
 import os
 import secrets
@@ -24,26 +24,26 @@ from service.server.settings import Settings
 from service.server.storage.open import open_storage
 
 POLL_S = 0.25
-"""How often a queue is asked for work."""
+"""Seconds between two looks into a queue."""
 APPLICATION = "relit"
 DEPOSED = 3
 """Exit code of a worker that lost its lock."""
 NICENESS = 5
-"""Of a worker, which fills every core for minutes: the API beside it answers first, and the worker alone on a machine is as fast."""
+"""Niceness of a worker, which fills every core for minutes: the API on the same machine answers first, and alone a worker is as fast."""
 
 
 def run_worker(settings: Settings, device: str, heartbeat: Heartbeat) -> None:
-    """Work until SIGTERM or the end of the parent process.
+    """Do jobs until SIGTERM or until the parent process ends, then end this process.
 
     Args:
         settings: of the service.
         device: cpu, cuda:0, …
-        heartbeat: told that the worker lives, and that its steps do.
+        heartbeat: shared with the supervisor.
     """
     os.nice(NICENESS)
     ending = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: ending.set())
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # of a terminal it comes to the supervisor too, which ends us in its order
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the supervisor as well, which then ends this process
     _end_with_parent(ending)
     log.configure(settings.log_level, settings.log_format)
     tracing = telemetry.provider(settings)
@@ -53,10 +53,10 @@ def run_worker(settings: Settings, device: str, heartbeat: Heartbeat) -> None:
     name = f"{host}-{device.replace(':', '')}-{os.getpid()}-{secrets.token_hex(4)}"
     lock = open_worker_lock(database, settings.data / "locks", name)
     if lock.hold() is LockState.REFUSED:
-        raise RuntimeError(f"the lock of {name} is held by another")  # the name is random
+        raise RuntimeError(f"another process holds the lock of {name}")  # its name is random
     queue = JobQueue(database)
     context = WorkerContext(database, open_storage(settings), cache_folder(settings), device, settings.max_pixels, settings.roots)
-    runner = JobRunner(context, queue, name, alive=heartbeat.step)
+    runner = JobRunner(context, name, alive=heartbeat.step)
     config: DBOSConfig = {
         "name": APPLICATION, "system_database_url": settings.sqlalchemy_url, "system_database_engine": database.engine,
         "application_version": VERSION, "executor_id": name, "serializer": SERIALIZER, "log_level": "ERROR", "run_migrations": False,
@@ -76,7 +76,7 @@ def run_worker(settings: Settings, device: str, heartbeat: Heartbeat) -> None:
     logger.info("worker ready", worker=name, device=device)
     ending.wait()
     logger.info("worker drains", worker=name)
-    for stop in dbos.background_thread_stop_events:  # takes nothing more from the queues
+    for stop in dbos.background_thread_stop_events:  # DBOS takes no more jobs from the queues
         stop.set()
     takeover.state = workers.DRAINING
     if not runner.drain(settings.drain_s):
@@ -91,16 +91,16 @@ def run_worker(settings: Settings, device: str, heartbeat: Heartbeat) -> None:
     lock.close()
     telemetry.close(tracing)
     logger.info("worker ended", worker=name)
-    os._exit(0)  # threads of the queue wait in steps that will not begin
+    os._exit(0)  # threads of DBOS are blocked before steps that do not start
 
 
 def cache_folder(settings: Settings) -> Path:
-    """Of this machine's stack caches."""
+    """Return the folder of the image stacks that this machine caches."""
     return settings.data / "cache"
 
 
 def _prepared(database: Database, settings: Settings, ending: threading.Event) -> None:
-    """Make the tables; wait for a database that does not answer."""
+    """Make the tables; wait while the database does not answer."""
     while True:
         try:
             prepare(settings, database)
@@ -117,7 +117,7 @@ def _depose() -> None:
 
 
 def _end_with_parent(ending: threading.Event) -> None:
-    """A worker does not outlive the process that looks after it by more than a step."""
+    """Set `ending` when the supervisor's process ends."""
     parent = parent_process()
     if parent is None:
         return

@@ -1,7 +1,8 @@
-"""Which workers live: each holds a lock named after it, which the operating system or the database drops when it dies.
+"""Locks that tell whether a worker lives: each worker holds one named after it, which is released when the worker dies.
 
-On SQLite all workers are on one machine and the lock is one on a file; on PostgreSQL it is an advisory lock of a session. Who takes over
-from a dead worker holds its lock meanwhile, so that one alone does. Names are never used again.
+On SQLite all workers are on one machine, and a lock is one on a file, which the operating system releases. On PostgreSQL it is an advisory
+lock of a session, which the server releases. A worker that takes over from a dead one holds that one's lock meanwhile, so that no two take
+over at once. Names of workers are never used again.
 """
 
 import os
@@ -18,44 +19,44 @@ from service.server import file_lock
 from service.server.database.engine import Database
 
 SPACE = 7
-"""Seed of the hash of names, so that our advisory locks meet no one else's."""
+"""Seed of the hash of names, so that these advisory locks do not coincide with those of other programs."""
 KEEPALIVE = {"tcp_keepalives_idle": 3, "tcp_keepalives_interval": 1, "tcp_keepalives_count": 3}
-"""Seconds and tries after which the server ends the session of a machine that is gone; by itself it would wait for hours."""
+"""Seconds and tries after which the server ends the session of a machine that is gone; its own default is hours."""
 
 
 class LockState(Enum):
-    """How the own lock is."""
+    """What `WorkerLock.hold` found."""
 
     KEPT = "kept"
     TAKEN = "taken"
-    """It had been lost, or is the first."""
+    """The lock was not held before, or had been lost."""
     REFUSED = "refused"
-    """Another has it."""
+    """Another process has the lock."""
 
 
 class WorkerLock(Protocol):
-    """The lock of a worker, and whether others hold theirs."""
+    """The lock of this worker, and a look at those of others."""
 
     def hold(self) -> LockState:
-        """Take the own lock, or make sure that it is still held."""
+        """Take the lock of this worker, or make sure that it is still held."""
 
     def dead(self, worker: str) -> AbstractContextManager[bool]:
-        """Whether a worker does not hold its lock; where it does not, it cannot take it, nor can another, within the context."""
+        """Return whether a worker has lost its lock; if so, nobody else can take that lock within the context."""
 
     def close(self) -> None:
-        """Let go."""
+        """Release the lock."""
 
 
 class FileWorkerLock:
-    """Locks on files of a folder."""
+    """Locks on the files of a folder."""
 
     def __init__(self, folder: Path, worker: str) -> None:
-        """Args: folder: of the locks. worker: who we are."""
+        """Args: folder: of the locks. worker: name of this worker."""
         self._folder, self._worker = folder, worker
         self._file: int | None = None
 
     def hold(self) -> LockState:
-        """A lock on a file lasts as long as the process, and is seen by others as long as the file has its name."""
+        """Take or keep the lock, which other processes see as long as the file has its name."""
         if self._file is not None:
             if file_lock.is_named(self._file, self._path(self._worker)):
                 return LockState.KEPT
@@ -65,7 +66,7 @@ class FileWorkerLock:
 
     @contextmanager
     def dead(self, worker: str) -> Iterator[bool]:
-        """Try its lock."""
+        """Try to take the lock of a worker."""
         file = self._take(worker)
         try:
             yield file is not None
@@ -74,7 +75,7 @@ class FileWorkerLock:
                 self._drop(file, worker)
 
     def close(self) -> None:
-        """Let go."""
+        """Release the lock."""
         if self._file is not None:
             self._drop(self._file, self._worker)
             self._file = None
@@ -95,12 +96,12 @@ class AdvisoryWorkerLock:
     """Advisory locks of one PostgreSQL session."""
 
     def __init__(self, database: Database, worker: str) -> None:
-        """Args: database: the store's. worker: who we are."""
+        """Args: database: of the service. worker: name of this worker."""
         self._engine, self._worker = database.engine, worker
         self._session: sa.Connection | None = None
 
     def hold(self) -> LockState:
-        """Ask the session, which after a restart of the server is a new one and has to take the lock again."""
+        """Take or keep the lock; after a restart of the server it is taken in a new session."""
         if self._session is not None:
             try:
                 self._session.execute(sa.text("SELECT 1"))
@@ -122,9 +123,9 @@ class AdvisoryWorkerLock:
 
     @contextmanager
     def dead(self, worker: str) -> Iterator[bool]:
-        """Try its lock."""
+        """Try to take the lock of a worker."""
         session = self._session
-        assert session is not None, "hold the own lock first"
+        assert session is not None, "hold the lock of this worker first"
         taken = self._take(session, worker)
         try:
             yield taken
@@ -134,7 +135,7 @@ class AdvisoryWorkerLock:
                     session.execute(sa.text("SELECT pg_advisory_unlock(hashtextextended(:name, :space))"), {"name": worker, "space": SPACE})
 
     def close(self) -> None:
-        """End the session."""
+        """End the session, which releases the lock."""
         if self._session is not None:
             self._session.invalidate()
             self._session.close()
@@ -146,5 +147,5 @@ class AdvisoryWorkerLock:
 
 
 def open_worker_lock(database: Database, locks: Path, worker: str) -> WorkerLock:
-    """The kind of lock that the database allows."""
+    """Return the lock of a worker: a file in `locks` with SQLite, else an advisory lock of PostgreSQL."""
     return FileWorkerLock(locks, worker) if database.is_sqlite else AdvisoryWorkerLock(database, worker)

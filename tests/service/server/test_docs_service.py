@@ -90,3 +90,11 @@ def test_the_sample_is_registered_once(tmp_path, capsys):
     first, second = capsys.readouterr().out.split("capture ")[1:]
     assert first == second
     database.close()
+
+
+def test_the_tests_that_the_code_names_exist():
+    def found(folder: Path, pattern: str) -> set[str]:
+        return {name for file in folder.rglob("*.py") for name in re.findall(pattern, file.read_text())}
+
+    named = found(HOME / "service" / "server", r"\btest_\w+")
+    assert len(named) > 5 and named <= found(HOME / "tests" / "service" / "server", r"def (test_\w+)")

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sa
-from dbos import DBOSClient
+from dbos import DBOSClient, WorkflowStatus
 
 from service.requests.identifiers import CAPTURE, ENVIRONMENT, new_id
 from service.requests.jobs import ANY_JOB, JobRequest, RelightJob
@@ -126,9 +126,13 @@ class Harness:
             {"worker": worker, "id": workflow_id(job, 1)}).rowcount)
         assert done == 1
 
+    def workflow(self, job: str) -> WorkflowStatus:
+        """What DBOS has recorded of the first attempt of a job."""
+        return DBOSClient(system_database_engine=self.database.engine, lazy=True).retrieve_workflow(workflow_id(job, 1)).get_status()
+
     def in_queue(self, job: str) -> tuple[str, str | None]:
         """How the first attempt of a job is in the queue, and in which."""
-        found = DBOSClient(system_database_engine=self.database.engine, lazy=True).retrieve_workflow(workflow_id(job, 1)).get_status()
+        found = self.workflow(job)
         return found.status, found.queue_name
 
     def results(self, job: str) -> Path:

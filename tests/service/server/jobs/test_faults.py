@@ -159,7 +159,7 @@ def test_a_job_on_a_full_disk_fails_with_a_sentence_and_goes_on_when_there_is_sp
         attempt = made.database.transact(lambda connection: jobs.queue_again(connection, job, jobs.FAILED))
         assert attempt == 2
         request = made.request(job)
-        made.database.transact(lambda connection: made.queue.enqueue(connection, job, attempt, request))
+        made.database.transact(lambda connection: made.queue.enqueue(connection, job, attempt, request, request.priority))
         row = made.ended(job)
         assert (row["state"], row["error"]) == (jobs.SUCCEEDED, None)
         assert digests(made.results(job)) == undisturbed.digests

@@ -16,7 +16,7 @@ from tests.service.server.jobs.harness import harness
 @pytest.fixture
 def claim(tmp_path, monkeypatch):
     monkeypatch.setattr(progress, "EVERY_S", 0.0)
-    monkeypatch.setattr(progress, "UNTOLD_S", 0.0)
+    monkeypatch.setattr(progress, "UNANSWERED_S", 0.0)
     with harness(tmp_path) as made:
         job = made.relight(new_id(CAPTURE), new_id(ENVIRONMENT), 10, chunk_frames=5)
         claim = Claim(job, 1, "one")

@@ -20,7 +20,7 @@ def runner(idle_harness, monkeypatch):
     """A worker `one` that has taken a job of two steps."""
     monkeypatch.setattr(runner_module, "FIRST_PAUSE_S", 0.0)
     context = WorkerContext(idle_harness.database, open_storage(idle_harness.settings), idle_harness.settings.data / "cache", "cpu", 1, ())
-    made = JobRunner(context, idle_harness.queue, "one", alive=lambda oldest: None)
+    made = JobRunner(context, "one", alive=lambda oldest: None)
     job = idle_harness.relight(new_id(CAPTURE), new_id(ENVIRONMENT), 10, chunk_frames=5)
     idle_harness.take(job, "one")
     return made, Claim(job, 1, "one")
@@ -45,7 +45,7 @@ def do_nothing(monkeypatch, run=lambda progress: None):
 def test_a_job_is_done_step_by_step(idle_harness, runner, monkeypatch):
     made, claim = runner
     do_nothing(monkeypatch)
-    assert made._run(claim, lambda name: made._step(claim, name)) == DONE
+    assert made.run(claim) == DONE
     row = idle_harness.row(claim.job)
     assert (row["state"], row["finished_steps"]) == (jobs.SUCCEEDED, NAMES)
 
@@ -55,36 +55,30 @@ def test_a_database_that_is_away_for_a_moment_is_waited_for(idle_harness, runner
     made, claim = runner
     do_nothing(monkeypatch)
     monkeypatch.setattr(runner_module.jobs, function, once(NO_ANSWER, getattr(jobs, function)))
-    outcome = made._run(claim, lambda name: made._step(claim, name))
-    if function == "end":  # all is done, and whoever takes it next has only to say so
-        assert (outcome, idle_harness.row(claim.job)["state"]) == (STOPPED, jobs.QUEUED)
-    else:
-        assert (outcome, idle_harness.row(claim.job)["state"]) == (DONE, jobs.SUCCEEDED)
+    assert (made.run(claim), idle_harness.row(claim.job)["state"]) == (DONE, jobs.SUCCEEDED)
     assert idle_harness.row(claim.job)["finished_steps"] == NAMES
 
 
-def test_a_job_whose_step_the_queue_could_not_record_goes_back(idle_harness, runner, monkeypatch):
+def test_a_job_that_was_given_back_goes_on_with_the_steps_that_are_left(idle_harness, runner, monkeypatch):
+    """DBOS starts the workflow from its beginning; the list of finished steps is the job's."""
     made, claim = runner
-    do_nothing(monkeypatch)
-
-    def step(name):
-        made._step(claim, name)
-        raise NO_ANSWER
-
-    assert made._run(claim, step) == STOPPED
-    row = idle_harness.row(claim.job)
-    assert (row["state"], row["worker"], row["finished_steps"]) == (jobs.QUEUED, None, NAMES[:1])
-    assert idle_harness.in_queue(claim.job) == ("ENQUEUED", "work")
+    begun = []
+    monkeypatch.setattr(runner_module, "steps_of", lambda job, context: [
+        JobStep(name, lambda progress, name=name: begun.append(name)) for name in NAMES])
+    jobs.begin(idle_harness.database, claim)
+    jobs.finish_step(idle_harness.database, claim, NAMES[:1])
+    assert made.run(claim) == DONE
+    assert begun == NAMES[1:]
 
 
-def test_an_error_of_the_queue_ends_the_job_with_a_sentence(idle_harness, runner, monkeypatch):
+def test_an_unexpected_error_ends_the_job_with_a_sentence(idle_harness, runner, monkeypatch):
     made, claim = runner
-    do_nothing(monkeypatch)
 
-    def step(name):
+    def fail(job, context):
         raise RuntimeError("of another's making")
 
-    assert made._run(claim, step) == jobs.FAILED
+    monkeypatch.setattr(runner_module, "steps_of", fail)
+    assert made.run(claim) == jobs.FAILED
     row = idle_harness.row(claim.job)
     assert (row["state"], row["error"]) == (jobs.FAILED, "an error of relit itself (RuntimeError): its log has more")
 
@@ -97,6 +91,6 @@ def test_a_worker_that_was_given_up_for_dead_publishes_nothing(idle_harness, run
 
     do_nothing(monkeypatch, lose)
     monkeypatch.setattr(made._context.storage, "publish", lambda *_: pytest.fail("another may be writing there"))
-    assert made._run(claim, lambda name: made._step(claim, name)) == STOPPED
+    assert made.run(claim) == STOPPED
     row = idle_harness.row(claim.job)
     assert (row["state"], row["worker"], row["finished_steps"]) == (jobs.QUEUED, None, [])

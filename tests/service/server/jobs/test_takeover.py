@@ -1,13 +1,17 @@
 """What becomes of a dead worker's jobs, and who may change a job; without processes, so that each moment can be set up."""
 
+import threading
+
 import pytest
+import sqlalchemy as sa
 
 from service.requests.identifiers import CAPTURE, ENVIRONMENT, new_id
 from service.server.database import jobs
-from service.server.database.jobs import Claim, Progress
-from service.server.jobs.queue import workflow_id
+from service.server.database.jobs import Claim, StageProgress
+from service.server.jobs.queue import job_of, workflow_id
 from service.server.jobs.takeover import FORGOTTEN_ROUNDS, GRACE_ROUNDS, Takeover
 from service.server.jobs.worker_lock import LockState, open_worker_lock
+from tests.service.server.jobs.harness import harness
 
 MAX_LOST = 3
 
@@ -21,18 +25,18 @@ def job(idle_harness):
     return job
 
 
-def takeover(harness, name, *, running=frozenset(), deposed=lambda: None):
-    lock = open_worker_lock(harness.database, harness.settings.data / "locks", name)
+def takeover(made, name, *, running=frozenset(), deposed=lambda: None):
+    lock = open_worker_lock(made.database, made.settings.data / "locks", name)
     assert lock.hold() is LockState.TAKEN
-    return lock, Takeover(harness.database, harness.queue, lock, name, every_s=1, max_lost=MAX_LOST, running=lambda: frozenset(running),
+    return lock, Takeover(made.database, made.queue, lock, name, every_s=1, max_lost=MAX_LOST, running=lambda: frozenset(running),
                           beat=lambda: None, deposed=deposed)
 
 
-def let_go(harness, lock, name):
+def let_go(made, lock, name):
     """Close a lock, and wait until the server, too, has ended the session."""
     lock.close()
-    other = open_worker_lock(harness.database, harness.settings.data / "locks", name)
-    harness.until(lambda: other.hold() is not LockState.REFUSED, "let go")
+    other = open_worker_lock(made.database, made.settings.data / "locks", name)
+    made.until(lambda: other.hold() is not LockState.REFUSED, "let go")
     return other
 
 
@@ -73,7 +77,7 @@ def test_a_worker_that_was_given_up_for_dead_changes_nothing_any_more(idle_harne
     one.round()
     before = dict(idle_harness.row(job))
     assert not jobs.begin(idle_harness.database, Claim(job, 2, "gone"))
-    assert not jobs.advance(idle_harness.database, gone, Progress("frames", 3, 10, None))
+    assert not jobs.advance(idle_harness.database, gone, StageProgress("frames", 3, 10, None))
     assert not jobs.finish_step(idle_harness.database, gone, ["frames 1-5"])
     assert not jobs.end(idle_harness.database, gone, jobs.FAILED, "it says")
     assert not jobs.is_claimed(idle_harness.database, gone)
@@ -84,6 +88,51 @@ def test_a_worker_that_was_given_up_for_dead_changes_nothing_any_more(idle_harne
     assert not idle_harness.database.transact(lambda connection: jobs.release(connection, gone))
     assert idle_harness.row(job)["worker"] == "two"
     lock.close()
+
+
+def test_a_change_that_waits_for_the_takeover_changes_nothing(on_postgres, tmp_path):
+    """Why the worker stands in the job's row: PostgreSQL looks again at the row that it waited for, and at no other."""
+    with harness(tmp_path, on_postgres) as made:
+        job = made.relight(new_id(CAPTURE), new_id(ENVIRONMENT), 10, chunk_frames=5)
+        gone = Claim(job, 1, "gone")
+        made.take(job, "gone")
+        assert jobs.begin(made.database, gone)
+        ended = []
+        late = threading.Thread(target=lambda: ended.append(jobs.end(made.database, gone, jobs.SUCCEEDED)))
+        with made.database.engine.begin() as connection:
+            assert jobs.record_lost_worker(connection, gone, MAX_LOST, "lost") == jobs.QUEUED
+            late.start()
+            made.until(lambda: made.database.row(sa.select(sa.text("1")).select_from(sa.text("pg_locks")).where(
+                sa.text("NOT granted"))), "waiting for the row")
+        late.join()
+        assert ended == [False]
+        assert made.row(job)["state"] == jobs.QUEUED
+
+
+def test_a_changed_priority_is_that_of_the_queue(idle_harness):
+    """Without another attempt, and among equal priorities the job keeps its place."""
+    first, second, third = (idle_harness.relight(new_id(CAPTURE), new_id(ENVIRONMENT), 10, chunk_frames=5) for _ in range(3))
+    before = idle_harness.row(second)
+
+    def change(connection, job, priority):
+        assert jobs.set_priority(connection, job, priority) == 1
+        idle_harness.queue.set_priority(connection, job, 1, priority)
+
+    def order():
+        sorted_as_dbos_does = sorted((idle_harness.workflow(job) for job in (first, second, third)),
+                                     key=lambda status: (status.priority, status.created_at))
+        return [job_of(status.workflow_id)[0] for status in sorted_as_dbos_does]
+
+    assert order() == [first, second, third]
+    idle_harness.database.transact(lambda connection: change(connection, third, before["priority"] + 1))
+    assert order() == [third, first, second]
+    idle_harness.database.transact(lambda connection: change(connection, second, before["priority"] + 1))
+    assert order() == [second, third, first]
+    row = idle_harness.row(second)
+    assert (row["attempt"], row["revision"], row["state"]) == (1, before["revision"] + 1, jobs.QUEUED)
+    idle_harness.take(second, "one")
+    jobs.begin(idle_harness.database, Claim(second, 1, "one"))
+    assert idle_harness.database.transact(lambda connection: jobs.set_priority(connection, second, 1)) is None  # it runs
 
 
 def test_a_worker_is_lost_once_whoever_finds_it_and_however_often(idle_harness, job):
@@ -118,7 +167,7 @@ def test_a_second_reaper_finds_nothing_to_do(idle_harness, job, monkeypatch):
 
 def test_a_job_that_loses_too_many_workers_fails(idle_harness, job):
     lock, one = takeover(idle_harness, "one")
-    jobs.advance(idle_harness.database, Claim(job, 1, "gone"), Progress("open", 0, 1, None))
+    jobs.advance(idle_harness.database, Claim(job, 1, "gone"), StageProgress("open", 0, 1, None))
     for lost in range(1, MAX_LOST + 2):
         one.round()
         assert idle_harness.row(job)["lost"] == lost
@@ -141,12 +190,12 @@ def test_more_frames_than_ever_before_count_as_a_finished_step(idle_harness, job
         jobs.begin(database, gone)
 
     lose()
-    jobs.advance(database, gone, Progress("frames", 4, 10, None))
+    jobs.advance(database, gone, StageProgress("frames", 4, 10, None))
     assert idle_harness.row(job)["lost"] == 0
     lose()
-    jobs.advance(database, gone, Progress("frames", 4, 10, None))  # the next worker comes as far, and no further
+    jobs.advance(database, gone, StageProgress("frames", 4, 10, None))  # the next worker comes as far, and no further
     assert idle_harness.row(job)["lost"] == 1
-    jobs.advance(database, gone, Progress("normals", 9, 10, None))  # stages that begin at their beginning again are no progress
+    jobs.advance(database, gone, StageProgress("normals", 9, 10, None))  # stages that begin at their beginning again are no progress
     assert idle_harness.row(job)["lost"] == 1
     jobs.finish_step(database, gone, ["frames 1-5"])
     assert idle_harness.row(job)["lost"] == 0
