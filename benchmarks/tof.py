@@ -14,6 +14,7 @@ from kernels.tof.continuous import Noise, decode
 from kernels.tof.decide import AGREEMENT_RAD, decide
 from kernels.tof.modulation import common_range_m, radians_per_metre
 from kernels.tof.unwrap import FLOOR_RAD, unwrap
+from stage.tof.light_time import SPEED_OF_LIGHT
 from tests.reference import tof as scenes
 
 COLS, ROWS = 512, 424
@@ -26,9 +27,9 @@ SETTLE_S = 0.1
 
 def kernels_work(images: np.ndarray, hz: np.ndarray, delta: np.ndarray) -> np.ndarray:
     """Compute the range by the kernels, without the vote, which the NumPy side lacks too."""
-    far = common_range_m(hz)
+    far = common_range_m(hz, SPEED_OF_LIGHT)
     found = decode(images, hz, delta, noise=Noise(1.0, 5.0), device="cpu")
-    ranges = decide(found, unwrap(found, nearest_m=0.0, farthest_m=far))
+    ranges = decide(found, unwrap(found, nearest_m=0.0, farthest_m=far, light_speed=SPEED_OF_LIGHT), light_speed=SPEED_OF_LIGHT)
     guide = wp.array(found.amplitude.numpy().mean(axis=0), device="cpu")
     return smooth(ranges.range, ranges.sigma, guide, ranges.status, ROWS, COLS, radius=RADIUS, spatial_px=SPATIAL).range.numpy()
 
@@ -51,10 +52,10 @@ def numpy_work(images: np.ndarray, hz: np.ndarray, delta: np.ndarray) -> np.ndar
         sigma.append(np.sqrt((b * b * aa - 2 * a * b * ab + a * a * bb) / q2 / q2))
         amplitude.append(np.sqrt(q2))
         evidence.append(2 * q2 / (aa + bb))
-    per_metre = radians_per_metre(frequencies).astype(f32)
+    per_metre = radians_per_metre(frequencies, SPEED_OF_LIGHT).astype(f32)
     weight = [1 / (s * s + f32(FLOOR_RAD**2)) for s in sigma]
     total = sum(w * k * k for w, k in zip(weight, per_metre, strict=True))
-    wave, far = 2 * np.pi / float(per_metre[-1]), common_range_m(hz)
+    wave, far = 2 * np.pi / float(per_metre[-1]), common_range_m(hz, SPEED_OF_LIGHT)
     best, best_cost = np.zeros_like(phase[0]), np.full_like(phase[0], np.inf)
     for n in range(-1, int(np.ceil(far / wave)) + 1):
         d = phase[-1] / per_metre[-1] + f32(n * wave)

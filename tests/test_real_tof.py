@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kernels.tof.modulation import SPEED_OF_LIGHT
 from kernels.tof.pileup import place, unhurried
 from kernels.tof.pulse_width import estimate_pulse
 from kernels.tof.returns import find_returns
 from stage.tof.calibration import TofCalibration, fit_line
+from stage.tof.light_time import SPEED_OF_LIGHT
 
 DATA = Path(os.environ.get("RELIT_TEST_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")) / "tmf8820_distance.json"
 BIN_M = SPEED_OF_LIGHT * 9.1e-11 / 2

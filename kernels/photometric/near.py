@@ -38,8 +38,8 @@ class NearField(NamedTuple):
         return NearField(self.places, self.points[:, np.minimum(pixels, self.points.shape[1] - 1)])
 
 
-class Near(NamedTuple):
-    """What the lights are to each pixel of a band; elements lie as in its readings."""
+class PixelLights(NamedTuple):
+    """Direction and falloff of every light at every pixel of a band; elements lie as in its readings."""
 
     toward: wp.array  # [3, packs · lights] float packs: unit direction from the surface to the light
     falloff: wp.array  # [packs · lights] float packs: irradiance at normal incidence / strength; 0 where it hardly shines
@@ -67,7 +67,7 @@ def pad_places(place: np.ndarray, lobe: np.ndarray) -> Places:
     return Places(np.pad(place, extra), np.pad(lobe, extra))
 
 
-def see_near(band: Band, readings: Readings, field: NearField) -> Near:
+def see_near(band: Band, readings: Readings, field: NearField) -> PixelLights:
     """Find the direction and falloff of every light at every pixel, and divide the readings by the falloff.
 
     Args:
@@ -88,23 +88,23 @@ def see_near(band: Band, readings: Readings, field: NearField) -> Near:
     device, pack = band.device, devices.pack_width(band.device)
     float_pack = pack_type(pack, wp.float32)
     held = np.pad(np.asarray(points, dtype=np.float32), ((0, 0), (0, -band.pixel_count % pack)), mode="edge")
-    near = Near(wp.empty((3, readings.values.shape[0]), dtype=float_pack, device=device),
-                wp.empty(readings.values.shape[0], dtype=float_pack, device=device))
+    lights = PixelLights(wp.empty((3, readings.values.shape[0]), dtype=float_pack, device=device),
+                         wp.empty(readings.values.shape[0], dtype=float_pack, device=device))
     devices.launch(_near_kernel(pack), band.packs,
                    [wp.array(places.place, dtype=wp.vec4, device=device), wp.array(places.lobe, dtype=wp.vec4, device=device),
                     wp.array(held.reshape(3, -1, pack), dtype=float_pack, device=device), readings.pack_stride,
-                    readings.light_stride], [readings.values, near.toward, near.falloff], device=device)
-    return near
+                    readings.light_stride], [readings.values, lights.toward, lights.falloff], device=device)
+    return lights
 
 
-def toward_or_none(near: Near | None, device: str) -> wp.array:
+def toward_or_none(pixel_lights: PixelLights | None, device: str) -> wp.array:
     """The directions as a kernel's argument; a kernel for distant lights does not read it."""
-    return wp.empty((3, 0), dtype=_float_pack(device), device=device) if near is None else near.toward
+    return wp.empty((3, 0), dtype=_float_pack(device), device=device) if pixel_lights is None else pixel_lights.toward
 
 
-def falloff_or_none(near: Near | None, device: str) -> wp.array:
+def falloff_or_none(pixel_lights: PixelLights | None, device: str) -> wp.array:
     """The same of the falloff."""
-    return wp.empty(0, dtype=_float_pack(device), device=device) if near is None else near.falloff
+    return wp.empty(0, dtype=_float_pack(device), device=device) if pixel_lights is None else pixel_lights.falloff
 
 
 def _float_pack(device: str) -> Any:

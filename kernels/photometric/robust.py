@@ -19,7 +19,7 @@ from kernels.normal_equations import add_reading, symmetric
 from kernels.packs import Band, pack_type
 from kernels.photometric.lambert import NormalFit, run_normal_kernel, write_normal
 from kernels.photometric.least_squares import fit_pixel
-from kernels.photometric.near import Near, directions_in
+from kernels.photometric.near import PixelLights, directions_in
 from kernels.photometric.readings import Readings
 
 BRIGHT_FRACTION = 0.1
@@ -44,14 +44,14 @@ BISECTIONS = 18
 """Steps in all; the others halve the difference, and find the value to 10⁻⁴ of itself, under the rounding of half values."""
 
 
-def solve_robust(band: Band, readings: Readings, directions: np.ndarray, near: Near | None = None) -> NormalFit:
+def solve_robust(band: Band, readings: Readings, directions: np.ndarray, pixel_lights: PixelLights | None = None) -> NormalFit:
     """Normals from the lights that, at each pixel, are neither shadow nor highlight.
 
     Args:
         band: the stack on the device.
         readings: its grey readings; on return each holds the weight, 0…1, that the light had in the fit.
         directions: [lights, 3] unit, from the surface to the light; padding is ignored.
-        near: directions and falloff per pixel, in place of `directions`, where some light is near.
+        pixel_lights: directions and falloff per pixel, in place of `directions`, where some light is near.
 
     Returns:
         Normals on the device; not synchronised on CUDA.
@@ -59,7 +59,7 @@ def solve_robust(band: Band, readings: Readings, directions: np.ndarray, near: N
     Raises:
         ArrayError: directions do not match the band.
     """
-    return run_normal_kernel(_robust_kernel, band, readings, directions, near)
+    return run_normal_kernel(_robust_kernel, band, readings, directions, pixel_lights)
 
 
 @wp.func

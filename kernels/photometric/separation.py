@@ -34,7 +34,7 @@ HIDDEN_TILT = 0.1
 (2/3)·0.5 + 0.04·cos 60° along: what an unseen highlight may tilt a normal by."""
 
 
-class Separation(NamedTuple):
+class SeparatedMoments(NamedTuple):
     """Responses of a band, told apart; the last axis is pixels, padded to whole packs."""
 
     diffuse: Moments
@@ -42,7 +42,7 @@ class Separation(NamedTuple):
 
 
 def separate_polarised(cross: Moments, parallel: Moments, grey_weights: tuple[float, float, float], *,
-                       pixel_count: int, device: str) -> Separation:
+                       pixel_count: int, device: str) -> SeparatedMoments:
     """Specular = parallel - cross; the diffuse responses are those of the cross frames, of half the diffuse light.
 
     Args:
@@ -55,10 +55,10 @@ def separate_polarised(cross: Moments, parallel: Moments, grey_weights: tuple[fl
     specular = zeros(pixel_count, wp.float32, device, rows=6)
     devices.launch(_difference_kernel, pixel_count, [cross.values, cross.status, parallel.values, parallel.status,
                                                      wp.vec3(*grey_weights)], [specular], device=device)
-    return Separation(cross, specular)
+    return SeparatedMoments(cross, specular)
 
 
-def separate_by_colour(mixed: Moments, view: np.ndarray, *, pixel_count: int, device: str) -> Separation:
+def separate_by_colour(mixed: Moments, view: np.ndarray, *, pixel_count: int, device: str) -> SeparatedMoments:
     """Diffuse and specular responses of unpolarised frames, where the diffuse colour is not grey.
 
     Args:
@@ -78,7 +78,7 @@ def separate_by_colour(mixed: Moments, view: np.ndarray, *, pixel_count: int, de
     specular = zeros(pixel_count, wp.float32, device, rows=6)
     devices.launch(_colour_kernel, pixel_count, [toward, mixed.status], [diffuse.values, diffuse.variance, diffuse.tilt, specular],
                    device=device)
-    return Separation(diffuse, specular)
+    return SeparatedMoments(diffuse, specular)
 
 
 def upload_view(view: np.ndarray, pixel_count: int, device: str) -> wp.array:

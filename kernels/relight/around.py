@@ -6,7 +6,7 @@ import itertools
 import numpy as np
 
 from kernels.relight.latlong import first_of_equals
-from kernels.relight.triangulation import find_faces, triangulate
+from kernels.relight.triangulation import find_faces, triangulate_sphere
 
 
 def lights_around(directions: np.ndarray, samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -23,7 +23,7 @@ def lights_around(directions: np.ndarray, samples: np.ndarray) -> tuple[np.ndarr
         ArrayError: fewer than four lights, or all in one plane.
     """
     kept = first_of_equals(directions)
-    triangles = triangulate(directions[kept])
+    triangles = triangulate_sphere(directions[kept])
     nearest = kept[np.argmax(triangles.vertex @ directions[kept].T, axis=1)]
     nearest[: len(kept)] = kept
     face, share = find_faces(triangles, samples)
@@ -44,7 +44,7 @@ def left_out(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         ArrayError: fewer than four lights, or all in one plane.
     """
     kept = first_of_equals(directions)
-    triangles = triangulate(directions[kept])
+    triangles = triangulate_sphere(directions[kept])
     real = len(kept)
     around: list[set[int]] = [set() for _ in range(len(triangles.vertex))]
     for corners in triangles.corner:

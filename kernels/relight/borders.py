@@ -18,7 +18,7 @@ QUARTERINGS = 4
 """What is left then, a thirty-second of a degree, goes whole to its nearest light."""
 
 
-class Samples(NamedTuple):
+class LatLongSamples(NamedTuple):
     """Samples of a lat-long map, a quarter of a degree from the middle to the edges or less."""
 
     polar: np.ndarray  # [samples] radians from +y to the middle
@@ -30,14 +30,14 @@ class Samples(NamedTuple):
 
 
 class Shares(NamedTuple):
-    """How samples are shared out; the shares of each add up to one."""
+    """Parts of samples that go to lights; the shares of each sample add up to one."""
 
-    sample: np.ndarray  # [n] index of the sample
+    sample: np.ndarray | slice  # [n] index of the sample
     light: np.ndarray  # [n]
     share: np.ndarray  # [n] float64
 
 
-def divide(samples: Samples, nearest: np.ndarray, lights: np.ndarray, *, quarterings: int = QUARTERINGS) -> Shares:
+def divide(samples: LatLongSamples, nearest: np.ndarray, lights: np.ndarray, *, quarterings: int = QUARTERINGS) -> Shares:
     """Share samples out to the cells of the lights by area.
 
     Args:
@@ -76,7 +76,7 @@ def reach(polar: np.ndarray, half_polar: float, half_azimuth: float) -> np.ndarr
     return np.hypot(height, width * (np.sin(polar) + height * np.abs(np.cos(polar))))
 
 
-def _frames(samples: Samples) -> np.ndarray:
+def _frames(samples: LatLongSamples) -> np.ndarray:
     """[samples, 3, 3]: unit vectors to the middle, and from there east (rightwards) and north."""
     sine, cosine, x, z = np.sin(samples.polar), np.cos(samples.polar), np.sin(samples.azimuth), -np.cos(samples.azimuth)
     return np.stack([np.stack([x * sine, cosine, z * sine], axis=1), np.stack([-z, np.zeros_like(x), x], axis=1),
@@ -103,11 +103,11 @@ def _rivals(middle: np.ndarray, radius: np.ndarray, nearest: np.ndarray, lights:
     return sample[order], rival[order]
 
 
-def _quarter(samples: Samples, chosen: np.ndarray, lights: np.ndarray, quarterings: int) -> Shares:
+def _quarter(samples: LatLongSamples, chosen: np.ndarray, lights: np.ndarray, quarterings: int) -> Shares:
     down, right = samples.half_polar / 2, samples.half_azimuth / 2
     polar = samples.polar[chosen, None] + down * np.array([-1, -1, 1, 1])
     azimuth = samples.azimuth[chosen, None] + right * np.array([-1, 1, -1, 1])
-    quarters = Samples(polar.reshape(-1), azimuth.reshape(-1), down, right)
+    quarters = LatLongSamples(polar.reshape(-1), azimuth.reshape(-1), down, right)
     nearest = np.argmax(_frames(quarters)[:, 0] @ lights.T, axis=1)
     part = divide(quarters, nearest, lights, quarterings=quarterings)
     solid_angle = np.sin(polar) / np.sin(polar).sum(axis=1, keepdims=True)

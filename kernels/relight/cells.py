@@ -16,8 +16,8 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.packs import pack_type
-from kernels.relight.borders import Samples, divide, reach
-from kernels.relight.latlong import LightEnergy, Part, SampleGrid, check, first_of_equals, gather
+from kernels.relight.borders import LatLongSamples, Shares, divide, reach
+from kernels.relight.latlong import LightEnergy, SampleGrid, check, first_of_equals, gather
 
 COSINE_STEP = 1e-6
 """Cosines in float32, and their differences, are right to within this."""
@@ -49,14 +49,14 @@ def integrate_cells(environment: np.ndarray, directions: np.ndarray, rotations: 
     directions, rotations = check(environment, directions, rotations)
     kept = first_of_equals(directions)
 
-    def split(rotation: np.ndarray, band: SampleGrid) -> Iterator[Part]:
+    def split(rotation: np.ndarray, band: SampleGrid) -> Iterator[Shares]:
         lights = directions[kept] @ rotation
         nearest = nearest_light(band, lights, device=device)
-        yield Part(slice(None), kept[nearest.light.reshape(-1)], (~nearest.crossed).reshape(-1))
+        yield Shares(slice(None), kept[nearest.light.reshape(-1)], (~nearest.crossed).reshape(-1))
         row, col = np.nonzero(nearest.crossed)
-        crossed = Samples(band.polar[row], band.azimuth[col], band.half_polar, band.half_azimuth)
+        crossed = LatLongSamples(band.polar[row], band.azimuth[col], band.half_polar, band.half_azimuth)
         shares = divide(crossed, nearest.light[row, col], lights)
-        yield Part((row * len(band.azimuth) + col)[shares.sample], kept[shares.light], shares.share)
+        yield Shares((row * len(band.azimuth) + col)[shares.sample], kept[shares.light], shares.share)
 
     return gather(environment, rotations, len(directions), split)
 

@@ -10,7 +10,7 @@ import numpy as np
 from kernels.errors import ArrayError
 from kernels.relight.environment import Weighting
 from kernels.relight.latlong import first_of_equals
-from kernels.relight.triangulation import find_faces, triangulate
+from kernels.relight.triangulation import find_faces, triangulate_sphere
 
 SAMPLE_PITCH_DEGREES = 1.0
 MIN_SAMPLES = 256
@@ -43,7 +43,7 @@ def integrate_discs(middles: np.ndarray, angles_degrees: np.ndarray, directions:
         raise ArrayError(f"middles are {middles.shape}, angles {np.shape(angles_degrees)}: give [discs, 3] and [discs]")
     kept = first_of_equals(directions)
     energy = np.zeros((len(middles), len(directions)))
-    triangles = triangulate(directions[kept]) if weighting is Weighting.SMOOTH and len(middles) else None
+    triangles = triangulate_sphere(directions[kept]) if weighting is Weighting.SMOOTH and len(middles) else None
     for disc, (middle, angle) in enumerate(zip(middles, angles_degrees, strict=True)):
         samples = disc_samples(middle, float(angle))
         if triangles is None:

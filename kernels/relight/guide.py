@@ -16,9 +16,8 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
-from kernels.microfacet import INVERSE_PI
 from kernels.packs import Band, as_packs, pack_type
-from kernels.relight.shading import Surface, lobes, require_same
+from kernels.relight.shading import Surface, lobes, modelled, require_same
 
 POOL = 2
 """Neighbours on each side whose sums count too."""
@@ -142,14 +141,12 @@ def _compare_kernel(pack: int) -> Any:
                     red, green, blue = captured[at, p], captured[padded + at, p], captured[2 * padded + at, p]
                     for k in range(pack):
                         seen = weight * float(lit[k]) * wp.static(1.0 / 255.0)
-                        matt = seen * INVERSE_PI * facing[k]
-                        mirror, edge = seen * shine[k] * (1.0 - rise[k]), seen * shine[k] * rise[k]
                         missing_r[k] += factor[0] * float(red[k])
                         missing_g[k] += factor[1] * float(green[k])
                         missing_b[k] += factor[2] * float(blue[k])
-                        told_r[k] += albedo_r[k] * matt + f0_r[k] * mirror + edge
-                        told_g[k] += albedo_g[k] * matt + f0_g[k] * mirror + edge
-                        told_b[k] += albedo_b[k] * matt + f0_b[k] * mirror + edge
+                        told_r[k] += modelled(seen, albedo_r[k], f0_r[k], facing[k], shine[k], rise[k])
+                        told_g[k] += modelled(seen, albedo_g[k], f0_g[k], facing[k], shine[k], rise[k])
+                        told_b[k] += modelled(seen, albedo_b[k], f0_b[k], facing[k], shine[k], rise[k])
                 for k in range(pack):
                     top[k] += missing_r[k] * told_r[k] + missing_g[k] * told_g[k] + missing_b[k] * told_b[k]
                     bottom[k] += told_r[k] * told_r[k] + told_g[k] * told_g[k] + told_b[k] * told_b[k]

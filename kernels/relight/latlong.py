@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels.errors import ArrayError
-from kernels.relight.turns import shared_turns
+from kernels.relight.borders import Shares
 
 SAMPLE_PITCH_DEGREES = 0.5
 """A sample is small enough to be flat: the areas of its parts are off by 3e-5 of it."""
@@ -22,6 +22,10 @@ EQUAL_RADIANS = 1e-4
 """Lights closer than this, 0.006 degrees, stand in one place; the first of them gets its energy."""
 BAND_SAMPLES = 1 << 19
 """Samples that are summed at one time: bounds the memory of a large map, and the sums find them in the cache."""
+
+
+EQUAL_COLUMNS = 1e-6
+"""Turns that differ from whole columns by this part of one, less than a thousandth of a second of arc, differ by whole ones."""
 
 
 class LightEnergy(NamedTuple):
@@ -52,12 +56,13 @@ class SampleGrid(NamedTuple):
             yield self._replace(polar=self.polar[rows], solid_angle=self.solid_angle[rows], texel_row=self.texel_row[rows])
 
 
-class Part(NamedTuple):
-    """Parts of samples that go to lights."""
+class Turn(NamedTuple):
+    """Frames whose turned maps differ by a move sideways alone."""
 
-    sample: np.ndarray | slice  # [n] index into the samples of a band, row by row
-    light: np.ndarray  # [n]
-    share: np.ndarray  # [n] float64 of the sample
+    rotation: np.ndarray  # [3, 3] float64, of the map before it is moved
+    frames: tuple[int, ...]
+    columns: tuple[int, ...]
+    """For each frame: the map turned is the map whose columns are taken from so much further right, then turned by `rotation`."""
 
 
 def cut(rows: int, cols: int) -> SampleGrid:
@@ -108,8 +113,33 @@ def first_of_equals(directions: np.ndarray) -> np.ndarray:
     return np.flatnonzero(~np.tril(close, -1).any(axis=1))
 
 
+def shared_turns(rotations: np.ndarray, columns: int) -> Iterator[Turn]:
+    """Group rotations of a lat-long map that differ by whole columns of samples about its axis.
+
+    A spin of 240 frames on a grid of 768 columns, 3.2 columns a frame, has five different turns.
+
+    Args:
+        rotations: [frames, 3, 3] float64: turned = rotation @ direction.
+        columns: of the grid that the map is cut into.
+    """
+    groups: dict[int, list[tuple[int, int]]] = {}
+    for frame, rotation in enumerate(rotations):
+        if not (rotation[1, 1] == 1 and rotation[0, 0] == rotation[2, 2] and rotation[0, 2] == -rotation[2, 0]):
+            yield Turn(rotation, (frame,), (0,))
+            continue
+        turn = np.arctan2(rotation[0, 2], rotation[0, 0]) / (2 * np.pi) * columns
+        whole = int(np.floor(turn + EQUAL_COLUMNS))
+        groups.setdefault(round((turn - whole) / EQUAL_COLUMNS), []).append((frame, whole))
+    for part, members in groups.items():
+        # turned by the part of a column, so that the weights of one frame do not depend on other frames
+        angle = part * EQUAL_COLUMNS / columns * 2 * np.pi
+        cosine, sine = np.cos(angle), np.sin(angle)
+        rotation = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
+        yield Turn(rotation, tuple(frame for frame, _ in members), tuple(whole for _, whole in members))
+
+
 def gather(environment: np.ndarray, rotations: np.ndarray, lights: int,
-           split: Callable[[np.ndarray, SampleGrid], Iterable[Part]]) -> LightEnergy:
+           split: Callable[[np.ndarray, SampleGrid], Iterable[Shares]]) -> LightEnergy:
     """Sum the energy of the samples of a map over lights.
 
     Args:

@@ -12,13 +12,12 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
-from kernels.microfacet import INVERSE_PI
 from kernels.packs import Band, as_packs, pack_type
 from kernels.relight.latlong import first_of_equals
-from kernels.relight.shading import Surface, lobes, require_same
+from kernels.relight.shading import Surface, lobes, modelled, require_same
 from kernels.relight.smooth import walk
 from kernels.relight.sources import Sources
-from kernels.relight.triangulation import edge_planes, triangulate
+from kernels.relight.triangulation import edge_planes, triangulate_sphere
 
 LEAST_PART = 1e-3
 """Of the energy of an imaginary light: lights far from a hole that would get less get none, the others have it."""
@@ -48,7 +47,7 @@ def sum_near(band: Band, surface: Surface, visible: wp.array, sources: Sources, 
         light, channel = np.argwhere(~(irradiance > 0))[0]
         raise ArrayError(f"irradiance of light {light} is 0 in channel {'RGB'[channel]}: its image says nothing about light from there")
     kept = first_of_equals(direction)
-    triangles = triangulate(direction[kept])
+    triangles = triangulate_sphere(direction[kept])
     vertex, owner = np.nonzero(triangles.share > LEAST_PART)
     start = np.searchsorted(vertex, np.arange(len(triangles.vertex) + 1))
     part = triangles.share[vertex, owner] / np.add.reduceat(triangles.share[vertex, owner], start[:-1])[vertex]
@@ -151,14 +150,12 @@ def _sum_kernel(pack: int) -> Any:
             wr, wg, wb = weights[light, p], weights[count + light, p], weights[2 * count + light, p]
             for k in range(pack):
                 seen = float(lit[k]) * wp.static(1.0 / 255.0)
-                matt = seen * INVERSE_PI * facing[k]
-                mirror, edge = seen * shine[k] * (1.0 - rise[k]), seen * shine[k] * rise[k]
                 image_r[k] += wr[k] * factor[0] * float(red[k])
                 image_g[k] += wg[k] * factor[1] * float(green[k])
                 image_b[k] += wb[k] * factor[2] * float(blue[k])
-                model_r[k] += wr[k] * (albedo_r[k] * matt + f0_r[k] * mirror + edge)
-                model_g[k] += wg[k] * (albedo_g[k] * matt + f0_g[k] * mirror + edge)
-                model_b[k] += wb[k] * (albedo_b[k] * matt + f0_b[k] * mirror + edge)
+                model_r[k] += wr[k] * modelled(seen, albedo_r[k], f0_r[k], facing[k], shine[k], rise[k])
+                model_g[k] += wg[k] * modelled(seen, albedo_g[k], f0_g[k], facing[k], shine[k], rise[k])
+                model_b[k] += wb[k] * modelled(seen, albedo_b[k], f0_b[k], facing[k], shine[k], rise[k])
         out[0, p] = image_r
         out[1, p] = image_g
         out[2, p] = image_b

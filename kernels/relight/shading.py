@@ -175,6 +175,12 @@ def lobes(pack: int) -> Any:
     return evaluate
 
 
+@wp.func
+def modelled(lit: float, albedo: float, f0: float, facing: float, shine: float, rise: float) -> float:
+    """Return the radiance of one channel under a light of irradiance one, from what `lobes` evaluates; `lit` is the visibility."""
+    return lit * (albedo * INVERSE_PI * facing + f0 * shine * (1.0 - rise) + shine * rise)
+
+
 @cache
 def _shade_kernel(pack: int) -> Any:
     lane_type, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.uint8)

@@ -14,8 +14,9 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
-from kernels.relight.latlong import LightEnergy, Part, SampleGrid, check, first_of_equals, gather
-from kernels.relight.triangulation import Triangulation, edge_planes, triangulate
+from kernels.relight.borders import Shares
+from kernels.relight.latlong import LightEnergy, SampleGrid, check, first_of_equals, gather
+from kernels.relight.triangulation import SphereTriangles, edge_planes, triangulate_sphere
 
 RUN = 64
 """Neighbouring samples of one thread: it seeks the first one's triangle over the whole sphere, the others' from the one before."""
@@ -49,12 +50,12 @@ def integrate_smooth(environment: np.ndarray, directions: np.ndarray, rotations:
     """
     directions, rotations = check(environment, directions, rotations)
     kept = first_of_equals(directions)
-    triangles = triangulate(directions[kept])
+    triangles = triangulate_sphere(directions[kept])
 
-    def split(rotation: np.ndarray, band: SampleGrid) -> Iterator[Part]:
+    def split(rotation: np.ndarray, band: SampleGrid) -> Iterator[Shares]:
         face, share = locate(band, triangles, rotation, device=device)
         for k in range(3):
-            yield Part(slice(None), triangles.corner[face, k], share[:, k])
+            yield Shares(slice(None), triangles.corner[face, k], share[:, k])
 
     sums = gather(environment, rotations, len(triangles.vertex), split)
     energy = np.zeros((len(rotations), len(directions), 3))
@@ -64,7 +65,7 @@ def integrate_smooth(environment: np.ndarray, directions: np.ndarray, rotations:
     return LightEnergy(energy, solid_angle)
 
 
-def locate(grid: SampleGrid, triangles: Triangulation, rotation: np.ndarray, *, device: str) -> Located:
+def locate(grid: SampleGrid, triangles: SphereTriangles, rotation: np.ndarray, *, device: str) -> Located:
     """Find the triangle that each sample of a grid lies in when the grid is turned, and where in it.
 
     Args:

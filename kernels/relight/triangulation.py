@@ -38,7 +38,7 @@ CHUNK = 4096
 """Directions that are held against all faces at one time: bounds the memory."""
 
 
-class Triangulation(NamedTuple):
+class SphereTriangles(NamedTuple):
     """Triangles that cover the sphere."""
 
     vertex: np.ndarray  # [vertices, 3] the lights; middles of polygons, in their planes; unit vectors to the middles of holes
@@ -53,7 +53,7 @@ class _Faces(NamedTuple):
     height: np.ndarray  # [faces] of the plane over the centre: cosine of the radius of the corners' circle
 
 
-def triangulate(directions: np.ndarray) -> Triangulation:
+def triangulate_sphere(directions: np.ndarray) -> SphereTriangles:
     """Triangulate the sphere between lights.
 
     Args:
@@ -70,7 +70,7 @@ def triangulate(directions: np.ndarray) -> Triangulation:
 
 
 @lru_cache(maxsize=REMEMBERED)
-def _remembered(directions_bytes: bytes, count: int) -> Triangulation:
+def _remembered(directions_bytes: bytes, count: int) -> SphereTriangles:
     """The triangles of lights that are asked for again and again: by every frame, every batch of pixels."""
     directions = np.frombuffer(directions_bytes).reshape(count, -1)
     random = np.random.default_rng(0)  # the same each time
@@ -97,10 +97,10 @@ def _remembered(directions_bytes: bytes, count: int) -> Triangulation:
         points = np.concatenate([points, shifted(vertex[-1:])])
         faces = _insert(faces, points, [len(points) - 1])
     share = _hand_on(faces.corner, np.concatenate([np.eye(len(directions)), polygons]), len(vertex))
-    return Triangulation(vertex, faces.corner, _neighbours(faces.corner), share)
+    return SphereTriangles(vertex, faces.corner, _neighbours(faces.corner), share)
 
 
-def edge_planes(triangles: Triangulation) -> tuple[np.ndarray, np.ndarray]:
+def edge_planes(triangles: SphereTriangles) -> tuple[np.ndarray, np.ndarray]:
     """The planes through the centre and the edge opposite to each corner.
 
     Returns:
@@ -113,7 +113,7 @@ def edge_planes(triangles: Triangulation) -> tuple[np.ndarray, np.ndarray]:
     return plane / length[..., None], length
 
 
-def find_faces(triangles: Triangulation, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def find_faces(triangles: SphereTriangles, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The triangle of each of some directions, too few for a launch.
 
     Args:

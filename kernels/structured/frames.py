@@ -20,10 +20,6 @@ class NoiseModel(NamedTuple):
     """Of photon noise: full scale over the electrons that fill it."""
 
 
-EIGHT_BIT = NoiseModel(0.003, 1.0e-4)
-"""Of full scale 1: an ordinary camera of eight bits whose pixels hold ten thousand electrons."""
-
-
 def require_frames(frames: Band, *numbers: int | None, channels: int = 1) -> None:
     """Refuse frames that do not exist or are taken twice, or images of another number of channels.
 

@@ -24,12 +24,11 @@ CHECK_EVERY = 4
 """Iterations between readings of the residual on CUDA, where each reading waits for the device."""
 
 
-class Progress(NamedTuple):
+class Convergence(NamedTuple):
     """How a solve ended."""
 
     iterations: int
-    residual: float  # preconditioned residual norm over the reference
-    reference: float  # preconditioned residual norm of the first guess of the first solve
+    residual: float  # preconditioned residual norm over that of the first guess
     converged: bool
 
 
@@ -151,7 +150,7 @@ def _turn(
 
 
 class Solver:
-    """Scratch memory and hierarchy of one grid; several solves may follow one another on changed weights.
+    """Conjugate gradients on one grid, with their scratch memory and multigrid hierarchy.
 
     Memory: five arrays of the grid beyond slopes and heights, and five thirds for the coarse levels.
     """
@@ -171,19 +170,17 @@ class Solver:
         h: wp.array,  # [size] float32, first guess; the answer on return
         *,
         tolerance: float,
-        reference: float | None = None,
         progress: Callable[[float], None] | None = None,
-    ) -> Progress:
-        """Improve h until the preconditioned residual norm is below tolerance·reference.
+    ) -> Convergence:
+        """Improve h until the preconditioned residual norm is below tolerance times its first value.
 
         Args:
             h: heights, changed in place.
             tolerance: relative; close to the relative error of the slopes of h in the weighted norm.
-            reference: the norm to be relative to; None for that of the first guess.
             progress: told the fraction done, by the logarithm of the residual.
 
         Returns:
-            Progress; reading the residual waits for the device, every CHECK_EVERY iterations on CUDA.
+            How the solve ended; reading the residual waits for the device, every CHECK_EVERY iterations on CUDA.
         """
         device, pitch, every = self.grid.device, self.grid.pitch, 1 if self.grid.device == "cpu" else CHECK_EVERY
         s = self.slopes
@@ -192,8 +189,7 @@ class Solver:
         self._precondition(0)
         wp.copy(self.p, self.z)
         norm = self._norm(0)
-        reference = norm if reference is None else reference
-        goal, start, step = tolerance * reference, norm, 0
+        goal, start, step = tolerance * norm, norm, 0
         while norm > goal and step < self.max_iterations:
             run(_multiply, self.grid.sums, [*weights, self.p, pitch], [self.q, self.summer.partial], device=device)
             self.summer.finish(self.pq, step)
@@ -206,7 +202,7 @@ class Solver:
                 norm = self._norm(step)
                 if progress is not None and norm > 0.0:
                     progress(min(1.0, math.log(start / norm) / math.log(start / goal)) if start > goal > 0.0 else 1.0)
-        return Progress(step, norm / reference if reference > 0.0 else 0.0, reference, norm <= goal)
+        return Convergence(step, norm / start if start > 0.0 else 0.0, norm <= goal)
 
     def _precondition(self, slot: int) -> None:
         """z = B·residual, rz[slot] = residual·z."""

@@ -9,10 +9,10 @@ import warp as wp
 
 from kernels.errors import ArrayError
 from kernels.surface.components import label_runs, place
-from kernels.surface.conjugate import Progress, Solver
-from kernels.surface.discontinuities import distrust_loops, reweigh
-from kernels.surface.grid import Grid, make_grid
-from kernels.surface.slopes import Slopes, pair_slopes, usable_pixels
+from kernels.surface.conjugate import Solver
+from kernels.surface.discontinuities import distrust_loops
+from kernels.surface.grid import make_grid
+from kernels.surface.slopes import pair_slopes, usable_pixels
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,19 +22,10 @@ class IntegrationOptions:
     tolerance: float = 1.0e-6
     """Where conjugate gradients stop: residual over its first value, close to the relative error of the slopes."""
     max_iterations: int = 200
-    """Of one solve; seven to fifteen are usual, mazes and scattered holes take more."""
+    """Seven to fifteen are usual, mazes and scattered holes take more."""
     discontinuities: bool = False
-    """Whether the surface may break: right for objects with parts in front of one another. On a smooth surface it
-    changes nothing but the share of noise (6 % more error at most in our trials) and takes up to twice as long; where
-    there are breaks it takes several solves."""
-    sharpness: float = 2.0
-    """How fast an edge is given up as its misfit, in squared pixels, exceeds its neighbour's (k of Cao et al.)."""
-    max_reweightings: int = 40
-    """Solves after the first with discontinuities; 0 breaks only where the normals contradict themselves."""
-    reweighting_tolerance: float = 1.0e-3
-    """They stop when the misfit changes by less than this fraction of itself."""
-    inner_tolerance: float = 1.0e-4
-    """Where each of those solves but the last stops."""
+    """Whether the surface may break where its normals contradict themselves: right for objects with parts in front of one another. On a
+    smooth surface it changes nothing but the share of noise (6 % more error at most in our trials)."""
 
 
 class Integration(NamedTuple):
@@ -42,8 +33,8 @@ class Integration(NamedTuple):
 
     height: wp.array  # [rows, cols] float32, camera-frame z, 0 outside
     components: int  # connected parts, each with a constant of its own
-    iterations: int  # of conjugate gradients, over all solves
-    residual: float  # of the last solve, relative
+    iterations: int  # of conjugate gradients
+    residual: float  # relative
     converged: bool
 
 
@@ -98,52 +89,12 @@ def integrate_normals(
 
     h = grid.zeros()
     if options.discontinuities:
-        done = _solve_breaking(h, slopes, grid, options, progress)
-    else:
-        solver = Solver(grid, slopes, max_iterations=options.max_iterations)
-        done = solver.solve(h, tolerance=options.tolerance, progress=progress)
-        del solver
+        slopes = distrust_loops(slopes, grid=grid)
+    done = Solver(grid, slopes, max_iterations=options.max_iterations).solve(h, tolerance=options.tolerance, progress=progress)
     height = place(h, runs, grid=grid, perspective=perspective, spacing=spacing, mean_z=mean_z)
     if progress is not None:
         progress(1.0)
     return Integration(height, runs.count, done.iterations, done.residual, done.converged)
-
-
-def _solve_breaking(
-    h: wp.array,  # [size] float32, the answer on return
-    slopes: Slopes,
-    grid: Grid,
-    options: IntegrationOptions,
-    progress: Callable[[float], None] | None,
-) -> Progress:
-    """Solve, reweigh and solve again until the misfit settles; the last solve goes to the full tolerance."""
-    base = distrust_loops(slopes, grid=grid)
-    rounds = options.max_reweightings
-    if rounds == 0:
-        return Solver(grid, base, max_iterations=options.max_iterations).solve(
-            h, tolerance=options.tolerance, progress=progress
-        )
-    working = base._replace(right_weight=wp.clone(base.right_weight), down_weight=wp.clone(base.down_weight))
-    solver = Solver(grid, working, max_iterations=options.max_iterations)
-    done = solver.solve(h, tolerance=options.inner_tolerance)
-    reference, iterations = done.reference, done.iterations
-    before, settled = float("inf"), False
-    total = wp.zeros(1, dtype=wp.float64, device=grid.device)
-    for k in range(rounds):
-        reweigh(base, h, sharpness=options.sharpness, grid=grid, summer=solver.summer, working=working, total=total)
-        solver.multigrid.refresh()
-        misfit = float(total.numpy()[0])
-        settled = abs(before - misfit) <= options.reweighting_tolerance * misfit
-        last = settled or k + 1 == rounds
-        tolerance = options.tolerance if last else options.inner_tolerance
-        done = solver.solve(h, tolerance=tolerance, reference=reference)
-        iterations += done.iterations
-        if progress is not None:
-            progress((k + 1) / rounds)
-        if settled:
-            break
-        before = misfit
-    return done._replace(iterations=iterations, converged=done.converged and settled)
 
 
 def _check(normal: Any, mask: Any, x: Any, y: Any, *, perspective: bool, mean_z: float) -> None:

@@ -210,7 +210,7 @@ class Multigrid:
 
     Args:
         grid: the finest layout.
-        right_weight, down_weight: its edges, kept by reference; call `refresh` after changing them.
+        right_weight, down_weight: its edges.
         target: the finest right-hand side, read by `cycle`.
         value: where `cycle` leaves its answer.
         scratch: an array that `cycle` may overwrite.
@@ -230,10 +230,6 @@ class Multigrid:
         while max(grid.rows, grid.cols) > COARSEST:
             grid = make_grid(-(-grid.rows // 2), -(-grid.cols // 2), grid.device)
             self.levels.append(Level(grid, *(grid.zeros() for _ in range(5))))
-        self.refresh()
-
-    def refresh(self) -> None:
-        """Recompute the coarse weights from the finest."""
         for fine, coarse in zip(self.levels, self.levels[1:], strict=False):
             g = coarse.grid
             inputs = [fine.right_weight, fine.down_weight, fine.grid.pitch, g.cols, g.pitch]

@@ -14,7 +14,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.packs import as_packs, pack_type, place, unwritten
-from kernels.tof.modulation import radians_per_metre
+from kernels.tof.modulation import require_frequencies
 
 LEAST_PHASES = 3
 WORST_CONDITION = 100.0
@@ -64,7 +64,7 @@ def weights(modulation_hz: Sequence[float] | np.ndarray, reference_phase_rad: Se
     factor = np.ones_like(hz) if scale is None else np.asarray(scale, dtype=np.float64)
     if not hz.shape == delta.shape == factor.shape or hz.ndim != 1:
         raise ArrayError(f"there are {hz.size} frequencies, {delta.size} reference phases and {factor.size} scales: give one an image")
-    radians_per_metre(hz)
+    require_frequencies(hz)
     if not np.all(np.isfinite(delta)) or not np.all(np.isfinite(factor) & (factor > 0)):
         raise ArrayError("reference phases must be finite, and scales above zero")
     frequencies, index = np.unique(hz, return_inverse=True)

@@ -43,11 +43,12 @@ def quantile(freedom: int, z: float) -> float:
     return float(freedom * (1 - a + z * a**0.5) ** 3)
 
 
-def decide(found: Correlation, weighed: Hypotheses, *, agreement_rad: float = AGREEMENT_RAD) -> Ranges:
+def decide(found: Correlation, weighed: Hypotheses, *, light_speed: float, agreement_rad: float = AGREEMENT_RAD) -> Ranges:
     """Take the most probable hypothesis of each pixel and say why where it is not good enough.
 
     Args:
         found, weighed: phases and hypotheses of the same pixels.
+        light_speed: metres a second.
         agreement_rad: systematic error of a phase up to which frequencies count as agreeing.
 
     Returns:
@@ -63,7 +64,7 @@ def decide(found: Correlation, weighed: Hypotheses, *, agreement_rad: float = AG
                       for dtype in (wp.float32, wp.float32, wp.float32, wp.int32, wp.int32)))
     devices.launch(decide_kernel(pack), pixels // pack, [
         *(as_packs(array, device) for array in (found.phase, found.sigma, found.evidence)),
-        floats(radians_per_metre(found.modulation_hz), device), floats(agree, device), floats(signal, device),
+        floats(radians_per_metre(found.modulation_hz, light_speed), device), floats(agree, device), floats(signal, device),
         *(as_packs(array, device) for array in (weighed.range, weighed.probability, weighed.sigma)), float(agreement_rad) ** 2,
     ], [as_packs(array, device) for array in result], device=device)
     return result

@@ -7,19 +7,18 @@ import numpy as np
 
 from kernels.errors import ArrayError
 
-SPEED_OF_LIGHT = 299_792_458.0
-"""Metres a second, in vacuum (SI, exact)."""
 REPEAT_TURNS = 0.02
 """Phases that differ by less than this part of a turn are the same again: nearer than noise of 0.1 rad tells apart."""
 MOST_TURNS = 1000
 """Of the lowest frequency within which a repeat is looked for: 7.5 km at 20 MHz."""
 
 
-def radians_per_metre(modulation_hz: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Phase that a metre of range adds: 4πf/c, light goes there and back.
+def radians_per_metre(modulation_hz: Sequence[float] | np.ndarray, light_speed: float) -> np.ndarray:
+    """Return the phase that a metre of range adds, 4πf/c: light goes there and back.
 
     Args:
         modulation_hz: [F] frequencies.
+        light_speed: c, metres a second.
 
     Returns:
         [F] float64.
@@ -27,19 +26,29 @@ def radians_per_metre(modulation_hz: Sequence[float] | np.ndarray) -> np.ndarray
     Raises:
         ArrayError: no frequency, or one is not above zero.
     """
+    return 4 * np.pi * require_frequencies(modulation_hz) / light_speed
+
+
+def require_frequencies(modulation_hz: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Return modulation frequencies as [F] float64, or refuse them.
+
+    Raises:
+        ArrayError: no frequency, or one is not above zero.
+    """
     hz = np.asarray(modulation_hz, dtype=np.float64).reshape(-1)
     if hz.size == 0 or not np.all(np.isfinite(hz) & (hz > 0)):
         raise ArrayError(f"modulation frequencies are {list(map(float, hz))}: give one or more above zero")
-    return 4 * np.pi * hz / SPEED_OF_LIGHT
+    return hz
 
 
-def common_range_m(modulation_hz: Sequence[float] | np.ndarray) -> float:
-    """The shortest range after which every phase is back where it was, within REPEAT_TURNS.
+def common_range_m(modulation_hz: Sequence[float] | np.ndarray, light_speed: float) -> float:
+    """Return the shortest range after which every phase repeats, within REPEAT_TURNS.
 
     For whole multiples of one frequency g it is c / (2g): 14.99 m for 20, 30 and 80 MHz.
 
     Args:
         modulation_hz: [F] frequencies; equal ones count once.
+        light_speed: metres a second.
 
     Returns:
         Metres; MOST_TURNS turns of the lowest frequency where they repeat later than that.
@@ -47,7 +56,7 @@ def common_range_m(modulation_hz: Sequence[float] | np.ndarray) -> float:
     Raises:
         ArrayError: no frequency, or one is not above zero.
     """
-    turns_per_metre = np.unique(radians_per_metre(modulation_hz)) / (2 * np.pi)
+    turns_per_metre = np.unique(radians_per_metre(modulation_hz, light_speed)) / (2 * np.pi)
     turns = np.arange(1, MOST_TURNS + 1)
     others = turns[:, None] * (turns_per_metre / turns_per_metre[0])
     repeats = np.all(np.abs(others - np.round(others)) < REPEAT_TURNS, axis=1)
@@ -55,7 +64,7 @@ def common_range_m(modulation_hz: Sequence[float] | np.ndarray) -> float:
     return float(turns[first] / turns_per_metre[0])
 
 
-def require_span(modulation_hz: Sequence[float] | np.ndarray, nearest_m: float, farthest_m: float) -> None:
+def require_span(modulation_hz: Sequence[float] | np.ndarray, nearest_m: float, farthest_m: float, light_speed: float) -> None:
     """Refuse a span that the frequencies cannot tell apart.
 
     Raises:
@@ -63,7 +72,7 @@ def require_span(modulation_hz: Sequence[float] | np.ndarray, nearest_m: float, 
     """
     if not 0 <= nearest_m < farthest_m:
         raise ArrayError(f"ranges from {nearest_m:g} to {farthest_m:g} m are no span: give 0 <= nearest < farthest")
-    common = common_range_m(modulation_hz)
+    common = common_range_m(modulation_hz, light_speed)
     if farthest_m - nearest_m > common * (1 + 1e-6):
         names = ", ".join(f"{hz / 1e6:g}" for hz in np.unique(modulation_hz))
         raise ArrayError(f"phases at {names} MHz repeat after {common:.4g} m, {farthest_m - nearest_m:.4g} m were asked for: "

@@ -13,12 +13,6 @@ REACH_SIGMAS = 4.5
 """Of a Gaussian: 7 in a million of its light lie outside."""
 STEPS_PER_SIGMA = 24
 STEPS_PER_BIN = 32
-FWHM_PER_SIGMA = 2.354820045
-"""Full width at half maximum of a Gaussian, over its standard deviation."""
-SWEEP_KNOTS = 8
-"""A bin of a pulse learned from a sweep: the sweep must step by less than a bin."""
-SWEEP_STIFFNESS = 1e-3
-"""Weight of bending in that fit, relative to that of the counts."""
 
 
 class Pulse(NamedTuple):
@@ -81,42 +75,3 @@ def measured(times_bins: Sequence[float] | np.ndarray, power: Sequence[float] | 
     step = grid[1] - grid[0]
     cumulative = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]))]) * step
     return Pulse(float(times[0]), float(step), cumulative / cumulative[-1], density / cumulative[-1])
-
-
-def from_sweep(counts: np.ndarray, position_bins: np.ndarray, *, before: float = 3.0, after: float = 24.0) -> Pulse:
-    """Learn the pulse finer than the bins from histograms of returns at known places.
-
-    A sweep that steps by parts of a bin samples the pulse at as many places between the bins: the pulse is the density on SWEEP_KNOTS
-    knots a bin whose sums over the bins are the counts, as smooth as they allow.
-
-    Args:
-        counts: [n, bins] histograms, one return each.
-        position_bins: [n] where each return is, in bins from the start.
-        before, after: how far the pulse reaches ahead of that and behind, bins.
-
-    Raises:
-        ArrayError: shapes do not match, or a histogram has no return.
-    """
-    if counts.ndim != 2 or position_bins.shape != (len(counts),):
-        raise ArrayError(f"counts are {counts.shape}, positions {position_bins.shape}: give [n, bins] and [n]")
-    bins, knots = counts.shape[1], round((before + after) * SWEEP_KNOTS)
-    index = np.arange(bins)
-    normal, right = np.zeros((knots, knots)), np.zeros(knots)
-    for histogram, position in zip(counts.astype(np.float64), position_bins, strict=True):
-        away = index - position
-        inside = (away > -before) & (away + 1 < after)
-        outside = (away + 1 < -before) | (away > after)
-        level = histogram[outside].mean() if outside.any() else 0.0
-        signal = histogram[inside] - level
-        if signal.sum() <= 0:
-            raise ArrayError(f"the histogram of the return at bin {position:.4g} has no return: take it out of the sweep")
-        # share of each knot's cell in each bin
-        low = (away[inside, None] + before) * SWEEP_KNOTS
-        cells = np.clip(low + SWEEP_KNOTS - np.arange(knots), 0, 1) - np.clip(low - np.arange(knots), 0, 1)
-        normal += cells.T @ cells
-        right += cells.T @ (signal / signal.sum())
-    bend = np.diff(np.eye(knots), n=2, axis=0)
-    weight = np.trace(normal) / knots * SWEEP_STIFFNESS
-    density = np.maximum(np.linalg.solve(normal + weight * bend.T @ bend + 1e-9 * weight * np.eye(knots), right), 0)
-    times = (np.arange(knots) + 0.5) / SWEEP_KNOTS - before
-    return measured(np.concatenate([[-before], times, [after]]), np.concatenate([[0.0], density, [0.0]]))

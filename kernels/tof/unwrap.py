@@ -36,12 +36,13 @@ class Hypotheses(NamedTuple):
     spacing_m: float  # between wraps of the highest frequency
 
 
-def unwrap(found: Correlation, *, nearest_m: float, farthest_m: float) -> Hypotheses:
+def unwrap(found: Correlation, *, nearest_m: float, farthest_m: float, light_speed: float) -> Hypotheses:
     """Weigh every wrap of every pixel.
 
     Args:
         found: phases with their standard deviations.
         nearest_m, farthest_m: the span to look in; END_SIGMAS standard deviations beyond either end are looked at too.
+        light_speed: metres a second.
 
     Returns:
         The hypotheses, on the device.
@@ -54,10 +55,10 @@ def unwrap(found: Correlation, *, nearest_m: float, farthest_m: float) -> Hypoth
         and hypotheses as Järemo Lawin, Forssén, Ovrén, "Efficient multi-frequency phase unwrapping using kernel density estimation",
         ECCV 2016.
     """
-    require_span(found.modulation_hz, nearest_m, farthest_m)
+    require_span(found.modulation_hz, nearest_m, farthest_m, light_speed)
     device, pixels = str(found.phase.device), found.phase.shape[1]
     pack = devices.pack_width(device)
-    per_metre = radians_per_metre(found.modulation_hz)
+    per_metre = radians_per_metre(found.modulation_hz, light_speed)
     wave = 2 * np.pi / per_metre[-1]
     shapes = (HYPOTHESES, pixels), (HYPOTHESES, pixels), (pixels,), (len(per_metre), pixels)
     ranges, probability, sigma, scratch = (wp.empty(shape, dtype=wp.float32, device=device) for shape in shapes)  # the kernel writes all

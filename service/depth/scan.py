@@ -7,7 +7,6 @@ import numpy as np
 
 from kernels import device as devices
 from kernels.status import SOLVED
-from kernels.tof.modulation import SPEED_OF_LIGHT
 from kernels.tof.pileup import correct_pileup, place, unhurried
 from kernels.tof.pulse import STEPS_PER_SIGMA
 from kernels.tof.pulse_width import estimate_pulse
@@ -22,6 +21,7 @@ from stage.files import write_text
 from stage.fingerprint import Fingerprints
 from stage.las import LAS_FILE, las_is_installed, write_las
 from stage.ply import POINTS_FILE, PointCloud, write_ply
+from stage.tof.light_time import SPEED_OF_LIGHT
 from stage.tof.scan import FILE_NAME, Shots, read_scan, world_points
 
 USD_FILE, REPORT_FILE = "points.usdc", "report.json"

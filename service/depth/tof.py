@@ -17,7 +17,7 @@ from kernels.tof.bilateral import smooth
 from kernels.tof.continuous import Correlation, Noise, decode, weights
 from kernels.tof.decide import AGREEMENT_RAD, UNCALIBRATED_RAD, decide
 from kernels.tof.flying import mark_flying
-from kernels.tof.modulation import SPEED_OF_LIGHT, common_range_m, require_span
+from kernels.tof.modulation import common_range_m, require_span
 from kernels.tof.noise import estimate_noise
 from kernels.tof.pileup import Exposed, correct_pileup, place, unhurried
 from kernels.tof.pulse import STEPS_PER_SIGMA, Pulse, gaussian, measured
@@ -34,6 +34,7 @@ from stage.camera import Camera
 from stage.capture import Capture
 from stage.tof.calibration import TofCalibration, read_calibration
 from stage.tof.frames import CorrelationImages, Histograms, is_pulsed, read_correlations, read_histograms
+from stage.tof.light_time import SPEED_OF_LIGHT
 
 MOST_RETURNS = 3
 """Returns that are looked for in a histogram."""
@@ -111,23 +112,23 @@ def solve_correlations(frames: CorrelationImages, options: TofOptions, calibrati
     rows, cols = usable.shape
     weights(frames.modulation_hz, frames.reference_phase_rad, frames.scale)  # faults of the frames come before those of the options
     nearest = near_m or 0.0
-    farthest = far_m or nearest + common_range_m(frames.modulation_hz)
-    require_span(frames.modulation_hz, nearest, farthest)
+    farthest = far_m or nearest + common_range_m(frames.modulation_hz, SPEED_OF_LIGHT)
+    require_span(frames.modulation_hz, nearest, farthest, SPEED_OF_LIGHT)
     noise, source = _noise(frames, calibration, limit, usable)
     found = decode(frames.images, frames.modulation_hz, frames.reference_phase_rad, noise=noise, saturation=limit, scale=frames.scale,
                    device=device)
     found = _straighten(found, calibration)
-    hypotheses = unwrap(found, nearest_m=nearest, farthest_m=farthest)
+    hypotheses = unwrap(found, nearest_m=nearest, farthest_m=farthest, light_speed=SPEED_OF_LIGHT)
     if options.vote:
         hypotheses = vote(hypotheses, rows, cols)
     straight = [hz for hz in found.modulation_hz.tolist() if calibration.of_frequency(hz) is not None]
     agreement = AGREEMENT_RAD if len(straight) == len(found.modulation_hz) else UNCALIBRATED_RAD
-    ranges = decide(found, hypotheses, agreement_rad=agreement)
+    ranges = decide(found, hypotheses, light_speed=SPEED_OF_LIGHT, agreement_rad=agreement)
     facts = {
         "modulation_hz": found.modulation_hz.tolist(),
         "images": len(frames.images),
         "span_m": [nearest, round(farthest, 4)],
-        "common_range_m": round(common_range_m(frames.modulation_hz), 4),
+        "common_range_m": round(common_range_m(frames.modulation_hz, SPEED_OF_LIGHT), 4),
         "vote": options.vote,
         "noise": {"electrons_per_unit": 1 / noise.shot if noise.shot > 0 else None, "read_units": noise.read, "from": source},
         "wiggling": straight,

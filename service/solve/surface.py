@@ -9,9 +9,8 @@ from kernels.surface.shadows import Projection
 from service.solve.solution import SolveInput
 from stage.camera import Camera
 
-OPTIONS = IntegrationOptions(discontinuities=True, max_reweightings=0)
-"""The surface may break where slopes around a pixel contradict each other: objects hide parts of themselves. The bilateral rounds
-that may follow gain little more on real objects and can settle on a wrong break where normals are noisy."""
+OPTIONS = IntegrationOptions(discontinuities=True)
+"""The surface may break where slopes around a pixel contradict each other: objects hide parts of themselves."""
 RINGS = 8
 """Unsolved pixels this near to solved ones are filled from their neighbours; farther ones, which few solves have, by blocks."""
 

@@ -9,7 +9,7 @@ from kernels.relight import sources
 from kernels.relight.discs import integrate_discs
 from kernels.relight.environment import Weighting
 from kernels.relight.near_sum import sum_near
-from kernels.relight.triangulation import triangulate
+from kernels.relight.triangulation import triangulate_sphere
 from tests.kernels.relight.lights import AXES, CUBE, icosahedron, ring, scattered, turn
 from tests.kernels.relight.surfaces import FLOAT, LOBE, pack_bytes, scattered_pixels, stored, upload
 from tests.kernels.scenes import HALF_ROUNDING, cap, colours, store
@@ -82,7 +82,7 @@ LAYOUTS = {"octahedron": AXES, "icosahedron": icosahedron() @ turn(0).T, "even":
 def test_a_light_far_away_is_shared_out_as_smooth_weighting_does(direction, device):
     """As a near light a million away and as a far one; in polygons and, below a dome, in holes too. Tolerance: SHARE, the pixels'
     places, a millionth of the distance, and the thousandth of an imaginary light that goes to others."""
-    holes = len(triangulate(direction).vertex) > len(direction)
+    holes = len(triangulate_sphere(direction).vertex) > len(direction)
     pixels, readings, toward = scattered_pixels(3), images(direction, 3, seed=2), scattered(14, 6)
     shares = integrate_discs(toward, np.zeros(14), direction, weighting=Weighting.SMOOTH)
     for i, share in enumerate(shares):

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from kernels.errors import ArrayError
 from kernels.relight.latlong import cut
 from kernels.relight.smooth import integrate_smooth, locate
-from kernels.relight.triangulation import triangulate
+from kernels.relight.triangulation import triangulate_sphere
 from tests.kernels.relight.lights import AXES, CUBE, STILL, SUM, icosahedron, ring, scattered, sun, turn
 from tests.kernels.scenes import cap
 from tests.reference import relight as reference
@@ -30,7 +30,7 @@ def shares(direction, *, at, device):
 
 def shares_along(direction, rotation, degrees, *, device):
     """Shares [steps, lights] along a great circle, from +z over -x, turned; and the directions there [steps, 3]."""
-    triangles, azimuth = triangulate(direction), np.pi + np.radians(degrees)
+    triangles, azimuth = triangulate_sphere(direction), np.pi + np.radians(degrees)
     grid = cut(*HALF_DEGREE)._replace(polar=np.array([np.pi / 2]), azimuth=azimuth)
     face, share = locate(grid, triangles, rotation, device=device)
     got = np.einsum("nk,nkl->nl", share, triangles.share[triangles.corner[face]])
@@ -113,7 +113,7 @@ def test_shares_reproduce_the_direction(direction, device):
 def test_energies_are_those_of_the_twin(rows, cols, seed, device):
     """With the same samples, triangles by trying all threes of lights, and shares by inversion."""
     environment, direction = np.random.default_rng(rows).gamma(0.3, 5.0, (rows, cols, 3)), scattered(16, 28)
-    assert len(triangulate(direction).vertex) == 16  # no imaginary lights, which the twin does not know
+    assert len(triangulate_sphere(direction).vertex) == 16  # no imaginary lights, which the twin does not know
     rotation = np.eye(3) if seed is None else turn(seed)
     got = integrate_smooth(environment, direction, rotation[None], device=device)
     energy, solid_angle = reference.smooth_energy(environment, direction, rotation, down=-(-360 // rows), across=-(-720 // cols))

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from kernels.relight.triangulation import triangulate
+from kernels.relight.triangulation import triangulate_sphere
 from tests.kernels.relight.lights import AXES, CUBE, dodecahedron, icosahedron, ring, scattered, turn
 from tests.kernels.scenes import cap
 
@@ -31,7 +31,7 @@ def planes(corners):
 @pytest.mark.parametrize("seed", [None, 0])
 def test_triangles_cover_the_sphere_once(direction, seed):
     direction = direction if seed is None else direction @ turn(seed).T
-    got = triangulate(direction)
+    got = triangulate_sphere(direction)
     np.testing.assert_array_equal(got.vertex[: len(direction)], direction)
     assert len(got.corner) == 2 * len(got.vertex) - 4  # Euler, of a closed surface of triangles
     assert len(np.unique(got.corner)) == len(got.vertex)
@@ -48,7 +48,7 @@ def test_triangles_cover_the_sphere_once(direction, seed):
 
 @pytest.mark.parametrize("direction", LAYOUTS.values(), ids=LAYOUTS)
 def test_energy_is_shared_out_whole(direction):
-    got = triangulate(direction)
+    got = triangulate_sphere(direction)
     assert got.share.min() >= 0
     np.testing.assert_allclose(got.share.sum(axis=1), 1, rtol=1e-13)
     np.testing.assert_array_equal(got.share[: len(direction)], np.eye(len(direction)))
@@ -58,7 +58,7 @@ def test_energy_is_shared_out_whole(direction):
 @pytest.mark.parametrize("seed", range(3))
 def test_triangles_are_the_convex_hull(count, seed):
     """By SciPy, of the lights and the imaginary ones."""
-    got = triangulate(scattered(count, seed))
+    got = triangulate_sphere(scattered(count, seed))
     hull = ConvexHull(unit(got.vertex))
     assert {frozenset(face) for face in got.corner.tolist()} == {frozenset(face) for face in hull.simplices.tolist()}
 
@@ -69,7 +69,7 @@ def test_triangles_are_the_convex_hull(count, seed):
 ], ids=["octahedron", "icosahedron", "cube", "dodecahedron", "dome"])
 def test_where_imaginary_lights_are(direction, imaginary):
     """In the middle of a square or pentagon, and below a dome; each shared out evenly over the corners."""
-    got = triangulate(direction)
+    got = triangulate_sphere(direction)
     assert len(got.vertex) - len(direction) == len(imaginary)
     for vertex, share in zip(got.vertex[len(direction) :], got.share[len(direction) :], strict=True):
         assert np.linalg.norm(np.array(imaginary) - vertex / np.linalg.norm(vertex), axis=1).min() < 1e-9
@@ -78,7 +78,7 @@ def test_where_imaginary_lights_are(direction, imaginary):
 
 
 def test_the_middle_of_a_polygon_lies_in_its_plane():
-    got = triangulate(dodecahedron())
+    got = triangulate_sphere(dodecahedron())
     np.testing.assert_allclose(got.vertex[20:], got.share[20:] @ dodecahedron(), atol=1e-15)
 
 
@@ -86,11 +86,11 @@ def test_the_middle_of_a_polygon_lies_in_its_plane():
 def test_a_hole_has_one_imaginary_light_in_its_middle(count, largest):
     """Behind the cap that the lights fill."""
     direction = cap(count, largest)
-    got = triangulate(direction)
+    got = triangulate_sphere(direction)
     behind = got.share[count:][got.vertex[count:, 2] < -0.95]
     assert len(behind) == 1
     assert behind[0][count - 30 :].sum() > 0.99 and behind[0].max() < 0.15  # to the rim, and not to a few of it
 
 
 def test_lights_all_around_have_no_holes():
-    assert len(triangulate(cap(20, 180)).vertex) == 20
+    assert len(triangulate_sphere(cap(20, 180)).vertex) == 20

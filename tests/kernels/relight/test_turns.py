@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kernels.relight.environment import Weighting, integrate
-from kernels.relight.turns import shared_turns
+from kernels.relight.latlong import shared_turns
 from stage.frames import rotation_about, rotation_about_y
 from tests.kernels.scenes import cap
 

@@ -6,9 +6,12 @@ import warp as wp
 
 from kernels.errors import ArrayError
 from kernels.structured.decoded import Decoded
-from kernels.structured.frames import EIGHT_BIT, upload
+from kernels.structured.frames import NoiseModel, upload
 from kernels.structured.join import cropped, join_periods
 from kernels.structured.phase import decode_phase
+
+EIGHT_BIT = NoiseModel(0.003, 1.0e-4)
+"""Of full scale 1: an ordinary camera of eight bits whose pixels hold ten thousand electrons."""
 
 
 def test_joined_periods_are_those_decoded_together(device):

@@ -77,16 +77,6 @@ def torn_sheet(n):
     return from_gradient(x, y, side * run**2, 2 * side * run, np.zeros_like(x))
 
 
-def shifted_lip(n):
-    """A sheet cut along y = 0, x > 0.02; one lip climbs, then runs level: that part leaves no trace in normals."""
-    x, y = plane_coordinates(n, n)
-    t = np.clip((x - 0.02) / 0.25, 0.0, 1.0)
-    up = y > 0
-    return from_gradient(
-        x, y, np.where(up, 0.3 * t * t * (3 - 2 * t), 0.0), np.where(up, 7.2 * t * (1 - t), 0.0), np.zeros_like(x)
-    )
-
-
 def ball_before_wall(n):
     """An occluding step all around a ball. Normals cannot tell how far the ball is from the wall."""
     x, y = plane_coordinates(n, n)

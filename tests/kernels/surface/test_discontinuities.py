@@ -16,9 +16,8 @@ def test_torn_sheet_is_found_up_to_its_tip(device):
     shape = shapes.torn_sheet(96)
     plain = worst(solve(shape, device), shape)
     assert plain > 0.3
-    loops = solve(shape, device, discontinuities=True, max_reweightings=0)
-    assert worst(loops, shape) < 1e-3  # only the first pixels of the tear, less than 0.01 pixel open, hold together
-    assert worst(solve(shape, device, discontinuities=True), shape) < 1e-3
+    broken = solve(shape, device, discontinuities=True)
+    assert worst(broken, shape) < 1e-3  # only the first pixels of the tear, less than 0.01 pixel open, hold together
 
 
 def test_tear_is_found_under_noise(device):
@@ -26,14 +25,6 @@ def test_tear_is_found_under_noise(device):
     noise = np.random.default_rng(0).normal(0, 0.01, shape.normal.shape)
     noisy = shape._replace(normal=(shape.normal + noise).astype(np.float32))
     assert worst(solve(noisy, device, discontinuities=True), shape) < 0.01
-
-
-def test_level_lip_needs_the_heights(device):
-    shape = shapes.shifted_lip(64)
-    assert worst(solve(shape, device, discontinuities=True, max_reweightings=0), shape) > 0.3
-    result = solve(shape, device, discontinuities=True)
-    assert result.converged
-    assert worst(result, shape) < 0.02
 
 
 def test_ball_keeps_its_shape_before_a_wall(device):

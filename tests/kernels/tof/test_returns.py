@@ -6,7 +6,7 @@ import pytest
 from kernels.errors import ArrayError
 from kernels.status import Status
 from kernels.tof.pileup import correct_pileup, place, unhurried
-from kernels.tof.pulse import from_sweep, gaussian, measured
+from kernels.tof.pulse import gaussian, measured
 from kernels.tof.pulse_width import estimate_pulse
 from kernels.tof.returns import find_returns
 from tests.reference import tof
@@ -134,23 +134,6 @@ def test_few_photons_do_not_make_the_pulse_narrow(photons, device):
     counts = tof.histogram(scaled, photons / 0.8, background=0.01, seed=8).reshape(-1, 64)
     estimated = estimate_pulse(unhurried(place(counts, device)), counts)
     assert estimated.step == pytest.approx(PULSE.step, rel=0.04)  # 512 histograms of six: 1.3 %, and the brightest are not just any
-
-
-def test_a_pulse_is_learned_from_a_sweep(device):
-    """An uneven pulse whose rise is shorter than a bin: with its own shape the ranges lose their bias of place within the bin."""
-    edges = np.arange(65.0)
-    at = 10 + np.arange(160) * 0.237
-
-    fine = np.linspace(-3, 24, 27 * 400 + 1)
-    jitter = np.exp(-0.5 * (np.arange(-800, 801) / 400 / 0.35) ** 2)
-    shape = np.convolve(np.where(fine > 0, np.exp(-np.clip(fine, 0, None) / 1.7), 0), jitter, mode="same")
-    total = np.cumsum(shape) / shape.sum()
-    counts = 1e5 * np.diff(np.interp(edges - at[:, None], fine, total), axis=1) + 2.0
-    pulse = from_sweep(counts[::2], at[::2])
-    error = solve(counts[1::2], device, pulse=pulse)["position"][0] - at[1::2]
-    plain = solve(counts[1::2], device, pulse=gaussian(1.0))["position"][0] - at[1::2]
-    assert np.std(error) < 0.03  # knots lie an eighth of a bin apart
-    assert np.std(error) < 0.4 * np.std(plain)
 
 
 def test_bad_pulses_and_options_are_refused(device):

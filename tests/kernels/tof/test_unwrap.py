@@ -25,10 +25,10 @@ def solve(images, settings, device, *, far=FAR, near=0.0, noise=NOISE, shape=Non
     hz, delta = (np.array(column) for column in zip(*settings, strict=True))
     flat = images.reshape(len(settings), -1).astype(np.float32)
     found = decode(flat, hz, delta, noise=noise, device=device, **options)
-    weighed = unwrap(found, nearest_m=near, farthest_m=far)
+    weighed = unwrap(found, nearest_m=near, farthest_m=far, light_speed=tof.LIGHT)
     if shape is not None:
         weighed = vote(weighed, *shape)
-    result = decide(found, weighed)
+    result = decide(found, weighed, light_speed=tof.LIGHT)
     return {name: getattr(result, name).numpy()[: flat.shape[1]] for name in result._fields}
 
 
