@@ -34,7 +34,7 @@ CPU_BLOCK = 1
 CUDA_BLOCK = 256
 """Threads of a CUDA block."""
 MAX_THREADS = 2**31 - 1
-"""Of one launch: kernels count threads in 32 bits."""
+"""Largest number of threads of one launch: kernels count threads in 32 bits."""
 
 _load_lock = threading.Lock()
 
@@ -61,24 +61,24 @@ def resolve(name: str | None = None) -> str:
 
 
 def names() -> list[str]:
-    """The devices of this machine, the CPU first."""
+    """Return the devices of this machine, the CPU first."""
     _start()
     return ["cpu", *(d.alias for d in wp.get_cuda_devices())]
 
 
 def describe(device: str) -> str:
-    """One line that says which device this is, for reports."""
+    """Return one line that names the device, for reports."""
     return f"cpu, {worker_count()} threads" if device == "cpu" else f"{device}, {wp.get_device(device).name}"
 
 
 def pack_width(device: str) -> int:
-    """How many pixels one thread takes on this device."""
+    """Return the number of pixels that one thread takes on this device."""
     _start()
     return PACK_CPU if device == "cpu" else PACK_CUDA
 
 
 def worker_count() -> int:
-    """How many CPU threads a launch is split over: the cores that this process may use."""
+    """Return the number of CPU threads that a launch is split over: the cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -143,7 +143,7 @@ def _start() -> None:
 
 @cache
 def _pool(workers: int) -> ThreadPoolExecutor:
-    """One thread a core, each kept on its own where the system allows: two woken on one core would take turns for milliseconds."""
+    """Return a pool of one thread for each core, bound to it where the system allows: two threads on one core would wait for each other."""
     cores = iter(sorted(os.sched_getaffinity(0))) if hasattr(os, "sched_setaffinity") else iter(())
 
     def settle() -> None:

@@ -15,7 +15,7 @@ INVERSE_PI = 0.31830988618
 
 @wp.func
 def schlick(hv: float) -> float:
-    """(1 - h·v)⁵: F = F0 + (1 - F0) · this."""
+    """Return Schlick's rise (1 - h·v)⁵: F = F0 + (1 - F0) · rise."""
     u = wp.max(1.0 - hv, 0.0)
     u2 = u * u
     return u2 * u2 * u
@@ -23,7 +23,7 @@ def schlick(hv: float) -> float:
 
 @wp.func
 def ggx(nl: float, nv: float, nh: float, alpha: float) -> float:
-    """D · V · n·l without Fresnel; 0 for a light below the horizon."""
+    """Return D · V · n·l without Fresnel; 0 for a light below the horizon."""
     a2 = alpha * alpha
     bottom = nh * nh * (a2 - 1.0) + 1.0
     distribution = a2 * INVERSE_PI / (bottom * bottom)
@@ -33,6 +33,6 @@ def ggx(nl: float, nv: float, nh: float, alpha: float) -> float:
 
 @wp.func
 def diffuse(nl: float, nv: float, hv2: float, rough: float, slope: float) -> float:
-    """π · diffuse BRDF of albedo 1 · n·l: Burley's lobe of roughness `rough` (below 0: Lambert's) times 1 + slope · (1 - n·l)."""
+    """Return π · diffuse BRDF of albedo 1 · n·l: Burley's lobe of roughness `rough` (below 0: Lambert's) times 1 + slope · (1 - n·l)."""
     retro = wp.where(rough >= 0.0, 2.0 * rough * hv2 - 0.5, 0.0)
     return nl * (1.0 + slope * (1.0 - nl)) * (1.0 + retro * schlick(nl)) * (1.0 + retro * schlick(nv))

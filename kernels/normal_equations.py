@@ -26,5 +26,5 @@ def add_reading(y: float, w: float, lx: float, ly: float, lz: float,
 
 @wp.func
 def symmetric(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float) -> wp.mat33:
-    """The symmetric matrix with these entries."""
+    """Return the symmetric matrix with these entries."""
     return wp.mat33(xx, xy, xz, xy, yy, yz, xz, yz, zz)

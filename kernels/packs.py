@@ -24,7 +24,7 @@ MAX_PIXELS = STRIDE_LIMIT // 12 // PACK_CPU * PACK_CPU - PACK_CPU
 
 @cache
 def pack_type(length: int, dtype: type) -> Any:
-    """The Warp vector type of `length` values of `dtype`."""
+    """Return the Warp vector type of `length` values of `dtype`."""
     return wp.types.vector(length=length, dtype=dtype)
 
 

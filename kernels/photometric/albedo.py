@@ -1,4 +1,4 @@
-"""Diffuse albedo per channel from solved normals and the weights that the fit gave each light."""
+"""Diffuse albedo per channel from solved normals and the weights that the fit gave each light (Woodham 1980)."""
 
 from functools import cache
 from typing import Any
@@ -10,19 +10,19 @@ from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.packs import Band, as_packs, pack_type, zeros
 from kernels.photometric.lambert import NormalFit
-from kernels.photometric.near import PixelLights, directions_in, falloff_or_none, toward_or_none
+from kernels.photometric.near import NearLights, directions_in, falloff_or_none, toward_or_none
 from kernels.photometric.readings import Lights, Readings
 
 
-def fit_albedo(band: Band, weights: Readings, fit: NormalFit, lights: Lights, pixel_lights: PixelLights | None = None) -> wp.array:
-    """Weighted least squares of radiance = ρ/π · E · n·l in each channel.
+def fit_albedo(band: Band, weights: Readings, fit: NormalFit, lights: Lights, near_lights: NearLights | None = None) -> wp.array:
+    """Fit the diffuse albedo: weighted least squares of radiance = ρ/π · E · n·l in each channel.
 
     Args:
         band: the stack on the device.
         weights: what the normal solver left in its readings: the weight of each light, 0…1.
         fit: the normals.
         lights: direction, irradiance and scale of each light.
-        pixel_lights: directions and falloff per pixel, in place of the lights' directions, where some light is near.
+        near_lights: directions and falloff per pixel, in place of the lights' directions, where some light is near.
 
     Returns:
         [3, pixels padded] float32 albedo ρ, scene-linear; 0 where there is no normal.
@@ -41,8 +41,8 @@ def fit_albedo(band: Band, weights: Readings, fit: NormalFit, lights: Lights, pi
     # E in stored units: radiance / scale = ρ/π · (E / scale) · n·l
     stored = np.divide(lights.irradiance, lights.scale[:, None], out=np.zeros_like(lights.irradiance),
                        where=lights.scale[:, None] > 0)
-    devices.launch(_albedo_kernel(devices.pack_width(device), pixel_lights is not None), band.packs,
-                   [band.values, weights.values, toward_or_none(pixel_lights, device), falloff_or_none(pixel_lights, device),
+    devices.launch(_albedo_kernel(devices.pack_width(device), near_lights is not None), band.packs,
+                   [band.values, weights.values, toward_or_none(near_lights, device), falloff_or_none(near_lights, device),
                     weights.pack_stride, weights.light_stride, as_packs(fit.normal, device),
                     wp.array(lights.direction, dtype=wp.vec3, device=device), wp.array(stored, dtype=wp.vec3, device=device)],
                    [albedo], device=device)

@@ -1,4 +1,11 @@
-"""Light that reached a pixel by way of its surroundings is taken off its readings."""
+"""Interreflection: light that reached a pixel from the surface around it is subtracted from its readings.
+
+Under one light a patch of albedo ρ sends ρ times the light that arrives at it; what arrives from other patches follows from the form
+factors between them (`surface.interreflection`) and the albedo found so far, and is taken off before the next fit.
+
+Sources: Goral, Torrance, Greenberg and Battaile, "Modeling the interaction of light between diffuse surfaces", SIGGRAPH 1984
+(radiosity); Nayar, Ikeuchi and Kanade, "Shape from interreflections", IJCV 1991 (shape and interreflection corrected in turn).
+"""
 
 from functools import cache
 from typing import Any

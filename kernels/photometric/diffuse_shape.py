@@ -3,6 +3,8 @@
 Real diffuse reflection is darker than Lambert's at grazing angles on smooth plastics and brighter on rough ceramics. A pixel alone
 cannot tell that shape from a tilt of its normal; all pixels together can: the shape with the least total cost of the
 hypothesis search is also the one with the least error of the normals (docs/figures.md).
+
+Source: the lobe is Burley's, "Physically-based shading at Disney", 2012, section 5.3; choosing its shape by cost is ours.
 """
 
 import itertools
@@ -13,7 +15,7 @@ from kernels.photometric.hypotheses import Diffuse, SearchOptions, search_normal
 from kernels.photometric.samples import Samples
 
 ROUGHNESSES = (-1.0, 0.05, 0.2, 0.35, 0.5, 0.65, 0.8)
-"""Of Burley's lobe; below 0: Lambert's."""
+"""Roughnesses of Burley's lobe that are tried; below 0: Lambert's."""
 SLOPES = (-0.3, -0.2, -0.1, 0.0, 0.1)
 """Further slope of the lobe."""
 REFINEMENT = 0.5

@@ -24,7 +24,7 @@ PRIOR_RESIDUAL = 0.01
 """One pseudo-observation with this residual, relative to M₀: four readings leave no residual, yet are not certain. Smaller than
 that of single lights, because a gradient's reading is a mean over every lamp."""
 ROUNDING = 2.0**-12
-"""Of a half reading, relative: what the length of M may be off by although the fit leaves no residual."""
+"""Relative rounding of a half reading: what the length of M may be off by although the fit leaves no residual."""
 CONFIDENCE_HALF = 0.01745329
 """Standard error of the normal, radians (one degree), at which confidence is one half."""
 
@@ -41,7 +41,7 @@ class GradientFit(NamedTuple):
 
 def diffuse_normals(diffuse: Moments, grey_weights: tuple[float, float, float], *, gain: float, pixel_count: int,
                     device: str) -> GradientFit:
-    """Normal, albedo and confidence from diffuse responses.
+    """Estimate normal, albedo and confidence from diffuse responses.
 
     Args:
         diffuse: the responses.

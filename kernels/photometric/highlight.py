@@ -28,9 +28,9 @@ MIN_LOBE, MAX_LOBE = 0.1, 1.1
 MIN_HALFWAY = 0.02
 """Least |r + v|: a mirror direction opposite the view is beyond grazing."""
 ROUNDS = 10
-"""Of angle and roughness in turn: each leaves at most half of the error of the angle, for the roughest lobe."""
+"""Rounds of angle and roughness in turn: each leaves at most half of the error of the angle, for the roughest lobe."""
 BISECTIONS = 10
-"""Of the roughness: 2⁻¹⁰ of its range."""
+"""Steps of the bisection for the roughness, to 2⁻¹⁰ of its range."""
 
 
 MIN_ROUGHNESS, MAX_ROUGHNESS = 0.05, 1.0
@@ -54,7 +54,7 @@ class Highlights(NamedTuple):
 
 def fit_highlights(parts: SeparatedMoments, grey_weights: tuple[float, float, float], view: np.ndarray, *, gain: float,
                    pixel_count: int, device: str) -> Highlights:
-    """Normal, F₀ and roughness of the lobe that has the highlight's responses.
+    """Estimate normal, F₀ and roughness of the lobe that has the highlight's responses.
 
     Args:
         parts: responses told apart by polarisation; radiance under a full sphere of radiance one.
@@ -81,7 +81,7 @@ def fit_highlights(parts: SeparatedMoments, grey_weights: tuple[float, float, fl
 
 def specular_normals(parts: SeparatedMoments, grey_weights: tuple[float, float, float], view: np.ndarray, *, gain: float,
                      pixel_count: int, device: str) -> wp.array:
-    """Normals halfway between the view and the centroid of the highlight: of a lobe symmetric about the mirror direction.
+    """Estimate normals halfway between the view and the centroid of the highlight: of a lobe symmetric about the mirror direction.
 
     Args:
         parts: responses told apart, by polarisation or by colour.
@@ -157,14 +157,14 @@ def grey_level(values: wp.array2d(dtype=float), step: int, grey: wp.vec3, p: int
 
 @wp.func
 def is_highlight(s0: float, s: wp.vec3, diffuse: float) -> bool:
-    """Whether specular responses tell a direction, beside diffuse light of this radiance."""
+    """Return whether specular responses tell a direction, beside diffuse light of this radiance."""
     lobe = wp.length(s) / wp.max(s0, 1.0e-30)
     return s0 > MIN_HIGHLIGHT * diffuse and s0 > 0.0 and lobe > MIN_LOBE and lobe < MAX_LOBE
 
 
 @wp.func
 def halfway(s: wp.vec3, v: wp.vec3) -> wp.vec3:
-    """The unit normal halfway between centroid and view; 0 when they are opposite."""
+    """Return the unit normal halfway between centroid and view; 0 when they are opposite."""
     h = wp.normalize(s) + v
     return wp.where(wp.length(h) > MIN_HALFWAY, wp.normalize(h), wp.vec3(0.0, 0.0, 0.0))
 

@@ -29,7 +29,7 @@ from kernels.photometric.tabulated_lobes import tabulated_lobes
 SHADOW_TRUST = 0.1
 """Weight that a reading of zero, or far below its prediction, keeps in the fit: it bounds the radiance and hardly measures it."""
 LEAST_NZ = 0.02
-"""Cosine to the viewer that candidates keep at the least: a visible surface faces the viewer."""
+"""Least cosine between a candidate and the viewer: a visible surface faces the viewer."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +67,7 @@ FINE = (((2.5, 5.0), 10), ((0.9, 1.8), 8), ((0.4,), 6), ((0.2,), 6), ((0.06,), 6
 
 
 class Search(NamedTuple):
-    """What a search found for each sampled pixel."""
+    """Best candidate of each sampled pixel."""
 
     normal: np.ndarray  # [n, 3] float32, unit
     cost: np.ndarray  # [n] float32, per light
@@ -75,7 +75,7 @@ class Search(NamedTuple):
     weights: np.ndarray  # [n, lobes] float32, of the mixture, for readings relative to the pixel's level
 
     def variance(self, light_count: int, ring_degrees: float) -> np.ndarray:
-        """Variance of the normals, degrees², by least squares: 2 · cost · ring² / (lights · rise), cost and rise per light.
+        """Return the variance of the normals, degrees², by least squares: 2 · cost · ring² / (lights · rise), cost and rise per light.
 
         Args:
             light_count: of the samples.
@@ -85,7 +85,7 @@ class Search(NamedTuple):
 
 
 def rings(degrees: tuple[float, ...], last_count: int) -> np.ndarray:
-    """Offsets of candidates from a centre: the centre, then rings.
+    """Return the offsets of candidates from a centre: the centre, then rings.
 
     Returns:
         [candidates, 4] float32: sine and cosine of the angle from the centre, cosine and sine of the azimuth.
@@ -102,7 +102,7 @@ def rings(degrees: tuple[float, ...], last_count: int) -> np.ndarray:
 def search_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse,
                    options: SearchOptions | None = None, wide: tuple[tuple[float, ...], int] = WIDE,
                    fine: tuple[tuple[tuple[float, ...], int], ...] = FINE, table: wp.array | None = None) -> Search:
-    """Search the normals of sampled pixels.
+    """Find the candidate normal of least cost for each sampled pixel.
 
     Args:
         samples: their readings.
@@ -150,7 +150,7 @@ def search_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse,
 
 @wp.func
 def tangents(n: wp.vec3):
-    """Two unit vectors that are perpendicular to a unit normal and to each other."""
+    """Return two unit vectors that are perpendicular to a unit normal and to each other."""
     up = wp.where(wp.abs(n[2]) < 0.9, wp.vec3(0.0, 0.0, 1.0), wp.vec3(1.0, 0.0, 0.0))
     tangent = wp.normalize(wp.cross(up, n))
     return tangent, wp.cross(n, tangent)

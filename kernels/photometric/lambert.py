@@ -11,7 +11,7 @@ from kernels.errors import ArrayError
 from kernels.normal_equations import add_reading, symmetric
 from kernels.packs import Band, pack_type, zeros
 from kernels.photometric.least_squares import confidence_of, fit_pixel
-from kernels.photometric.near import PixelLights, directions_in, toward_or_none
+from kernels.photometric.near import NearLights, directions_in, toward_or_none
 from kernels.photometric.readings import Readings
 from kernels.status import OK
 
@@ -25,14 +25,14 @@ class NormalFit(NamedTuple):
     status: wp.array  # [pixels] int32, kernels.status.Status
 
 
-def solve_lambert(band: Band, readings: Readings, directions: np.ndarray, pixel_lights: PixelLights | None = None) -> NormalFit:
-    """Least squares on every light with a reading above zero.
+def solve_lambert(band: Band, readings: Readings, directions: np.ndarray, near_lights: NearLights | None = None) -> NormalFit:
+    """Estimate normals by least squares on every light with a reading above zero.
 
     Args:
         band: the stack on the device.
         readings: its grey readings; on return each holds the weight that the light had in the fit: 1 or 0.
         directions: [lights, 3] unit, from the surface to the light; padding is ignored.
-        pixel_lights: directions and falloff per pixel, in place of `directions`, where some light is near.
+        near_lights: directions and falloff per pixel, in place of `directions`, where some light is near.
 
     Returns:
         Normals on the device; not synchronised on CUDA.
@@ -43,10 +43,10 @@ def solve_lambert(band: Band, readings: Readings, directions: np.ndarray, pixel_
     Source:
         Woodham, "Photometric method for determining surface orientation from multiple images", Optical Engineering 1980.
     """
-    return run_normal_kernel(_lambert_kernel, band, readings, directions, pixel_lights)
+    return run_normal_kernel(_lambert_kernel, band, readings, directions, near_lights)
 
 
-def run_normal_kernel(make: Any, band: Band, readings: Readings, directions: np.ndarray, pixel_lights: PixelLights | None) -> NormalFit:
+def run_normal_kernel(make: Any, band: Band, readings: Readings, directions: np.ndarray, near_lights: NearLights | None) -> NormalFit:
     """Launch a kernel that turns readings into normals; shared by the solvers that differ in the kernel alone."""
     if directions.shape != (band.frame_count, 3):
         raise ArrayError(f"directions are {directions.shape}, the band has {band.frame_count} lights: give a row for each")
@@ -55,8 +55,8 @@ def run_normal_kernel(make: Any, band: Band, readings: Readings, directions: np.
                     zeros(band.pixel_count, wp.float32, band.device),
                     zeros(band.pixel_count, wp.int32, band.device))
     lights = wp.array(np.ascontiguousarray(directions, dtype=np.float32), dtype=wp.vec3, device=band.device)
-    devices.launch(make(devices.pack_width(band.device), pixel_lights is not None), band.packs,
-                   [lights, toward_or_none(pixel_lights, band.device), readings.pack_stride, readings.light_stride],
+    devices.launch(make(devices.pack_width(band.device), near_lights is not None), band.packs,
+                   [lights, toward_or_none(near_lights, band.device), readings.pack_stride, readings.light_stride],
                    [readings.values, *fit], device=band.device)
     return fit
 

@@ -23,7 +23,7 @@ CONFIDENCE_HALF = 0.01745329
 
 @wp.struct
 class LambertFit:
-    """One pixel's fit."""
+    """Least-squares fit of one pixel."""
 
     b: wp.vec3  # albedo / π · normal
     across: float  # trace of G⁻¹ across the normal: variance of the normal, radians², for residuals of variance |b|²
@@ -63,6 +63,6 @@ def fit_pixel(g: wp.mat33, r: wp.vec3, squares: float, count: int) -> LambertFit
 
 @wp.func
 def confidence_of(across: float, residual: float, count: float) -> float:
-    """1 / (1 + standard error of the normal / 1°); residual is Σ (y - b·l)² / |b|² over `count` readings."""
+    """Return the confidence 1 / (1 + standard error of the normal / 1°); residual is Σ (y - b·l)² / |b|² over `count` readings."""
     variance = (residual + PRIOR_RESIDUAL * PRIOR_RESIDUAL) / (wp.max(count - 3.0, 0.0) + 1.0)
     return 1.0 / (1.0 + wp.sqrt(across * variance) / CONFIDENCE_HALF)

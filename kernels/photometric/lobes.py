@@ -1,4 +1,4 @@
-"""What the search and the material fit expect a light to read: parts that their kernels close over, here for lights of one
+"""Readings that the search and the material fit expect under a light: parts that their kernels close over, here for lights of one
 direction.
 
 `tabulated_lobes` has the same parts for lights of any extent, looked up in a table, so that one kernel body serves both.
@@ -18,7 +18,7 @@ MIXTURE = 1 + len(LOBES)
 MIXTURE_F0 = 0.04
 """Reflectance at normal incidence whose Fresnel rise the lobes have; readings at grazing half vectors hardly tell it."""
 LOBE_SCALE = 0.1 / MIXTURE_F0
-"""Of the GGX lobes beside the diffuse one, so that their weights are of one order."""
+"""Scale of the GGX lobes beside the diffuse one, so that their weights are of one order."""
 GEOMETRY = 2
 """Scratch beside the lobes for each light: 1 / |l + v| and (1 - h·v)⁵."""
 
@@ -31,7 +31,7 @@ class Lobes(NamedTuple):
     held: int
     """Values of a light in scratch: its lobes, and what `prepare` keeps there."""
     relaxation: float
-    """Of the non-negative solve: above one where lobes are much alike."""
+    """Over-relaxation of the non-negative solve: above one where lobes are much alike."""
     prepare: Any
     """Writes what depends on light and view alone."""
     fill: Any
@@ -49,7 +49,7 @@ class Reflectance(NamedTuple):
 
 @cache
 def direction_lobes(lanes: int) -> Lobes:
-    """The mixture under lights of one direction each."""
+    """Return the mixture of lobes under lights of one direction each."""
     lane_type = pack_type(lanes, wp.float32)
     widths = wp.types.vector(length=len(LOBES), dtype=wp.float32)
 
@@ -101,7 +101,7 @@ def direction_lobes(lanes: int) -> Lobes:
 
 @cache
 def direction_reflectance(lanes: int) -> Reflectance:
-    """The contract's BRDF under lights of one direction each."""
+    """Return the contract's BRDF under lights of one direction each."""
     lane_type = pack_type(lanes, wp.float32)
 
     @wp.func

@@ -8,6 +8,10 @@ Highlights of dielectrics have the colour of the light, so the three channels sh
 that costs clearly more and the surface is a metal, without diffuse reflection. Pixels that saw no highlight cannot tell F0 from
 roughness: they take the materials that the object's pixels share (`shared_materials`), in the mixture that explains them, wherever that
 explains them about as well as a material of their own.
+
+Sources: the BRDF is that of `kernels.microfacet` (Walter et al., EGSR 2007; Heitz, JCGT 2014; Schlick 1994; Burley 2012); non-negative
+least squares after Lawson and Hanson, "Solving Least Squares Problems", 1974, chapter 23; highlights of the light's colour after Shafer,
+"Using color to separate reflection components", Color Research and Application 1985.
 """
 
 import math
@@ -44,7 +48,7 @@ best."""
 
 
 class Material(NamedTuple):
-    """What was fitted for each sampled pixel."""
+    """Material of each sampled pixel."""
 
     diffuse_albedo: np.ndarray  # [n, 3] float32
     specular: np.ndarray  # [n, 3] float32, F0, 0…1
@@ -62,7 +66,7 @@ def fit_material(samples: Samples, normal: np.ndarray, *, shape: Diffuse, option
         shape: of the diffuse lobe.
         options: noise and shadows, as in the search.
         table: of response_table, for lights that are not of one direction each; its diffuse lobe is Lambert's whatever the shape.
-        shared: [materials, 4] F0 and roughness of shared_materials.choose_materials; None: every pixel for itself.
+        shared: [materials, 4] F0 and roughness of shared_materials.choose_materials; None: every pixel has a material of its own.
 
     Returns:
         The materials. The albedo is that of the Lambertian lobe closest to the fitted diffuse lobe under the capture's lights, so
@@ -88,7 +92,7 @@ def fit_material(samples: Samples, normal: np.ndarray, *, shape: Diffuse, option
 
 
 def fit_tinted(samples: Samples, normal: np.ndarray, *, shape: Diffuse, options: SearchOptions | None = None) -> Material:
-    """Fit the material of sampled pixels with an F0 of each channel's own: the freest fit, where cost alone is asked for.
+    """Fit the material of sampled pixels with an F0 for each channel: the fit with the most unknowns, and so the least cost.
 
     Args:
         samples, normal, shape, options: as for fit_material.

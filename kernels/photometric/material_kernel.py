@@ -13,7 +13,7 @@ from kernels.photometric.lobes import Reflectance
 ROUGHNESS_FIRST, ROUGHNESS_STEP, ROUGHNESS_COUNT = 0.1, 0.075, 13
 """Grid of roughness, 0.1 to 1; below 0.1 a lobe is narrower than lights of any rig are apart."""
 HALVINGS = 3
-"""Of the step about the best: to a resolution of 0.01."""
+"""Halvings of the step about the best: to a resolution of 0.01."""
 REWEIGHTINGS = 4
 """Rounds of the robust fit at each roughness."""
 COMMON_ROUNDS = 3
@@ -21,7 +21,7 @@ COMMON_ROUNDS = 3
 
 
 TINTED = wp.constant(0)
-"""Of the specular lobe are free: F0 of each channel, and roughness. Metals."""
+"""F0 of each channel and the roughness are free, as on metals."""
 NEUTRAL = wp.constant(1)
 """One F0 up to a bound, and roughness: dielectrics, whose highlights have the colour of the light."""
 GIVEN = wp.constant(2)
@@ -30,14 +30,14 @@ GIVEN = wp.constant(2)
 
 @wp.func
 def squared_misfit(reading: float, predicted: float, bright: float, noise: wp.vec2):
-    """A third of r²/σ² of one channel's reading."""
+    """Return a third of r²/σ² of one channel's reading."""
     off = (reading - predicted) / wp.max(noise[0] * bright + noise[1] * wp.max(reading, 0.0), 1.0e-20)
     return off * off / 3.0
 
 
 @wp.func
 def weigh(shining: float, expected: float, off2: float, bright: float, noise: wp.vec2, shadow: wp.vec2):
-    """The weight of a light in the robust fit, one for all channels because a shadow is one in each of them, and its cost."""
+    """Return the weight of a light in the robust fit, one for all channels because a shadow is one in each of them, and its cost."""
     dark = wp.where(shining < shadow[1] * expected, 1, 0) * wp.where(off2 > shadow[0], 1, 0)
     given = wp.where(shining >= 0.0, 1.0, 0.0)
     relative = bright / wp.max(noise[0] * bright + noise[1] * wp.max(shining, 0.0) / 3.0, 1.0e-20)
@@ -47,7 +47,7 @@ def weigh(shining: float, expected: float, off2: float, bright: float, noise: wp
 
 @cache
 def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
-    """The kernel for one width of packs and one kind of light.
+    """Return the kernel for one width of packs and one kind of light.
 
     Args:
         lanes: pixels of a pack.

@@ -38,7 +38,7 @@ class Moments(NamedTuple):
 
 
 def fit_moments(band: Band, rows: np.ndarray, scale: np.ndarray, grey_weights: tuple[float, float, float]) -> Moments:
-    """Least squares of radiance = mean · M₀ + dipole · M in each channel.
+    """Fit the responses M₀ and M: least squares of radiance = mean · M₀ + dipole · M in each channel.
 
     A reading of zero or below is a measurement here (a mirror that shows the dark end of a gradient reads zero); a saturated
     one, or one that is not finite in every channel, is not.

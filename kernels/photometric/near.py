@@ -3,6 +3,9 @@
 A light is a homogeneous point (x, y, z, w): the way from a surface point p to it is xyz - w p. With w = 1 it is a point light at
 xyz, with w = 0 a distant light in direction xyz, so that one kernel takes both. At normal incidence the irradiance is the light's
 strength times its falloff: cos^μ/d² for a point light, 1 for a distant one. A reading divided by the falloff is b·l again.
+
+Source: Quéau, Durix, Wu, Cremers, Lauze and Durou, "LED-based photometric stereo: modeling, calibration and numerical solution", JMIV 2018
+(point lights of anisotropy μ).
 """
 
 from functools import cache
@@ -34,11 +37,11 @@ class NearField(NamedTuple):
     points: np.ndarray  # [3, pixels] float32, camera frame, in the unit of the places; finite at every pixel
 
     def at(self, pixels: np.ndarray) -> "NearField":
-        """The field of some pixels, [n] positions; a position past the end, as padding has, is the last pixel."""
+        """Return the field of some pixels, [n] positions; a position past the end, as padding has, is the last pixel."""
         return NearField(self.places, self.points[:, np.minimum(pixels, self.points.shape[1] - 1)])
 
 
-class PixelLights(NamedTuple):
+class NearLights(NamedTuple):
     """Direction and falloff of every light at every pixel of a band; elements lie as in its readings."""
 
     toward: wp.array  # [3, packs · lights] float packs: unit direction from the surface to the light
@@ -67,7 +70,7 @@ def pad_places(place: np.ndarray, lobe: np.ndarray) -> Places:
     return Places(np.pad(place, extra), np.pad(lobe, extra))
 
 
-def see_near(band: Band, readings: Readings, field: NearField) -> PixelLights:
+def see_near(band: Band, readings: Readings, field: NearField) -> NearLights:
     """Find the direction and falloff of every light at every pixel, and divide the readings by the falloff.
 
     Args:
@@ -88,8 +91,8 @@ def see_near(band: Band, readings: Readings, field: NearField) -> PixelLights:
     device, pack = band.device, devices.pack_width(band.device)
     float_pack = pack_type(pack, wp.float32)
     held = np.pad(np.asarray(points, dtype=np.float32), ((0, 0), (0, -band.pixel_count % pack)), mode="edge")
-    lights = PixelLights(wp.empty((3, readings.values.shape[0]), dtype=float_pack, device=device),
-                         wp.empty(readings.values.shape[0], dtype=float_pack, device=device))
+    lights = NearLights(wp.empty((3, readings.values.shape[0]), dtype=float_pack, device=device),
+                        wp.empty(readings.values.shape[0], dtype=float_pack, device=device))
     devices.launch(_near_kernel(pack), band.packs,
                    [wp.array(places.place, dtype=wp.vec4, device=device), wp.array(places.lobe, dtype=wp.vec4, device=device),
                     wp.array(held.reshape(3, -1, pack), dtype=float_pack, device=device), readings.pack_stride,
@@ -97,14 +100,14 @@ def see_near(band: Band, readings: Readings, field: NearField) -> PixelLights:
     return lights
 
 
-def toward_or_none(pixel_lights: PixelLights | None, device: str) -> wp.array:
-    """The directions as a kernel's argument; a kernel for distant lights does not read it."""
-    return wp.empty((3, 0), dtype=_float_pack(device), device=device) if pixel_lights is None else pixel_lights.toward
+def toward_or_none(near_lights: NearLights | None, device: str) -> wp.array:
+    """Return the directions as a kernel takes them: empty for distant lights, whose kernel does not read them."""
+    return wp.empty((3, 0), dtype=_float_pack(device), device=device) if near_lights is None else near_lights.toward
 
 
-def falloff_or_none(pixel_lights: PixelLights | None, device: str) -> wp.array:
-    """The same of the falloff."""
-    return wp.empty(0, dtype=_float_pack(device), device=device) if pixel_lights is None else pixel_lights.falloff
+def falloff_or_none(near_lights: NearLights | None, device: str) -> wp.array:
+    """Return the falloff as a kernel takes it: empty for distant lights."""
+    return wp.empty(0, dtype=_float_pack(device), device=device) if near_lights is None else near_lights.falloff
 
 
 def _float_pack(device: str) -> Any:
@@ -135,14 +138,14 @@ def directions_in(pack: int, near: bool) -> tuple[Any, int]:
 
 @wp.func
 def near_direction(place: wp.vec4, x: float, y: float, z: float) -> wp.vec3:
-    """Unit direction from the point to a light of either kind; 0 for padding."""
+    """Return the unit direction from the point to a light of either kind; 0 for padding."""
     way = wp.vec3(place[0] - place[3] * x, place[1] - place[3] * y, place[2] - place[3] * z)
     return way / wp.max(wp.length(way), 1.0e-20)
 
 
 @wp.func
 def falloff(place: wp.vec4, lobe: wp.vec4, x: float, y: float, z: float) -> float:
-    """Irradiance at normal incidence over the light's strength: cos^μ/d², 1 if distant; 0 where the light hardly shines."""
+    """Return the irradiance at normal incidence over the light's strength: cos^μ/d², 1 if distant; 0 where the light hardly shines."""
     if place[3] == 0.0:
         return 1.0
     way = wp.vec3(place[0] - x, place[1] - y, place[2] - z)

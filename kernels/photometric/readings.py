@@ -1,4 +1,4 @@
-"""What every photometric solver starts from: the lights as arrays, and one grey reading per light and pixel.
+"""Input of every photometric solver: the lights as arrays, and one grey reading per light and pixel.
 
 A grey reading is a weighted sum over the channels of radiance / irradiance, so that for a Lambertian surface it is b·l with
 b = albedo / π · normal, whatever the strength and colour of the lights. A reading of zero or less, or a saturated one, bounds
@@ -64,7 +64,7 @@ def pad_lights(direction: np.ndarray, irradiance: np.ndarray, scale: np.ndarray 
 
 
 def channel_weights(lights: Lights, grey_weights: tuple[float, float, float]) -> np.ndarray:
-    """The grey weights of the channels that every light reaches, summing to 1: readings of differently coloured lights compare.
+    """Return the grey weights of the channels that every light reaches, summing to 1: readings of differently coloured lights compare.
 
     Returns:
         [3] float64.
@@ -81,7 +81,7 @@ def channel_weights(lights: Lights, grey_weights: tuple[float, float, float]) ->
 
 
 def grey_factors(lights: Lights, grey_weights: tuple[float, float, float]) -> np.ndarray:
-    """What each stored channel is multiplied by to give the grey reading, with channel_weights.
+    """Return the factor of each stored channel in the grey reading, with channel_weights.
 
     Returns:
         [lights, 3] float32; 0 for padding.

@@ -1,4 +1,4 @@
-"""Normals from a table measured on a ball of the same material: what the lights make a normal read, whatever its reflectance.
+"""Normals from a table of readings measured on a ball of the same material.
 
 The search of `hypotheses` with one lobe, the ball's, at every candidate normal; its weight is how bright the pixel is beside the
 ball, so albedo may vary and the kind of reflectance may not.
@@ -20,7 +20,7 @@ from kernels.photometric.sampling import AROUND, AROUND_OPTIONS, FINE, HEMISPHER
 
 
 class ReferenceFit(NamedTuple):
-    """What was found for each sampled pixel, on the host."""
+    """Normal of each sampled pixel, on the host."""
 
     normal: np.ndarray  # [n, 3] float32, unit
     confidence: np.ndarray  # [n] float32: 1 / (1 + standard error of the normal / 1°)
@@ -28,7 +28,7 @@ class ReferenceFit(NamedTuple):
 
 
 def reference_table(readings: np.ndarray, device: str) -> wp.array:
-    """A table of what the ball reads at each of response_table.nodes.
+    """Return a table of the readings of the ball at each of response_table.nodes.
 
     Args:
         readings: [GRID², lights] not negative.
@@ -48,7 +48,7 @@ def reference_table(readings: np.ndarray, device: str) -> wp.array:
 
 
 def solve_reference(samples: Samples, table: wp.array, view: np.ndarray) -> ReferenceFit:
-    """Solve sampled pixels.
+    """Estimate the normals of sampled pixels.
 
     Args:
         samples: their readings, in the units of the ball's.

@@ -30,13 +30,13 @@ STEPS = 12
 TILT, BEND = 0.002, 0.01
 """Differences of normal, radians, and of roughness, from which derivatives are taken."""
 LONGEST_TILT, LONGEST_BEND = 0.05, 0.1
-"""Of one step."""
+"""Largest change in one step."""
 DAMPING, DAMPING_UP, DAMPING_DOWN = 0.01, 8.0, 0.3
 LEAST_ROUGHNESS = 0.05
 
 
 class Refinement(NamedTuple):
-    """What was fitted for each sampled pixel."""
+    """Refined normal and material of each sampled pixel."""
 
     normal: np.ndarray  # [n, 3] float32, unit
     roughness: np.ndarray  # [n] float32
@@ -45,7 +45,7 @@ class Refinement(NamedTuple):
 
 def refine(samples: Samples, normal: np.ndarray, roughness: np.ndarray, *, shape: Diffuse,
            options: SearchOptions | None = None) -> Refinement:
-    """Refine sampled pixels under lights of one direction each.
+    """Refine the normal and material of sampled pixels under lights of one direction each.
 
     Args:
         samples: their readings.
@@ -72,7 +72,7 @@ def refine(samples: Samples, normal: np.ndarray, roughness: np.ndarray, *, shape
 
 @wp.func
 def active(dd: float, ds: float, ss: float, rd: float, rs: float):
-    """Which of two non-negative unknowns, albedo and F0, are above 0 in the least-squares fit: 1.0 or 0.0 of each."""
+    """Return which of two non-negative unknowns, albedo and F0, are above 0 in the least-squares fit: 1.0 or 0.0 of each."""
     bottom = dd * ss - ds * ds
     safe = bottom > 1.0e-6 * dd * ss
     both = safe and ss * rd >= ds * rs and dd * rs >= ds * rd
@@ -84,7 +84,7 @@ def active(dd: float, ds: float, ss: float, rd: float, rs: float):
 
 @wp.func
 def solve_symmetric(m00: float, m01: float, m02: float, m11: float, m12: float, m22: float, b: wp.vec3):
-    """Solution of a symmetric positive definite 3 × 3 system; 0 where it is not one."""
+    """Return the solution of a symmetric positive definite 3 × 3 system; 0 where it is not one."""
     c00, c01, c02 = m11 * m22 - m12 * m12, m02 * m12 - m01 * m22, m01 * m12 - m02 * m11
     bottom = m00 * c00 + m01 * c01 + m02 * c02
     c11, c12, c22 = m00 * m22 - m02 * m02, m01 * m02 - m00 * m12, m00 * m11 - m01 * m01

@@ -1,4 +1,4 @@
-"""What a light of any extent makes each lobe read, tabulated over the normals of the visible hemisphere.
+"""Readings of each lobe under lights of any extent, tabulated over the normals of the visible hemisphere.
 
 A light is samples of its radiance, each a small disc of its solid angle, here as shares of the light's irradiance: their sum is
 one, and a light of one sample is a distant one. At a node of the table, normal n under view z, a column holds for every light
@@ -29,7 +29,7 @@ from kernels.microfacet import INVERSE_PI, ggx, schlick
 from kernels.packs import pack_type
 
 GRID = 96
-"""Nodes of a side: 0.9° apart at the pole, 1.7° at the most, so that a lamp 15° across is tabulated to 0.3 % of its peak."""
+"""Nodes of a side: 0.9° apart at the pole, at most 1.7°, so that a lamp 15° across is tabulated to 0.3 % of its peak."""
 WIDTH_COUNT = 10
 NARROWEST, WIDTH_RATIO = 1 / 15, 15.0 ** (1 / (WIDTH_COUNT - 1))
 """GGX widths α of the table, from 0.067 (narrower ones fall between the samples of a source at grazing angles) to 1 in even
@@ -41,7 +41,7 @@ SEARCH_WIDTHS = (2, 4, 6)
 """Which of WIDTHS the mixture of the search has beside the mirror, α = 0.12, 0.22 and 0.41: over a wide light a narrower lobe is
 a sum of the mirror's and the next, and a wider one of the last and the diffuse one."""
 SPECULAR_SCALE = 0.1
-"""Of a lobe of the search beside the diffuse one, so that their weights are of one order."""
+"""Scale of a specular lobe of the search beside the diffuse one, so that their weights are of one order."""
 COLUMNS = 3 + 2 * WIDTH_COUNT
 SEARCH_LOBES = 2 + len(SEARCH_WIDTHS)
 """Diffuse, mirror, GGX lobes."""
@@ -55,7 +55,7 @@ MIRROR_SPREAD = 0.026
 
 def response_table(direction: np.ndarray, solid_angle: np.ndarray, light: np.ndarray, share: np.ndarray, *,
                    light_count: int, device: str) -> wp.array:
-    """Tabulate lights.
+    """Tabulate the readings of every lobe under every light.
 
     Args:
         direction: [samples, 3] unit, from the surface to the sample.
@@ -95,7 +95,7 @@ def response_table(direction: np.ndarray, solid_angle: np.ndarray, light: np.nda
 
 
 def search_table(table: wp.array, f0: float) -> wp.array:
-    """The lobes of the search, specular ones of reflectance f0 at normal incidence.
+    """Return the lobes of the search, specular ones of reflectance f0 at normal incidence.
 
     Returns:
         [GRID², lights, SEARCH_LOBES] float32: π times the diffuse column, and SPECULAR_SCALE / f0 times the mirror and the GGX
@@ -108,7 +108,7 @@ def search_table(table: wp.array, f0: float) -> wp.array:
 
 
 def nodes() -> np.ndarray:
-    """[GRID², 3] float64: the normals of the table, those at the rim raised to LEAST_NZ."""
+    """Return the [GRID², 3] float64 normals of the table, those at the rim raised to LEAST_NZ."""
     u, v = np.meshgrid(*[np.linspace(-1, 1, GRID)] * 2, indexing="ij")
     x, y = (u + v) / 2, (u - v) / 2
     normals = np.stack([x, y, np.maximum(1 - np.abs(x) - np.abs(y), 0)], axis=-1).reshape(-1, 3)
@@ -119,7 +119,7 @@ def nodes() -> np.ndarray:
 
 @wp.func
 def grid_position(n: wp.vec3) -> wp.vec2:
-    """Where a normal of the visible hemisphere lies among the nodes, 0…GRID - 1 each way."""
+    """Return where a normal of the visible hemisphere lies among the nodes, 0…GRID - 1 each way."""
     scale = wp.static(0.5 * (GRID - 1)) / (wp.abs(n[0]) + wp.abs(n[1]) + wp.max(n[2], 0.0))
     middle = wp.static(0.5 * (GRID - 1))
     return wp.vec2(middle + (n[0] + n[1]) * scale, middle + (n[0] - n[1]) * scale)

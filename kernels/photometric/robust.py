@@ -19,7 +19,7 @@ from kernels.normal_equations import add_reading, symmetric
 from kernels.packs import Band, pack_type
 from kernels.photometric.lambert import NormalFit, run_normal_kernel, write_normal
 from kernels.photometric.least_squares import fit_pixel
-from kernels.photometric.near import PixelLights, directions_in
+from kernels.photometric.near import NearLights, directions_in
 from kernels.photometric.readings import Readings
 
 BRIGHT_FRACTION = 0.1
@@ -37,21 +37,21 @@ CAUCHY_SCALE = 0.05
 REWEIGHTINGS = 5
 """Rounds of re-weighting; the normal moves under 0.01° after five on real data."""
 RANGE = 2.0**-26
-"""Of the brightest reading: the least value that the bright end can have. A lamp mirrored in black is 2²⁰ times brighter."""
+"""Least value that the bright end can have, as a part of the brightest reading. A lamp mirrored in black is 2²⁰ times brighter."""
 HALVINGS_OF_RATIO = 6
 """Steps that halve the ratio between the bounds of a rank's value: 2²⁶ becomes 1.33, whatever the highlight."""
 BISECTIONS = 18
-"""Steps in all; the others halve the difference, and find the value to 10⁻⁴ of itself, under the rounding of half values."""
+"""Steps in all; the others halve the difference, and find the value to a relative 10⁻⁴, under the rounding of half values."""
 
 
-def solve_robust(band: Band, readings: Readings, directions: np.ndarray, pixel_lights: PixelLights | None = None) -> NormalFit:
-    """Normals from the lights that, at each pixel, are neither shadow nor highlight.
+def solve_robust(band: Band, readings: Readings, directions: np.ndarray, near_lights: NearLights | None = None) -> NormalFit:
+    """Estimate normals from the lights that, at each pixel, are neither shadow nor highlight.
 
     Args:
         band: the stack on the device.
         readings: its grey readings; on return each holds the weight, 0…1, that the light had in the fit.
         directions: [lights, 3] unit, from the surface to the light; padding is ignored.
-        pixel_lights: directions and falloff per pixel, in place of `directions`, where some light is near.
+        near_lights: directions and falloff per pixel, in place of `directions`, where some light is near.
 
     Returns:
         Normals on the device; not synchronised on CUDA.
@@ -59,7 +59,7 @@ def solve_robust(band: Band, readings: Readings, directions: np.ndarray, pixel_l
     Raises:
         ArrayError: directions do not match the band.
     """
-    return run_normal_kernel(_robust_kernel, band, readings, directions, pixel_lights)
+    return run_normal_kernel(_robust_kernel, band, readings, directions, near_lights)
 
 
 @wp.func

@@ -1,4 +1,4 @@
-"""Readings of chosen pixels, gathered pixel by pixel for solvers that work hard on each: what lies outside the mask costs nothing."""
+"""Readings of chosen pixels, gathered for solvers that take long for each pixel: pixels outside the mask cost nothing."""
 
 from functools import cache
 from typing import Any, NamedTuple
@@ -39,12 +39,12 @@ class Samples(NamedTuple):
 
 
 def lanes_of(device: str) -> int:
-    """Pixels of one thread on this device."""
+    """Return the number of pixels that one thread takes on this device."""
     return devices.pack_width(device) if device == "cpu" else LANES_CUDA
 
 
 def evenly(count: int, most: int) -> np.ndarray:
-    """Indices at even steps through a number of things: all of them, or as many as asked for at the most.
+    """Return indices at even steps from 0 to count - 1: all of them, or `most` where there are more.
 
     Args:
         count: one or more.
@@ -109,14 +109,14 @@ def gather(band: Band, pixels: np.ndarray, view: np.ndarray, lights: Lights, fac
 
 
 def per_pixel(samples: Samples, values: np.ndarray) -> wp.array:
-    """[n, k] host values of the sampled pixels as [k, packs] packs on the device."""
+    """Return [n, k] host values of the sampled pixels as [k, packs] packs on the device."""
     order = np.minimum(np.arange(samples.packs * samples.lanes), samples.pixel_count - 1)
     planes = np.ascontiguousarray(values[order].astype(np.float32).T).reshape(values.shape[1], samples.packs, samples.lanes)
     return wp.array(planes, dtype=pack_type(samples.lanes, wp.float32), device=samples.device)
 
 
 def to_host(samples: Samples, packs: wp.array) -> np.ndarray:
-    """[k, packs] or [packs] packs as [n, k] or [n] host values; waits for the device."""
+    """Return [k, packs] or [packs] packs as [n, k] or [n] host values; waits for the device."""
     values = packs.numpy()
     flat = values.reshape(*values.shape[:-2], -1) if values.ndim > 1 else values
     flat = flat.reshape(-1, samples.packs * samples.lanes)[:, : samples.pixel_count]

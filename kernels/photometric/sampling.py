@@ -59,7 +59,7 @@ class Regime(IntEnum):
 
 
 class SamplingFit(NamedTuple):
-    """What was found for each sampled pixel, on the host."""
+    """Normal, material and regime of each sampled pixel, on the host."""
 
     normal: np.ndarray  # [n, 3] float32, unit
     diffuse_albedo: np.ndarray  # [n, 3] float32
@@ -79,13 +79,13 @@ class SamplingTables(NamedTuple):
 
 
 def sampling_tables(responses: wp.array) -> SamplingTables:
-    """The tables of the search, from response_table. Waits for the device."""
+    """Return the tables of the search, from response_table. Waits for the device."""
     return SamplingTables(responses, search_table(responses, DIELECTRIC), search_table(responses, METAL))
 
 
 def solve_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, *,
                    options: SearchOptions = OPTIONS) -> SamplingFit:
-    """Solve sampled pixels.
+    """Estimate normal, material and regime of sampled pixels.
 
     Args:
         samples: their readings, radiance over the irradiance of each light.
@@ -118,7 +118,7 @@ def solve_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, *
 
 
 def _choose(second: np.ndarray, a: tuple[np.ndarray, ...], b: tuple[np.ndarray, ...]) -> list[np.ndarray]:
-    """Of two results, field by field, the second where it is better."""
+    """Return the second of two results, field by field, where it is better, else the first."""
     return [np.where(second if x.ndim == 1 else second[:, None], y, x) for x, y in zip(a, b, strict=True)]
 
 

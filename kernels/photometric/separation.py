@@ -5,7 +5,7 @@ frame holds D/2 and a parallel frame D/2 + S, so S = parallel - cross and D = 2 
 
 By colour (dichromatic reflection): the highlight of a dielectric has the colour of the light, here white. The part of a colour
 that is perpendicular to white is diffuse alone, whatever the highlight is (Mallick et al. 2005), and its responses give the
-diffuse shading t = M/M₀. How much white the diffuse colour itself holds is seen where the highlight is not: two gradients add
+diffuse shading t = M/M₀. How much white the diffuse colour holds is seen where the highlight is not: two gradients add
 up to the light (1 - r·ω)/2 that is dark at the mirror direction r of the normal, under which a sharp highlight gives nothing:
 M₀ - r·M = ρ(1 - r·t), so ρ = (M₀ - r·M)/(1 - r·t) in each channel, and the rest is specular. A grey diffuse colour has no
 part perpendicular to white: there nothing is separated, and the result says by how much a highlight may mislead.
@@ -43,7 +43,9 @@ class SeparatedMoments(NamedTuple):
 
 def separate_polarised(cross: Moments, parallel: Moments, grey_weights: tuple[float, float, float], *,
                        pixel_count: int, device: str) -> SeparatedMoments:
-    """Specular = parallel - cross; the diffuse responses are those of the cross frames, of half the diffuse light.
+    """Separate responses by polarisation: specular = parallel - cross.
+
+    The diffuse responses are those of the cross frames, of half the diffuse light.
 
     Args:
         cross: responses of the cross-polarised frames.
@@ -59,7 +61,7 @@ def separate_polarised(cross: Moments, parallel: Moments, grey_weights: tuple[fl
 
 
 def separate_by_colour(mixed: Moments, view: np.ndarray, *, pixel_count: int, device: str) -> SeparatedMoments:
-    """Diffuse and specular responses of unpolarised frames, where the diffuse colour is not grey.
+    """Separate the diffuse and specular responses of unpolarised frames, where the diffuse colour is not grey.
 
     Args:
         mixed: responses of the unpolarised frames.
@@ -82,7 +84,7 @@ def separate_by_colour(mixed: Moments, view: np.ndarray, *, pixel_count: int, de
 
 
 def upload_view(view: np.ndarray, pixel_count: int, device: str) -> wp.array:
-    """View vectors on the device, [3, pixels padded to whole packs].
+    """Return view vectors on the device, [3, pixels padded to whole packs].
 
     Raises:
         ArrayError: view is neither [3, pixels] nor [3, 1].

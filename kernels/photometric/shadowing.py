@@ -1,4 +1,8 @@
-"""Readings in cast shadow, as the height says, are taken out of the samples: what is known to be shadow need not be guessed."""
+"""Cast shadows: readings whose light is hidden by the surface, as its height says, are taken out of the samples.
+
+Source: photometric stereo without the shadowed lights of a pixel, Barsky and Petrou, "The 4-source photometric stereo technique for
+three-dimensional surfaces in the presence of highlights and shadows", TPAMI 2003; here the shadows are marched over a height map.
+"""
 
 from functools import cache
 from typing import Any

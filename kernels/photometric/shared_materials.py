@@ -17,7 +17,7 @@ from kernels.photometric.samples import Samples, evenly
 CANDIDATES = 100
 """Pixels whose materials are candidates."""
 MOST = 8
-"""Materials at the most."""
+"""Largest number of materials."""
 LEAST_GAIN = 0.01
 """Part of the total cost that one more must save."""
 

@@ -2,6 +2,11 @@
 
 Normals come from the hypothesis search under the diffuse shape that the object shares and under shapes close to it, and from the joint
 fit of a single lobe; they are averaged, each weighted by how well it explains the pixel. The material then follows for the normal found.
+
+Sources: the contract's BRDF is GGX (Walter et al., "Microfacet models for refraction through rough surfaces", EGSR 2007) with Smith's
+height-correlated masking (Heitz, "Understanding the masking-shadowing function", JCGT 2014), Schlick's Fresnel ("An inexpensive BRDF
+model for physically-based rendering", Computer Graphics Forum 1994) and Burley's diffuse lobe (2012); the search for normals is that of
+`hypotheses`, after Hui and Sankaranarayanan, TPAMI 2017. Averaging the normals of several models is ours.
 """
 
 from typing import NamedTuple
@@ -26,7 +31,7 @@ RING_DEGREES = FINE[-1][0][-1]
 
 
 class SvbrdfFit(NamedTuple):
-    """What was found for each sampled pixel, on the host."""
+    """Normal and material of each sampled pixel, on the host."""
 
     normal: np.ndarray  # [n, 3] float32, unit
     diffuse_albedo: np.ndarray  # [n, 3] float32
@@ -38,7 +43,7 @@ class SvbrdfFit(NamedTuple):
 
 def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, options: SearchOptions | None = None,
                  shared: np.ndarray | None = None, roughness: np.ndarray | None = None, single_lobe: bool = True) -> SvbrdfFit:
-    """Solve sampled pixels.
+    """Estimate the normal and the material of sampled pixels.
 
     Args:
         samples: their readings.
@@ -79,7 +84,7 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, options
 
 
 def average_normals(normals: np.ndarray, costs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean of a pixel's normals under several models, each weighted by exp(-(cost - best) / (temperature · best)).
+    """Return the mean of a pixel's normals under several models, each weighted by exp(-(cost - best) / (temperature · best)).
 
     Args:
         normals: [models, n, 3] unit.

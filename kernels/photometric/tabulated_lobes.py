@@ -23,20 +23,20 @@ from kernels.photometric.response_table import (
 )
 
 RELAXATION = 1.6
-"""Of the non-negative solve: lobes integrated over wide lights are much alike, and plain sweeps would crawl."""
+"""Over-relaxation of the non-negative solve: lobes integrated over wide lights are much alike, and plain sweeps would converge slowly."""
 LOG_MIRROR, LOG_NARROWEST, LOG_RATIO = math.log(MIRROR_ALPHA), math.log(NARROWEST), math.log(WIDTH_RATIO)
 
 
 @wp.func
 def reflecting_normal(n: wp.vec3, v: wp.vec3) -> wp.vec3:
-    """The normal that reflects the table's view to where n reflects v."""
+    """Return the normal that reflects the table's view to where n reflects v."""
     r = 2.0 * wp.dot(n, v) * n - v
     return wp.normalize(wp.vec3(r[0], r[1], wp.max(r[2] + 1.0, LEAST_NZ)))
 
 
 @wp.func
 def look_up(table: wp.array3d(dtype=float), place: wp.vec2, light: int, column: int) -> float:
-    """One column at a place among the nodes, bilinear."""
+    """Return one column of the table at a place among its nodes, interpolated bilinearly."""
     i = wp.clamp(int(place[0]), 0, wp.static(GRID - 2))
     j = wp.clamp(int(place[1]), 0, wp.static(GRID - 2))
     a = place[0] - float(i)
@@ -49,7 +49,7 @@ def look_up(table: wp.array3d(dtype=float), place: wp.vec2, light: int, column: 
 
 @wp.func
 def width_position(roughness: float) -> float:
-    """Where a roughness lies among the widths of the table: 0 the mirror, 1 the narrowest GGX lobe; linear in log α between."""
+    """Return where a roughness lies among the widths of the table: 0 the mirror, 1 the narrowest GGX lobe; linear in log α between."""
     width = 2.0 * wp.log(wp.max(roughness, 1.0e-3))
     above = 1.0 + (width - LOG_NARROWEST) / LOG_RATIO
     below = (width - LOG_MIRROR) / wp.static(LOG_NARROWEST - LOG_MIRROR)
@@ -58,7 +58,7 @@ def width_position(roughness: float) -> float:
 
 @cache
 def tabulated_lobes(lanes: int, count: int) -> Lobes:
-    """The mixture of a search table of `count` lobes."""
+    """Return the mixture of a search table of `count` lobes."""
     lane_type = pack_type(lanes, wp.float32)
     pairs = wp.types.matrix(shape=(4, lanes), dtype=wp.float32)
 
@@ -96,7 +96,7 @@ def tabulated_lobes(lanes: int, count: int) -> Lobes:
 
 @cache
 def tabulated_reflectance(lanes: int) -> Reflectance:
-    """The contract's BRDF from a response table; a roughness of 0 stands for no specular lobe at all."""
+    """Return the contract's BRDF from a response table; a roughness of 0 stands for no specular lobe at all."""
     lane_type = pack_type(lanes, wp.float32)
 
     @wp.func

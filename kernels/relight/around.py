@@ -10,7 +10,7 @@ from kernels.relight.triangulation import find_faces, triangulate_sphere
 
 
 def lights_around(directions: np.ndarray, samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The three lights whose triangle each sample lies in.
+    """Return the three lights whose triangle each sample lies in.
 
     Args:
         directions: [lights, 3] unit vectors, four or more not in one plane.
@@ -31,7 +31,7 @@ def lights_around(directions: np.ndarray, samples: np.ndarray) -> tuple[np.ndarr
 
 
 def left_out(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The lights that each light would be predicted from if it were not there, and their shares.
+    """Return the lights that each light would be predicted from if it were missing, and their shares.
 
     Args:
         directions: [lights, 3] unit vectors, four or more not in one plane.

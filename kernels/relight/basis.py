@@ -21,7 +21,7 @@ from kernels.packs import Band, as_packs, pack_type
 TILE = 4
 """Lights down and across whose products one thread sums: 16 sums in registers; divides the light padding of 8."""
 THREADS = 1 << 16
-"""Of one launch, about: enough to fill a large device, with 16 MB of partial sums."""
+"""Approximate threads of one launch: enough to fill a large device, with 16 MB of partial sums."""
 MAX_CHUNKS = 64
 """Pixel ranges with sums of their own: on the CPU those of one range are in the cache for all tiles."""
 
@@ -34,13 +34,13 @@ class Basis(NamedTuple):
 
     @property
     def truncation(self) -> np.ndarray:
-        """[3] root of the squared sums left out, over those of the images: the relative RMS error of each channel; 0 where dark."""
+        """The [3] relative RMS error of each channel: root of the squared sums left out over those of the images; 0 where dark."""
         squares = self.singular_values**2
         return np.sqrt(squares[:, self.matrix.shape[1] :].sum(axis=1) / np.maximum(squares.sum(axis=1), np.finfo(float).tiny))
 
 
 def gram(band: Band, keep: np.ndarray) -> np.ndarray:
-    """Inner products of the stored images of a band over some of its pixels.
+    """Return the inner products of the stored images of a band over some of its pixels.
 
     Args:
         band: the stack on the device.
@@ -70,7 +70,7 @@ def gram(band: Band, keep: np.ndarray) -> np.ndarray:
 
 
 def principal(products: np.ndarray, count: int) -> Basis:
-    """The best basis of `count` images for each channel.
+    """Return the best basis of `count` images for each channel.
 
     Args:
         products: [3, lights, lights] Gram matrices, summed over all bands, of radiance and without padding.
@@ -94,7 +94,7 @@ def principal(products: np.ndarray, count: int) -> Basis:
 
 
 def projection(basis: Basis, scale: np.ndarray) -> np.ndarray:
-    """Weights with which batch.combine_batch turns stored images into coefficient images.
+    """Return the weights with which batch.combine_batch turns stored images into coefficient images.
 
     Args:
         basis: of principal.
@@ -111,7 +111,10 @@ def projection(basis: Basis, scale: np.ndarray) -> np.ndarray:
 
 @cache
 def gram_kernel(pack: int) -> Any:
-    """One thread a tile of light pairs, a channel and a pixel range. A product of two half values is exact in float."""
+    """Return the kernel, one thread for a tile of light pairs, a channel and a pixel range.
+
+    A product of two half values is exact in float.
+    """
     half_pack, float_pack = pack_type(pack, wp.float16), pack_type(pack, wp.float32)
     side = wp.types.matrix(shape=(TILE, pack), dtype=wp.float32)
     sums = wp.types.matrix(shape=(TILE, TILE), dtype=wp.float64)

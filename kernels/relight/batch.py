@@ -15,7 +15,7 @@ from kernels.packs import Band, as_packs, pack_type
 from kernels.relight.combine import check_weights
 
 BLOCK_BYTES = 16 << 20
-"""Of float32 that one BLAS call reads: bounds the scratch memory, and large enough that starting BLAS threads costs nothing."""
+"""Bytes of float32 that one BLAS call reads: bounds the scratch memory, and large enough that starting BLAS threads costs nothing."""
 GROUP = 32
 """Frames of every BLAS call, made up with frames of nothing: with another number BLAS may sum in another order, and a frame in the same
 place shall be the same to the last bit, whichever others there are."""
@@ -24,7 +24,7 @@ REGISTER_FRAMES = 8
 
 
 def combine_batch(band: Band, weights: np.ndarray) -> wp.array:
-    """Many relit frames.
+    """Relight many frames: a weighted sum of the stored images for each.
 
     Args:
         band: the stack on the device.
@@ -101,7 +101,7 @@ def _widen_kernel(pack: int) -> Any:
 
 @cache
 def register_kernel(pack: int) -> Any:
-    """The CUDA kernel: one thread a pack and eight frames, their sums in registers."""
+    """Return the CUDA kernel: one thread for a pack and eight frames, their sums in registers."""
     half_pack, float_pack = pack_type(pack, wp.float16), pack_type(pack, wp.float32)
     sums = wp.types.matrix(shape=(REGISTER_FRAMES, pack), dtype=wp.float32)
 

@@ -1,4 +1,4 @@
-"""What part of a small sample of the sphere lies in the cell of each light.
+"""Parts of a small sample of the sphere that lie in the cells of the lights.
 
 In the plane that touches the sphere in the sample's middle, the border between two cells is a straight line, as every great circle
 is, and so are the meridians at the sample's sides. Its top and bottom bend a little, by 5e-6 of a radian at the ends of half a
@@ -71,7 +71,7 @@ def divide(samples: LatLongSamples, nearest: np.ndarray, lights: np.ndarray, *, 
 
 
 def reach(polar: np.ndarray, half_polar: float, half_azimuth: float) -> np.ndarray:
-    """[samples] distance from the middle to the farthest corner, in the plane that touches the sphere in the middle."""
+    """Return the [samples] distance from the middle to the farthest corner, in the plane that touches the sphere in the middle."""
     height, width = np.tan(half_polar), np.tan(half_azimuth)
     return np.hypot(height, width * (np.sin(polar) + height * np.abs(np.cos(polar))))
 

@@ -25,7 +25,7 @@ LIGHTS_PER_PASS = 4
 
 
 def combine(band: Band, weights: np.ndarray) -> wp.array:
-    """One relit frame.
+    """Relight one frame: a weighted sum of the stored images.
 
     Args:
         band: the stack on the device.
@@ -65,7 +65,7 @@ def check_weights(weights: np.ndarray, shape: tuple[int, ...]) -> None:
 
 @cache
 def chunk_kernel(pack: int) -> Any:
-    """The CPU kernel: one thread a chunk of packs."""
+    """Return the CPU kernel: one thread for a chunk of packs."""
     half_pack, float_pack = pack_type(pack, wp.float16), pack_type(pack, wp.float32)
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -103,7 +103,7 @@ def chunk_kernel(pack: int) -> Any:
 
 @cache
 def register_kernel(pack: int) -> Any:
-    """The CUDA kernel: one thread a pack, its sum in registers."""
+    """Return the CUDA kernel: one thread for a pack, its sum in registers."""
     half_pack, float_pack = pack_type(pack, wp.float16), pack_type(pack, wp.float32)
 
     @wp.kernel(enable_backward=False, module="unique")

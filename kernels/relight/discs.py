@@ -14,7 +14,7 @@ from kernels.relight.triangulation import find_faces, triangulate_sphere
 
 SAMPLE_PITCH_DEGREES = 1.0
 MIN_SAMPLES = 256
-"""Of a disc however small, so that it passes from one light to the next in steps of 0.4 % of it."""
+"""Least number of samples of a disc, so that it passes from one light to the next in steps of 0.4 % of it."""
 
 
 def integrate_discs(middles: np.ndarray, angles_degrees: np.ndarray, directions: np.ndarray, *, weighting: Weighting) -> np.ndarray:
@@ -57,7 +57,7 @@ def integrate_discs(middles: np.ndarray, angles_degrees: np.ndarray, directions:
 
 
 def disc_samples(middle: np.ndarray, angle_degrees: float) -> np.ndarray:
-    """Directions spread evenly over a disc on the sphere, each standing for the same solid angle.
+    """Return directions spread evenly over a disc on the sphere, each standing for the same solid angle.
 
     Args:
         middle: [3] unit vector.

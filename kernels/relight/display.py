@@ -17,7 +17,7 @@ from kernels.packs import Band, as_packs, pack_type, zeros
 
 
 def encode(band: Band, gains: np.ndarray, display_from_stack: np.ndarray) -> Band:
-    """Display values of every stored image.
+    """Encode every stored image for a display.
 
     Args:
         band: the stack on the device.
@@ -25,7 +25,7 @@ def encode(band: Band, gains: np.ndarray, display_from_stack: np.ndarray) -> Ban
         display_from_stack: [3, 3] linear RGB of the display from that of the stack; white is 1.
 
     Returns:
-        A band of the same shape: 0…1, half (off by 1/16 of an 8-bit step at the most); not synchronised on CUDA.
+        A band of the same shape: 0…1, half (off by at most 1/16 of an 8-bit step); not synchronised on CUDA.
 
     Raises:
         ArrayError: gains or matrix of another shape, or not finite.
@@ -46,7 +46,7 @@ def encode(band: Band, gains: np.ndarray, display_from_stack: np.ndarray) -> Ban
 
 @wp.func
 def srgb(linear: float) -> float:
-    """The sRGB curve of a value limited to 0…1."""
+    """Return the sRGB curve of a value limited to 0…1."""
     value = wp.clamp(linear, 0.0, 1.0)
     if value <= 0.0031308:
         return 12.92 * value
@@ -55,7 +55,7 @@ def srgb(linear: float) -> float:
 
 @cache
 def encode_kernel(pack: int) -> Any:
-    """One thread a pack of one light, all three channels."""
+    """Return the kernel: one thread for a pack of one light, all three channels."""
     half_pack = pack_type(pack, wp.float16)
 
     @wp.kernel(enable_backward=False, module="unique")

@@ -17,7 +17,7 @@ from kernels.relight.smooth import integrate_smooth
 
 
 class Weighting(StrEnum):
-    """How a direction of the environment is shared out over the lights."""
+    """Ways to share a direction of the environment out over the lights."""
 
     CELLS = "cells"
     """Whole to the nearest light: shadows and highlights as sharp as a light's own, a moving sun steps from light to light."""
@@ -48,7 +48,7 @@ def integrate(environment: np.ndarray, directions: np.ndarray, rotations: np.nda
 
 
 def light_weights(given: LightEnergy, irradiance: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """What each stored image is multiplied by so that the sum is lit by the environment.
+    """Return the weight of each stored image with which their sum is lit by the environment.
 
     Args:
         given: to each light, of integrate.

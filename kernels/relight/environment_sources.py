@@ -20,7 +20,7 @@ EVEN = 0.25
 
 
 class EnvironmentSamples(NamedTuple):
-    """What a map sends."""
+    """Samples of the radiance of a map."""
 
     direction: np.ndarray  # [n, 3] float64 unit vectors, of the unturned map
     energy: np.ndarray  # [n, 3] float64 ∫ L dω of each box
@@ -28,11 +28,11 @@ class EnvironmentSamples(NamedTuple):
 
 
 def sample_environment(environment: np.ndarray, count: int = SAMPLES) -> EnvironmentSamples:
-    """Cut a lat-long map into samples.
+    """Cut a lat-long map into samples: direction, energy and angular radius.
 
     Args:
         environment: [rows, cols, 3] scene-linear radiance, finite, 0 or above; frames as of the contract.
-        count: how many, at the most.
+        count: largest number of samples.
 
     Returns:
         The samples that have energy; their sum is that of the map.

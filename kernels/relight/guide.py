@@ -49,7 +49,7 @@ def seen_lobes(specular: np.ndarray, roughness: np.ndarray, direction: np.ndarra
 
 def compare_model(band: Band, surface: Surface, visible: wp.array, direction: np.ndarray, irradiance: np.ndarray, scale: np.ndarray,
                 neighbours: np.ndarray, shares: np.ndarray) -> wp.array:
-    """Compare what the model says with what the captured images say.
+    """Compare the model with the captured images, each left out and predicted from its neighbours.
 
     Args:
         band: captured images of the same pixels as the surface.
@@ -84,7 +84,9 @@ def compare_model(band: Band, surface: Surface, visible: wp.array, direction: np
 
 
 def fit_trust(sums: np.ndarray, pixels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """β from the sums of each pixel and of its neighbours: a pixel's own lights are few, and what is wrong about a model is wrong around.
+    """Return β from the sums of each pixel and of its neighbours.
+
+    A pixel's own lights are few, and a model that is wrong at a pixel is wrong around it too.
 
     Args:
         sums: [2, n] of compare_model.

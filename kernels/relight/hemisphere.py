@@ -17,7 +17,7 @@ thousand times the error of a reading."""
 
 
 def biquadratic(directions: np.ndarray) -> np.ndarray:
-    """The six terms of a polynomial texture map.
+    """Return the six terms of a polynomial texture map.
 
     Args:
         directions: [lights, 3] unit vectors to the lights.
@@ -32,7 +32,7 @@ def biquadratic(directions: np.ndarray) -> np.ndarray:
 
 
 def hemispherical_harmonics(directions: np.ndarray, terms: int) -> np.ndarray:
-    """Functions that are orthonormal over the hemisphere.
+    """Return functions that are orthonormal over the hemisphere.
 
     Args:
         directions: [lights, 3] unit vectors to the lights, z ≥ 0.
@@ -78,7 +78,7 @@ def hemispherical_harmonics(directions: np.ndarray, terms: int) -> np.ndarray:
 
 
 def fit_weights(functions: np.ndarray) -> np.ndarray:
-    """What each image is multiplied by so that the sum is a coefficient: least squares.
+    """Return the weight of each image with which their sum is a coefficient of the least-squares fit.
 
     Args:
         functions: [lights, terms].

@@ -29,7 +29,7 @@ EQUAL_COLUMNS = 1e-6
 
 
 class LightEnergy(NamedTuple):
-    """What an environment sends to each light."""
+    """Energy of an environment that each light stands for."""
 
     energy: np.ndarray  # [frames, lights, 3] float64: ∫ w L dω, W/m² of the map's unit; w is the light's part of each direction
     solid_angle: np.ndarray  # [frames, lights] float64 steradians: ∫ w dω
@@ -49,7 +49,7 @@ class SampleGrid(NamedTuple):
     """Samples of a texel side by side."""
 
     def bands(self) -> Iterator["SampleGrid"]:
-        """The same grid, some rows at a time."""
+        """Return the same grid, some rows at a time."""
         size = max(1, BAND_SAMPLES // len(self.azimuth))
         for start in range(0, len(self.polar), size):
             rows = slice(start, start + size)
@@ -82,7 +82,7 @@ def cut(rows: int, cols: int) -> SampleGrid:
 
 
 def check(environment: np.ndarray, directions: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Refuse what cannot be integrated.
+    """Check an environment, directions and rotations, and refuse what cannot be integrated.
 
     Returns:
         Directions, normalised, and rotations, in float64.
@@ -108,7 +108,7 @@ def check(environment: np.ndarray, directions: np.ndarray, rotations: np.ndarray
 
 
 def first_of_equals(directions: np.ndarray) -> np.ndarray:
-    """Ascending indices of the lights that do not stand where an earlier one does."""
+    """Return the ascending indices of the lights that have no earlier light in the same place."""
     close = directions @ directions.T > 1 - EQUAL_RADIANS**2 / 2
     return np.flatnonzero(~np.tril(close, -1).any(axis=1))
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 ROUNDS = 8
-"""Of the power iteration for the colour: it converges by the ratio of the squared eigenvalues, ten or more on real surfaces."""
+"""Rounds of the power iteration for the colour: it converges by the ratio of the squared eigenvalues, ten or more on real surfaces."""
 WHITE = 255.0
 
 
@@ -20,14 +20,14 @@ class Luminance(NamedTuple):
 
 
 def separate(coefficients: np.ndarray, functions: np.ndarray) -> Luminance:
-    """The product of a colour and a luminance function that is closest to three fitted channels.
+    """Return the product of a colour and a luminance function that is closest to three fitted channels.
 
     Args:
         coefficients: [terms, 3, pixels] float32, of channels whose white is 255.
         functions: [lights, terms] over which closeness is meant.
 
     Returns:
-        The colour that the brightest of the lights shows, white at the most, so that each pixel's luminance reaches 255; 0 where it
+        The colour that the brightest of the lights shows, at most white, so that each pixel's luminance reaches 255; 0 where it
         is black.
     """
     moments = functions.T @ functions

@@ -1,6 +1,9 @@
-"""Which samples of light have their shadows marched: a small bright light throws sharp ones, and a few marches serve all its samples.
+"""Groups of light samples that share one visibility: a small bright light casts sharp shadows, and a few marches serve all its samples.
 
-Marching is what shading costs most. So the samples that need it are put together in groups, and each group is marched to one place.
+Marching takes most of the time of shading. So the samples that need it are put together in groups, and each group is marched to one place.
+
+Source: one visibility for a cluster of lights, as in Dong, Grosch, Ritschel, Kautz and Seidel, "Real-time indirect illumination with
+clustered visibility", VMV 2009.
 """
 
 import numpy as np

@@ -20,7 +20,7 @@ from kernels.relight.sources import Sources
 from kernels.relight.triangulation import edge_planes, triangulate_sphere
 
 LEAST_PART = 1e-3
-"""Of the energy of an imaginary light: lights far from a hole that would get less get none, the others have it."""
+"""Least part of the energy of an imaginary light: lights far from a hole that would get less get none, the others have it."""
 
 
 def sum_near(band: Band, surface: Surface, visible: wp.array, sources: Sources, direction: np.ndarray, irradiance: np.ndarray,

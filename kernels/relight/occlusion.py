@@ -14,7 +14,7 @@ from kernels.surface.shadows import NO_REACH, Projection, in_shadow_within, unpr
 
 def see_lights(place: np.ndarray, pixels: np.ndarray, height: wp.array, mask: wp.array, projection: Projection, *,
                device: str) -> wp.array:
-    """March from every pixel to every light.
+    """Return which pixels see which lights, by marching from every pixel to every light.
 
     Args:
         place: [n, 4] unit direction and 0, or position and 1, as of sources.Sources.

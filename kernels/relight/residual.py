@@ -13,7 +13,7 @@ from kernels.packs import Band, as_packs, pack_type, zeros
 
 def squared_residual(band: Band, gains: np.ndarray, coefficients: np.ndarray, functions: np.ndarray, *,
                      low: float = -np.inf, high: float = np.inf) -> wp.array:
-    """Σ over the lights of (image − rebuilt image)² at each pixel.
+    """Return Σ over the lights of (image − rebuilt image)² at each pixel.
 
     Args:
         band: the stack on the device.
@@ -47,7 +47,7 @@ def squared_residual(band: Band, gains: np.ndarray, coefficients: np.ndarray, fu
 
 @cache
 def residual_kernel(pack: int) -> Any:
-    """One thread a pack of one channel."""
+    """Return the kernel: one thread for a pack of one channel."""
     half_pack, float_pack = pack_type(pack, wp.float16), pack_type(pack, wp.float32)
 
     @wp.kernel(enable_backward=False, module="unique")

@@ -19,7 +19,7 @@ from kernels.relight.sources import Sources
 LEAST_ROUGHNESS = 0.05
 """Below it a lobe is narrower than any sample of a light."""
 LEAST_FACING = 0.02
-"""Of n·v: normals of pixels at the rim may look away from the viewer by a little."""
+"""Least n·v: normals of pixels at the rim may look away from the viewer by a little."""
 PLANES = 16
 """Values of a pixel: normal, albedo, F0, view, position (3 each), roughness."""
 
@@ -33,7 +33,7 @@ class Surface(NamedTuple):
 
     @property
     def packs(self) -> int:
-        """How many packs cover the pixels; the last is filled up with copies of the last pixel."""
+        """Number of packs that cover the pixels; the last is filled up with copies of the last pixel."""
         return int(self.values.shape[1])
 
 
@@ -80,7 +80,7 @@ def upload_sources(sources: Sources, device: str) -> SourcesOnDevice:
 
 
 def shade(surface: Surface, sources: Sources, visible: wp.array | None = None) -> wp.array:
-    """Light a surface.
+    """Return the radiance of a surface under samples of light.
 
     Args:
         surface: the pixels.
@@ -121,12 +121,12 @@ def require_same(band: Band, surface: Surface, visible: wp.array, count: int) ->
 
 @cache
 def lobes(pack: int) -> Any:
-    """Warp function: what every pixel of a pack makes of a sample at one place."""
+    """Return the Warp function that evaluates the lobes of every pixel of a pack under a sample at one place."""
     lane_type = pack_type(pack, wp.float32)
 
     @wp.func
     def evaluate(values: wp.array2d(dtype=lane_type), p: int, place: wp.vec4, axis: wp.vec4):
-        """n·l, D V n·l, Schlick's rise, and what of the energy arrives."""
+        """Return n·l, D V n·l, Schlick's rise, and the part of the energy that arrives."""
         facing, shine, rise, arriving = lane_type(), lane_type(), lane_type(), lane_type()
         nx, ny, nz = values[0, p], values[1, p], values[2, p]
         vx, vy, vz = values[9, p], values[10, p], values[11, p]

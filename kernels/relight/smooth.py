@@ -93,7 +93,7 @@ def locate(grid: SampleGrid, triangles: SphereTriangles, rotation: np.ndarray, *
 
 @wp.func
 def walk(direction: wp.vec3, start: int, inward: wp.array(dtype=wp.vec3), neighbour: wp.array(dtype=int)):
-    """The face that a direction lies in, sought from another one, and the sines of its angles from the three edges."""
+    """Return the face that a direction lies in, sought from a face near it, and the sines of its angles from the three edges."""
     here = wp.int32(start)
     a, b, c = float(0.0), float(0.0), float(0.0)
     # across the edge that the direction lies beyond, again and again: on a convex hull every step leads to a face whose plane the

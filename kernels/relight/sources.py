@@ -31,12 +31,12 @@ class Sources(NamedTuple):
 
     @property
     def count(self) -> int:
-        """How many samples."""
+        """Number of samples."""
         return len(self.place)
 
 
 def far(direction: np.ndarray, irradiance: np.ndarray) -> Sources:
-    """Far lights.
+    """Return far lights as samples.
 
     Args:
         direction: [n, 3] unit vectors to them.
@@ -46,7 +46,7 @@ def far(direction: np.ndarray, irradiance: np.ndarray) -> Sources:
 
 
 def point(position: np.ndarray, intensity: np.ndarray, axis: np.ndarray | None = None, exponent: float = 0.0) -> Sources:
-    """One point light: irradiance = intensity · cos^exponent / distance².
+    """Return one point light as a sample: irradiance = intensity · cos^exponent / distance².
 
     Args:
         position: [3] in the unit of the surface, camera frame.
@@ -59,7 +59,7 @@ def point(position: np.ndarray, intensity: np.ndarray, axis: np.ndarray | None =
 
 
 def sphere(centre: np.ndarray, radius: float, radiance: np.ndarray, count: int = SPHERE_SAMPLES) -> Sources:
-    """A sphere of even radiance.
+    """Return samples of a sphere of even radiance.
 
     Args:
         centre: [3], camera frame.
@@ -82,7 +82,9 @@ def sphere(centre: np.ndarray, radius: float, radiance: np.ndarray, count: int =
 
 def rectangle(centre: np.ndarray, edge_u: np.ndarray, edge_v: np.ndarray, radiance: np.ndarray,
               count: int = RECTANGLE_SAMPLES) -> Sources:
-    """A rectangle of even radiance that shines to one side, against edge_u × edge_v, as a UsdLux RectLight of width u and height v does.
+    """Return samples of a rectangle of even radiance that shines to one side.
+
+    It shines against edge_u × edge_v, as a UsdLux RectLight of width u and height v does.
 
     Args:
         centre: [3], camera frame.
@@ -107,7 +109,7 @@ def rectangle(centre: np.ndarray, edge_u: np.ndarray, edge_v: np.ndarray, radian
 
 
 def join(parts: list[Sources]) -> Sources:
-    """All samples of some sources, in order."""
+    """Return all samples of some sources, in order."""
     return Sources(*(np.concatenate(planes) for planes in zip(*parts, strict=True)))
 
 

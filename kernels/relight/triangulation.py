@@ -18,7 +18,7 @@ import numpy as np
 from kernels.errors import ArrayError
 
 SHIFT = 1e-10
-"""Lights are shifted by this at the most, along all axes, so that no four lie in one plane to the last digit: a million times the rounding
+"""Lights are shifted by at most this along all axes, so that no four lie in one plane to the last digit: a million times the rounding
 of float64, and less than a light stands out between neighbours a ten-thousandth of a radian away."""
 FLAT = 1e-3
 """Lights as near to one plane as this lie in it; the measured directions of a ring scatter more."""
@@ -54,7 +54,7 @@ class _Faces(NamedTuple):
 
 
 def triangulate_sphere(directions: np.ndarray) -> SphereTriangles:
-    """Triangulate the sphere between lights.
+    """Return the spherical Delaunay triangles of the lights.
 
     Args:
         directions: [lights, 3] unit vectors, no two of them closer than a ten-thousandth of a radian.
@@ -101,7 +101,7 @@ def _remembered(directions_bytes: bytes, count: int) -> SphereTriangles:
 
 
 def edge_planes(triangles: SphereTriangles) -> tuple[np.ndarray, np.ndarray]:
-    """The planes through the centre and the edge opposite to each corner.
+    """Return the planes through the centre and the edge opposite to each corner.
 
     Returns:
         inward: [faces, 3, 3] unit normals: a direction's sine of the angle from each edge is its product with them.
@@ -114,7 +114,7 @@ def edge_planes(triangles: SphereTriangles) -> tuple[np.ndarray, np.ndarray]:
 
 
 def find_faces(triangles: SphereTriangles, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The triangle of each of some directions, too few for a launch.
+    """Return the triangle that each of a few directions lies in, on the host.
 
     Args:
         triangles: that cover the sphere.

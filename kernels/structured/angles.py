@@ -13,7 +13,7 @@ TURN = 2.0 * math.pi
 
 @wp.func
 def angle_of(x: float, y: float) -> float:
-    """atan2(y, x), 0 to 2π, within 4e-7; 0 for the zero vector.
+    """Return atan2(y, x), 0 to 2π, within 4e-7; 0 for the zero vector.
 
     Source: Moshier, Cephes Mathematical Library, atanf (odd polynomial of degree nine up to tan π/8).
     """
@@ -34,7 +34,7 @@ def angle_of(x: float, y: float) -> float:
 
 @wp.func
 def sine_quarter(t: float) -> float:
-    """sin 2πt for a quarter of a turn either way, within 1e-7: Taylor's polynomial of degree eleven."""
+    """Return sin 2πt for |t| of a quarter of a turn at most, within 1e-7: Taylor's polynomial of degree eleven."""
     x = TURN * t
     z = x * x
     series = ((((-2.5052108e-8 * z + 2.7557319e-6) * z - 1.98412698e-4) * z + 8.33333333e-3) * z - 1.66666667e-1) * z
@@ -43,11 +43,11 @@ def sine_quarter(t: float) -> float:
 
 @wp.func
 def cosine_of_turns(t: float) -> float:
-    """cos 2πt, within 2e-7 for small t; the rounding of t itself is added for large."""
+    """Return cos 2πt, within 2e-7 for small t; the rounding of t itself is added for large."""
     return sine_quarter(0.25 - wp.abs(t - wp.floor(t + 0.5)))
 
 
 @wp.func
 def sine_of_turns(t: float) -> float:
-    """sin 2πt, as cosine_of_turns."""
+    """Return sin 2πt, as cosine_of_turns does."""
     return cosine_of_turns(t - 0.25)

@@ -28,7 +28,7 @@ SHADOW_SIGMAS = 5.0
 DOUBT_SIGMAS = 3.0
 """Difference over its deviation below which a bit may be wrong: one pixel in 740 by noise alone at the limit."""
 DOUBT_PART = 0.05
-"""Of the contrast: with less of it a bit is a mixture of both stripes, and blur rather than noise decides."""
+"""Part of the contrast that a difference must have: with less, a bit is a mixture of both stripes, and blur rather than noise decides."""
 LARGEST = 1.0e15
 """A contrast above this counts as infinite: it is squared in float32."""
 MAX_SPREAD = 1
@@ -111,7 +111,7 @@ def _decode(make: Any, code: str, frames: Band, bits: Sequence[int], inverses: S
 
 @wp.func
 def gray_to_binary(gray: int) -> int:
-    """The number whose reflected binary code this is; up to 32 bits."""
+    """Return the number whose reflected binary (Gray) code is given; up to 32 bits."""
     code = gray ^ (gray >> 1)
     code = code ^ (code >> 2)
     code = code ^ (code >> 4)
@@ -121,19 +121,19 @@ def gray_to_binary(gray: int) -> int:
 
 @wp.func
 def number_binary(shown: int, base_bit: int, above: int) -> int:
-    """The stripe whose bits are shown."""
+    """Return the stripe whose plain binary code is given."""
     return shown
 
 
 @wp.func
 def number_gray(shown: int, base_bit: int, above: int) -> int:
-    """The stripe whose Gray code is shown."""
+    """Return the stripe whose Gray code is given."""
     return gray_to_binary(shown)
 
 
 @wp.func
 def number_xor(shown: int, base_bit: int, above: int) -> int:
-    """The stripe whose Gray code, its upper bits laid over by one of them, is shown."""
+    """Return the stripe whose XOR code is given: a Gray code whose bits in `above` are combined with bit `base_bit`."""
     return gray_to_binary(shown ^ (above & (-((shown >> base_bit) & 1))))
 
 

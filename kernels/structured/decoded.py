@@ -1,4 +1,4 @@
-"""What every decoder of projected codes returns."""
+"""Result of every decoder of projected codes."""
 
 from math import sqrt
 from typing import NamedTuple

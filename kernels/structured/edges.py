@@ -85,7 +85,7 @@ class Edge:
 @wp.func
 def find_edge(readings: wp.array2d(dtype=float), rows: wp.array2d(dtype=int), number: wp.array(dtype=int), status: wp.array(dtype=wp.uint8),
               pixel: int, step: int, room: int, stripe: float, read_variance: float, gain: float) -> Edge:
-    """The first edge from a pixel in one direction; none where decoded pixels end or stripes are not neighbours."""
+    """Return the first edge from a pixel in one direction; none where decoded pixels end or stripes are not neighbours."""
     edge = Edge()
     here = pixel
     for away in range(room):

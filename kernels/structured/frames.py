@@ -17,7 +17,7 @@ class NoiseModel(NamedTuple):
     read: float
     """Standard deviation in the dark: read noise and quantisation."""
     gain: float
-    """Of photon noise: full scale over the electrons that fill it."""
+    """Gain of photon noise: full scale over the electrons that fill it."""
 
 
 def require_frames(frames: Band, *numbers: int | None, channels: int = 1) -> None:
@@ -74,7 +74,7 @@ def upload(values: np.ndarray, saturated: np.ndarray | None = None, *, device: s
 
 
 def stack(images: Sequence[np.ndarray]) -> np.ndarray:
-    """Images as `upload` takes them.
+    """Return images as `upload` takes them.
 
     Args:
         images: [rows, cols] or [rows, cols, channels] each, linear, of one size.
@@ -95,13 +95,13 @@ def stack(images: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def saturated_bits(saturated: np.ndarray) -> np.ndarray:
-    """[⌈frames / 8⌉, pixels] uint8 of [frames, pixels] bool."""
+    """Return [⌈frames / 8⌉, pixels] uint8 bits of [frames, pixels] bool."""
     return np.packbits(np.pad(saturated, ((0, -len(saturated) % 8), (0, 0))), axis=0, bitorder="little")
 
 
 @cache
 def cut_in(pack: int) -> Any:
-    """Warp function: the bits of the frames of a mask that saturate at the pixels of a pack; 0 where none does."""
+    """Return the Warp function that gives the bits of the frames of a mask that saturate at each pixel of a pack; 0 where none does."""
     int_pack, byte_pack = pack_type(pack, wp.int32), pack_type(pack, wp.uint8)
 
     @wp.func

@@ -11,7 +11,7 @@ from kernels.structured.phase import WrappedPhase
 
 
 def join_periods(parts: Sequence[WrappedPhase]) -> WrappedPhase:
-    """All periods of several phases of the same pixels, in the order given.
+    """Return all periods of several phases of the same pixels, in the order given.
 
     Raises:
         ArrayError: nothing is given, or the pixels differ.
@@ -34,7 +34,7 @@ def join_periods(parts: Sequence[WrappedPhase]) -> WrappedPhase:
 
 
 def cropped(decoded: Decoded, first: int, count: int, *, device: str) -> Decoded:
-    """`count` pixels from `first` on, padded to whole packs; a copy.
+    """Return a copy of `count` pixels from `first` on, padded to whole packs.
 
     Raises:
         ArrayError: there are not as many.

@@ -27,7 +27,7 @@ from kernels.structured.frames import NoiseModel, check_noise, check_stripes, cu
 SHADOW_SIGMAS = 5.0
 """White minus black over its deviation (all channels together): below, the projector does not reach the pixel."""
 LEVEL_ERROR = 0.02
-"""Of white minus black, by which a level may be off beyond noise: responses, and light from other surfaces."""
+"""Part of white minus black by which a level may be off beyond noise: responses, and light from other surfaces."""
 DOUBT_CHI2 = 9.0
 """χ² between the best and the second-best level that noise alone leaves (three standard deviations)."""
 DOUBT_RATIO = 0.44
@@ -90,7 +90,7 @@ def decode_kary(frames: Band, digits: Sequence[int], *, white: int, black: int, 
 
 
 def expected_levels(levels: np.ndarray, crosstalk: np.ndarray | None) -> np.ndarray:
-    """What each digit value reads, as a part of white minus black.
+    """Return the reading of each digit value, as a part of white minus black.
 
     Returns:
         [k, channels] float64.

@@ -26,7 +26,7 @@ from kernels.structured.phase import decode_phase
 from kernels.structured.unwrap import keep_better
 
 LEVEL_ERROR = 0.02
-"""Of the amplitude, by which a reading may be off beyond noise: responses, and amplitudes that are not quite alike."""
+"""Part of the amplitude by which a reading may be off beyond noise: responses, and amplitudes that are not quite alike."""
 UNDECIDED_CHI2 = 9.0
 """χ² of the second-best wrap that is not enough to rule it out (three standard deviations) …"""
 UNDECIDED_RATIO = 2.0
@@ -34,7 +34,7 @@ UNDECIDED_RATIO = 2.0
 MULTIPATH_CHI2 = 225.0
 """χ² of the best wrap beyond which the readings contradict each other."""
 MIN_SEPARATION = 0.05
-"""Of the amplitude, by which the readings at two places must differ, all frames together."""
+"""Part of the amplitude by which the readings at two places must differ, all frames together."""
 BORDER_PX = 0.5
 """How far outside the projector a place may seem to lie."""
 STEPS = 3
@@ -47,7 +47,7 @@ _SATURATED, _UNDECIDED, _MULTIPATH, _OUT_OF_RANGE = (int(s) for s in (Status.SAT
 
 def decode_micro(frames: Band, numbers: Sequence[int], periods_px: Sequence[float], shifts: Sequence[float], *,
                  black: int | None = None, extent: float, noise: NoiseModel) -> Decoded:
-    """The coordinate from frames of several close periods that share offset and amplitude.
+    """Decode the coordinate from frames of several close periods that share offset and amplitude.
 
     Args:
         frames: linear images of one channel.

@@ -21,7 +21,7 @@ from kernels.structured.phase import WrappedPhase, add_frame, phase_of, weights
 
 
 def decode_modulated(frames: Band, numbers: Sequence[Sequence[int]], *, period_px: float, noise: NoiseModel) -> WrappedPhase:
-    """Wrapped phase of one period, of direct light alone.
+    """Decode the wrapped phase of one period from direct light alone.
 
     Args:
         frames: linear images of one channel.

@@ -49,7 +49,7 @@ class WrappedPhase(NamedTuple):
 
 def decode_phase(frames: Band, numbers: Sequence[int], periods_px: Sequence[float], shifts: Sequence[float], *,
                  black: int | None = None, noise: NoiseModel) -> WrappedPhase:
-    """Wrapped phase of every period.
+    """Decode the wrapped phase of every period.
 
     Args:
         frames: linear images of one channel.
@@ -95,7 +95,7 @@ def decode_phase(frames: Band, numbers: Sequence[int], periods_px: Sequence[floa
 
 
 def weights(shifts: np.ndarray, period_px: float) -> np.ndarray:
-    """What each reading is multiplied by to give A, C and S: rows of the pseudo-inverse.
+    """Return the weights of each reading in A, C and S: rows of the pseudo-inverse.
 
     Args:
         shifts: [frames] turns.

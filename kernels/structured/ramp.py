@@ -26,7 +26,7 @@ LARGEST = 1.0e15
 BORDER_SIGMAS = 4.0
 """Deviations by which a place may seem to lie outside the projector."""
 HALVINGS = 12
-"""Of the table; 4096 steps, between which a response as bent as level^2.2 is straight to 1e-7 of full scale."""
+"""Halvings that search the table of 4096 steps, between which a response as bent as level^2.2 is straight to 1e-7 of full scale."""
 TABLE = 2**HALVINGS
 MIN_STEP = 1.0e-12
 """Least rise of the ratio between two places of the table, so that its slope can be divided by."""
@@ -36,7 +36,7 @@ _SATURATED, _SHADOWED, _OUT_OF_RANGE = int(Status.SATURATED), int(Status.SHADOWE
 
 def decode_ramp(frames: Band, *, up: int | None = None, down: int | None = None, white: int | None = None,
                 black: int | None = None, extent: float, response: np.ndarray | None = None, noise: NoiseModel) -> Decoded:
-    """The coordinate from two of a rising ramp, a falling ramp and white.
+    """Decode the coordinate from two of a rising ramp, a falling ramp and white.
 
     Args:
         frames: linear images of one channel.
@@ -72,7 +72,7 @@ def decode_ramp(frames: Band, *, up: int | None = None, down: int | None = None,
 
 
 def ratio_table(response: np.ndarray | None, *, pair: bool) -> np.ndarray:
-    """The ratio at TABLE + 1 even places of a rising ramp, from 0 to 1.
+    """Return the ratio at TABLE + 1 even places of a rising ramp, from 0 to 1.
 
     Raises:
         ArrayError: a response that does not rise.

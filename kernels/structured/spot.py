@@ -48,7 +48,7 @@ class Meeting(NamedTuple):
 
 
 def find_spot(signal: np.ndarray) -> Spot:
-    """Sub-pixel centroid of the brightest spot.
+    """Return the sub-pixel centroid of the brightest spot.
 
     Args:
         signal: [rows, cols] float32, the frame less its background; what is not to be looked at is NaN.
@@ -77,7 +77,7 @@ def find_spot(signal: np.ndarray) -> Spot:
     peak = float(near.max())
     if peak < NOISE_FACTOR * noise:
         return none
-    # two noises above nothing at the least, so that the spot does not run out into the noise
+    # at least two noises above nothing, so that the spot does not run out into the noise
     floor = max(LEVEL * peak, 2 * noise)
     inside = _hanging_together(window > floor, row - top, col - left)
     weight = np.where(inside, window - floor, 0).astype(np.float64)
@@ -104,7 +104,7 @@ def find_spot(signal: np.ndarray) -> Spot:
 
 
 def nearest_points(origins_a: np.ndarray, directions_a: np.ndarray, origins_b: np.ndarray, directions_b: np.ndarray) -> Meeting:
-    """The points with the least sum of squared distances to two rays each.
+    """Return the points with the least sum of squared distances to two rays each.
 
     Args:
         origins_a: [n, 3] or [3], metres. directions_a: [n, 3], of any length. The same of b.

@@ -54,7 +54,7 @@ class PlaneMeeting(NamedTuple):
 
 
 def find_stripe(signal: np.ndarray, *, along: str, noise: float, device: str) -> Stripe:
-    """The stripe's centre on each row or column.
+    """Find the stripe's centre on each row or column.
 
     Args:
         signal: [rows, cols] float32, the frame less its background; 0 where it is not to be looked at.
@@ -175,7 +175,7 @@ def _stripe_kernel(first: int,
 
 
 def plane_depths(x: np.ndarray, y: np.ndarray, point: np.ndarray, normal: np.ndarray, *, along: str) -> PlaneMeeting:
-    """Depth at which lines of sight (x, y, -1) through the camera's centre meet a plane of light.
+    """Return the depth at which lines of sight (x, y, -1) through the camera's centre meet a plane of light.
 
     Args:
         x, y: [n] float64.

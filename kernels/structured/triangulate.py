@@ -35,7 +35,7 @@ _OUT_OF_RANGE, _ILL_POSED, _AMBIGUOUS = int(Status.OUT_OF_RANGE), int(Status.ILL
 
 
 class ProjectorModel(NamedTuple):
-    """A projector as the kernel needs it."""
+    """Intrinsics and pose of a projector."""
 
     size: tuple[float, float]  # width, height, pixels
     focal: tuple[float, float]  # pixels
@@ -81,7 +81,7 @@ class Image:
 
 @wp.func
 def project(g: Projection, a: wp.vec3, s: float) -> Image:
-    """Image of the point at inverse depth s (Brown 1966, as OpenCV writes it)."""
+    """Return the image of the point at inverse depth s (Brown 1966, as OpenCV writes it)."""
     q = a + g.shift * s
     z = wp.where(wp.abs(q[2]) > 1.0e-12, q[2], 1.0e-12)
     x, y = q[0] / z, q[1] / z
@@ -115,7 +115,7 @@ class Found:
 @wp.func
 def locate(g: Projection, a: wp.vec3, u: float, v: float, weight_u: float, weight_v: float, near: float, far: float,
            limit: float) -> Found:
-    """The point on a line of sight that is decoded as (u, v); a weight (1/variance) of zero leaves that axis out."""
+    """Return the point on a line of sight that is decoded as (u, v); a weight (1/variance) of zero leaves that axis out."""
     found = Found()
     # the lens aside, the axis along which the point moves farther says where to begin
     x, y = (u - g.principal[0]) / g.focal[0], (v - g.principal[1]) / g.focal[1]
@@ -156,14 +156,14 @@ def locate(g: Projection, a: wp.vec3, u: float, v: float, weight_u: float, weigh
 
 @wp.func
 def weight_of(code: int, sigma: float) -> float:
-    """1 / variance of a coordinate, 0 where it is not decoded."""
+    """Return 1 / variance of a coordinate, 0 where it is not decoded."""
     floor = wp.max(sigma, MIN_SIGMA_PX)
     return wp.where(code == OK, 1.0, wp.where(code == _AMBIGUOUS, 1.0, 0.0)) / (floor * floor)
 
 
 def triangulate(x: np.ndarray, y: np.ndarray, columns: Decoded | None, rows: Decoded | None, projector: ProjectorModel, *,
                 near_m: float, far_m: float, max_residual_px: float, device: str) -> Triangulation:
-    """Depth of a band from one or both projector coordinates.
+    """Return the depth of a band from one or both projector coordinates.
 
     Args:
         x: [pixels] where each line of sight crosses z = -1 of the camera frame, lens distortion undone: (x, y, -1) is along it.

@@ -34,7 +34,7 @@ MULTIPATH_CHI2 = 225.0
 MIN_SEPARATION = 0.02
 """Radians by which the phases of two places must differ, so that the periods tell them apart at all."""
 MIN_COVER = 0.75
-"""Of the projector, that the periods must tell apart. Where they repeat just within it, the places at its two ends that look alike are
+"""Part of the projector that the periods must tell apart. Where they repeat just within it, the places at its two ends that look alike are
 UNDECIDED and the rest is not; with less than this, most places would be."""
 BORDER_SIGMAS = 4.0
 """Deviations by which a place may seem to lie outside the projector."""
@@ -47,7 +47,7 @@ _OUT_OF_RANGE, _UNDECIDED, _MULTIPATH = int(Status.OUT_OF_RANGE), int(Status.UND
 
 
 def unwrap_range(periods_px: tuple[float, ...], extent: float) -> float:
-    """How far apart two places must be before the periods show the same phases again.
+    """Return how far apart two places must be before the periods show the same phases again.
 
     Args:
         periods_px: all of them.
@@ -68,7 +68,7 @@ def unwrap_range(periods_px: tuple[float, ...], extent: float) -> float:
 
 
 def unwrap_jointly(wrapped: WrappedPhase, *, extent: float) -> Decoded:
-    """The coordinate that fits the phases of all periods best.
+    """Return the coordinate that fits the phases of all periods best.
 
     Args:
         wrapped: phases of one or more periods.
@@ -99,7 +99,7 @@ def unwrap_jointly(wrapped: WrappedPhase, *, extent: float) -> Decoded:
 
 
 def unwrap_by_code(wrapped: WrappedPhase, coarse: Decoded, *, stripe_px: float, extent: float) -> Decoded:
-    """Each phase in the wrap that lies nearest to a stripe of another code; several periods are averaged by their variance.
+    """Return each phase in the wrap nearest to a stripe of another code; several periods are averaged by their variance.
 
     Args:
         wrapped: phases of one or more periods.

@@ -159,7 +159,7 @@ def place(
     spacing: float,
     mean_z: float,
 ) -> wp.array:
-    """Camera-frame z of every pixel, the mean of each component at mean_z.
+    """Return the camera-frame z of every pixel, the mean of each component at mean_z.
 
     Returns:
         [rows, cols] float32, 0 outside the runs.

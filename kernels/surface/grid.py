@@ -56,11 +56,11 @@ class Grid(NamedTuple):
     device: str
 
     def zeros(self, dtype: Any = wp.float32) -> wp.array:
-        """A new array of this layout, all zero."""
+        """Return a new array of this layout, all zero."""
         return wp.zeros(self.size, dtype=dtype, device=self.device)
 
     def colour(self, parity: int) -> Sweep:
-        """The pixels of one chessboard colour."""
+        """Return the walk over the pixels of one chessboard colour."""
         return self.odd if parity else self.even
 
 
@@ -103,7 +103,7 @@ def run(kernel: Any, sweep: Sweep, inputs: list[Any], outputs: list[Any], *, dev
 
 @wp.func
 def cell_of(walk: Walk, t: int, k: int):
-    """The k-th cell of thread t."""
+    """Return the k-th cell of thread t."""
     return walk.start + walk.stride * (t * walk.across + k * walk.along)
 
 

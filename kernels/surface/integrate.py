@@ -50,7 +50,7 @@ def integrate_normals(
     device: str,
     progress: Callable[[float], None] | None = None,
 ) -> Integration:
-    """Integrate a normal map to a height map.
+    """Integrate a normal map to a height map by weighted least squares.
 
     Args:
         normal: unit normals, n_z > 0 towards an orthographic viewer. A pixel whose normal is not finite, or shorter

@@ -1,4 +1,4 @@
-"""How much light the patches of a surface send each other: form factors from points, normals and areas, with hidden pairs left out.
+"""Light that the patches of a surface send each other: form factors from points, normals and areas, with hidden pairs left out.
 
 Source: Nayar, Ikeuchi and Kanade, "Shape from interreflections", IJCV 1991: on a Lambertian surface radiance = direct + ρ K radiance
 with K of this file, so that the direct light follows from the measured radiance without a series of bounces.
@@ -21,7 +21,7 @@ SIGHT_MARGIN_PIXELS = 1.0
 
 def form_factors(points: np.ndarray, normals: np.ndarray, areas: np.ndarray, height: wp.array, mask: wp.array,
                  projection: Projection, *, device: str) -> wp.array:
-    """Form factors K[i, j] = cosᵢ cosⱼ Aⱼ / (π r²) between patches; 0 where something stands between.
+    """Return the form factors K[i, j] = cosᵢ cosⱼ Aⱼ / (π r²) between patches; 0 where something stands between.
 
     Args:
         points: [n, 3] camera-frame centres.

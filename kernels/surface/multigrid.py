@@ -48,7 +48,7 @@ def edge_sum(
     i: int,
     pitch: int,
 ):
-    """(sum of weights, weighted sum of the neighbours' values) of cell i."""
+    """Return (sum of weights, weighted sum of the neighbours' values) of cell i."""
     left = wx[i - 1]
     right = wx[i]
     up = wy[i - pitch]
@@ -237,7 +237,7 @@ class Multigrid:
             devices.launch(_coarsen, g.rows * g.cols, inputs, outputs, device=g.device)
 
     def cycle(self) -> None:
-        """value = B·target, with B a symmetric positive definite approximation of the inverse."""
+        """Set value = B·target, with B a symmetric positive definite approximation of the inverse."""
         for fine, coarse in zip(self.levels, self.levels[1:], strict=False):
             self._down(fine, coarse)
         self._coarsest()

@@ -29,14 +29,14 @@ class Projection(NamedTuple):
 
 @wp.func
 def project(point: wp.vec3, perspective: bool, scale: wp.vec2, centre: wp.vec2) -> wp.vec2:
-    """Continuous image coordinates of a camera-frame point."""
+    """Return the continuous image coordinates of a camera-frame point."""
     far = wp.where(perspective, wp.max(-point[2], 1.0e-9), 1.0)
     return wp.vec2(centre[0] + scale[0] * point[0] / far, centre[1] - scale[1] * point[1] / far)
 
 
 @wp.func
 def unproject(u: float, v: float, z: float, perspective: bool, scale: wp.vec2, centre: wp.vec2) -> wp.vec3:
-    """The camera-frame point of height z at continuous image coordinates."""
+    """Return the camera-frame point of height z at continuous image coordinates."""
     far = wp.where(perspective, -z, 1.0)
     return wp.vec3((u - centre[0]) / scale[0] * far, (centre[1] - v) / scale[1] * far, z)
 
@@ -44,7 +44,7 @@ def unproject(u: float, v: float, z: float, perspective: bool, scale: wp.vec2, c
 @wp.func
 def in_shadow_within(height: wp.array2d(dtype=float), mask: wp.array2d(dtype=wp.uint8), row: int, col: int, toward: wp.vec3,
                      reach: float, perspective: bool, scale: wp.vec2, centre: wp.vec2) -> bool:
-    """Whether the surface stands in this direction from this pixel before `reach`: what lies behind a light hides nothing."""
+    """Return whether the surface hides a light in this direction from this pixel before `reach`: what lies behind a light hides nothing."""
     z = height[row, col]
     start = unproject(float(col) + 0.5, float(row) + 0.5, z, perspective, scale, centre)
     pixel = wp.where(perspective, -z, 1.0) / (0.5 * (scale[0] + scale[1]))  # what a pixel spans here

@@ -72,7 +72,7 @@ def _mark_usable(
 
 
 def usable_pixels(normal: wp.array, mask: wp.array, x: wp.array, y: wp.array, *, device: str) -> wp.array:
-    """The pixels that take part: in the mask, with a finite normal of some length. [rows, cols] uint8."""
+    """Return the pixels that take part, [rows, cols] uint8: in the mask, with a finite normal of some length."""
     usable = wp.empty(mask.shape, dtype=wp.uint8, device=device)
     devices.launch(_mark_usable, mask.shape[0] * mask.shape[1], [normal, mask, x, y], [usable], device=device)
     return usable
@@ -80,7 +80,7 @@ def usable_pixels(normal: wp.array, mask: wp.array, x: wp.array, y: wp.array, *,
 
 @wp.func
 def orthographic_slope(m: wp.vec3, ri: wp.vec3, rj: wp.vec3, spacing: float):
-    """(slope of z, weight) of one pair, in units of the spacing."""
+    """Return (slope of z, weight) of one pair, in units of the spacing."""
     lean = wp.dot(rj - ri, m)
     facing = wp.max(m[2], _FLOOR * wp.length(m))
     slope = wp.float32(0.0)
@@ -91,7 +91,7 @@ def orthographic_slope(m: wp.vec3, ri: wp.vec3, rj: wp.vec3, spacing: float):
 
 @wp.func
 def perspective_slope(m: wp.vec3, ri: wp.vec3, rj: wp.vec3, spacing: float):
-    """(slope of −log d, weight) of one pair, in units of the spacing: it grows towards the viewer, as z does."""
+    """Return (slope of −log d, weight) of one pair, in units of the spacing: it grows towards the viewer, as z does."""
     lean = wp.dot(rj - ri, m)
     floor = _FLOOR * wp.length(m) * wp.length(ri)
     facing = -wp.dot(ri, m)
@@ -169,7 +169,7 @@ def pair_slopes(
     perspective: bool,
     spacing: float,
 ) -> Slopes:
-    """Slopes and weights of every pair of 4-neighbours that are both usable.
+    """Return the slopes and weights of every pair of 4-neighbours that are both usable.
 
     Args:
         normal, usable, x, y: as above.

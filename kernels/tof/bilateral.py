@@ -24,7 +24,7 @@ RANGE_SIGMAS = 3.0
 LEAST_STEP = 0.02
 """Part of the range at which it does so however well both are known: slopes are surfaces too."""
 LEAST_DETERMINANT = 1e-3
-"""Of the plane's matrix, over that of independent unit spreads: below it the neighbours lie on a line, and are averaged."""
+"""Least determinant of the plane's matrix over that of independent unit spreads: below it the neighbours lie on a line and are averaged."""
 LEAST_VARIANCE = 1e-12
 """m²: a micrometre, so that noise-free pixels have a weight."""
 LEAST_GUIDE = 1e-30
@@ -38,7 +38,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 class Smoothed(NamedTuple):
-    """[rows · cols] on the device; pixels that were not OK keep what they had."""
+    """Smoothed image, [rows · cols] on the device; pixels that were not OK keep what they had."""
 
     range: wp.array  # [pixel] float32 metres
     sigma: wp.array  # [pixel] float32 metres: of the fit, for independent errors of the neighbours
@@ -46,7 +46,7 @@ class Smoothed(NamedTuple):
 
 def smooth(ranges: wp.array, sigma: wp.array, guide: wp.array, status: wp.array, rows: int, cols: int, *, radius: int = 2,
            spatial_px: float = 1.5) -> Smoothed:
-    """Put each range on the plane through its neighbours.
+    """Smooth ranges: put each on the plane through its neighbours.
 
     Args:
         ranges, sigma: [rows · cols] float32 metres, padded or not.
@@ -97,7 +97,7 @@ def _packs(array: wp.array, pack: int, step: int, count: int) -> wp.array:
 
 @cache
 def frame_kernel(pack: int) -> Any:
-    """The kernel for packs of this many pixels, which divide a row; public for the test that compiles it for CUDA."""
+    """Return the kernel for packs of this many pixels, which divide a row."""
     float_pack, int_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32)
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -138,7 +138,7 @@ def frame_kernel(pack: int) -> Any:
 
 @cache
 def smooth_kernel(pack: int) -> Any:
-    """The kernel for packs of this many pixels; public for the test that compiles it for CUDA."""
+    """Return the kernel for packs of this many pixels."""
     float_pack = pack_type(pack, wp.float32)
 
     @wp.kernel(enable_backward=False, module="unique")

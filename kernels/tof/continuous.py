@@ -18,22 +18,22 @@ from kernels.tof.modulation import require_frequencies
 
 LEAST_PHASES = 3
 WORST_CONDITION = 100.0
-"""Of the least-squares matrix, largest over smallest singular value: beyond it the phases lie too close together."""
+"""Largest over smallest singular value of the least-squares matrix: beyond it the phases lie too close together."""
 ROUNDING = 2e-7
-"""Relative error of a reading kept in float32: what noise-free images have at the least."""
+"""Relative error of a reading kept in float32: the least noise of an image."""
 
 
 class Noise(NamedTuple):
-    """Variance of a reading: read² + shot · reading, of one electron at the least; all in the unit of the images."""
+    """Variance of a reading: read² + shot · reading, at least that of one electron; all in the unit of the images."""
 
     shot: float
-    """Of a reading of one unit: one over the electrons that a unit stands for."""
+    """Variance of a reading of one unit: one over the electrons that a unit stands for."""
     read: float
     """Standard deviation of a reading without light."""
 
 
 class Correlation(NamedTuple):
-    """What the images of each frequency say; [frequency, pixel] on the device, frequencies ascending, pixels padded to whole packs."""
+    """Phase, amplitude and offset at each frequency, ascending; [frequency, pixel] on the device, pixels padded to whole packs."""
 
     phase: wp.array  # float32, 0…2π
     sigma: wp.array  # float32 radians: standard deviation of the phase; 0 where nothing was modulated, -1 where a reading saturates
@@ -47,7 +47,7 @@ class Correlation(NamedTuple):
 
 def weights(modulation_hz: Sequence[float] | np.ndarray, reference_phase_rad: Sequence[float] | np.ndarray,
             scale: Sequence[float] | np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The rows that turn images into (P, a, b), and the frequency of each image.
+    """Return the rows that turn images into (P, a, b), and the frequency of each image.
 
     Args:
         modulation_hz: [M] of each image.
@@ -86,7 +86,7 @@ def weights(modulation_hz: Sequence[float] | np.ndarray, reference_phase_rad: Se
 def decode(images: np.ndarray, modulation_hz: Sequence[float] | np.ndarray, reference_phase_rad: Sequence[float] | np.ndarray, *,
            noise: Noise, saturation: float | None = None, scale: Sequence[float] | np.ndarray | None = None,
            device: str) -> Correlation:
-    """Least squares for phase, amplitude and offset of each frequency, with the noise that they inherit.
+    """Fit phase, amplitude and offset of each frequency by least squares, with the noise that they inherit.
 
     Args:
         images: [M, pixel] float32 readings, in any order.
@@ -129,7 +129,7 @@ def decode(images: np.ndarray, modulation_hz: Sequence[float] | np.ndarray, refe
 
 @wp.func
 def arctangent(z: float):
-    """Of 0…1, to 3e-8 (Abramowitz and Stegun 4.4.49): unlike the library's, the same few operations for a whole pack."""
+    """Return the arctangent of 0…1, to 3e-8 (Abramowitz and Stegun 4.4.49), without branches, so that a pack becomes SIMD instructions."""
     x = z * z
     even = float(0.0028662257)
     even = even * x - 0.0161657367
@@ -144,7 +144,7 @@ def arctangent(z: float):
 
 @wp.func
 def phase_of(a: float, b: float):
-    """The angle of (a, b), 0…2π; 0 of (0, 0)."""
+    """Return the angle of (a, b), 0…2π; 0 for (0, 0)."""
     across = wp.abs(a)
     up = wp.abs(b)
     angle = arctangent(wp.min(across, up) / wp.max(wp.max(across, up), 1.0e-30))
@@ -155,7 +155,7 @@ def phase_of(a: float, b: float):
 
 @cache
 def decode_kernel(pack: int) -> Any:
-    """The kernel for packs of this many pixels; public for the test that compiles it for CUDA."""
+    """Return the kernel for packs of this many pixels."""
     float_pack = pack_type(pack, wp.float32)
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -185,7 +185,7 @@ def decode_kernel(pack: int) -> Any:
             row_p, row_a, row_b = basis[j, 0], basis[j, 1], basis[j, 2]
             for k in range(pack):
                 blind[k] += wp.where(wp.abs(y[k]) < saturation, 0.0, 1.0)  # NaN is not below it either
-                variance = read_variance + shot * wp.max(y[k], shot) + (ROUNDING * y[k]) * (ROUNDING * y[k])  # an electron at the least
+                variance = read_variance + shot * wp.max(y[k], shot) + (ROUNDING * y[k]) * (ROUNDING * y[k])  # at least an electron
                 level[k] += row_p * y[k]
                 a[k] += row_a * y[k]
                 b[k] += row_b * y[k]

@@ -38,7 +38,7 @@ class Ranges(NamedTuple):
 
 
 def quantile(freedom: int, z: float) -> float:
-    """Of the chi-squared distribution, by Wilson and Hilferty's approximation (PNAS 1931): error below 3 % here."""
+    """Return a quantile of the chi-squared distribution, by Wilson and Hilferty's approximation (PNAS 1931): error below 3 % here."""
     a = 2 / (9 * freedom)
     return float(freedom * (1 - a + z * a**0.5) ** 3)
 
@@ -72,7 +72,7 @@ def decide(found: Correlation, weighed: Hypotheses, *, light_speed: float, agree
 
 @cache
 def decide_kernel(pack: int) -> Any:
-    """The kernel for packs of this many pixels; public for the test that compiles it for CUDA."""
+    """Return the kernel for packs of this many pixels."""
     float_pack, int_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32)
 
     @wp.kernel(enable_backward=False, module="unique")

@@ -1,5 +1,10 @@
-"""Flying pixels: a pixel that sees the edge of one surface before another measures a range between the two. Found and taken out, no
-other pixel touched: nothing is smoothed, and smoothing is a filter of its own."""
+"""Flying pixels: a pixel that sees the edge of one surface before another measures a range between the two.
+
+They are marked and no other pixel changes: smoothing is a filter of its own.
+
+Source: Sabov and Krüger, "Identification and correction of flying pixels in range camera data", SCCG 2008; here a pixel is judged by the
+straight lines through its neighbours on either side and by their standard deviations.
+"""
 
 
 import numpy as np
@@ -20,7 +25,7 @@ STEEPEST = 10.0
 ASIDE = 0.9
 """Part of a pixel's own departure below which a step across the line counts as the slope of that side; one as far off may fly too."""
 LEAST_SUPPORT = 2
-"""Of the eight neighbours on the same surface: a wire one pixel wide has two; of fewer neighbours one in three."""
+"""Least number of the eight neighbours on the same surface: a wire one pixel wide has two; of fewer neighbours one in three."""
 
 _OK, _FLYING = int(Status.OK), int(Status.FLYING)
 
@@ -67,7 +72,7 @@ def require_image(*arrays: wp.array, rows: int, cols: int) -> None:
 
 @wp.func
 def seen(status: wp.array(dtype=wp.int32), r: int, c: int, rows: int, cols: int):
-    """Whether there is a measured pixel."""
+    """Return whether the pixel lies in the image and is measured."""
     inside = False
     if r >= 0 and c >= 0 and r < rows and c < cols:
         inside = status[r * cols + c] == _OK
@@ -77,7 +82,7 @@ def seen(status: wp.array(dtype=wp.int32), r: int, c: int, rows: int, cols: int)
 @wp.func
 def step_aside(ranges: wp.array(dtype=wp.float32), status: wp.array(dtype=wp.int32), r: int, c: int, dr: int, dc: int, rows: int,
                cols: int, most: float):
-    """Largest step from a pixel to its neighbours across the direction (dr, dc), of those below `most`."""
+    """Return the largest step from a pixel to its neighbours across the direction (dr, dc), of those below `most`."""
     here = ranges[r * cols + c]
     largest = float(0.0)
     for side in range(2):

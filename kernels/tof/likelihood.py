@@ -43,14 +43,14 @@ class Shape:
 
 
 def recorded(exposed: Exposed) -> Recorded:
-    """The histograms as the kernels take them."""
+    """Return the histograms as the kernels take them."""
     given = Recorded()
     given.counts, given.awake, given.per_pulse = exposed.counts, exposed.awake, 1 / exposed.pulses
     return given
 
 
 def shape(pulse: Pulse, device: str) -> Shape:
-    """The pulse as the kernels take it."""
+    """Return the pulse as the kernels take it."""
     given = Shape()
     given.cumulative = wp.array(pulse.cumulative.astype(np.float32), dtype=wp.float32, device=device)
     given.density = wp.array(pulse.density.astype(np.float32), dtype=wp.float32, device=device)
@@ -60,7 +60,7 @@ def shape(pulse: Pulse, device: str) -> Shape:
 
 @wp.func
 def table_at(table: wp.array(dtype=wp.float32), x: float, begin: float, per_step: float):
-    """Of a table, linearly; its first entry before it begins, its last after it ends."""
+    """Return a table's value, interpolated linearly; its first entry before it begins, its last after it ends."""
     u = wp.clamp((x - begin) * per_step, 0.0, float(table.shape[0] - 1))
     k = wp.min(int(u), table.shape[0] - 2)
     part = u - float(k)
@@ -69,13 +69,13 @@ def table_at(table: wp.array(dtype=wp.float32), x: float, begin: float, per_step
 
 @wp.func
 def share_before(pulse: Shape, x: float):
-    """Of a return, what comes before x, bins after its time."""
+    """Return the part of a return that comes before x, in bins after its time."""
     return table_at(pulse.cumulative, x, pulse.begin, pulse.per_step)
 
 
 @wp.func
 def density_at(pulse: Shape, x: float):
-    """Of a return, a bin, x bins after its time; zero outside the table."""
+    """Return the part of a return per bin at x bins after its time; zero outside the table."""
     u = (x - pulse.begin) * pulse.per_step
     value = float(0.0)
     if u > 0.0 and u < float(pulse.density.shape[0] - 1):
@@ -85,13 +85,13 @@ def density_at(pulse: Shape, x: float):
 
 @wp.func
 def first_bin_of(pulse: Shape, t: float):
-    """The first bin that a return at t reaches, not before the histogram."""
+    """Return the first bin that a return at t reaches, not before the histogram."""
     return wp.max(int(wp.floor(t + pulse.begin)), 0)
 
 
 @wp.func
 def end_bin_of(pulse: Shape, t: float, bins: int):
-    """The bin after the last that a return at t reaches, not after the histogram."""
+    """Return the bin after the last that a return at t reaches, not after the histogram."""
     return wp.min(int(wp.ceil(t + pulse.end)), bins)
 
 
@@ -99,7 +99,7 @@ def end_bin_of(pulse: Shape, t: float, bins: int):
 def mean_of_bin(pulse: Shape, i: int, p: int, without: int, found: int, background: float,
                 position: wp.array2d(dtype=wp.float32),  # [return, pixel]
                 photons: wp.array2d(dtype=wp.float32)):  # [return, pixel]
-    """Photons of background and returns in a bin, without those of the return `without` (-1: with all)."""
+    """Return the photons of background and returns in a bin, without those of the return `without` (-1: with all)."""
     mean = float(background)
     for m in range(found):
         if m != without:
@@ -110,7 +110,7 @@ def mean_of_bin(pulse: Shape, i: int, p: int, without: int, found: int, backgrou
 
 @wp.func
 def counted_part(x: float):
-    """r: of the photons that come, the part that is counted, with x photons a pulse that counts one at most."""
+    """Return r, the part of the arriving photons that is counted, with x photons a pulse of which one at most is counted."""
     part = float(1.0)
     if x > 0.05:
         part = (1.0 - wp.exp(-x)) / x
@@ -121,7 +121,7 @@ def counted_part(x: float):
 
 @wp.func
 def counted(given: Recorded, i: int, p: int):
-    """n: photons that were counted, from what Coates's correction made of them."""
+    """Return n, the photons that were counted, from what Coates's correction made of them."""
     count = given.counts[i, p]
     if given.per_pulse > 0.0 and given.awake[i, p] > 0.0:
         count = count * counted_part(count * given.per_pulse / given.awake[i, p])
@@ -130,7 +130,7 @@ def counted(given: Recorded, i: int, p: int):
 
 @wp.func
 def likelihood_gain(given: Recorded, i: int, p: int, old: float, new: float):
-    """Log likelihood of a bin of mean `new`, less that of mean `old`."""
+    """Return the log likelihood of a bin of mean `new`, less that of mean `old`."""
     count = counted(given, i, p)
     gain = -(given.awake[i, p] - count * given.per_pulse) * (new - old)
     if count > 0.0:
@@ -140,12 +140,12 @@ def likelihood_gain(given: Recorded, i: int, p: int, old: float, new: float):
 
 @wp.func
 def likelihood_slope(given: Recorded, i: int, p: int, mean: float):
-    """Derivative of the log likelihood of a bin by its mean."""
+    """Return the derivative of the log likelihood of a bin by its mean."""
     return counted(given, i, p) / (mean * counted_part(mean * given.per_pulse)) - given.awake[i, p]
 
 
 @wp.func
 def information(given: Recorded, i: int, p: int, mean: float):
-    """Fisher information of a bin about its mean."""
+    """Return the Fisher information of a bin about its mean."""
     x = mean * given.per_pulse
     return given.awake[i, p] / (mean * counted_part(x) * wp.exp(x))

@@ -1,4 +1,4 @@
-"""What a set of modulation frequencies can tell: radians a metre, and the range after which all phases repeat together."""
+"""Limits of a set of modulation frequencies: radians a metre, and the range after which all phases repeat together."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -10,7 +10,7 @@ from kernels.errors import ArrayError
 REPEAT_TURNS = 0.02
 """Phases that differ by less than this part of a turn are the same again: nearer than noise of 0.1 rad tells apart."""
 MOST_TURNS = 1000
-"""Of the lowest frequency within which a repeat is looked for: 7.5 km at 20 MHz."""
+"""Turns of the lowest frequency within which a repeat is looked for: 7.5 km at 20 MHz."""
 
 
 def radians_per_metre(modulation_hz: Sequence[float] | np.ndarray, light_speed: float) -> np.ndarray:

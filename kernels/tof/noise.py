@@ -1,4 +1,4 @@
-"""The noise of correlation images, estimated from the images themselves: variance against level, a photon transfer curve."""
+"""The noise of correlation images, estimated from the images: variance against level, a photon transfer curve."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,7 +9,7 @@ from kernels.errors import ArrayError
 from kernels.tof.continuous import LEAST_PHASES, Noise, weights
 
 BINS = 24
-"""Of equal numbers of pixels, over the level."""
+"""Bins of equal numbers of pixels over the level."""
 LEAST_IN_BIN = 32
 """Readings of a bin; of fewer than three bins no line is drawn, and all noise counts as read noise."""
 LEAST_READ_ELECTRONS = 5.0
@@ -17,7 +17,7 @@ LEAST_READ_ELECTRONS = 5.0
 HIDDEN = 4.0
 """Shot noise of the darkest bin over that read noise, as variances, from which it cannot be seen."""
 CHI_SQUARED_MEDIAN = 0.4549
-"""Of one degree of freedom."""
+"""Median of chi-squared with one degree of freedom."""
 
 
 def estimate_noise(images: np.ndarray, modulation_hz: Sequence[float] | np.ndarray, reference_phase_rad: Sequence[float] | np.ndarray,
@@ -94,7 +94,7 @@ class _Pairs(NamedTuple):
 
 
 def _fit(level: np.ndarray, squared: np.ndarray) -> Noise:
-    """Line through the medians of squared noise over bins of level; neither coefficient below zero."""
+    """Return the line through the medians of squared noise over bins of level; neither coefficient below zero."""
     bins = min(BINS, len(level) // LEAST_IN_BIN)
     if bins < 3:
         return Noise(0.0, float(squared.mean()) ** 0.5)

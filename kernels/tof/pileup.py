@@ -25,7 +25,7 @@ class Exposed(NamedTuple):
 
 
 def place(counts: np.ndarray, device: str) -> wp.array:
-    """Histograms on the device as [bin, pixel] float32, laid out so that the threads of the device read them in order.
+    """Return histograms on the device as [bin, pixel] float32, laid out so that the threads of the device read them in order.
 
     Args:
         counts: [pixel, bin], not negative.
@@ -46,7 +46,7 @@ def place(counts: np.ndarray, device: str) -> wp.array:
 
 
 def correct_pileup(counts: wp.array, *, pulses: int) -> Exposed:
-    """Undo pile-up.
+    """Undo pile-up: return the photons that each bin would have counted.
 
     Of `pulses`, those without a photon in bins before i are left at bin i; of these the counted part q had at least one photon in the
     bin, so that the expected number is -ln(1 - q) a pulse.
@@ -73,7 +73,7 @@ def correct_pileup(counts: wp.array, *, pulses: int) -> Exposed:
 
 
 def unhurried(counts: wp.array) -> Exposed:
-    """Counts of a detector that is always awake."""
+    """Return the counts of a detector that is always awake, as correct_pileup returns them."""
     return Exposed(counts, wp.full(counts.shape, 1.0, dtype=wp.float32, device=counts.device))
 
 

@@ -10,7 +10,7 @@ from kernels.errors import ArrayError
 from kernels.tof.modulation import require_ascending
 
 REACH_SIGMAS = 4.5
-"""Of a Gaussian: 7 in a million of its light lie outside."""
+"""Half width of the table of a Gaussian, in standard deviations: 7 in a million of its light lie outside."""
 STEPS_PER_SIGMA = 24
 STEPS_PER_BIN = 32
 
@@ -30,12 +30,12 @@ class Pulse(NamedTuple):
 
     @property
     def width(self) -> float:
-        """Of the part above half the maximum, in bins."""
+        """Full width at half maximum, in bins."""
         return float(self.step * np.count_nonzero(self.density > 0.5 * self.density.max()))
 
 
 def gaussian(sigma_bins: float) -> Pulse:
-    """A Gaussian pulse.
+    """Return a Gaussian pulse.
 
     Args:
         sigma_bins: standard deviation, in bins, jitter of the detector included.
@@ -54,7 +54,7 @@ def gaussian(sigma_bins: float) -> Pulse:
 
 
 def measured(times_bins: Sequence[float] | np.ndarray, power: Sequence[float] | np.ndarray) -> Pulse:
-    """A pulse from samples of its power; time 0 is that of a return at no distance.
+    """Return a pulse from samples of its power; time 0 is that of a return at no distance.
 
     Args:
         times_bins: [n ≥ 3] ascending times, in bins.

@@ -1,4 +1,4 @@
-"""How wide the pulse is, from the histograms themselves: the Gaussian under which the brightest of them are likeliest."""
+"""The width of the pulse, from the histograms: the Gaussian under which the brightest of them are likeliest."""
 
 import numpy as np
 import warp as wp
@@ -22,7 +22,7 @@ LEAST_SIGMA = 1e-6
 
 
 def estimate_pulse(exposed: Exposed, counts: np.ndarray) -> Pulse:
-    """The Gaussian pulse under which the brightest histograms are likeliest; waits for the device.
+    """Return the Gaussian pulse under which the brightest histograms are likeliest; waits for the device.
 
     Args:
         exposed: of all pixels.

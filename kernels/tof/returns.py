@@ -35,13 +35,13 @@ from kernels.tof.times import peak_reach, return_times
 FALSE_ALARMS = 1e-3
 """Part of the pixels without a return in which one is found."""
 POSITIONS_PER_BIN = 2
-"""Of the search: the refinement starts at most a quarter of a bin away."""
+"""Positions that the search tries in a bin: the refinement starts at most a quarter of a bin away."""
 POSITIONS_PER_WIDTH = 2
 """At least: of a pulse narrower than a bin, light at the edge that tells on which side of the bin it lies must not be missed."""
 LEAST_SHARE = 0.05
-"""Of a return that must fall into the histogram."""
+"""Least part of a return that must fall into the histogram."""
 ROUNDS, ROUNDS_TOGETHER = 2, 8
-"""Of background and refinement, each return in turn: of returns alone, and of returns that overlap and push each other."""
+"""Rounds of background and refinement, each return in turn: for returns alone, and for returns that overlap."""
 LEAST_OUTSIDE = 4
 """Bins without a return that the background is taken from; with fewer it stays at what the search took it for."""
 SCORING_STEPS = 8
@@ -112,7 +112,7 @@ def find_returns(exposed: Exposed, pulse: Pulse, *, most: int = 1, first_bin: fl
 
 
 def threshold(bins: int) -> float:
-    """Evidence that chance reaches in FALSE_ALARMS of the histograms: chi-squared of two degrees of freedom, in any of the bins."""
+    """Return the evidence that chance reaches in FALSE_ALARMS of the histograms: chi-squared with two degrees of freedom in any bin."""
     return float(2 * np.log(bins / FALSE_ALARMS))
 
 

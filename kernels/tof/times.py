@@ -35,7 +35,7 @@ from kernels.tof.pulse import Pulse
 NODES = 4
 """Intervals of a segment of the integral, by Simpson's rule."""
 LONGEST_PART = 0.25
-"""Of one side of the peak: the longest segment. The first is as long as the bound, each next one twice as long."""
+"""Longest segment, as a part of one side of the peak. The first is as long as the bound, each next one twice as long."""
 NEGLIGIBLE = 12.0
 """Log likelihood under the top at which a side of the peak ends: what lies beyond adds a hundred-thousandth."""
 HIGHEST = 30.0
@@ -43,13 +43,13 @@ HIGHEST = 30.0
 STRENGTH_STEPS, SMALL_CHANGE = 6, 0.2
 """Newton steps towards the best strength, and the part of it from which the rest of the likelihood is that of a parabola."""
 LEAST_DETERMINANT = 1e-9
-"""Of two returns' information, in units of their photons: with less, float32 cannot tell what one takes from the other."""
+"""Least determinant of two returns' information, in units of their photons: with less, float32 cannot tell one from the other."""
 
 wp.set_module_options({"enable_backward": False})
 
 
 class Times(NamedTuple):
-    """Of each return; 0 where there is none. On the device."""
+    """Time of each return, on the device; 0 where there is none."""
 
     position: wp.array  # [return, pixel] float32 bins
     sigma: wp.array  # [return, pixel] float32 bins
@@ -57,7 +57,7 @@ class Times(NamedTuple):
 
 def return_times(exposed: Exposed, pulse: Pulse, position: wp.array, photons: wp.array, background: wp.array, *, first_bin: float,
                  last_bin: float) -> Times:
-    """Mean and standard deviation of the time of each return.
+    """Return the mean and the standard deviation of the time of each return.
 
     Args:
         exposed: the histograms.
@@ -86,7 +86,10 @@ def return_times(exposed: Exposed, pulse: Pulse, position: wp.array, photons: wp
 
 @wp.func
 def peak_reach(pulse: Shape):
-    """Bins to each side that belong to a peak: nearer than the width two returns are one, and a narrow pulse may be anywhere in its bin."""
+    """Return the bins to each side of a peak that belong to it.
+
+    Two returns nearer than the width are one, and a narrow pulse may be anywhere in its bin.
+    """
     return 0.5 * pulse.width + 1.0
 
 
@@ -100,8 +103,8 @@ def _slopes(pulse: Shape, i: int, t: float, s: float):
 @wp.func
 def _bounds(given: Recorded, pulse: Shape, k: int, p: int, found: int, b: float,
             position: wp.array2d(dtype=wp.float32), photons: wp.array2d(dtype=wp.float32)):
-    """Of return k: information about its time; how the logarithm of its best strength changes with it; and how much larger the variance is
-    because its nearest neighbour is unknown too."""
+    """Return the information about the time of return k, how the logarithm of its best strength changes with it, and how much larger its
+    variance is because its nearest neighbour is unknown too."""
     t = position[k, p]
     s = photons[k, p]
     near = wp.int32(-1)

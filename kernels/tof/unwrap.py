@@ -70,13 +70,13 @@ def unwrap(found: Correlation, *, nearest_m: float, farthest_m: float, light_spe
 
 
 def floats(values: Any, device: Any) -> wp.array:
-    """A small table on the device, float32."""
+    """Return a small table on the device, float32."""
     return wp.array(np.asarray(values, dtype=np.float32), dtype=wp.float32, device=device)
 
 
 @wp.func
 def decay(x: float):
-    """exp(-x) of 0 … 80, to 3e-7 of it, and exp(-80) beyond: unlike the library's, the same few operations for a whole pack."""
+    """Return exp(-x) for 0…80, to 3e-7 of it, and exp(-80) beyond, without branches, so that a pack becomes SIMD instructions."""
     near = wp.min(x, 80.0)
     halvings = wp.rint(near * 1.44269504)
     y = (halvings * 0.693359375 - near) - halvings * 2.12194440e-4  # ln 2 in two parts, the first product exact; -½ ln 2 … ½ ln 2
@@ -92,7 +92,7 @@ def decay(x: float):
 
 @cache
 def unwrap_kernel(pack: int) -> Any:
-    """The kernel for packs of this many pixels; public for the test that compiles it for CUDA."""
+    """Return the kernel for packs of this many pixels."""
     float_pack = pack_type(pack, wp.float32)
 
     @wp.kernel(enable_backward=False, module="unique")

@@ -15,7 +15,7 @@ SAME_SURFACE = 0.3
 CERTAIN = 1 - 1e-5
 """Probability from which a pixel is not asked again: two rounds multiply the odds of another wrap by at most 1 / STRANGER²."""
 STRANGER = 0.02
-"""Prior of a pixel on a surface that none of its neighbours is on: how far they can outvote what it measured itself."""
+"""Prior of a pixel on a surface that none of its neighbours is on: how far they can outvote its own measurement."""
 
 wp.set_module_options({"enable_backward": False})
 
@@ -35,7 +35,7 @@ def vote(weighed: Hypotheses, rows: int, cols: int) -> Hypotheses:
 
     Source:
         Järemo Lawin, Forssén, Ovrén, "Efficient multi-frequency phase unwrapping using kernel density estimation", ECCV 2016; here
-        as a factor on what the pixel measured itself.
+        as a factor on the pixel's own measurement.
     """
     device, pixels = weighed.range.device, weighed.range.shape[1]
     if not 0 < rows * cols <= pixels:
@@ -51,7 +51,7 @@ def vote(weighed: Hypotheses, rows: int, cols: int) -> Hypotheses:
 
 @wp.func
 def nearness(distance: float, inverse: float):
-    """Of two ranges on one surface: 1 at none, 0 from a radius on (biweight)."""
+    """Return how near two ranges are: 1 where they are equal, 0 from a radius on (biweight)."""
     u = distance * inverse
     v = wp.max(1.0 - u * u, 0.0)
     return v * v

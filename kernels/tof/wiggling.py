@@ -1,4 +1,7 @@
-"""Harmonic (wiggling) correction: a light source that is no pure cosine bends the phase; a table says by how much at each phase."""
+"""Harmonic (wiggling) correction: a light source that is no pure cosine bends the phase; a table says by how much at each phase.
+
+Source: Lindner and Kolb, "Lateral and depth calibration of PMD-distance sensors", ISVC 2006.
+"""
 
 
 import numpy as np
@@ -9,13 +12,13 @@ from kernels.errors import ArrayError
 from kernels.tof.continuous import Correlation
 
 ENTRIES = 512
-"""Of the table on the device: between two, the eighth harmonic of a correction departs from a straight line by less than 0.2 % of it."""
+"""Entries of the table: between two, the eighth harmonic of a correction departs from a straight line by less than 0.2 % of it."""
 
 wp.set_module_options({"enable_backward": False})
 
 
 def sample_harmonics(cosines: np.ndarray, sines: np.ndarray) -> np.ndarray:
-    """Σ_h cosines[h]·cos hφ + sines[h]·sin hφ at ENTRIES phases.
+    """Return Σ_h cosines[h]·cos hφ + sines[h]·sin hφ at ENTRIES phases.
 
     Args:
         cosines, sines: [H] radians, h from 0.
@@ -28,7 +31,7 @@ def sample_harmonics(cosines: np.ndarray, sines: np.ndarray) -> np.ndarray:
 
 
 def straighten(found: Correlation, table: np.ndarray) -> Correlation:
-    """Subtract from each phase what the table has at it.
+    """Correct each phase by the table's value at it.
 
     Args:
         found: phases as measured.

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels import packs
-from kernels.photometric.near import NearField, PixelLights, see_near
+from kernels.photometric.near import NearField, NearLights, see_near
 from kernels.photometric.readings import Lights, Readings, grey_factors, grey_readings
 from kernels.photometric.samples import Samples, gather
 from kernels.status import Status
@@ -37,7 +37,7 @@ class ReadBand(NamedTuple):
     inside: np.ndarray  # [n] bool: which of these pixels are inside the mask
     band: packs.Band
     readings: Readings
-    near: PixelLights | None
+    near: NearLights | None
     """Direction and falloff of each light at each pixel, where some light is near."""
 
 
