@@ -12,14 +12,14 @@ from service.usd.textures import FILE_NAMES, write_textures
 from stage.maps import SurfaceMaps
 
 Progress = Callable[[str, float], None]
-"""Is told what is being done now, and which part of the whole was done before it (0…1)."""
+"""Called with the name of the work that begins and the fraction of the whole that is done, 0…1."""
 
 TEXTURES_START, TEXTURES_END = 0.1, 0.9
-"""Where the textures lie in the whole, as measured for 4000 by 3000 pixels."""
+"""Fractions of the whole at which the textures begin and end, as measured for 4000 by 3000 pixels."""
 
 
 class AssetReport(NamedTuple):
-    """What was written."""
+    """The files and the sizes of an asset."""
 
     path: Path  # the asset
     textures: tuple[Path, ...]  # files beside it; empty for .usdz, which holds them

@@ -1,4 +1,4 @@
-"""A measured depth as USD: a mesh between neighbouring pixels of one surface, or points; with the colours of the scene."""
+"""Writes a measured depth as a USD asset: a mesh between neighbouring pixels of one surface, or points; with the scene's colours."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
+from service.usd.camera import define_camera
 from service.usd.errors import AssetError
 from service.usd.files import check_suffix, write_layer
 from service.usd.mesh import SurfaceMesh, height_mesh, without_faces
 from service.usd.points import define_points, linear_colours, set_display_color
-from service.usd.rig import define_camera
 from service.usd.scene import define_mesh, define_root, hint_extent
 from stage.depth_maps import DepthMaps
 from stage.depth_normals import same_surface
@@ -18,13 +18,13 @@ from stage.maps import SurfaceMaps
 from stage.ply import PointCloud
 
 POINT_WIDTH = 1.5
-"""Of a point, in pixels' footprints: neighbours just overlap, corner to corner."""
+"""Width of a point in footprints of a pixel: neighbouring points just overlap, corner to corner."""
 GREY = 0.5
-"""Linear colour of points whose colour is not known."""
+"""Linear colour where none is known."""
 
 
 def write_depth_points(maps: DepthMaps, cloud: PointCloud | None, path: str | Path, *, name: str) -> None:
-    """Write the measured points.
+    """Write the measured points as a USD asset.
 
     Args:
         maps: a depth; its points are taken where there is no cloud.
@@ -52,7 +52,7 @@ def write_depth_points(maps: DepthMaps, cloud: PointCloud | None, path: str | Pa
 
 
 def write_depth_mesh(maps: DepthMaps, cloud: PointCloud | None, path: str | Path, *, name: str) -> None:
-    """Write a mesh that is not bridged where the depth breaks.
+    """Write a depth as a mesh without faces over steps of the depth.
 
     Args:
         maps: a depth.
@@ -80,7 +80,7 @@ def write_depth_mesh(maps: DepthMaps, cloud: PointCloud | None, path: str | Path
 
 
 def depth_mesh(maps: DepthMaps) -> SurfaceMesh:
-    """Faces between neighbouring pixels; none over a step that is steeper than 80 degrees.
+    """Return faces between neighbouring pixels, without those over a step that is steeper than 80 degrees.
 
     Raises:
         AssetError: there is no face.
@@ -92,7 +92,7 @@ def depth_mesh(maps: DepthMaps) -> SurfaceMesh:
 
 
 def _torn(corners: np.ndarray, mesh: SurfaceMesh, maps: DepthMaps) -> np.ndarray:
-    """[faces] bool: whether nearest and farthest corner cannot lie on one surface; a diagonal apart at the most."""
+    """Return [faces] bool: True where the nearest and the farthest corner, at most a diagonal apart, cannot lie on one surface."""
     if len(corners) == 0:
         return np.zeros(0, dtype=bool)
     return ~same_surface(corners.min(axis=1), corners.max(axis=1), mesh.step * float(np.sqrt(2)), maps.camera)

@@ -1,4 +1,4 @@
-"""maps.exr or depth.exr → a USD asset."""
+"""Exports maps.exr or depth.exr as a USD asset."""
 
 import re
 from pathlib import Path

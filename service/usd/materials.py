@@ -1,4 +1,7 @@
-"""The material: UsdPreviewSurface in its specular workflow, which is the BRDF that the solvers fit."""
+"""The material of an asset: UsdPreviewSurface in its specular workflow, which is the reflectance model that the solvers fit.
+
+Source: OpenUSD, "UsdPreviewSurface Specification": the surface, UsdUVTexture and UsdPrimvarReader.
+"""
 
 from collections.abc import Mapping
 

@@ -48,7 +48,7 @@ class SurfaceMesh(NamedTuple):
 
 
 def height_mesh(maps: SurfaceMaps, *, vertex_budget: int = VERTEX_BUDGET) -> SurfaceMesh:
-    """Turn a height map into a mesh.
+    """Return a height map as a mesh.
 
     Args:
         maps: with `height`; pixels outside the mask, not finite, or not in front of a perspective camera get no vertex.
@@ -88,7 +88,7 @@ def height_mesh(maps: SurfaceMaps, *, vertex_budget: int = VERTEX_BUDGET) -> Sur
 
 
 def without_faces(mesh: SurfaceMesh, torn: np.ndarray) -> SurfaceMesh:
-    """The mesh without some of its faces and the vertices that only they used.
+    """Return the mesh without some of its faces and without the vertices that only these used.
 
     Args:
         torn: [Q + T] bool, quads first.
@@ -111,7 +111,7 @@ def without_faces(mesh: SurfaceMesh, torn: np.ndarray) -> SurfaceMesh:
 
 def face_to_vertex(quad_values: np.ndarray, triangle_values: np.ndarray, quads: np.ndarray, triangles: np.ndarray,
                    vertex_count: int) -> np.ndarray:
-    """Sum a vector per face onto the corners of each face, and give it length one.
+    """Sum a vector for each face onto the face's corners, and normalise the sums.
 
     Args:
         quad_values: [Q, 3]. triangle_values: [T, 3].
@@ -126,7 +126,7 @@ def face_to_vertex(quad_values: np.ndarray, triangle_values: np.ndarray, quads: 
 
 
 def _step(valid: np.ndarray, vertex_budget: int) -> int:
-    """The smallest step whose vertices fit the budget."""
+    """Return the smallest step whose vertices fit the budget."""
     step = max(1, math.isqrt(np.count_nonzero(valid) // vertex_budget))
     while np.count_nonzero(valid[::step, ::step]) > vertex_budget:
         step += 1
@@ -134,7 +134,7 @@ def _step(valid: np.ndarray, vertex_budget: int) -> int:
 
 
 def _faces(valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Quads [Q, 4] and triangles [T, 3] between valid grid points, as flat grid numbers."""
+    """Return quads [Q, 4] and triangles [T, 3] between valid grid points, as flat grid numbers."""
     numbers = np.arange(valid.size).reshape(valid.shape)
 
     def corners(grid: np.ndarray) -> np.ndarray:
@@ -149,7 +149,7 @@ def _faces(valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _normals(points: np.ndarray, quads: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Vertex normals [V, 3] float32: the area vectors of the adjacent faces, summed."""
+    """Return vertex normals [V, 3] float32: the normalised sums of the area vectors of the adjacent faces."""
     p = points.astype(np.float64)
     quad_area = np.cross(p[quads[:, 2]] - p[quads[:, 0]], p[quads[:, 3]] - p[quads[:, 1]])
     triangle_area = np.cross(p[triangles[:, 1]] - p[triangles[:, 0]], p[triangles[:, 2]] - p[triangles[:, 0]])

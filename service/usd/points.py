@@ -1,6 +1,6 @@
 """Point clouds as UsdGeom.Points.
 
-Source: OpenUSD, UsdGeomPoints: widths are diameters in scene units; displayColor is scene-linear.
+Source: OpenUSD, UsdGeomPoints: widths are diameters of the points, in scene units; displayColor is scene-linear.
 """
 
 from pathlib import Path

@@ -1,26 +1,29 @@
-"""The prims of an asset: /Name with Geom/Mesh, Looks/Material and Camera, and what is known about it."""
+"""The prims of an asset: /Name with Geom/Mesh, Looks/Material and Camera, and its metadata.
+
+Source: OpenUSD: UsdModelAPI (kind, names), UsdGeomModelAPI (extentsHint), UsdGeom (axes, units, meshes).
+"""
 
 from collections.abc import Mapping
 
 import numpy as np
 from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdShade, Vt
 
+from service.usd.camera import define_camera
 from service.usd.materials import define_material
 from service.usd.mesh import SurfaceMesh
-from service.usd.rig import define_camera
 from service.usd.textures import Texture
 from stage.camera import Camera
 from stage.maps import SurfaceMaps
 
 UNIT_WITHOUT_SCALE_M = 0.001
-"""A capture without a scale: one pixel is taken as one millimetre, so that the asset has a size one can see."""
+"""Metres of a pixel where the capture has no scale, so that the asset has a visible size."""
 
 SCALE_NOTE = "unknown: the capture gives no scale, so one pixel is taken as one millimetre"
 
 
 def define_asset(usd_stage: Usd.Stage, maps: SurfaceMaps, mesh: SurfaceMesh, textures: Mapping[str, Texture], *,
                  name: str, texture_folder: str) -> None:
-    """Fill an empty stage with the asset.
+    """Define the prims of an asset on an empty USD stage.
 
     Args:
         textures: written beside the layer, in texture_folder ("./…").
@@ -44,7 +47,7 @@ def define_asset(usd_stage: Usd.Stage, maps: SurfaceMaps, mesh: SurfaceMesh, tex
 
 
 def define_root(usd_stage: Usd.Stage, camera: Camera, provenance: Mapping[str, str], *, name: str, unit_m: float) -> UsdGeom.Xform:
-    """Axes, unit, the root prim and what is known about it.
+    """Define axes, unit and the root prim with its metadata, and return that prim.
 
     Args:
         camera: its world_from_camera becomes the root's transform.
@@ -63,13 +66,13 @@ def define_root(usd_stage: Usd.Stage, camera: Camera, provenance: Mapping[str, s
 
 
 def hint_extent(root: UsdGeom.Xform) -> None:
-    """The bounding box of everything below the root, for readers that do not load it."""
+    """Write the bounding box of everything below the root, for readers that do not load it."""
     model = UsdGeom.ModelAPI.Apply(root.GetPrim())
     model.SetExtentsHint(model.ComputeExtentsHint(UsdGeom.BBoxCache(Usd.TimeCode.Default(), [UsdGeom.Tokens.default_])))
 
 
 def _describe(usd_stage: Usd.Stage, root: Usd.Prim, camera: Camera, provenance: Mapping[str, str], name: str) -> None:
-    """What the asset is and where it comes from: kind, names, provenance."""
+    """Write kind, names and provenance."""
     model = Usd.ModelAPI(root)
     model.SetKind(Kind.Tokens.component)
     model.SetAssetName(name)
@@ -85,7 +88,7 @@ def _describe(usd_stage: Usd.Stage, root: Usd.Prim, camera: Camera, provenance: 
 
 
 def define_mesh(usd_stage: Usd.Stage, path: Sdf.Path, mesh: SurfaceMesh) -> UsdGeom.Mesh:
-    """The polygons, their normals and texture coordinates."""
+    """Define the polygons with normals and texture coordinates."""
     usd_mesh = UsdGeom.Mesh.Define(usd_stage, path)
     usd_mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     usd_mesh.CreateDoubleSidedAttr(True)
@@ -102,7 +105,7 @@ def define_mesh(usd_stage: Usd.Stage, path: Sdf.Path, mesh: SurfaceMesh) -> UsdG
 
 
 def _matrix(world_from_camera: tuple[tuple[float, ...], ...], unit_m: float) -> Gf.Matrix4d:
-    """A column-vector transform in metres as USD's row-vector transform in scene units."""
+    """Return a column-vector transform in metres as USD's row-vector transform in scene units."""
     matrix = np.array(world_from_camera, dtype=np.float64)
     matrix[:3, 3] /= unit_m
     return Gf.Matrix4d(*matrix.T.ravel().tolist())

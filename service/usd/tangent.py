@@ -13,14 +13,14 @@ from service.usd.mesh import SurfaceMesh, face_to_vertex
 
 
 class TangentFrame(NamedTuple):
-    """The frame of the mesh at every texel; zero where no vertex is near."""
+    """The tangent frame of the mesh at every texel; zero where no vertex is near."""
 
     tangent: np.ndarray  # [rows, cols, 3] float32, unit, camera frame, towards growing s
     normal: np.ndarray  # [rows, cols, 3] float32, unit, camera frame, the interpolated vertex normal
     covered: np.ndarray  # [rows, cols] bool, True where the frame exists
 
     def express(self, normal: np.ndarray) -> np.ndarray:
-        """Camera-frame normals in tangent space.
+        """Return camera-frame normals in tangent space.
 
         Args:
             normal: [rows, cols, 3] unit, camera frame.
@@ -34,7 +34,7 @@ class TangentFrame(NamedTuple):
 
 
 def tangent_frame(mesh: SurfaceMesh, shape: tuple[int, int]) -> TangentFrame:
-    """The frame that a renderer interpolates over the mesh, at each texel centre.
+    """Return the frame that a renderer interpolates over the mesh, at each texel centre.
 
     Args:
         shape: rows, cols of the texture; that of the height map.
@@ -51,7 +51,7 @@ def tangent_frame(mesh: SurfaceMesh, shape: tuple[int, int]) -> TangentFrame:
 
 
 def vertex_tangents(mesh: SurfaceMesh) -> np.ndarray:
-    """Unit tangents ∂P/∂s of the planar texture coordinates, perpendicular to the vertex normals.
+    """Return unit tangents ∂P/∂s of the planar texture coordinates, perpendicular to the vertex normals.
 
     Returns:
         [V, 3] float32. Each face adds its ∂P/∂s, weighted by its area in the texture.
@@ -72,7 +72,7 @@ def vertex_tangents(mesh: SurfaceMesh) -> np.ndarray:
 
 
 def _spread(values: np.ndarray, mesh: SurfaceMesh, shape: tuple[int, int]) -> np.ndarray:
-    """Vertex values [V, 3] at every pixel, bilinear between the vertices; zero where there is none."""
+    """Return vertex values [V, 3] at every pixel, bilinear between the vertices; zero where no vertex is near."""
     step = mesh.step
     grid = np.zeros((-(-shape[0] // step), -(-shape[1] // step), 3), dtype=np.float32)
     grid[mesh.rows // step, mesh.cols // step] = values
@@ -87,7 +87,7 @@ def _spread(values: np.ndarray, mesh: SurfaceMesh, shape: tuple[int, int]) -> np
 
 
 def _unit(vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vectors of length one, zero where they were zero; and where they were not."""
+    """Return the vectors with length one, or zero where they were zero, and where they were not zero."""
     length = np.linalg.norm(vectors, axis=-1)
     present = length > 0
     return vectors / np.where(present, length, 1)[..., None], present

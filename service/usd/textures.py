@@ -18,7 +18,7 @@ from stage.images import write_png
 from stage.maps import SurfaceMaps
 
 DISPLAY_SPACE = "srgb_rec709_scene"
-"""What UsdUVTexture means by sourceColorSpace sRGB: Rec.709 primaries, the sRGB curve."""
+"""The space that UsdUVTexture calls sRGB in sourceColorSpace: Rec.709 primaries and the sRGB curve."""
 
 BLEED_TEXELS = 8
 """How far colour is bled over the edge of the mask: bilinear filtering stays clean down to the third mip level."""
@@ -33,7 +33,7 @@ FILE_NAMES = tuple(f"{layer}.png" for layer in LAYERS)
 
 
 class Texture(NamedTuple):
-    """One written image, and how a material has to read it."""
+    """A written image, and how a material has to read it."""
 
     file_name: str
     color_space: str  # the UsdUVTexture token: sRGB or raw
@@ -83,7 +83,7 @@ def write_textures(maps: SurfaceMaps, mesh: SurfaceMesh, folder: Path, *,
 
 
 def quantise(values: np.ndarray, known: np.ndarray, dtype: type[np.unsignedinteger]) -> tuple[np.ndarray, int]:
-    """Round 0…1 to the codes of an integer type.
+    """Round values of 0…1 to the codes of an integer type.
 
     Returns:
         codes, as values; and the number of known pixels with a channel more than half a code outside 0…1.
@@ -96,7 +96,7 @@ def quantise(values: np.ndarray, known: np.ndarray, dtype: type[np.unsignedinteg
 
 
 def _to_display(values: np.ndarray, color_space: str) -> np.ndarray:
-    """Colours [rows, cols, 3] of the maps, encoded for the screen; not clipped."""
+    """Return colours [rows, cols, 3] of the maps in the display space; not clipped."""
     try:
         return convert(np.ascontiguousarray(values), color_space, DISPLAY_SPACE)
     except ValueError as error:
@@ -105,7 +105,7 @@ def _to_display(values: np.ndarray, color_space: str) -> np.ndarray:
 
 
 def _tangent_space(normal: np.ndarray, known: np.ndarray, mesh: SurfaceMesh) -> tuple[np.ndarray, np.ndarray]:
-    """Normals [rows, cols, 3] as 0…1 in the tangent space of the mesh, and where they are known."""
+    """Return normals [rows, cols, 3] as 0…1 in the tangent space of the mesh, and where they are known."""
     frame = tangent_frame(mesh, known.shape)
     length = np.linalg.norm(np.where(known[..., None], normal, 0), axis=-1)
     known = known & frame.covered & (length > 0)
@@ -114,15 +114,15 @@ def _tangent_space(normal: np.ndarray, known: np.ndarray, mesh: SurfaceMesh) -> 
 
 
 def bleed(values: np.ndarray, known: np.ndarray, *, reach: int) -> np.ndarray:
-    """Fill unknown texels from their known neighbours, ring by ring; beyond the reach, with the mean.
+    """Fill unknown texels from their known neighbours, ring by ring, so that filtering a texture does not darken its border.
 
     Args:
         values: [rows, cols] or [rows, cols, channels] float32.
         known: [rows, cols] bool; known texels are returned as they are.
-        reach: how many texels far. The mean beyond it is for the coarse mip levels.
+        reach: number of rings; texels beyond get the mean of the known ones, for the coarse mip levels.
 
     Returns:
-        As values. Zero throughout when nothing is known.
+        An array like `values`; zero throughout when nothing is known.
     """
     planes = values[..., None] if values.ndim == 2 else values
     filled = np.pad(np.where(known[..., None], planes, 0), ((1, 1), (1, 1), (0, 0)))
@@ -147,7 +147,7 @@ def bleed(values: np.ndarray, known: np.ndarray, *, reach: int) -> np.ndarray:
 
 
 def _around(texels: np.ndarray, done: np.ndarray, inside: np.ndarray) -> np.ndarray:
-    """The texels [n, 2] of the image that touch these and are not done, each once."""
+    """Return the texels [n, 2] of the image that touch these and are not done, each once."""
     touched = np.zeros_like(done)
     for r, c in _NEIGHBOURS:
         touched[texels[:, 0] + r, texels[:, 1] + c] = True

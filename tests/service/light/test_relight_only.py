@@ -15,14 +15,19 @@ SCENE = make_scene(size=64, lights=12)
 PARTS = ("33-40", "5", "9-16", "1-4", "17-32", "6-8")
 """Of 1-40, out of order, some of one frame, some over the border of a chunk of frames."""
 
+COARSE_PITCH_DEGREES = 4.0
+"""Eight times coarser than maps are cut: to the last bit the same is asked of fewer samples as well."""
+
 
 def digests(folder):
     return {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in files_in(folder)}
 
 
 @pytest.fixture
-def compare(relit, tmp_path):
+def compare(relit, tmp_path, monkeypatch):
     """Relight whole and in parts, each from a capture without caches; the frames and what the parts made of them."""
+    monkeypatch.setattr("kernels.relight.latlong.SAMPLE_PITCH_DEGREES", COARSE_PITCH_DEGREES)
+
     def run(capture, frames, parts, *options):
         whole = relit("relight", capture, "--frames", frames, "--out", tmp_path / "whole" / "a.##.exr", "--cache", tmp_path / "c1",
                       *options)

@@ -1,4 +1,7 @@
-"""The capturing camera as a USD camera, so that a DCC can look at the asset through it."""
+"""The capturing camera as a UsdGeom.Camera, through which a DCC application shows the asset as it was captured.
+
+Source: OpenUSD, UsdGeomCamera: apertures, focal length and their units.
+"""
 
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom
@@ -12,11 +15,11 @@ APERTURE_UNIT = 0.1
 """USD gives focal lengths and apertures in tenths of a scene unit (UsdGeomCamera, "Units of Measure")."""
 
 ORTHOGRAPHIC_CLEARANCE = 0.5
-"""How far in front of the surface an orthographic camera stands, in image widths: it has no place of its own."""
+"""Distance of an orthographic camera from the surface, in image widths; its image does not depend on it."""
 
 
 def define_camera(usd_stage: Usd.Stage, path: Sdf.Path, camera: Camera, extent: np.ndarray) -> UsdGeom.Camera:
-    """Define the camera in the camera frame, framing exactly the image.
+    """Define a camera at the origin of the camera frame whose picture is exactly the image.
 
     Args:
         extent: [2, 3] bounding box of the surface, camera frame, scene units; it sets the clipping range, and where
