@@ -43,9 +43,9 @@ def fifths(error, sigma):
 @pytest.mark.parametrize(("sigma_bins", "background", "low", "high"), [
     (0.8, 0.02, 5, 60), (0.8, 2.0, 12, 100), (0.8, 60.0, 60, 400), (2.0, 0.5, 10, 200), (4.0, 2.0, 30, 300), (0.3, 0.5, 8, 100)])
 def test_sigma_is_the_error_at_low_counts(sigma_bins, background, low, high, device):
-    """In each fifth of the pixels, from those told best to those told worst; the median of 4000 errors scatters by 2 %. With the Fisher
+    """In each fifth of the pixels, from those told best to those told worst; the median of 2400 errors scatters by 2.6 %. With the Fisher
     information, and no more than a bin over √12, sigma was too small up to 2.3 times."""
-    time, counts = draw(log_uniform(low, high), sigma_bins, background, seed=1)
+    time, counts = draw(log_uniform(low, high, 12000), sigma_bins, background, seed=1)
     found = solve(counts, sigma_bins, device)
     error, sigma = found["position"][0] - time, found["sigma"][0]
     right = (found["photons"][0] > 0) & (np.abs(error) < 4 * sigma_bins)
@@ -59,7 +59,7 @@ def test_sigma_is_the_error_at_low_counts(sigma_bins, background, low, high, dev
 @pytest.mark.parametrize("photons", [20.0, 2000.0])
 def test_sigma_is_the_error_of_pulses_that_hide_in_a_bin(sigma_bins, photons, device):
     """Errors are even over what the bin leaves open there, and not normal: RMS alone."""
-    time, counts = draw(np.full(20000, photons), sigma_bins, 0.5, seed=2)
+    time, counts = draw(np.full(12000, photons), sigma_bins, 0.5, seed=2)
     found = solve(counts, sigma_bins, device)
     error, sigma = found["position"][0] - time, found["sigma"][0]
     right = (found["photons"][0] > 0) & (np.abs(error) < 1.5)
@@ -107,18 +107,21 @@ def test_the_posterior_is_that_of_the_twin(sigma_bins, photons, pulses, device):
         assert spread == pytest.approx(sigma, rel=0.05)
 
 
-@pytest.mark.parametrize(("background", "low", "high"), [(0.05, 1, 40), (0.5, 2, 60), (2.0, 3, 80)])
-def test_confidence_is_how_often_the_peak_is_right(background, low, high, device):
-    """Every other pixel has no return: those that are accepted and wrong are as many as confidence says. There are some hundred of
-    them, and how bright returns are is not known beforehand: within a factor of two."""
-    photons = log_uniform(low, high, 200000)
+@pytest.mark.parametrize(("background", "low", "high", "clear", "pixels"), [(0.05, 1, 40, 12, 60000), (0.5, 2, 60, 20, 120000),
+                                                                            (2.0, 3, 80, 30, 150000)])
+def test_confidence_is_how_often_the_peak_is_right(background, low, high, clear, pixels, device):
+    """Every other pixel has no return: those that are accepted and wrong are as many as confidence says. There are 20 of them or more,
+    which scatters by a quarter, and how bright returns are is not known beforehand: within a factor of two. Pixels are solved one by one,
+    and brighter ones than `clear`, which are never wrong, are left out."""
+    photons = log_uniform(low, high, pixels)
     photons[::2] = 0
+    photons = photons[photons < clear]
     time, counts = draw(photons, 0.8, background, seed=6)
     found = solve(counts, 0.8, device)
     accepted = found["photons"][0] > 0
     wrong = accepted & ((photons == 0) | (np.abs(found["position"][0] - time) > 4 * 0.8))
     said = (1 - found["confidence"][0])[accepted].sum()
-    assert wrong.sum() > 30
+    assert wrong.sum() >= 20
     assert 0.5 < said / wrong.sum() < 2
     doubtful = accepted & (found["confidence"][0] < 0.99)
     assert 0.4 < (1 - found["confidence"][0])[doubtful].mean() / wrong[doubtful].mean() < 2.5

@@ -122,15 +122,17 @@ def test_calibration_takes_wiggling_offset_and_drift_out(tmp_path):
 
 
 def test_histograms_pile_up_and_returns(tmp_path):
-    counts = tof.histogram(VIEW, 4000, pulses=3000, background=0.05, seed=2)
-    _, maps, report = run(write(tmp_path / "p", pulsed_frames(counts, pulses=3000, first_photon_only=True)))
-    assert np.median(np.abs(maps.range - VIEW.distance)[maps.mask]) < 0.020
+    view, camera = tof.room(ROWS // 2, COLS // 2), {**CAMERA, "resolution": [COLS // 2, ROWS // 2], "focal_px": [55.0, 55.0]}
+    counts = tof.histogram(view, 4000, pulses=3000, background=0.05, seed=2)
+    _, maps, report = run(write(tmp_path / "p", pulsed_frames(counts, pulses=3000, first_photon_only=True), camera=camera))
+    assert np.median(np.abs(maps.range - view.distance)[maps.mask]) < 0.020
     assert maps.mask.mean() > 0.7
     assert report["found"]["pulse"]["sigma_s"] == pytest.approx(1.2e-9, rel=0.05)
-    near = tof.View(np.clip(VIEW.distance, 0.5, 7), VIEW.albedo, VIEW.cosine)
-    two = write(tmp_path / "q", pulsed_frames(tof.histogram(near, 200000, seed=1, second=(2.0, 0.6))))
-    for which, behind in (("first", 0.0), ("last", 2.0)):
-        _, maps, _ = run(two, which=which)
+    near = tof.View(np.clip(view.distance, 0.5, 7), view.albedo, view.cosine)
+    two = write(tmp_path / "q", pulsed_frames(tof.histogram(near, 200000, seed=1, second=(2.0, 0.6))), camera=camera)
+    write_calibration(TofCalibration(pulse_sigma_s=1.2e-9), tmp_path / "pulse.json")
+    for which, behind, known in (("first", 0.0, {}), ("last", 2.0, {"calibration": tmp_path / "pulse.json"})):
+        _, maps, _ = run(two, which=which, **known)
         assert np.median(np.abs(maps.range - near.distance - behind)[maps.mask]) < 0.02
 
 
