@@ -11,6 +11,7 @@ from service.depth.projection import make_patterns, make_plan
 from service.requests.patterns import PatternCode, PatternsRequest, PlanRequest
 from stage.manifest import Frame
 from stage.patterns.codes import collect, draw
+from tests.service.recording import Recording
 
 SIZE = (96, 40)
 
@@ -63,24 +64,10 @@ def test_every_code_has_a_row_and_the_planner_knows_its_cost():
     assert make_plan(PlanRequest(projector=(1280, 800)))[0].depth_sigma_m is None
 
 
-class Told:
-    """A Progress that remembers what it was told."""
-
-    def __init__(self) -> None:
-        self.stages: list[tuple[str, int]] = []
-        self.done: list[int] = []
-
-    def stage(self, name: str, total: int) -> None:
-        self.stages.append((name, total))
-
-    def advance(self, done: int) -> None:
-        self.done.append(done)
-
-
 def test_progress_counts_the_images(tmp_path):
-    told = Told()
+    told = Recording()
     result = make_patterns(PatternsRequest(code=PatternCode.RAMP, projector=SIZE, out=tmp_path), told)
-    assert told.stages == [("draw", len(result.images))] and told.done == list(range(1, len(result.images) + 1))
+    assert told.stages == [("draw", len(result.images), list(range(1, len(result.images) + 1)))]
 
 
 def test_plan_and_images_at_once(relit, tmp_path):
