@@ -1,7 +1,7 @@
-"""One table from what can go wrong to what a person is told.
+"""The errors whose text is a sentence for the person who asked, and the line that is shown for each.
 
-RequestError       a request asks for something that cannot be (frames backwards, a pattern without ####); names the option
-ValidationError    pydantic's: a value of a request cannot be; names the field
+RequestError       a request asks for something impossible (frames that run backwards, a name without ####); names the option
+ValidationError    pydantic's: a field of a request has an invalid value; names the field
 """
 
 from pydantic import ValidationError
@@ -13,7 +13,7 @@ from stage.records import describe
 
 
 class RequestError(ValueError):
-    """A request is wrong: the message names the option."""
+    """A request asks for something impossible; the message names the option."""
 
 
 USER_ERRORS: tuple[type[Exception], ...] = (RequestError, ValidationError, StageError, KernelError, AssetError)
@@ -21,7 +21,10 @@ USER_ERRORS: tuple[type[Exception], ...] = (RequestError, ValidationError, Stage
 
 
 def sentence(error: BaseException) -> str:
-    """The one line to show: names of files and fields come into it as others wrote them, so what is not plain text is escaped."""
+    """Return the line to show for an error.
+
+    Names of files and fields stand in it as others wrote them, so characters that cannot be printed are escaped.
+    """
     if isinstance(error, ValidationError):
         raised = (fault.get("ctx", {}).get("error") for fault in error.errors())
         text = next((str(found) for found in raised if isinstance(found, RequestError)), None) or describe(error)

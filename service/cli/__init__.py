@@ -1,1 +1,1 @@
-"""The command line: one file a group of commands. Heavy imports happen inside commands, so that start-up stays short."""
+"""The command line, one module for each group of commands. Heavy imports stand inside commands, so that the program starts fast."""

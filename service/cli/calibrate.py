@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from service.calibrate.results import Calibration
 
 LIGHT_ROWS = 12
-"""Lights that the table shows; the report holds all."""
+"""The number of lights that the table shows; the report holds all."""
 VIEW_ROWS = 40
-"""Views that the table shows; the report holds all."""
+"""The number of views that the table shows; the report holds all."""
 
 
 def register(app: typer.Typer) -> None:

@@ -1,4 +1,4 @@
-"""relit import, relit info: captures in."""
+"""relit import and relit info: make a capture of data laid out another way, and look at one."""
 
 from pathlib import Path
 from typing import Annotated

@@ -10,7 +10,7 @@ from service.cli.request_commands import local_command
 from service.requests.demo import BenchRequest, DemoRequest
 
 SERVICE = "service"
-"""Folder of the service, in that of the demo."""
+"""The folder of the demo's service, inside the folder of the demo."""
 
 ServeOption = Annotated[bool, typer.Option("--serve", help="Then open the service on it, for this machine alone.")]
 

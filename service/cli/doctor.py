@@ -1,4 +1,4 @@
-"""relit doctor: is this installation sound?"""
+"""relit doctor: check this installation."""
 
 from pathlib import Path
 from typing import Annotated
@@ -63,7 +63,7 @@ def doctor(only: DoctorDevice = None, data: DataOption = None, config: ConfigOpt
 
 
 def _service(data: Path | None, config: Path | None) -> list[str]:
-    """Look at the service, where there is one; what is wrong."""
+    """Check the service, where there is one; return what is wrong."""
     settings = settings_of(config, data=data)
     if data is None and config is None and not settings.data.is_dir():
         return []

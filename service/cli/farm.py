@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from service.farm.template import Job
 
 CHUNK_FRAMES = 32
-"""As many as one product makes (service.light.combine): with fewer the images are read more often."""
+"""Default for the frames of a task: as many as one product makes (service.light.combine); with fewer, images are read more often."""
 
 JobOption = Annotated[Path, typer.Option(
     "--job", metavar="FILE.yaml|DIR", show_default=False,

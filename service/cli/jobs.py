@@ -1,4 +1,4 @@
-"""relit jobs: the jobs of a service, looked at and steered."""
+"""relit jobs: list, show, wait for, cancel, retry and resume the jobs of a service, and fetch their results."""
 
 from collections.abc import Callable
 from datetime import datetime

@@ -69,7 +69,7 @@ def revoke(
 
 
 def _open(settings: Any) -> Any:
-    """The database of a service that is there: a wrong --data makes none."""
+    """Open the database of an existing service; a wrong --data makes no new one."""
     from service.errors import RequestError
     from service.server.database.engine import create as create_tables
     from service.server.database.engine import open_database

@@ -1,4 +1,4 @@
-"""relit relight, relit shade: new light on captures and on solved maps."""
+"""relit relight and relit shade: pictures of captures and of solved maps under new light."""
 
 import typer
 

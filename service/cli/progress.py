@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 COUNTED = ("frames", "shade")
-"""Stages that the percentage of a farm counts: the others are short, or come once."""
+"""The stages that count for the percentage of a farm; the others are short."""
 
 
 class ProgressStyle(Choice):

@@ -34,9 +34,9 @@ from service.requests.base import Options, Role
 from service.requests.options import Model, Option, build, help_text, options_of, typed
 
 ORDER = (Role.INPUT, Role.OUTPUT, Role.CHOICE, Role.RUN, Role.MACHINE)
-"""In which the help lists options."""
+"""The order in which the help lists options."""
 READ_BY_TYPER = (bool, int, float, Path, Enum)
-"""Types that Typer reads; anything else is a text that the model takes apart."""
+"""The types that Typer reads; anything else is a text that the model parses."""
 
 
 def _known(name: str | None) -> str | None:
@@ -54,10 +54,10 @@ HostOption = Annotated[str | None, typer.Option(
 
 
 class Given(Generic[Model]):
-    """What was typed for the options of a model; what was left out is not in it."""
+    """The values that were typed for the options of a model, without those that were left out."""
 
     def __init__(self, model: type[Model], values: Mapping[str, Any]) -> None:
-        """Args: model: the model; values: by the names of its options."""
+        """Keep values by the names of the options of a model."""
         self.model, self.values = model, dict(values)
 
     def build(self, **changes: Any) -> Model:

@@ -1,4 +1,4 @@
-"""relit serve and relit worker: the service, and a worker beside it."""
+"""relit serve and relit worker: run the service, or a worker on another machine."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -28,7 +28,7 @@ def serve(
         "--device", help="A worker on this device, again for more; none: no worker. Without it every GPU, else the CPU.",
         show_default=False)] = None,
 ) -> None:
-    """The service: the API, and a worker on each device."""
+    """Run the service: the API, and a worker on each device."""
     from service.server.serve import serve as run
 
     run(settings_of(config, data=data, host=host, port=port, anonymous=anonymous, devices=tuple(device) if device else None))
@@ -40,14 +40,14 @@ def worker(
     data: DataOption = None,
     config: ConfigOption = None,
 ) -> None:
-    """A worker more, on any machine that sees the database and the storage."""
+    """Run one more worker, on any machine that sees the database and the storage."""
     from service.server.serve import work as run
 
     run(settings_of(config, data=data), device)
 
 
 def settings_of(config: Path | None, **given: Any) -> Any:
-    """The settings, with what was given on the command line."""
+    """Return the settings, with what was given on the command line."""
     from service.server.settings import Settings
 
     return Settings(config=config, **{name: value for name, value in given.items() if value is not None})  # type: ignore[call-arg]

@@ -1,4 +1,4 @@
-"""Options of the commands that speak with a service, declared once."""
+"""The options of the commands that speak with a service, and the client that they use."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,7 +24,7 @@ CancelOption = Annotated[bool, typer.Option(
 
 @contextmanager
 def connected(server: str, key: str | None) -> "Iterator[Client]":
-    """A client; its errors become one sentence and exit code 2.
+    """Yield a client whose errors become one sentence and exit code 2.
 
     Raises:
         RequestError: the service says no, or does not answer.

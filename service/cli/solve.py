@@ -1,4 +1,4 @@
-"""relit solve, relit basis, relit export: from a capture to maps or coefficient images, and from results to an asset."""
+"""relit solve, relit basis and relit export: maps or coefficient images of a capture, and USD assets of results."""
 
 import typer
 

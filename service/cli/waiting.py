@@ -1,4 +1,4 @@
-"""Waiting for a job of a service, on a terminal."""
+"""What `relit submit` and `relit jobs` do after a job was handed in: wait for it, and fetch its results."""
 
 import sys
 from pathlib import Path

@@ -12,7 +12,7 @@ from service.requests.relight import RelightRequest
 from service.requests.shade import ShadeRequest
 
 MOST_TURNS = 1024
-"""Values of a task's parameter, by the specification."""
+"""The specification's limit on the values of a task's parameter."""
 
 
 def relight_job(request: RelightRequest, *, chunk_frames: int, gpu: bool) -> Job:

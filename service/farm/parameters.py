@@ -1,4 +1,4 @@
-"""Parameters of a job: what is asked of whoever submits it, and the values that this program was given for them.
+"""The parameters of a job: what the person who submits it may change, with the values that this program was given.
 
 Texts that a person chose are always parameters. A template is a form in which {{…}} is filled in, and a parameter's value is not looked
 through again; so no path or name, whatever is in it, is taken for anything else. No shell reads them either.
@@ -13,17 +13,17 @@ from service.requests.base import Request, Role
 from service.requests.options import Option, help_text, typed, values_of
 
 LONGEST = 1024
-"""Characters of a value, by the specification."""
+"""The specification's limit on the characters of a value."""
 
 
 class Parameters:
-    """Parameters in the order in which they are asked for. Each method adds one and returns what stands for its value in the template."""
+    """Parameters in the order of the template. Each method adds one and returns the text that stands for its value there."""
 
     def __init__(self) -> None:
-        """None yet."""
+        """Begin without parameters."""
         self.definitions: list[Mapping[str, Any]] = []
         self.values: dict[str, str] = {}
-        """Of the parameters that have no default."""
+        """The values of the parameters that have no default."""
 
     def text(self, name: str, value: str, about: str) -> str:
         """Add a text with a default."""

@@ -14,13 +14,13 @@ from service.requests.base import Request
 from stage.files import write_text
 
 NOTICE_S = 60
-"""Between the signal that asks a task to end and the one that kills it: the frames that are being written are finished."""
+"""Seconds between the signal that asks a task to end and the signal that kills it, in which frames that are being written are finished."""
 LONGEST_NAME = 128
 TEMPLATE_SUFFIXES = (".yaml", ".yml")
 
 
 class Job(NamedTuple):
-    """A template, and values for those of its parameters that have no default."""
+    """A template, with values for its parameters that have no default."""
 
     template: Mapping[str, Any]
     values: Mapping[str, str]
@@ -68,7 +68,7 @@ def job(command: str, subject: Path, words: list[str], request: Request, given: 
 
 
 def write_job(made: Job, where: Path) -> JobFiles:
-    """Write a job.
+    """Write the template of a job and its values.
 
     Args:
         made: the job.

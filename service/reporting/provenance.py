@@ -1,4 +1,4 @@
-"""Where a result came from: the same few lines in every EXR, USD file and report."""
+"""Provenance: the attributes in EXR and USD files that say what a result was made from, and the text of reports."""
 
 import json
 import platform
@@ -10,11 +10,11 @@ from service.requests.base import Options, Role
 from service.requests.options import role_of
 
 REPORTED = ("relit", "warp-lang", "numpy", "OpenEXR", "OpenImageIO", "opencv-python-headless", "usd-core")
-"""Distributions whose versions a report names."""
+"""The distributions whose versions a report names."""
 
 
 def versions() -> dict[str, str]:
-    """Versions of this program and of what its results depend on."""
+    """Return the versions of this program and of the libraries that its results depend on."""
     found = {"python": platform.python_version()}
     for name in REPORTED:
         try:
@@ -25,7 +25,7 @@ def versions() -> dict[str, str]:
 
 
 def metadata(request: Options, *, capture: str, inputs: str, method: str | None = None, near_lights: int = 0) -> dict[str, str]:
-    """String attributes for result files. Nothing in them changes between two runs on the same inputs.
+    """Return string attributes for result files. They are equal for two runs on the same inputs.
 
     Args:
         request: what was asked; paths and device are left out, so that results do not depend on where they were made, and so is
@@ -53,5 +53,5 @@ def _choices(request: Options) -> dict[str, Any]:
 
 
 def report(**sections: Any) -> str:
-    """The text of a report.json: the sections in the order given, then software versions."""
+    """Return the text of a report.json: the sections in the order given, then software versions."""
     return json.dumps({"schema": "relit.report/1", **sections, "versions": versions()}, indent=2) + "\n"

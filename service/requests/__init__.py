@@ -1,1 +1,1 @@
-"""What can be asked of Relit: one frozen model a job, the same for the command line, the API, the farm and the provenance record."""
+"""What can be asked of Relit: one frozen model for each kind of work, of which the command line, the API and farm templates are made."""

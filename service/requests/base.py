@@ -9,7 +9,9 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict
+from pydantic import BaseModel, BeforeValidator, ConfigDict, GetJsonSchemaHandler
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema
 
 
 def _split_commas(given: Any) -> Any:
@@ -30,9 +32,9 @@ def _sides(given: Any) -> Any:
 
 
 Commas = BeforeValidator(_split_commas)
-"""Of a tuple: several values may be given as one text with commas between."""
+"""Marks a tuple whose values may be given as one text with commas between."""
 WidthHeight = BeforeValidator(_sides)
-"""Of two numbers: they may be given as one text with an x between."""
+"""Marks two numbers that may be given as one text with an x between."""
 
 
 class Role(StrEnum):
@@ -55,13 +57,13 @@ class Spelling:
     """How an option is typed, where the rule does not say it."""
 
     flag: str | None = None
-    """In place of the field's name, such as --filter."""
+    """The flag, such as --filter, where it does not follow from the field's name."""
     off: str | None = None
     """The flag that turns a switch off, in place of --no-…."""
     metavar: str | None = None
-    """What stands for the value in the help."""
+    """The word that stands for the value in the help."""
     argument: bool = False
-    """Given by its place, without a flag."""
+    """Whether the value is given by its place, without a flag."""
 
 
 class Choice(StrEnum):
@@ -70,7 +72,7 @@ class Choice(StrEnum):
     words: str
 
     def __new__(cls, value: str, words: str = "") -> Self:
-        """Make a value with its words; none where the value says enough."""
+        """Make a value with the words that explain it; none where the value says enough."""
         member = str.__new__(cls, value)
         member._value_ = value
         member.words = words
@@ -81,9 +83,17 @@ class Choice(StrEnum):
         """Return the values that have words, with them, as one line."""
         return "; ".join(f"{member}: {member.words}" for member in cls if member.words)
 
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        """Return the JSON schema of the set, which explains its values too."""
+        schema = handler.resolve_ref_schema(handler(core))
+        if explained := cls.explained():
+            schema["description"] = f"{schema.get('description', '')} {explained}.".strip()
+        return schema
+
 
 class Options(BaseModel):
-    """Base of every model: what is not known is refused."""
+    """Base of every model; unknown fields are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
@@ -103,7 +113,7 @@ class Request(DeviceRequest):
 
 
 class StackOptions(Options):
-    """About the images of a capture."""
+    """How the images of a capture are aligned."""
 
     align: bool = False
     """The subject moves: warp every frame to the time of the middle tracking frame (light type full). The mask belongs to that time."""
@@ -112,5 +122,5 @@ class StackOptions(Options):
 
     @property
     def aligned(self) -> bool:
-        """Whether frames are warped."""
+        """Return whether frames are warped."""
         return self.align or self.align_to is not None

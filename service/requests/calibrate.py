@@ -1,4 +1,4 @@
-"""What `relit calibrate` takes: one frozen model a kind."""
+"""What `relit calibrate` takes: one frozen model for each kind."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,7 +17,7 @@ IMAGES = Spelling(argument=True, metavar="IMAGE...")
 
 
 class Circle(Options):
-    """The outline of a ball, typed."""
+    """The outline of a ball in the image."""
 
     u: Finite
     v: Finite

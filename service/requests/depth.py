@@ -52,7 +52,7 @@ class TofChoices(Options):
 
 
 class TofOptions(TofChoices):
-    """The same, with the camera's calibration."""
+    """How time of flight is solved, with the camera's calibration."""
 
     calibration: Annotated[Path | None, Role.INPUT, Spelling(flag="--tof-calibration")] = None
     """Noise, wiggling, offset, drift and pulse of a time-of-flight camera: a relit.tof/1 file; None: noise and pulse are estimated from
@@ -60,7 +60,7 @@ class TofOptions(TofChoices):
 
 
 class DepthOptions(Options):
-    """How depth is decoded and which of it is kept."""
+    """How depth is decoded, and which depths are kept."""
 
     using: Ranging | None = None
     """Which frames, where a capture holds several kinds; None: those that there are."""
@@ -77,7 +77,7 @@ class DepthOptions(Options):
     photon_gain: NotNegative = 1e-4
     """Photon noise: full scale over the electrons that fill a pixel; patterns only."""
     tof: TofChoices = TofChoices()
-    """Of time of flight; `near_m` and `far_m` are ranges along the ray there."""
+    """How time of flight is solved; `near_m` and `far_m` are ranges along the ray there."""
     normals: bool = False
     """Write nx ny nz into points.ply too."""
 
@@ -90,4 +90,4 @@ class DepthRequest(DepthOptions, Request):
     out: Annotated[Path, Role.OUTPUT]
     """Folder for depth.exr, points.ply and report.json."""
     tof: TofOptions = TofOptions()
-    """Of time of flight, with the camera's calibration; `near_m` and `far_m` are ranges along the ray there."""
+    """How time of flight is solved, with the camera's calibration; `near_m` and `far_m` are ranges along the ray there."""

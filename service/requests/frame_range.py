@@ -5,11 +5,11 @@ import re
 from service.errors import RequestError
 
 MAX_FRAMES = 100_000
-"""Over an hour of film; more is a slip of the finger that would fill the memory before the first frame."""
+"""The largest number of frames in one run, over an hour of film: more would fill the memory before the first frame."""
 
 
 def frame_numbers(text: str | None, steps: int) -> list[int]:
-    """`7` or `1-24` as numbers.
+    """Return the numbers of `7` or `1-24`.
 
     Args:
         text: None: 1, or 1 to the number of steps.
@@ -29,7 +29,7 @@ def frame_numbers(text: str | None, steps: int) -> list[int]:
 
 
 def part_of(numbers: list[int], text: str) -> range:
-    """A part of a range of frames, in the same form.
+    """Return the numbers of a part of a range of frames, given in the same form.
 
     Args:
         numbers: of the whole range, one after the other.

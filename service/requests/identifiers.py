@@ -1,4 +1,4 @@
-"""Identifiers of what the service keeps: a prefix that says what it is, and 20 random letters and digits."""
+"""Identifiers of captures, environments, uploads, jobs and keys: a prefix, and 20 random letters and digits."""
 
 import secrets
 from typing import Annotated
@@ -14,12 +14,12 @@ CAPTURE, ENVIRONMENT, UPLOAD, JOB, KEY = "cap", "env", "up", "job", "key"
 
 
 def new_id(prefix: str) -> str:
-    """A new identifier: 100 random bits."""
+    """Return a new identifier: a prefix and 100 random bits."""
     return f"{prefix}_" + "".join(secrets.choice(ALPHABET) for _ in range(LENGTH))
 
 
 def pattern(prefix: str) -> str:
-    """The regular expression of the identifiers with a prefix."""
+    """Return the regular expression of the identifiers with a prefix."""
     return f"^{prefix}_[{ALPHABET}]{{{LENGTH}}}$"
 
 

@@ -1,4 +1,4 @@
-"""What a job of the service is asked: options as on the command line, and names of captures and jobs in place of paths."""
+"""The jobs of the service: options as on the command line, with identifiers of captures and jobs in place of paths."""
 
 from typing import Annotated, Literal
 
@@ -15,7 +15,7 @@ from service.requests.solve import SolveOptions
 
 DEFAULT_PORT = 8470
 DEFAULT_SERVER = f"http://127.0.0.1:{DEFAULT_PORT}"
-"""Where a service is looked for that nothing else is said about."""
+"""The address at which a client looks for the service if it is given no other."""
 
 CAPTURE = Spelling(argument=True, metavar="CAPTURE")
 MAPS = Spelling(argument=True, metavar="JOB")
@@ -120,6 +120,6 @@ class PipelineJob(JobRequest):
 
 
 UserJob = Annotated[SolveJob | DepthJob | RelightJob | ShadeJob | ExportJob | PipelineJob, Field(discriminator="kind")]
-"""What may be asked for through the API."""
+"""Every kind of job that the API accepts."""
 AnyJob = Annotated[CheckJob | SolveJob | DepthJob | RelightJob | ShadeJob | ExportJob | PipelineJob, Field(discriminator="kind")]
 ANY_JOB: TypeAdapter[CheckJob | SolveJob | DepthJob | RelightJob | ShadeJob | ExportJob | PipelineJob] = TypeAdapter(AnyJob)

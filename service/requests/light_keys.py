@@ -1,4 +1,4 @@
-"""Light keys: lights, environment, captured images and exposure animated by a small JSON (schema relit.keys/1, docs/relight.md)."""
+"""Light keys: a JSON file that animates lights, environment, captured images and exposure (schema relit.keys/1, docs/relight.md)."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -16,10 +16,10 @@ SCHEMA = "relit.keys/1"
 SUN_DEGREES = 0.53
 """Angular diameter of the sun, and the default of UsdLux DistantLight."""
 OPPOSITE = -1 + 1e-6
-"""Cosine of two directions between which no shortest way can be told: within 0.1 degrees of opposite."""
+"""Two directions whose cosine is below this are opposite within 0.1 degrees: there is no one shortest way between them."""
 
 LAST_FRAME = 999_999_999
-"""As large as the number of a frame may be."""
+"""The largest number of a frame."""
 Stops = Annotated[float, Field(ge=-MAX_STOPS, le=MAX_STOPS)]
 
 
@@ -32,21 +32,21 @@ class Key(Strict):
 
 
 class EnvironmentKey(Key):
-    """How the map stands: turned about an axis by the right-hand rule (about +y: from +z towards +x)."""
+    """The turn of the environment map about an axis by the right-hand rule (about +y: from +z towards +x), and its exposure."""
 
     turn_degrees: float = 0.0
     axis: Direction = (0.0, 1.0, 0.0)
     exposure: Stops = 0.0
-    """Stops, of the environment alone."""
+    """Stops, for the environment alone."""
 
 
 class LightKey(Key):
-    """A far disc of even radiance."""
+    """A distant disc of even radiance."""
 
     direction: Direction
     """From the surface to the middle of the disc, camera frame."""
     irradiance: Rgb
-    """On a surface that faces it, in the unit of the captured lights."""
+    """Irradiance on a surface that faces the light, in the unit of the captured lights."""
     angle_degrees: Annotated[float, Field(ge=0, le=180)] = SUN_DEGREES
     """Diameter of the disc as seen from the object."""
 
@@ -58,7 +58,7 @@ class WeightKey(Key):
 
 
 class ExposureKey(Key):
-    """Of the whole frame, beside --exposure."""
+    """The exposure of the whole frame, added to --exposure."""
 
     stops: Stops
 
@@ -105,7 +105,7 @@ class LightTrack(Strict):
 
     name: Text
     color_space: Annotated[ColorSpaceName, AfterValidator(_linear)] = "lin_rec709_scene"
-    """Of its irradiance."""
+    """The colour space of the irradiance."""
     keys: Annotated[tuple[LightKey, ...], Some, FirstFault, InOrder, AfterValidator(_ways)]
 
 
@@ -117,11 +117,11 @@ class CapturedTrack(Strict):
 
 
 class LightKeys(Strict):
-    """Everything a light-key file says."""
+    """The content of a light-key file."""
 
     schema_: Literal["relit.keys/1"] = Field(alias="schema")
     frames_per_second: Positive | None = None
-    """For the reader of the frames: keys stand at frame numbers."""
+    """Frames per second, for whoever plays the frames: keys stand at frame numbers."""
     environment: Annotated[tuple[EnvironmentKey, ...], FirstFault, InOrder, AfterValidator(_axes)] = ()
     lights: Annotated[tuple[LightTrack, ...], FirstFault] = ()
     captured: Annotated[tuple[CapturedTrack, ...], FirstFault] = ()

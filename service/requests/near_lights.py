@@ -1,4 +1,4 @@
-"""Lights near a surface as a person gives them: numbers with commas between, or the same by name in JSON."""
+"""Point, sphere and rectangle lights near a surface, given as numbers with commas between or by name in JSON."""
 
 from typing import Annotated, Any, NamedTuple, Self
 
@@ -10,7 +10,7 @@ RIGHT_ANGLE = 1e-3
 
 
 BRIGHTEST = 1e15
-"""Of any light: brighter by far than half can show, and safe from overflow."""
+"""The largest value of a light: far brighter than half can show, and safe from overflow."""
 
 
 class _Member(NamedTuple):
@@ -35,10 +35,10 @@ class PointLight(_NearLight):
     """A point light: irradiance = intensity · cos^anisotropy / distance²."""
 
     position_m: Vector
-    """In the camera frame; in pixels where the maps have no scale."""
+    """Position in the camera frame, in metres; in pixels where the maps have no scale."""
     intensity: Light
     axis: Vector | None = None
-    """The way it shines; None: evenly."""
+    """Direction in which it shines; None: evenly in all."""
     anisotropy: float = Field(default=0.0, ge=0)
     """Exponent of the cosine about the axis."""
 
@@ -64,7 +64,7 @@ class RectangleLight(_NearLight):
 
     center_m: Vector
     edge_u_m: Vector
-    """The whole edge."""
+    """Vector from one end of the edge to the other."""
     edge_v_m: Vector
     radiance: Light
 
@@ -78,7 +78,7 @@ class RectangleLight(_NearLight):
 
 
 def _read(form: str, parts: tuple[_Member, ...], optional: int = 0) -> Any:
-    """Take text `a,b,c,…` apart; lists of JSON become tuples."""
+    """Return a validator that reads `a,b,c,…`; lists of JSON become tuples."""
     whole, least = sum(part.numbers for part in parts), sum(part.numbers for part in parts[: len(parts) - optional])
 
     def read(given: Any) -> Any:

@@ -25,15 +25,15 @@ Model = TypeVar("Model", bound=Options)
 
 
 class Option(NamedTuple):
-    """One option."""
+    """An option, as a field of a model declares it."""
 
     name: str
-    """Of the parameter: the field's, or what its flag says."""
+    """Name of the parameter: that of the field, or of its flag."""
     field: FieldInfo
     kind: Any
     """The type of the value, without None and constraints."""
     constraints: tuple[Any, ...]
-    """What the value must fulfil, and what reads it."""
+    """The limits and validators of the value."""
     role: Role
     spelling: Spelling
 

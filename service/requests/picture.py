@@ -1,4 +1,4 @@
-"""What every command that writes pictures under new light takes."""
+"""What all requests for pictures under new light have in common."""
 
 from typing import Annotated
 
@@ -8,11 +8,11 @@ from service.requests.base import Choice, Commas, Options, Spelling
 from stage.model import FirstFault
 
 MAX_STOPS = 32.0
-"""Of exposure either way: more than half has from its smallest value to its largest."""
+"""The largest exposure, up or down: more than half has between its smallest and its largest value."""
 
 
 class Layer(Choice):
-    """What a relit frame may carry."""
+    """A layer of a relit frame."""
 
     BEAUTY = "beauty", "the relit image, always there"
     DIFFUSE = "diffuse", "the same without the specular layer"

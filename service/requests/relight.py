@@ -52,5 +52,5 @@ class RelightRequest(RelightOptions, Request):
 
     @property
     def weighting(self) -> LightWeights:
-        """The weights that are used."""
+        """Return the weights that are used."""
         return self.weights or (LightWeights.CELLS if self.maps is None else LightWeights.SMOOTH)

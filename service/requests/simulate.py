@@ -1,4 +1,4 @@
-"""What `relit simulate` takes: one frozen model a kind of camera."""
+"""What `relit simulate` takes: one frozen model for each kind of camera."""
 
 from pathlib import Path
 from typing import Annotated
@@ -12,7 +12,7 @@ NotBelow0 = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 class SimulateRequest(Options):
-    """Base: the scene, and where to put the capture."""
+    """The scene, and where to write the capture."""
 
     depth: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="DEPTH")]
     """A depth.exr, or its folder: the scene and its camera."""
@@ -23,7 +23,7 @@ class SimulateRequest(Options):
     seed: int = 0
     """Seed of the noise."""
     noise: bool = True
-    """Shot and read noise."""
+    """Add shot and read noise."""
 
 
 class SimulateCwRequest(SimulateRequest):

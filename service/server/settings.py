@@ -17,6 +17,7 @@ from pydantic import AfterValidator, Field, model_validator
 from pydantic_settings import BaseSettings, InitSettingsSource, NoDecode, PydanticBaseSettingsSource, SettingsConfigDict
 
 from service.errors import RequestError
+from service.requests.jobs import DEFAULT_PORT
 
 Count = Annotated[int, Field(ge=1)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -54,7 +55,7 @@ class Settings(BaseSettings):
     """What copies of objects of `storage_url` may take in the data folder of each machine, beside those that are in use."""
     host: str = "127.0.0.1"
     """Address that the API listens on."""
-    port: Annotated[int, Field(ge=0, le=65535)] = 8470
+    port: Annotated[int, Field(ge=0, le=65535)] = DEFAULT_PORT
     """Port that the API listens on; 0 takes a free one."""
     anonymous: bool = False
     """Let requests without a key work in the project `default`; on loopback addresses alone."""

@@ -230,7 +230,7 @@ def nothing(cap: Path) -> None:
 
 BAD = {
     "more coefficients than lights": (nothing, "b.exr", ["--count", "10"], "--count 10: ", "capture.json has 9 lights: give 1 to 9"),
-    "no coefficients": (nothing, "b.exr", ["--count", "0"], "--count", "greater than or equal to 1"),
+    "no coefficients": (nothing, "b.exr", ["--count", "0"], "count: is 0", "greater than or equal to 1"),
     "a suffix of no kind": (nothing, "b.png", [], "b.png: end the name in .exr", ""),
     "no suffix": (nothing, "b", [], "b: end the name in .exr", ""),
     "the suffix of another kind": (nothing, "b.exr", ["--kind", "hsh"], "b.exr: end the name in .rti for --kind hsh", ""),
