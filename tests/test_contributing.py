@@ -1,0 +1,35 @@
+"""CONTRIBUTING.md leads through the code as it is."""
+
+import re
+
+import pytest
+
+from tests.test_architecture import HOME, IMPORTS, module_name
+
+TEXT = (HOME / "CONTRIBUTING.md").read_text(encoding="utf-8")
+WAYS = {title: re.findall(r"^\d\. `([^`]+)`( \(another process\))?", body, re.MULTILINE)
+        for title, body in re.findall(r"^\*\*([^*]+)\*\*: .*\n\n((?:\d\. .*\n)+)", TEXT, re.MULTILINE)}
+MOST_FILES = 8
+"""Of a way: more is not seen at once."""
+
+
+def test_the_ways_are_read():
+    assert list(WAYS) == ["Solve", "Relight with maps", "Depth", "A job of the service", "Export"]
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_way_is_short_and_each_file_is_reached_from_one_before_it(way):
+    files = WAYS[way]
+    assert 2 < len(files) <= MOST_FILES
+    reached: set[str] = set()
+    for number, (file, another_process) in enumerate(files):
+        assert (HOME / file).is_file(), file
+        name = module_name(HOME / file)
+        assert number == 0 or another_process or name in reached, f"{file} is imported by none of the files before it"
+        reached |= {part for found in IMPORTS if found.importer == name for part in (found.target, found.target.rpartition(".")[0])}
+
+
+@pytest.mark.parametrize("path", sorted(set(re.findall(r"`([a-z_]+/[a-z_/.]*)`", TEXT))))
+def test_every_path_exists(path):
+    """A folder of the service is named without service/ in the table of its folders."""
+    assert (HOME / path).exists() or (HOME / "service" / path).exists()
