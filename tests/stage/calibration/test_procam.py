@@ -1,5 +1,7 @@
 """Projector-camera calibration from exact corners, and corners from exact correspondences."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -77,11 +79,16 @@ def test_too_few_views_are_refused():
         calibrate(list(views(2)), BOARD, SQUARE, (400, 300), (800, 600))
 
 
+@cache
+def fine_rays(device, oversample):
+    """Rays of the parts of each pixel: the same for every pose, and a second's work where the lens is distorted."""
+    return reference.rays(device, np.stack(np.meshgrid((np.arange(device.width * oversample) + 0.5) / oversample,
+                                                       (np.arange(device.height * oversample) + 0.5) / oversample), axis=-1))
+
+
 def board_image(pose, device=CAMERA, oversample=3):
     """Radiance of the board, and the projector's coordinates at each pixel centre."""
-    fine = np.stack(np.meshgrid((np.arange(device.width * oversample) + 0.5) / oversample,
-                                (np.arange(device.height * oversample) + 0.5) / oversample), axis=-1)
-    rays = reference.rays(device, fine)
+    rays = fine_rays(device, oversample)
     normal = pose[:3, 2]
     own = (rays * (pose[:3, 3] @ normal / (rays @ normal))[..., None] - pose[:3, 3]) @ pose[:3, :3]
     across, down = own[..., 0] / SQUARE + (BOARD[0] + 1) / 2, -own[..., 1] / SQUARE + (BOARD[1] + 1) / 2
