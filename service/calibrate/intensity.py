@@ -2,7 +2,15 @@
 
 import numpy as np
 
-from service.calibrate.results import Calibration, Measured, digits, finish, kept, open_captures, triple
+from service.calibrate.results import (
+    LightCalibration,
+    MeasuredLight,
+    digits,
+    leave_out_failures,
+    open_captures,
+    three_numbers,
+    write_lights,
+)
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import IntensityRequest
 from stage.calibration.apply import with_brightness
@@ -16,7 +24,7 @@ BEHIND_Z = -0.2
 """A light with z below this, more than 101° from the view axis, is flagged: the object shows it at grazing angles only."""
 
 
-def intensity(request: IntensityRequest, progress: Progress | None = None) -> Calibration:
+def intensity(request: IntensityRequest, progress: Progress | None = None) -> LightCalibration:
     """Measure the irradiance of each light of known direction from images of a mostly Lambertian object; the mean is 1.
 
     Raises:
@@ -51,7 +59,7 @@ def intensity(request: IntensityRequest, progress: Progress | None = None) -> Ca
         found = fit_intensities(readings, usable, directions)
     except CalibrationError as error:
         raise CalibrationError(f"{source.folder}: {error}") from error
-    results: list[Measured | CalibrationError] = []
+    results: list[MeasuredLight | CalibrationError] = []
     for lit, rgb, residual, sigma in zip(captures.lit, found.irradiance, found.residual, found.uncertainty, strict=True):
         assert isinstance(lit.light, DistantLight)
         if np.isnan(rgb).any():
@@ -59,9 +67,9 @@ def intensity(request: IntensityRequest, progress: Progress | None = None) -> Ca
             continue
         flags = ["behind: seen at grazing angles only"] if lit.light.direction[2] < BEHIND_Z else []
         entry = {"irradiance": digits(rgb), "uncertainty": digits(sigma), "residual": digits(residual), "flags": flags}
-        row = (triple(rgb), f"{100 * sigma.max():.2g} %", f"{residual.max():.3f}")
-        results.append(Measured(with_brightness(lit.light, rgb), entry, row, float(sigma.max())))
+        row = (three_numbers(rgb), f"{100 * sigma.max():.2g} %", f"{residual.max():.3f}")
+        results.append(MeasuredLight(with_brightness(lit.light, rgb), entry, row, float(sigma.max())))
     timings.close()
-    measured = kept(captures, results, drop_failed=request.drop_failed)
-    return finish("intensity", request, captures, measured, headings=("irradiance", "sure to", "residual"),
-                  summary={"pixels": found.pixels})
+    measured = leave_out_failures(captures, results, drop_failed=request.drop_failed)
+    return write_lights("intensity", request, captures, measured, headings=("irradiance", "sure to", "residual"),
+                        summary={"pixels": found.pixels})

@@ -8,7 +8,16 @@ from typing import NamedTuple
 import numpy as np
 
 from service.calibrate.balls import ball_entry, balls_of, check_metric
-from service.calibrate.results import Calibration, Captures, Measured, digits, finish, kept, open_captures, triple
+from service.calibrate.results import (
+    LightCalibration,
+    LightCaptures,
+    MeasuredLight,
+    digits,
+    leave_out_failures,
+    open_captures,
+    three_numbers,
+    write_lights,
+)
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import GreyBallRequest, LightPositionsRequest, MirrorBallRequest
 from stage.calibration.apply import LitFrame, SingleLight, as_direction, as_position, lit_frames, with_brightness
@@ -25,14 +34,14 @@ READERS = 4
 """Images that are decoded at the same time: bounds the memory."""
 
 
-class Patch(NamedTuple):
+class BallPixels(NamedTuple):
     """The pixels of one frame in the box around a ball."""
 
     radiance: np.ndarray  # [h, w, 3] float32
     saturated: np.ndarray | None  # [h, w] bool
 
 
-def mirror_ball(request: MirrorBallRequest, progress: Progress | None = None) -> Calibration:
+def mirror_ball(request: MirrorBallRequest, progress: Progress | None = None) -> LightCalibration:
     """Measure the directions of distant lights from the bright spot on one mirror ball.
 
     Raises:
@@ -47,23 +56,23 @@ def mirror_ball(request: MirrorBallRequest, progress: Progress | None = None) ->
     # what is not measured stays as the target has it
     targets = _targets(captures)
 
-    def measure(lit: LitFrame, patches: Sequence[Patch]) -> Measured:
+    def measure(lit: LitFrame, patches: Sequence[BallPixels]) -> MeasuredLight:
         spot = find_spot(patches[0].radiance, patches[0].saturated, ball, view, options)
         light = targets[lit.number]
         flags = [*spot.flags, *(["irradiance set to 1"] if isinstance(light, PointLight) else [])]
         entry = {"direction": digits(spot.direction), "uncertainty_degrees": round(spot.uncertainty_degrees, 4),
                  "spot_degrees": round(spot.spot_degrees, 3), "spot_pixels": spot.pixels, "spot_uv": digits(spot.uv),
                  "flags": flags}
-        row = (triple(spot.direction), f"{spot.uncertainty_degrees:.2f}°", f"{spot.spot_degrees:.2f}°")
-        return Measured(as_direction(light, spot.direction), entry, row, spot.uncertainty_degrees)
+        row = (three_numbers(spot.direction), f"{spot.uncertainty_degrees:.2f}°", f"{spot.spot_degrees:.2f}°")
+        return MeasuredLight(as_direction(light, spot.direction), entry, row, spot.uncertainty_degrees)
 
-    results = kept(captures, _each(captures, [view], measure, timings), drop_failed=request.drop_failed)
+    results = leave_out_failures(captures, _measure_each(captures, [view], measure, timings), drop_failed=request.drop_failed)
     timings.close()
-    return finish("mirror-ball", request, captures, results, headings=("direction", "sure to", "spot"),
-                  summary={"balls": [ball_entry(ball)]})
+    return write_lights("mirror-ball", request, captures, results, headings=("direction", "sure to", "spot"),
+                        summary={"balls": [ball_entry(ball)]})
 
 
-def light_positions(request: LightPositionsRequest, progress: Progress | None = None) -> Calibration:
+def light_positions(request: LightPositionsRequest, progress: Progress | None = None) -> LightCalibration:
     """Measure the positions of near lights from the bright spots on two or more mirror balls.
 
     Raises:
@@ -80,7 +89,7 @@ def light_positions(request: LightPositionsRequest, progress: Progress | None = 
     targets = _targets(captures)
     options = SpotOptions(level=request.level)
 
-    def measure(lit: LitFrame, patches: Sequence[Patch]) -> Measured:
+    def measure(lit: LitFrame, patches: Sequence[BallPixels]) -> MeasuredLight:
         spots = []
         for number, (patch, ball, view) in enumerate(zip(patches, balls, views, strict=True), start=1):
             try:
@@ -92,16 +101,16 @@ def light_positions(request: LightPositionsRequest, progress: Progress | None = 
         flags = [*found.flags, *(f"ball {n}: {flag}" for n, spot in enumerate(spots, start=1) for flag in spot.flags)]
         entry = {"position_m": digits(found.position), "residual_m": float(f"{found.residual:.3g}"),
                  "uncertainty_m": float(f"{found.uncertainty:.3g}"), "flags": flags}
-        row = (triple(found.position), f"{found.uncertainty:.2g} m", f"{found.residual:.2g} m")
-        return Measured(as_position(targets[lit.number], found.position, middle), entry, row, found.uncertainty)
+        row = (three_numbers(found.position), f"{found.uncertainty:.2g} m", f"{found.residual:.2g} m")
+        return MeasuredLight(as_position(targets[lit.number], found.position, middle), entry, row, found.uncertainty)
 
-    results = kept(captures, _each(captures, views, measure, timings), drop_failed=request.drop_failed)
+    results = leave_out_failures(captures, _measure_each(captures, views, measure, timings), drop_failed=request.drop_failed)
     timings.close()
-    return finish("light-positions", request, captures, results, headings=("position, m", "sure to", "residual"),
-                  summary={"balls": [ball_entry(ball) for ball in balls]})
+    return write_lights("light-positions", request, captures, results, headings=("position, m", "sure to", "residual"),
+                        summary={"balls": [ball_entry(ball) for ball in balls]})
 
 
-def grey_ball(request: GreyBallRequest, progress: Progress | None = None) -> Calibration:
+def grey_ball(request: GreyBallRequest, progress: Progress | None = None) -> LightCalibration:
     """Measure the irradiance or intensity of each light from the shading of one grey ball.
 
     Raises:
@@ -123,7 +132,7 @@ def grey_ball(request: GreyBallRequest, progress: Progress | None = None) -> Cal
             raise ManifestError(f"{where}: its distance to the ball needs {need}")
     view = view_ball(ball, camera)
 
-    def measure(lit: LitFrame, patches: Sequence[Patch]) -> Measured:
+    def measure(lit: LitFrame, patches: Sequence[BallPixels]) -> MeasuredLight:
         patch, light, entry = patches[0], lit.light, {}
         if request.refine_direction:
             shading = fit_direction(patch.radiance, patch.saturated, view)
@@ -132,22 +141,23 @@ def grey_ball(request: GreyBallRequest, progress: Progress | None = None) -> Cal
         found = fit_brightness(patch.radiance, patch.saturated, light, view)
         entry |= {"scale": digits(found.scale), "residual": round(found.residual, 5), "pixels": found.pixels,
                   "flags": ["not Lambertian under this light"] if found.residual > 0.1 else []}
-        return Measured(with_brightness(light, found.scale), entry, (), found.residual)
+        return MeasuredLight(with_brightness(light, found.scale), entry, (), found.residual)
 
-    results = kept(captures, _each(captures, [view], measure, timings), drop_failed=request.drop_failed)
+    results = leave_out_failures(captures, _measure_each(captures, [view], measure, timings), drop_failed=request.drop_failed)
     timings.close()
-    return finish("grey-ball", request, captures, _scaled(results, request.albedo),
-                  headings=("irradiance", "residual"), summary={"balls": [ball_entry(ball)]})
+    return write_lights("grey-ball", request, captures, _scaled(results, request.albedo),
+                        headings=("irradiance", "residual"), summary={"balls": [ball_entry(ball)]})
 
 
-def _each(captures: Captures, views: Sequence[BallView], measure: Callable[[LitFrame, Sequence[Patch]], Measured],
-          timings: Timings) -> list[Measured | CalibrationError]:
+def _measure_each(captures: LightCaptures, views: Sequence[BallView],
+                  measure: Callable[[LitFrame, Sequence[BallPixels]], MeasuredLight],
+                  timings: Timings) -> list[MeasuredLight | CalibrationError]:
     """Measure the light of every lit frame, and return its error in place of a result where it cannot be measured."""
     correction = Correction.of(captures.source)
 
-    def one(lit: LitFrame) -> Measured | CalibrationError:
+    def one(lit: LitFrame) -> MeasuredLight | CalibrationError:
         radiance = correction.apply(lit.frame)
-        patches = [Patch(radiance.pixels[view.box], None if radiance.saturated is None else radiance.saturated[view.box])
+        patches = [BallPixels(radiance.pixels[view.box], None if radiance.saturated is None else radiance.saturated[view.box])
                    for view in views]
         try:
             return measure(lit, patches)
@@ -163,12 +173,12 @@ def _each(captures: Captures, views: Sequence[BallView], measure: Callable[[LitF
     return results
 
 
-def _targets(captures: Captures) -> dict[int, SingleLight]:
+def _targets(captures: LightCaptures) -> dict[int, SingleLight]:
     """Return the light of each measured frame as the target's manifest has it now, by the frame's number in the source."""
     return {lit.number: own.light for lit, own in zip(captures.lit, lit_frames(captures.target), strict=True)}
 
 
-def _scaled(results: Sequence[Measured], albedo: tuple[float, float, float] | None) -> list[Measured]:
+def _scaled(results: Sequence[MeasuredLight], albedo: tuple[float, float, float] | None) -> list[MeasuredLight]:
     """Divide ρ/π · irradiance by the ball's albedo / π, or scale it so that the mean over lights and channels is 1."""
     scales = np.array([result.entry["scale"] for result in results if result.light is not None])
     factor = np.full(3, 1 / scales.mean()) if albedo is None else np.pi / np.array(albedo)
@@ -178,7 +188,7 @@ def _scaled(results: Sequence[Measured], albedo: tuple[float, float, float] | No
             rgb = np.array(result.entry["scale"]) * factor
             name = "irradiance" if isinstance(result.light, DistantLight) else "intensity"
             entry = {name: digits(rgb), **{key: value for key, value in result.entry.items() if key != "scale"}}
-            scaled.append(Measured(with_brightness(result.light, rgb), entry, (triple(rgb), f"{result.entry['residual']:.3f}"),
+            scaled.append(MeasuredLight(with_brightness(result.light, rgb), entry, (three_numbers(rgb), f"{result.entry['residual']:.3f}"),
                                    result.doubt))
         else:
             scaled.append(result)

@@ -20,7 +20,7 @@ REPORT_FILE = "calibration.json"
 SCHEMA = "relit.calibration/1"
 
 
-class Calibration(NamedTuple):
+class LightCalibration(NamedTuple):
     """The files that a calibration of lights wrote, and its table."""
 
     manifest_path: Path
@@ -31,7 +31,7 @@ class Calibration(NamedTuple):
     summary: str
 
 
-class Captures(NamedTuple):
+class LightCaptures(NamedTuple):
     """The capture in which lights are measured, and the capture that they are written to."""
 
     source: Capture
@@ -41,7 +41,7 @@ class Captures(NamedTuple):
     """Lit frames of the source."""
 
 
-class Measured(NamedTuple):
+class MeasuredLight(NamedTuple):
     """The result of one light."""
 
     light: SingleLight | None
@@ -54,7 +54,7 @@ class Measured(NamedTuple):
     """Uncertainty or residual, by which the table is sorted."""
 
 
-def open_captures(request: LightsRequest) -> Captures:
+def open_captures(request: LightsRequest) -> LightCaptures:
     """Open the captures that a request names.
 
     Raises:
@@ -70,10 +70,11 @@ def open_captures(request: LightsRequest) -> Captures:
     path = target.folder / FILE_NAME if request.out is None else request.out
     if path.suffix.lower() != ".json" or path.name == REPORT_FILE or path.is_dir():
         raise RequestError(f"--out {path}: must be a .json file of its own: it takes the place of {FILE_NAME}")
-    return Captures(source, target, path, lit)
+    return LightCaptures(source, target, path, lit)
 
 
-def kept(captures: Captures, results: Sequence[Measured | CalibrationError], *, drop_failed: bool) -> list[Measured]:
+def leave_out_failures(captures: LightCaptures, results: Sequence[MeasuredLight | CalibrationError], *,
+                       drop_failed: bool) -> list[MeasuredLight]:
     """Return the results with each failure as a frame that is left out.
 
     Raises:
@@ -85,12 +86,12 @@ def kept(captures: Captures, results: Sequence[Measured | CalibrationError], *, 
         others = f" (and {len(failed) - 1} more frames)" if len(failed) > 1 else ""
         hint = "" if len(failed) == len(results) else "; --drop-failed leaves such frames out"
         raise CalibrationError(f"{captures.source.file(lit.frame.image)}: {error}{others}{hint}")
-    return [Measured(None, {"dropped": str(result), "flags": ["dropped"]}) if isinstance(result, CalibrationError) else result
+    return [MeasuredLight(None, {"dropped": str(result), "flags": ["dropped"]}) if isinstance(result, CalibrationError) else result
             for result in results]
 
 
-def finish(kind: str, request: BaseModel, captures: Captures, results: Sequence[Measured], *, headings: tuple[str, ...],
-           summary: dict[str, Any]) -> Calibration:
+def write_lights(kind: str, request: BaseModel, captures: LightCaptures, results: Sequence[MeasuredLight], *,
+                 headings: tuple[str, ...], summary: dict[str, Any]) -> LightCalibration:
     """Write the report, then the manifest, each whole or not at all, and return what was written."""
     manifest = with_lights(captures.target, [result.light for result in results])
     lights = [{"frame": lit.number, "image": lit.frame.image, **result.entry,
@@ -106,7 +107,7 @@ def finish(kind: str, request: BaseModel, captures: Captures, results: Sequence[
     rows = [(lit.frame.image, *result.row, ", ".join(result.entry["flags"])) for lit, result in measured]
     counts = (len(measured), "measured"), (dropped, "left out"), (flagged, "flagged")
     text = ", ".join(f"{count} {what}" for count, what in counts if count)
-    return Calibration(captures.manifest_path, report, ("frame", *headings, "flags"), rows, text)
+    return LightCalibration(captures.manifest_path, report, ("frame", *headings, "flags"), rows, text)
 
 
 def write_results(kind: str, request: BaseModel, manifest: Manifest, manifest_path: Path, section: dict[str, Any]) -> Path:
@@ -128,7 +129,7 @@ def digits(values: Iterable[float]) -> list[float]:
     return [float(f"{value:.6g}") for value in values]
 
 
-def triple(values: Iterable[float]) -> str:
+def three_numbers(values: Iterable[float]) -> str:
     """Return three numbers as a cell of the table."""
     return " ".join(f"{value:7.3f}" for value in values)
 

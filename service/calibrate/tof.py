@@ -55,13 +55,13 @@ def calibrate_tof(sweep: Path, out: Path, *, device: str | None = None, progress
     kinds = {is_pulsed(capture) for capture in captures}
     if len(kinds) > 1:
         raise RequestError(f"{sweep}: steps: some are cw and some pulsed: give a sweep for each")
-    plain = _errors(plan, captures, None, where, timings)
+    plain = _range_errors(plan, captures, None, where, timings)
     if kinds == {True}:
-        known: dict[str, Any] = _line(plan, captures, plain)
+        known: dict[str, Any] = _scale_and_offset(plan, captures, plain)
     else:
-        known = _wiggling(plan, captures, where, timings)
+        known = _harmonics(plan, captures, where, timings)
     calibration = TofCalibration.model_validate(known)
-    after = _errors(plan, captures, calibration, where, timings)
+    after = _range_errors(plan, captures, calibration, where, timings)
     if plan.has_drift:
         warm = np.array([step.temperature_c for step in plan.steps], dtype=np.float64)
         drift, level = fit_temperature(after, warm)
@@ -72,7 +72,7 @@ def calibrate_tof(sweep: Path, out: Path, *, device: str | None = None, progress
     return TofCalibrationResult(calibration, out, float(np.sqrt(np.mean(plain**2))), float(np.sqrt(np.mean(after**2))), len(plan.steps))
 
 
-def _errors(plan: Sweep, captures: list[Capture], calibration: TofCalibration | None, device: str, timings: Timings) -> np.ndarray:
+def _range_errors(plan: Sweep, captures: list[Capture], calibration: TofCalibration | None, device: str, timings: Timings) -> np.ndarray:
     """Return [steps] the median of measured less true range, metres."""
     errors = []
     for step, capture in zip(plan.steps, captures, strict=True):
@@ -88,7 +88,7 @@ def _true_range(step: SweepDistance, capture: Capture) -> np.ndarray:
     return step.depth_m / z_per_range(capture.camera)
 
 
-def _line(plan: Sweep, captures: list[Capture], errors: np.ndarray) -> dict[str, Any]:
+def _scale_and_offset(plan: Sweep, captures: list[Capture], errors: np.ndarray) -> dict[str, Any]:
     """Return scale and offset, fitted to the median ranges of the steps."""
     true = np.array([float(np.median(_true_range(step, capture)[capture.mask()]))
                      for step, capture in zip(plan.steps, captures, strict=True)])
@@ -96,7 +96,7 @@ def _line(plan: Sweep, captures: list[Capture], errors: np.ndarray) -> dict[str,
     return {"scale": scale, "offset_m": offset}
 
 
-def _wiggling(plan: Sweep, captures: list[Capture], device: str, timings: Timings) -> dict[str, Any]:
+def _harmonics(plan: Sweep, captures: list[Capture], device: str, timings: Timings) -> dict[str, Any]:
     """Return the harmonics of each frequency, fitted to the steps at the commonest temperature."""
     chosen = [(step, capture) for step, capture in zip(plan.steps, captures, strict=True)
               if step.temperature_c == plan.commonest_temperature_c]

@@ -28,7 +28,7 @@ class Inspection(NamedTuple):
     faults: list[str]
 
 
-class _Level(NamedTuple):
+class _FrameLevel(NamedTuple):
     """The readings of one frame."""
 
     peak: float
@@ -76,7 +76,7 @@ def inspect(path: Path, progress: Progress | None = None) -> Inspection:
     except StageError as error:
         faults.append(str(error))
     if isinstance(lights, PlacedLights):
-        facts.append(("near lights", _near(lights)))
+        facts.append(("near lights", _near_lights(lights)))
     if not faults:
         try:
             Correction.of(capture)
@@ -105,7 +105,7 @@ def _facts(capture: Capture) -> Iterator[tuple[str, str]]:
         yield "lights", f"{len(directions)} distant, up to {widest:.0f} degrees from the view axis, {behind} behind the object"
 
 
-def _near(lights: PlacedLights) -> str:
+def _near_lights(lights: PlacedLights) -> str:
     """Return how many near lights there are, and how far away."""
     near = lights.place[:, 3] == 1
     distance = np.linalg.norm(lights.place[near, :3] - lights.centre, axis=1)
@@ -120,14 +120,14 @@ def _kind(frame: Frame) -> str:
     return f"{frame.laser.type} laser" if frame.laser is not None else "time of flight"
 
 
-def _level(capture: Capture, frame: Frame) -> _Level:
+def _level(capture: Capture, frame: Frame) -> _FrameLevel:
     """Return the brightest value and the saturated readings of one frame, or its fault."""
     path = capture.file(frame.image)
     try:
         pixels = images.read_pixels(path)
         images.check_radiance(path, pixels)
     except StageError as error:
-        return _Level(0.0, 0, str(error))
+        return _FrameLevel(0.0, 0, str(error))
     limit = capture.manifest.saturation
     saturated = 0 if limit is None else int((pixels >= limit).any(axis=-1).sum())
-    return _Level(float(pixels.max()), saturated, None)
+    return _FrameLevel(float(pixels.max()), saturated, None)

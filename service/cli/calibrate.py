@@ -22,7 +22,7 @@ from service.requests.calibrate import (
 
 if TYPE_CHECKING:
     from service.calibrate.images import ImageCalibration
-    from service.calibrate.results import Calibration
+    from service.calibrate.results import LightCalibration
 
 LIGHT_ROWS = 12
 """The number of lights that the table shows; the report holds all."""
@@ -138,7 +138,7 @@ def _tof(request: TofCalibrationRequest) -> None:
     print(f"error    {1000 * result.before_m:.2f} mm before, {1000 * result.after_m:.2f} mm after, RMS over {result.steps} steps")
 
 
-def _print_lights(result: "Calibration") -> None:
+def _print_lights(result: "LightCalibration") -> None:
     """Print where the results are, and the lights that are least sure."""
     print(f"capture  {result.manifest_path}")
     print(f"report   {result.report_path}")

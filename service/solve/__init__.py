@@ -1,1 +1,1 @@
-"""Light-stage captures to normals, reflectance and height."""
+"""Solving captures for normals, reflectance and height."""

@@ -36,12 +36,12 @@ def solve_extended(given: SolveInput, lights: ExtendedLights) -> Solution:
     parts = done = 0
     for inside in view_parts(given.camera, mask):
         parts += 1
-        turn = turn_to_z(view(inside).mean(axis=0, dtype=np.float64))
-        tables = sampling_tables(response_table(lights.direction @ turn.T, lights.solid_angle, lights.light, lights.share,
+        rotation = rotation_to_z(view(inside).mean(axis=0, dtype=np.float64))
+        tables = sampling_tables(response_table(lights.direction @ rotation.T, lights.solid_angle, lights.light, lights.share,
                                                 light_count=count, device=given.device))
 
-        def turned_view(pixels: np.ndarray, turn: np.ndarray = turn) -> np.ndarray:
-            return (view(pixels) @ turn.T).astype(np.float32)
+        def turned_view(pixels: np.ndarray, rotation: np.ndarray = rotation) -> np.ndarray:
+            return (view(pixels) @ rotation.T).astype(np.float32)
 
         for pixels, samples in pixel_batches(given, padded, turned_view, inside, lobes=SEARCH_LOBES):
             found = solve_sampling(samples, tables, turned_view(pixels))
@@ -49,7 +49,7 @@ def solve_extended(given: SolveInput, lights: ExtendedLights) -> Solution:
             ok = status == Status.OK
             kept = pixels[ok]
             result.status[pixels] = status
-            result.normal[:, kept] = (found.normal @ turn).T[:, ok]
+            result.normal[:, kept] = (found.normal @ rotation).T[:, ok]
             result.albedo[:, kept] = found.diffuse_albedo.T[:, ok]
             result.specular[:, kept] = found.specular.T[:, ok]
             result.roughness[kept] = found.roughness[ok]
@@ -84,7 +84,7 @@ def _parts(angle: np.ndarray) -> np.ndarray:
     return np.minimum(((angle - angle.min(initial=0.0)) * count / max(width, 1e-9)).astype(int), count - 1)
 
 
-def turn_to_z(view: np.ndarray) -> np.ndarray:
+def rotation_to_z(view: np.ndarray) -> np.ndarray:
     """Return [3, 3] the smallest rotation that brings a direction of the camera's half space to z."""
     x, y, z = view / np.linalg.norm(view)
     a = 1 / (1 + z)

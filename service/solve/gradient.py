@@ -56,21 +56,21 @@ def solve_gradients(given: SolveInput, frames: GradientFrames) -> Solution:
                 parts = separate_by_colour(diffuse, toward, pixel_count=band.pixel_count, device=device)
                 diffuse = parts.diffuse
                 normal = specular_normals(parts, GREY_WEIGHTS, toward, gain=gain, pixel_count=band.pixel_count, device=device)
-                _keep(result.specular_normal, here, kept, normal)
+                _store(result.specular_normal, here, kept, normal)
             elif frames.parallel is not None:
                 parallel = _moments(band, frames.parallel, stack)
                 parts = separate_polarised(diffuse, parallel, GREY_WEIGHTS, pixel_count=band.pixel_count, device=device)
                 highlight = fit_highlights(parts, GREY_WEIGHTS, toward, gain=gain, pixel_count=band.pixel_count, device=device)
-                _keep(result.specular_normal, here, kept, highlight.normal)
-                _keep(result.specular, here, kept, highlight.f0)
-                _keep(result.roughness, here, kept, highlight.roughness)
+                _store(result.specular_normal, here, kept, highlight.normal)
+                _store(result.specular, here, kept, highlight.f0)
+                _store(result.roughness, here, kept, highlight.roughness)
             fit = diffuse_normals(diffuse, GREY_WEIGHTS, gain=gain, pixel_count=band.pixel_count, device=device)
-            _keep(result.normal, here, kept, fit.normal)
-            _keep(result.albedo, here, kept, fit.albedo)
-            _keep(result.confidence, here, kept, fit.confidence)
-            _keep(result.residual, here, kept, diffuse.residual)
-            _keep(result.status, here, kept, fit.status)
-            _keep(length, here, kept, fit.length)
+            _store(result.normal, here, kept, fit.normal)
+            _store(result.albedo, here, kept, fit.albedo)
+            _store(result.confidence, here, kept, fit.confidence)
+            _store(result.residual, here, kept, diffuse.residual)
+            _store(result.status, here, kept, fit.status)
+            _store(length, here, kept, fit.length)
             if frames.parallel is not None:
                 metal[here] = _take_highlight(result, here, parts.specular.numpy()[:3, : len(kept)])
                 result.residual[here] = np.where(metal[here], parallel.residual.numpy()[: len(kept)], result.residual[here])
@@ -118,7 +118,7 @@ def _take_highlight(result: Solution, here: slice, specular: np.ndarray) -> np.n
     return metal
 
 
-def _keep(target: np.ndarray | None, here: slice, kept: np.ndarray, found: Any) -> None:
+def _store(target: np.ndarray | None, here: slice, kept: np.ndarray, found: Any) -> None:
     """Store the result of a band; 0 outside the mask, which as a status is UNSOLVED."""
     assert target is not None
     target[..., here] = np.where(kept, found.numpy()[..., : len(kept)], 0)

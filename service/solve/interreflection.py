@@ -3,6 +3,9 @@
 The image is cut into square patches. Their radiance under each light is measured, so that all bounces are in it, and form factors
 carry it from patch to patch (kernels/surface/interreflection.py). The light that arrives is interpolated between patches and
 subtracted from the readings of each pixel (kernels/photometric/bounce.py).
+
+Source: Nayar, Ikeuchi and Kanade, "Shape from interreflections", IJCV 1991, section 3: on a Lambertian surface radiance is direct
+radiance + ρ K radiance, with the form factors in K.
 """
 
 import math

@@ -88,12 +88,12 @@ def whole_surface(height: np.ndarray, solved: np.ndarray, mask: np.ndarray, *, m
     largest[order[np.append(home[order][1:] != home[order][:-1], True)]] = True
     if not largest.all():
         kept = solved & largest[np.where(solved, part, 0)]
-        reached = _grown(out, kept, mask)
+        reached = _fill(out, kept, mask)
         there, here = (np.bincount(part[solved], weights=z[solved]) / size for z in (reached, out))
         there[largest] = here[largest]
         moved = out * (there / here)[part] if perspective else out + (there - here)[part]
         out = np.where(solved, moved, out)
-    out = _grown(out, solved, mask)
+    out = _fill(out, solved, mask)
     mean = out[mask].mean()
     return (out * (mean_z / mean) if perspective else out + (mean_z - mean)).astype(np.float32)
 
@@ -106,7 +106,7 @@ def _labels(mask: np.ndarray) -> np.ndarray:
     return out
 
 
-def _grown(height: np.ndarray, known: np.ndarray, mask: np.ndarray) -> np.ndarray:
+def _fill(height: np.ndarray, known: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Return the known heights, and a height for all other pixels."""
     out, known = np.where(known, height, 0), known.copy()
     for _ in range(RINGS):
@@ -116,7 +116,7 @@ def _grown(height: np.ndarray, known: np.ndarray, mask: np.ndarray) -> np.ndarra
             break
         out[ring] = total[ring] / count[ring]
         known |= ring
-    return _filled(out, known.astype(np.float64))
+    return _fill_by_blocks(out, known.astype(np.float64))
 
 
 def _around(values: np.ndarray) -> np.ndarray:
@@ -125,7 +125,7 @@ def _around(values: np.ndarray) -> np.ndarray:
     return framed[:-2, 1:-1] + framed[2:, 1:-1] + framed[1:-1, :-2] + framed[1:-1, 2:]
 
 
-def _filled(total: np.ndarray, count: np.ndarray) -> np.ndarray:
+def _fill_by_blocks(total: np.ndarray, count: np.ndarray) -> np.ndarray:
     """Return the mean where a height is known; elsewhere that of the smallest block of 2, 4, 8, … pixels that holds one.
 
     Args:
@@ -135,6 +135,6 @@ def _filled(total: np.ndarray, count: np.ndarray) -> np.ndarray:
         return total / count
     rows, cols = total.shape
     even = ((0, rows % 2), (0, cols % 2))
-    coarse = _filled(*(np.pad(a, even).reshape(-(-rows // 2), 2, -(-cols // 2), 2).sum(axis=(1, 3)) for a in (total, count)))
+    coarse = _fill_by_blocks(*(np.pad(a, even).reshape(-(-rows // 2), 2, -(-cols // 2), 2).sum(axis=(1, 3)) for a in (total, count)))
     finer = coarse.repeat(2, axis=0).repeat(2, axis=1)[:rows, :cols]
     return np.where(count > 0, total / np.maximum(count, 1), finer)
