@@ -1,5 +1,7 @@
 """The table against direct quadrature of the same sources in float64."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -13,9 +15,14 @@ CHOSEN = np.random.default_rng(0).choice(np.flatnonzero(NORMALS[:, 2] > 0.2), 25
 IRRADIANCE = twin.irradiance(SHARPNESS)
 
 
+@cache
+def tabulated(device) -> np.ndarray:
+    return table_of(device).numpy()
+
+
 @pytest.fixture
 def table(device) -> np.ndarray:
-    return table_of(device).numpy()
+    return tabulated(device)
 
 
 def worst(found: np.ndarray, truth: np.ndarray) -> float:

@@ -81,7 +81,7 @@ def test_sigma_knows_what_pile_up_costs(photons, pulses, device):
 @pytest.mark.parametrize("apart", [2.5, 3.0, 4.0, 6.0])
 def test_two_returns_that_overlap_are_at_their_places_with_their_errors(apart, device):
     """Pulses of two bins, `apart` of their standard deviations apart."""
-    time, counts = draw(np.full(6000, 2000.0), 2.0, 0.5, seed=4, second=(2.0 * apart, 0.5))
+    time, counts = draw(np.full(3000, 2000.0), 2.0, 0.5, seed=4, second=(2.0 * apart, 0.5))
     found = solve(counts, 2.0, device, most=3)
     both = (found["photons"][1] > 0) & (found["photons"][2] == 0)
     assert both.mean() > 0.75
