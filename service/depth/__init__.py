@@ -1,1 +1,1 @@
-"""Projected patterns, lasers and time of flight to depth."""
+"""Depth from projected patterns, lasers and time of flight; direct and global light; and the patterns to project."""

@@ -33,16 +33,16 @@ from stage.patterns.ramp import ramp_patterns
 
 
 class CodeRow(NamedTuple):
-    """Everything about one code that commands need."""
+    """What the commands need to know about one code."""
 
     decoder: Callable[[AxisCodes], AxisDecoder | None]
-    """How the frames of an axis are decoded; None if they hold no such code."""
+    """Returns how the frames of an axis are decoded, or None if they hold no such code."""
     patterns: Callable[[PatternsRequest, Axis, int], Sequence[Pattern]]
-    """The frames to project along an axis of so many pixels; raises ValueError for options that cannot be."""
+    """Returns the frames to project along an axis of so many pixels; raises ValueError if an option cannot be used."""
     options: tuple[str, ...]
-    """Options of `relit patterns` that say something about the code."""
+    """The options of `relit patterns` that belong to the code."""
     cost: Callable[[PlanRequest, int], Cost] | None
-    """Its line in the planner's table for so many columns; None if another code's line counts for it too."""
+    """Returns the line of the planner's table for so many columns; None if the line of another code stands for this one too."""
 
 
 def _phase_frames(request: PatternsRequest, axis: Axis, extent: int) -> Sequence[Pattern]:
@@ -140,7 +140,7 @@ CODES: dict[PatternCode, CodeRow] = {
 
 CODES_OF_OPTION = {option: tuple(code for code in PatternCode if option in CODES[code].options)
                    for row in CODES.values() for option in row.options}
-"""Option of `relit patterns` → the codes that it belongs to; with another code it is refused."""
+"""The codes that each option of `relit patterns` belongs to; with another code the option is refused."""
 
 
 def choose_decoder(collected: Collected, axis: Axis, projector: PatternDevice, *,

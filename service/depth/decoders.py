@@ -33,7 +33,7 @@ from stage.patterns.ramp import RampCode
 
 
 class PatternDevice(NamedTuple):
-    """What decoding needs to know of a projector; its lens and pose come later."""
+    """The properties of a projector that decoding needs; its lens and pose are needed by triangulation alone."""
 
     resolution: Resolution
     response: tuple[float, ...] | None = None
@@ -45,9 +45,9 @@ class Readings(NamedTuple):
 
     grey: Band
     colour: Band | None
-    """The same with three channels, where a code has colours."""
+    """The frames with three channels; None if no code has colours."""
     columns: int
-    """Pixels of an image row: the band is whole rows."""
+    """Number of pixels of an image row; the band consists of whole rows."""
 
 
 @dataclass(frozen=True)
@@ -56,14 +56,14 @@ class AxisDecoder:
 
     axis: Axis
     name: str
-    """For the report: gray with inverses, phase numbered by gray, …"""
+    """The name for the report: gray with inverses, phase numbered by gray, …"""
     colour: bool
-    """Whether it needs colour frames."""
+    """True if it needs colour frames."""
     decode: Callable[[Readings, NoiseModel], Decoded]
     used: tuple[Code, ...]
-    """Codes that it reads."""
+    """The codes that it reads."""
     halo: int = 0
-    """Rows beyond a band, above and below, that decoding looks at."""
+    """Number of rows above and below a band that decoding reads too."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class AxisCodes:
 
     @classmethod
     def of(cls, collected: Collected, axis: Axis, projector: PatternDevice, *, refine: bool) -> "AxisCodes":
-        """Keep the codes of the axis that lack no frame."""
+        """Return the codes of the axis that lack no frame."""
         ready = tuple(code for code in collected.codes if code.axis == axis and code.lacks(collected.white, collected.black) is None)
         return cls(axis, ready, collected.white, collected.black, projector, refine)
 

@@ -34,18 +34,18 @@ from stage.ply import POINTS_FILE, write_ply
 
 REPORT_FILE = "report.json"
 PLAUSIBLE_M = 0.005, 500.0
-"""Median depths that a projector or laser measures: outside, the units of the calibration are wrong."""
+"""Median depths that are plausible for a projector or a laser; beyond them the units of the calibration are wrong."""
 
 
 class Kind(NamedTuple):
     """One kind of frames that depth is measured with."""
 
     holds: Callable[[Frame], bool]
-    """Whether a frame is of this kind. Black and white frames go with any."""
+    """Tells whether a frame is of this kind. Black and white frames go with any kind."""
     solve: Callable[[Capture, np.ndarray, DepthRequest, str, Timings], DepthSolution]
-    """Capture, mask, request, device and timings → solution."""
+    """Measures the depth of a capture, from its mask, the request, the device and the timings to tell of."""
     lengths: str | None
-    """Field of the manifest whose unit is wrong if the depths are not plausible; None: depths of any size are."""
+    """The field of the manifest whose unit is wrong if the depths are not plausible; None if depths of any size are plausible."""
 
 
 KINDS: dict[Ranging, Kind] = {
@@ -57,7 +57,7 @@ KINDS: dict[Ranging, Kind] = {
                           capture, request.tof, near_m=request.near_m, far_m=request.far_m, device=device, timings=timings),
                       None),
 }
-"""Kind of frames → how depth is measured with them."""
+"""How depth is measured with each kind of frames."""
 
 
 class DepthResult(NamedTuple):
@@ -70,7 +70,7 @@ class DepthResult(NamedTuple):
     method: str
     points: int
     counts: dict[str, int]
-    """Pixels of the mask per status."""
+    """Number of pixels of the mask with each status."""
 
 
 def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResult:

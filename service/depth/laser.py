@@ -1,4 +1,4 @@
-"""Laser frames → depth: the spot of each ray, the stripe of each plane, and all of them in one map.
+"""Depth from laser frames: the spot of each ray and the stripe of each plane, put together in one map.
 
 Source: Steger, "An unbiased detector of curvilinear structures", PAMI 1998 (stripes).
 """
@@ -25,14 +25,14 @@ from stage.ranging import LaserPlane, LaserRay
 from stage.triangulation_check import check_perspective
 
 MAX_GAP = 0.02
-"""Part of its distance by which the laser's ray may miss the line of sight: beyond, the spot is not that ray's."""
+"""Distance between the laser's ray and the line of sight over the distance of the spot, above which the spot is not that ray's."""
 LEAST_FOR_AMBIENT = 3
-"""Laser frames from which the least value of each pixel over them is taken for ambient light, where there is no frame of it."""
+"""Number of laser frames from which on their least value at each pixel is taken for ambient light, if there is no frame of it."""
 LEAST_PART, OF_PERCENTILE = 0.03, 95.0
-"""Of the brightest lines' peak over all frames (their 95th percentile): a line whose peak is lower sees the stripe's light by way of
-other surfaces, as in the laser's shadow or when the stripe has left the image; or a surface thirty times darker."""
+"""A line whose peak is below this fraction of the brightest lines' peaks over all frames (their 95th percentile) sees the stripe's light by
+way of other surfaces, as in the laser's shadow or when the stripe has left the image; or it sees a surface thirty times darker."""
 NOISE_SAMPLE = 200_000
-"""Pixels from which the noise of a frame is taken."""
+"""Number of pixels from which the noise of a frame is estimated."""
 
 
 class _Spot(NamedTuple):

@@ -1,4 +1,4 @@
-"""Pattern frames → depth: decode each axis band by band, then triangulate."""
+"""Depth from frames under projected patterns: decode each axis band by band, then triangulate."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -29,11 +29,11 @@ from stage.projector import Projector
 from stage.triangulation_check import check_projector
 
 SCALE_PERCENTILE = 99.9
-"""Of the brightest frame's pixels: full scale of images that have none of their own (floating point, no saturation given)."""
+"""Percentile of the brightest frame that is taken for full scale, for images in floating point without a given saturation."""
 SCALE_SAMPLE = 500_000
-"""Pixels of a frame from which it is taken."""
+"""Number of pixels of a frame from which full scale is taken."""
 DECODE_BYTES_PER_PIXEL = 200
-"""What decoding and triangulation allocate beside the planes."""
+"""Memory that decoding and triangulation take for each pixel, beside the planes."""
 
 
 class PatternCodes(NamedTuple):

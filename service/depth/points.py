@@ -10,7 +10,7 @@ from stage.depth_normals import depth_normals
 from stage.ply import PointCloud
 
 WHITE_PERCENTILE = 99.0
-"""Of the solved pixels' brightest channel: shown as full white, so that a few highlights do not darken the cloud."""
+"""Percentile of the brightest channel that is shown as full white, so that a few highlights do not darken the cloud."""
 
 
 def point_cloud(solution: DepthSolution, camera: Camera, *, color_space: str, normals: bool) -> PointCloud:

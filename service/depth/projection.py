@@ -24,11 +24,11 @@ AXES: dict[PatternAxis, tuple[Axis, ...]] = {
 
 
 class PatternsResult(NamedTuple):
-    """What was written."""
+    """The files that were written."""
 
     images: tuple[Path, ...]
     fragment: Path
-    """patterns.json: the frames, as capture.json takes them."""
+    """patterns.json, which holds the frames as capture.json takes them."""
 
 
 def make_patterns(request: PatternsRequest, progress: Progress | None = None) -> PatternsResult:

@@ -36,10 +36,10 @@ class ScanResult(NamedTuple):
     points_path: Path
     usd_path: Path
     las_path: Path | None
-    """Where it was asked for."""
+    """None if it was not asked for."""
     report_path: Path
     counts: dict[str, int]
-    """Shots by what became of them."""
+    """Number of shots and points, and of those left out, by reason."""
 
 
 def scan(request: ScanRequest, progress: Progress | None = None) -> ScanResult:

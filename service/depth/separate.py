@@ -35,15 +35,15 @@ from stage.result_metadata import result_metadata
 SEPARATION_FILE = "separation.exr"
 METHOD = "separation"
 LONGEST_PX = 64.0
-"""Longest period that is taken unasked, about a twentieth of a projector's width: light between surfaces follows longer ones, and would
-count as direct."""
+"""The longest period that is used unless the request names one, about a twentieth of a projector's width: light between surfaces follows
+longer ones, and would count as direct."""
 SUM_TOLERANCE = 0.1
-"""Part by which direct and global light together may differ from the white frame. The mean of a sinusoid is half of white if the
+"""Fraction by which direct and global light together may differ from the white frame. The mean of a sinusoid is half of white if the
 projector and the camera are linear; a projector of gamma 2.2 without correction differs by 0.3."""
 LIT_PART = 0.05
-"""Of the light of the brightest pixels (99th percentile): at darker pixels noise decides which part the light is."""
+"""Fraction of the light of the brightest pixels (99th percentile) below which noise decides how the light is divided."""
 BYTES_PER_PIXEL = 80
-"""What the separation of a band allocates beside the planes."""
+"""Memory that separation takes for each pixel, beside the planes."""
 
 
 class Sinusoid(NamedTuple):
@@ -53,7 +53,7 @@ class Sinusoid(NamedTuple):
     frames: tuple[int, ...]
     """Indices into the capture's frames."""
     shifts: tuple[float, ...]
-    """Of each frame, turns."""
+    """The shift of each frame in turns."""
 
 
 class LightParts(NamedTuple):
@@ -73,7 +73,7 @@ class SeparationResult(NamedTuple):
     global_share: dict[str, float]
     """Global light over all light at the lit pixels: 5th percentile, median and 95th; empty if none is lit."""
     counts: dict[str, int]
-    """Pixels of the mask per status."""
+    """Number of pixels of the mask with each status."""
 
 
 def separate(request: SeparateRequest, progress: Progress | None = None) -> SeparationResult:

@@ -8,7 +8,7 @@ import numpy as np
 from kernels.status import SOLVED, Status
 
 HALF_SURE = 1e-3
-"""Standard deviation of the depth, as a part of it, at which confidence is one half."""
+"""Standard deviation of the depth over the depth, at which confidence is one half."""
 
 
 @dataclass
@@ -16,7 +16,7 @@ class DepthSolution:
     """Depth at every pixel of the image; only pixels with a status of kernels.status.SOLVED have values."""
 
     method: str
-    """Of the report: what was decoded."""
+    """What was decoded, in words for the report."""
     depth: np.ndarray  # [rows, cols] float32 metres
     status: np.ndarray  # [rows, cols] uint8
     sigma: np.ndarray | None = None  # [rows, cols] float32 metres
@@ -29,7 +29,7 @@ class DepthSolution:
     points: np.ndarray | None = None  # [n, 3] float32: measured places between pixel centres, in place of a point a pixel
     pixels: np.ndarray | None = None  # [n, 2] int: row and column of each of these, for its colour
     facts: dict[str, Any] = field(default_factory=dict)
-    """For the report."""
+    """What was found out on the way, for the report."""
 
     @property
     def solved(self) -> np.ndarray:

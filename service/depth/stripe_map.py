@@ -1,4 +1,4 @@
-"""Stripe centres between pixels → a depth at pixel centres.
+"""The depth at pixel centres, from stripe centres that lie between pixels.
 
 A stripe's centre lies up to half a pixel beside the centre of its pixel. On a sloping surface that is another depth, by more than the
 centre is uncertain; so the sample is carried to the pixel's centre along the slope to its neighbours in the same line, of other
@@ -15,9 +15,9 @@ from stage.camera import Camera
 from stage.depth_normals import same_surface
 
 SLOPE_PX = 32.0
-"""How far away a neighbour may be to say the slope."""
+"""Distance up to which a neighbour determines the slope."""
 JOIN_PX = 2.0
-"""Pixels between two samples that are no farther apart than this are filled."""
+"""Distance of two samples up to which the pixels between them are filled."""
 
 
 class StripeSamples(NamedTuple):

@@ -1,4 +1,4 @@
-"""Time-of-flight frames of a capture → range and depth of each pixel.
+"""Range and depth of each pixel from the time-of-flight frames of a capture.
 
 Continuous wave: correlation images → noise, phases, wiggling, wraps. Pulsed: photon histograms → pile-up, pulse, returns. Either way
 the range is then corrected with the camera's calibration, filtered, and turned into depth. The sources stand with the kernels of each

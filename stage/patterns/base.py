@@ -13,7 +13,7 @@ Axis = Literal["column", "row"]
 Index = Annotated[int, Field(ge=0)]
 Level = Annotated[float, Field(ge=0, le=1)]
 Steps = Annotated[int, Field(ge=3)]
-"""Shifts of a wave: three unknowns (offset, amplitude, phase) need three."""
+"""Number of shifts of a wave; its three unknowns (offset, amplitude, phase) need three."""
 
 
 class UniformPattern(Strict):

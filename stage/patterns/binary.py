@@ -84,11 +84,11 @@ class BinaryCode(NamedTuple):
     axis: Axis
     stripe_px: float
     base_bit: int
-    """Of xor; else 0."""
+    """The base bit of xor; else 0."""
     frames: tuple[int, ...]
-    """Frame of each bit, bit 0 (the finest) first."""
+    """The frame of each bit, bit 0 (the finest) first."""
     inverses: tuple[int, ...] | None
-    """Frame of each inverse; None without them."""
+    """The frame of each inverse; None without them."""
 
     @classmethod
     def collect(cls, frames: Mapping[BinaryPattern | XorPattern, int]) -> "BinaryCode":

@@ -73,7 +73,7 @@ class KaryCode(NamedTuple):
     levels: tuple[float, ...] | None
     colors: tuple[Rgb, ...] | None
     frames: tuple[int, ...]
-    """Frame of each digit, digit 0 (the finest) first."""
+    """The frame of each digit, digit 0 (the finest) first."""
 
     @property
     def name(self) -> str:

@@ -15,14 +15,14 @@ from stage.model import Positive, Strict
 from stage.patterns.base import Axis, Index, Steps, check_index
 
 FULL_STEPS = 3
-"""Frames of different shifts that a phase of its own needs."""
+"""Number of frames of different shifts that determine a phase without other periods."""
 JOINT = (((16.0, 18.0, 21.0), 1008), ((16.0, 18.0, 22.0), 1280), ((16.0, 22.0, 26.0), 2048), ((16.0, 17.0, 19.0), 4096))
 """Sets of periods and the projector width that they serve. At it, the phases of two places differ by 0.6, 0.5, 0.4 and 0.28 radians
 (root sum of squares) at least; 16, 22, 26 repeat after 2288 pixels, 16, 18, 22 after 1584, 16, 17, 19 after 5168."""
 MICRO_BAND = 0.15
 """Micro phase shifting keeps its periods within this part of their mean: near enough that one offset and amplitude serve all."""
 MICRO_TRIALS = 400
-"""Sets of periods that are tried; more improve the distance between codes by a few per cent."""
+"""Number of sets of periods that are tried; more improve the distance between codes by a few per cent."""
 
 
 class PhasePattern(Strict):
@@ -54,9 +54,9 @@ class PhaseCode(NamedTuple):
     axis: Axis
     frames: tuple[int, ...]
     periods_px: tuple[float, ...]
-    """Of each frame."""
+    """The period of each frame."""
     shifts: tuple[float, ...]
-    """Of each frame, turns: step / steps."""
+    """The shift of each frame in turns: step / steps."""
 
     @property
     def name(self) -> str:

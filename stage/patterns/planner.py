@@ -55,7 +55,7 @@ class Plan(NamedTuple):
     images: int
     """Images as projected here."""
     seconds: float
-    """To capture them."""
+    """Time to capture the images."""
     column_sigma_px: float
     depth_sigma_m: float | None
     """None without a rig."""
