@@ -94,7 +94,7 @@ def step_aside(ranges: wp.array(dtype=wp.float32), status: wp.array(dtype=wp.int
     return largest
 
 
-@wp.kernel(module="unique", module_options={"max_unroll": 2})
+@wp.kernel(module="unique", module_options={"max_unroll": 2})  # unrolled, it is no faster and takes seconds to compile
 def _flying_kernel(first: int,
                    ranges: wp.array(dtype=wp.float32),
                    sigma: wp.array(dtype=wp.float32),

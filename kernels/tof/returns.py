@@ -179,7 +179,7 @@ def scored(given: Recorded, pulse: Shape, k: int, p: int, found: int, b: float, 
     return wp.vec2f(t, s)
 
 
-@wp.kernel(module="unique", module_options={"max_unroll": 0})
+@wp.kernel(module="unique", module_options={"max_unroll": 0})  # unrolled, it is no faster and takes seconds to compile
 def _returns_kernel(first: int,
                     given: Recorded,
                     pulse: Shape,

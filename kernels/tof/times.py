@@ -167,7 +167,7 @@ def _best_gain(given: Recorded, pulse: Shape, t: float, along: float, k: int, p:
     return best
 
 
-@wp.kernel(module="unique", module_options={"max_unroll": 0})
+@wp.kernel(module="unique", module_options={"max_unroll": 0})  # unrolled, it is no faster and takes seconds to compile
 def _times_kernel(first: int,
                   given: Recorded,
                   pulse: Shape,
