@@ -209,7 +209,7 @@ def _fit_lobe(table: wp.array(dtype=_Row), s0: float, lobe: float, spread: float
     return wp.vec2(angle, roughness)
 
 
-@wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})  # unrolled, it is no faster and takes seconds to compile
+@wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})  # unrolled: no faster, slow to compile
 def _highlight_kernel(first: int,
                       specular: wp.array2d(dtype=float),  # [6, N]
                       diffuse: wp.array2d(dtype=float),  # [12, N]
