@@ -112,6 +112,14 @@ def test_mask_saturation_and_provenance(relit, tmp_path):
     assert metadata["relit:inputs"] == report["inputs"]["content"] and "relit:camera" in metadata
 
 
+def test_bands_do_not_show(relit, tmp_path, monkeypatch):
+    write(tmp_path, [*phases(), BLACK])
+    whole = solve(relit, tmp_path)[:2]
+    monkeypatch.setattr("stage.planes.BAND_BYTES", 5 * COLS * (4 * 5 * 3 + 80))  # five rows
+    for one, other in zip(whole, solve(relit, tmp_path)[:2], strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
 def fails(relit, folder: Path, words: str, *arguments):
     outcome = relit("separate", folder, "--out", folder / "out", *arguments)
     assert outcome.code == 2 and len(outcome.err.splitlines()) == 1 and words in outcome.err, outcome.err
