@@ -1,6 +1,7 @@
 """What the service loses when its processes are killed, hang or are without their database: the table of docs/service_faults.md.
 
-python -m benchmarks.service_faults [--seed N] [--write docs/service_faults.md]; some minutes; needs the server programs of PostgreSQL.
+python -m benchmarks.service_faults [--seed N] [--sqlite | --write docs/service_faults.md]; some minutes. Without --sqlite it needs the
+server programs of PostgreSQL; with it the rows of PostgreSQL's restarts are left out.
 """
 
 import argparse
@@ -13,6 +14,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
@@ -35,6 +37,10 @@ KILLS = {AT_WORK: 15, WITH_SUPERVISOR: 8, SUPERVISOR: 3, IDLE: 4}
 """30, in random order."""
 
 
+NewDatabase = Callable[[], str | None]
+"""Returns the URL of an empty database; None: SQLite in the data folder."""
+
+
 class Fault(NamedTuple):
     """A row of the table."""
 
@@ -50,33 +56,33 @@ class Fault(NamedTuple):
     """Jobs that did not succeed."""
 
 
-class Site(NamedTuple):
-    """What is relit, and what it comes to undisturbed."""
+class Scene(NamedTuple):
+    """What is relit, and the digests of its frames when nothing disturbs the job."""
 
     capture: Path
     environment: Path
     digests: dict[str, str]
 
 
-def make_site(folder: Path) -> Site:
+def make_scene_files(folder: Path) -> Scene:
     capture = write_capture(folder / "capture", make_scene(size=SIZE, lights=LIGHTS))
     environment = write_exr(folder / "sky.exr", np.random.default_rng(7).random((16, 32, 3)))
-    return Site(capture, environment, relit_relight(capture, environment, FRAMES, folder / "frames"))
+    return Scene(capture, environment, relit_relight(capture, environment, FRAMES, folder / "frames"))
 
 
-def submit(made: Harness, site: Site) -> str:
-    return made.relight(made.register(site.capture, CAPTURE), made.register(site.environment, ENVIRONMENT), FRAMES,
+def submit(made: Harness, scene: Scene) -> str:
+    return made.relight(made.register(scene.capture, CAPTURE), made.register(scene.environment, ENVIRONMENT), FRAMES,
                         chunk_frames=CHUNK_FRAMES)
 
 
-def settle(made: Harness, site: Site, job: str) -> tuple[int, int, int]:
+def settle(made: Harness, scene: Scene, job: str) -> tuple[int, int, int]:
     """Wait for the job: frames that were to be there, those that are as undisturbed, jobs lost."""
     row = made.ended(job, within_s=600)
     there = digests(made.results(job))
-    assert there.keys() <= site.digests.keys(), f"besides the frames: {sorted(there.keys() - site.digests.keys())}"
+    assert there.keys() <= scene.digests.keys(), f"besides the frames: {sorted(there.keys() - scene.digests.keys())}"
     made.until(lambda: made.queue.taken_by() == {}, "left by everybody")
     made.never_two_at_once(job)
-    return FRAMES, sum(there.get(name) == digest for name, digest in site.digests.items()), int(row["state"] != jobs.SUCCEEDED)
+    return FRAMES, sum(there.get(name) == digest for name, digest in scene.digests.items()), int(row["state"] != jobs.SUCCEEDED)
 
 
 def tell(made: Harness, job: str, kind: str, took: float | None) -> None:
@@ -125,44 +131,44 @@ def _lives(pid: int) -> bool:
     return True
 
 
-def kills(folder: Path, server: Postgres, site: Site, chance: random.Random) -> list[Fault]:
+def kills(folder: Path, new_database: NewDatabase, scene: Scene, chance: random.Random) -> list[Fault]:
     """The 30 kills in one job: each when so many frames are there, and up to a second later."""
     order = [kind for kind, times in KILLS.items() for _ in range(times)]
     chance.shuffle(order)
     frames = sorted(chance.randrange(FRAMES - 2 * CHUNK_FRAMES) for _ in order)
     takeovers: dict[str, list[float]] = {kind: [] for kind in KILLS}
-    with harness(folder, server.new_database(), max_lost=len(order)) as made:
+    with harness(folder, new_database(), max_lost=len(order)) as made:
         for _ in range(WORKERS):
             made.start()
         made.ready(WORKERS)
-        job = submit(made, site)
+        job = submit(made, scene)
         for kind, at in zip(order, frames, strict=True):
             made.until(lambda at=at: made.frames_there(job) >= at, f"{at} frames")
             time.sleep(chance.uniform(0, 1))
             took = kill(made, job, kind, chance)
             tell(made, job, kind, took)
             takeovers[kind] += [] if took is None else [took]
-        wanted, identical, lost = settle(made, site, job)
+        wanted, identical, lost = settle(made, scene, job)
     rows = [Fault(kind, times, 0, 0, takeovers[kind], 0) for kind, times in KILLS.items()]
     dead = [each for kind in KILLS if kind != SUPERVISOR for each in takeovers[kind]]
     return [*rows, Fault("**these together, in one job, in random order**", len(order), wanted, identical, dead, lost)]
 
 
-def disturbed(folder: Path, server: Postgres, site: Site, kind: str, times: int, disturb: Callable[[Harness, str], float | None], *,
-              environment: dict[str, str] | None = None, **settings: float) -> Fault:
+def disturbed(folder: Path, new_database: NewDatabase, scene: Scene, kind: str, times: int,
+              disturb: Callable[[Harness, str], float | None], *, environment: dict[str, str] | None = None, **settings: float) -> Fault:
     """A job during which something happens so many times, evenly over its frames."""
     takeovers: list[float] = []
-    with harness(folder, server.new_database(), **settings) as made:
+    with harness(folder, new_database(), **settings) as made:
         for _ in range(WORKERS):
             made.start(**(environment or {}))
         made.ready(WORKERS)
-        job = submit(made, site)
+        job = submit(made, scene)
         for number in range(times):
             made.until(lambda at=(2 * number + 1) * FRAMES // (2 * times + 1): made.frames_there(job) >= at, "that many frames")
             took = disturb(made, job)
             takeovers += [] if took is None else [took]
             tell(made, job, kind, took)
-        wanted, identical, lost = settle(made, site, job)
+        wanted, identical, lost = settle(made, scene, job)
         return Fault(kind, times, wanted, identical, takeovers, lost)
 
 
@@ -247,30 +253,35 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=random.randrange(2**32))
     parser.add_argument("--write", type=Path, help="the document that the table goes into")
+    parser.add_argument("--sqlite", action="store_true", help="without PostgreSQL")
     chosen = parser.parse_args(arguments)
     programs = binaries()
-    if programs is None:
+    if programs is None and not chosen.sqlite:
         sys.exit("no PostgreSQL server programs: neither on the PATH nor in /usr/lib/postgresql")
     print(f"seed {chosen.seed}")
     began, load = time.monotonic(), os.getloadavg()[0]
-    with tempfile.TemporaryDirectory(prefix="relit-faults-") as name, postgres(programs) as server:
+    with tempfile.TemporaryDirectory(prefix="relit-faults-") as name, ExitStack() as stack:
         folder = Path(name)
-        site = make_site(folder)
-        faults = kills(folder / "kills", server, site, random.Random(chosen.seed))
-        for number, (kind, times, disturb, settings) in enumerate((
-                ("SIGKILL of all workers at once", 3, kill_all, {}),
-                ("SIGSTOP of the worker at work", 2, stop_one, {"stall_s": STALL_S}),
-                ("SIGTERM to the `relit worker` at work", 3, ask_one_to_end, {}),
-                ("PostgreSQL restarted (fast)", 3, restarted(server, "fast", 0.0), {}),
-                ("PostgreSQL restarted (immediate)", 3, restarted(server, "immediate", 0.0), {}),
-                ("PostgreSQL away for 10 s", 2, restarted(server, "fast", 10.0), {}))):
-            faults.append(disturbed(folder / str(number), server, site, kind, times, disturb, **settings))
+        server = None if chosen.sqlite or programs is None else stack.enter_context(postgres(programs))
+        new_database: NewDatabase = (lambda: None) if server is None else server.new_database
+        scene = make_scene_files(folder)
+        faults = kills(folder / "kills", new_database, scene, random.Random(chosen.seed))
+        rows: list[tuple[str, int, Callable[[Harness, str], float | None], dict[str, float]]] = [
+            ("SIGKILL of all workers at once", 3, kill_all, {}),
+            ("SIGSTOP of the worker at work", 2, stop_one, {"stall_s": STALL_S}),
+            ("SIGTERM to the `relit worker` at work", 3, ask_one_to_end, {})]
+        if server is not None:
+            rows += [("PostgreSQL restarted (fast)", 3, restarted(server, "fast", 0.0), {}),
+                     ("PostgreSQL restarted (immediate)", 3, restarted(server, "immediate", 0.0), {}),
+                     ("PostgreSQL away for 10 s", 2, restarted(server, "fast", 10.0), {})]
+        for number, (kind, times, disturb, settings) in enumerate(rows):
+            faults.append(disturbed(folder / str(number), new_database, scene, kind, times, disturb, **settings))
     text = document(faults, chosen.seed, time.monotonic() - began, load)
     print(text)
     dead = [each for fault in faults if "SIGKILL of the worker" in fault.kind or "all workers" in fault.kind for each in fault.takeovers_s]
     assert all(fault.identical == fault.frames and fault.lost == 0 for fault in faults), "frames or jobs are lost"
     assert max(dead) < TAKEOVER_LIMIT_S, f"a takeover took {max(dead):.1f} s"
-    if chosen.write is not None:
+    if chosen.write is not None and not chosen.sqlite:
         chosen.write.write_text(text)
 
 

@@ -1,4 +1,4 @@
-"""The log of the service: one event a line, with the request and the job that it belongs to."""
+"""The log of the service: one event in a line, with its request and its job."""
 
 import logging
 import sys
@@ -9,7 +9,7 @@ logger = structlog.stdlib.get_logger("relit")
 
 
 def configure(level: str, form: str) -> None:
-    """Log to standard error, and what libraries have to say too.
+    """Log to standard error, the warnings of libraries too.
 
     Args:
         level: debug, info, warning or error.
@@ -38,8 +38,9 @@ def configure(level: str, form: str) -> None:
                         cache_logger_on_first_use=True)
 
 
-def adopt(library: str) -> None:
-    """Let what a library says go the way of all lines: some set up a way of their own."""
+def adopt(library: str, *, without: type[BaseException]) -> None:
+    """Write what a library logs, which may have set up handlers of its own, as this log; leave out its reports of one exception."""
     theirs = logging.getLogger(library)
     theirs.handlers.clear()
     theirs.propagate = True
+    theirs.addFilter(lambda record: not (record.exc_info and isinstance(record.exc_info[1], without)))

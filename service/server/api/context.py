@@ -1,5 +1,6 @@
-"""What every route is given: the service behind the app, who asks, and the token of a request that creates something."""
+"""What routes depend on: the service, the caller and its scope, the space that is left, and requests that may be sent twice."""
 
+import shutil
 import threading
 from collections.abc import Awaitable, Callable
 from typing import Annotated, Any, NamedTuple
@@ -9,8 +10,7 @@ from fastapi import Depends, Header, Request, Security
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
 from service.requests.keys import Scope
-from service.server.api.limits import Limiter
-from service.server.api.local import require_local
+from service.server.api.access import RateLimiter, require_local
 from service.server.api.problems import ApiError
 from service.server.api.watch import Watcher
 from service.server.database import idempotency, keys
@@ -22,25 +22,28 @@ from service.server.storage.folder import Storage
 
 DEFAULT_PROJECT = "default"
 ANONYMOUS = Caller(DEFAULT_PROJECT, Scope.ADMIN, None)
+SPACE_RETRY_S = 600
+FOR_WORK, FOR_UPLOAD = "new work", "this upload"
+"""Purposes of space, as the sentence names them."""
 
 
 class Service(NamedTuple):
-    """ServiceDep the app."""
+    """The parts of the service that routes use."""
 
     settings: Settings
     database: Database
     queue: JobQueue
     storage: Storage
-    limiter: Limiter
+    limiter: RateLimiter
     draining: threading.Event
-    """Set when the service is to end: it answers on while its workers finish their steps, and is not ready."""
+    """Set when the service is asked to end: it still answers while its workers finish their steps, and says that it is not ready."""
     closing: threading.Event
-    """Set when the workers have ended: streams end now, and then the service."""
+    """Set when the workers have ended: streams of events end, and then the service."""
     watcher: Watcher
 
 
-async def service_of(request: Request) -> Service:  # what waits for nothing is async, which saves a turn in a thread
-    """The service of the app that got the request."""
+async def service_of(request: Request) -> Service:  # async, as it waits for nothing: FastAPI calls it without a thread
+    """Return the service of the app that received the request."""
     found: Service = request.app.state.service
     return found
 
@@ -50,7 +53,11 @@ bearer = HTTPBearer(auto_error=False, scheme_name="key", description="A key of `
 
 
 def caller_of(service: ServiceDep, request: Request, given: Annotated[HTTPAuthorizationCredentials | None, Security(bearer)]) -> Caller:
-    """Who asks, within the limits of the key."""
+    """Return who sent the request.
+
+    Raises:
+        ApiError: there is no valid key and none may be left out, or the key asks too often.
+    """
     caller = None
     if given is not None:
         caller = keys.find(service.database, given.credentials)
@@ -81,16 +88,16 @@ IdempotencyKey = Annotated[str | None, Header(
     description="Chosen by the client: the same request sent again with it creates nothing again.")]
 
 
-def made_before(service: Service, caller: Caller, token: str | None, asked: Any) -> str | None:
-    """What the same request has created already: it is not looked at again whether it could be created now."""
+def created_before(service: Service, caller: Caller, token: str | None, asked: Any) -> str | None:
+    """Return what the same request has created before; None: nothing. Whether it could be created now does not matter then."""
     try:
         return None if token is None else idempotency.created_by(service.database, caller.project, token, asked)
     except idempotency.TokenReused:
         raise _reused(token) from None
 
 
-def once(service: Service, caller: Caller, token: str | None, asked: Any, make: Callable[[sa.Connection], str]) -> tuple[str, bool]:
-    """Create something, once for an Idempotency-Key; arguments as `idempotency.create_once`."""
+def create_once(service: Service, caller: Caller, token: str | None, asked: Any, make: Callable[[sa.Connection], str]) -> tuple[str, bool]:
+    """Create something once for an Idempotency-Key; the arguments are those of `idempotency.create_once`."""
     try:
         return idempotency.create_once(service.database, caller.project, token, asked, make)
     except idempotency.TokenReused:
@@ -99,3 +106,23 @@ def once(service: Service, caller: Caller, token: str | None, asked: Any, make: 
 
 def _reused(token: str | None) -> ApiError:
     return ApiError("invalid", f"Idempotency-Key {token}: came with another request before: choose a new one")
+
+
+def has_space(settings: Settings, length: int = 0) -> bool:
+    """Return whether `min_free_bytes` are left in the data folder after `length` more bytes."""
+    return shutil.disk_usage(settings.data).free - length >= settings.min_free_bytes
+
+
+def require_space(service: Service, purpose: str, length: int = 0) -> None:
+    """Refuse a request for which there is no space.
+
+    Args:
+        service: of the request.
+        purpose: FOR_WORK or FOR_UPLOAD.
+        length: bytes that will be written, if that is known.
+
+    Raises:
+        ApiError: less than `min_free_bytes` would be left.
+    """
+    if not has_space(service.settings, length):
+        raise ApiError("full", f"the service has no space left for {purpose}", headers={"Retry-After": str(SPACE_RETRY_S)})

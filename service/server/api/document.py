@@ -1,4 +1,4 @@
-"""The OpenAPI document: what FastAPI makes of the routes, said as it is."""
+"""The OpenAPI document: that of FastAPI, with the headers, examples and problems that it leaves out."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -9,22 +9,22 @@ from fastapi.openapi.utils import get_openapi
 from service.server.api.problems import KINDS, MEDIA_TYPE, OF_STATUS
 
 TAGS = {
-    "captures": "What was photographed: uploaded file by file, or registered where it lies on the server.",
-    "environments": "Lat-long maps that jobs light a capture with; they come as captures do.",
-    "uploads": "Files on their way in, by the tus 1.0 protocol: gone on with after a break, checked by checksum.",
-    "jobs": "Work that is queued, done by workers, and outlives any of them.",
-    "events": "Jobs as they change, without asking again and again.",
-    "results": "What jobs have made.",
-    "operations": "For those who keep the service running.",
+    "captures": "Photographs with their manifest: uploaded file by file, or registered where they lie on the server.",
+    "environments": "Lat-long maps by which jobs light a capture; created as captures are.",
+    "uploads": "Files of captures and environments, by the tus 1.0 protocol: resumed after an interruption, verified by checksums.",
+    "jobs": "Requests for work, which are queued, and survive the workers that do them.",
+    "events": "Changes of jobs, as server-sent events.",
+    "results": "Files that jobs have made.",
+    "operations": "Health, readiness and metrics, for operators.",
 }
-REQUEST_ID = {"description": "Name of the request in the log.", "schema": {"type": "string"}}
-RETRY_AFTER = {"description": "Seconds until it is worth trying again.", "schema": {"type": "integer", "minimum": 0}}
+REQUEST_ID = {"description": "Identifier of the request in the log.", "schema": {"type": "string"}}
+RETRY_AFTER = {"description": "Seconds until the request may succeed.", "schema": {"type": "integer", "minimum": 0}}
 HEADERS: dict[int, dict[str, Any]] = {
     401: {"WWW-Authenticate": {"description": "Bearer.", "schema": {"type": "string"}}},
     416: {"Content-Range": {"description": "bytes */ and the size of the file.", "schema": {"type": "string"}}},
     **{status: {"Retry-After": RETRY_AFTER} for status in (429, 503, 507)},
 }
-LOCATION = {"description": "Path of what was created.", "schema": {"type": "string"}}
+LOCATION = {"description": "Path of the new resource.", "schema": {"type": "string"}}
 EXAMPLES: dict[str, dict[str, Any]] = {
     "JobView": {
         "id": "job_0123456789abcdefghjk", "state": "running", "attempt": 1, "revision": 7, "priority": 50,
@@ -40,14 +40,14 @@ EXAMPLES: dict[str, dict[str, Any]] = {
         "name": "frame.0001.exr", "size": 177062, "modified_at": "2026-11-20T09:00:02Z",
         "url": "/v1/jobs/job_0123456789abcdefghjk/results/frame.0001.exr"},
 }
-"""Of answers. FastAPI would leave out what is null, and a null is said here."""
+"""Examples of answers. FastAPI would leave out fields that are null."""
 METHODS = ("options", "get", "head", "post", "put", "patch", "delete")
 WITH_BODY = (400, 413, 415)
-"""How every body can be refused, beside by what it says."""
+"""Statuses with which any body can be refused, whatever its content."""
 
 
 def install(app: FastAPI) -> None:
-    """Serve the document of the app's routes."""
+    """Make the app serve the document of its routes."""
 
     def document() -> dict[str, Any]:
         if app.openapi_schema is None:
@@ -68,7 +68,7 @@ def _document(app: FastAPI) -> dict[str, Any]:
     for schema in made["components"]["schemas"].values():
         for field in schema.get("properties", {}).values():
             if "description" in field:
-                field["description"] = field["description"].replace("None:", "null:")  # written beside Python, read beside JSON
+                field["description"] = field["description"].replace("None:", "null:")  # docstrings are about Python
     return made
 
 
@@ -79,7 +79,7 @@ def _operations(document: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 def _describe(operation: dict[str, Any]) -> None:
     for parameter in operation.get("parameters", []):
-        parameter["schema"] = _without_null(parameter["schema"])  # a parameter is there or not
+        parameter["schema"] = _without_null(parameter["schema"])  # a parameter is given or not, and never null
     body = operation.get("requestBody", {}).get("content", {})
     for status in WITH_BODY if "application/json" in body else ():
         operation["responses"].setdefault(str(status), {"description": KINDS[OF_STATUS[status]].title})

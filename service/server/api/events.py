@@ -1,4 +1,4 @@
-"""Jobs as they change, as server-sent events (https://html.spec.whatwg.org/multipage/server-sent-events.html)."""
+"""Routes that stream the changes of jobs as server-sent events (https://html.spec.whatwg.org/multipage/server-sent-events.html)."""
 
 import json
 from collections.abc import AsyncIterator
@@ -17,8 +17,8 @@ from service.views.states import ENDED
 router = APIRouter(tags=["events"], responses=responses(401, 403, 429, 503))
 
 SILENCE_S = 15.0
-"""After which a comment says that the service is there, so that nobody between closes the connection."""
-HEADERS = {"Cache-Control": "no-cache", "X-Accel-Buffering": "no"}  # the second for nginx, which would hold them back
+"""Seconds without an event after which a comment is sent, so that no proxy closes the connection."""
+HEADERS = {"Cache-Control": "no-cache", "X-Accel-Buffering": "no"}  # the second header is for nginx, which would delay events
 EXAMPLE = 'event: job\ndata: {"id": "job_0123456789abcdefghjk", "state": "running", …}\nid: 7\n\n'
 STREAM: dict[str, Any] = {
     "description": "Events `job`, each with a JobView as data and its revision as id, and `gone` with the id of a job that was deleted.",
@@ -31,7 +31,7 @@ LastEvent = Annotated[str | None, Header(
 @router.get("/v1/jobs/{job}/events", responses={**responses(404, 422), 200: STREAM, 204: NOTHING_MORE}, response_class=Response,
             summary="Watch a job")
 async def stream_job(service: ServiceDep, found: Annotated[JobView, Depends(job_of)], last: LastEvent = None) -> Response:
-    """The job as it is, then as it becomes with every change; the stream ends when the job has."""
+    """Send the job as it is, and then with every change; the stream ends when the job has ended."""
     known = int(last) if last is not None and int(last) <= found.revision else 0
     if found.state in ENDED and known == found.revision:
         return Response(status_code=204)
@@ -41,7 +41,7 @@ async def stream_job(service: ServiceDep, found: Annotated[JobView, Depends(job_
 
 @router.get("/v1/events", responses={200: STREAM}, response_class=Response, summary="Watch all jobs of the project")
 async def stream_jobs(service: ServiceDep, caller: Reader) -> Response:
-    """The jobs that have not ended or ended a moment ago, then every job of the project as it changes; the stream does not end."""
+    """Send the jobs that have not ended or ended lately, then every job of the project as it changes; the stream does not end."""
     service.watcher.require_room()
     return EventSourceResponse(_stream(service.watcher, caller.project, to_its_end=False), headers=HEADERS)
 
@@ -57,7 +57,7 @@ async def _stream(watcher: Watcher, topic: str, *, known: int = 0, to_its_end: b
             if to_its_end and any(change.ended for change in news):
                 return
     finally:
-        watcher.leave(listener)
+        watcher.remove(listener)
 
 
 def _event(change: Change, *, identified: bool) -> bytes:

@@ -1,4 +1,4 @@
-"""Captures and environments: created to be uploaded, or registered where they lie on the server; checked, listed, deleted."""
+"""Routes of captures and environments: create for an upload, or register where they lie on the server; check, list, delete."""
 
 import os
 from pathlib import Path
@@ -11,9 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from service.requests.identifiers import CAPTURE, ENVIRONMENT, CaptureId, EnvironmentId, new_id
 from service.requests.jobs import CheckJob
 from service.requests.keys import Scope
-from service.server.api.context import IdempotencyKey, Reader, Service, ServiceDep, Writer, once
+from service.server.api.context import FOR_WORK, IdempotencyKey, Reader, Service, ServiceDep, Writer, create_once, require_space
 from service.server.api.problems import ApiError, responses
-from service.server.api.space import FOR_WORK, require_space
 from service.server.api.submission import submit
 from service.server.api.views import intake_view
 from service.server.database import intakes, jobs, uploads
@@ -33,30 +32,30 @@ Name = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f
 
 
 class NewCapture(BaseModel):
-    """A capture that is to come."""
+    """A capture to create."""
 
     model_config = ConfigDict(extra="forbid")
 
     name: Name
     folder: str | None = None
-    """Of the server, under one of its roots: the capture is used where it lies. Needs the scope admin; null: files are uploaded."""
+    """Folder of the server below one of its roots; the capture is used where it lies. Needs the scope admin; null: files are uploaded."""
 
 
 class NewEnvironment(BaseModel):
-    """An environment that is to come."""
+    """An environment to create."""
 
     model_config = ConfigDict(extra="forbid")
 
     name: Name
     file: str | None = None
-    """Of the server, under one of its roots, as `folder` of a capture."""
+    """File of the server below one of its roots, as `folder` of a capture."""
 
 
 @captures.post("", status_code=201, responses=responses(404, 409, 507), summary="Create a capture")
 def create_capture(service: ServiceDep, caller: Writer, response: Response, wanted: Annotated[NewCapture, Body(
         openapi_examples={"upload": {"value": {"name": "owl"}}, "register": {"value": {"name": "owl", "folder": "/captures/owl"}}})],
                    token: IdempotencyKey = None) -> IntakeView:
-    """Create a capture, and then upload its files; or register a folder of the server, which is checked at once."""
+    """Create a capture, whose files are then uploaded; or register a folder of the server, which is checked at once."""
     folder = None if wanted.folder is None else _registered(service, caller, "folder", wanted.folder)
     if folder is not None and not os.path.isdir(folder):
         raise ApiError("invalid", "folder: there is no such folder")
@@ -67,7 +66,7 @@ def create_capture(service: ServiceDep, caller: Writer, response: Response, want
 def create_environment(service: ServiceDep, caller: Writer, response: Response, wanted: Annotated[NewEnvironment, Body(
         openapi_examples={"upload": {"value": {"name": "sky"}}, "register": {"value": {"name": "sky", "file": "/hdr/sky.exr"}}})],
                        token: IdempotencyKey = None) -> IntakeView:
-    """Create an environment, and then upload its one lat-long image; or register a file of the server, which is checked at once."""
+    """Create an environment, whose one lat-long image is then uploaded; or register a file of the server, which is checked at once."""
     file = None if wanted.file is None else _registered(service, caller, "file", wanted.file)
     if file is not None and not os.path.isfile(file):
         raise ApiError("invalid", "file: there is no such file")
@@ -76,57 +75,57 @@ def create_environment(service: ServiceDep, caller: Writer, response: Response, 
 
 @captures.get("", responses=responses(404), summary="List captures, the newest first")
 def list_captures(service: ServiceDep, caller: Reader, limit: Limit = 100, before: CaptureId | None = None) -> IntakePage:
-    """Captures of the project, a page at a time."""
+    """List the captures of the project, one page at a time."""
     return _page(service, caller, CAPTURE, limit, before)
 
 
 @environments.get("", responses=responses(404), summary="List environments, the newest first")
 def list_environments(service: ServiceDep, caller: Reader, limit: Limit = 100, before: EnvironmentId | None = None) -> IntakePage:
-    """Environments of the project, a page at a time."""
+    """List the environments of the project, one page at a time."""
     return _page(service, caller, ENVIRONMENT, limit, before)
 
 
 @captures.get("/{capture}", responses=responses(404), summary="Look at a capture")
 def get_capture(service: ServiceDep, caller: Reader, capture: CaptureId) -> IntakeView:
-    """State of a capture, and what its check found."""
+    """Return the state of a capture and the facts that its check found."""
     return intake_view(row_of(service, caller, capture))
 
 
 @environments.get("/{environment}", responses=responses(404), summary="Look at an environment")
 def get_environment(service: ServiceDep, caller: Reader, environment: EnvironmentId) -> IntakeView:
-    """State of an environment, and what its check found."""
+    """Return the state of an environment and the facts that its check found."""
     return intake_view(row_of(service, caller, environment))
 
 
 @captures.post("/{capture}/validate", status_code=202, responses=responses(404, 409, 507), summary="Check an uploaded capture")
 def validate_capture(service: ServiceDep, caller: Writer, capture: CaptureId) -> IntakeView:
-    """Take no more files, and look at manifest, names and headers; jobs may use it once it is ready."""
+    """Accept no more files, and check manifest, names and headers; jobs may use the capture when it is ready."""
     return _validate(service, caller, capture)
 
 
 @environments.post("/{environment}/validate", status_code=202, responses=responses(404, 409, 507), summary="Check an uploaded environment")
 def validate_environment(service: ServiceDep, caller: Writer, environment: EnvironmentId) -> IntakeView:
-    """Take no more files, and look at the image's header; jobs may use it once it is ready."""
+    """Accept no more files, and check the image's header; jobs may use the environment when it is ready."""
     return _validate(service, caller, environment)
 
 
 @captures.delete("/{capture}", status_code=204, responses=responses(404, 409), summary="Delete a capture")
 def delete_capture(service: ServiceDep, caller: Writer, capture: CaptureId) -> None:
-    """Remove a capture that no running or waiting job reads; what was registered stays where it lies."""
+    """Delete a capture that no queued or running job reads; a registered folder stays where it lies."""
     _delete(service, caller, capture)
 
 
 @environments.delete("/{environment}", status_code=204, responses=responses(404, 409), summary="Delete an environment")
 def delete_environment(service: ServiceDep, caller: Writer, environment: EnvironmentId) -> None:
-    """Remove an environment that no running or waiting job reads; what was registered stays where it lies."""
+    """Delete an environment that no queued or running job reads; a registered file stays where it lies."""
     _delete(service, caller, environment)
 
 
 def row_of(service: Service, caller: Caller, identifier: str) -> sa.RowMapping:
-    """A capture or environment of the caller's project.
+    """Return the row of a capture or environment of the caller's project.
 
     Raises:
-        ApiError: there is none.
+        ApiError: the project has no such capture or environment.
     """
     row = intakes.find(service.database, identifier, caller.project)
     if row is None:
@@ -158,7 +157,7 @@ def _create(service: Service, caller: Caller, prefix: str, name: str, folder: Pa
             submit(service, caller, CheckJob(kind="check", intake=identifier), connection, [identifier])
         return identifier
 
-    identifier, _ = once(service, caller, token, [prefix, name, None if folder is None else str(folder)], make)
+    identifier, _ = create_once(service, caller, token, [prefix, name, None if folder is None else str(folder)], make)
     response.headers["Location"] = f"/v1/{layout.FOLDERS[prefix]}/{identifier}"
     return intake_view(row_of(service, caller, identifier))
 

@@ -1,19 +1,29 @@
-"""Jobs: handed in, looked at, cancelled, begun again, deleted."""
+"""Routes of jobs: submit, look at, cancel, retry, resume, change the priority, delete."""
 
+import json
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import sqlalchemy as sa
 from fastapi import APIRouter, Body, Path, Query, Response
 from fastapi.openapi.models import Example
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, TypeAdapter
+from pydantic_core import CoreSchema, core_schema
 
 from service.requests.identifiers import JobId
 from service.requests.jobs import CheckJob, JobRequest, UserJob
-from service.server.api.context import IdempotencyKey, Reader, Service, ServiceDep, Writer, made_before, once
-from service.server.api.exact import Exact
+from service.server.api.context import (
+    FOR_WORK,
+    IdempotencyKey,
+    Reader,
+    Service,
+    ServiceDep,
+    Writer,
+    create_once,
+    created_before,
+    require_space,
+)
 from service.server.api.problems import ApiError, responses
-from service.server.api.space import FOR_WORK, require_space
 from service.server.api.submission import inputs_of, require_queue, spelled_out, submit
 from service.server.api.views import job_view
 from service.server.database import jobs
@@ -35,29 +45,48 @@ EXAMPLES: dict[str, Example] = {
     "pipeline": {"value": {"kind": "pipeline", "capture": CAPTURE, "environment": SKY, "guided": True,
                            "relight": {"frames": "1-240", "spin_degrees": 360}}},
 }
+
+
+class StrictJson:
+    """Annotation of a body that is read as JSON, without conversions: "5" is not taken for 5, nor 1 for true.
+
+    FastAPI gives Pydantic Python objects, and of these it converts values, which the OpenAPI document does not promise. Its strict mode
+    works for JSON text only: of Python objects it refuses every list for a tuple and every text for an enumeration.
+    """
+
+    def __init__(self, kind: Any) -> None:
+        """Args: kind: the type to read, of which the annotated type is a base."""
+        self._kind, self._adapter = kind, TypeAdapter[Any](kind)
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """Return the schema of the type, with the strict reader."""
+        return core_schema.no_info_wrap_validator_function(
+            lambda value, _: self._adapter.validate_json(json.dumps(value), strict=True), handler.generate_schema(self._kind))
+
+
 JobName = Annotated[JobId, Path(description="Identifier of the job.")]
-Asked = Annotated[JobRequest, Exact(UserJob), Body(openapi_examples=EXAMPLES)]
+Asked = Annotated[JobRequest, StrictJson(UserJob), Body(openapi_examples=EXAMPLES)]
 States = Annotated[Sequence[states.JobState], Query(description="Of these states alone; none: of all.")]
 
 
 class Priority(BaseModel):
-    """How soon a job that has not begun goes."""
+    """The priority of a queued job."""
 
     model_config = ConfigDict(extra="forbid")
 
     priority: Annotated[int, Field(ge=0, le=100, strict=True, description="Higher goes first.")]
 
 
-@router.post("", status_code=202, responses=responses(404, 409, 507), summary="Hand a job in")
+@router.post("", status_code=202, responses=responses(404, 409, 507), summary="Submit a job")
 def create_job(service: ServiceDep, caller: Writer, response: Response, request: Asked, token: IdempotencyKey = None) -> JobView:
-    """Queue a job. Its Location has its state; /events streams it, /results has what it made."""
+    """Queue a job. Its Location gives its state, /events streams its changes, /results lists its files."""
     asked = ["job", request.model_dump(mode="json", by_alias=True)]
-    job = made_before(service, caller, token, asked)
+    job = created_before(service, caller, token, asked)
     if job is None:
         require_space(service, FOR_WORK)
         inputs = inputs_of(service, caller.project, request)
         spelled = spelled_out(service, caller.project, request)
-        job, _ = once(service, caller, token, asked, lambda connection: submit(service, caller, spelled, connection, inputs))
+        job, _ = create_once(service, caller, token, asked, lambda connection: submit(service, caller, spelled, connection, inputs))
     response.headers["Location"] = f"/v1/jobs/{job}"
     return view(service, caller, job)
 
@@ -66,7 +95,7 @@ def create_job(service: ServiceDep, caller: Writer, response: Response, request:
 def list_jobs(service: ServiceDep, caller: Reader, state: States = (),
               limit: Annotated[int, Query(ge=1, le=500)] = 100,
               before: Annotated[JobId | None, Query(description="`next` of the page before.")] = None) -> JobPage:
-    """Jobs of the project, a page at a time."""
+    """List the jobs of the project, one page at a time."""
     after = None
     if before is not None:
         row = jobs.find(service.database, before, caller.project)
@@ -79,13 +108,13 @@ def list_jobs(service: ServiceDep, caller: Reader, state: States = (),
 
 @router.get("/{job}", responses=responses(404), summary="Look at a job")
 def get_job(service: ServiceDep, caller: Reader, job: JobName) -> JobView:
-    """State, progress and error of a job."""
+    """Return state, progress and error of a job."""
     return view(service, caller, job)
 
 
 @router.post("/{job}/cancel", status_code=202, responses=responses(404, 409), summary="Cancel a job")
 def cancel_job(service: ServiceDep, caller: Writer, job: JobName) -> JobView:
-    """Stop a job: at once where it waits, else at its next sign of progress. What it has made stays."""
+    """Cancel a job: at once if it is queued, else at its next sign of progress. Its results stay."""
     before = view(service, caller, job)
     if not service.database.transact(lambda connection: jobs.cancel(connection, job)):
         raise ApiError("conflict", f"{job} is {before.state}: it has ended")
@@ -93,22 +122,22 @@ def cancel_job(service: ServiceDep, caller: Writer, job: JobName) -> JobView:
     return view(service, caller, job)
 
 
-@router.post("/{job}/retry", status_code=202, responses=responses(404, 409, 507), summary="Try a failed job again")
+@router.post("/{job}/retry", status_code=202, responses=responses(404, 409, 507), summary="Retry a failed job")
 def retry_job(service: ServiceDep, caller: Writer, job: JobName) -> JobView:
-    """Begin a failed job again; steps and frames that are done stay."""
+    """Queue a failed job again; its finished steps and frames are kept."""
     return _again(service, caller, job, states.FAILED)
 
 
-@router.post("/{job}/resume", status_code=202, responses=responses(404, 409, 507), summary="Go on with a cancelled job")
+@router.post("/{job}/resume", status_code=202, responses=responses(404, 409, 507), summary="Resume a cancelled job")
 def resume_job(service: ServiceDep, caller: Writer, job: JobName) -> JobView:
-    """Go on with a cancelled job; steps and frames that are done stay."""
+    """Queue a cancelled job again; its finished steps and frames are kept."""
     return _again(service, caller, job, states.CANCELLED)
 
 
 @router.patch("/{job}", responses=responses(404, 409), summary="Change the priority of a job")
 def change_priority(service: ServiceDep, caller: Writer, job: JobName,
                     wanted: Annotated[Priority, Body(openapi_examples={"sooner": {"value": {"priority": 90}}})]) -> JobView:
-    """Give a job that has not begun another priority."""
+    """Change the priority of a queued job; it stays the same attempt."""
     before = view(service, caller, job)
 
     def work(connection: sa.Connection) -> bool:
@@ -124,7 +153,7 @@ def change_priority(service: ServiceDep, caller: Writer, job: JobName,
 
 @router.delete("/{job}", status_code=204, responses=responses(404, 409), summary="Delete a job and its results")
 def delete_job(service: ServiceDep, caller: Writer, job: JobName) -> None:
-    """Remove a job that has ended, with all that it made."""
+    """Delete a job that has ended, with its results."""
     before = view(service, caller, job)
 
     def work(connection: sa.Connection) -> bool:
@@ -139,15 +168,15 @@ def delete_job(service: ServiceDep, caller: Writer, job: JobName) -> None:
 
 
 def job_of(service: ServiceDep, caller: Reader, job: JobName) -> JobView:
-    """The job that a path names."""
+    """Return the job that the path names."""
     return view(service, caller, job)
 
 
 def view(service: Service, caller: Caller, job: str) -> JobView:
-    """A job of the caller's project.
+    """Return a job of the caller's project.
 
     Raises:
-        ApiError: there is none.
+        ApiError: the project has no such job.
     """
     row = jobs.find(service.database, job, caller.project)
     if row is None:

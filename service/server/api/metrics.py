@@ -1,4 +1,4 @@
-"""What /metrics counts, for Prometheus. No label names a project, a key or a job: who may read the numbers learns of none."""
+"""The metrics of /metrics, for Prometheus. No label names a project, a key or a job, so that the metrics reveal none."""
 
 import shutil
 import time
@@ -21,16 +21,16 @@ from service.views.states import ACTIVE, ENDED
 CONTENT_TYPE = CONTENT_TYPE_LATEST
 METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 OTHER = "other"
-"""Label of methods and paths that are none of ours: whoever makes names up makes no numbers."""
-disable_created_metrics()  # type: ignore[no-untyped-call]  # a time beside every number, which nobody asks for
+"""Label of unknown methods and paths, so that invented names make no new metrics."""
+disable_created_metrics()  # type: ignore[no-untyped-call]  # which would add a time to every metric
 STATES = (*ACTIVE, *ENDED)
 
 
 class Metrics:
-    """The numbers of one API process, and of the database behind it."""
+    """The metrics of one API process, and those from the database."""
 
     def __init__(self, settings: Settings, database: Database) -> None:
-        """Args: settings: of the service. database: of the store."""
+        """Args: settings, database: of the service."""
         self._registry = CollectorRegistry()
         ProcessCollector(registry=self._registry)
         GCCollector(registry=self._registry)
@@ -41,10 +41,10 @@ class Metrics:
                                 registry=self._registry)
         self._received = Counter("relit_http_received_bytes", "Bytes of bodies that came, uploads above all.", ("route",),
                                  registry=self._registry)
-        self._registry.register(_Store(settings, database))
+        self._registry.register(_DatabaseMetrics(settings, database))
 
     def count(self, scope: Scope, status: int, waited_s: float, received: int) -> None:
-        """A request has ended; status 0: without an answer."""
+        """Count a request that has ended; status 0: without an answer."""
         method = scope["method"] if scope["method"] in METHODS else OTHER
         route = str(getattr(scope.get("route"), "path_format", OTHER))
         self._requests.labels(method, route, str(status)).inc()
@@ -53,22 +53,22 @@ class Metrics:
             self._received.labels(route).inc(received)
 
     def text(self) -> bytes:
-        """All of them as Prometheus reads them."""
+        """Return all metrics in the format of Prometheus."""
         return generate_latest(self._registry)
 
 
-class _Store(Collector):
-    """Numbers of the store, asked for when they are read."""
+class _DatabaseMetrics(Collector):
+    """Metrics from the database, which are asked for when they are read."""
 
     def __init__(self, settings: Settings, database: Database) -> None:
         self._settings, self._database = settings, database
 
     def describe(self) -> list[Metric]:
-        """Nothing is asked when it is registered."""
+        """Return no metrics, so that registering asks the database nothing."""
         return []
 
     def collect(self) -> Iterator[Metric]:
-        """What the database says now; where it does not answer, that alone."""
+        """Return the metrics; if the database does not answer, only that it does not."""
         yield GaugeMetricFamily("relit_storage_free_bytes", "Space left where the data folder is.",
                                 value=shutil.disk_usage(self._settings.data).free)
         try:

@@ -1,4 +1,4 @@
-"""For those who operate the service: whether it lives, whether it is ready, and its numbers."""
+"""Routes for operators: health, readiness and metrics."""
 
 import threading
 import time
@@ -9,36 +9,35 @@ from fastapi.security import HTTPAuthorizationCredentials
 from pydantic import BaseModel
 
 from service.requests.keys import Scope
-from service.server.api.context import Service, ServiceDep, bearer, caller_of
-from service.server.api.local import require_local
+from service.server.api.access import require_local
+from service.server.api.context import Service, ServiceDep, bearer, caller_of, has_space
 from service.server.api.metrics import CONTENT_TYPE
 from service.server.api.problems import ApiError, responses
-from service.server.api.space import has_space
 from service.server.database import workers
 from service.server.database.engine import UNANSWERED
 from stage.errors import StorageError
 
 router = APIRouter(tags=["operations"])
 KEEP_S = 1.0
-"""How long what was found is answered again, so that those who ask often cost nothing."""
+"""Seconds for which a result is used again, so that frequent requests cost nothing."""
 
 
 class Health(BaseModel):
-    """Nothing is wrong."""
+    """The answer of a service that works."""
 
     status: Literal["ok"] = "ok"
 
 
 class Readiness:
-    """Looks whether the service can do its work."""
+    """The last result of the readiness checks."""
 
     def __init__(self) -> None:
-        """Nothing is known yet."""
+        """Create it without a result."""
         self._lock = threading.Lock()
         self._looked_at, self._wrong = -KEEP_S, list[str]()
 
     def wrong(self, service: Service) -> list[str]:
-        """What is wrong: sentences that name nothing of the machine, for anybody may read them."""
+        """Return what is wrong, in sentences that name nothing of the machine, as anybody may read them."""
         if service.draining.is_set():
             return ["the service is ending"]
         with self._lock:
@@ -66,13 +65,13 @@ def _faults(service: Service) -> list[str]:
 
 @router.get("/healthz", summary="Whether the process answers")
 async def get_health() -> Health:
-    """Ask whether the process is to be started again; needs no key."""
+    """Tell whether the process answers; needs no key."""
     return Health()
 
 
 @router.get("/readyz", responses=responses(503), summary="Whether the service can do its work")
 def get_readiness(service: ServiceDep, request: Request) -> Health:
-    """Database, storage, space left and workers; 503 says what is wrong, also while the service ends. Needs no key."""
+    """Check database, storage, space left and workers; 503 says what is wrong, also while the service ends. Needs no key."""
     readiness: Readiness = request.app.state.readiness
     if wrong := readiness.wrong(service):
         raise ApiError("unavailable", "; ".join(wrong), headers={"Retry-After": "5"})
@@ -81,7 +80,7 @@ def get_readiness(service: ServiceDep, request: Request) -> Health:
 
 def operator_of(service: ServiceDep, request: Request,
                 given: Annotated[HTTPAuthorizationCredentials | None, Security(bearer)]) -> None:
-    """Who may read the numbers: this machine where the service listens to it alone; else a key of scope admin."""
+    """Refuse who may not read the metrics: a key of scope admin may, and this machine if the service listens to it only."""
     if given is None and service.settings.loopback:
         require_local(request)
     elif not (caller := caller_of(service, request, given)).may(Scope.ADMIN):
@@ -90,7 +89,7 @@ def operator_of(service: ServiceDep, request: Request,
 
 @router.get("/metrics", dependencies=[Depends(operator_of)], responses={
     **responses(401, 403, 429), 200: {"content": {"text/plain": {"schema": {"type": "string"}}}}},
-    response_class=Response, summary="Numbers for Prometheus", openapi_extra={"security": [{}]})
+    response_class=Response, summary="Metrics for Prometheus", openapi_extra={"security": [{}]})
 def get_metrics(request: Request) -> Response:
-    """Requests, jobs by state, workers by device and more. A service that listens beyond this machine asks for a key of scope admin."""
+    """Return requests, jobs by state, workers by device and more. A service that listens beyond this machine needs a key of scope admin."""
     return Response(request.app.state.metrics.text(), media_type=CONTENT_TYPE)

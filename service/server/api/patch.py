@@ -1,14 +1,13 @@
-"""One PATCH of an upload: checked, written behind what is there, found right, and only then counted."""
+"""One PATCH of an upload: its body is appended to the part file, verified, and only then counted."""
 
 import contextlib
 import hashlib
 import hmac
 import time
 
-from service.server.api.context import Service
+from service.server.api.context import FOR_UPLOAD, Service, require_space
 from service.server.api.problems import ApiError
-from service.server.api.receive import RunningHashes, Writer
-from service.server.api.space import FOR_UPLOAD, require_space
+from service.server.api.receive import PartWriter, RunningHashes
 from service.server.api.tus import Checksum
 from service.server.database import uploads
 from service.server.database.uploads import Row
@@ -21,21 +20,24 @@ BUSY_RETRY_S = 1
 
 
 being_written: set[str] = set()
-"""Uploads that a PATCH of this process has locked."""
+"""Identifiers of the uploads that a PATCH of this process has locked."""
 
 
-class Patch:
-    """Its part is locked from `begin` to `close`. All methods wait for the disk or the database: call them from a thread."""
+class UploadPatch:
+    """A PATCH of an upload, whose part file is locked from `begin` to `close`.
+
+    The methods wait for the disk or the database: call them from a thread.
+    """
 
     def __init__(self, service: Service, hashes: RunningHashes, upload: Row, *, offset: int, checksum: Checksum | None) -> None:
-        """Prepare.
+        """Create the patch; `begin` locks the part file.
 
         Args:
-            service: the service.
-            hashes: of uploads that are not complete.
-            upload: its row; read again when nobody else can change it.
-            offset: where the client goes on.
-            checksum: of the body, where the client says it.
+            service: of the request.
+            hashes: of the uploads that are not complete.
+            upload: row of the upload, which is read again under the lock.
+            offset: from which the client continues.
+            checksum: of the body; None: the client gave none.
         """
         self._service, self._hashes, self._row, self._offset, self._checksum = service, hashes, upload, offset, checksum
         self._part: Part | None = None
@@ -43,10 +45,10 @@ class Patch:
         self._saved = 0
 
     def begin(self) -> None:
-        """Lock the part and cut off what was never found right.
+        """Lock the part file and cut off bytes that were not counted.
 
         Raises:
-            ApiError: locked, gone, another offset, or no space.
+            ApiError: it is locked, was deleted, has another offset, or there is no space.
         """
         try:
             self._part = Part.open(parts_folder(self._service.settings), self._row["id"])
@@ -57,7 +59,7 @@ class Patch:
         self._row = row = self._still_there()
         start = self._saved = safe_offset(row, self._part.size)
         if row["done"]:
-            self._part.drop()  # the lock was all that was wanted
+            self._part.drop()  # opening it made an empty file
         if self._offset != start:
             raise ApiError("conflict", f"Upload-Offset: is {self._offset}, {start} bytes are here", headers={"Upload-Offset": str(start)})
         if not row["done"]:
@@ -65,20 +67,20 @@ class Patch:
             self._part.cut(start)
         self._whole = None if row["sha256"] is None or row["done"] else self._hashes.take(row["id"], start)
         digests = [digest for digest in (self._digest, self._whole) if digest is not None]
-        self.writer = Writer(self._part, start, row["length"], digests=digests,
+        self.writer = PartWriter(self._part, start, row["length"], digests=digests,
                              save=self._save if self._checksum is None else None, guard=lambda: require_space(self._service, FOR_UPLOAD))
 
     def end(self, broken: str | None) -> Row:
-        """Count what came.
+        """Verify and count the bytes that came.
 
         Args:
             broken: why the body did not come to its end; None: it did.
 
         Returns:
-            The upload as its row is now.
+            The row of the upload as it is now.
 
         Raises:
-            ApiError: a checksum does not fit, or the body was broken.
+            ApiError: a checksum is wrong, or the body did not come to its end.
         """
         assert self._part is not None
         if self._row["done"]:
@@ -102,7 +104,7 @@ class Patch:
         return {**self._row, "received": self.writer.at, "done": self.writer.at == self._row["length"], "touched_at": time.time()}
 
     def give_up(self) -> None:
-        """Drop what was not counted; a disk that refuses even that is left alone, for the next PATCH does it again."""
+        """Cut off bytes that were not counted; if the disk refuses that, the next PATCH does it."""
         assert self._part is not None
         with contextlib.suppress(Exception):
             self.writer.settle()
@@ -110,7 +112,7 @@ class Patch:
             self._part.cut(self._saved)
 
     def close(self) -> None:
-        """Let the next one in."""
+        """Unlock the part file."""
         if self._part is not None:
             self._part.close()
             being_written.discard(self._row["id"])
@@ -131,7 +133,7 @@ class Patch:
         prefix = layout.intake(row["project"], row["intake"])
         service.storage.put(self._part.path, prefix, row["path"])
         if not uploads.finish(service.database, row["id"], row["length"]):
-            service.storage.remove(prefix)  # nothing but its deletion takes an upload's row while the part is locked
+            service.storage.remove(prefix)  # the capture was deleted: nothing else removes the row while the part file is locked
             self._gone()
         logger.info("upload complete", upload=row["id"], intake=row["intake"], path=row["path"], length=row["length"])
 
@@ -154,26 +156,27 @@ class Patch:
 
 
 def safe_offset(row: Row, there: int) -> int:
-    """Bytes of an upload that a client need not send again.
+    """Return the number of bytes of an upload that the client need not send again.
 
     Args:
         row: of the upload, settled.
-        there: size of its part. It is smaller than what was counted where somebody has removed it.
+        there: size of its part file, which is smaller than what was counted if somebody has removed it.
     """
     received = int(row["received"])
     return received if row["done"] or there >= received else 0
 
 
 def settled(service: Service, row: Row) -> Row:
-    """The upload as it is: the service may have ended after a complete file was moved into its capture, and before that was noted."""
+    """Return the row of an upload, corrected if the service ended after it moved the complete file and before it recorded that."""
     if row["done"] or stored_bytes(parts_folder(service.settings), row["id"]) >= row["received"]:
         return row
-    moved = service.storage.open(layout.intake(row["project"], row["intake"]), row["path"])  # one of before was deleted when this began
+    # not an older file of this path: that was deleted when the upload began
+    moved = service.storage.open(layout.intake(row["project"], row["intake"]), row["path"])
     if moved is None or moved.stat().st_size != row["length"] or not uploads.finish(service.database, row["id"], row["length"]):
         return row
     return {**row, "received": row["length"], "done": True}
 
 
 def received_of(service: Service, row: Row) -> int:
-    """Bytes of an upload that need not be sent again."""
+    """Return the number of bytes of an upload that the client need not send again."""
     return safe_offset(row, 0 if row["done"] else stored_bytes(parts_folder(service.settings), row["id"]))

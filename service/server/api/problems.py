@@ -1,4 +1,4 @@
-"""Everything that a request can be refused with, in one table (RFC 9457, application/problem+json)."""
+"""The problems with which a request can be refused, in one table (RFC 9457, application/problem+json)."""
 
 from collections.abc import Mapping
 from http import HTTPStatus
@@ -19,88 +19,86 @@ from stage.errors import StorageError
 
 MEDIA_TYPE = "application/problem+json"
 CHECKSUM_MISMATCH = 460
-"""What the tus protocol gives a wrong checksum."""
+"""Status of a wrong checksum in the tus protocol."""
 RETRY_S = 5
-MAX_FAULTS = 20
-"""Of a request, that are told."""
 MAX_TEXT, MAX_FAULTS = 2000, 20
-"""Characters of a sentence, and values, that an answer says at most: it may repeat what was sent."""
+"""Characters of a sentence and number of invalid values that an answer repeats at most."""
 
 
-class Kind(NamedTuple):
-    """A row of the table."""
+class ProblemKind(NamedTuple):
+    """Status and title of a kind of problem."""
 
     status: int
     title: str
 
 
-KINDS: dict[str, Kind] = {
-    "bad-request": Kind(400, "The request is malformed"),
-    "unauthenticated": Kind(401, "A valid key is needed"),
-    "forbidden": Kind(403, "The key does not allow this"),
-    "not-found": Kind(404, "There is no such thing in this project"),
-    "method-not-allowed": Kind(405, "The method is not allowed here"),
-    "conflict": Kind(409, "It is not in a state for this"),
-    "gone": Kind(410, "It is not there any more"),
-    "precondition-failed": Kind(412, "The precondition does not hold"),
-    "too-large": Kind(413, "It is larger than the service takes"),
-    "unsupported-media-type": Kind(415, "The content type is not taken here"),
-    "range-not-satisfiable": Kind(416, "The range lies outside the file"),
-    "invalid": Kind(422, "A value cannot be"),
-    "locked": Kind(423, "Another request is writing it"),
-    "too-many": Kind(429, "Too many requests or jobs"),
-    "checksum-mismatch": Kind(CHECKSUM_MISMATCH, "The checksum does not fit"),
-    "internal": Kind(500, "An error of relit itself"),
-    "unavailable": Kind(503, "The service cannot answer now"),
-    "full": Kind(507, "There is no space left"),
+KINDS: dict[str, ProblemKind] = {
+    "bad-request": ProblemKind(400, "Malformed request"),
+    "unauthenticated": ProblemKind(401, "A valid key is needed"),
+    "forbidden": ProblemKind(403, "The key does not allow this"),
+    "not-found": ProblemKind(404, "Not found in this project"),
+    "method-not-allowed": ProblemKind(405, "The path does not take this method"),
+    "conflict": ProblemKind(409, "The current state does not allow this"),
+    "gone": ProblemKind(410, "The upload has expired"),
+    "precondition-failed": ProblemKind(412, "The precondition does not hold"),
+    "too-large": ProblemKind(413, "Larger than the service accepts"),
+    "unsupported-media-type": ProblemKind(415, "The path does not take this content type"),
+    "range-not-satisfiable": ProblemKind(416, "The range lies outside the file"),
+    "invalid": ProblemKind(422, "Invalid value"),
+    "locked": ProblemKind(423, "Another request is writing this upload"),
+    "too-many": ProblemKind(429, "Too many requests or jobs"),
+    "checksum-mismatch": ProblemKind(CHECKSUM_MISMATCH, "Wrong checksum"),
+    "internal": ProblemKind(500, "Internal error of relit"),
+    "unavailable": ProblemKind(503, "The service cannot answer now"),
+    "full": ProblemKind(507, "No space left"),
 }
 OF_STATUS = {kind.status: name for name, kind in KINDS.items()}
 
 
 class Fault(BaseModel):
-    """One value that cannot be."""
+    """One invalid value."""
 
     model_config = ConfigDict(use_attribute_docstrings=True)
 
     field: str
-    """Where it is: body.options.frames, query.limit …"""
+    """The name of the value: body.options.frames, query.limit …"""
     message: str
 
 
 class Problem(BaseModel):
-    """What a refused request is answered with (RFC 9457)."""
+    """The answer to a refused request (RFC 9457)."""
 
     model_config = ConfigDict(use_attribute_docstrings=True)
 
     type: str
-    """urn:relit:problem: and the kind."""
+    """urn:relit:problem: and the kind of problem."""
     title: str
     status: int
     detail: str
-    """One sentence for a person."""
+    """One sentence for people."""
     request_id: str
-    """Also in the log."""
+    """The identifier of the request, which is also in the log."""
     errors: list[Fault] = []
-    """Values that cannot be, where there are such."""
+    """The invalid values, if there are any."""
 
 
 class ApiError(Exception):
-    """Refuse a request."""
+    """Raised to refuse a request."""
 
     def __init__(self, kind: str, detail: str, *, headers: Mapping[str, str] | None = None) -> None:
-        """Args: kind: of KINDS. detail: one sentence. headers: of the answer."""
+        """Args: kind: name in KINDS. detail: one sentence. headers: of the answer."""
         super().__init__(detail)
         self.kind, self.detail, self.headers = kind, detail, dict(headers or {})
 
 
 def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """The problems that a route may answer with, for the OpenAPI document."""
+    """Return the problems that a route may answer with, for the OpenAPI document."""
     return {status: {"model": Problem, "description": KINDS[OF_STATUS[status]].title,
                      "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}} for status in statuses}
 
 
 def install(app: FastAPI) -> None:
-    """Answer every error of the app from the table; what is none of these, service.server.api.trace does."""
+    """Answer the errors of the app from the table; middleware.RequestLog answers those that are unexpected."""
 
     @app.exception_handler(ApiError)
     async def refused(request: Request, error: ApiError) -> JSONResponse:
@@ -138,12 +136,12 @@ def install(app: FastAPI) -> None:
 
 
 def plain(text: str) -> str:
-    """Text that can be sent: halves of characters, which JSON can say and UTF-8 cannot, are spelled out; and not too long."""
+    """Return text that can be sent: cut to MAX_TEXT, and with halves of characters, which UTF-8 does not have, written as escapes."""
     return text[:MAX_TEXT].encode("utf-8", "backslashreplace").decode()
 
 
 def _allowed(request: Request) -> list[str]:
-    """The methods of all routes of a path: the router knows those of the first alone."""
+    """Return the methods of all routes of a path; the router names those of the first only."""
     path = request.scope["path"]
     found = (route.methods or () for route in iter_route_contexts(request.app.routes) if route.path_regex.match(path))
     return sorted({method for methods in found for method in methods})
@@ -151,7 +149,7 @@ def _allowed(request: Request) -> list[str]:
 
 def answer(request: Request, kind: str, detail: str, *, faults: list[Fault] | None = None,
            headers: Mapping[str, str] | None = None) -> JSONResponse:
-    """The response of a kind."""
+    """Return the response for a kind of problem."""
     row, detail = KINDS[kind], plain(detail)
     request.state.problem = detail  # for the log
     problem = Problem(type=f"urn:relit:problem:{kind}", title=row.title, status=row.status, detail=detail,

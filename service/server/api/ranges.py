@@ -1,38 +1,38 @@
-"""Conditions and parts of a download: entity tags (RFC 9110 section 13) and byte ranges (section 14)."""
+"""Preconditions and ranges of a download: entity tags (RFC 9110 section 13) and byte ranges (section 14)."""
 
 import re
 import secrets
 from typing import NamedTuple
 
 MAX_RANGES = 16
-"""Of one request; one that asks for more gets the whole file."""
+"""Ranges of one request; a request for more gets the whole file."""
 TAG = re.compile(r'(W/)?("[\x21\x23-\x7e\x80-\xff]*")')
 RANGE = re.compile(r"\s*(?:([0-9]{1,18})-([0-9]{0,18})|-([0-9]{1,18}))\s*")
 
 
 class Span(NamedTuple):
-    """Bytes of a file."""
+    """A range of bytes of a file."""
 
     start: int
     stop: int
-    """The first that is not of it."""
+    """The first byte after the range."""
 
 
 def names(header: str, etag: str, *, strong: bool) -> bool:
-    """Whether a list of entity tags has this one, or is *; strong: a weak tag is never the same."""
+    """Return whether a list of entity tags contains `etag` or is *; with `strong`, weak tags do not count."""
     return header.strip() == "*" or any(tag == etag and not (weak and strong) for weak, tag in TAG.findall(header))
 
 
 def asked_for(header: str | None, size: int) -> list[Span] | None:
-    """The parts of a file that a Range header asks for.
+    """Return the ranges of a file that a Range header asks for.
 
     Args:
-        header: None: there is none.
-        size: of the file.
+        header: the header; None: the request has none.
+        size: of the file, bytes.
 
     Returns:
-        The parts that are there, in the order asked; none: the range lies outside. None: the whole file is asked for, or nothing that
-        can be understood, which is the same (section 14.2).
+        The ranges within the file, in the order of the header; an empty list if all lie outside. None: the header asks for the whole
+        file or cannot be read, which is the same (section 14.2).
     """
     unit, _, text = (header or "").partition("=")
     parts = [RANGE.fullmatch(part) for part in text.split(",")]
@@ -52,12 +52,12 @@ def asked_for(header: str | None, size: int) -> list[Span] | None:
 
 
 def content_range(span: Span, size: int) -> str:
-    """The header that says which part it is."""
+    """Return the Content-Range header of a range."""
     return f"bytes {span.start}-{span.stop - 1}/{size}"
 
 
 class Multipart(NamedTuple):
-    """Several parts in one body (section 14.6)."""
+    """A body with several ranges (section 14.6)."""
 
     media_type: str
     pieces: list[bytes | Span]
@@ -65,7 +65,7 @@ class Multipart(NamedTuple):
 
 
 def multipart(spans: list[Span], size: int, media_type: str) -> Multipart:
-    """Parts with what says which they are between them."""
+    """Return the body of several ranges, each with its headers."""
     boundary = secrets.token_hex(16)
     pieces: list[bytes | Span] = []
     for span in spans:

@@ -1,4 +1,4 @@
-"""The body of one PATCH, from the network to the part file: in bounded memory, with the disk at work while the network is."""
+"""The body of a PATCH on its way to the part file: in bounded memory, and written while more of it arrives."""
 
 import asyncio
 import hashlib
@@ -13,54 +13,54 @@ from starlette.requests import ClientDisconnect
 from service.server.storage.parts import Part
 
 BLOCK = 1 << 20
-"""Bytes that are written at once; two of them are in memory."""
+"""Bytes that are written at once; two such blocks are in memory."""
 MAX_PIECES = 512
-"""Of a block: the system writes 1024 at once, and a client that sends byte by byte fills no memory with their heads."""
+"""Pieces of a block at most: the system writes 1024 at once, and a client that sends single bytes must not fill the memory."""
 FLUSH_EVERY = 16 << 20
-"""Bytes after which the disk is told to have them for sure, while more come: little is left to wait for at the end."""
+"""Bytes after which the file is flushed to the disk while more arrive, so that little is left to flush at the end."""
 SAVE_EVERY = 64 << 20
-"""Bytes after which it is also noted that it has them."""
+"""Bytes after which the flushed offset is also recorded."""
 IDLE_S = 60.0
-"""Without a byte for this long the client is taken for gone, so that it can come again: the part is locked until then."""
+"""Seconds without a byte after which the client counts as gone; until then the part file is locked, and it cannot continue."""
 KEPT = 1024
-"""Running hashes of uploads that are kept for their next PATCH."""
+"""Number of uploads whose running hash is kept for their next PATCH."""
 
 savers = ThreadPoolExecutor(4, thread_name_prefix="relit-save")
-"""They wait for the disk, beside the threads that write."""
+"""Threads that flush, beside those that write."""
 
 
-class Broken(Exception):
-    """The body did not come to its end; one sentence."""
+class BodyBroken(Exception):
+    """The body did not come to its end; the message is one sentence."""
 
 
 class TooLong(Exception):
-    """More bytes came than the upload has."""
+    """More bytes came than the length of the upload."""
 
 
-class Writer:
-    """Appends blocks to a part and has them saved on the way; beside that, hashes them. Each of the two in its own thread."""
+class PartWriter:
+    """Appends blocks to a part file, flushes them, and hashes them in another thread."""
 
     def __init__(self, part: Part, start: int, length: int, *, digests: list[Any], save: Callable[[int], None] | None,
                  guard: Callable[[], None]) -> None:
-        """Prepare.
+        """Create the writer.
 
         Args:
             part: cut to `start`.
             start: offset of the first byte.
-            length: that the upload will have.
-            digests: of hashlib, fed with every byte.
-            save: told of every offset up to which all bytes are on the disk; None: they are not trusted until the end of the body.
-            guard: asked at times whether there is space left; raises where there is not.
+            length: of the complete upload.
+            digests: hashes of hashlib, which get every byte.
+            save: called with offsets up to which all bytes are on the disk; None: nothing counts before the whole body is verified.
+            guard: called from time to time; raises if there is no space left.
         """
         self._part, self._length, self._digests, self._save, self._guard = part, length, digests, save, guard
         self.at = self._flushed = self._saved = start
         self._saving: Future[None] | None = None
 
     async def take(self, pieces: list[bytes]) -> None:
-        """Write and hash one block; the one before must be done.
+        """Write and hash one block; the previous one must be finished.
 
         Raises:
-            TooLong: it goes beyond the end of the upload.
+            TooLong: the block goes beyond the end of the upload.
             StorageError: the disk refuses.
         """
         loop = asyncio.get_running_loop()
@@ -72,7 +72,7 @@ class Writer:
                 await hashing
 
     def settle(self) -> None:
-        """Wait for what is being saved; raises what went wrong with it."""
+        """Wait for the flush that is under way, and raise its error."""
         saving, self._saving = self._saving, None
         if saving is not None:
             saving.result()
@@ -101,12 +101,12 @@ class Writer:
             self._saved = at
 
 
-async def pour(stream: AsyncIterator[bytes], writer: Writer) -> None:
-    """Write a body, block after block.
+async def write_body(stream: AsyncIterator[bytes], writer: PartWriter) -> None:
+    """Write a body to a part file, block by block.
 
     Raises:
-        Broken: the client is gone, or sends nothing; what was written stays.
-        TooLong: more came than the upload has.
+        BodyBroken: the client is gone or sends nothing; the bytes that were written stay.
+        TooLong: more bytes came than the length of the upload.
         StorageError: the disk refuses.
     """
     loop = asyncio.get_running_loop()
@@ -126,9 +126,9 @@ async def pour(stream: AsyncIterator[bytes], writer: Writer) -> None:
                 writing, block, size = loop.create_task(writer.take(block)), [], 0
                 idle.reschedule(loop.time() + IDLE_S)
     except TimeoutError:
-        raise Broken(f"nothing came for {IDLE_S:g} s") from None
+        raise BodyBroken(f"nothing came for {IDLE_S:g} s") from None
     except ClientDisconnect:
-        raise Broken("the connection ended before the body did") from None
+        raise BodyBroken("the connection ended before the body did") from None
     finally:
         if writing is not None:
             await writing
@@ -137,15 +137,15 @@ async def pour(stream: AsyncIterator[bytes], writer: Writer) -> None:
 
 
 class RunningHashes:
-    """SHA-256 of what has come of each upload: a whole file need not be read again at its end. Those of a process before are lost."""
+    """The running SHA-256 of each upload, so that a complete file need not be read again; a restart of the process loses them."""
 
     def __init__(self) -> None:
-        """Empty."""
+        """Create an empty collection."""
         self._kept: OrderedDict[str, tuple[int, Any]] = OrderedDict()
         self._lock = threading.Lock()
 
     def take(self, upload: str, start: int) -> Any | None:
-        """The hash of the first bytes, to be fed with those that follow; None: not known."""
+        """Return the hash of the first `start` bytes, to be updated with the next ones; None: it is not known."""
         with self._lock:
             at, digest = self._kept.pop(upload, (None, None))
         if start == 0:
@@ -153,7 +153,7 @@ class RunningHashes:
         return digest if at == start else None
 
     def keep(self, upload: str, at: int, digest: Any) -> None:
-        """For the next PATCH."""
+        """Keep the hash of the first `at` bytes for the next PATCH."""
         with self._lock:
             self._kept[upload] = (at, digest)
             while len(self._kept) > KEPT:

@@ -1,6 +1,8 @@
-"""What a job has made: the listing, and files to download, whole or in part (RFC 9110: ETag, preconditions, ranges).
+"""Routes of results: the list of a job's files, and downloads, whole or in part (RFC 9110: ETag, preconditions, ranges).
 
-A file is opened once, so that its ETag, its size and its bytes are those of one file, whatever takes its place meanwhile.
+A file is opened once, so that its ETag, its size and its bytes are those of one file, whatever replaces it meanwhile. Starlette's
+FileResponse does not keep that: it opens the path again to send it, and takes a Last-Modified of the same second for the same file. It
+also has no preconditions, answers an unreadable Range with 400 instead of the file, and 416 without a problem document.
 """
 
 import os
@@ -27,7 +29,7 @@ router = APIRouter(prefix="/v1/jobs/{job}/results", tags=["results"], responses=
 
 MAX_PAGE = 1000
 PIECE_BYTES = 1 << 20
-"""Read and sent at a time."""
+"""Bytes that are read and sent at once."""
 MEDIA_TYPES = {".exr": "image/x-exr", ".usdz": "model/vnd.usdz+zip", ".usda": "model/vnd.usda", ".json": "application/json",
                ".png": "image/png"}
 BYTES = "application/octet-stream"
@@ -45,7 +47,7 @@ Tags = Annotated[str | None, Header(description="Entity tags, or *.")]
 
 
 class Opened(NamedTuple):
-    """A file that is read."""
+    """An open file."""
 
     name: str
     descriptor: int
@@ -55,10 +57,10 @@ class Opened(NamedTuple):
 
 
 def opened(service: ServiceDep, caller: Reader, request: Request, job: JobName, name: Name) -> Iterator[Opened]:
-    """The file of a name, open until the answer has been sent.
+    """Open a result until the answer has been sent.
 
     Raises:
-        ApiError: there is none.
+        ApiError: there is no such result.
     """
     view(service, caller, job)
     nothing = ApiError("not-found", f"{job} has no such result")
@@ -66,7 +68,7 @@ def opened(service: ServiceDep, caller: Reader, request: Request, job: JobName, 
         check_path(name)
     except NameFault:
         raise nothing from None
-    if not request.scope["path"].endswith(f"/{name}"):  # the router leaves a line break at the end out
+    if not request.scope["path"].endswith(f"/{name}"):  # the router drops a line break at the end
         raise nothing
     path = service.storage.open(layout.results(caller.project, job), name)
     if path is None:
@@ -77,17 +79,17 @@ def opened(service: ServiceDep, caller: Reader, request: Request, job: JobName, 
         raise nothing from None
     try:
         status = os.fstat(descriptor)
-        etag = f'"{status.st_ino:x}-{status.st_mtime_ns:x}-{status.st_size:x}"'  # files are replaced, and never written to again
+        etag = f'"{status.st_ino:x}-{status.st_mtime_ns:x}-{status.st_size:x}"'  # results are replaced, and never written to again
         yield Opened(name, descriptor, status.st_size, etag, status.st_mtime)
     finally:
         os.close(descriptor)
 
 
-@router.get("", summary="List what a job has made")
+@router.get("", summary="List the results of a job")
 def list_results(service: ServiceDep, caller: Reader, job: JobName,
                  limit: Annotated[int, Query(ge=1, le=MAX_PAGE)] = MAX_PAGE,
                  after: Annotated[str | None, Query(description="`next` of the page before.")] = None) -> ResultPage:
-    """Files by name, a page at a time; of a job that runs, those that are complete."""
+    """List the files by name, one page at a time; of a running job, the complete ones."""
     view(service, caller, job)
     files = [file for file in service.storage.files(layout.results(caller.project, job)) if after is None or file.name > after]
     return ResultPage(results=[result_view(job, file) for file in files[:limit]],
@@ -99,7 +101,7 @@ async def download_result(file: Annotated[Opened, Depends(opened)], if_match: Ta
                           wanted: Annotated[str | None, Header(alias="Range", description="bytes=0-99, for one, or several.")] = None,
                           if_range: Annotated[str | None, Header(description="The entity tag that Range is meant for.")] = None,
                           ) -> Response:
-    """A file, or parts of it. It never changes under its ETag, so that a download which broke off can be gone on with."""
+    """Send a file, or parts of it. Under one ETag a file never changes, so that an interrupted download can be continued."""
     headers = _headers(file)
     if _unchanged(file, if_match, if_none_match):
         return Response(status_code=304, headers=headers)
@@ -120,7 +122,7 @@ async def download_result(file: Annotated[Opened, Depends(opened)], if_match: Ta
 @router.head("/{name:path}", responses={200: DOWNLOAD[200], 304: DOWNLOAD[304], 412: DOWNLOAD[412]}, response_class=Response,
              summary="Size and ETag of a result")
 async def head_result(file: Annotated[Opened, Depends(opened)], if_match: Tags = None, if_none_match: Tags = None) -> Response:
-    """What a download would be answered with, without the file."""
+    """Send the headers of a download, without the file."""
     headers = _headers(file)
     if _unchanged(file, if_match, if_none_match):
         return Response(status_code=304, headers=headers)

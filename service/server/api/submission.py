@@ -1,4 +1,4 @@
-"""Whether a job can be handed in: what it reads is there and ready, and nothing is asked beyond the limits."""
+"""Whether a job can be submitted: its captures and environments are ready, and it keeps within the limits."""
 
 import sqlalchemy as sa
 
@@ -16,7 +16,7 @@ QUEUE_RETRY_S = 30
 
 
 def submit(service: Service, caller: Caller, request: JobRequest, connection: sa.Connection, inputs: list[str]) -> str:
-    """Queue a job in the caller's transaction; of `inputs_of` and `spelled_out`."""
+    """Queue a job in the caller's transaction; `request` is that of `spelled_out`, `inputs` those of `inputs_of`."""
     job = service.queue.submit(connection, project=caller.project, key=caller.key, request=request, inputs=inputs,
                               chunk_frames=service.settings.chunk_frames, trace=telemetry.current())
     require_queue(service, caller, connection)
@@ -24,17 +24,21 @@ def submit(service: Service, caller: Caller, request: JobRequest, connection: sa
 
 
 def require_queue(service: Service, caller: Caller, connection: sa.Connection) -> None:
-    """Undo the transaction where the caller's key has more jobs waiting in it than it may."""
+    """Refuse, and so roll back the transaction, if the caller's key has too many queued jobs.
+
+    Raises:
+        ApiError: more than `max_queued` jobs are queued.
+    """
     most = service.settings.max_queued
     if jobs.count_queued(connection, caller.project, caller.key) > most:
         raise ApiError("too-many", f"{most} jobs of this key have not begun", headers={"Retry-After": str(QUEUE_RETRY_S)})
 
 
 def inputs_of(service: Service, project: str, request: JobRequest) -> list[str]:
-    """What a job reads.
+    """Return the identifiers of the captures, environments and jobs that a job reads.
 
     Raises:
-        ApiError: it is not there, or not ready.
+        ApiError: one of them does not exist or is not ready.
     """
     read = []
     for field in ("capture", "environment", "reference_ball"):
@@ -49,11 +53,11 @@ def inputs_of(service: Service, project: str, request: JobRequest) -> list[str]:
 
 
 def spelled_out(service: Service, project: str, request: JobRequest) -> JobRequest:
-    """The request with its frames as numbers, so that its steps are known before the capture is opened.
+    """Return the request with a range of frames in numbers, so that its steps are known before the capture is opened.
 
     Raises:
-        RequestError: the frames are no range.
-        ApiError: too many frames, or nothing lights them.
+        RequestError: the frames are not a range.
+        ApiError: there are too many frames, or nothing lights them.
     """
     if isinstance(request, RelightJob):
         if request.environment is None and request.keys is None:

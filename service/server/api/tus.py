@@ -1,4 +1,4 @@
-"""What the tus 1.0 protocol says in headers (https://tus.io/protocols/resumable-upload)."""
+"""The headers of the tus 1.0 protocol (https://tus.io/protocols/resumable-upload)."""
 
 import binascii
 import hashlib
@@ -22,7 +22,7 @@ PLACES = re.compile(r"/v1/(uploads(/[^/]*)?|(captures|environments)/[^/]*/files)
 OVERRIDE = b"x-http-method-override"
 OVERRIDES = (b"PATCH", b"DELETE", b"HEAD")
 CHECKSUM_PATTERN = "^sha(1|256) [A-Za-z0-9+/]{27,43}=$"
-"""Of Upload-Checksum, for the OpenAPI document: the protocol has a status of its own for what is none."""
+"""Pattern of Upload-Checksum for the OpenAPI document only: the protocol has its own status for a malformed one."""
 HEX_SHA256 = re.compile(r"[0-9a-f]{64}")
 METADATA_KEYS = ("path", "sha256")
 
@@ -38,17 +38,17 @@ Speaking = Depends(_version)
 
 
 class Checksum(NamedTuple):
-    """Of the bytes of one request."""
+    """The checksum of the body of one request."""
 
     algorithm: str
     digest: bytes
 
     @classmethod
     def of(cls, header: str) -> "Checksum":
-        """From Upload-Checksum.
+        """Read an Upload-Checksum header.
 
         Raises:
-            ApiError: another algorithm, or no digest of it.
+            ApiError: the algorithm is unknown, or the digest malformed.
         """
         algorithm, _, text = header.partition(" ")
         if algorithm not in ALGORITHMS:
@@ -60,17 +60,17 @@ class Checksum(NamedTuple):
 
 
 class Metadata(NamedTuple):
-    """What a client says of a file."""
+    """Path and checksum of a file, as the client gives them."""
 
     path: str
     sha256: str | None
 
     @classmethod
     def of(cls, header: str) -> "Metadata":
-        """From Upload-Metadata; whether the path is safe is not looked at.
+        """Read an Upload-Metadata header; whether the path is safe is not checked.
 
         Raises:
-            ApiError: it is malformed, or has a key that is not known.
+            ApiError: the header is malformed or has an unknown key.
         """
         found: dict[str, str] = {}
         for pair in header.split(","):
@@ -108,19 +108,19 @@ def state_headers(row: Row, received: int, upload_hours: float) -> dict[str, str
 
 
 def expires_at(row: Row, upload_hours: float) -> float:
-    """When an upload that is not complete is removed, in seconds since 1970."""
+    """Return when an incomplete upload is removed, in seconds since 1970."""
     return float(row["touched_at"]) + 3600 * upload_hours
 
 
-class Tus:
-    """ASGI middleware: every answer about uploads names the version, also one that refuses; and a method may come in a header."""
+class TusHeaders:
+    """ASGI middleware: answers about uploads, refusals too, name the version of tus; a header may override the method."""
 
     def __init__(self, app: ASGIApp) -> None:
-        """Args: app: inside."""
+        """Args: app: the next application."""
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on."""
+        """Pass a request on, and add the version to its answer."""
         if scope["type"] != "http" or not PLACES.fullmatch(scope["path"]):
             await self._app(scope, receive, send)
             return
@@ -136,7 +136,7 @@ class Tus:
 
 
 def documented(*names: str) -> dict[str, Any]:
-    """Headers of an answer, for the OpenAPI document."""
+    """Return the headers of an answer for the OpenAPI document."""
     return {name: {"schema": {"type": "string"}} for name in ("Tus-Resumable", *names)}
 
 

@@ -1,4 +1,4 @@
-"""Files of captures and environments: resumable uploads by tus 1.0 with creation, checksum, expiration and termination."""
+"""Routes of uploads: files of captures and environments, by tus 1.0 with creation, checksum, expiration and termination."""
 
 import asyncio
 import time
@@ -9,12 +9,11 @@ import sqlalchemy as sa
 from fastapi import APIRouter, Header, Query, Request, Response
 
 from service.requests.identifiers import ENVIRONMENT, UPLOAD, CaptureId, EnvironmentId, UploadId, new_id
-from service.server.api.context import IdempotencyKey, Reader, Service, ServiceDep, Writer, once
+from service.server.api.context import FOR_UPLOAD, IdempotencyKey, Reader, Service, ServiceDep, Writer, create_once, require_space
 from service.server.api.intakes import row_of
-from service.server.api.patch import Patch, being_written, received_of, settled
+from service.server.api.patch import UploadPatch, being_written, received_of, settled
 from service.server.api.problems import ApiError, responses
-from service.server.api.receive import Broken, RunningHashes, TooLong, pour
-from service.server.api.space import FOR_UPLOAD, require_space
+from service.server.api.receive import BodyBroken, RunningHashes, TooLong, write_body
 from service.server.api.tus import (
     ALGORITHMS,
     CHECKSUM_PATTERN,
@@ -42,9 +41,9 @@ listings = APIRouter(prefix="/v1", tags=["uploads"], responses=responses(401, 40
 options = APIRouter(prefix="/v1", tags=["uploads"])
 hashes = RunningHashes()
 BREAK_S, LOOK_S = 2.0, 0.02
-"""A client whose connection broke asks how much came, maybe before the break is noticed here: this long it waits for that."""
+"""Seconds for which HEAD waits for a PATCH to end, and between two looks: a client may ask before its broken connection is noticed here."""
 
-UploadLength = Annotated[int, Header(alias="Upload-Length", ge=0, description="Bytes that the file has.")]
+UploadLength = Annotated[int, Header(alias="Upload-Length", ge=0, description="Length of the file, bytes.")]
 UploadMetadata = Annotated[str, Header(
     alias="Upload-Metadata", max_length=4096, description="`path` and the name within the capture in base64; then, if you like, a comma, "
     "`sha256` and its 64 hexadecimal digits in base64.",
@@ -55,13 +54,13 @@ CREATED: dict[int | str, dict[str, Any]] = {
     201: {"description": "Created", "headers": documented("Location", "Upload-Offset", "Upload-Expires")}, **responses(409, 413, 507)}
 
 
-@options.options("/uploads", status_code=204, summary="What of tus is spoken here",
+@options.options("/uploads", status_code=204, summary="What the server supports of tus",
                  responses={204: {"headers": documented("Tus-Version", "Tus-Extension", "Tus-Max-Size", "Tus-Checksum-Algorithm")}})
 @options.options("/uploads/{upload}", status_code=204, include_in_schema=False)
 @options.options("/captures/{capture}/files", status_code=204, include_in_schema=False)
 @options.options("/environments/{environment}/files", status_code=204, include_in_schema=False)
 def abilities(service: ServiceDep, response: Response) -> None:
-    """Version, extensions and limits."""
+    """Return version, extensions and limits."""
     response.headers.update({"Tus-Version": VERSION, "Tus-Extension": ",".join(EXTENSIONS), "Tus-Checksum-Algorithm": ",".join(ALGORITHMS),
                              "Tus-Max-Size": str(service.settings.max_upload_bytes)})
 
@@ -69,21 +68,21 @@ def abilities(service: ServiceDep, response: Response) -> None:
 @router.post("/captures/{capture}/files", status_code=201, responses=CREATED, summary="Begin to upload a file of a capture")
 def create_capture_file(service: ServiceDep, caller: Writer, response: Response, capture: CaptureId, length: UploadLength,
                         metadata: UploadMetadata, token: IdempotencyKey = None) -> FileView:
-    """The file takes the place of a complete one of the same path, while the capture is receiving or refused."""
+    """Create an upload; its file replaces a complete one of the same path, while the capture is receiving or refused."""
     return _create(service, caller, capture, length, Metadata.of(metadata), token, response)
 
 
 @router.post("/environments/{environment}/files", status_code=201, responses=CREATED, summary="Begin to upload the file of an environment")
 def create_environment_file(service: ServiceDep, caller: Writer, response: Response, environment: EnvironmentId, length: UploadLength,
                             metadata: UploadMetadata, token: IdempotencyKey = None) -> FileView:
-    """An environment has one file; it takes the place of a complete one of the same path."""
+    """Create the upload of the one file of an environment; it replaces a complete one of the same path."""
     return _create(service, caller, environment, length, Metadata.of(metadata), token, response)
 
 
-@router.head("/uploads/{upload}", response_class=Response, summary="How far an upload is", responses={
+@router.head("/uploads/{upload}", response_class=Response, summary="Look at an upload", responses={
     200: {"headers": documented("Upload-Offset", "Upload-Length", "Upload-Metadata")}, **responses(410)})
 async def head_upload(service: ServiceDep, caller: Reader, upload: UploadId) -> Response:
-    """Upload-Offset tells how many bytes are safe: go on there."""
+    """Return Upload-Offset: the number of bytes that are safe, where the upload is to be continued."""
     deadline = time.monotonic() + BREAK_S
     while upload in being_written and time.monotonic() < deadline:
         await asyncio.sleep(LOOK_S)
@@ -93,18 +92,18 @@ async def head_upload(service: ServiceDep, caller: Reader, upload: UploadId) -> 
                              "Upload-Length": str(row["length"]), "Upload-Metadata": metadata_header(row)})
 
 
-@router.patch("/uploads/{upload}", status_code=204, summary="Add to an upload", openapi_extra={
+@router.patch("/uploads/{upload}", status_code=204, summary="Continue an upload", openapi_extra={
     "requestBody": {"required": True, "content": {CONTENT_TYPE: {"schema": {"type": "string", "format": "binary"}}}}},
     responses={204: {"headers": documented("Upload-Offset", "Upload-Expires")}, **responses(400, 409, 410, 413, 415, 423, 460, 507)})
 async def patch_upload(
     service: ServiceDep, caller: Writer, request: Request, response: Response, upload: UploadId,
-    offset: Annotated[int, Header(alias="Upload-Offset", ge=0, description="Where the body begins: as many bytes as are there.")],
+    offset: Annotated[int, Header(alias="Upload-Offset", ge=0, description="Offset of the body: the number of bytes that the server has.")],
     checksum: Annotated[str | None, Header(
         alias="Upload-Checksum", json_schema_extra={"pattern": CHECKSUM_PATTERN},
-        description="`sha1` or `sha256`, a space, and the digest of the body in base64: a body with another is dropped.",
+        description="`sha1` or `sha256`, a space, and the digest of the body in base64: a body with another digest is dropped.",
         openapi_examples={"none": {"value": "sha1 2jmj7l5rSw0yVb/vlWAYkK/YBwk="}})] = None,
 ) -> None:
-    """Write the body behind what is there. The last byte completes the file, which is then in the capture."""
+    """Append the body to the upload. The last byte completes the file, which is then in the capture."""
     if request.headers.get("content-type", "").partition(";")[0].strip().lower() != CONTENT_TYPE:
         raise ApiError("unsupported-media-type", f"Content-Type: give {CONTENT_TYPE}")
     expected = None if checksum is None else Checksum.of(checksum)
@@ -112,7 +111,7 @@ async def patch_upload(
     announced = request.headers.get("content-length", "0")
     if announced.isdigit() and offset + int(announced) > row["length"]:
         raise _too_long(row)
-    patch = Patch(service, hashes, row, offset=offset, checksum=expected)
+    patch = UploadPatch(service, hashes, row, offset=offset, checksum=expected)
     try:
         await asyncio.to_thread(patch.begin)
         row = await _take(patch, request, row)
@@ -123,7 +122,7 @@ async def patch_upload(
 
 @router.delete("/uploads/{upload}", status_code=204, responses=responses(409, 410, 423), summary="Delete an upload")
 def delete_upload(service: ServiceDep, caller: Writer, upload: UploadId) -> None:
-    """Give an upload up; or take a complete file out of a capture that is receiving or refused."""
+    """Delete an upload; or delete a complete file from a capture that is receiving or refused."""
     row = _row(service, caller, upload)
     folder = parts_folder(service.settings)
     try:
@@ -145,23 +144,23 @@ def delete_upload(service: ServiceDep, caller: Writer, upload: UploadId) -> None
 
 @listings.get("/captures/{capture}/files", summary="List the files of a capture")
 def list_capture_files(service: ServiceDep, caller: Reader, capture: CaptureId, limit: Limit = 1000, after: After = None) -> FilePage:
-    """Files that were uploaded, complete or not; none of a capture that is registered."""
+    """List the uploaded files, complete or not; a registered capture has none."""
     return _page(service, caller, capture, limit, after)
 
 
 @listings.get("/environments/{environment}/files", summary="List the file of an environment")
 def list_environment_files(service: ServiceDep, caller: Reader, environment: EnvironmentId, limit: Limit = 1000,
                            after: After = None) -> FilePage:
-    """The file that was uploaded, complete or not; none of an environment that is registered."""
+    """List the uploaded file, complete or not; a registered environment has none."""
     return _page(service, caller, environment, limit, after)
 
 
-async def _take(patch: Patch, request: Request, row: Row) -> Row:
+async def _take(patch: UploadPatch, request: Request, row: Row) -> Row:
     broken = None
     try:
         try:
-            await pour(request.stream(), patch.writer)
-        except Broken as error:
+            await write_body(request.stream(), patch.writer)
+        except BodyBroken as error:
             broken = str(error)
         except TooLong:
             raise _too_long(row) from None
@@ -198,11 +197,11 @@ def _create(service: Service, caller: Caller, intake: str, length: int, given: M
         return identifier
 
     asked = ["upload", intake, given.path, length, given.sha256]
-    upload, _ = once(service, caller, token, asked, make)
+    upload, _ = create_once(service, caller, token, asked, make)
     row = uploads.find(service.database, upload, caller.project)
-    if row is None and token is not None:  # what the token made was deleted or replaced since: the same request makes another
+    if row is None and token is not None:  # the upload was deleted or replaced since: the same request makes another
         service.database.transact(partial(idempotency.forget_token, project=caller.project, token=token, gone=upload))
-        upload, _ = once(service, caller, token, asked, make)
+        upload, _ = create_once(service, caller, token, asked, make)
         row = uploads.find(service.database, upload, caller.project)
     if row is None:
         raise ApiError("conflict", f"{upload}: was deleted at the same time")
@@ -224,7 +223,7 @@ def _answer(service: Service, row: Row, response: Response) -> FileView:
 
 
 def _complete_empty(service: Service, row: Row) -> Row:
-    patch = Patch(service, hashes, row, offset=0, checksum=None)
+    patch = UploadPatch(service, hashes, row, offset=0, checksum=None)
     try:
         patch.begin()
         return patch.end(None)

@@ -1,4 +1,4 @@
-"""Watching jobs: one look at the database a tick for everybody who listens, however many they are."""
+"""Watching jobs: one query per tick serves all listeners, however many there are."""
 
 import asyncio
 import threading
@@ -15,15 +15,15 @@ from service.server.log import logger
 from service.views.states import ENDED
 
 TICK_S = 0.25
-"""Between two looks; of changes between them the last is told."""
+"""Seconds between two queries; of several changes between them, the last is sent."""
 MAX_LISTENERS = 4096
-"""Of this process."""
+"""Listeners of this process at most."""
 MAX_PENDING = 2000
-"""Jobs with news that a listener has not taken: one that lags further is let go, and begins again when it comes back."""
+"""Changed jobs that a listener has not taken at most: the stream of a slower one ends, and its client connects again."""
 
 
 class Change(NamedTuple):
-    """News of a job."""
+    """A change of a job."""
 
     job: str
     revision: int
@@ -33,10 +33,10 @@ class Change(NamedTuple):
 
 
 class Listener:
-    """Who listens to a job, or to all jobs of a project. It holds the last news of each job and no more."""
+    """A listener to a job or to all jobs of a project. It keeps only the last change of each job."""
 
     def __init__(self, topic: str, after: int) -> None:
-        """Args: topic: a job or a project. after: revision of the job that is known already."""
+        """Args: topic: a job or a project. after: revision of the job that the client has."""
         self.topic, self.fresh = topic, True
         self._after = after
         self._pending: dict[str, Change] = {}
@@ -44,7 +44,7 @@ class Listener:
         self._news = asyncio.Event()
 
     def offer(self, change: Change) -> None:
-        """Take note of news."""
+        """Keep a change until it is taken."""
         if change.data is None or change.revision > self._after:
             self._pending[change.job] = change
             self._news.set()
@@ -52,12 +52,12 @@ class Listener:
             self.close()
 
     def close(self) -> None:
-        """There will be no more."""
+        """End the stream of this listener."""
         self._closed = True
         self._news.set()
 
     async def take(self, within_s: float) -> list[Change] | None:
-        """The news since the last call; none came within this time: an empty list; None: there will be no more."""
+        """Return the changes since the last call; an empty list if none came in time; None if the stream is to end."""
         if not self._news.is_set():
             try:
                 await asyncio.wait_for(self._news.wait(), within_s)
@@ -71,26 +71,26 @@ class Listener:
 
 
 class Watcher:
-    """Looks at jobs that somebody listens to. All of it but the queries runs in the event loop."""
+    """Queries the jobs that have listeners. Everything except the queries runs in the event loop."""
 
     def __init__(self, database: Database, closing: threading.Event) -> None:
-        """Args: database: of the store. closing: set when streams are to end, for the service does."""
+        """Args: database: of the service. closing: set when the service ends, and streams with it."""
         self._database, self._closing = database, closing
         self._listeners: dict[str, set[Listener]] = {}
         self._seen: dict[str, tuple[str, int]] = {}  # project and revision of jobs as they were told last
         self._task: asyncio.Task[None] | None = None
 
     def require_room(self) -> None:
-        """Raises: ApiError: too many listen, or the service ends."""
+        """Raises: ApiError: there are too many listeners, or the service ends."""
         if self._closing.is_set() or sum(map(len, self._listeners.values())) >= MAX_LISTENERS:
             raise ApiError("unavailable", "no further stream of events can be opened here now", headers={"Retry-After": str(RETRY_S)})
 
     def listen(self, topic: str, *, after: int = 0) -> Listener:
-        """Begin to listen; `leave` must follow.
+        """Add a listener, which `remove` must remove.
 
         Args:
-            topic: a job, or a project for all of its jobs that have not ended, or ended lately.
-            after: revision of the job that the listener knows.
+            topic: a job; or a project, for all its jobs that have not ended or ended lately.
+            after: revision of the job that the client has.
         """
         listener = Listener(topic, after)
         self._listeners.setdefault(topic, set()).add(listener)
@@ -98,8 +98,8 @@ class Watcher:
             self._task = asyncio.get_running_loop().create_task(self._run())
         return listener
 
-    def leave(self, listener: Listener) -> None:
-        """Listen no more."""
+    def remove(self, listener: Listener) -> None:
+        """Remove a listener."""
         others = self._listeners.get(listener.topic, set())
         others.discard(listener)
         if not others:
@@ -121,13 +121,13 @@ class Watcher:
                 await asyncio.sleep(TICK_S)
         except Exception as error:
             logger.error("watching jobs failed: streams of events end", exc_info=error)
-        finally:  # nobody is left to wait for ever
+        finally:  # no listener waits for ever
             self._seen = {}
             for listener in self._all():
                 listener.close()
 
     async def _look(self) -> None:
-        present, topics, known = set(self._all()), list(self._listeners), set(self._seen)  # who comes while we look is told the next time
+        present, topics, known = set(self._all()), list(self._listeners), set(self._seen)  # who comes now is served next
         found = {row["id"]: row for row in await asyncio.to_thread(jobs.watched, self._database, topics)}
         fresh = {listener.topic for listener in present if listener.fresh}
         changed = {job for job, row in found.items() if job in fresh or row["project"] in fresh or job not in self._seen

@@ -9,6 +9,7 @@ from multiprocessing import parent_process
 from pathlib import Path
 
 from dbos import DBOS, DBOSConfig
+from dbos import error as dbos_error
 
 from service.server import log, telemetry
 from service.server.database import workers
@@ -63,7 +64,7 @@ def run_worker(settings: Settings, device: str, heartbeat: Heartbeat) -> None:
         "use_listen_notify": False,
     }
     dbos = DBOS(config=config)
-    log.adopt("dbos")
+    log.adopt("dbos", without=dbos_error.DBOSAwaitedWorkflowCancelledError)  # DBOS reports it for every job that is cancelled while it runs
     runner.register()
     takeover = Takeover(database, queue, lock, name, every_s=settings.takeover_s, max_lost=settings.max_lost,
                         running=lambda: runner.running, beat=heartbeat.beat, deposed=_depose)

@@ -1,6 +1,6 @@
-"""An object store as obstore reads it: objects listed, fetched in ranges, sent in parts, deleted; every fault one sentence.
+"""An object store, through obstore: lists, fetches in ranges, sends in parts and deletes objects; every error is one sentence.
 
-Credentials, region and endpoint of S3 come from the usual variables (AWS_ACCESS_KEY_ID, AWS_REGION, AWS_ENDPOINT_URL …).
+The credentials, region and endpoint of S3 come from the usual variables (AWS_ACCESS_KEY_ID, AWS_REGION, AWS_ENDPOINT_URL …).
 """
 
 import os
@@ -15,51 +15,54 @@ from service.errors import RequestError
 from stage.errors import StorageError, storage
 
 PIECE_BYTES = PART_BYTES = 16 << 20
-"""Fetched and sent in one request: small enough that a slow line ends one within REQUEST_S, large enough that requests do not count."""
+"""Bytes of one request: few enough for a slow line to send them within REQUEST_S, enough for the number of requests not to matter."""
 MOST_PARTS = 9_000
-"""S3 takes an object in 10 000 parts at most."""
+"""Parts of an object at most; S3 accepts 10 000."""
 PARTS_AT_ONCE = 2
-"""Of one file; several files are sent at one time."""
+"""Parts of one file that are sent at one time; several files are sent at one time."""
 DELETED_AT_ONCE = 1000
 CONNECT_S, REQUEST_S = 10, 120
 RETRIES, RETRY_S = 8, 120
-"""After faults of the network and of the store (5xx), with growing pauses; then the step fails."""
+"""Retries, and their time in all, after errors of the network and of the store (5xx), with growing pauses; then the step fails."""
 PROBE_RETRIES, PROBE_S = 1, 5
-"""Of a look whether the store answers, which somebody waits for."""
+"""Retries and time of a check whether the store answers, for which somebody waits."""
 
 
 class Object(NamedTuple):
-    """One object."""
+    """An object of the store."""
 
     path: str
     size: int
     modified_at: float
     version: str
-    """Another when the content is another: its ETag."""
+    """The ETag, which changes with the content."""
 
 
 class Bucket:
     """The objects below a URL."""
 
     def __init__(self, url: str) -> None:
-        """Args: url: s3://bucket/prefix or file:///folder. Nothing is asked of the store yet.
+        """Create the bucket; the store is not asked anything.
+
+        Args:
+            url: s3://bucket/prefix or file:///folder.
 
         Raises:
-            RequestError: another kind of URL, or obstore is not installed.
+            RequestError: the URL is of another kind, or obstore is not installed.
         """
         self.url = url.rstrip("/")
         self._store = _store(url, retries=RETRIES, retry_s=RETRY_S, request_s=REQUEST_S)
         self._probe = _store(url, retries=PROBE_RETRIES, retry_s=PROBE_S, request_s=PROBE_S)
 
     def below(self, prefix: str) -> list[Object]:
-        """Every object whose path begins with a prefix and a /."""
+        """Return all objects whose path begins with the prefix and a /."""
         import obstore
 
         with self._told("list", prefix):
             return [_object(meta) for batch in obstore.list(self._store, prefix=f"{prefix}/") for meta in batch]
 
     def find(self, path: str) -> Object | None:
-        """One object; None: there is none."""
+        """Return one object; None: there is none."""
         import obstore
         from obstore.exceptions import GenericError
 
@@ -74,12 +77,15 @@ class Bucket:
                 raise
 
     def fetch(self, found: Object, target: Path, moved: Callable[[], None]) -> None:
-        """Copy an object into a file; what takes its place meanwhile is noticed.
+        """Copy an object into a file.
 
         Args:
             found: the object.
-            target: the file, which is written anew.
-            moved: called after every piece; what it raises ends the copy.
+            target: the file, which is overwritten.
+            moved: called after every piece; an exception of it ends the copy.
+
+        Raises:
+            StorageError: the object cannot be read, or was replaced meanwhile.
         """
         import obstore
 
@@ -94,7 +100,7 @@ class Bucket:
                 moved()
 
     def send(self, file: Path, path: str, moved: Callable[[], None]) -> Object:
-        """Copy a file into an object, which appears whole or not at all; arguments as of `fetch`."""
+        """Copy a file into an object, which appears complete or not at all; `moved` is that of `fetch`."""
         import obstore
 
         with storage("read", file), open(file, "rb") as source:
@@ -112,29 +118,29 @@ class Bucket:
         return sent
 
     def mark(self, path: str) -> None:
-        """Make an empty object."""
+        """Write an empty object."""
         import obstore
 
         with self._told("write", path):
             obstore.put(self._store, path, b"", use_multipart=False)
 
     def delete(self, paths: list[str]) -> None:
-        """Delete objects, those that are gone already too."""
+        """Delete objects; some may be gone already."""
         import obstore
 
         for begin in range(0, len(paths), DELETED_AT_ONCE):
             with self._told("delete", paths[begin]):
                 try:
                     obstore.delete(self._store, paths[begin : begin + DELETED_AT_ONCE])
-                except FileNotFoundError:  # not from S3, which takes that as done; one at a time then
+                except FileNotFoundError:  # of a store of files, which stops at a missing one: one at a time then
                     for path in paths[begin : begin + DELETED_AT_ONCE]:
                         _delete(self._store, path)
 
     def check(self, path: str) -> None:
-        """Write and delete an object, and do not wait long for it.
+        """Write and delete an object, with few retries.
 
         Raises:
-            StorageError: it cannot be done.
+            StorageError: the store refuses or does not answer.
         """
         import obstore
 
@@ -144,7 +150,7 @@ class Bucket:
 
     @contextmanager
     def _told(self, action: str, path: str) -> Iterator[None]:
-        """Turn what obstore raises into one sentence."""
+        """Turn an exception of obstore into a StorageError of one sentence."""
         from obstore.exceptions import BaseError
 
         try:
@@ -201,7 +207,7 @@ def _delete(store: Any, path: str) -> None:
 
 
 def _reason(error: Exception) -> str:
-    """What obstore says, without what is for its own authors."""
+    """Return the message of an exception of obstore, without its debugging information."""
     from obstore import exceptions
 
     if isinstance(error, exceptions.PermissionDeniedError):

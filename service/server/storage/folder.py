@@ -1,4 +1,4 @@
-"""Storage in the data folder. Writers rename whole files into place, so that what has a name without a leading dot is complete."""
+"""Storage in the data folder. Writers rename complete files into place: a file whose name has no leading dot is complete."""
 
 import os
 import shutil
@@ -11,74 +11,74 @@ from stage.errors import storage
 
 
 class StoredFile(NamedTuple):
-    """One file."""
+    """A file of the storage."""
 
     name: str
-    """Below its prefix, / between folders."""
+    """Name below its prefix, with / between folders."""
     size: int
     modified_at: float
 
 
 class Storage(Protocol):
-    """What the service asks of a storage. A prefix is one of service.server.storage.layout."""
+    """What the service needs of a storage. A prefix is one of service.server.storage.layout."""
 
     def local(self, prefix: str, names: Collection[str] | None = None, progress: Progress | None = None) -> Path:
-        """A folder of this machine with files of a prefix, to be read.
+        """Return a folder of this machine with files of a prefix, for reading.
 
         Args:
             prefix: of the files.
-            names: those that are needed, as far as they are there; None: all.
-            progress: told of every file that is fetched.
+            names: files that are needed, if they exist; None: all files.
+            progress: of the files that are fetched.
         """
 
     def workspace(self, prefix: str) -> Path:
-        """A folder of this machine to write files of a prefix into; what is there already, `local` brings into it."""
+        """Return a folder of this machine into which files of a prefix are written; `local` puts existing files there."""
 
     def publish(self, prefix: str, progress: Progress | None = None) -> None:
-        """Make what was written into the workspace part of the storage; `progress` is told of every file that is sent."""
+        """Make the files in the workspace part of the storage; `progress` is that of the files that are sent."""
 
     def put(self, file: Path, prefix: str, name: str) -> None:
-        """Move a finished file into the storage."""
+        """Move a complete file into the storage."""
 
     def delete(self, prefix: str, name: str) -> None:
-        """Delete one file; nothing happens where there is none."""
+        """Delete one file, if there is one."""
 
     def files(self, prefix: str) -> list[StoredFile]:
-        """The files of a prefix, by name."""
+        """Return the files of a prefix, by name."""
 
     def open(self, prefix: str, name: str) -> Path | None:
-        """A file of this machine with the content of one; None: there is none."""
+        """Return a file of this machine with the content of one file; None: there is no such file."""
 
     def remove(self, prefix: str) -> None:
         """Delete all files of a prefix."""
 
     def tidy(self) -> None:
-        """Finish removals that were interrupted."""
+        """Finish deletions that were interrupted."""
 
     def check(self) -> None:
         """Raises: StorageError: nothing can be written."""
 
 
 class FolderStorage:
-    """The files of a prefix lie in the folder of that name."""
+    """A storage whose prefixes are folders of the data folder."""
 
     def __init__(self, root: Path) -> None:
         """Args: root: the data folder."""
         self._root = root
 
     def local(self, prefix: str, names: Collection[str] | None = None, progress: Progress | None = None) -> Path:
-        """The folder itself: nothing has to be fetched."""
+        """Return the folder of the prefix: nothing has to be fetched."""
         return self._root / prefix
 
     def workspace(self, prefix: str) -> Path:
-        """The folder itself."""
+        """Return the folder of the prefix, which is made if there is none."""
         folder = self._root / prefix
         with storage("make", folder):
             folder.mkdir(parents=True, exist_ok=True)
         return folder
 
     def publish(self, prefix: str, progress: Progress | None = None) -> None:
-        """Files are there already; what a killed writer left half-written goes."""
+        """Delete the temporary files of a killed writer, and flush the folder; the files are already in place."""
         folder = self._root / prefix
         if folder.is_dir():
             sweep(folder)
@@ -86,7 +86,7 @@ class FolderStorage:
                 _sync(folder)
 
     def put(self, file: Path, prefix: str, name: str) -> None:
-        """Rename into place.
+        """Rename the file into place.
 
         Raises:
             StorageError: the folder cannot be written.
@@ -98,7 +98,7 @@ class FolderStorage:
             _sync(target.parent)
 
     def delete(self, prefix: str, name: str) -> None:
-        """Unlink it, and the folders that are empty then."""
+        """Delete the file, and the folders that are empty then."""
         target = self._root / prefix / name
         with storage("remove", target):
             target.unlink(missing_ok=True)
@@ -109,27 +109,27 @@ class FolderStorage:
                 return
 
     def files(self, prefix: str) -> list[StoredFile]:
-        """Every complete file."""
+        """Return all complete files of a prefix, by name."""
         return sorted(stored_below(self._root / prefix))
 
     def open(self, prefix: str, name: str) -> Path | None:
-        """The file itself."""
+        """Return the path of a file; None: there is none, or a link leads to it."""
         folder = self._root / prefix
         path = folder / name
-        return path if is_shown(name) and path.is_file() and path.resolve() == folder.resolve() / name else None  # by no link
+        return path if is_shown(name) and path.is_file() and path.resolve() == folder.resolve() / name else None  # not through a link
 
     def remove(self, prefix: str) -> None:
-        """Delete the folder; hidden first, so that a half-deleted one is not seen."""
+        """Delete the folder; it is hidden first, so that a part of it is not shown."""
         folder = self._root / prefix
         with storage("remove", folder):
             drop_folder(folder)
 
     def tidy(self) -> None:
-        """Delete what is hidden for it."""
+        """Delete the folders whose deletion was interrupted."""
         drop_hidden(self._root)
 
     def check(self) -> None:
-        """Write and remove a file."""
+        """Write and delete a file."""
         probe = self._root / f".probe-{os.getpid()}"
         with storage("write in", self._root):
             probe.write_bytes(b"relit")
@@ -137,7 +137,7 @@ class FolderStorage:
 
 
 def _sync(folder: Path) -> None:
-    """So that a name which was just given outlives a loss of power."""
+    """Flush a folder, so that a new name in it survives a loss of power."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -146,14 +146,14 @@ def _sync(folder: Path) -> None:
 
 
 def is_shown(name: str) -> bool:
-    """Whether a name is one of a complete file: no part of it is empty, begins with a dot, or leads elsewhere."""
+    """Return whether a name is that of a complete file: no part of it is empty or begins with a dot."""
     return "\0" not in name and all(part and not part.startswith(".") for part in name.split("/"))
 
 
 def drop_folder(folder: Path) -> None:
-    """Delete a folder, where there is one; hidden first, so that nobody finds half of it."""
+    """Delete a folder, if there is one; it is hidden first, so that nobody finds a part of it."""
     doomed = folder.with_name(f".{folder.name}.removed")
-    shutil.rmtree(doomed, ignore_errors=True)  # of a process that was killed here
+    shutil.rmtree(doomed, ignore_errors=True)  # left by a process that was killed here
     try:
         folder.rename(doomed)
     except FileNotFoundError:
@@ -162,20 +162,20 @@ def drop_folder(folder: Path) -> None:
 
 
 def drop_hidden(root: Path) -> None:
-    """Delete what killed processes had hidden, of prefixes below a folder."""
+    """Delete the folders below `root` that killed processes had hidden."""
     for folder in root.glob("projects/*/*/.*.removed"):
         shutil.rmtree(folder, ignore_errors=True)
 
 
 def sweep(folder: Path) -> None:
-    """Remove the temporary files that a killed writer left."""
+    """Delete the temporary files that a killed writer left."""
     for path in folder.rglob(".*"):
         if path.is_file():
             path.unlink(missing_ok=True)
 
 
 def stored_below(folder: Path, before: str = "") -> Iterator[StoredFile]:
-    """Complete files below a folder; none where there is no folder."""
+    """Yield the complete files below a folder; none if there is no folder."""
     if not folder.is_dir():
         return
     for entry in os.scandir(folder):

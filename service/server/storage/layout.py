@@ -1,4 +1,4 @@
-"""The layout of the storage: what lies where, below the data folder or the prefix of an object store (docs/service_storage.md).
+"""The layout of the storage: where files lie below the data folder or the prefix of an object store (docs/service_storage.md).
 
 projects/PROJECT/captures/ID/…        an uploaded capture
 projects/PROJECT/environments/ID/…    an uploaded environment, one image
@@ -9,7 +9,7 @@ from service.requests.identifiers import CAPTURE, ENVIRONMENT
 
 MAPS = "maps.exr"
 SOLVED = (MAPS, "depth.exr", "points.ply")
-"""What other jobs and later steps read of a solve or a depth."""
+"""Files of a solve or a depth that other jobs and later steps read."""
 FRAMES = "frame.####.exr"
 PICTURE = "picture.exr"
 ASSET = "asset"
@@ -17,10 +17,10 @@ FOLDERS = {CAPTURE: "captures", ENVIRONMENT: "environments"}
 
 
 def intake(project: str, identifier: str) -> str:
-    """Prefix of a capture or an environment."""
+    """Return the prefix of a capture or an environment."""
     return f"projects/{project}/{FOLDERS[identifier.partition('_')[0]]}/{identifier}"
 
 
 def results(project: str, job: str) -> str:
-    """Prefix of the results of a job."""
+    """Return the prefix of the results of a job."""
     return f"projects/{project}/jobs/{job}"

@@ -1,4 +1,4 @@
-"""Storage in an object store. Workers read and write copies on their own disks; objects appear whole or not at all."""
+"""Storage in an object store. Workers read and write copies on their own disks; objects appear complete or not at all."""
 
 import threading
 import time
@@ -15,30 +15,30 @@ from stage.files import replacing
 
 T = TypeVar("T")
 TRANSFERS = 8
-"""Files on their way at one time."""
+"""Files that are transferred at one time."""
 LOOK_S = 0.5
-"""How often those who wait are told that bytes have moved."""
+"""Seconds between two reports of progress."""
 REMOVED = "removed"
-"""removed/PREFIX is there while a prefix is being deleted, so that no half of it is shown."""
+"""The object removed/PREFIX exists while a prefix is being deleted, so that a part of it is not shown."""
 PROBE = "probe"
 CHECK_S = 30.0
-"""How long a look at the store is good for: each costs two requests."""
+"""Seconds for which the result of a check counts: each check costs two requests."""
 
 
 class ObjectStorage:
-    """The files of a prefix are the objects of that prefix."""
+    """A storage whose files are the objects of a bucket."""
 
     def __init__(self, bucket: Bucket, scratch: Scratch) -> None:
-        """Args: bucket: where objects are. scratch: their copies on this machine."""
+        """Args: bucket: with the objects. scratch: their copies on this machine."""
         self._bucket, self._scratch = bucket, scratch
         self._checking = threading.Lock()
         self._checked_at = -CHECK_S
 
     def local(self, prefix: str, names: Collection[str] | None = None, progress: Progress | None = None) -> Path:
-        """A copy; what is there already of the same version is not fetched again.
+        """Return a folder with copies; a copy of the same version is not fetched again.
 
         Raises:
-            StorageError: the store cannot be read, or the copy not be written.
+            StorageError: the store cannot be read, or a copy not be written.
         """
         objects = self._objects(prefix)
         with self._scratch.entry(prefix, _sign_of_life(progress)) as entry:
@@ -50,14 +50,14 @@ class ObjectStorage:
         return self._scratch.files(prefix)
 
     def workspace(self, prefix: str) -> Path:
-        """A folder of this machine's copies."""
+        """Return the folder of the copies, into which results are written."""
         return self._scratch.files(prefix)
 
     def publish(self, prefix: str, progress: Progress | None = None) -> None:
-        """Send files that are new or have changed.
+        """Send the files that are new or have changed.
 
         Raises:
-            StorageError: a file cannot be sent; those that were are whole.
+            StorageError: a file cannot be sent; those that were sent are complete.
         """
         with self._scratch.entry(prefix, _sign_of_life(progress)) as entry:
             sweep(entry.files)
@@ -69,24 +69,24 @@ class ObjectStorage:
             _transfer("upload", new, send, entry, progress)
 
     def put(self, file: Path, prefix: str, name: str) -> None:
-        """Send a file, and remove it here.
+        """Send a file, and delete it on this machine.
 
         Raises:
-            StorageError: it cannot be sent.
+            StorageError: the file cannot be sent.
         """
         self._bucket.send(file, f"{prefix}/{name}", lambda: None)
         file.unlink()
 
     def delete(self, prefix: str, name: str) -> None:
-        """Delete the object; copies lose it when they are brought up to date."""
+        """Delete the object; its copies go when they are updated."""
         self._bucket.delete([f"{prefix}/{name}"])
 
     def files(self, prefix: str) -> list[StoredFile]:
-        """Every object."""
+        """Return all files of a prefix, by name."""
         return sorted(StoredFile(name, found.size, found.modified_at) for name, found in self._objects(prefix).items())
 
     def open(self, prefix: str, name: str) -> Path | None:
-        """A copy of one object, fetched if it has changed."""
+        """Return a copy of one object, which is fetched if it has changed; None: there is no such object."""
         if not is_shown(name) or self._is_removed(prefix):
             return None
         found = self._bucket.find(f"{prefix}/{name}")
@@ -98,20 +98,20 @@ class ObjectStorage:
         return self._scratch.files(prefix) / name
 
     def remove(self, prefix: str) -> None:
-        """Delete the objects; hidden first, so that half-deleted ones are not seen."""
+        """Delete the objects; the prefix is hidden first, so that a part of it is not shown."""
         self._bucket.mark(f"{REMOVED}/{prefix}")
         self._scratch.remove(prefix)
         self._bucket.delete([found.path for found in self._bucket.below(prefix)])
         self._bucket.delete([f"{REMOVED}/{prefix}"])
 
     def tidy(self) -> None:
-        """Delete what is marked for it, and what is left of copies."""
+        """Delete the prefixes and copies whose deletion was interrupted."""
         for found in self._bucket.below(REMOVED):
             self.remove(found.path.removeprefix(f"{REMOVED}/"))
         self._scratch.tidy()
 
     def check(self) -> None:
-        """Write and delete an object, at most every CHECK_S."""
+        """Write and delete an object, at most once in CHECK_S."""
         with self._checking:
             if time.monotonic() - self._checked_at >= CHECK_S:
                 self._bucket.check(PROBE)
@@ -121,7 +121,7 @@ class ObjectStorage:
         return self._bucket.find(f"{REMOVED}/{prefix}") is not None
 
     def _objects(self, prefix: str) -> dict[str, Object]:
-        """Objects by their name below the prefix."""
+        """Return the objects of a prefix by name."""
         if self._is_removed(prefix):
             return {}
         named = ((found.path.removeprefix(f"{prefix}/"), found) for found in self._bucket.below(prefix))
@@ -142,19 +142,19 @@ class ObjectStorage:
 
 
 class _Ended(Exception):
-    """The others are not wanted any more."""
+    """Another transfer has failed."""
 
 
 def _transfer(stage: str, items: Sequence[T], move: Callable[[T, Callable[[], None]], tuple[str, str]], entry: Entry,
               progress: Progress | None) -> None:
-    """Move files, several at one time; the first fault ends all of them, and so does what `progress` raises.
+    """Transfer files, several at one time; the first error ends all transfers, as does an exception of `progress`.
 
     Args:
-        stage: what to call it.
-        items: to be moved.
-        move: moves one, calls what it is given after every piece, and returns name and version.
-        entry: notes them.
-        progress: told whenever bytes have moved, so that silence means that nothing moves.
+        stage: name of the stage.
+        items: to transfer.
+        move: transfers one item, calls its second argument after every piece, and returns name and version.
+        entry: records name and version.
+        progress: called whenever bytes were transferred, so that silence means that nothing moves.
     """
     if not items:
         return
@@ -184,5 +184,5 @@ def _transfer(stage: str, items: Sequence[T], move: Callable[[T, Callable[[], No
 
 
 def _sign_of_life(progress: Progress | None) -> Callable[[], None]:
-    """Called while another worker of this machine moves the files."""
+    """Return what to call while another worker of this machine transfers the files."""
     return (lambda: None) if progress is None else (lambda: progress.advance(0))

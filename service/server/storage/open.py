@@ -1,14 +1,14 @@
-"""The storage that the settings ask for."""
+"""The storage that the settings name."""
 
 from service.server.settings import Settings
 from service.server.storage.folder import FolderStorage, Storage
 
 SCRATCH = "scratch"
-"""Folder of the data folder for copies of objects."""
+"""Name of the folder, in the data folder, for copies of objects."""
 
 
 def open_storage(settings: Settings) -> Storage:
-    """Open the storage; nothing is written into it.
+    """Open the storage that the settings name; nothing is written into it.
 
     Raises:
         RequestError: storage_url cannot be used.

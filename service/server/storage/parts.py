@@ -1,4 +1,4 @@
-"""The bytes of an upload that is not complete: one file each, <upload>.part, which one request writes at a time."""
+"""Part files: the bytes of each incomplete upload, in the file <upload>.part, which one request writes at a time."""
 
 import os
 import threading
@@ -16,24 +16,24 @@ READ = 1 << 20
 
 
 class PartLocked(Exception):
-    """Another request, of this process or another one, has the part."""
+    """Another request, of this process or another one, has locked the part file."""
 
 
 class Part:
-    """An open part, locked until it is closed. Its methods may be called from any thread, one after the other."""
+    """An open part file, locked until it is closed. Its methods may be called from any thread, one at a time."""
 
     def __init__(self, path: Path, descriptor: int) -> None:
-        """Args: path: of the file. descriptor: open and locked; of `open`."""
+        """Args: path: of the file. descriptor: open and locked, from `open`."""
         self.path = path
         self._descriptor: int | None = descriptor
-        self._lock = threading.Lock()  # so that nothing is written to a descriptor that was closed meanwhile
+        self._lock = threading.Lock()  # so that nobody writes to a descriptor that was closed meanwhile
 
     @classmethod
     def open(cls, folder: Path, upload: str) -> Self:
-        """Take the part of an upload; an empty one where there is none.
+        """Open and lock the part file of an upload; it is made if there is none.
 
         Raises:
-            PartLocked: another has it.
+            PartLocked: another request has locked it.
             StorageError: the folder cannot be written.
         """
         path = _path(folder, upload)
@@ -46,40 +46,40 @@ class Part:
 
     @staticmethod
     def discard(folder: Path, upload: str) -> None:
-        """Remove the part of an upload that is forgotten, whoever has it."""
+        """Delete the part file of an upload that was deleted, whether or not it is locked."""
         path = _path(folder, upload)
         with storage("remove", path):
             path.unlink(missing_ok=True)
 
     @property
     def size(self) -> int:
-        """Bytes that are there, safe or not."""
+        """Size of the file, bytes; those at its end may not be counted yet."""
         with self._lock:
             return os.fstat(self._open()).st_size
 
     def cut(self, size: int) -> None:
-        """Keep the first bytes alone, and go on behind them."""
+        """Cut the file to `size` bytes, and append from there."""
         with self._lock, storage("write", self.path):
             os.ftruncate(self._open(), size)
             os.lseek(self._open(), size, os.SEEK_SET)
 
     def append(self, pieces: Sequence[bytes]) -> None:
-        """Write behind what is there.
+        """Append bytes.
 
         Raises:
-            StorageError: no space left, or a fault of the disk.
+            StorageError: there is no space left, or the disk fails.
         """
         left = sum(map(len, pieces))
         with self._lock, storage("write", self.path):
             while left:
                 written = os.writev(self._open(), pieces)
                 left -= written
-                pieces = _behind(pieces, written) if left else ()
+                pieces = _rest(pieces, written) if left else ()
 
     def sync(self) -> None:
-        """Wait until all that was written is on the disk."""
+        """Flush the file to the disk."""
         with self._lock:
-            descriptor = os.dup(self._open())  # more is written meanwhile
+            descriptor = os.dup(self._open())  # more may be written meanwhile
         try:
             with storage("write", self.path):
                 os.fsync(descriptor)
@@ -87,7 +87,7 @@ class Part:
             os.close(descriptor)
 
     def digest_into(self, digest: Any) -> None:
-        """Feed all bytes to a hash of hashlib."""
+        """Update a hash of hashlib with all bytes."""
         with self._lock, storage("read", self.path):
             at = 0
             while block := os.pread(self._open(), READ, at):
@@ -95,23 +95,23 @@ class Part:
                 at += len(block)
 
     def drop(self) -> None:
-        """Remove the file."""
+        """Delete the file."""
         with storage("remove", self.path):
             self.path.unlink(missing_ok=True)
 
     def close(self) -> None:
-        """Let go of it; waits for a write that is under way."""
+        """Close and unlock the file, after a write that is under way."""
         with self._lock:
             if self._descriptor is not None:
                 os.close(self._descriptor)
                 self._descriptor = None
 
     def __enter__(self) -> Self:
-        """Closed at the end."""
+        """Return the part file, which is closed at the end."""
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        """Let go."""
+        """Close the part file."""
         self.close()
 
     def _open(self) -> int:
@@ -121,12 +121,12 @@ class Part:
 
 
 def parts_folder(settings: Settings) -> Path:
-    """Where the parts of a service lie."""
+    """Return the folder of the part files."""
     return settings.data / "uploads"
 
 
 def stored_bytes(folder: Path, upload: str) -> int:
-    """Size of the part of an upload; 0 where there is none."""
+    """Return the size of the part file of an upload; 0 if there is none."""
     try:
         return _path(folder, upload).stat().st_size
     except FileNotFoundError:
@@ -134,7 +134,7 @@ def stored_bytes(folder: Path, upload: str) -> int:
 
 
 def leftovers(folder: Path, before: float) -> Iterator[str]:
-    """Uploads whose part was not written since a time (seconds since 1970)."""
+    """Yield the uploads whose part file was not written since a time (seconds since 1970)."""
     for path in folder.glob(f"*{SUFFIX}"):
         try:
             if path.stat().st_mtime < before:
@@ -143,8 +143,8 @@ def leftovers(folder: Path, before: float) -> Iterator[str]:
             continue
 
 
-def _behind(pieces: Sequence[bytes], written: int) -> list[bytes]:
-    """What is left of pieces of which the disk took only a part."""
+def _rest(pieces: Sequence[bytes], written: int) -> list[bytes]:
+    """Return the bytes that are left of pieces after `written` bytes."""
     return [b"".join(pieces)[written:]]
 
 

@@ -1,7 +1,7 @@
-"""Copies of objects on this machine: a folder a prefix, with a record of which version of which object each file is.
+"""Copies of objects on this machine: a folder for each prefix, with a record of the object version that each file is a copy of.
 
 data/scratch/PREFIX/files/…        the files
-data/scratch/PREFIX/objects.json   of each: version of the object, size, and when the file was written
+data/scratch/PREFIX/objects.json   for each file: version of the object, size, and when the file was written
 data/scratch/PREFIX/lock           held while files are fetched or sent, so that two workers of a machine fetch once
 """
 
@@ -20,16 +20,16 @@ from stage.files import write_text
 FILES, RECORD, LOCK = "files", "objects.json", "lock"
 WAIT_S = 0.2
 IN_USE_S = 6 * 3600.0
-"""Prefixes used in this time stay, whatever the limit: a step may read or write them."""
+"""Seconds for which a used prefix stays, whatever the limit: a step may read or write it."""
 SAVE_S = 2.0
-"""How often the record is written while files come: a killed worker has so much to fetch again."""
+"""Seconds between two records while files are fetched; a worker that is killed loses the files since the last one."""
 
 
 class Entry:
-    """The copy of one prefix, while its lock is held."""
+    """The copies of one prefix, while its lock is held."""
 
     def __init__(self, folder: Path) -> None:
-        """Args: folder: of the entry."""
+        """Args: folder: of the prefix."""
         self.files = folder / FILES
         self._path = folder / RECORD
         self._saved_at = time.monotonic()
@@ -39,38 +39,38 @@ class Entry:
             self._record = {}
 
     def version(self, name: str) -> str | None:
-        """The version that a file is a copy of; None: it is not there, or was written since."""
+        """Return the version that a file is a copy of; None: there is no file, or it was written since."""
         noted = self._record.get(name)
         return None if noted is None or noted[1:] != _state(self.files / name) else str(noted[0])
 
     def note(self, name: str, version: str) -> None:
-        """A file is a copy of a version now."""
+        """Record that a file is a copy of a version."""
         self._record[name] = [version, *_state(self.files / name)]
         if time.monotonic() - self._saved_at > SAVE_S:
             self.save()
 
     def forget_others(self, names: set[str]) -> None:
-        """Remove copies of objects that are gone."""
+        """Delete copies of objects that no longer exist."""
         for name in [name for name in self._record if name not in names]:
             if self.version(name) is not None:
                 (self.files / name).unlink(missing_ok=True)
             del self._record[name]
 
     def save(self) -> None:
-        """Write the record."""
+        """Write the record to its file."""
         write_text(self._path, json.dumps(self._record))
         self._saved_at = time.monotonic()
 
 
 class Scratch:
-    """The copies of a machine."""
+    """The copies of objects on this machine."""
 
     def __init__(self, root: Path, limit_bytes: int) -> None:
-        """Args: root: their folder. limit_bytes: what prefixes may take that are not in use."""
+        """Args: root: folder of the copies. limit_bytes: size of the prefixes that are not in use at most."""
         self._root, self._limit_bytes = root, limit_bytes
 
     def files(self, prefix: str) -> Path:
-        """The folder of the files of a prefix, which is made."""
+        """Return the folder with the files of a prefix, which is made if there is none."""
         folder = self._root / prefix / FILES
         with storage("make", folder):
             folder.mkdir(parents=True, exist_ok=True)
@@ -78,7 +78,7 @@ class Scratch:
 
     @contextmanager
     def entry(self, prefix: str, waiting: Callable[[], None]) -> Iterator[Entry]:
-        """Hold the copy of a prefix; `waiting` is called again and again while another holds it."""
+        """Lock the copies of a prefix; `waiting` is called again and again while another process has the lock."""
         with self._lock(prefix, waiting):
             entry = Entry(self._root / prefix)
             try:
@@ -87,15 +87,15 @@ class Scratch:
                 entry.save()
 
     def remove(self, prefix: str) -> None:
-        """Drop the copy of a prefix."""
+        """Delete the copies of a prefix."""
         drop_folder(self._root / prefix)
 
     def tidy(self) -> None:
-        """Delete what is left of copies that were being dropped."""
+        """Delete what an interrupted deletion has left."""
         drop_hidden(self._root)
 
     def make_room(self, wanted_bytes: int) -> None:
-        """Drop copies, those longest unused first, until the others and what is wanted are within the limit; none that is in use."""
+        """Delete the prefixes that were unused longest until `wanted_bytes` more fit into the limit; prefixes in use stay."""
         found = sorted((_used_at(lock.parent), _size(lock.parent / FILES), lock.parent)
                        for lock in self._root.glob(f"projects/*/*/*/{LOCK}"))
         total = wanted_bytes + sum(size for _, size, _ in found)
@@ -109,7 +109,7 @@ class Scratch:
     def _lock(self, prefix: str, waiting: Callable[[], None]) -> Iterator[None]:
         path = self._root / prefix / LOCK
         while True:
-            self.files(prefix)  # the copy may be dropped while we wait
+            self.files(prefix)  # the folder may be deleted meanwhile
             with storage("make", path):
                 descriptor = file_lock.take(path, 0o644)
             if descriptor is not None:
@@ -124,7 +124,7 @@ class Scratch:
 
 
 def _state(path: Path) -> list[object]:
-    """Size and time of a file; empty where there is none."""
+    """Return size and time of a file; an empty list if there is none."""
     try:
         status = path.stat()
     except (FileNotFoundError, NotADirectoryError):
@@ -133,7 +133,7 @@ def _state(path: Path) -> list[object]:
 
 
 def _used_at(folder: Path) -> float:
-    """When a file was fetched, sent or written last."""
+    """Return when a file was last fetched, sent or written."""
     return max((path.stat().st_mtime for path in (folder / LOCK, folder / FILES) if path.exists()), default=0.0)
 
 

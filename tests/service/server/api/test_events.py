@@ -174,7 +174,7 @@ def test_one_look_at_the_database_serves_all(database, quick):
         assert threading.active_count() - threads < 20  # a pool's at the most, none for each who listens
         assert len([statement for statement in asked if "relit_jobs.request" in statement]) == 1  # made once for all
         for listener in listeners:
-            watcher.leave(listener)
+            watcher.remove(listener)
 
     asyncio.run(follow())
 
@@ -187,14 +187,14 @@ def test_who_leaves_is_forgotten_and_with_the_last_one_the_watching_ends(databas
         first, second = watcher.listen(job), watcher.listen(PROJECT)
         await next_of(first)
         task = watcher._task
-        watcher.leave(first)
-        watcher.leave(second)
+        watcher.remove(first)
+        watcher.remove(second)
         assert watcher._listeners == {}
         await asyncio.wait_for(task, WAIT_S)
         assert watcher._seen == {}
         third = watcher.listen(job)  # and begins again
         assert [change.revision for change in await next_of(third)] == [1]
-        watcher.leave(third)
+        watcher.remove(third)
 
     asyncio.run(follow())
 
@@ -234,7 +234,7 @@ def test_a_database_that_does_not_answer_is_waited_for(database, quick, monkeypa
         away.clear()
         change, = await next_of(listener)
         assert json.loads(change.data)["state"] == "running"
-        watcher.leave(listener)
+        watcher.remove(listener)
 
     asyncio.run(follow())
     said = capfd.readouterr()
@@ -303,7 +303,7 @@ def test_there_is_a_limit_and_an_end(database, quick, monkeypatch):
         with pytest.raises(ApiError) as refused:
             watcher.require_room()
         assert refused.value.kind == "unavailable" and "Retry-After" in refused.value.headers
-        watcher.leave(first)
+        watcher.remove(first)
         watcher.require_room()
         last = watcher.listen(PROJECT)
         closing.set()

@@ -6,8 +6,8 @@ import httpx2
 import pytest
 
 from service.requests.keys import NewKey, Scope
-from service.server.api import limits
-from service.server.api.limits import Limiter
+from service.server.api import access
+from service.server.api.access import RateLimiter
 from service.server.api.problems import ApiError
 from service.server.database import intakes, jobs, keys
 from service.server.database.engine import Database, connect
@@ -76,7 +76,7 @@ def test_a_key_that_asks_too_often_waits_and_others_do_not(small, client):
 
 def test_tokens_come_back_with_time():
     now = 0.0
-    limiter = Limiter(2.0, 3, clock=lambda: now)
+    limiter = RateLimiter(2.0, 3, clock=lambda: now)
     for _ in range(3):
         limiter.take("a")
     with pytest.raises(ApiError) as error:
@@ -95,9 +95,9 @@ def test_tokens_come_back_with_time():
 
 
 def test_keys_that_ask_no_more_are_forgotten(monkeypatch):
-    monkeypatch.setattr(limits, "FORGET_ABOVE", 10)
+    monkeypatch.setattr(access, "FORGET_ABOVE", 10)
     now = 0.0
-    limiter = Limiter(1.0, 1, clock=lambda: now)
+    limiter = RateLimiter(1.0, 1, clock=lambda: now)
     for number in range(10):
         limiter.take(str(number))
     now = 100.0

@@ -207,6 +207,16 @@ def test_what_libraries_say_is_in_the_same_log(server):
     until(lambda: [line for line in lines_of(server) if line.get("logger") == "uvicorn.error"], "nothing of uvicorn")
 
 
+def test_a_job_that_is_cancelled_while_it_runs_is_no_error(server, client, owl, sky):
+    request = {"kind": "relight", "capture": owl, "environment": sky, "options": {"frames": "1-500"}}
+    job = client.post("/v1/jobs", json=request).json()["id"]
+    server.wait(client, f"/v1/jobs/{job}", ("running",))
+    client.post(f"/v1/jobs/{job}/cancel").raise_for_status()
+    until(lambda: [line for line in lines_of(server) if line.get("job") == job and line["event"] == "step stopped"], "not stopped")
+    time.sleep(1.5)  # in which DBOS looks at the workflow's status
+    assert [line for line in lines_of(server) if line["level"] == "error"] == []
+
+
 def test_a_job_is_followed_through_the_log(server, client, owl):
     job = client.post("/v1/jobs", json={"kind": "solve", "capture": owl, "options": {"method": "lambert"}}).json()["id"]
     server.wait(client, f"/v1/jobs/{job}", ("succeeded",))
