@@ -1,4 +1,4 @@
-"""Is a service sound? What `relit doctor` looks at where there is one; nothing is made or changed."""
+"""The checks of `relit doctor` on a service; nothing is made or changed."""
 
 import os
 import shutil
@@ -20,7 +20,7 @@ GIB = 1024**3
 
 
 class Finding(NamedTuple):
-    """One line."""
+    """A line of the report."""
 
     subject: str
     text: str
@@ -28,7 +28,7 @@ class Finding(NamedTuple):
 
 
 def look(settings: Settings) -> Iterator[Finding]:
-    """Look at the service of these settings, one thing after the other."""
+    """Yield what is found about the service of these settings."""
     yield Finding("service", ", ".join(f"{name} {version(name)}" for name in LIBRARIES))
     for name, near in unknown_variables(os.environ).items():
         yield Finding("settings", f"{name} is no setting" + (f": is {near} meant?" if near else ""), True)
@@ -43,7 +43,7 @@ def look(settings: Settings) -> Iterator[Finding]:
         database = connect(settings.sqlalchemy_url, connections=1)
         require_version(database)
         yield Finding("database", f"{settings.sqlite_file if settings.is_sqlite else 'PostgreSQL'} answers")
-        yield from _store(settings, database)
+        yield from _database(settings, database)
     except DatabaseError as error:
         yield Finding("database", str(error), True)
     except DBAPIError as error:
@@ -65,7 +65,7 @@ def _storage(settings: Settings) -> Iterator[Finding]:
                                                            else ""), full)
 
 
-def _store(settings: Settings, database: Database) -> Iterator[Finding]:
+def _database(settings: Settings, database: Database) -> Iterator[Finding]:
     made = [row for row in keys.listing(database) if row["revoked_at"] is None]
     if made:
         yield Finding("keys", f"{len(made)}, of {len({row['project'] for row in made})} projects")

@@ -1,4 +1,4 @@
-"""Locks on files that come and go: whoever has the lock has it on the file that bears the name, not on one that was removed meanwhile."""
+"""Locks on files that are created and deleted: the lock is on the file that has the name, not on one that was deleted meanwhile."""
 
 import fcntl
 import os
@@ -6,14 +6,14 @@ from pathlib import Path
 
 
 def take(path: Path, mode: int = 0o600) -> int | None:
-    """Lock a file, which is made where there is none; its folder must be there.
+    """Lock a file, which is created if there is none; its folder must exist.
 
     Args:
-        path: of the file; no link.
-        mode: of a file that is made.
+        path: of the file, not of a link.
+        mode: permissions of a new file.
 
     Returns:
-        Its descriptor, open for reading and writing, whose closing lets go; None: another has the lock.
+        The descriptor, open for reading and writing; closing it releases the lock. None: another process has the lock.
 
     Raises:
         OSError: the file cannot be opened.
@@ -30,11 +30,11 @@ def take(path: Path, mode: int = 0o600) -> int | None:
         except BaseException:
             os.close(descriptor)
             raise
-        os.close(descriptor)  # it was removed, or moved, between our two calls
+        os.close(descriptor)  # the file was deleted or moved between the two calls
 
 
 def is_named(descriptor: int, path: Path) -> bool:
-    """Whether the file of a descriptor still bears the name."""
+    """Return whether the file of a descriptor still has the name `path`."""
     try:
         return os.path.samestat(os.fstat(descriptor), path.stat(follow_symlinks=False))
     except FileNotFoundError:

@@ -1,6 +1,6 @@
-"""What the service clears away by itself: old jobs, uploads that were given up, and what is left of workers and captures that are gone.
+"""Housekeeping: the service deletes old jobs, abandoned uploads, and what workers and captures that are gone have left.
 
-Captures, environments and jobs that have not ended are never removed.
+Captures, environments and jobs that have not ended are never deleted.
 """
 
 import shutil
@@ -27,24 +27,24 @@ from stage.errors import StorageError
 EVERY_S = 600.0
 HOUR_S, DAY_S = 3600.0, 86_400.0
 TOKEN_S = DAY_S
-"""How long the token of a request that created something is remembered."""
+"""Seconds for which an idempotency token is remembered."""
 UNFINISHED_S = DAY_S
-"""A stack that nothing was added to for this long will never be finished."""
+"""Seconds without a write after which an unfinished image stack is deleted."""
 SILENT_S = HOUR_S
-"""A worker that was not seen for this long is forgotten, in the round after the one that noticed: one that the database was away from
-for as long is seen again between the two."""
+"""Seconds after which a worker that was not seen is forgotten, in the second round that finds it so: after a database was away for as long,
+its workers are seen again between the two rounds."""
 
 
 class Housekeeper:
-    """Clears away every few minutes, in a thread of its own."""
+    """A thread that does the housekeeping every EVERY_S."""
 
     def __init__(self, settings: Settings, database: Database, storage: Storage, queue: JobQueue, *,
                  clock: Callable[[], float] = time.time) -> None:
-        """Prepare.
+        """Create the thread; `start` starts it.
 
         Args:
             settings, database, storage, queue: of the service.
-            clock: seconds since 1970.
+            clock: returns seconds since 1970.
         """
         self._settings, self._database, self._storage, self._queue, self._clock = settings, database, storage, queue, clock
         self._silent: set[str] = set()
@@ -52,17 +52,17 @@ class Housekeeper:
         self._thread = threading.Thread(target=self._run, name="relit-housekeeping", daemon=True)
 
     def start(self) -> None:
-        """Begin, with a round at once."""
+        """Start the thread, which begins with a round."""
         self._thread.start()
 
     def stop(self) -> None:
-        """End, after the piece of work that is going on."""
+        """End the thread after its current piece of work."""
         self._ended.set()
         self._thread.join()
 
     def round(self) -> None:
-        """Clear away once; what one piece cannot do is tried again in the next round."""
-        for piece in (self._jobs, self._uploads, self._tokens, self._workers, self._caches, self._halves):
+        """Do all pieces of work once; a piece that fails is tried again in the next round."""
+        for piece in (self._jobs, self._uploads, self._tokens, self._workers, self._caches, self._interrupted):
             if self._ended.is_set():
                 return
             try:
@@ -100,7 +100,7 @@ class Housekeeper:
         for worker in silent & self._silent:
             workers.remove(self._database, worker)
             if self._database.is_sqlite:
-                with FileWorkerLock(self._settings.data / "locks", "").dead(worker):  # which removes the lock of one that is
+                with FileWorkerLock(self._settings.data / "locks", "").dead(worker):  # which deletes the lock file of a worker that is dead
                     pass
             logger.info("worker forgotten", worker=worker)
         self._silent = silent - self._silent
@@ -111,7 +111,7 @@ class Housekeeper:
             return
         there = {path.name: path for path in folder.iterdir() if path.is_dir()}
         kept = intakes.last_used(self._database, list(there))
-        for name in there.keys() - kept.keys():  # of captures that were deleted, or half removed
+        for name in there.keys() - kept.keys():  # of captures that were deleted
             _clear(there[name])
         if self._settings.cache_bytes is None:
             return
@@ -124,22 +124,22 @@ class Housekeeper:
                 _clear(there[name])
                 total -= sizes[name]
 
-    def _halves(self) -> None:
-        """What was being removed, or made, when somebody pulled the plug."""
+    def _interrupted(self) -> None:
+        """Finish deletions, and delete unfinished files, that a power failure or a kill interrupted."""
         self._storage.tidy()
-        for path in cache_folder(self._settings).rglob(".*"):  # of a worker that was killed while it made a stack
+        for path in cache_folder(self._settings).rglob(".*"):  # of a worker that was killed while it wrote a stack
             if path.is_file() and path.stat().st_mtime < self._clock() - UNFINISHED_S:
                 path.unlink(missing_ok=True)
                 logger.info("unfinished stack removed", file=path.name)
 
 
 def _forget(connection: sa.Connection, job: str) -> bool:
-    """Whether a job was forgotten: not where another that has not ended reads its results, or it was begun again meanwhile."""
+    """Delete a job; return False if a job that has not ended reads its results, or it was queued again meanwhile."""
     return not jobs.users_of(connection, job, active=True) and jobs.remove(connection, job)
 
 
 def _clear(folder: Path) -> None:
-    """Out of sight at once, so that no job finds half of it."""
+    """Delete a stack cache; it is hidden first, so that no job finds a part of it."""
     if folder.name.startswith("."):  # it is hidden already
         shutil.rmtree(folder, ignore_errors=True)
     else:

@@ -1,7 +1,6 @@
-"""Names of uploaded files: what means the same file, and only that file, on every system that may see it.
+"""Names of uploaded files: a name must mean the same file, and only that file, on every system that may read it.
 
-Results and captures are opened from Windows, macOS and Linux, so a name that one of them cannot hold, or would take for another's, is
-refused on all.
+Results and captures are opened from Windows, macOS and Linux, so a name is refused that one of them does not allow, or takes for another.
 """
 
 import unicodedata
@@ -9,13 +8,13 @@ import unicodedata
 from service.errors import RequestError
 
 MAX_PART_BYTES = 255
-"""Of a file or folder: what common file systems hold."""
+"""Bytes of the name of a file or folder at most, as in common file systems."""
 MAX_PATH_BYTES = 800
-"""Of the whole path. Folded it grows to three times as much at most, and PostgreSQL indexes no more than 2704 bytes."""
+"""Bytes of the whole path at most. Folding makes it up to three times as long, and PostgreSQL indexes no more than 2704 bytes."""
 MAX_DEPTH = 8
-"""Folders and the file: a capture needs one, a sequence of captures two."""
+"""Names in a path at most: a capture needs one, a sequence of captures two."""
 FORBIDDEN = '<>:"\\|?*'
-"""On Windows; backslash and colon would lead elsewhere there."""
+"""Characters that Windows forbids, or that lead elsewhere there."""
 HIDDEN_CATEGORIES = {
     "Cc": "a control character",
     "Cf": "a character that is not seen and changes how the others are",
@@ -26,40 +25,40 @@ HIDDEN_CATEGORIES = {
 }
 DEVICES = {"con", "prn", "aux", "nul", "conin$", "conout$", *(f"{port}{digit}" for port in ("com", "lpt") for digit in "0123456789¹²³")}
 SHOWN = 100
-"""Characters of a bad name that a sentence repeats."""
+"""Characters of a refused name that a sentence repeats at most."""
 
 
 class NameFault(RequestError):
-    """A name cannot be that of a file: one sentence that says why."""
+    """A name cannot be used for a file; the message says why in one sentence."""
 
 
 def check_path(path: str) -> None:
-    """Refuse a path that is not safe everywhere.
+    """Refuse a path that is not safe on every system.
 
     Args:
-        path: within a capture, with / between.
+        path: within a capture, with / between folders.
 
     Raises:
-        NameFault: with the reason.
+        NameFault: the path is not safe.
     """
     if fault := _fault(path):
         raise NameFault(f"path {shown(path)}: {fault}")
 
 
 def shown(path: str) -> str:
-    """A name as it can be put into a sentence: in quotes, everything that is not plain text escaped, and not too long."""
+    """Return a name for a sentence: in quotes, with unprintable characters as escapes, and shortened."""
     plain = (character if character.isprintable() and not _hidden(character) else ascii(character)[1:-1] for character in path[:SHOWN])
     text = "".join(plain)
     return f'"{text}"' if len(path) <= SHOWN else f'"{text}…"'
 
 
 def folded(path: str) -> str:
-    """What two paths share that a file system without upper and lower case takes for one (Unicode 3.13, canonical caseless matching)."""
+    """Return a form of a path that is equal for paths which differ only in case (Unicode 3.13, canonical caseless matching)."""
     return unicodedata.normalize("NFD", unicodedata.normalize("NFD", path).casefold())
 
 
 def folders_of(path: str) -> list[str]:
-    """The folders that a path lies in, the outermost first."""
+    """Return the folders of a path, the outermost first."""
     parts = path.split("/")
     return ["/".join(parts[:count]) for count in range(1, len(parts))]
 

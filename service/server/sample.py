@@ -1,4 +1,4 @@
-"""The shipped sample in a service that was just opened on it, so that there is something to try."""
+"""The sample capture of `relit demo --serve`: registered in the service, with commands to try."""
 
 import json
 from pathlib import Path
@@ -15,7 +15,7 @@ from service.views.states import REFUSED
 
 
 def greet(address: str, database: Database, queue: JobQueue, sample: Path) -> None:
-    """Register the sample and its sky, and say what can be done with them.
+    """Register the sample and its environment, and print commands that use them.
 
     Args:
         address: of the service.
@@ -32,7 +32,7 @@ def greet(address: str, database: Database, queue: JobQueue, sample: Path) -> No
 
 
 def _registered(database: Database, queue: JobQueue, kind: str, path: Path) -> str:
-    """The identifier under which it is known already, or is now."""
+    """Return the identifier of a path, which is registered if it is not yet."""
     for row in intakes.latest(database, DEFAULT_PROJECT, kind, limit=500):
         if row["folder"] == str(path) and row["state"] != REFUSED:
             return str(row["id"])

@@ -1,7 +1,8 @@
-"""The processes of the service: the API with the workers that it looks after, or a worker alone.
+"""The processes of the service: the API with its workers, or one worker.
 
-Asked to end (SIGTERM or SIGINT), the service answers on, and is not ready, while its workers finish their steps and hand their jobs back;
-then streams and requests end, and it. Asked twice it ends at once: jobs are taken over, as after a crash.
+When the service is asked to end (SIGTERM or SIGINT), it still answers, and says that it is not ready, while its workers finish their steps
+and return their jobs. Then requests and streams of events end, and then the service. At a second signal it ends at once, and its jobs are
+taken over, as after a crash.
 """
 
 import asyncio
@@ -33,14 +34,14 @@ from service.server.storage.open import open_storage
 
 T = TypeVar("T")
 CLOSE_S = 5
-"""How long open requests (streams of events among them) may take to end when the service ends."""
+"""Seconds that open requests, streams of events among them, may take to end when the service ends."""
 BACKLOG = 2048
-"""Connections that wait to be accepted, as uvicorn has it."""
+"""Connections that may wait to be accepted; the default of uvicorn."""
 READ_BYTES = 1 << 20
 """Bytes read from a connection at once: with the 256 KiB of asyncio an upload takes a quarter longer."""
 SIGNALS = (signal.SIGTERM, signal.SIGINT)
 SAME_S = 1.0
-"""Signals that come together are one: terminals, `timeout` and supervisors signal a process and its group."""
+"""Seconds within which signals count as one: terminals, `timeout` and supervisors signal a process and its group."""
 
 
 def serve(settings: Settings, *, greet: Callable[[str, Database, JobQueue], None] | None = None) -> None:
@@ -48,7 +49,7 @@ def serve(settings: Settings, *, greet: Callable[[str, Database, JobQueue], None
 
     Args:
         settings: of the service.
-        greet: called when it is about to answer, with its address, its database and its queue.
+        greet: called before the service answers, with its address, its database and its queue.
 
     Raises:
         RequestError: the address, the data folder or the database cannot be used, or a device is not on this machine.
@@ -90,7 +91,7 @@ def serve(settings: Settings, *, greet: Callable[[str, Database, JobQueue], None
     try:
         server.run(sockets=[listening])
     finally:
-        asked.put(0)  # where the server ended by itself
+        asked.put(0)  # if the server ended without a signal
         ending.join()
         database.close()
         telemetry.close(tracing)
@@ -98,12 +99,12 @@ def serve(settings: Settings, *, greet: Callable[[str, Database, JobQueue], None
 
 
 def work(settings: Settings, device: str | None) -> None:
-    """One worker, started again when it dies, until SIGTERM or SIGINT."""
+    """Run one worker, which is started again when it dies, until SIGTERM or SIGINT."""
     supervisors: list[Supervisor] = []
     asked = _signals(supervisors)
     _configure(settings)
     open_database(settings, prepare).close()
-    telemetry.close(telemetry.provider(settings))  # so that a missing extra is said here, and not by every worker
+    telemetry.close(telemetry.provider(settings))  # so that a missing extra is reported here, and not by every worker
     supervisors.append(Supervisor(settings, [_elsewhere(_resolve, device)]))
     supervisors[0].start()
     asked.get()
@@ -120,7 +121,7 @@ class _Connection(H11Protocol):
 
 
 class _Server(uvicorn.Server):
-    """Signals are ours: uvicorn would stop to answer at the first."""
+    """A server without signal handlers: those of uvicorn would end it at the first signal."""
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -128,8 +129,8 @@ class _Server(uvicorn.Server):
 
 
 def _signals(supervisors: list[Supervisor]) -> "SimpleQueue[int]":
-    """Put the first signal into a queue; end at the second, and the workers with us."""
-    asked: SimpleQueue[int] = SimpleQueue()  # its put may interrupt its get
+    """Put the first signal into a queue; at the second, kill the workers and end this process."""
+    asked: SimpleQueue[int] = SimpleQueue()  # its put may interrupt its get, in the signal handler
     heard: list[float] = []
 
     def hear(number: int, _frame: object) -> None:
@@ -181,7 +182,7 @@ def _devices(settings: Settings) -> list[str]:
 
 
 def _elsewhere(ask: Callable[..., T], *arguments: object) -> T:
-    """Ask in a process of its own: this one never touches CUDA, so that a fault of a driver does not end it."""
+    """Call a function in another process: this one never loads CUDA, so that a failing driver does not end it."""
     with multiprocessing.get_context("spawn").Pool(1) as pool:
         return pool.apply(ask, arguments)
 

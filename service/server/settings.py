@@ -1,6 +1,6 @@
-"""Settings of the service: by environment (RELIT_…), by a TOML file that RELIT_CONFIG or --config names, else as here.
+"""Settings of the service: from the environment (RELIT_…), or a TOML file that RELIT_CONFIG or --config names, else the defaults here.
 
-docs/service.md has the same list for operators, and a test compares the two.
+A test compares this list with that of docs/service.md.
 """
 
 import os
@@ -24,7 +24,7 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 PREFIX = "RELIT_"
 CONFIG = "RELIT_CONFIG"
 OTHERS = (CONFIG, "RELIT_SERVER", "RELIT_KEY")
-"""Variables of the program that are no settings of the service."""
+"""Variables of the program that are not settings of the service."""
 TESTS = "RELIT_TEST_"
 NO_WORKER = "none"
 
@@ -37,9 +37,9 @@ Folder = Annotated[Path, AfterValidator(_absolute)]
 
 
 class Settings(BaseSettings):
-    """Everything that an operator may choose.
+    """What an operator may choose.
 
-    Settings(config=FILE, name=value, …): what is given goes before the environment, and that before the file.
+    Settings(config=FILE, name=value, …): arguments override the environment, which overrides the file.
     """
 
     model_config = SettingsConfigDict(env_prefix=PREFIX, extra="forbid", frozen=True, env_ignore_empty=True, validate_default=True,
@@ -52,58 +52,58 @@ class Settings(BaseSettings):
     storage_url: str | None = None
     """s3://bucket/prefix (needs the extra `s3`) or file:///folder, for captures and results; without it the data folder."""
     scratch_bytes: Count = 500 * 1024**3
-    """What copies of objects of `storage_url` may take in the data folder of each machine, beside those that are in use."""
+    """Bytes that copies of objects of `storage_url` may take in the data folder of each machine, besides those in use."""
     host: str = "127.0.0.1"
     """Address that the API listens on."""
     port: Annotated[int, Field(ge=0, le=65535)] = DEFAULT_PORT
     """Port that the API listens on; 0 takes a free one."""
     anonymous: bool = False
-    """Let requests without a key work in the project `default`; on loopback addresses alone."""
+    """Accept requests without a key, in the project `default`; only on loopback addresses."""
     roots: Annotated[tuple[Folder, ...], NoDecode] = ()
-    """Folders of the server whose captures and environments may be registered without an upload; in the environment with : between."""
+    """Folders of the server whose captures and environments may be registered without an upload; in the environment separated by `:`."""
     devices: Annotated[tuple[str, ...], NoDecode] = ()
-    """Devices that `relit serve` starts a worker on, with commas between; without it every GPU, else the CPU; `none` for no worker."""
+    """Devices on which `relit serve` starts a worker, separated by commas; without it every GPU, else the CPU; `none` for no worker."""
 
     max_upload_bytes: Count = 64 * 1024**3
-    """Of one file."""
+    """Bytes of one uploaded file at most."""
     max_capture_files: Count = 20_000
-    """Of one capture."""
+    """Files of one capture at most."""
     max_pixels: Count = 200_000_000
-    """Of one image; its header is read before its pixels are."""
+    """Pixels of one image at most; its header is read before its pixels."""
     max_frames: Count = 20_000
-    """Of one relight."""
+    """Frames of one relight at most."""
     max_queued: Count = 200
-    """Jobs of one key that have not begun."""
+    """Queued jobs of one key at most."""
     requests_per_second: Positive = 50.0
-    """Of one key, on average, in each API process."""
+    """Requests of one key a second, on average, in each API process."""
     request_burst: Count = 200
     """Requests of one key that may come at once."""
     min_free_bytes: Annotated[int, Field(ge=0)] = 1024**3
-    """Uploads and jobs are refused when the data folder has less space left."""
+    """Bytes that must be free in the data folder; uploads and jobs are refused when less is left."""
 
     chunk_frames: Annotated[int, Field(ge=1, le=4096)] = 128
     """Frames of one durable step of a relight."""
     stall_s: Positive = 900.0
-    """A worker whose step makes no progress for this long is killed; its job begins the step again."""
+    """Seconds without progress in a step after which its worker is killed; the job begins the step again."""
     max_lost: Count = 3
     """Workers that a job may lose in one step before it fails."""
     takeover_s: Positive = 2.0
-    """How often a worker looks for jobs whose worker died."""
+    """Seconds between two looks of a worker for jobs whose worker died."""
     drain_s: Positive = 60.0
-    """How long a worker that is asked to end may take to finish its step, before it hands the job back."""
+    """Seconds that a worker that is asked to end may take to finish its step before it returns the job to the queue."""
 
     upload_hours: Positive = 48.0
-    """Uploads that nobody has added to for this long are removed."""
+    """Hours after which an upload that was not continued is deleted."""
     retention_days: Positive | None = None
-    """Jobs and their results are removed this long after they ended; without it never."""
+    """Days after which an ended job and its results are deleted; without it never."""
     cache_bytes: Count | None = None
-    """Stack caches beyond this are removed, those that no job has read for longest first; without it only those of deleted captures."""
+    """Bytes of image stacks that are cached at most, beyond which the longest unused go; without it only those of deleted captures."""
     log_level: Literal["debug", "info", "warning", "error"] = "info"
-    """Least severity that is logged."""
+    """Lowest severity that is logged."""
     log_format: Literal["json", "text"] = "json"
-    """How a line of the log is written."""
+    """Format of the lines of the log."""
     otel_endpoint: str | None = None
-    """http://collector:4318: traces are sent to its /v1/traces (needs the extra `otel`); without it none are."""
+    """http://collector:4318, to whose /v1/traces traces are sent (needs the extra `otel`); without it none are sent."""
 
     @model_validator(mode="before")
     @classmethod
@@ -114,13 +114,13 @@ class Settings(BaseSettings):
         return given
 
     @model_validator(mode="after")
-    def _no_open_door(self) -> Self:
+    def _anonymous_is_local(self) -> Self:
         if self.anonymous and not self.loopback:
             raise ValueError(f"anonymous: requests without a key are let in on loopback addresses alone, and host is {self.host}")
         return self
 
     @model_validator(mode="after")
-    def _sense(self) -> Self:
+    def _consistent(self) -> Self:
         if NO_WORKER in self.devices and len(self.devices) > 1:
             raise ValueError(f"devices: {NO_WORKER} stands alone, and they are {', '.join(self.devices)}")
         if self.otel_endpoint is not None and (urlsplit(self.otel_endpoint).scheme not in ("http", "https")
@@ -130,7 +130,7 @@ class Settings(BaseSettings):
 
     @cached_property
     def loopback(self) -> bool:
-        """Whether the API listens to this machine alone."""
+        """Whether the API listens to this machine only."""
         return is_loopback(self.host)
 
     @property
@@ -140,12 +140,12 @@ class Settings(BaseSettings):
 
     @property
     def sqlite_file(self) -> Path:
-        """The database, where it is a file."""
+        """Path of the database of SQLite."""
         return self.data / "relit.sqlite"
 
     @property
     def sqlalchemy_url(self) -> str:
-        """Of the database, with the driver that we install."""
+        """URL of the database for SQLAlchemy, with the installed driver."""
         if self.database_url is None:
             return f"sqlite:///{self.sqlite_file}"
         scheme, _, rest = self.database_url.partition("://")
@@ -155,14 +155,14 @@ class Settings(BaseSettings):
     def settings_customise_sources(cls, settings_cls: type[BaseSettings], init_settings: PydanticBaseSettingsSource,
                                    env_settings: PydanticBaseSettingsSource, dotenv_settings: PydanticBaseSettingsSource,
                                    file_secret_settings: PydanticBaseSettingsSource) -> tuple[PydanticBaseSettingsSource, ...]:
-        """Arguments, then the environment, then the file."""
+        """Return the sources: arguments, the environment, the file."""
         assert isinstance(init_settings, InitSettingsSource)
         file = init_settings.init_kwargs.pop("config", None) or os.environ.get(CONFIG)
         return (init_settings, env_settings, *((InitSettingsSource(settings_cls, _of_file(Path(file))),) if file else ()))
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a name or address is this machine's alone."""
+    """Return whether a host name or address is one of loopback."""
     if host == "localhost":
         return True
     try:
@@ -172,7 +172,7 @@ def is_loopback(host: str) -> bool:
 
 
 def unknown_variables(environment: Mapping[str, str]) -> dict[str, str | None]:
-    """Variables that look like settings and are none, each with the one that was meant, where one is near."""
+    """Return variables that look like settings and are not, each with the most similar setting, if there is one."""
     names = [f"{PREFIX}{name.upper()}" for name in Settings.model_fields]
     return {name: next(iter(get_close_matches(name, names, 1, 0.8)), None) for name in sorted(environment)
             if name.startswith(PREFIX) and not name.startswith(TESTS) and name not in names and name not in OTHERS}

@@ -1,4 +1,4 @@
-"""Traces of requests, and of the steps of the jobs that they made, sent as OpenTelemetry where the settings name a collector."""
+"""OpenTelemetry traces of requests and of the steps of their jobs, sent if the settings name a collector."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,10 +19,13 @@ PROPAGATOR = TraceContextTextMapPropagator()
 
 
 def provider(settings: Settings) -> "TracerProvider | None":
-    """What makes the spans of this process and sends them; None: none are wanted. To be called once.
+    """Create what makes and sends the spans of this process; call it once.
+
+    Returns:
+        None if the settings name no collector.
 
     Raises:
-        RequestError: the extra is not installed.
+        RequestError: the extra `otel` is not installed.
     """
     if settings.otel_endpoint is None:
         return None
@@ -40,13 +43,13 @@ def provider(settings: Settings) -> "TracerProvider | None":
 
 
 def close(made: "TracerProvider | None") -> None:
-    """Send what is not sent yet."""
+    """Send the remaining spans."""
     if made is not None:
         made.shutdown()
 
 
 def current() -> str | None:
-    """Where we are, as a W3C traceparent; None: in no span."""
+    """Return the current span as a W3C traceparent; None: there is none."""
     carrier: dict[str, str] = {}
     PROPAGATOR.inject(carrier)
     return carrier.get(PARENT)
@@ -54,7 +57,7 @@ def current() -> str | None:
 
 @contextmanager
 def span(name: str, parent: str | None, **attributes: str | int) -> Iterator[None]:
-    """A span of ours, below that of a traceparent."""
+    """Open a span below that of a traceparent."""
     above = None if parent is None else PROPAGATOR.extract({PARENT: parent})
     with trace.get_tracer("relit", __version__).start_as_current_span(
             name, context=above, attributes={f"relit.{key}": value for key, value in attributes.items()}):

@@ -1,1 +1,1 @@
-"""What the service remembers, in one SQL database: keys, captures, uploads, jobs, workers."""
+"""The database of the service: keys, captures and environments, uploads, jobs, workers."""

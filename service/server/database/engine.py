@@ -1,4 +1,4 @@
-"""The database: SQLite in the data folder, or PostgreSQL; opened, checked, and patient with a server that restarts."""
+"""The database: SQLite in the data folder, or PostgreSQL. Transactions can wait while its server restarts."""
 
 import time
 from collections.abc import Callable
@@ -14,45 +14,45 @@ from service.server.settings import Settings
 
 T = TypeVar("T")
 BUSY_MS = 30_000
-"""How long a write waits for another process's on SQLite."""
+"""Milliseconds for which a write on SQLite waits for that of another process."""
 CREATE_LOCK = 0x72656C6974
-"""Of the PostgreSQL advisory lock under which the tables are made."""
+"""Number of the advisory lock of PostgreSQL under which the tables are made."""
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 2.0
 UNANSWERED = (OperationalError, InterfaceError, InternalError, PoolTimeoutError)
-"""What a database raises that may answer another time: it restarts, its disk is full, it is locked for long."""
+"""Exceptions of a database that may answer later: it restarts, its disk is full, or it is locked for long."""
 
 
 def message_of(error: BaseException) -> str:
-    """What the database itself said, without the statement around it."""
+    """Return the message of the database, without the SQL statement."""
     return str(getattr(error, "orig", error))
 
 
 class DatabaseError(Exception):
-    """The database cannot be used: the message says which and why."""
+    """The database cannot be used; the message says which and why."""
 
 
 class Database:
-    """Transactions on the service's tables."""
+    """Transactions on the tables of the service."""
 
     def __init__(self, engine: sa.Engine) -> None:
-        """Args: engine: of `connect`."""
+        """Args: engine: from `connect`."""
         self.engine = engine
 
     @property
     def is_sqlite(self) -> bool:
-        """Whether it is a file."""
+        """Whether the database is a file of SQLite."""
         return self.engine.dialect.name == "sqlite"
 
     def transact(self, work: Callable[[sa.Connection], T], *, patience_s: float = 0.0) -> T:
-        """Run work in one transaction: all of it happens, or nothing.
+        """Run `work` in one transaction.
 
         Args:
-            work: gets the connection; called again where the connection was lost and patience is left, so it must not do anything
-                but read and write the database.
-            patience_s: how long to go on trying while the server cannot be reached or the disk is full.
+            work: called with the connection; called again if the connection was lost and patience is left, so it may only read and write
+                the database.
+            patience_s: seconds for which to try again while the server cannot be reached or the disk is full.
 
         Raises:
-            DBAPIError: the database does not answer, or takes what is written for wrong.
+            DBAPIError: the database does not answer, or refuses a value.
         """
         pause, deadline = FIRST_PAUSE_S, time.monotonic() + patience_s
         while True:
@@ -66,22 +66,22 @@ class Database:
             pause = min(2 * pause, LONGEST_PAUSE_S)
 
     def rows(self, query: "sa.Select[Any]") -> list[sa.RowMapping]:
-        """What a query finds."""
+        """Return all rows of a query."""
         with self.engine.connect() as connection:
             return list(connection.execute(query).mappings())
 
     def row(self, query: "sa.Select[Any]") -> sa.RowMapping | None:
-        """The first row that a query finds."""
+        """Return the first row of a query; None: there is none."""
         found = self.rows(query.limit(1))
         return found[0] if found else None
 
     def check(self) -> None:
-        """Raises: DBAPIError: it does not answer."""
+        """Raises: DBAPIError: the database does not answer."""
         with self.engine.connect() as connection:
             connection.execute(sa.text("SELECT 1"))
 
     def close(self) -> None:
-        """Let go of the connections."""
+        """Close the connections."""
         self.engine.dispose()
 
 
@@ -89,11 +89,11 @@ def connect(url: str, *, connections: int = 10) -> Database:
     """Open a database; nothing is created.
 
     Args:
-        url: SQLAlchemy's, sqlite:///path or postgresql+psycopg://….
-        connections: at most.
+        url: of SQLAlchemy: sqlite:///path or postgresql+psycopg://….
+        connections: number of connections at most.
 
     Raises:
-        DatabaseError: the URL is none.
+        DatabaseError: the URL is malformed or of another database.
     """
     try:
         parsed = sa.make_url(url)
@@ -112,11 +112,11 @@ def connect(url: str, *, connections: int = 10) -> Database:
 
 
 def open_database(settings: Settings, prepare: Callable[[Settings, Database], None]) -> Database:
-    """Open the database.
+    """Open the database that the settings name.
 
     Args:
         settings: of the service.
-        prepare: makes the tables that are needed, or looks whether they are there.
+        prepare: makes the tables, or checks that they exist.
 
     Raises:
         RequestError: the data folder or the database cannot be used.
@@ -135,10 +135,10 @@ def open_database(settings: Settings, prepare: Callable[[Settings, Database], No
 
 
 def create(database: Database) -> None:
-    """Make the tables where there are none.
+    """Make the tables if there are none.
 
     Raises:
-        DatabaseError: they are those of another version of the program.
+        DatabaseError: the tables are those of another version of the program.
     """
     with database.engine.begin() as connection:
         if database.is_sqlite:
@@ -154,10 +154,10 @@ def create(database: Database) -> None:
 
 
 def require_version(database: Database) -> None:
-    """Look whether the tables are ours; nothing is created.
+    """Check that the tables exist; nothing is created.
 
     Raises:
-        DatabaseError: there are none, or those of another version of the program.
+        DatabaseError: there are no tables, or they are those of another version of the program.
     """
     with database.engine.connect() as connection:
         if not sa.inspect(connection).has_table(tables.about.name):
@@ -172,11 +172,11 @@ def _require(version: int | None) -> None:
 
 
 def _sqlite(connection: Any, _record: Any) -> None:
-    connection.isolation_level = "IMMEDIATE"  # a write takes the lock at its beginning, so that none is turned away in its middle
+    connection.isolation_level = "IMMEDIATE"  # a write takes the lock at its beginning, so that none fails halfway
     for pragma in (f"busy_timeout={BUSY_MS}", "journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON"):
         connection.execute(f"PRAGMA {pragma}")
 
 
 def storable(text: str) -> str:
-    """A sentence that every database takes: it may repeat a name with NUL, or with bytes that are no text."""
+    """Return a text that every database accepts: without NUL, and without bytes that are not text."""
     return text.replace("\0", "\ufffd").encode("utf-8", "replace").decode()

@@ -1,4 +1,4 @@
-"""A request that creates something, sent again with the same token, creates nothing again."""
+"""Idempotency tokens: a request that is sent again with the same token creates nothing again."""
 
 import hashlib
 import json
@@ -14,24 +14,24 @@ from service.server.database.tables import idempotency
 
 
 class TokenReused(Exception):
-    """The token came with another request before."""
+    """The token was sent with another request before."""
 
 
 def create_once(database: Database, project: str, token: str | None, asked: Any, make: Callable[[sa.Connection], str]) -> tuple[str, bool]:
-    """Create something, once for a token.
+    """Create something once for a token.
 
     Args:
-        database: where.
-        project: whose.
-        token: that the client chose; None: every request creates.
-        asked: all that the request says, as JSON can hold it.
-        make: creates it in the transaction, and returns its identifier.
+        database: of the service.
+        project: of the caller.
+        token: chosen by the client; None: every request creates.
+        asked: all values of the request, as JSON can hold them.
+        make: creates in the transaction, and returns the identifier of what it created.
 
     Returns:
         The identifier, and whether it was created now.
 
     Raises:
-        TokenReused: the token belongs to another request.
+        TokenReused: the token was sent with another request before.
     """
     if token is None:
         return database.transact(make), True
@@ -42,30 +42,30 @@ def create_once(database: Database, project: str, token: str | None, asked: Any,
         if row is not None:
             return _same(row, fingerprint), False
         connection.execute(idempotency.insert().values(project=project, token=token, fingerprint=fingerprint, made="",
-                                                       created_at=time.time()))  # the same request, at the same time, waits here
+                                                       created_at=time.time()))  # the same request at the same time waits here
         created = make(connection)
         connection.execute(idempotency.update().where(*_is(project, token)).values(made=created))
         return created, True
 
     try:
         return database.transact(work)
-    except IntegrityError:  # the same request, at the same time: it is there now, or the error is another's
+    except IntegrityError:  # the same request at the same time has created it, or the error is another one
         return database.transact(work)
 
 
 def created_by(database: Database, project: str, token: str, asked: Any) -> str | None:
-    """What was created with a token; None: nothing. Arguments and errors as of `once`."""
+    """Return what was created with a token; None: nothing. Arguments and errors are those of `create_once`."""
     row = database.row(_by_token(project, token))
     return None if row is None else _same(row, _fingerprint(asked))
 
 
 def forget_token(connection: sa.Connection, project: str, token: str, gone: str) -> None:
-    """What a token made is gone: it may make another, unless it has already."""
+    """Forget a token whose creation was deleted, so that it can create another, unless it has already."""
     connection.execute(idempotency.delete().where(*_is(project, token), idempotency.c.made == gone))
 
 
 def drop_before(connection: sa.Connection, when: float) -> None:
-    """Forget tokens of requests before a time."""
+    """Forget the tokens of requests before a time."""
     connection.execute(idempotency.delete().where(idempotency.c.created_at < when))
 
 

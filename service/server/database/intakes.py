@@ -1,6 +1,6 @@
-"""What was handed in to be worked on: captures and environments, uploaded or registered where they lie.
+"""Intakes: captures and environments, uploaded or registered where they lie.
 
-receiving (an upload) → checking → ready | refused. What is checking or ready is not written to any more.
+receiving (an upload) → checking → ready | refused. The files of an intake do not change while it is checking or ready.
 """
 
 import time
@@ -16,27 +16,29 @@ from service.views.states import CHECKING, READY, RECEIVING, REFUSED
 
 
 def insert(connection: sa.Connection, *, identifier: str, project: str, kind: str, name: str, folder: str | None) -> None:
-    """Write down a new one: receiving an upload, or registered and about to be checked."""
+    """Insert an intake: receiving an upload if `folder` is None, else registered and about to be checked."""
     connection.execute(intakes.insert().values(id=identifier, project=project, kind=kind, name=name, folder=folder, created_at=time.time(),
                                                state=RECEIVING if folder is None else CHECKING))
 
 
 def find(database: Database, identifier: str, project: str) -> sa.RowMapping | None:
-    """One of a project."""
+    """Return an intake of a project, or None."""
     return database.row(sa.select(intakes).where(intakes.c.id == identifier, intakes.c.project == project))
 
 
 def latest(database: Database, project: str, kind: str, *, limit: int, before: tuple[float, str] | None = None) -> list[sa.RowMapping]:
-    """Those of a project, the newest first; `before` as in `jobs.latest`."""
+    """Return a page of the intakes of a project, the newest first; `before` is that of `jobs.latest`."""
     query = sa.select(intakes).where(intakes.c.project == project, intakes.c.kind == kind)
     return database.rows(newest_first(query, intakes, limit=limit, before=before))
 
 
 def lock_for_files(connection: sa.Connection, identifier: str, project: str) -> bool:
-    """Keep one that takes files from being checked or deleted until the transaction ends; what was refused is being mended now.
+    """Lock an intake that receives files, so that it is neither checked nor deleted before the transaction ends.
+
+    An intake that was refused is receiving again.
 
     Returns:
-        False where it is not there, or takes none.
+        False if there is no such intake, or its files do not change any more.
     """
     return connection.execute(intakes.update().where(
         intakes.c.id == identifier, intakes.c.project == project, intakes.c.folder.is_(None), intakes.c.state.in_((RECEIVING, REFUSED)),
@@ -44,7 +46,7 @@ def lock_for_files(connection: sa.Connection, identifier: str, project: str) -> 
 
 
 def last_used(database: Database, identifiers: Sequence[str]) -> dict[str, float]:
-    """Of those that there are: when a job that reads it last changed, or when it was created."""
+    """Return for each intake that exists when a job that reads it last changed or, without such a job, when it was created."""
     used = sa.func.coalesce(sa.func.max(jobs.c.updated_at), intakes.c.created_at).label("used")
     read = intakes.outerjoin(job_inputs, job_inputs.c.input == intakes.c.id).outerjoin(jobs, jobs.c.id == job_inputs.c.job)
     query = sa.select(intakes.c.id, used).select_from(read).where(intakes.c.id.in_(identifiers))
@@ -52,28 +54,29 @@ def last_used(database: Database, identifiers: Sequence[str]) -> dict[str, float
 
 
 def begin_check(connection: sa.Connection, identifier: str) -> bool:
-    """Take no more files, and wait for the check; false where it is checking or ready already."""
+    """Let an intake receive no more files and wait for its check; return False if it is checking or ready already."""
     return connection.execute(intakes.update().where(intakes.c.id == identifier, intakes.c.state.in_((RECEIVING, REFUSED))).values(
         state=CHECKING, problem=None)).rowcount == 1
 
 
 def accept(database: Database, identifier: str, facts: dict[str, Any]) -> None:
-    """The check found nothing wrong."""
+    """Record that the check found nothing wrong, and the facts that it found."""
     _judge(database, identifier, state=READY, facts=facts, problem=None)
 
 
 def refuse(database: Database, identifier: str, problem: str) -> None:
-    """The check found something: an upload may be mended and checked again."""
+    """Record the problem that the check found; the files of an upload may then be replaced and checked again."""
     _judge(database, identifier, state=REFUSED, problem=storable(problem))
 
 
 def remove(connection: sa.Connection, identifier: str) -> list[str] | None:
-    """Forget one, and its uploads.
+    """Delete an intake and its uploads.
 
     Returns:
-        Identifiers of uploads that were not complete; None where it was not there.
+        Identifiers of the uploads that were not complete; None: there is no such intake.
     """
-    connection.execute(intakes.update().where(intakes.c.id == identifier).values(name=intakes.c.name))  # no upload may come meanwhile
+    # locks the row, so that no upload begins meanwhile
+    connection.execute(intakes.update().where(intakes.c.id == identifier).values(name=intakes.c.name))
     parts = list(connection.execute(sa.select(uploads.c.id).where(uploads.c.intake == identifier, uploads.c.done.is_(False))).scalars())
     connection.execute(uploads.delete().where(uploads.c.intake == identifier))
     return parts if connection.execute(intakes.delete().where(intakes.c.id == identifier)).rowcount == 1 else None

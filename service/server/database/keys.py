@@ -1,4 +1,4 @@
-"""API keys: whom the service lets in. Only a hash of the secret is kept."""
+"""API keys. Only a hash of their secret is kept."""
 
 import hashlib
 import hmac
@@ -14,30 +14,30 @@ from service.server.database.engine import Database
 from service.server.database.tables import keys
 
 SECRET_BYTES = 32
-"""256 random bits: no one finds them by trying, so that one round of SHA-256 is enough."""
+"""256 random bits cannot be found by trying, so that one round of SHA-256 is enough."""
 
 
 ORDER = list(Scope)
 
 
 class Caller(NamedTuple):
-    """Who asks."""
+    """Who sends a request."""
 
     project: str
     scope: Scope
     key: str | None
-    """Identifier of the key; None: anonymous."""
+    """Identifier of the key; None: the request has no key."""
 
     def may(self, scope: Scope) -> bool:
-        """Whether the caller's scope allows what this one does."""
+        """Return whether the caller's scope includes this one."""
         return ORDER.index(self.scope) >= ORDER.index(scope)
 
 
 def create(database: Database, wanted: NewKey) -> str:
-    """Make a key.
+    """Create a key.
 
     Returns:
-        The key as its user presents it; it cannot be shown again.
+        The key as its user sends it; it cannot be shown again.
     """
     identifier, secret = new_id(KEY), secrets.token_urlsafe(SECRET_BYTES)
     database.transact(lambda connection: connection.execute(keys.insert().values(
@@ -46,7 +46,7 @@ def create(database: Database, wanted: NewKey) -> str:
 
 
 def find(database: Database, presented: str) -> Caller | None:
-    """Who presents a key; None: it is none of ours, or was revoked."""
+    """Return the caller to whom a key belongs; None: the key is unknown or was revoked."""
     identifier, _, secret = presented.partition(".")
     row = database.row(sa.select(keys).where(keys.c.id == identifier, keys.c.revoked_at.is_(None)))
     if row is None or not hmac.compare_digest(row["digest"], _digest(secret)):
@@ -55,13 +55,13 @@ def find(database: Database, presented: str) -> Caller | None:
 
 
 def revoke(database: Database, identifier: str) -> bool:
-    """Take a key back; false where there is none that is not revoked."""
+    """Revoke a key; return False if there is no such key or it was revoked before."""
     return database.transact(lambda connection: connection.execute(keys.update().where(
         keys.c.id == identifier, keys.c.revoked_at.is_(None)).values(revoked_at=time.time())).rowcount == 1)
 
 
 def listing(database: Database, project: str | None = None) -> list[sa.RowMapping]:
-    """Keys that were made, without their secrets; the oldest first."""
+    """Return the keys of a project or of all, without their secrets, the oldest first."""
     query = sa.select(keys.c.id, keys.c.project, keys.c.name, keys.c.scope, keys.c.created_at, keys.c.revoked_at)
     return database.rows((query if project is None else query.where(keys.c.project == project)).order_by(keys.c.created_at))
 

@@ -1,6 +1,6 @@
-"""Files on their way into a capture or an environment: one row each, from the first byte until the capture is deleted.
+"""Uploads: a row for each file of a capture or an environment, from its creation until the capture is deleted.
 
-`received` counts bytes that are on the disk and were found right; what lies behind them in the part file is cut off before more come.
+`received` counts bytes that are on the disk and verified; what the part file has behind them is cut off before more is appended.
 """
 
 import time
@@ -16,28 +16,28 @@ from service.server.safe_names import folded, folders_of, shown
 from service.server.storage.parts import Part, PartLocked, leftovers
 
 Row = Mapping[str, Any]
-"""An upload: the columns of its table."""
+"""A row of the uploads table."""
 AFTER_SLASH = "0"
-"""The character behind /: a folder's files are those between the two."""
+"""The character after /: the paths of the files in a folder sort between the two."""
 
 
 class PathTaken(Exception):
-    """Another file has the path, or one that is the same on some file systems; one sentence."""
+    """Another file has the path, or one that some file systems take for the same; the message is one sentence."""
 
 
 def insert(connection: sa.Connection, *, identifier: str, project: str, intake: str, path: str, length: int, sha256: str | None) -> None:
-    """Write down a new one, of which nothing has come; the caller holds the capture.
+    """Insert an upload without bytes; the caller has locked the intake.
 
     Args:
         connection: of the caller's transaction.
-        identifier: its own.
-        project, intake: where it belongs.
-        path: within the capture, safe.
-        length: bytes that will come.
-        sha256: of all of them, where it is known.
+        identifier: of the upload.
+        project, intake: to which it belongs.
+        path: within the capture, checked.
+        length: of the complete file, bytes.
+        sha256: of the complete file; None: it is not known.
 
     Raises:
-        PathTaken: by a file that is not this very one.
+        PathTaken: another file has the path.
     """
     _require_free(connection, intake, path)
     connection.execute(uploads.insert().values(
@@ -46,28 +46,28 @@ def insert(connection: sa.Connection, *, identifier: str, project: str, intake: 
 
 
 def find(database: Database, identifier: str, project: str) -> Row | None:
-    """One of a project."""
+    """Return an upload of a project, or None."""
     row = database.row(sa.select(uploads).where(uploads.c.id == identifier, uploads.c.project == project))
     return None if row is None else dict(row)
 
 
 def at_path(connection: sa.Connection, intake: str, path: str) -> sa.RowMapping | None:
-    """The one of a path."""
+    """Return the upload that will be stored at `path`, or None."""
     return connection.execute(sa.select(uploads).where(uploads.c.intake == intake, uploads.c.path == path)).mappings().one_or_none()
 
 
 def count(connection: sa.Connection, intake: str) -> int:
-    """Files of a capture, complete or not."""
+    """Return the number of files of an intake, complete or not."""
     return int(connection.execute(sa.select(sa.func.count()).where(uploads.c.intake == intake)).scalar_one())
 
 
 def unfinished(connection: sa.Connection, intake: str) -> sa.RowMapping | None:
-    """A file of a capture that is not complete."""
+    """Return a file of an intake that is not complete; None: all are complete."""
     return connection.execute(sa.select(uploads).where(uploads.c.intake == intake, uploads.c.done.is_(False)).limit(1)).mappings().first()
 
 
 def listing(database: Database, intake: str, *, limit: int, after: str | None = None) -> list[Row]:
-    """Files of a capture by path, those behind a path alone where one is given."""
+    """Return a page of the files of an intake, by path; with `after`, those after that path."""
     query = sa.select(uploads).where(uploads.c.intake == intake)
     if after is not None:
         query = query.where(uploads.c.folded > folded(after))
@@ -75,30 +75,30 @@ def listing(database: Database, intake: str, *, limit: int, after: str | None = 
 
 
 def advance(database: Database, identifier: str, received: int) -> bool:
-    """So many bytes are safe; false where the upload is there no more."""
+    """Record the number of bytes that are safe; return False if the upload was deleted."""
     return _change(database, identifier, received=received)
 
 
 def finish(database: Database, identifier: str, length: int) -> bool:
-    """All bytes are in the storage; false where the upload is there no more."""
+    """Record that the complete file is in the storage; return False if the upload was deleted."""
     return _change(database, identifier, received=length, done=True)
 
 
 def remove(connection: sa.Connection, identifier: str) -> bool:
-    """Forget one."""
+    """Delete an upload; return False if there is none."""
     return connection.execute(uploads.delete().where(uploads.c.id == identifier)).rowcount == 1
 
 
 def expire(database: Database, folder: Path, before: float) -> int:
-    """Remove uploads that nobody has added to since a time, and part files that belong to none.
+    """Delete uploads that were not continued since a time, and part files without an upload.
 
     Args:
-        database: of the store.
+        database: of the service.
         folder: of the part files.
-        before: seconds since 1970.
+        before: the time, seconds since 1970.
 
     Returns:
-        How many were removed.
+        The number of deleted uploads.
     """
     removed = 0
     for row in database.rows(sa.select(uploads.c.id).where(uploads.c.done.is_(False), uploads.c.touched_at < before)):
@@ -112,7 +112,7 @@ def expire(database: Database, folder: Path, before: float) -> int:
 def _expire(database: Database, folder: Path, identifier: str, before: float) -> bool:
     try:
         part = Part.open(folder, identifier)
-    except PartLocked:  # somebody is adding to it
+    except PartLocked:  # a request is adding to it
         return False
     with part:
         gone = database.transact(lambda connection: connection.execute(uploads.delete().where(
