@@ -21,7 +21,7 @@ from service.server.log import logger
 from service.server.settings import Settings
 from service.server.storage import layout
 from service.server.storage.folder import Storage, drop_folder
-from service.server.storage.parts import parts_folder
+from service.server.storage.part_files import part_files_folder
 from stage.errors import StorageError
 
 EVERY_S = 600.0
@@ -88,7 +88,7 @@ class Housekeeper:
                 logger.info("job removed", job=row["id"], project=row["project"])
 
     def _uploads(self) -> None:
-        removed = uploads.expire(self._database, parts_folder(self._settings), self._clock() - self._settings.upload_hours * HOUR_S)
+        removed = uploads.expire(self._database, part_files_folder(self._settings), self._clock() - self._settings.upload_hours * HOUR_S)
         if removed:
             logger.info("uploads removed", count=removed)
 

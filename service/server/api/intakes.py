@@ -19,7 +19,7 @@ from service.server.database import intakes, jobs, uploads
 from service.server.database.keys import Caller
 from service.server.safe_names import shown
 from service.server.storage import layout
-from service.server.storage.parts import Part, parts_folder
+from service.server.storage.part_files import PartFile, part_files_folder
 from service.views import states
 from service.views.intakes import IntakePage, IntakeView
 from stage.files import resolved
@@ -200,5 +200,5 @@ def _delete(service: Service, caller: Caller, identifier: str) -> None:
     parts = service.database.transact(work)
     if parts is not None and row["folder"] is None:
         for upload in parts:
-            Part.discard(parts_folder(service.settings), upload)
+            PartFile.discard(part_files_folder(service.settings), upload)
         service.storage.remove(layout.intake(caller.project, identifier))

@@ -7,14 +7,14 @@ import time
 
 from service.server.api.context import FOR_UPLOAD, Service, require_space
 from service.server.api.problems import ApiError
-from service.server.api.receive import PartWriter, RunningHashes
+from service.server.api.receive import PartFileWriter, RunningHashes
 from service.server.api.tus import Checksum
 from service.server.database import uploads
 from service.server.database.uploads import Row
 from service.server.log import logger
 from service.server.safe_names import shown
 from service.server.storage import layout
-from service.server.storage.parts import Part, PartLocked, parts_folder, stored_bytes
+from service.server.storage.part_files import PartFile, PartFileLocked, part_files_folder, stored_bytes
 
 BUSY_RETRY_S = 1
 
@@ -40,7 +40,7 @@ class UploadPatch:
             checksum: of the body; None: the client gave none.
         """
         self._service, self._hashes, self._row, self._offset, self._checksum = service, hashes, upload, offset, checksum
-        self._part: Part | None = None
+        self._part: PartFile | None = None
         self._digest = None if checksum is None else hashlib.new(checksum.algorithm)
         self._saved = 0
 
@@ -51,8 +51,8 @@ class UploadPatch:
             ApiError: it is locked, was deleted, has another offset, or there is no space.
         """
         try:
-            self._part = Part.open(parts_folder(self._service.settings), self._row["id"])
-        except PartLocked:
+            self._part = PartFile.open(part_files_folder(self._service.settings), self._row["id"])
+        except PartFileLocked:
             raise ApiError("locked", f"{self._row['id']}: another request is adding to it",
                            headers={"Retry-After": str(BUSY_RETRY_S)}) from None
         being_written.add(self._row["id"])
@@ -67,7 +67,7 @@ class UploadPatch:
             self._part.cut(start)
         self._whole = None if row["sha256"] is None or row["done"] else self._hashes.take(row["id"], start)
         digests = [digest for digest in (self._digest, self._whole) if digest is not None]
-        self.writer = PartWriter(self._part, start, row["length"], digests=digests,
+        self.writer = PartFileWriter(self._part, start, row["length"], digests=digests,
                              save=self._save if self._checksum is None else None, guard=lambda: require_space(self._service, FOR_UPLOAD))
 
     def end(self, broken: str | None) -> Row:
@@ -168,7 +168,7 @@ def safe_offset(row: Row, there: int) -> int:
 
 def settled(service: Service, row: Row) -> Row:
     """Return the row of an upload, corrected if the service ended after it moved the complete file and before it recorded that."""
-    if row["done"] or stored_bytes(parts_folder(service.settings), row["id"]) >= row["received"]:
+    if row["done"] or stored_bytes(part_files_folder(service.settings), row["id"]) >= row["received"]:
         return row
     # not an older file of this path: that was deleted when the upload began
     moved = service.storage.open(layout.intake(row["project"], row["intake"]), row["path"])
@@ -179,4 +179,4 @@ def settled(service: Service, row: Row) -> Row:
 
 def received_of(service: Service, row: Row) -> int:
     """Return the number of bytes of an upload that the client need not send again."""
-    return safe_offset(row, 0 if row["done"] else stored_bytes(parts_folder(service.settings), row["id"]))
+    return safe_offset(row, 0 if row["done"] else stored_bytes(part_files_folder(service.settings), row["id"]))

@@ -10,7 +10,7 @@ from typing import Any
 
 from starlette.requests import ClientDisconnect
 
-from service.server.storage.parts import Part
+from service.server.storage.part_files import PartFile
 
 BLOCK = 1 << 20
 """Bytes that are written at once; two such blocks are in memory."""
@@ -37,10 +37,10 @@ class TooLong(Exception):
     """More bytes came than the length of the upload."""
 
 
-class PartWriter:
+class PartFileWriter:
     """Appends blocks to a part file, flushes them, and hashes them in another thread."""
 
-    def __init__(self, part: Part, start: int, length: int, *, digests: list[Any], save: Callable[[int], None] | None,
+    def __init__(self, part: PartFile, start: int, length: int, *, digests: list[Any], save: Callable[[int], None] | None,
                  guard: Callable[[], None]) -> None:
         """Create the writer.
 
@@ -101,7 +101,7 @@ class PartWriter:
             self._saved = at
 
 
-async def write_body(stream: AsyncIterator[bytes], writer: PartWriter) -> None:
+async def write_body(stream: AsyncIterator[bytes], writer: PartFileWriter) -> None:
     """Write a body to a part file, block by block.
 
     Raises:

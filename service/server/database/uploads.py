@@ -13,7 +13,7 @@ import sqlalchemy as sa
 from service.server.database.engine import Database
 from service.server.database.tables import uploads
 from service.server.safe_names import folded, folders_of, shown
-from service.server.storage.parts import Part, PartLocked, leftovers
+from service.server.storage.part_files import PartFile, PartFileLocked, leftovers
 
 Row = Mapping[str, Any]
 """A row of the uploads table."""
@@ -105,14 +105,14 @@ def expire(database: Database, folder: Path, before: float) -> int:
         removed += _expire(database, folder, row["id"], before)
     for identifier in leftovers(folder, before):
         if database.row(sa.select(uploads.c.id).where(uploads.c.id == identifier, uploads.c.done.is_(False))) is None:
-            Part.discard(folder, identifier)
+            PartFile.discard(folder, identifier)
     return removed
 
 
 def _expire(database: Database, folder: Path, identifier: str, before: float) -> bool:
     try:
-        part = Part.open(folder, identifier)
-    except PartLocked:  # a request is adding to it
+        part = PartFile.open(folder, identifier)
+    except PartFileLocked:  # a request is adding to it
         return False
     with part:
         gone = database.transact(lambda connection: connection.execute(uploads.delete().where(

@@ -15,7 +15,7 @@ from service.server.jobs.queue import JobQueue, prepare
 from service.server.settings import Settings
 from service.server.storage import layout
 from service.server.storage.open import open_storage
-from service.server.storage.parts import Part, parts_folder
+from service.server.storage.part_files import PartFile, part_files_folder
 
 DAYS = 30.0
 PROJECT = "larch"
@@ -112,16 +112,16 @@ def test_results_that_a_waiting_job_reads_stay_until_it_has_ended(house):
 
 
 def test_uploads_that_nobody_goes_on_with_expire(house):
-    capture, upload, folder = house.capture(), new_id(UPLOAD), parts_folder(house.settings)
+    capture, upload, folder = house.capture(), new_id(UPLOAD), part_files_folder(house.settings)
     house.database.transact(lambda connection: uploads.insert(
         connection, identifier=upload, project=PROJECT, intake=capture, path="000.exr", length=10, sha256=None))
-    with Part.open(folder, upload) as part:
+    with PartFile.open(folder, upload) as part:
         part.append([b"12345"])
     house.now += 47 * HOUR_S
     house.keeper.round()
     assert uploads.find(house.database, upload, PROJECT) and part.path.exists()
     house.now += 2 * HOUR_S
-    with Part.open(folder, upload):  # a request adds to it
+    with PartFile.open(folder, upload):  # a request adds to it
         house.keeper.round()
         assert uploads.find(house.database, upload, PROJECT)
     house.keeper.round()

@@ -14,6 +14,7 @@ from sqlalchemy.exc import OperationalError
 
 from service.requests.identifiers import new_id
 from service.requests.jobs import SolveJob
+from service.server import log
 from service.server.api import events, watch
 from service.server.api.app import create_app
 from service.server.api.problems import ApiError
@@ -213,6 +214,7 @@ def test_only_the_last_of_several_changes_is_kept_for_one_who_is_slow(monkeypatc
 
 
 def test_a_database_that_does_not_answer_is_waited_for(database, quick, monkeypatch, capfd):
+    log.configure("info", "json")  # to the standard error of this test, whatever ran before it
     job = queue(database)
     away = threading.Event()
     ask = jobs.watched

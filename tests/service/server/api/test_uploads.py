@@ -19,7 +19,7 @@ from service.requests.keys import NewKey, Scope
 from service.server.database import keys, uploads
 from service.server.database.engine import connect, create
 from service.server.database.intakes import insert as insert_intake
-from service.server.storage.parts import Part, PartLocked
+from service.server.storage.part_files import PartFile, PartFileLocked
 from tests.service.postgres import binaries, postgres
 from tests.service.server.api.conftest import SAMPLES
 from tests.service.server.api.tus import VERSION, Answer, Tus, checksum, encoded
@@ -471,12 +471,12 @@ def test_what_nobody_adds_to_expires(tmp_path):
     database.transact(fill)
     assert uploads.finish(database, ids["done"], 4)
     for identifier in ids.values():
-        Part.open(folder, identifier).close()
+        PartFile.open(folder, identifier).close()
     limit = time.time()
     assert uploads.advance(database, ids["new"], 2)
-    Part.open(folder, "up_orphan").close()
+    PartFile.open(folder, "up_orphan").close()
     os.utime(folder / "up_orphan.part", (limit + 1, limit + 1))  # the clock of files is a coarse one
-    with Part.open(folder, ids["busy"]):
+    with PartFile.open(folder, ids["busy"]):
         assert uploads.expire(database, folder, limit) == 1
     assert {name for name, identifier in ids.items() if uploads.find(database, identifier, "p") is not None} == {"busy", "new", "done"}
     assert {path.stem for path in folder.iterdir()} == {ids["busy"], ids["new"], "up_orphan"}
@@ -487,8 +487,8 @@ def test_what_nobody_adds_to_expires(tmp_path):
 
 
 def test_a_part_is_locked_once(tmp_path):
-    with Part.open(tmp_path, "up_1") as first, pytest.raises(PartLocked):
+    with PartFile.open(tmp_path, "up_1") as first, pytest.raises(PartFileLocked):
         first.append([b"da", b"", b"ta"])
-        Part.open(tmp_path, "up_1")
-    with Part.open(tmp_path, "up_1") as again:
+        PartFile.open(tmp_path, "up_1")
+    with PartFile.open(tmp_path, "up_1") as again:
         assert again.size == 4

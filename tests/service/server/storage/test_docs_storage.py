@@ -12,7 +12,7 @@ from service.server.jobs.worker import cache_folder
 from service.server.settings import Settings
 from service.server.storage import layout, objects, scratch
 from service.server.storage.open import SCRATCH
-from service.server.storage.parts import parts_folder
+from service.server.storage.part_files import part_files_folder
 
 TEXT = (Path(__file__).parents[4] / "docs" / "service_storage.md").read_text(encoding="utf-8")
 
@@ -23,8 +23,8 @@ def test_every_name_is_in_the_docs(tmp_path):
         assert f"{os.path.dirname(layout.intake('PROJECT', new_id(kind)))}/ID/…" in TEXT and f"`{kind}_…`" in TEXT
     assert f"{os.path.dirname(layout.results('PROJECT', new_id(JOB)))}/ID/…" in TEXT
     for name in (*layout.SOLVED, layout.FRAMES.replace("####", "0001"), layout.PICTURE, f"{layout.ASSET}.usdz", KEYS_FILE,
-                 f"{parts_folder(settings).name}/", f"{cache_folder(settings).name}/", f"{SCRATCH}/", f"{objects.REMOVED}/", objects.PROBE,
-                 "storage_url", "scratch_bytes", "chunk_frames", "database_url"):
+                 f"{part_files_folder(settings).name}/", f"{cache_folder(settings).name}/", f"{SCRATCH}/", f"{objects.REMOVED}/",
+                 objects.PROBE, "storage_url", "scratch_bytes", "chunk_frames", "database_url"):
         assert name in TEXT, name
     assert {"storage_url", "scratch_bytes", "chunk_frames", "database_url"} <= Settings.model_fields.keys()
     assert scratch.IN_USE_S == 6 * 3600 and "the last six hours" in TEXT

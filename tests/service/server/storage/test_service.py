@@ -26,6 +26,7 @@ def url(request, tmp_path):
     return (tmp_path / "store").as_uri() if request.param == "file" else request.getfixturevalue("s3")
 
 
+@pytest.mark.long
 def test_a_pipeline_with_uploads_in_an_object_store(relit, tmp_path, url):
     capture = write_capture(tmp_path / "cap", make_scene(size=16, lights=6))
     sky = write_exr(tmp_path / "sky.exr", np.random.default_rng(3).random((8, 16, 3)))

@@ -15,11 +15,11 @@ SUFFIX = ".part"
 READ = 1 << 20
 
 
-class PartLocked(Exception):
+class PartFileLocked(Exception):
     """Another request, of this process or another one, has locked the part file."""
 
 
-class Part:
+class PartFile:
     """An open part file, locked until it is closed. Its methods may be called from any thread, one at a time."""
 
     def __init__(self, path: Path, descriptor: int) -> None:
@@ -33,7 +33,7 @@ class Part:
         """Open and lock the part file of an upload; it is made if there is none.
 
         Raises:
-            PartLocked: another request has locked it.
+            PartFileLocked: another request has locked it.
             StorageError: the folder cannot be written.
         """
         path = _path(folder, upload)
@@ -41,7 +41,7 @@ class Part:
             folder.mkdir(parents=True, exist_ok=True)
             descriptor = file_lock.take(path, 0o644)
         if descriptor is None:
-            raise PartLocked
+            raise PartFileLocked
         return cls(path, descriptor)
 
     @staticmethod
@@ -120,7 +120,7 @@ class Part:
         return self._descriptor
 
 
-def parts_folder(settings: Settings) -> Path:
+def part_files_folder(settings: Settings) -> Path:
     """Return the folder of the part files."""
     return settings.data / "uploads"
 
