@@ -77,77 +77,72 @@ def _join(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return root
 
 
+@wp.struct
+class DeviceRuns:
+    """Runs on the device, and where each begins in the flat layout of a grid."""
+
+    start: wp.array(dtype=wp.int32)  # [M]
+    length: wp.array(dtype=wp.int32)
+    row: wp.array(dtype=wp.int32)
+    col: wp.array(dtype=wp.int32)
+
+
 @wp.kernel
-def _sum_runs(
-    first: int,
-    value: wp.array(dtype=wp.float32),
-    start: wp.array(dtype=wp.int32),
-    length: wp.array(dtype=wp.int32),
-    # outputs
-    total: wp.array(dtype=wp.float64),
-):
+def _sum_runs(first: int,
+              runs: DeviceRuns,
+              value: wp.array(dtype=wp.float32),
+              # outputs
+              total: wp.array(dtype=wp.float64)):
     m = first + wp.tid()
     s = wp.float64(0.0)
-    for i in range(start[m], start[m] + length[m]):
+    for i in range(runs.start[m], runs.start[m] + runs.length[m]):
         s += wp.float64(value[i])
     total[m] = s
 
 
 @wp.kernel
-def _sum_depths(
-    first: int,
-    value: wp.array(dtype=wp.float32),
-    start: wp.array(dtype=wp.int32),
-    length: wp.array(dtype=wp.int32),
-    mean: wp.array(dtype=wp.float64),
-    spacing: wp.float64,
-    # outputs
-    total: wp.array(dtype=wp.float64),
-):
+def _sum_depths(first: int,
+                runs: DeviceRuns,
+                value: wp.array(dtype=wp.float32),
+                mean: wp.array(dtype=wp.float64),
+                spacing: wp.float64,
+                # outputs
+                total: wp.array(dtype=wp.float64)):
     m = first + wp.tid()
     s = wp.float64(0.0)
-    for i in range(start[m], start[m] + length[m]):
+    for i in range(runs.start[m], runs.start[m] + runs.length[m]):
         s += wp.exp(spacing * (mean[m] - wp.float64(value[i])))
     total[m] = s
 
 
 @wp.kernel
-def _write_heights(
-    first: int,
-    value: wp.array(dtype=wp.float32),
-    start: wp.array(dtype=wp.int32),
-    length: wp.array(dtype=wp.int32),
-    row: wp.array(dtype=wp.int32),
-    col: wp.array(dtype=wp.int32),
-    mean: wp.array(dtype=wp.float64),
-    spacing: wp.float64,
-    mean_z: wp.float64,
-    # outputs
-    height: wp.array2d(dtype=wp.float32),
-):
+def _write_heights(first: int,
+                   runs: DeviceRuns,
+                   value: wp.array(dtype=wp.float32),
+                   mean: wp.array(dtype=wp.float64),
+                   spacing: wp.float64,
+                   mean_z: wp.float64,
+                   # outputs
+                   height: wp.array2d(dtype=wp.float32)):
     m = first + wp.tid()
-    for k in range(length[m]):
-        height[row[m], col[m] + k] = wp.float32(mean_z + spacing * (wp.float64(value[start[m] + k]) - mean[m]))
+    for k in range(runs.length[m]):
+        z = mean_z + spacing * (wp.float64(value[runs.start[m] + k]) - mean[m])
+        height[runs.row[m], runs.col[m] + k] = wp.float32(z)
 
 
 @wp.kernel
-def _write_depths(
-    first: int,
-    value: wp.array(dtype=wp.float32),
-    start: wp.array(dtype=wp.int32),
-    length: wp.array(dtype=wp.int32),
-    row: wp.array(dtype=wp.int32),
-    col: wp.array(dtype=wp.int32),
-    mean: wp.array(dtype=wp.float64),
-    spacing: wp.float64,
-    scale: wp.array(dtype=wp.float64),
-    # outputs
-    height: wp.array2d(dtype=wp.float32),
-):
+def _write_depths(first: int,
+                  runs: DeviceRuns,
+                  value: wp.array(dtype=wp.float32),
+                  mean: wp.array(dtype=wp.float64),
+                  spacing: wp.float64,
+                  scale: wp.array(dtype=wp.float64),
+                  # outputs
+                  height: wp.array2d(dtype=wp.float32)):
     m = first + wp.tid()
-    for k in range(length[m]):
-        depth = scale[m] * wp.exp(spacing * (mean[m] - wp.float64(value[start[m] + k])))
-        height[row[m], col[m] + k] = wp.float32(-depth)
+    for k in range(runs.length[m]):
+        depth = scale[m] * wp.exp(spacing * (mean[m] - wp.float64(value[runs.start[m] + k])))
+        height[runs.row[m], runs.col[m] + k] = wp.float32(-depth)
 
 
 def place(
@@ -177,22 +172,20 @@ def place(
     def per_run(values: np.ndarray, dtype: type) -> wp.array:
         return wp.array(values, dtype=dtype, device=device)
 
-    start = per_run((runs.row + 1) * grid.pitch + runs.first_col + 1, wp.int32)
-    stretch = per_run(length, wp.int32)
-    row, col = per_run(runs.row, wp.int32), per_run(runs.first_col, wp.int32)
+    there = DeviceRuns()
+    there.start = per_run((runs.row + 1) * grid.pitch + runs.first_col + 1, wp.int32)
+    there.length, there.row, there.col = (per_run(values, wp.int32) for values in (length, runs.row, runs.first_col))
     total = wp.zeros(count, dtype=wp.float64, device=device)
 
     def component_mean() -> np.ndarray:
         return (np.bincount(runs.label, weights=total.numpy()) / pixels)[runs.label]
 
-    devices.launch(_sum_runs, count, [value, start, stretch], [total], device=device)
+    devices.launch(_sum_runs, count, [there, value], [total], device=device)
     mean = per_run(component_mean(), wp.float64)
     if perspective:
-        devices.launch(_sum_depths, count, [value, start, stretch, mean, spacing], [total], device=device)
+        devices.launch(_sum_depths, count, [there, value, mean, spacing], [total], device=device)
         scale = per_run(-mean_z / component_mean(), wp.float64)
-        inputs = [value, start, stretch, row, col, mean, spacing, scale]
-        devices.launch(_write_depths, count, inputs, [height], device=device)
+        devices.launch(_write_depths, count, [there, value, mean, spacing, scale], [height], device=device)
     else:
-        inputs = [value, start, stretch, row, col, mean, spacing, mean_z]
-        devices.launch(_write_heights, count, inputs, [height], device=device)
+        devices.launch(_write_heights, count, [there, value, mean, spacing, mean_z], [height], device=device)
     return height

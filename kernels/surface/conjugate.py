@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import warp as wp
 
-from kernels.surface.grid import Grid, Summer, Walk, cell_of, run
+from kernels.surface.grid import EdgeWeights, Grid, Summer, Walk, end_cell, first_cell, run
 from kernels.surface.multigrid import Multigrid
 from kernels.surface.slopes import Slopes
 
@@ -33,120 +33,95 @@ class Convergence(NamedTuple):
 
 
 @wp.kernel
-def _descent(
-    first: int,
-    walk: Walk,
-    gx: wp.array(dtype=wp.float32),
-    gy: wp.array(dtype=wp.float32),
-    wx: wp.array(dtype=wp.float32),
-    wy: wp.array(dtype=wp.float32),
-    h: wp.array(dtype=wp.float32),
-    pitch: int,
-    # outputs
-    residual: wp.array(dtype=wp.float32),
-):
+def _descent(first: int,
+             walk: Walk,
+             right: wp.array(dtype=wp.float32),
+             down: wp.array(dtype=wp.float32),
+             weights: EdgeWeights,
+             h: wp.array(dtype=wp.float32),
+             # outputs
+             residual: wp.array(dtype=wp.float32)):
     """Minus half the gradient of the least squares at h."""
     t = first + wp.tid()
-    for k in range(walk.steps):
-        i = cell_of(walk, t, k)
-        if i < walk.end:
-            s = wx[i] * (h[i + 1] - h[i] - gx[i]) - wx[i - 1] * (h[i] - h[i - 1] - gx[i - 1])
-            s += wy[i] * (h[i + pitch] - h[i] - gy[i]) - wy[i - pitch] * (h[i] - h[i - pitch] - gy[i - pitch])
-            residual[i] = s
+    pitch = weights.pitch
+    for i in range(first_cell(walk, t), end_cell(walk, t), walk.step):
+        s = weights.right[i] * (h[i + 1] - h[i] - right[i]) - weights.right[i - 1] * (h[i] - h[i - 1] - right[i - 1])
+        s += weights.down[i] * (h[i + pitch] - h[i] - down[i]) - weights.down[i - pitch] * (h[i] - h[i - pitch] - down[i - pitch])
+        residual[i] = s
 
 
 @wp.kernel
-def _multiply(
-    first: int,
-    walk: Walk,
-    wx: wp.array(dtype=wp.float32),
-    wy: wp.array(dtype=wp.float32),
-    p: wp.array(dtype=wp.float32),
-    pitch: int,
-    # outputs
-    q: wp.array(dtype=wp.float32),
-    partial: wp.array(dtype=wp.float64),
-):
+def _multiply(first: int,
+              walk: Walk,
+              weights: EdgeWeights,
+              p: wp.array(dtype=wp.float32),
+              # outputs
+              q: wp.array(dtype=wp.float32),
+              partial: wp.array(dtype=wp.float64)):
     """q = A·p, and each thread's part of p·q."""
     t = first + wp.tid()
+    pitch = weights.pitch
     total = wp.float64(0.0)
-    for k in range(walk.steps):
-        i = cell_of(walk, t, k)
-        if i < walk.end:
-            v = p[i]
-            s = wx[i] * (v - p[i + 1]) + wx[i - 1] * (v - p[i - 1])
-            s += wy[i] * (v - p[i + pitch]) + wy[i - pitch] * (v - p[i - pitch])
-            q[i] = s
-            total += wp.float64(v) * wp.float64(s)
+    for i in range(first_cell(walk, t), end_cell(walk, t), walk.step):
+        v = p[i]
+        s = weights.right[i] * (v - p[i + 1]) + weights.right[i - 1] * (v - p[i - 1])
+        s += weights.down[i] * (v - p[i + pitch]) + weights.down[i - pitch] * (v - p[i - pitch])
+        q[i] = s
+        total += wp.float64(v) * wp.float64(s)
     partial[t] = total
 
 
 @wp.kernel
-def _dot(
-    first: int,
-    walk: Walk,
-    a: wp.array(dtype=wp.float32),
-    b: wp.array(dtype=wp.float32),
-    # outputs
-    partial: wp.array(dtype=wp.float64),
-):
+def _dot(first: int,
+         walk: Walk,
+         a: wp.array(dtype=wp.float32),
+         b: wp.array(dtype=wp.float32),
+         # outputs
+         partial: wp.array(dtype=wp.float64)):
     t = first + wp.tid()
     total = wp.float64(0.0)
-    for k in range(walk.steps):
-        i = cell_of(walk, t, k)
-        if i < walk.end:
-            total += wp.float64(a[i]) * wp.float64(b[i])
+    for i in range(first_cell(walk, t), end_cell(walk, t), walk.step):
+        total += wp.float64(a[i]) * wp.float64(b[i])
     partial[t] = total
 
 
 @wp.func
 def _ratio(over: wp.array(dtype=wp.float64), i: int, under: wp.array(dtype=wp.float64), j: int):
     """over[i] / under[j], and 0 once the iteration has nothing left to do."""
-    q = wp.float32(0.0)
-    if under[j] > wp.float64(0.0):
-        q = wp.float32(over[i] / under[j])
-    return q
+    return wp.where(under[j] > wp.float64(0.0), wp.float32(over[i] / under[j]), 0.0)
 
 
 @wp.kernel
-def _advance(
-    first: int,
-    walk: Walk,
-    rz: wp.array(dtype=wp.float64),
-    pq: wp.array(dtype=wp.float64),
-    step: int,
-    p: wp.array(dtype=wp.float32),
-    q: wp.array(dtype=wp.float32),
-    # outputs
-    h: wp.array(dtype=wp.float32),
-    residual: wp.array(dtype=wp.float32),
-):
+def _advance(first: int,
+             walk: Walk,
+             rz: wp.array(dtype=wp.float64),
+             pq: wp.array(dtype=wp.float64),
+             step: int,
+             p: wp.array(dtype=wp.float32),
+             q: wp.array(dtype=wp.float32),
+             # outputs
+             h: wp.array(dtype=wp.float32),
+             residual: wp.array(dtype=wp.float32)):
     t = first + wp.tid()
     alpha = _ratio(rz, step, pq, step)
-    for k in range(walk.steps):
-        i = cell_of(walk, t, k)
-        if i < walk.end:
-            h[i] = h[i] + alpha * p[i]
-            residual[i] = residual[i] - alpha * q[i]
+    for i in range(first_cell(walk, t), end_cell(walk, t), walk.step):
+        h[i] = h[i] + alpha * p[i]
+        residual[i] = residual[i] - alpha * q[i]
 
 
 @wp.kernel
-def _turn(
-    first: int,
-    walk: Walk,
-    rz: wp.array(dtype=wp.float64),
-    step: int,
-    z: wp.array(dtype=wp.float32),
-    # outputs
-    p: wp.array(dtype=wp.float32),
-):
+def _turn(first: int,
+          walk: Walk,
+          rz: wp.array(dtype=wp.float64),
+          step: int,
+          z: wp.array(dtype=wp.float32),
+          # outputs
+          p: wp.array(dtype=wp.float32)):
     """The next direction of search."""
     t = first + wp.tid()
     beta = _ratio(rz, step + 1, rz, step)
-    for k in range(walk.steps):
-        i = cell_of(walk, t, k)
-        if i < walk.end:
-            p[i] = z[i] + beta * p[i]
+    for i in range(first_cell(walk, t), end_cell(walk, t), walk.step):
+        p[i] = z[i] + beta * p[i]
 
 
 class Solver:
@@ -158,9 +133,7 @@ class Solver:
     def __init__(self, grid: Grid, slopes: Slopes, *, max_iterations: int):
         self.grid, self.slopes, self.max_iterations = grid, slopes, max_iterations
         self.residual, self.z, self.p, self.q = (grid.zeros() for _ in range(4))
-        self.multigrid = Multigrid(
-            grid, slopes.right_weight, slopes.down_weight, target=self.residual, value=self.z, scratch=self.q
-        )
+        self.multigrid = Multigrid(grid, slopes.weights, target=self.residual, value=self.z, scratch=self.q)
         self.summer = Summer(grid)
         self.rz = wp.zeros(max_iterations + 1, dtype=wp.float64, device=grid.device)
         self.pq = wp.zeros(max_iterations, dtype=wp.float64, device=grid.device)
@@ -182,21 +155,18 @@ class Solver:
         Returns:
             How the solve ended; reading the residual waits for the device, every CHECK_EVERY iterations on CUDA.
         """
-        device, pitch, every = self.grid.device, self.grid.pitch, 1 if self.grid.device == "cpu" else CHECK_EVERY
-        s = self.slopes
-        weights = [s.right_weight, s.down_weight]
-        run(_descent, self.grid.cells, [s.right, s.down, *weights, h, pitch], [self.residual], device=device)
+        grid, every = self.grid, 1 if self.grid.device == "cpu" else CHECK_EVERY
+        run(_descent, grid.cells, [*self.slopes, h], [self.residual])
         self._precondition(0)
         wp.copy(self.p, self.z)
         norm = self._norm(0)
         goal, start, step = tolerance * norm, norm, 0
         while norm > goal and step < self.max_iterations:
-            run(_multiply, self.grid.sums, [*weights, self.p, pitch], [self.q, self.summer.partial], device=device)
+            run(_multiply, grid.sums, [self.slopes.weights, self.p], [self.q, self.summer.partial])
             self.summer.finish(self.pq, step)
-            inputs = [self.rz, self.pq, step, self.p, self.q]
-            run(_advance, self.grid.cells, inputs, [h, self.residual], device=device)
+            run(_advance, grid.cells, [self.rz, self.pq, step, self.p, self.q], [h, self.residual])
             self._precondition(step + 1)
-            run(_turn, self.grid.cells, [self.rz, step, self.z], [self.p], device=device)
+            run(_turn, grid.cells, [self.rz, step, self.z], [self.p])
             step += 1
             if step % every == 0 or step == self.max_iterations:
                 norm = self._norm(step)
@@ -207,7 +177,7 @@ class Solver:
     def _precondition(self, slot: int) -> None:
         """z = B·residual, rz[slot] = residual·z."""
         self.multigrid.cycle()
-        run(_dot, self.grid.sums, [self.residual, self.z], [self.summer.partial], device=self.grid.device)
+        run(_dot, self.grid.sums, [self.residual, self.z], [self.summer.partial])
         self.summer.finish(self.rz, slot)
 
     def _norm(self, slot: int) -> float:

@@ -16,7 +16,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
-from kernels.surface.grid import Grid, Walk, cell_of, run
+from kernels.surface.grid import EdgeWeights, Grid, Walk, end_cell, first_cell, run
 from kernels.surface.slopes import Slopes
 
 wp.set_module_options({"enable_backward": False})
@@ -36,38 +36,25 @@ _TRUST = wp.constant(wp.float32(LEAST_TRUST))
 
 
 @wp.func
-def _loop_sum(
-    gx: wp.array(dtype=wp.float32),
-    gy: wp.array(dtype=wp.float32),
-    wx: wp.array(dtype=wp.float32),
-    wy: wp.array(dtype=wp.float32),
-    i: int,
-    pitch: int,
-):
+def _loop_sum(right: wp.array(dtype=wp.float32), down: wp.array(dtype=wp.float32), weights: EdgeWeights, i: int):
     """Weighted squared sum of the slopes around cell i and the three right of and below it; −1 where one is missing."""
-    least = wp.min(wp.min(wx[i], wx[i + pitch]), wp.min(wy[i], wy[i + 1]))
-    c = gx[i] + gy[i + 1] - gx[i + pitch] - gy[i]
-    e = wp.float32(-1.0)
-    if least > 0.0:
-        e = least * c * c
-    return e
+    below = i + weights.pitch
+    least = wp.min(wp.min(weights.right[i], weights.right[below]), wp.min(weights.down[i], weights.down[i + 1]))
+    c = right[i] + down[i + 1] - right[below] - down[i]
+    return wp.where(least > 0.0, least * c * c, -1.0)
 
 
 @wp.kernel
-def _sample_loops(
-    first: int,
-    gx: wp.array(dtype=wp.float32),
-    gy: wp.array(dtype=wp.float32),
-    wx: wp.array(dtype=wp.float32),
-    wy: wp.array(dtype=wp.float32),
-    start: int,
-    stride: int,
-    pitch: int,
-    # outputs
-    loop: wp.array(dtype=wp.float32),
-):
+def _sample_loops(first: int,
+                  right: wp.array(dtype=wp.float32),
+                  down: wp.array(dtype=wp.float32),
+                  weights: EdgeWeights,
+                  start: int,
+                  stride: int,
+                  # outputs
+                  loop: wp.array(dtype=wp.float32)):
     t = first + wp.tid()
-    loop[t] = _loop_sum(gx, gy, wx, wy, start + t * stride, pitch)
+    loop[t] = _loop_sum(right, down, weights, start + t * stride)
 
 
 @wp.func
@@ -81,26 +68,20 @@ def _loop_trust(one: float, other: float, scale: float):
 
 
 @wp.kernel
-def _distrust_loops(
-    first: int,
-    walk: Walk,
-    gx: wp.array(dtype=wp.float32),
-    gy: wp.array(dtype=wp.float32),
-    wx: wp.array(dtype=wp.float32),
-    wy: wp.array(dtype=wp.float32),
-    scale: float,
-    pitch: int,
-    # outputs
-    right_weight: wp.array(dtype=wp.float32),
-    down_weight: wp.array(dtype=wp.float32),
-):
+def _distrust_loops(first: int,
+                    walk: Walk,
+                    right: wp.array(dtype=wp.float32),
+                    down: wp.array(dtype=wp.float32),
+                    weights: EdgeWeights,
+                    scale: float,
+                    # outputs
+                    lowered: EdgeWeights):
     t = first + wp.tid()
-    for k in range(walk.steps):
-        i = cell_of(walk, t, k)
-        if i < walk.end:
-            here = _loop_sum(gx, gy, wx, wy, i, pitch)
-            right_weight[i] = wx[i] * _loop_trust(here, _loop_sum(gx, gy, wx, wy, i - pitch, pitch), scale)
-            down_weight[i] = wy[i] * _loop_trust(here, _loop_sum(gx, gy, wx, wy, i - 1, pitch), scale)
+    for i in range(first_cell(walk, t), end_cell(walk, t), walk.step):
+        here = _loop_sum(right, down, weights, i)
+        above = _loop_sum(right, down, weights, i - weights.pitch)
+        lowered.right[i] = weights.right[i] * _loop_trust(here, above, scale)
+        lowered.down[i] = weights.down[i] * _loop_trust(here, _loop_sum(right, down, weights, i - 1), scale)
 
 
 def distrust_loops(slopes: Slopes, *, grid: Grid) -> Slopes:
@@ -113,13 +94,10 @@ def distrust_loops(slopes: Slopes, *, grid: Grid) -> Slopes:
     stride = max(1, count // SAMPLES)
     stride += 1 - stride % 2 if stride > 1 else 0
     samples = wp.zeros(-(-count // stride), dtype=wp.float32, device=grid.device)
-    inputs = [*slopes, start, stride, grid.pitch]
-    devices.launch(_sample_loops, samples.shape[0], inputs, [samples], device=grid.device)
+    devices.launch(_sample_loops, samples.shape[0], [*slopes, start, stride], [samples], device=grid.device)
     loops = samples.numpy()
     loops = loops[loops >= 0.0]
     noise = MAD_TO_SIGMA * float(np.sqrt(np.median(loops))) if loops.size else 0.0
-    lowered = slopes._replace(right_weight=grid.zeros(), down_weight=grid.zeros())
-    outputs = [lowered.right_weight, lowered.down_weight]
-    inputs = [*slopes, max(LEAST_LOOP, NOISE_LOOPS * noise), grid.pitch]
-    run(_distrust_loops, grid.cells, inputs, outputs, device=grid.device)
+    lowered = slopes._replace(weights=grid.no_edges())
+    run(_distrust_loops, grid.cells, [*slopes, max(LEAST_LOOP, NOISE_LOOPS * noise)], [lowered.weights])
     return lowered

@@ -25,14 +25,22 @@ FOLD_THREADS = 256
 
 @wp.struct
 class Walk:
-    """Which cells thread t visits: start + stride·(t·across + k·along) for k < steps, below end."""
+    """Which cells thread t visits: every `step`-th of the `span` cells from start + t · apart on, below end."""
 
     start: wp.int32
-    stride: wp.int32
-    across: wp.int32
-    along: wp.int32
-    steps: wp.int32
+    apart: wp.int32
+    step: wp.int32
+    span: wp.int32
     end: wp.int32
+
+
+@wp.struct
+class EdgeWeights:
+    """Weight of each edge of a grid, at the cell of its left or upper pixel. A weight of 0 is no edge."""
+
+    right: wp.array(dtype=wp.float32)  # [size], 0…1
+    down: wp.array(dtype=wp.float32)
+    pitch: wp.int32
 
 
 class Sweep(NamedTuple):
@@ -40,6 +48,7 @@ class Sweep(NamedTuple):
 
     walk: Walk
     threads: int
+    device: str
 
 
 class Grid(NamedTuple):
@@ -58,6 +67,12 @@ class Grid(NamedTuple):
     def zeros(self, dtype: Any = wp.float32) -> wp.array:
         """Return a new array of this layout, all zero."""
         return wp.zeros(self.size, dtype=dtype, device=self.device)
+
+    def no_edges(self) -> EdgeWeights:
+        """Return new edge weights, all zero."""
+        weights = EdgeWeights()
+        weights.right, weights.down, weights.pitch = self.zeros(), self.zeros(), self.pitch
+        return weights
 
     def colour(self, parity: int) -> Sweep:
         """Return the walk over the pixels of one chessboard colour."""
@@ -84,27 +99,33 @@ def make_grid(rows: int, cols: int, device: str) -> Grid:
 def _sweep(start: int, end: int, stride: int, device: str, *, threads: int | None = None) -> Sweep:
     count = max(0, -(-(end - start) // stride))
     walk = Walk()
-    walk.start, walk.stride, walk.end = start, stride, end
+    walk.start, walk.end = start, end
     if device == "cpu":  # neighbouring cells one after another
         threads = max(1, math.ceil(count / CPU_RUN))
-        walk.steps = math.ceil(count / threads)
-        walk.across, walk.along = walk.steps, 1
+        walk.step, walk.span = stride, stride * math.ceil(count / threads)
+        walk.apart = walk.span
     else:  # neighbouring cells in neighbouring threads
         threads = max(1, min(count, threads or count))
-        walk.steps = math.ceil(count / threads)
-        walk.across, walk.along = 1, threads
-    return Sweep(walk, threads)
+        walk.step, walk.span = stride * threads, end - start
+        walk.apart = stride
+    return Sweep(walk, threads, device)
 
 
-def run(kernel: Any, sweep: Sweep, inputs: list[Any], outputs: list[Any], *, device: str) -> None:
+def run(kernel: Any, sweep: Sweep, inputs: list[Any], outputs: list[Any]) -> None:
     """Launch a kernel whose arguments begin with `first: int, walk: Walk`."""
-    devices.launch(kernel, sweep.threads, [sweep.walk, *inputs], outputs, device=device)
+    devices.launch(kernel, sweep.threads, [sweep.walk, *inputs], outputs, device=sweep.device)
 
 
 @wp.func
-def cell_of(walk: Walk, t: int, k: int):
-    """Return the k-th cell of thread t."""
-    return walk.start + walk.stride * (t * walk.across + k * walk.along)
+def first_cell(walk: Walk, t: int):
+    """Return the cell that thread t visits first."""
+    return walk.start + t * walk.apart
+
+
+@wp.func
+def end_cell(walk: Walk, t: int):
+    """Return the cell that thread t stops before."""
+    return wp.min(first_cell(walk, t) + walk.span, walk.end)
 
 
 @wp.kernel

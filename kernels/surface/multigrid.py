@@ -14,12 +14,13 @@ transpose of the prolongation, so the cycle is symmetric and positive definite w
 conjugate gradients need. A pixel without edges gets 0.
 """
 
+import itertools
 from typing import NamedTuple
 
 import warp as wp
 
 from kernels import device as devices
-from kernels.surface.grid import Grid, Walk, cell_of, make_grid, run
+from kernels.surface.grid import EdgeWeights, Grid, Walk, end_cell, first_cell, make_grid, run
 
 wp.set_module_options({"enable_backward": False})
 
@@ -33,248 +34,179 @@ class Level(NamedTuple):
     """One grid of the hierarchy."""
 
     grid: Grid
-    right_weight: wp.array  # [size] float32
-    down_weight: wp.array
+    weights: EdgeWeights
     target: wp.array  # [size] float32, right-hand side
     value: wp.array  # [size] float32, the level's answer
     scratch: wp.array
 
 
 @wp.func
-def edge_sum(
-    value: wp.array(dtype=wp.float32),
-    wx: wp.array(dtype=wp.float32),
-    wy: wp.array(dtype=wp.float32),
-    i: int,
-    pitch: int,
-):
-    """Return (sum of weights, weighted sum of the neighbours' values) of cell i."""
-    left = wx[i - 1]
-    right = wx[i]
-    up = wy[i - pitch]
-    down = wy[i]
-    around = left * value[i - 1] + right * value[i + 1] + up * value[i - pitch] + down * value[i + pitch]
-    return wp.vec2(left + right + up + down, around)
+def diagonal(weights: EdgeWeights, i: int):
+    """Return the sum of the weights of cell i."""
+    return weights.right[i - 1] + weights.right[i] + weights.down[i - weights.pitch] + weights.down[i]
+
+
+@wp.func
+def relaxed(weights: EdgeWeights, target: wp.array(dtype=wp.float32), value: wp.array(dtype=wp.float32), i: int):
+    """Return the value of cell i that fulfils its equation given its neighbours, and 0 for a cell without edges."""
+    pitch, d = weights.pitch, diagonal(weights, i)
+    around = (weights.right[i - 1] * value[i - 1] + weights.right[i] * value[i + 1]
+              + weights.down[i - pitch] * value[i - pitch] + weights.down[i] * value[i + pitch])
+    return wp.where(d > 0.0, (target[i] + around) / d, 0.0)
 
 
 @wp.kernel
-def _smooth_from_zero(
-    first: int,
-    walk: Walk,
-    wx: wp.array(dtype=wp.float32),
-    wy: wp.array(dtype=wp.float32),
-    target: wp.array(dtype=wp.float32),
-    pitch: int,
-    # outputs
-    value: wp.array(dtype=wp.float32),
-):
+def _smooth_from_zero(first: int,
+                      walk: Walk,
+                      weights: EdgeWeights,
+                      target: wp.array(dtype=wp.float32),
+                      # outputs
+                      value: wp.array(dtype=wp.float32)):
     t = first + wp.tid()
-    for k in range(walk.steps):
-        i = cell_of(walk, t, k)
-        if i < walk.end:
-            d = wx[i - 1] + wx[i] + wy[i - pitch] + wy[i]
-            v = wp.float32(0.0)
-            if d > 0.0:
-                v = target[i] / d
-            value[i] = v
+    for i in range(first_cell(walk, t), end_cell(walk, t), walk.step):
+        d = diagonal(weights, i)
+        value[i] = wp.where(d > 0.0, target[i] / d, 0.0)
 
 
 @wp.kernel
-def _smooth(
-    first: int,
-    walk: Walk,
-    wx: wp.array(dtype=wp.float32),
-    wy: wp.array(dtype=wp.float32),
-    target: wp.array(dtype=wp.float32),
-    pitch: int,
-    # outputs
-    value: wp.array(dtype=wp.float32),
-):
+def _smooth(first: int,
+            walk: Walk,
+            weights: EdgeWeights,
+            target: wp.array(dtype=wp.float32),
+            # outputs
+            value: wp.array(dtype=wp.float32)):
     t = first + wp.tid()
-    for k in range(walk.steps):
-        i = cell_of(walk, t, k)
-        if i < walk.end:
-            e = edge_sum(value, wx, wy, i, pitch)
-            v = wp.float32(0.0)
-            if e[0] > 0.0:
-                v = (target[i] + e[1]) / e[0]
-            value[i] = v
+    for i in range(first_cell(walk, t), end_cell(walk, t), walk.step):
+        value[i] = relaxed(weights, target, value, i)
 
 
 @wp.kernel
-def _scaled_residual(
-    first: int,
-    walk: Walk,
-    wx: wp.array(dtype=wp.float32),
-    wy: wp.array(dtype=wp.float32),
-    target: wp.array(dtype=wp.float32),
-    value: wp.array(dtype=wp.float32),
-    pitch: int,
-    # outputs
-    scaled: wp.array(dtype=wp.float32),
-):
-    """Residual over diagonal."""
+def _scaled_residual(first: int,
+                     walk: Walk,
+                     weights: EdgeWeights,
+                     target: wp.array(dtype=wp.float32),
+                     value: wp.array(dtype=wp.float32),
+                     # outputs
+                     scaled: wp.array(dtype=wp.float32)):
+    """Residual over diagonal; a cell without edges has the value 0."""
     t = first + wp.tid()
-    for k in range(walk.steps):
-        i = cell_of(walk, t, k)
-        if i < walk.end:
-            e = edge_sum(value, wx, wy, i, pitch)
-            v = wp.float32(0.0)
-            if e[0] > 0.0:
-                v = (target[i] + e[1]) / e[0] - value[i]
-            scaled[i] = v
+    for i in range(first_cell(walk, t), end_cell(walk, t), walk.step):
+        scaled[i] = relaxed(weights, target, value, i) - value[i]
 
 
-@wp.kernel
-def _restrict(
-    first: int,
-    wx: wp.array(dtype=wp.float32),
-    wy: wp.array(dtype=wp.float32),
-    scaled: wp.array(dtype=wp.float32),
-    pitch: int,
-    cols: int,
-    coarse_pitch: int,
-    # outputs
-    target: wp.array(dtype=wp.float32),
-):
-    """The transpose of _prolong: a red pixel's residual goes to the cells of its neighbours. Black residuals are 0."""
-    p = first + wp.tid()
+@wp.func
+def halved_cell(p: int, cols: int, pitch: int, coarse_pitch: int):
+    """Return the upper left fine cell of coarse pixel p, and the coarse cell."""
     r = p // cols
     c = p - r * cols
-    k = (2 * r + 1) * pitch + 2 * c + 1  # always even: the cell's black pixels are this one
-    j = k + pitch + 1  # and the one diagonally below
-    s = wx[k - 1] * scaled[k - 1] + wx[k] * scaled[k + 1]
-    s += wy[k - pitch] * scaled[k - pitch] + wy[k] * scaled[k + pitch]
-    s += wx[j - 1] * scaled[j - 1] + wx[j] * scaled[j + 1]
-    s += wy[j - pitch] * scaled[j - pitch] + wy[j] * scaled[j + pitch]
-    target[(r + 1) * coarse_pitch + c + 1] = s
+    return (2 * r + 1) * pitch + 2 * c + 1, (r + 1) * coarse_pitch + c + 1
 
 
 @wp.kernel
-def _prolong(
-    first: int,
-    walk: Walk,
-    wx: wp.array(dtype=wp.float32),
-    wy: wp.array(dtype=wp.float32),
-    coarse: wp.array(dtype=wp.float32),
-    pitch: int,
-    coarse_pitch: int,
-    # outputs
-    value: wp.array(dtype=wp.float32),
-):
+def _restrict(first: int,
+              weights: EdgeWeights,
+              scaled: wp.array(dtype=wp.float32),
+              cols: int,
+              coarse_pitch: int,
+              # outputs
+              target: wp.array(dtype=wp.float32)):
+    """The transpose of _prolong: a red pixel's residual goes to the cells of its neighbours. Black residuals are 0."""
+    pitch = weights.pitch
+    k, coarse = halved_cell(first + wp.tid(), cols, pitch, coarse_pitch)  # k is always even: the cell's black pixels are this one
+    j = k + pitch + 1  # and the one diagonally below
+    s = weights.right[k - 1] * scaled[k - 1] + weights.right[k] * scaled[k + 1]
+    s += weights.down[k - pitch] * scaled[k - pitch] + weights.down[k] * scaled[k + pitch]
+    s += weights.right[j - 1] * scaled[j - 1] + weights.right[j] * scaled[j + 1]
+    s += weights.down[j - pitch] * scaled[j - pitch] + weights.down[j] * scaled[j + pitch]
+    target[coarse] = s
+
+
+@wp.kernel
+def _prolong(first: int,
+             walk: Walk,
+             weights: EdgeWeights,
+             coarse: wp.array(dtype=wp.float32),
+             coarse_pitch: int,
+             # outputs
+             value: wp.array(dtype=wp.float32)):
     """Add the coarse correction at one colour; smoothing the other colour next replaces what it would get."""
     t = first + wp.tid()
-    for k in range(walk.steps):
-        i = cell_of(walk, t, k)
-        if i < walk.end:
-            left = wx[i - 1]
-            right = wx[i]
-            up = wy[i - pitch]
-            down = wy[i]
-            d = left + right + up + down
-            if d > 0.0:
-                r = i // pitch - 1
-                c = i - (r + 1) * pitch - 1
-                row = (r // 2 + 1) * coarse_pitch + 1
-                col = c // 2
-                above = row - coarse_pitch * (1 - r % 2)
-                below = row + coarse_pitch * (r % 2)
-                s = left * coarse[row + col - (1 - c % 2)] + right * coarse[row + col + c % 2]
-                s += up * coarse[above + col] + down * coarse[below + col]
-                value[i] = value[i] + s / d
+    pitch = weights.pitch
+    for i in range(first_cell(walk, t), end_cell(walk, t), walk.step):
+        d = diagonal(weights, i)
+        if d > 0.0:
+            r = i // pitch - 1
+            c = i - (r + 1) * pitch - 1
+            row = (r // 2 + 1) * coarse_pitch + 1
+            col = c // 2
+            above = row - coarse_pitch * (1 - r % 2)
+            below = row + coarse_pitch * (r % 2)
+            s = weights.right[i - 1] * coarse[row + col - (1 - c % 2)] + weights.right[i] * coarse[row + col + c % 2]
+            s += weights.down[i - pitch] * coarse[above + col] + weights.down[i] * coarse[below + col]
+            value[i] = value[i] + s / d
 
 
 @wp.kernel
-def _coarsen(
-    first: int,
-    wx: wp.array(dtype=wp.float32),
-    wy: wp.array(dtype=wp.float32),
-    pitch: int,
-    cols: int,
-    coarse_pitch: int,
-    # outputs
-    coarse_wx: wp.array(dtype=wp.float32),
-    coarse_wy: wp.array(dtype=wp.float32),
-):
-    p = first + wp.tid()
-    r = p // cols
-    c = p - r * cols
-    i = (2 * r + 1) * pitch + 2 * c + 1
-    k = (r + 1) * coarse_pitch + c + 1
-    coarse_wx[k] = 0.5 * (wx[i + 1] + wx[i + 1 + pitch])
-    coarse_wy[k] = 0.5 * (wy[i + pitch] + wy[i + pitch + 1])
+def _coarsen(first: int,
+             weights: EdgeWeights,
+             cols: int,
+             # outputs
+             coarse: EdgeWeights):
+    pitch = weights.pitch
+    i, k = halved_cell(first + wp.tid(), cols, pitch, coarse.pitch)
+    coarse.right[k] = 0.5 * (weights.right[i + 1] + weights.right[i + 1 + pitch])
+    coarse.down[k] = 0.5 * (weights.down[i + pitch] + weights.down[i + pitch + 1])
 
 
 class Multigrid:
-    """The hierarchy over one pair of weight arrays.
+    """The hierarchy over one grid's edge weights.
 
     Args:
         grid: the finest layout.
-        right_weight, down_weight: its edges.
+        weights: of its edges.
         target: the finest right-hand side, read by `cycle`.
         value: where `cycle` leaves its answer.
         scratch: an array that `cycle` may overwrite.
     """
 
-    def __init__(
-        self,
-        grid: Grid,
-        right_weight: wp.array,  # [size] float32
-        down_weight: wp.array,
-        *,
-        target: wp.array,
-        value: wp.array,
-        scratch: wp.array,
-    ):
-        self.levels = [Level(grid, right_weight, down_weight, target, value, scratch)]
+    def __init__(self, grid: Grid, weights: EdgeWeights, *, target: wp.array, value: wp.array, scratch: wp.array):
+        self.levels = [Level(grid, weights, target, value, scratch)]
         while max(grid.rows, grid.cols) > COARSEST:
             grid = make_grid(-(-grid.rows // 2), -(-grid.cols // 2), grid.device)
-            self.levels.append(Level(grid, *(grid.zeros() for _ in range(5))))
-        for fine, coarse in zip(self.levels, self.levels[1:], strict=False):
+            self.levels.append(Level(grid, grid.no_edges(), *(grid.zeros() for _ in range(3))))
+        for fine, coarse in itertools.pairwise(self.levels):
             g = coarse.grid
-            inputs = [fine.right_weight, fine.down_weight, fine.grid.pitch, g.cols, g.pitch]
-            outputs = [coarse.right_weight, coarse.down_weight]
-            devices.launch(_coarsen, g.rows * g.cols, inputs, outputs, device=g.device)
+            devices.launch(_coarsen, g.rows * g.cols, [fine.weights, g.cols], [coarse.weights], device=g.device)
 
     def cycle(self) -> None:
         """Set value = B·target, with B a symmetric positive definite approximation of the inverse."""
-        for fine, coarse in zip(self.levels, self.levels[1:], strict=False):
+        for fine, coarse in itertools.pairwise(self.levels):
             self._down(fine, coarse)
         self._coarsest()
-        for fine, coarse in zip(self.levels[-2::-1], self.levels[:0:-1], strict=True):
+        for coarse, fine in itertools.pairwise(self.levels[::-1]):
             self._up(fine, coarse)
 
     def _smooth(self, level: Level, parity: int) -> None:
-        inputs = [level.right_weight, level.down_weight, level.target, level.grid.pitch]
-        run(_smooth, level.grid.colour(parity), inputs, [level.value], device=level.grid.device)
+        run(_smooth, level.grid.colour(parity), [level.weights, level.target], [level.value])
 
     def _start(self, level: Level) -> None:
         """Red (odd) cells from a guess of zero, then black."""
-        inputs = [level.right_weight, level.down_weight, level.target, level.grid.pitch]
-        run(_smooth_from_zero, level.grid.odd, inputs, [level.value], device=level.grid.device)
+        run(_smooth_from_zero, level.grid.odd, [level.weights, level.target], [level.value])
         self._smooth(level, 0)
 
     def _down(self, fine: Level, coarse: Level) -> None:
         self._start(fine)
-        g, device = coarse.grid, coarse.grid.device
-        weights = [fine.right_weight, fine.down_weight]
-        inputs = [*weights, fine.target, fine.value, fine.grid.pitch]
-        run(_scaled_residual, fine.grid.odd, inputs, [fine.scratch], device=device)
-        inputs = [*weights, fine.scratch, fine.grid.pitch, g.cols, g.pitch]
-        devices.launch(_restrict, g.rows * g.cols, inputs, [coarse.target], device=device)
+        g = coarse.grid
+        run(_scaled_residual, fine.grid.odd, [fine.weights, fine.target, fine.value], [fine.scratch])
+        devices.launch(_restrict, g.rows * g.cols, [fine.weights, fine.scratch, g.cols, g.pitch], [coarse.target], device=g.device)
 
     def _up(self, fine: Level, coarse: Level) -> None:
-        inputs = [fine.right_weight, fine.down_weight, coarse.value, fine.grid.pitch, coarse.grid.pitch]
-        run(_prolong, fine.grid.odd, inputs, [fine.value], device=fine.grid.device)
+        run(_prolong, fine.grid.odd, [fine.weights, coarse.value, coarse.grid.pitch], [fine.value])
         self._smooth(fine, 0)
         self._smooth(fine, 1)
 
     def _coarsest(self) -> None:
         level = self.levels[-1]
         self._start(level)
-        for _ in range(COARSEST_SWEEPS - 1):
-            self._smooth(level, 1)
-            self._smooth(level, 0)
-        for _ in range(COARSEST_SWEEPS):
-            self._smooth(level, 0)
-            self._smooth(level, 1)
+        for parity in (1, 0) * (COARSEST_SWEEPS - 1) + (0, 1) * COARSEST_SWEEPS:
+            self._smooth(level, parity)

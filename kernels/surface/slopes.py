@@ -22,12 +22,13 @@ Sources: Quéau, Durou & Aujol, "Normal Integration: A Survey", 2018, for log-de
 "Bilateral Normal Integration", ECCV 2022, for residuals weighted by the cosine.
 """
 
+from functools import cache
 from typing import Any, NamedTuple
 
 import warp as wp
 
 from kernels import device as devices
-from kernels.surface.grid import Grid
+from kernels.surface.grid import EdgeWeights, Grid
 
 wp.set_module_options({"enable_backward": False})
 
@@ -41,24 +42,21 @@ _LEAST = wp.constant(wp.float32(STEEPEST**2))
 
 
 class Slopes(NamedTuple):
-    """Per edge, in the layout of a Grid, at the cell of its left or upper pixel. A weight of 0 is no edge."""
+    """Slope of each edge of a grid, at the cell of its left or upper pixel, and its weight."""
 
     right: wp.array  # [size] float32, height difference in units of s
     down: wp.array
-    right_weight: wp.array  # [size] float32, 0…1
-    down_weight: wp.array
+    weights: EdgeWeights
 
 
 @wp.kernel
-def _mark_usable(
-    first: int,
-    normal: wp.array3d(dtype=wp.float32),  # [3, rows, cols]
-    mask: wp.array2d(dtype=wp.uint8),
-    x: wp.array2d(dtype=wp.float32),
-    y: wp.array2d(dtype=wp.float32),
-    # outputs
-    usable: wp.array2d(dtype=wp.uint8),
-):
+def _mark_usable(first: int,
+                 normal: wp.array3d(dtype=wp.float32),  # [3, rows, cols]
+                 mask: wp.array2d(dtype=wp.uint8),
+                 x: wp.array2d(dtype=wp.float32),
+                 y: wp.array2d(dtype=wp.float32),
+                 # outputs
+                 usable: wp.array2d(dtype=wp.uint8)):
     p = first + wp.tid()
     r = p // mask.shape[1]
     c = p - r * mask.shape[1]
@@ -112,51 +110,48 @@ def _normal_at(normal: wp.array3d(dtype=wp.float32), r: int, c: int):
     return wp.normalize(wp.vec3(normal[0, r, c], normal[1, r, c], normal[2, r, c]))
 
 
-def _make_kernel(pair: Any, name: str) -> Any:
+@cache
+def _edge_kernel(perspective: bool) -> Any:
     """The kernel over all edges, for one projection."""
+    pair = perspective_slope if perspective else orthographic_slope
 
-    def edges(
-        first: int,
-        normal: wp.array3d(dtype=wp.float32),
-        usable: wp.array2d(dtype=wp.uint8),
-        x: wp.array2d(dtype=wp.float32),
-        y: wp.array2d(dtype=wp.float32),
-        spacing: float,
-        pitch: int,
-        # outputs
-        right: wp.array(dtype=wp.float32),
-        down: wp.array(dtype=wp.float32),
-        right_weight: wp.array(dtype=wp.float32),
-        down_weight: wp.array(dtype=wp.float32),
-    ):
+    @wp.func
+    def edge_to(normal: wp.array3d(dtype=wp.float32), usable: wp.array2d(dtype=wp.uint8), x: wp.array2d(dtype=wp.float32),
+                y: wp.array2d(dtype=wp.float32), n: wp.vec3, ri: wp.vec3, r: int, c: int, spacing: float):
+        """Return (slope, weight) of the edge from a pixel of normal n on the ray ri to pixel (r, c), zeros where that is not usable."""
+        edge = wp.vec2()
+        # nested, because a kernel evaluates both sides of `and`
+        if r < usable.shape[0] and c < usable.shape[1]:  # noqa: SIM102
+            if usable[r, c] != wp.uint8(0):
+                edge = pair(n + _normal_at(normal, r, c), ri, wp.vec3(x[r, c], y[r, c], -1.0), spacing)
+        return edge
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def edge_kernel(first: int,
+                    normal: wp.array3d(dtype=wp.float32),
+                    usable: wp.array2d(dtype=wp.uint8),
+                    x: wp.array2d(dtype=wp.float32),
+                    y: wp.array2d(dtype=wp.float32),
+                    spacing: float,
+                    # outputs
+                    right: wp.array(dtype=wp.float32),
+                    down: wp.array(dtype=wp.float32),
+                    weights: EdgeWeights):
         p = first + wp.tid()
         r = p // usable.shape[1]
         c = p - r * usable.shape[1]
         if usable[r, c] == wp.uint8(0):
             return
-        i = (r + 1) * pitch + c + 1
-        n = _normal_at(normal, r, c)
-        ri = wp.vec3(x[r, c], y[r, c], -1.0)
-        # nested, because a kernel evaluates both sides of `and`
-        if c + 1 < usable.shape[1]:  # noqa: SIM102
-            if usable[r, c + 1] != wp.uint8(0):
-                rj = wp.vec3(x[r, c + 1], y[r, c + 1], -1.0)
-                edge = pair(n + _normal_at(normal, r, c + 1), ri, rj, spacing)
-                right[i] = edge[0]
-                right_weight[i] = edge[1]
-        if r + 1 < usable.shape[0]:  # noqa: SIM102
-            if usable[r + 1, c] != wp.uint8(0):
-                rj = wp.vec3(x[r + 1, c], y[r + 1, c], -1.0)
-                edge = pair(n + _normal_at(normal, r + 1, c), ri, rj, spacing)
-                down[i] = edge[0]
-                down_weight[i] = edge[1]
+        i = (r + 1) * weights.pitch + c + 1
+        n, ri = _normal_at(normal, r, c), wp.vec3(x[r, c], y[r, c], -1.0)
+        edge = edge_to(normal, usable, x, y, n, ri, r, c + 1, spacing)
+        right[i] = edge[0]
+        weights.right[i] = edge[1]
+        edge = edge_to(normal, usable, x, y, n, ri, r + 1, c, spacing)
+        down[i] = edge[0]
+        weights.down[i] = edge[1]
 
-    edges.__name__ = edges.__qualname__ = name
-    return wp.kernel(edges)
-
-
-_orthographic_edges = _make_kernel(orthographic_slope, "orthographic_edges")
-_perspective_edges = _make_kernel(perspective_slope, "perspective_edges")
+    return edge_kernel
 
 
 def pair_slopes(
@@ -180,8 +175,7 @@ def pair_slopes(
     Returns:
         Slopes in units of the spacing, growing towards the viewer: of z (orthographic) or of −log d (perspective).
     """
-    slopes = Slopes(grid.zeros(), grid.zeros(), grid.zeros(), grid.zeros())
-    kernel = _perspective_edges if perspective else _orthographic_edges
-    inputs = [normal, usable, x, y, spacing, grid.pitch]
-    devices.launch(kernel, grid.rows * grid.cols, inputs, list(slopes), device=grid.device)
+    slopes = Slopes(grid.zeros(), grid.zeros(), grid.no_edges())
+    inputs = [normal, usable, x, y, spacing]
+    devices.launch(_edge_kernel(perspective), grid.rows * grid.cols, inputs, list(slopes), device=grid.device)
     return slopes

@@ -8,9 +8,8 @@ from kernels.surface import grid as grids
 
 def visited(sweep):
     walk = sweep.walk
-    t, k = np.meshgrid(np.arange(sweep.threads), np.arange(walk.steps))
-    cells = (walk.start + walk.stride * (t * walk.across + k * walk.along)).ravel()
-    return np.sort(cells[cells < walk.end])
+    begins = walk.start + np.arange(sweep.threads) * walk.apart
+    return np.sort(np.concatenate([np.arange(begin, min(begin + walk.span, walk.end), walk.step) for begin in begins]))
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (9, 1), (7, 10), (131, 257), (300, 301)])
@@ -34,7 +33,7 @@ def test_every_pixel_is_visited_once(size, layout):
 @pytest.mark.parametrize("count", [1, 255, 256, 257, 5000])
 def test_sum_of_many_parts(count, device):
     grid = grids.make_grid(4, 4, device)
-    summer = grids.Summer(grid._replace(sums=grids.Sweep(grid.sums.walk, count)))
+    summer = grids.Summer(grid._replace(sums=grid.sums._replace(threads=count)))
     summer.partial.assign(np.arange(count) + 0.5)
     total = grids.make_grid(1, 3, device).zeros(grids.wp.float64)
     summer.finish(total, 2)

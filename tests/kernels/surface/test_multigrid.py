@@ -17,18 +17,18 @@ def hierarchy(mask, device, *, contrast=0.0, seed=0):
     right, down = (inside * 10 ** rng.uniform(-contrast, 0, inside.shape) for _ in range(2))
     right *= np.roll(inside, -1, axis=1)
     down *= np.roll(inside, -1, axis=0)
-    arrays = [grid.zeros() for _ in range(5)]
-    arrays[0].assign(right.ravel().astype(np.float32))
-    arrays[1].assign(down.ravel().astype(np.float32))
-    multigrid = Multigrid(grid, *arrays[:2], target=arrays[2], value=arrays[3], scratch=arrays[4])
+    weights, (target_on_device, answer, scratch) = grid.no_edges(), (grid.zeros() for _ in range(3))
+    weights.right.assign(right.ravel().astype(np.float32))
+    weights.down.assign(down.ravel().astype(np.float32))
+    multigrid = Multigrid(grid, weights, target=target_on_device, value=answer, scratch=scratch)
     here = np.flatnonzero(inside.ravel())
 
     def cycle(target):
         flat = np.zeros(grid.size, dtype=np.float32)
         flat[here] = target
-        arrays[2].assign(flat)
+        target_on_device.assign(flat)
         multigrid.cycle()
-        return arrays[3].numpy()[here].astype(np.float64)
+        return answer.numpy()[here].astype(np.float64)
 
     def product(value):
         v = np.zeros(grid.size)
