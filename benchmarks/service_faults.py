@@ -237,8 +237,8 @@ on a private PostgreSQL, during which faults happen; the kills come at random mo
 *identical* if its file equals, bit by bit, the file that `relit relight` makes undisturbed. The script fails if a frame
 is missing or different, if there is any other file (hidden ones too), if two workers had one job at the same time, if a
 job is lost or left over in the queue, or if a takeover from a killed worker takes {TAKEOVER_LIMIT_S:g} s or longer.
-`tests/service/server/jobs` has these faults at small size, the kills on SQLite too, and others: a job that kills its
-workers, a full disk, a killed API.
+With `--sqlite` it has the rows without restarts, on SQLite. `tests/service/server/jobs` has these faults at small size, and others: a job
+that kills its workers, a full disk, a killed API.
 
 {chr(10).join(table(faults))}
 
