@@ -28,6 +28,12 @@ def pack_type(length: int, dtype: type) -> Any:
     return wp.types.vector(length=length, dtype=dtype)
 
 
+@cache
+def channels_type(length: int) -> Any:
+    """Return the Warp matrix type of three channels of `length` float32 values."""
+    return wp.types.matrix(shape=(3, length), dtype=wp.float32)
+
+
 class Band(NamedTuple):
     """Readings of a pixel range on a device, as packs, and which of them saturate.
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import warp as wp
 
-from kernels.packs import pack_type
+from kernels.packs import channels_type, pack_type
 from kernels.photometric.hypotheses import SHADOW_TRUST
 from kernels.photometric.lobes import Reflectance
 
@@ -56,7 +56,7 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
     """
     respond, lambertian = reflectance
     lane_type = pack_type(lanes, wp.float32)
-    channels = wp.types.matrix(shape=(3, lanes), dtype=wp.float32)
+    channels = channels_type(lanes)
     bare_trials = int(bare)
     searched = bare_trials + ROUGHNESS_COUNT + 2 * HALVINGS
 

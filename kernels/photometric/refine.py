@@ -17,7 +17,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
-from kernels.packs import pack_type
+from kernels.packs import channels_type, pack_type
 from kernels.photometric.hypotheses import LEAST_NZ, Diffuse, SearchOptions, tangents
 from kernels.photometric.lobes import Reflectance, direction_reflectance
 from kernels.photometric.material_kernel import squared_misfit, weigh
@@ -97,7 +97,7 @@ def solve_symmetric(m00: float, m01: float, m02: float, m11: float, m12: float, 
 def _refine_kernel(lanes: int, reflectance: Reflectance) -> Any:
     respond, _ = reflectance
     lane_type = pack_type(lanes, wp.float32)
-    channels = wp.types.matrix(shape=(3, lanes), dtype=wp.float32)
+    channels = channels_type(lanes)
     triples = wp.types.matrix(shape=(9, lanes), dtype=wp.float32)  # [3 · channel + unknown]
     squares = wp.types.matrix(shape=(6, lanes), dtype=wp.float32)  # 00 01 02 11 12 22
 

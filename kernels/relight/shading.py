@@ -13,7 +13,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.microfacet import INVERSE_PI
-from kernels.packs import Band, as_packs, pack_type
+from kernels.packs import Band, as_packs, channels_type, pack_type
 from kernels.relight.sources import Sources
 
 LEAST_ROUGHNESS = 0.05
@@ -184,7 +184,7 @@ def modelled(lit: float, albedo: float, f0: float, facing: float, shine: float, 
 
 @cache
 def _shade_kernel(pack: int) -> Any:
-    lane_type, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.uint8)
+    lane_type, byte_pack, channels = pack_type(pack, wp.float32), pack_type(pack, wp.uint8), channels_type(pack)
     evaluate = lobes(pack)
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
@@ -199,10 +199,7 @@ def _shade_kernel(pack: int) -> Any:
                      # outputs
                      out: wp.array2d(dtype=lane_type)):  # [6, P]
         p = first + wp.tid()
-        # of each channel: n·l, D V n·l, and that times Schlick's rise
-        matt_r, matt_g, matt_b = lane_type(), lane_type(), lane_type()
-        shine_r, shine_g, shine_b = lane_type(), lane_type(), lane_type()
-        rise_r, rise_g, rise_b = lane_type(), lane_type(), lane_type()
+        matt, glossy, raised = channels(), channels(), channels()  # n·l, D V n·l, and that times Schlick's rise
         for n in range(place.shape[0]):
             facing, shine, rise, lit = evaluate(values, p, place[n], axis[n])
             rows = occluder[n]
@@ -220,33 +217,19 @@ def _shade_kernel(pack: int) -> Any:
                             whole[k] += parts[corner]
                 for k in range(pack):
                     lit[k] = lit[k] * whole[k]
-            e = energy[n]
-            er, eg, eb = e[0], e[1], e[2]
+            for c in range(3):
+                e = energy[n][c]
+                for k in range(pack):
+                    lobe = lit[k] * shine[k]
+                    matt[c, k] += e * (lit[k] * facing[k])
+                    glossy[c, k] += e * lobe
+                    raised[c, k] += e * (lobe * rise[k])
+        for c in range(3):
+            albedo, f0 = values[3 + c, p], values[6 + c, p]
             for k in range(pack):
-                matt = lit[k] * facing[k]
-                lobe = lit[k] * shine[k]
-                raised = lobe * rise[k]
-                matt_r[k] += er * matt
-                matt_g[k] += eg * matt
-                matt_b[k] += eb * matt
-                shine_r[k] += er * lobe
-                shine_g[k] += eg * lobe
-                shine_b[k] += eb * lobe
-                rise_r[k] += er * raised
-                rise_g[k] += eg * raised
-                rise_b[k] += eb * raised
-        for k in range(pack):
-            matt_r[k] = values[3, p][k] * INVERSE_PI * matt_r[k]
-            matt_g[k] = values[4, p][k] * INVERSE_PI * matt_g[k]
-            matt_b[k] = values[5, p][k] * INVERSE_PI * matt_b[k]
-            shine_r[k] = values[6, p][k] * shine_r[k] + (1.0 - values[6, p][k]) * rise_r[k]
-            shine_g[k] = values[7, p][k] * shine_g[k] + (1.0 - values[7, p][k]) * rise_g[k]
-            shine_b[k] = values[8, p][k] * shine_b[k] + (1.0 - values[8, p][k]) * rise_b[k]
-        out[0, p] = matt_r
-        out[1, p] = matt_g
-        out[2, p] = matt_b
-        out[3, p] = shine_r
-        out[4, p] = shine_g
-        out[5, p] = shine_b
+                matt[c, k] = albedo[k] * INVERSE_PI * matt[c, k]
+                glossy[c, k] = f0[k] * glossy[c, k] + (1.0 - f0[k]) * raised[c, k]
+            out[c, p] = matt[c]
+            out[3 + c, p] = glossy[c]
 
     return shade_kernel
