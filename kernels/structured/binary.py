@@ -19,8 +19,8 @@ import warp as wp
 from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.packs import Band, as_packs, pack_type
-from kernels.status import OK, Status
-from kernels.structured.decoded import Decoded, stripe_place, unwritten_decoded
+from kernels.status import OK
+from kernels.structured.decoded import Decoded, place_stripe, unwritten_decoded
 from kernels.structured.frames import NoiseModel, check_noise, check_stripes, cut_in, require_frames, saturation_masks
 
 SHADOW_SIGMAS = 5.0
@@ -31,13 +31,8 @@ DOUBT_PART = 0.05
 """Part of the contrast that a difference must have: with less, a bit is a mixture of both stripes, and blur rather than noise decides."""
 LARGEST = 1.0e15
 """A contrast above this counts as infinite: it is squared in float32."""
-MAX_SPREAD = 1
-"""Stripes that the readings of a pixel with doubtful bits may lie apart."""
 MAX_BITS = 24
 """Stripes are counted in float32 at the end, exact up to here."""
-
-_SATURATED, _SHADOWED, _UNDECIDED, _OUT_OF_RANGE = (int(s) for s in (Status.SATURATED, Status.SHADOWED, Status.UNDECIDED,
-                                                                    Status.OUT_OF_RANGE))
 
 
 def decode_binary(frames: Band, bits: Sequence[int], inverses: Sequence[int] | None = None, *, white: int | None = None,
@@ -212,28 +207,15 @@ def _stripe_kernel(pack: int, code: Literal["binary", "gray", "xor"] = "gray", i
             low = doubt[k] & (-doubt[k])
             rest = doubt[k] & (doubt[k] - 1)
             second = rest & (-rest)
-            stripe_read = number_of(shown[k], base_bit, above)
-            stripe_low = number_of(shown[k] ^ low, base_bit, above)
-            stripe_second = number_of(shown[k] ^ second, base_bit, above)
-            stripe_both = number_of(shown[k] ^ low ^ second, base_bit, above)
-            least = wp.min(wp.min(stripe_read, stripe_low), wp.min(stripe_second, stripe_both))
-            most = wp.max(wp.max(stripe_read, stripe_low), wp.max(stripe_second, stripe_both))
-            apart = most - least
-            if cut[k] != 0:
-                result[k] = wp.uint8(_SATURATED)
-            elif not (contrast[k] > 0.0 and contrast[k] < LARGEST
-                      and contrast[k] * contrast[k] >= wp.static(SHADOW_SIGMAS**2) * spread[k]):  # NaN too
-                result[k] = wp.uint8(_SHADOWED)
-            elif (rest & (rest - 1)) != 0 or apart > wp.static(MAX_SPREAD):
-                result[k] = wp.uint8(_UNDECIDED)
-            elif float(least) * stripe >= extent:
-                result[k] = wp.uint8(_OUT_OF_RANGE)
-            else:
-                result[k] = wp.uint8(OK)
-                place = stripe_place(least, most, stripe, extent)
-                u[k] = place[0]
-                error[k] = place[1]
-                signal[k] = 0.5 * contrast[k]
+            lit = contrast[k] > 0.0 and contrast[k] < LARGEST and (  # False for NaN too
+                contrast[k] * contrast[k] >= wp.static(SHADOW_SIGMAS**2) * spread[k])
+            code, place, deviation = place_stripe(
+                cut[k], lit, (rest & (rest - 1)) == 0, number_of(shown[k], base_bit, above), number_of(shown[k] ^ low, base_bit, above),
+                number_of(shown[k] ^ second, base_bit, above), number_of(shown[k] ^ low ^ second, base_bit, above), stripe, extent)
+            u[k] = place
+            error[k] = deviation
+            signal[k] = wp.where(code == OK, 0.5 * contrast[k], 0.0)
+            result[k] = wp.uint8(code)
         coordinate[p] = u
         sigma[p] = error
         amplitude[p] = signal

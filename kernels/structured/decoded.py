@@ -6,9 +6,15 @@ from typing import NamedTuple
 import warp as wp
 
 from kernels.packs import unwritten
+from kernels.status import OK, Status
 
 STRIPE_DEVIATION = 1.0 / sqrt(12.0)
 """Standard deviation of a place evenly distributed over a stripe of width one."""
+MAX_SPREAD = 1
+"""Stripes that the readings of a pixel with doubtful digits may lie apart."""
+
+_SATURATED, _SHADOWED, _UNDECIDED, _OUT_OF_RANGE = (int(s) for s in (Status.SATURATED, Status.SHADOWED, Status.UNDECIDED,
+                                                                    Status.OUT_OF_RANGE))
 
 
 class Decoded(NamedTuple):
@@ -26,8 +32,32 @@ def unwritten_decoded(pixels: int, device: str) -> Decoded:
 
 
 @wp.func
-def stripe_place(least: int, most: int, stripe: float, extent: float) -> wp.vec2:
-    """Return the middle of the stripes from `least` to `most`, each `stripe` pixels wide, and its standard deviation."""
+def place_stripe(cut: int, lit: bool, settled: bool, read: int, one: int, other: int, both: int, stripe: float, extent: float):
+    """Return the status of a pixel, the middle of the stripes that it may show and its deviation: 0 and 0 where the status is not OK.
+
+    Args:
+        cut: not 0 where a frame saturates.
+        lit: whether the projector reaches the pixel.
+        settled: whether two digits at most are in doubt.
+        read, one, other, both: number of the stripe as read, with the other choice of either doubtful digit, and of both.
+        stripe: width of a stripe, projector pixels.
+        extent: projector pixels along the axis.
+    """
+    least = wp.min(wp.min(read, one), wp.min(other, both))
+    most = wp.max(wp.max(read, one), wp.max(other, both))
     start = float(least) * stripe
-    end = wp.min((float(most) + 1.0) * stripe, extent)
-    return wp.vec2(0.5 * (start + end), STRIPE_DEVIATION * (end - start))
+    middle, deviation = float(0.0), float(0.0)
+    code = OK
+    if cut != 0:
+        code = _SATURATED
+    elif not lit:
+        code = _SHADOWED
+    elif not settled or most - least > MAX_SPREAD:
+        code = _UNDECIDED
+    elif start >= extent:
+        code = _OUT_OF_RANGE
+    else:
+        end = wp.min((float(most) + 1.0) * stripe, extent)
+        middle = 0.5 * (start + end)
+        deviation = STRIPE_DEVIATION * (end - start)
+    return code, middle, deviation

@@ -20,8 +20,8 @@ import warp as wp
 from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.packs import Band, as_packs, pack_type
-from kernels.status import OK, Status
-from kernels.structured.decoded import Decoded, stripe_place, unwritten_decoded
+from kernels.status import OK
+from kernels.structured.decoded import Decoded, place_stripe, unwritten_decoded
 from kernels.structured.frames import NoiseModel, check_noise, check_stripes, cut_in, require_frames, saturation_masks
 
 SHADOW_SIGMAS = 5.0
@@ -32,8 +32,6 @@ DOUBT_CHI2 = 9.0
 """χ² between the best and the second-best level that noise alone leaves (three standard deviations)."""
 DOUBT_RATIO = 0.44
 """χ² of the best over that of the second-best: above, the reading lies more than two fifths of the way to the next level."""
-MAX_SPREAD = 1
-"""Stripes that the readings of a pixel with doubtful digits may lie apart."""
 MAX_STRIPES = 1 << 24
 """Stripes are counted in float32 at the end, exact up to here."""
 MIN_LEVEL_STEP = 1.0e-3
@@ -41,9 +39,6 @@ MIN_LEVEL_STEP = 1.0e-3
 LARGEST = 1.0e15
 """A signal above this counts as infinite: it is squared in float32."""
 FAR = 1.0e30
-
-_SATURATED, _SHADOWED, _UNDECIDED, _OUT_OF_RANGE = (int(s) for s in (Status.SATURATED, Status.SHADOWED, Status.UNDECIDED,
-                                                                    Status.OUT_OF_RANGE))
 
 
 def decode_kary(frames: Band, digits: Sequence[int], *, white: int, black: int, levels: np.ndarray, reflected: bool,
@@ -166,10 +161,7 @@ def _kary_kernel(pack: int, channels: Literal[1, 3] = 1) -> Any:
         sum0, sum1, sum2, sum3 = int_pack(), int_pack(), int_pack(), int_pack()
         for back in range(order.shape[0]):
             frame = order[order.shape[0] - 1 - back]
-            best, second, nearest, next_nearest = float_pack(), float_pack(), int_pack(), int_pack()
-            for k in range(pack):
-                best[k] = FAR
-                second[k] = FAR
+            best, second, nearest, next_nearest = float_pack(FAR), float_pack(FAR), int_pack(), int_pack()
             for digit in range(base):
                 cost = float_pack()
                 for channel in range(channels):
@@ -206,22 +198,12 @@ def _kary_kernel(pack: int, channels: Literal[1, 3] = 1) -> Any:
                 append_digit(d3, base, reflected, code3[k], sum3[k])
         u, error, result = float_pack(), float_pack(), byte_pack()
         for k in range(pack):
-            least = wp.min(wp.min(code0[k], code1[k]), wp.min(code2[k], code3[k]))
-            most = wp.max(wp.max(code0[k], code1[k]), wp.max(code2[k], code3[k]))
-            if cut[k] != 0:
-                result[k] = wp.uint8(_SATURATED)
-            elif not (lit[k] >= wp.static(SHADOW_SIGMAS**2) and signal[k] < LARGEST):  # NaN too
-                result[k] = wp.uint8(_SHADOWED)
-            elif doubts[k] > 2 or most - least > wp.static(MAX_SPREAD):
-                result[k] = wp.uint8(_UNDECIDED)
-            elif float(least) * stripe >= extent:
-                result[k] = wp.uint8(_OUT_OF_RANGE)
-            else:
-                result[k] = wp.uint8(OK)
-                place = stripe_place(least, most, stripe, extent)
-                u[k] = place[0]
-                error[k] = place[1]
-            signal[k] = wp.where(int(result[k]) == OK, signal[k], 0.0)
+            reached = lit[k] >= wp.static(SHADOW_SIGMAS**2) and signal[k] < LARGEST  # False for NaN too
+            code, place, deviation = place_stripe(cut[k], reached, doubts[k] <= 2, code0[k], code1[k], code2[k], code3[k], stripe, extent)
+            u[k] = place
+            error[k] = deviation
+            signal[k] = wp.where(code == OK, signal[k], 0.0)
+            result[k] = wp.uint8(code)
         coordinate[p] = u
         sigma[p] = error
         amplitude[p] = signal

@@ -23,26 +23,18 @@ from kernels.structured.angles import TURN, cosine_of_turns, sine_of_turns
 from kernels.structured.decoded import Decoded, unwritten_decoded
 from kernels.structured.frames import NoiseModel, cut_in, require_frames, saturation_masks
 from kernels.structured.phase import decode_phase
-from kernels.structured.unwrap import keep_better
+from kernels.structured.unwrap import FAR, judge, keep_better
 
 LEVEL_ERROR = 0.02
 """Part of the amplitude by which a reading may be off beyond noise: responses, and amplitudes that are not quite alike."""
-UNDECIDED_CHI2 = 9.0
-"""χ² of the second-best wrap that is not enough to rule it out (three standard deviations) …"""
-UNDECIDED_RATIO = 2.0
-"""… beyond so many times that of the best."""
-MULTIPATH_CHI2 = 225.0
-"""χ² of the best wrap beyond which the readings contradict each other."""
 MIN_SEPARATION = 0.05
 """Part of the amplitude by which the readings at two places must differ, all frames together."""
 BORDER_PX = 0.5
 """How far outside the projector a place may seem to lie."""
 STEPS = 3
 """Gauss-Newton steps; the start is off by the noise of three readings, and each step squares the error."""
-FAR = 1.0e30
 
-_SATURATED, _UNDECIDED, _MULTIPATH, _OUT_OF_RANGE = (int(s) for s in (Status.SATURATED, Status.UNDECIDED, Status.MULTIPATH,
-                                                                     Status.OUT_OF_RANGE))
+_SATURATED, _MULTIPATH, _OUT_OF_RANGE = int(Status.SATURATED), int(Status.MULTIPATH), int(Status.OUT_OF_RANGE)
 
 
 def decode_micro(frames: Band, numbers: Sequence[int], periods_px: Sequence[float], shifts: Sequence[float], *,
@@ -157,10 +149,8 @@ def _micro_kernel(pack: int) -> Any:
             turned[2 * f + 1, p] = sine
 
         # every wrap of the reference, and how well the other frames fit there
-        best, second, place, trust, known = float_pack(), float_pack(), float_pack(), float_pack(), float_pack()
+        best, second, place, trust, known = float_pack(FAR), float_pack(FAR), float_pack(), float_pack(), float_pack()
         for k in range(pack):
-            best[k] = FAR
-            second[k] = FAR
             trust[k] = 1.0 / (2.0 * (read_variance + gain * wp.max(mean[k], 0.0)) + wp.static(LEVEL_ERROR**2) * swing[k] * swing[k])
             slope_reference = swing[k] * TURN / period
             known[k] = 0.5 * shifts * slope_reference * slope_reference + 1.0e-20
@@ -220,12 +210,9 @@ def _micro_kernel(pack: int) -> Any:
             if cut[k] != 0:
                 code = _SATURATED
             elif code == OK:
-                if best[k] >= FAR:
-                    code = _OUT_OF_RANGE
-                elif not (best[k] < MULTIPATH_CHI2 and information[k] > 0.0):  # NaN too
+                code = judge(best[k], second[k])
+                if code != _OUT_OF_RANGE and not information[k] > 0.0:  # NaN too
                     code = _MULTIPATH
-                elif second[k] < UNDECIDED_CHI2 + UNDECIDED_RATIO * best[k]:
-                    code = _UNDECIDED
             if code == OK:
                 u_out[k] = place[k]
                 error[k] = 1.0 / wp.sqrt(information[k])

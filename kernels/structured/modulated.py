@@ -17,7 +17,7 @@ from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.packs import Band, as_packs, pack_type, unwritten
 from kernels.structured.frames import NoiseModel, check_noise, cut_in, require_frames, saturation_masks
-from kernels.structured.phase import WrappedPhase, add_frame, phase_of, weights
+from kernels.structured.phase import WrappedPhase, add_frame, weights, write_phases_in
 
 
 def decode_modulated(frames: Band, numbers: Sequence[Sequence[int]], *, period_px: float, noise: NoiseModel) -> WrappedPhase:
@@ -60,7 +60,7 @@ def decode_modulated(frames: Band, numbers: Sequence[Sequence[int]], *, period_p
 @cache
 def _modulated_kernel(pack: int) -> Any:
     float_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.uint8)
-    cut_of = cut_in(pack)
+    cut_of, write_phases = cut_in(pack), write_phases_in(pack)
 
     @wp.kernel(enable_backward=False, module="unique")
     def modulated_kernel(first: int,
@@ -110,18 +110,7 @@ def _modulated_kernel(pack: int) -> Any:
             for k in range(pack):
                 add_frame(direct[k], variance[k], row[0], row[1], row[2],
                           mean[k], along[k], across[k], vaa[k], vcc[k], vss[k], vcs[k])
-        angle, swing, error, level, result = float_pack(), float_pack(), float_pack(), float_pack(), byte_pack()
-        for k in range(pack):
-            found = phase_of(cut[k], mean[k], along[k], across[k], vaa[k], vcc[k], vss[k], vcs[k], 0.0, 0.0)
-            angle[k] = found.phase
-            swing[k] = found.amplitude
-            level[k] = found.offset
-            error[k] = found.sigma
-            result[k] = wp.uint8(found.status)
-        phase[0, p] = angle
-        amplitude[0, p] = swing
-        offset[0, p] = level
-        sigma[0, p] = error
-        status[0, p] = result
+        write_phases(0, p, cut, mean, along, across, vaa, vcc, vss, vcs, float_pack(), float_pack(),
+                     phase, amplitude, offset, sigma, status)
 
     return modulated_kernel

@@ -168,9 +168,36 @@ def phase_of(cut: int, mean: float, along: float, across: float, vaa: float, vcc
 
 
 @cache
+def write_phases_in(pack: int) -> Any:
+    """Return the Warp function that writes the phase of every pixel of a pack, one row of a WrappedPhase, from its sums."""
+    float_pack, int_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32), pack_type(pack, wp.uint8)
+
+    @wp.func
+    def write_phases(row: int, p: int, cut: int_pack, mean: float_pack, along: float_pack, across: float_pack, vaa: float_pack,
+                     vcc: float_pack, vss: float_pack, vcs: float_pack, dark: float_pack, dark_variance: float_pack,
+                     phase: wp.array2d(dtype=float_pack), amplitude: wp.array2d(dtype=float_pack), offset: wp.array2d(dtype=float_pack),
+                     sigma: wp.array2d(dtype=float_pack), status: wp.array2d(dtype=byte_pack)):
+        angle, swing, level, error, result = float_pack(), float_pack(), float_pack(), float_pack(), byte_pack()
+        for k in range(pack):
+            found = phase_of(cut[k], mean[k], along[k], across[k], vaa[k], vcc[k], vss[k], vcs[k], dark[k], dark_variance[k])
+            angle[k] = found.phase
+            swing[k] = found.amplitude
+            level[k] = found.offset
+            error[k] = found.sigma
+            result[k] = wp.uint8(found.status)
+        phase[row, p] = angle
+        amplitude[row, p] = swing
+        offset[row, p] = level
+        sigma[row, p] = error
+        status[row, p] = result
+
+    return write_phases
+
+
+@cache
 def _phase_kernel(pack: int, ambient: bool = False) -> Any:
     float_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.uint8)
-    cut_of = cut_in(pack)
+    cut_of, write_phases = cut_in(pack), write_phases_in(pack)
 
     @wp.kernel(enable_backward=False, module="unique")
     def phase_kernel(first: int,
@@ -190,9 +217,11 @@ def _phase_kernel(pack: int, ambient: bool = False) -> Any:
                      sigma: wp.array2d(dtype=float_pack),
                      status: wp.array2d(dtype=byte_pack)):
         p = first + wp.tid()
-        dark = float_pack()
+        dark, dark_variance = float_pack(), float_pack()
         if wp.static(ambient):
             dark = values[black, p]
+            for k in range(pack):
+                dark_variance[k] = read_variance + gain * wp.max(dark[k], 0.0)
         for period in range(masks.shape[0]):
             cut = cut_of(saturated, masks[period], p)
             mean, along, across = float_pack(), float_pack(), float_pack()
@@ -203,19 +232,7 @@ def _phase_kernel(pack: int, ambient: bool = False) -> Any:
                 for k in range(pack):
                     add_frame(reading[k], read_variance + gain * wp.max(reading[k], 0.0), a, c, s,
                               mean[k], along[k], across[k], vaa[k], vcc[k], vss[k], vcs[k])
-            angle, swing, level, error, result = float_pack(), float_pack(), float_pack(), float_pack(), byte_pack()
-            for k in range(pack):
-                dark_variance = wp.static(1.0 if ambient else 0.0) * (read_variance + gain * wp.max(dark[k], 0.0))
-                found = phase_of(cut[k], mean[k], along[k], across[k], vaa[k], vcc[k], vss[k], vcs[k], dark[k], dark_variance)
-                angle[k] = found.phase
-                swing[k] = found.amplitude
-                level[k] = found.offset
-                error[k] = found.sigma
-                result[k] = wp.uint8(found.status)
-            phase[period, p] = angle
-            amplitude[period, p] = swing
-            offset[period, p] = level
-            sigma[period, p] = error
-            status[period, p] = result
+            write_phases(period, p, cut, mean, along, across, vaa, vcc, vss, vcs, dark, dark_variance,
+                         phase, amplitude, offset, sigma, status)
 
     return phase_kernel

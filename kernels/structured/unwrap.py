@@ -148,6 +148,19 @@ def keep_better(cost: float, candidate: float, best: wp.ref[float], second: wp.r
     place += better * (candidate - place)
 
 
+@wp.func
+def judge(best: float, second: float) -> int:
+    """Return the status of the candidate that costs least from the two lowest costs, in χ²."""
+    code = OK
+    if best >= FAR:
+        code = _OUT_OF_RANGE
+    elif best > MULTIPATH_CHI2:
+        code = _MULTIPATH
+    elif second < UNDECIDED_CHI2 + UNDECIDED_RATIO * best:
+        code = _UNDECIDED
+    return code
+
+
 @cache
 def _joint_kernel(pack: int) -> Any:
     float_pack, int_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32), pack_type(pack, wp.uint8)
@@ -224,12 +237,7 @@ def _joint_kernel(pack: int) -> Any:
         u_out, error, result = float_pack(), float_pack(), byte_pack()
         for k in range(pack):
             if code[k] == OK:
-                if best[k] >= FAR:
-                    code[k] = _OUT_OF_RANGE
-                elif best[k] > MULTIPATH_CHI2:
-                    code[k] = _MULTIPATH
-                elif second[k] < UNDECIDED_CHI2 + UNDECIDED_RATIO * best[k]:
-                    code[k] = _UNDECIDED
+                code[k] = judge(best[k], second[k])
             if code[k] == OK:
                 u_out[k] = place[k] - slope_sum[k] / information[k]
                 error[k] = 1.0 / wp.sqrt(information[k])
