@@ -58,6 +58,7 @@ def test_every_scope_is_described():
     assert re.findall(r"^\| `(\w+)` \| (?:captures|also)", TEXT, re.MULTILINE) == [scope.value for scope in Scope]
 
 
+@pytest.mark.long
 def test_the_service_of_the_demo_says_what_to_try_and_that_works(tmp_path):
     """`relit demo --serve`, without the demo itself."""
     assert "relit demo --serve" in (HOME / "Makefile").read_text() and "make serve" in TEXT

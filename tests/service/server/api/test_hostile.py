@@ -252,6 +252,7 @@ def failures(server) -> list[str]:
     return [json.loads(line)["error"] for line in server.log.read_text().splitlines() if '"event": "job failed"' in line]
 
 
+@pytest.mark.long
 def test_hostile_captures_are_refused_by_name(server, client, registered):
     made = {}
     for number, (what, (change, _)) in enumerate(HOSTILE.items()):

@@ -110,6 +110,7 @@ def test_a_database_that_goes_away_and_comes_back(tmp_path):
         assert "Traceback" not in server.log.read_text()
 
 
+@pytest.mark.long
 def test_a_worker_of_its_own_makes_the_service_ready_and_ends_clean(tmp_path):
     with serving(tmp_path, "--anonymous", "--device", "none", min_free_bytes="0") as server, server.client() as client:
         assert "no worker" in client.get("/readyz").json()["detail"]

@@ -63,6 +63,7 @@ def test_a_worker_that_hangs_is_killed_and_its_job_taken_over(tmp_path, undistur
         assert any(event["event"] == "worker hangs: it is killed" for event in made.events())
 
 
+@pytest.mark.long
 def test_a_worker_that_is_asked_to_end_finishes_its_step_and_hands_the_job_back(tmp_path, on_postgres, undisturbed):
     with harness(tmp_path, on_postgres) as made:
         worker = made.start(PYTHONPATH=SABOTAGE, SABOTAGE="slow")

@@ -86,6 +86,7 @@ def test_the_service_drains_when_it_is_asked_to_end(tmp_path, undisturbed, monke
         database.close()
 
 
+@pytest.mark.long
 def test_the_api_has_no_warp_and_workers_are_spawned(tmp_path, undisturbed):
     with serving(tmp_path, *OPTIONS, **SETTINGS, roots=str(undisturbed.capture.parent)) as server, server.client() as client:
         job = begin(server, client, undisturbed)
