@@ -42,12 +42,13 @@ Vector = tuple[float, float, float]
 """The x, y and z of a point or a direction."""
 Direction = Annotated[Vector, AfterValidator(_unit)]
 """A vector of any length above zero, which is normalised to length one."""
-NotNegative = Annotated[float, Field(ge=0)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Rgb = tuple[NotNegative, NotNegative, NotNegative]
 """Red, green and blue, none of them negative."""
 LitRgb = Annotated[Rgb, AfterValidator(_lit)]
 """The colour of a light: red, green and blue, none of them negative and not all of them zero."""
-Positive = Annotated[float, Field(gt=0)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1)]
 Resolution = tuple[Count, Count]
 """The width and height of an image in pixels."""

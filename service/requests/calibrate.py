@@ -7,10 +7,8 @@ from pydantic import BeforeValidator, Field
 
 from service.errors import RequestError
 from service.requests.base import Commas, DeviceRequest, Options, Request, Role, Spelling, WidthHeight
+from stage.model import Count, Finite, Positive
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Above0 = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Count = Annotated[int, Field(ge=1)]
 Corners = Annotated[int, Field(ge=3)]
 CAPTURE = Spelling(argument=True, metavar="CAPTURE")
 IMAGES = Spelling(argument=True, metavar="IMAGE...")
@@ -21,7 +19,7 @@ class Circle(Options):
 
     u: Finite
     v: Finite
-    radius_px: Above0
+    radius_px: Positive
 
 
 def _numbers(text: str) -> list[float]:
@@ -98,7 +96,7 @@ class MirrorBallRequest(BallRequest):
 class LightPositionsRequest(MirrorBallRequest):
     """Positions of near lights from two or more mirror balls."""
 
-    ball_radius_m: tuple[Above0, ...] = ()
+    ball_radius_m: tuple[Positive, ...] = ()
     """Radius in metres, of every ball or once for each; an orthographic camera with pixel_size_m needs none."""
     ball_z_m: tuple[Finite, ...] = ()
     """Camera-frame z of the centres in metres, for an orthographic camera; empty: surface_z_m, or 0."""
@@ -107,11 +105,11 @@ class LightPositionsRequest(MirrorBallRequest):
 class GreyBallRequest(BallRequest):
     """Brightness of each light from one grey ball."""
 
-    albedo: Annotated[tuple[Above0, Above0, Above0] | None, BeforeValidator(_albedo), Spelling(metavar="R,G,B")] = None
+    albedo: Annotated[tuple[Positive, Positive, Positive] | None, BeforeValidator(_albedo), Spelling(metavar="R,G,B")] = None
     """Albedo of the ball, one number or three; None: irradiance is relative, mean 1."""
     refine_direction: bool = False
     """Take the direction of distant lights from the shading, in place of the manifest."""
-    ball_radius_m: Above0 | None = None
+    ball_radius_m: Positive | None = None
     """Radius of the ball in metres, for point lights and a perspective camera."""
     ball_z_m: Finite | None = None
     """Camera-frame z of the ball's centre in metres, for point lights and an orthographic camera; None: surface_z_m, or 0."""
@@ -160,7 +158,7 @@ class ProcamRequest(Request):
     """Folders with a capture.json, one a pose of the board."""
     board: Annotated[tuple[Corners, Corners], BeforeValidator(_board), Spelling(metavar="9x6")]
     """Inner corners of the chessboard, across and down."""
-    square_m: Above0
+    square_m: Positive
     """Side of a square in metres."""
     projector: Annotated[tuple[Count, Count] | None, WidthHeight, Spelling(metavar="1280x800")] = None
     """Width and height of the projector in pixels; None: what the captures say."""

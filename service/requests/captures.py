@@ -3,12 +3,11 @@
 from pathlib import Path
 from typing import Annotated, Self
 
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
 from service.errors import RequestError
 from service.requests.base import Choice, Options, Role, Spelling, WidthHeight
-
-Pixels = Annotated[int, Field(ge=1)]
+from stage.model import Positive, Resolution
 
 
 class ImportFormat(Choice):
@@ -28,11 +27,11 @@ class ImportRequest(Options):
     """Folder of the data, or the .lp file."""
     destination: Annotated[Path, Role.OUTPUT, Spelling(argument=True, metavar="DST")]
     """Folder for the capture; may be SRC."""
-    projector: Annotated[tuple[Pixels, Pixels] | None, WidthHeight, Spelling(metavar="1280x800")] = None
+    projector: Annotated[Resolution | None, WidthHeight, Spelling(metavar="1280x800")] = None
     """opencv-gray: width and height of the projector in pixels."""
     calibration: Annotated[Path | None, Role.INPUT] = None
     """opencv-gray: OpenCV file (.yml, .xml, .json) with both devices, R and T; without it see relit calibrate procam."""
-    unit_m: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0
+    unit_m: Positive = 1.0
     """opencv-gray: metres of one unit of T: 0.001 for millimetres."""
 
     @model_validator(mode="after")

@@ -3,12 +3,10 @@
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator
 
 from service.requests.base import Choice, Commas, Options, Request, Role, Spelling
-
-Above0 = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+from stage.model import Finite, NotNegative, Positive
 
 
 def _without_blanks(given: Any) -> Any:
@@ -47,7 +45,7 @@ class TofChoices(Options):
     """Time of flight, continuous wave: let neighbours decide between wraps that a pixel leaves open."""
     which: Annotated[WhichReturn, Spelling(flag="--return")] = WhichReturn.STRONGEST
     """Time of flight, pulsed: the return that is the depth, of several."""
-    temperature_c: float | None = Field(default=None, allow_inf_nan=False)
+    temperature_c: Finite | None = None
     """Temperature of the camera, for a time-of-flight calibration with a temperature drift."""
 
 
@@ -64,15 +62,15 @@ class DepthOptions(Options):
 
     using: Ranging | None = None
     """Which frames, where a capture holds several kinds; None: those that there are."""
-    near_m: Above0 | None = None
+    near_m: Positive | None = None
     """Depths below, in metres, are out of range."""
-    far_m: Above0 | None = None
+    far_m: Positive | None = None
     """Depths above, in metres, are out of range."""
-    max_residual_px: Above0 = 4.0
+    max_residual_px: Positive = 4.0
     """Where column and row are decoded: how far, in projector pixels, they may lie from a place that the line of sight passes."""
     refine: bool = True
     """Interpolate a Gray code with inverses between the edges of its stripes."""
-    read_noise: Above0 = 0.003
+    read_noise: Positive = 0.003
     """Standard deviation of a reading in the dark, quantisation included, as a part of full scale; patterns only."""
     photon_gain: NotNegative = 1e-4
     """Photon noise: full scale over the electrons that fill a pixel; patterns only."""

@@ -6,12 +6,12 @@ from typing import Annotated
 from pydantic import Field
 
 from service.requests.base import Choice, Commas, Options, Role, Spelling, WidthHeight
+from stage.model import Positive
 
 MAX_SIDE = 16384
 """Pixels of a projector's side; larger than any that is built."""
 
 Side = Annotated[int, Field(ge=1, le=MAX_SIDE)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 class PatternCode(Choice):

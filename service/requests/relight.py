@@ -3,10 +3,13 @@
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field
-
 from service.requests.base import Choice, Request, Role, Spelling, StackOptions
 from service.requests.picture import PictureOptions
+from stage.model import Finite
+
+CHUNK_FRAMES = 32
+"""Most frames that are computed in one pass over the images: with more the product takes no less time for each frame, and writing begins
+later. A task of a render farm makes as many by default: with fewer, images are read more often."""
 
 
 class LightWeights(Choice):
@@ -23,7 +26,7 @@ class RelightOptions(PictureOptions, StackOptions):
     """A number, or first-last; None: 1, or 1 to the number of time steps."""
     weights: LightWeights | None = None
     """How light from between the captured lights is shared out over them; None: cells, with maps smooth."""
-    spin_degrees: float = Field(default=0.0, allow_inf_nan=False)
+    spin_degrees: Finite = 0.0
     """How far the environment turns about +y, +z towards +x, over the whole range; the first frame is unturned, and a full turn closes."""
 
 

@@ -3,9 +3,8 @@
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field
-
 from service.requests.base import DeviceRequest, Role, Spelling
+from stage.model import Positive
 
 
 class ScanRequest(DeviceRequest):
@@ -15,9 +14,9 @@ class ScanRequest(DeviceRequest):
     """A folder with a scan.json, or the file."""
     out: Annotated[Path, Role.OUTPUT]
     """Folder for points.ply, points.usdc, points.las where it is asked for, and report.json."""
-    near_m: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    near_m: Positive | None = None
     """Nearer returns, in metres, are left out."""
-    far_m: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    far_m: Positive | None = None
     """Farther returns, in metres, are left out."""
     las: bool = False
     """Write points.las (LAS 1.4) too; needs laspy: pip install 'relit[las]'."""

@@ -6,6 +6,7 @@ from typing import Annotated
 from pydantic import Field
 
 from service.requests.base import Request, Role, Spelling
+from stage.model import Positive
 
 
 class SeparateRequest(Request):
@@ -15,7 +16,7 @@ class SeparateRequest(Request):
     """Folder with a capture.json."""
     out: Annotated[Path, Role.OUTPUT]
     """Folder for separation.exr and report.json."""
-    period_px: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    period_px: Positive | None = None
     """Period of the phase frames to use, in projector pixels; None: the shortest, up to 64."""
     black_level: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = 0.0
     """Light of the projector's black over that of its white, for a capture without a black frame."""

@@ -3,12 +3,10 @@
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field
-
 from service.requests.base import Request, Role, Spelling
 from service.requests.near_lights import POINT_FORM, RECTANGLE_FORM, SPHERE_FORM, GivenPoint, GivenRectangle, GivenSphere
 from service.requests.picture import PictureOptions
-from stage.model import FirstFault
+from stage.model import Finite, FirstFault
 
 
 class ShadeOptions(PictureOptions):
@@ -20,7 +18,7 @@ class ShadeOptions(PictureOptions):
     """A sphere light: centre, radius, radiance. Any number of them."""
     rectangle: Annotated[tuple[GivenRectangle, ...], FirstFault, Spelling(metavar=RECTANGLE_FORM)] = ()
     """A rectangle light: centre, its two edges, radiance; it shines against u x v, as a USD RectLight does. Any number of them."""
-    turn_degrees: float = Field(default=0.0, allow_inf_nan=False)
+    turn_degrees: Finite = 0.0
     """How far the environment is turned about +y, +z towards +x."""
 
 

@@ -6,9 +6,7 @@ from typing import Annotated
 from pydantic import Field
 
 from service.requests.base import Commas, Options, Role, Spelling
-
-Above0 = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NotBelow0 = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+from stage.model import Count, NotNegative, Positive
 
 
 class SimulateRequest(Options):
@@ -29,17 +27,17 @@ class SimulateRequest(Options):
 class SimulateCwRequest(SimulateRequest):
     """Correlation images of a continuous-wave camera."""
 
-    modulation_hz: Annotated[tuple[Above0, ...], Commas, Field(min_length=1)] = (20e6, 30e6, 80e6)
+    modulation_hz: Annotated[tuple[Positive, ...], Commas, Field(min_length=1)] = (20e6, 30e6, 80e6)
     """Frequencies, as text with commas between."""
     phases: Annotated[int, Field(ge=3)] = 4
     """Images a frequency, evenly spaced in phase."""
-    signal_electrons: Above0 = 1e5
+    signal_electrons: Positive = 1e5
     """Electrons of a white surface that faces the camera at one metre, in one image."""
-    ambient_electrons: NotBelow0 = 0.0
+    ambient_electrons: NotNegative = 0.0
     """Electrons of ambient light on a white surface, in one image."""
-    read_noise_electrons: NotBelow0 = 5.0
+    read_noise_electrons: NotNegative = 5.0
     """Standard deviation of the read noise, in electrons."""
-    full_well: Above0 | None = None
+    full_well: Positive | None = None
     """Electrons at which a reading saturates; None: none does."""
 
 
@@ -48,13 +46,13 @@ class SimulatePulsedRequest(SimulateRequest):
 
     bins: Annotated[int, Field(ge=3)] = 64
     """Bins of a histogram."""
-    bin_s: Above0 = 1.5e-9
+    bin_s: Positive = 1.5e-9
     """Seconds a bin."""
-    pulse_sigma_s: Above0 = 1.2e-9
+    pulse_sigma_s: Positive = 1.2e-9
     """Standard deviation of the pulse, in seconds."""
-    signal_photons: Above0 = 4000.0
+    signal_photons: Positive = 4000.0
     """Photons of a white surface that faces the camera at one metre, all pulses together."""
-    background: NotBelow0 = 0.5
+    background: NotNegative = 0.5
     """Photons of ambient light a bin, all pulses together."""
-    pulses: Annotated[int, Field(ge=1)] | None = None
+    pulses: Count | None = None
     """Number of pulses; with it, only the first photon after each pulse is counted."""
