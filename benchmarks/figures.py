@@ -30,6 +30,7 @@ from benchmarks.tof import rows as tof_rows
 from benchmarks.tof_accuracy import accuracy_rows
 from benchmarks.tof_bound import bound_rows
 from service.demo.bench import bench
+from service.requests.demo import BenchRequest
 from service.requests.solve import Method, SolveRequest
 from service.solve.solve import solve
 from stage import exr
@@ -125,7 +126,7 @@ def rig(given: argparse.Namespace) -> list[str] | None:
 
 def speed(_: argparse.Namespace) -> list[str]:
     """Measure the table of `relit bench`, and the general solver against NumPy."""
-    return [*bench(None, 9), "", *search_rows()]
+    return [*bench(BenchRequest()), "", *search_rows()]
 
 
 def tof(_: argparse.Namespace) -> list[str]:

@@ -16,6 +16,10 @@ SCANLINES_PER_CHUNK = {0: 1, 1: 1, 2: 1, 3: 16, 4: 32, 5: 16, 6: 32, 7: 32, 8: 3
 """The rows of one chunk by the compression code of the file format (OpenEXR file layout, "Scan line blocks")."""
 
 
+HALF_MAX = 65504.0
+"""The largest half value."""
+
+
 class Compression:
     """The compressions with which relit writes."""
 

@@ -17,8 +17,6 @@ from stage import exr
 from stage.files import write_text
 
 SCHEMA = "relit.basis/1"
-HALF_MAX = 65504.0
-"""The largest half value."""
 HALF_RMS_MIN = 2.0**-11
 """The least root mean square of a layer that is stored as half: an eighth of it still has all bits of a half value."""
 DIGITS = 9
@@ -37,7 +35,7 @@ def layer_types(rms: np.ndarray, largest: float) -> list[type[np.floating[Any]]]
         rms: [K, 3] the root mean square of each basis image.
         largest: an upper bound of the absolute values of all layers.
     """
-    return [np.float16 if largest <= HALF_MAX and row.max() >= HALF_RMS_MIN else np.float32 for row in rms]
+    return [np.float16 if largest <= exr.HALF_MAX and row.max() >= HALF_RMS_MIN else np.float32 for row in rms]
 
 
 def write_layers(path: str | Path, layers: Sequence[np.ndarray], mask: np.ndarray, *, color_space: str,

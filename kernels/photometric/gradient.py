@@ -13,6 +13,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.packs import zeros
+from kernels.photometric.least_squares import CONFIDENCE_HALF
 from kernels.photometric.moments import Moments
 from kernels.status import DARK, ILL_POSED, OK
 
@@ -20,13 +21,11 @@ MIN_LENGTH = 0.05
 """Least (3/2)|M|/M₀: below, the pixel is as bright from every side and the direction of M is noise."""
 MAX_LENGTH = 1.5
 """Largest: (3/2)|M|/M₀ of light from one direction alone; above, the readings contradict each other."""
-PRIOR_RESIDUAL = 0.01
+PRIOR_GRADIENT_RESIDUAL = 0.01
 """One pseudo-observation with this residual, relative to M₀: four readings leave no residual, yet are not certain. Smaller than
 that of single lights, because a gradient's reading is a mean over every lamp."""
 ROUNDING = 2.0**-12
 """Relative rounding of a half reading: what the length of M may be off by although the fit leaves no residual."""
-CONFIDENCE_HALF = 0.01745329
-"""Standard error of the normal, radians (one degree), at which confidence is one half."""
 
 
 class GradientFit(NamedTuple):
@@ -102,7 +101,7 @@ def _diffuse_kernel(first: int,
         normal[c, p] = n[c]
         albedo[c, p] = gain * wp.max(moments[4 * c, p], 0.0)
     length[p] = 1.5 * size
-    squares = (spare[p] + 4.0) * residual[p] * residual[p] + PRIOR_RESIDUAL * PRIOR_RESIDUAL
+    squares = (spare[p] + 4.0) * residual[p] * residual[p] + PRIOR_GRADIENT_RESIDUAL * PRIOR_GRADIENT_RESIDUAL
     noise = 2.0 * variance[p] * squares / ((spare[p] + 1.0) * size * size)
     explained = wp.static(2.0 * 1.5) * wp.sqrt(variance[p]) * (ROUNDING + residual[p])
     bent = 2.0 * wp.max(wp.abs(1.0 - 1.5 * size) - explained, 0.0)

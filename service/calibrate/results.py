@@ -16,7 +16,7 @@ from stage.errors import CalibrationError
 from stage.files import write_text
 from stage.manifest import FILE_NAME, Manifest, write_manifest
 
-REPORT_FILE = "calibration.json"
+CALIBRATION_FILE = "calibration.json"
 SCHEMA = "relit.calibration/1"
 
 
@@ -68,7 +68,7 @@ def open_captures(request: LightsRequest) -> LightCaptures:
         target = Capture.open(request.apply_to)
         check_same_setup(source, target)
     path = target.folder / FILE_NAME if request.out is None else request.out
-    if path.suffix.lower() != ".json" or path.name == REPORT_FILE or path.is_dir():
+    if path.suffix.lower() != ".json" or path.name == CALIBRATION_FILE or path.is_dir():
         raise RequestError(f"--out {path}: must be a .json file of its own: it takes the place of {FILE_NAME}")
     return LightCaptures(source, target, path, lit)
 
@@ -116,7 +116,7 @@ def write_results(kind: str, request: BaseModel, manifest: Manifest, manifest_pa
     Returns:
         The path of the report.
     """
-    path = manifest_path.parent / REPORT_FILE
+    path = manifest_path.parent / CALIBRATION_FILE
     options = request.model_dump(mode="json", exclude={"capture", "apply_to", "out"})
     data = {"schema": SCHEMA, **_earlier(path), kind: {"options": options, **section, "versions": versions()}}
     write_text(path, json.dumps(data, indent=2) + "\n")

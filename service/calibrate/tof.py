@@ -11,6 +11,7 @@ from kernels.tof.noise import estimate_noise
 from service.depth.tof import solve_tof, z_per_range
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
+from service.requests.calibrate import TofCalibrationRequest
 from service.requests.depth import TofOptions
 from stage.capture import Capture
 from stage.tof.calibration import Harmonics, TofCalibration, fit_harmonics, fit_line, fit_temperature, write_calibration
@@ -35,13 +36,11 @@ class TofCalibrationResult(NamedTuple):
     steps: int
 
 
-def calibrate_tof(sweep: Path, out: Path, *, device: str | None = None, progress: Progress | None = None) -> TofCalibrationResult:
+def calibrate_tof(request: TofCalibrationRequest, progress: Progress | None = None) -> TofCalibrationResult:
     """Calibrate a time-of-flight camera, and write the calibration.
 
     Args:
-        sweep: a relit.tof-sweep/1 file.
-        out: the relit.tof/1 file to write.
-        device: where to solve.
+        request: the sweep, and the file to write.
         progress: told how far the work is.
 
     Raises:
@@ -49,27 +48,28 @@ def calibrate_tof(sweep: Path, out: Path, *, device: str | None = None, progress
         RequestError: steps of both kinds, or a step without a solved pixel.
     """
     timings = Timings(progress)
-    where = devices.resolve(device)
+    device, sweep = devices.resolve(request.device), request.sweep
     plan = read_sweep(sweep)
     captures = [Capture.open(sweep.parent / step.capture) for step in plan.steps]
     kinds = {is_pulsed(capture) for capture in captures}
     if len(kinds) > 1:
         raise RequestError(f"{sweep}: steps: some are cw and some pulsed: give a sweep for each")
-    plain = _range_errors(plan, captures, None, where, timings)
+    plain = _range_errors(plan, captures, None, device, timings)
     if kinds == {True}:
         known: dict[str, Any] = _scale_and_offset(plan, captures, plain)
     else:
-        known = _harmonics(plan, captures, where, timings)
+        known = _harmonics(plan, captures, device, timings)
     calibration = TofCalibration.model_validate(known)
-    after = _range_errors(plan, captures, calibration, where, timings)
+    after = _range_errors(plan, captures, calibration, device, timings)
     if plan.has_drift:
         warm = np.array([step.temperature_c for step in plan.steps], dtype=np.float64)
         drift, level = fit_temperature(after, warm)
         calibration = TofCalibration.model_validate({**known, "temperature": drift, "offset_m": calibration.offset_m + level})
         after = after - level - drift.metres_per_c * (warm - drift.reference_c)
-    write_calibration(calibration, out)
+    write_calibration(calibration, request.out)
     timings.close()
-    return TofCalibrationResult(calibration, out, float(np.sqrt(np.mean(plain**2))), float(np.sqrt(np.mean(after**2))), len(plan.steps))
+    before_m, after_m = (float(np.sqrt(np.mean(errors**2))) for errors in (plain, after))
+    return TofCalibrationResult(calibration, request.out, before_m, after_m, len(plan.steps))
 
 
 def _range_errors(plan: Sweep, captures: list[Capture], calibration: TofCalibration | None, device: str, timings: Timings) -> np.ndarray:

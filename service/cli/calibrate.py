@@ -128,7 +128,7 @@ def _tof(request: TofCalibrationRequest) -> None:
     from service.calibrate.tof import calibrate_tof
 
     with ProgressBar() as bar:
-        result = calibrate_tof(request.sweep, request.out, device=request.device, progress=bar)
+        result = calibrate_tof(request, bar)
     print(f"file     {result.path}")
     drift = result.calibration.temperature
     found = [f"wiggling at {harmonics.modulation_hz / 1e6:g} MHz" for harmonics in result.calibration.harmonics]

@@ -25,7 +25,7 @@ def _demo(request: DemoRequest, serve: ServeOption = False) -> None:
     from service.demo.demo import demo
 
     with ProgressBar() as bar:
-        result = demo(request.out, device=request.device, progress=bar)
+        result = demo(request, bar)
     print(f"maps     {result.solved.maps_path}")
     print(f"report   {result.solved.report_path}")
     print(f"asset    {result.asset}")
@@ -51,5 +51,5 @@ def _bench(request: BenchRequest) -> None:
     from service.demo.bench import bench
 
     with ProgressBar() as bar:
-        lines = bench(request.device, request.repeats, bar)
+        lines = bench(request, bar)
     print("\n".join(lines))

@@ -8,14 +8,11 @@ import typer
 
 from service.cli.request_commands import Given, command
 from service.requests.base import Role
-from service.requests.relight import RelightRequest
+from service.requests.relight import CHUNK_FRAMES, RelightRequest
 from service.requests.shade import ShadeRequest
 
 if TYPE_CHECKING:
     from service.farm.template import Job
-
-CHUNK_FRAMES = 32
-"""Default for the frames of a task: as many as one product makes (service.light.combine); with fewer, images are read more often."""
 
 JobOption = Annotated[Path, typer.Option(
     "--job", metavar="FILE.yaml|DIR", show_default=False,

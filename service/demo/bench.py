@@ -15,25 +15,25 @@ from kernels.photometric.robust import solve_robust
 from kernels.relight.batch import combine_batch
 from kernels.relight.combine import combine
 from service.reporting.progress import Progress, Timings
+from service.requests.demo import BenchRequest
 from stage.colour import GREY_WEIGHTS
 
 LIGHTS, SIDE, FRAMES = 64, 512, 24
 """64 lights of 512 x 512 half, as in docs/figures.md."""
 
 
-def bench(device: str | None, repeats: int, progress: Progress | None = None) -> list[str]:
+def bench(request: BenchRequest, progress: Progress | None = None) -> list[str]:
     """Measure the speed of the kernels on this machine.
 
     Args:
-        device: cpu, cuda:0, …; None: the first CUDA device, else the CPU.
-        repeats: runs of each kernel, of which the median is taken.
+        request: the device, and the runs of each kernel, of which the median is taken.
         progress: told how far the work is.
 
     Returns:
         Lines of a Markdown table: what, milliseconds, pixels per second, against what, its milliseconds, ratio (above 1: faster).
     """
     timings = Timings(progress)
-    name = devices.resolve(device)
+    name = devices.resolve(request.device)
     timings.stage("bench", 5)
     rng = np.random.default_rng(0)
     pixels = SIDE * SIDE
@@ -51,7 +51,7 @@ def bench(device: str | None, repeats: int, progress: Progress | None = None) ->
         work()
         wp.synchronize_device(name)
         seconds = []
-        for _ in range(repeats):
+        for _ in range(request.repeats):
             began = time.perf_counter()
             work()
             wp.synchronize_device(name)
@@ -85,7 +85,7 @@ def bench(device: str | None, repeats: int, progress: Progress | None = None) ->
         timed(lambda: np.linalg.pinv(lights.direction) @ grey))
     row("robust normals and albedo", timed(robust), "lambert normals, above", timed(lambert))
     timings.close()
-    return [f"{devices.describe(name)}; {LIGHTS} lights, {SIDE}x{SIDE} half, median of {repeats}", "",
+    return [f"{devices.describe(name)}; {LIGHTS} lights, {SIDE}x{SIDE} half, median of {request.repeats}", "",
             "| what | ms | Mpixel/s | against | ms | ratio |", "|---|---|---|---|---|---|", *rows]
 
 

@@ -8,6 +8,7 @@ from service.demo.preview import write_preview
 from service.errors import RequestError
 from service.light.relight import relight
 from service.reporting.progress import Progress, Timings
+from service.requests.demo import DemoRequest
 from service.requests.export import ExportRequest
 from service.requests.relight import LightWeights, RelightRequest
 from service.requests.solve import SolveRequest
@@ -45,15 +46,14 @@ def sample_folder() -> Path:
     raise RequestError(f"the sample capture {SAMPLE} is not installed: run the demo from a checkout of relit")
 
 
-def demo(out: Path, *, device: str | None = None, progress: Progress | None = None) -> DemoResult:
+def demo(request: DemoRequest, progress: Progress | None = None) -> DemoResult:
     """Solve, export and relight the sample, and write a preview.
 
     Args:
-        out: folder for the results; its `.relit` holds the stack cache, so that nothing is written into the sample.
-        device: cpu, cuda:0, …; None: the first CUDA device, else the CPU.
+        request: the device, and the folder for the results; its `.relit` holds the stack cache, so that nothing is written into the sample.
         progress: told how far the work is.
     """
-    sample = sample_folder()
+    sample, out, device = sample_folder(), request.out, request.device
     cache = out / ".relit"
     solved = solve(SolveRequest(capture=sample, out=out, device=device, cache=cache), progress)
     asset = export(ExportRequest(maps=out, out=out / "asset.usdz"), progress)

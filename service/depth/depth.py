@@ -20,7 +20,7 @@ from service.depth.solution import DepthSolution
 from service.depth.tof import solve_tof
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
-from service.reporting.provenance import metadata, report
+from service.reporting.provenance import REPORT_FILE, metadata, report
 from service.requests.depth import DepthRequest, Ranging
 from stage.capture import Capture
 from stage.depth_maps import DEPTH_FILE, DepthMaps
@@ -32,7 +32,6 @@ from stage.manifest import FILE_NAME, Frame
 from stage.patterns.base import UniformPattern
 from stage.ply import POINTS_FILE, write_ply
 
-REPORT_FILE = "report.json"
 PLAUSIBLE_M = 0.005, 500.0
 """Median depths that are plausible for a projector or a laser; beyond them the units of the calibration are wrong."""
 

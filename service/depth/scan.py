@@ -14,17 +14,17 @@ from kernels.tof.returns import find_returns
 from service.depth.points import srgb_bytes, white_of
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
-from service.reporting.provenance import metadata, report
+from service.reporting.provenance import REPORT_FILE, metadata, report
 from service.requests.scan import ScanRequest
 from service.usd.points import write_points
 from stage.files import write_text
 from stage.fingerprint import Fingerprints
 from stage.las import LAS_FILE, las_is_installed, write_las
 from stage.ply import POINTS_FILE, PointCloud, write_ply
-from stage.tof.light_time import SPEED_OF_LIGHT
+from stage.tof.light_time import range_of_delay_m
 from stage.tof.scan import FILE_NAME, Shots, read_scan, world_points
 
-USD_FILE, REPORT_FILE = "points.usdc", "report.json"
+USD_FILE = "points.usdc"
 MOST_RETURNS = 4
 """Returns that are looked for in a waveform."""
 
@@ -112,4 +112,4 @@ def _returns(shots: Shots, device: str) -> tuple[np.ndarray, np.ndarray, np.ndar
     time_s = waveforms.start_s + found.position.numpy()[number, index].astype(np.float64) * waveforms.bin_s
     facts = {"ranges": "from waveforms", "pulse_sigma_s": float(f"{pulse.step * STEPS_PER_SIGMA * waveforms.bin_s:.4g}"),
              "shots_with_several_returns": int(there[1].sum())}
-    return index, SPEED_OF_LIGHT * time_s / 2, found.photons.numpy()[number, index], facts
+    return index, range_of_delay_m(time_s), found.photons.numpy()[number, index], facts

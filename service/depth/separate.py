@@ -13,10 +13,10 @@ from kernels import device as devices
 from kernels.status import OK, Status
 from kernels.structured.frames import saturated_bits, upload
 from kernels.structured.separation import separate as separate_band
-from service.depth.depth import REPORT_FILE, content_of, statistics
+from service.depth.depth import content_of, statistics
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
-from service.reporting.provenance import metadata, report
+from service.reporting.provenance import REPORT_FILE, metadata, report
 from service.requests.separate import SeparateRequest
 from stage import exr
 from stage.capture import Capture

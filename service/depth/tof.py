@@ -34,7 +34,7 @@ from stage.camera import Camera
 from stage.capture import Capture
 from stage.tof.calibration import TofCalibration, read_calibration
 from stage.tof.frames import CorrelationImages, Histograms, is_pulsed, read_correlations, read_histograms
-from stage.tof.light_time import SPEED_OF_LIGHT
+from stage.tof.light_time import SPEED_OF_LIGHT, range_of_delay_m
 
 MOST_RETURNS = 3
 """Returns that are looked for in a histogram."""
@@ -177,8 +177,8 @@ def solve_histograms(frames: Histograms, options: TofOptions, calibration: TofCa
         ArrayError: the histograms hold nothing.
         RequestError: the span lies outside the histogram.
     """
-    bin_m = SPEED_OF_LIGHT * frames.bin_s / 2
-    start_m = SPEED_OF_LIGHT * frames.start_s / 2
+    bin_m = range_of_delay_m(frames.bin_s)
+    start_m = range_of_delay_m(frames.start_s)
     end_m = start_m + bin_m * frames.counts.shape[1]
     nearest = start_m if near_m is None else near_m
     farthest = end_m if far_m is None else far_m

@@ -7,12 +7,11 @@ import numpy as np
 from kernels import packs
 from kernels.relight.batch import combine_batch
 from kernels.relight.combine import combine
+from service.requests.relight import CHUNK_FRAMES
 from stage.stack import Stack
 
 CHUNK_BYTES = 256 << 20
 """Most bytes of linear frames, in float32, in a chunk. Two chunks are held at one time: one is computed while the one before is written."""
-CHUNK_FRAMES = 32
-"""Most frames in a chunk: with more the product takes no less time for each frame, and writing begins later."""
 
 
 def chunk_frames(stack: Stack) -> int:

@@ -15,7 +15,6 @@ from service.requests.picture import FrameCompression, Layer, PictureOptions
 from stage import exr
 from stage.colour import rgb_matrix
 
-HALF_MAX = 65504.0
 COMPRESSIONS = {FrameCompression.ZIP: exr.Compression.ZIP, FrameCompression.PIZ: exr.Compression.PIZ,
                 FrameCompression.DWAA: exr.Compression.DWAA}
 
@@ -110,7 +109,7 @@ class FrameWriter:
     def _write(self, file: FrameFile, frame: np.ndarray, specular: np.ndarray | None, form: FrameFormat) -> None:
         began = time.perf_counter()
         frame = _finished(frame, file, form)
-        clipped = int(((frame > HALF_MAX) | (frame < -HALF_MAX)).any(axis=0).sum())
+        clipped = int(((frame > exr.HALF_MAX) | (frame < -exr.HALF_MAX)).any(axis=0).sum())
         channels = _half(frame, form, "")
         if specular is not None:
             specular = _finished(specular, file, form)
@@ -137,5 +136,5 @@ def _finished(frame: np.ndarray, file: FrameFile, form: FrameFormat) -> np.ndarr
 
 def _half(frame: np.ndarray, form: FrameFormat, prefix: str) -> dict[str, np.ndarray]:
     """Return the channels as half, clipped."""
-    planes = np.clip(frame, -HALF_MAX, HALF_MAX).astype(np.float16).reshape(3, form.resolution[1], form.resolution[0])
+    planes = np.clip(frame, -exr.HALF_MAX, exr.HALF_MAX).astype(np.float16).reshape(3, form.resolution[1], form.resolution[0])
     return {prefix + name: plane for name, plane in zip("RGB", planes, strict=True)}

@@ -11,6 +11,7 @@ from service.requests.options import role_of
 
 REPORTED = ("relit", "warp-lang", "numpy", "OpenEXR", "OpenImageIO", "opencv-python-headless", "usd-core")
 """The distributions whose versions a report names."""
+REPORT_FILE = "report.json"
 
 
 def versions() -> dict[str, str]:

@@ -30,7 +30,7 @@ TOKEN_S = DAY_S
 """Seconds for which an idempotency token is remembered."""
 UNFINISHED_S = DAY_S
 """Seconds without a write after which an unfinished image stack is deleted."""
-SILENT_S = HOUR_S
+FORGET_S = HOUR_S
 """Seconds after which a worker that was not seen is forgotten, in the second round that finds it so: after a database was away for as long,
 its workers are seen again between the two rounds."""
 
@@ -96,11 +96,11 @@ class Housekeeper:
         self._database.transact(lambda connection: idempotency.drop_before(connection, self._clock() - TOKEN_S))
 
     def _workers(self) -> None:
-        silent = {row["id"] for row in workers.not_seen_since(self._database, self._clock() - SILENT_S)}
+        silent = {row["id"] for row in workers.not_seen_since(self._database, self._clock() - FORGET_S)}
         for worker in silent & self._silent:
             workers.remove(self._database, worker)
             if self._database.is_sqlite:
-                with FileWorkerLock(self._settings.data / "locks", "").dead(worker):  # which deletes the lock file of a worker that is dead
+                with FileWorkerLock(self._settings.locks, "").dead(worker):  # which deletes the lock file of a worker that is dead
                     pass
             logger.info("worker forgotten", worker=worker)
         self._silent = silent - self._silent

@@ -7,9 +7,9 @@ import sqlalchemy as sa
 
 from service.requests.identifiers import CAPTURE, ENVIRONMENT, new_id
 from service.requests.jobs import CheckJob
-from service.server.api.context import DEFAULT_PROJECT
 from service.server.database import intakes
 from service.server.database.engine import Database
+from service.server.database.keys import DEFAULT_PROJECT
 from service.server.jobs.queue import JobQueue
 from service.views.states import REFUSED
 

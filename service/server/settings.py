@@ -18,9 +18,8 @@ from pydantic_settings import BaseSettings, InitSettingsSource, NoDecode, Pydant
 
 from service.errors import RequestError
 from service.requests.jobs import DEFAULT_PORT
+from stage.model import Count, Positive
 
-Count = Annotated[int, Field(ge=1)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 PREFIX = "RELIT_"
 CONFIG = "RELIT_CONFIG"
 OTHERS = (CONFIG, "RELIT_SERVER", "RELIT_KEY")
@@ -142,6 +141,11 @@ class Settings(BaseSettings):
     def sqlite_file(self) -> Path:
         """Path of the database of SQLite."""
         return self.data / "relit.sqlite"
+
+    @property
+    def locks(self) -> Path:
+        """Folder of the lock files by which the workers of SQLite are known to be alive."""
+        return self.data / "locks"
 
     @property
     def sqlalchemy_url(self) -> str:

@@ -12,7 +12,7 @@ from kernels.status import SOLVED, Status
 from kernels.surface.integrate import Integration
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
-from service.reporting.provenance import metadata, report
+from service.reporting.provenance import REPORT_FILE, metadata, report
 from service.requests.solve import Method, SolveRequest
 from service.solve.distant import solve_distant
 from service.solve.extended import solve_extended
@@ -39,7 +39,6 @@ from stage.reference_ball import ReferenceBall, reference_ball
 SVBRDF_LIGHTS = 12
 """From this many lights on svbrdf is the default: it fits six lobes and a direction to each pixel, and was better than robust on
 every object tried with eight to 96 lights (docs/figures.md)."""
-REPORT_FILE = "report.json"
 
 Solver = Callable[[SolveInput, Any], Solution]
 

@@ -1,6 +1,11 @@
 """The speed of light, and the range that belongs to a delay or a phase."""
 
 import math
+from typing import TypeVar
+
+import numpy as np
+
+Time = TypeVar("Time", float, np.ndarray)
 
 SPEED_OF_LIGHT = 299_792_458.0
 """The speed of light in vacuum in metres a second (SI, exact)."""
@@ -11,7 +16,7 @@ def delay_s(path_m: float) -> float:
     return path_m / SPEED_OF_LIGHT
 
 
-def range_of_delay_m(time_s: float) -> float:
+def range_of_delay_m(time_s: Time) -> Time:
     """Return the range from the time of flight there and back: d = c·t/2."""
     return SPEED_OF_LIGHT * time_s / 2
 

@@ -15,12 +15,11 @@ from service.server.api.problems import ApiError
 from service.server.api.watch import Watcher
 from service.server.database import idempotency, keys
 from service.server.database.engine import Database
-from service.server.database.keys import Caller
+from service.server.database.keys import DEFAULT_PROJECT, Caller
 from service.server.jobs.queue import JobQueue
 from service.server.settings import Settings
 from service.server.storage.folder import Storage
 
-DEFAULT_PROJECT = "default"
 ANONYMOUS = Caller(DEFAULT_PROJECT, Scope.ADMIN, None)
 SPACE_RETRY_S = 600
 FOR_WORK, FOR_UPLOAD = "new work", "this upload"
@@ -82,7 +81,6 @@ def _scoped(scope: Scope) -> Callable[[Caller], Awaitable[Caller]]:
 
 Reader = Annotated[Caller, Depends(_scoped(Scope.READ))]
 Writer = Annotated[Caller, Depends(_scoped(Scope.WRITE))]
-Admin = Annotated[Caller, Depends(_scoped(Scope.ADMIN))]
 IdempotencyKey = Annotated[str | None, Header(
     alias="Idempotency-Key", min_length=1, max_length=255, pattern=r"^[\x21-\x7e]+$",
     description="Chosen by the client: the same request sent again with it creates nothing again.")]

@@ -8,7 +8,7 @@ from fastapi import APIRouter, Depends, Header, Response
 from fastapi.sse import KEEPALIVE_COMMENT, EventSourceResponse, format_sse_event
 
 from service.server.api.context import Reader, ServiceDep
-from service.server.api.jobs import job_of
+from service.server.api.jobs import get_job
 from service.server.api.problems import responses
 from service.server.api.watch import Change, Watcher
 from service.views.jobs import JobView
@@ -30,7 +30,7 @@ LastEvent = Annotated[str | None, Header(
 
 @router.get("/v1/jobs/{job}/events", responses={**responses(404, 422), 200: STREAM, 204: NOTHING_MORE}, response_class=Response,
             summary="Watch a job")
-async def stream_job(service: ServiceDep, found: Annotated[JobView, Depends(job_of)], last: LastEvent = None) -> Response:
+async def stream_job(service: ServiceDep, found: Annotated[JobView, Depends(get_job)], last: LastEvent = None) -> Response:
     """Send the job as it is, and then with every change; the stream ends when the job has ended."""
     known = int(last) if last is not None and int(last) <= found.revision else 0
     if found.state in ENDED and known == found.revision:

@@ -167,11 +167,6 @@ def delete_job(service: ServiceDep, caller: Writer, job: JobName) -> None:
     service.queue.forget(job, before.attempt)
 
 
-def job_of(service: ServiceDep, caller: Reader, job: JobName) -> JobView:
-    """Return the job that the path names."""
-    return view(service, caller, job)
-
-
 def view(service: Service, caller: Caller, job: str) -> JobView:
     """Return a job of the caller's project.
 

@@ -15,8 +15,8 @@ from service.server.database.tables import keys
 
 SECRET_BYTES = 32
 """256 random bits cannot be found by trying, so that one round of SHA-256 is enough."""
-
-
+DEFAULT_PROJECT = "default"
+"""The project of whoever needs no key: requests from the machine of an anonymous service, and the sample of `relit demo --serve`."""
 ORDER = list(Scope)
 
 

@@ -52,7 +52,7 @@ def run_worker(settings: Settings, device: str, heartbeat: Heartbeat) -> None:
     _prepared(database, settings, ending)
     host = socket.gethostname()
     name = f"{host}-{device.replace(':', '')}-{os.getpid()}-{secrets.token_hex(4)}"
-    lock = open_worker_lock(database, settings.data / "locks", name)
+    lock = open_worker_lock(database, settings.locks, name)
     if lock.hold() is LockState.REFUSED:
         raise RuntimeError(f"another process holds the lock of {name}")  # its name is random
     queue = JobQueue(database)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from service.calibrate.tof import calibrate_tof
+from service.requests.calibrate import TofCalibrationRequest
 from stage.camera import Camera
 from stage.errors import StageError
 from stage.tof.calibration import read_calibration
@@ -55,7 +56,7 @@ def test_wiggling_offset_and_drift_of_a_sweep(tmp_path, relit):
 def test_scale_and_offset_of_a_pulsed_sweep(tmp_path):
     steps = [(f"d{k}", depth, 0.05 + 0.01 * depth, None) for k, depth in enumerate(np.linspace(1, 8, 6))]
     path = sweep(tmp_path, steps, lambda view: pulsed_frames(tof.histogram(view, 1e6, seed=0)))
-    result = calibrate_tof(path, tmp_path / "c.json", device="cpu")
+    result = calibrate_tof(TofCalibrationRequest(sweep=path, out=tmp_path / "c.json", device="cpu"))
     assert result.before_m > 0.05 and result.after_m < 2e-3
     assert result.calibration.offset_m == pytest.approx(0.05, abs=0.01)
 
@@ -67,6 +68,6 @@ def test_scale_and_offset_of_a_pulsed_sweep(tmp_path):
 ])
 def test_sweeps_that_say_too_little_are_refused(steps, message, tmp_path):
     with pytest.raises(StageError) as caught:
-        calibrate_tof(sweep(tmp_path, steps, cw), tmp_path / "c.json", device="cpu")
+        calibrate_tof(TofCalibrationRequest(sweep=sweep(tmp_path, steps, cw), out=tmp_path / "c.json", device="cpu"))
     assert message in str(caught.value)
     assert not (tmp_path / "c.json").exists()

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.cli.farm import CHUNK_FRAMES
+from service.cli import farm
 from service.farm.template import Job, write_job
 from service.light import combine
 from service.requests.base import Role
@@ -144,7 +144,7 @@ def test_every_template_is_valid(relit, tmp_path, command):
 
 
 def test_a_chunk_is_as_many_frames_as_a_product_makes():
-    assert CHUNK_FRAMES == combine.CHUNK_FRAMES
+    assert combine.CHUNK_FRAMES is farm.CHUNK_FRAMES
 
 
 @pytest.mark.parametrize(("words", "sentence"), [

@@ -151,7 +151,7 @@ def test_tokens_are_remembered_for_a_day(house):
 def test_workers_that_are_gone_are_forgotten_and_those_that_come_back_are_not(house):
     for name in ("dead", "alive"):
         workers.insert(house.database, name, host="h", pid=1, device="cpu")
-    locks = house.settings.data / "locks"
+    locks = house.settings.locks
     locks.mkdir()
     (locks / "dead.lock").write_bytes(b"")
 

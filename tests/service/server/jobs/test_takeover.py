@@ -26,7 +26,7 @@ def job(idle_harness):
 
 
 def takeover(made, name, *, running=frozenset(), deposed=lambda: None):
-    lock = open_worker_lock(made.database, made.settings.data / "locks", name)
+    lock = open_worker_lock(made.database, made.settings.locks, name)
     assert lock.hold() is LockState.TAKEN
     return lock, Takeover(made.database, made.queue, lock, name, every_s=1, max_lost=MAX_LOST, running=lambda: frozenset(running),
                           beat=lambda: None, deposed=deposed)
@@ -35,7 +35,7 @@ def takeover(made, name, *, running=frozenset(), deposed=lambda: None):
 def let_go(made, lock, name):
     """Close a lock, and wait until the server, too, has ended the session."""
     lock.close()
-    other = open_worker_lock(made.database, made.settings.data / "locks", name)
+    other = open_worker_lock(made.database, made.settings.locks, name)
     made.until(lambda: other.hold() is not LockState.REFUSED, "let go")
     return other
 

@@ -8,7 +8,7 @@ from tests.service.server.jobs.harness import harness
 
 
 def pair(harness):
-    return [open_worker_lock(harness.database, harness.settings.data / "locks", name) for name in ("one", "two")]
+    return [open_worker_lock(harness.database, harness.settings.locks, name) for name in ("one", "two")]
 
 
 def is_dead(lock, worker):
@@ -35,7 +35,7 @@ def test_a_worker_that_never_was_is_dead(idle_harness):
 
 def test_one_alone_takes_over_and_the_dead_does_not_come_back_meanwhile(idle_harness):
     one, two = pair(idle_harness)
-    three = open_worker_lock(idle_harness.database, idle_harness.settings.data / "locks", "three")
+    three = open_worker_lock(idle_harness.database, idle_harness.settings.locks, "three")
     one.hold()
     two.hold()
     with one.dead("three") as dead, two.dead("three") as also:
