@@ -60,6 +60,12 @@ class SearchOptions:
     """A reading below this fraction of its prediction may be a cast shadow."""
 
 
+def criteria(options: SearchOptions, shape: Diffuse) -> list[Any]:
+    """Return what the kernels judge by, as they take it: s0 and s1; r²/σ² of the cost of a shadow, and its depth; the diffuse lobe."""
+    return [wp.vec2(options.noise_floor, options.noise_slope), wp.vec2(math.expm1(options.shadow_cost), options.shadow_depth),
+            wp.vec2(shape.rough, shape.slope)]
+
+
 WIDE = ((5.0, 10.0, 16.0, 24.0, 34.0, 46.0), 30)
 """First rings, degrees from the start, and how many candidates the last one has."""
 FINE = (((2.5, 5.0), 10), ((0.9, 1.8), 8), ((0.4,), 6), ((0.2,), 6), ((0.06,), 6))
@@ -135,14 +141,11 @@ def search_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse,
     table = wp.empty((0, 0, 0), dtype=wp.float32, device=device) if table is None else table
     scratch = wp.empty(packs * lights * held, dtype=lane_type, device=device)
     strides = (lights * held, 1) if device == "cpu" else (1, packs)
-    noise = wp.vec2(options.noise_floor, options.noise_slope)
-    shadow = wp.vec2(math.expm1(options.shadow_cost), options.shadow_depth)
-    form = wp.vec2(shape.rough, shape.slope)
     for degrees, count in (wide, *fine):
         offsets = wp.array(rings(degrees, count), dtype=wp.vec4, device=device)
         radius = math.sin(math.radians(degrees[0])) if len(degrees) == 1 else 0.0
         devices.launch(_search_kernel(lanes, lobes, options.reweightings, options.sweeps), packs,
-                       [samples.grey, samples.toward, table, samples.view, offsets, radius, noise, shadow, form, lights,
+                       [samples.grey, samples.toward, table, samples.view, offsets, radius, *criteria(options, shape), lights,
                         samples.pack_stride, samples.light_stride, *strides],
                        [scratch, normal, cost, curvature, weights], device=device, uneven=True)
     return Search(to_host(samples, normal), to_host(samples, cost), to_host(samples, curvature), to_host(samples, weights))

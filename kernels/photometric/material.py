@@ -14,7 +14,6 @@ least squares after Lawson and Hanson, "Solving Least Squares Problems", 1974, c
 "Using color to separate reflection components", Color Research and Application 1985.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +22,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.packs import pack_type
-from kernels.photometric.hypotheses import Diffuse, SearchOptions
+from kernels.photometric.hypotheses import Diffuse, SearchOptions, criteria
 from kernels.photometric.lobes import direction_reflectance
 from kernels.photometric.material_kernel import GIVEN, NEUTRAL, TINTED, material_kernel
 from kernels.photometric.response_table import COLUMNS
@@ -122,9 +121,7 @@ def _fit(samples: Samples, normal: np.ndarray, shape: Diffuse, options: SearchOp
     known = wp.vec4() if given is None else wp.vec4(*map(float, given))
     devices.launch(material_kernel(lanes, reflectance, table is not None), packs,
                    [samples.colour, samples.toward, responses, samples.level, samples.view, per_pixel(samples, normal),
-                    wp.vec2(options.noise_floor, options.noise_slope),
-                    wp.vec2(math.expm1(options.shadow_cost), options.shadow_depth), wp.vec2(shape.rough, shape.slope),
-                    freedom, known, samples.light_count, samples.pack_stride, samples.light_stride],
+                    *criteria(options, shape), freedom, known, samples.light_count, samples.pack_stride, samples.light_stride],
                    [fitted], device=device)
     values = to_host(samples, fitted)
     return Material(values[:, :3], values[:, 3:6], np.where(values[:, 6] > 0, values[:, 6], 1).astype(np.float32),

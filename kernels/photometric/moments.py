@@ -17,7 +17,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
-from kernels.packs import Band, pack_type, zeros
+from kernels.packs import Band, channels_type, pack_type, zeros
 from kernels.status import DARK, OK, TOO_FEW_LIGHTS
 
 LARGEST_HALF = 65504.0
@@ -74,47 +74,12 @@ def fit_moments(band: Band, rows: np.ndarray, scale: np.ndarray, grey_weights: t
     return fit
 
 
-@wp.func
-def add_response(value: float, mean: float, x: float, y: float, z: float,
-                 r0: wp.ref[float], rx: wp.ref[float], ry: wp.ref[float], rz: wp.ref[float]):
-    """Add a frame's reading to the right-hand side of one channel."""
-    r0 += mean * value
-    rx += x * value
-    ry += y * value
-    rz += z * value
-
-
-@wp.func
-def solve_channel(known: float, pivot: float, g0: wp.vec3, gg: wp.vec3,
-                  r0: wp.ref[float], rx: wp.ref[float], ry: wp.ref[float], rz: wp.ref[float]):
-    """Replace the right-hand side of one channel by its M₀ and M, or by 0 where `known` is 0.
-
-    No frame has a gradient along two axes, so that each axis is eliminated on its own.
-    """
-    r = wp.vec3(rx, ry, rz)
-    m0 = (r0 - wp.dot(wp.cw_div(g0, gg), r)) / pivot
-    m = wp.cw_div(r - m0 * g0, gg)
-    r0 = known * m0
-    rx = known * m[0]
-    ry = known * m[1]
-    rz = known * m[2]
-
-
-@wp.func
-def write_channel(moments: wp.array2d(dtype=float), channel: int, pixel: int, m0: float, x: float, y: float, z: float):
-    """Write the four responses of one channel."""
-    moments[4 * channel, pixel] = m0
-    moments[4 * channel + 1, pixel] = x
-    moments[4 * channel + 2, pixel] = y
-    moments[4 * channel + 3, pixel] = z
-
-
 @cache
 def _moments_kernel(pack: int) -> Any:
     half_pack, byte_pack = pack_type(pack, wp.float16), pack_type(pack, wp.uint8)
-    float_pack, int_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32)
+    float_pack, int_pack, channels = pack_type(pack, wp.float32), pack_type(pack, wp.int32), channels_type(pack)
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
     def moments_kernel(first: int,
                        values: wp.array2d(dtype=half_pack),  # [3 · L, P] stored radiance
                        saturated: wp.array2d(dtype=byte_pack),  # [L / 8, P] bits
@@ -134,9 +99,7 @@ def _moments_kernel(pack: int) -> Any:
         # normal equations: shared by the channels, then the right-hand side of each
         count, g00 = float_pack(), float_pack()
         g0x, g0y, g0z, gxx, gyy, gzz = float_pack(), float_pack(), float_pack(), float_pack(), float_pack(), float_pack()
-        r0, rx, ry, rz = float_pack(), float_pack(), float_pack(), float_pack()
-        s0, sx, sy, sz = float_pack(), float_pack(), float_pack(), float_pack()
-        b0, bx, by, bz = float_pack(), float_pack(), float_pack(), float_pack()
+        m0, mx, my, mz = channels(), channels(), channels(), channels()  # right-hand sides, and then M₀ and M
         for frame in range(frames.shape[0]):
             light = frames[frame]
             red, green, blue = values[light, p], values[lights + light, p], values[2 * lights + light, p]
@@ -144,12 +107,14 @@ def _moments_kernel(pack: int) -> Any:
             shift = light % 8
             unit = scale[frame]
             mean, x, y, z = rows[frame][0], rows[frame][1], rows[frame][2], rows[frame][3]
+            used = float_pack()
             for k in range(pack):
                 top = wp.max(wp.max(wp.abs(float(red[k])), wp.abs(float(green[k]))), wp.abs(float(blue[k])))
                 total = float(red[k]) + float(green[k]) + float(blue[k])
                 clear = ((int(bits[k]) >> shift) & 1) == 0
-                used = clear and top <= LARGEST_HALF and total == total  # a maximum may pass over a NaN, a sum does not
-                w = wp.where(used, 1.0, 0.0)
+                # a maximum may pass over a NaN, a sum does not
+                w = wp.where(clear and top <= LARGEST_HALF and total == total, 1.0, 0.0)
+                used[k] = w
                 count[k] += w
                 g00[k] += w * mean * mean
                 g0x[k] += w * mean * x
@@ -158,11 +123,15 @@ def _moments_kernel(pack: int) -> Any:
                 gxx[k] += w * x * x
                 gyy[k] += w * y * y
                 gzz[k] += w * z * z
-                add_response(wp.where(used, unit * float(red[k]), 0.0), mean, x, y, z, r0[k], rx[k], ry[k], rz[k])
-                add_response(wp.where(used, unit * float(green[k]), 0.0), mean, x, y, z, s0[k], sx[k], sy[k], sz[k])
-                add_response(wp.where(used, unit * float(blue[k]), 0.0), mean, x, y, z, b0[k], bx[k], by[k], bz[k])
+            for c in range(3):
+                reading = values[c * lights + light, p]
+                for k in range(pack):
+                    value = wp.where(used[k] > 0.0, unit * float(reading[k]), 0.0)
+                    m0[c, k] += mean * value
+                    mx[c, k] += x * value
+                    my[c, k] += y * value
+                    mz[c, k] += z * value
 
-        # the solution takes the place of the right-hand sides
         code = int_pack()
         for k in range(pack):
             g0 = wp.vec3(g0x[k], g0y[k], g0z[k])
@@ -174,10 +143,15 @@ def _moments_kernel(pack: int) -> Any:
             known = known and pivot > MIN_PIVOT
             pivot = wp.where(known, pivot, 1.0)
             on = wp.where(known, 1.0, 0.0)
-            solve_channel(on, pivot, g0, gg, r0[k], rx[k], ry[k], rz[k])
-            solve_channel(on, pivot, g0, gg, s0[k], sx[k], sy[k], sz[k])
-            solve_channel(on, pivot, g0, gg, b0[k], bx[k], by[k], bz[k])
-            lit = grey[0] * r0[k] + grey[1] * s0[k] + grey[2] * b0[k] > 0.0
+            for c in range(3):  # no frame has a gradient along two axes, so that each axis is eliminated on its own
+                r = wp.vec3(mx[c, k], my[c, k], mz[c, k])
+                first_moment = (m0[c, k] - wp.dot(u, r)) / pivot
+                m = wp.cw_div(r - first_moment * g0, gg)
+                m0[c, k] = on * first_moment
+                mx[c, k] = on * m[0]
+                my[c, k] = on * m[1]
+                mz[c, k] = on * m[2]
+            lit = grey[0] * m0[0, k] + grey[1] * m0[1, k] + grey[2] * m0[2, k] > 0.0
             code[k] = wp.where(known, wp.where(lit, OK, DARK), TOO_FEW_LIGHTS)
             if code[k] == OK:
                 variance[p * pack + k] = (1.0 / gg[0] + 1.0 / gg[1] + 1.0 / gg[2] + wp.dot(u, u) / pivot) / 3.0
@@ -187,26 +161,29 @@ def _moments_kernel(pack: int) -> Any:
         squares = float_pack()
         for frame in range(frames.shape[0]):
             light = frames[frame]
-            seen_r, seen_g, seen_b = values[light, p], values[lights + light, p], values[2 * lights + light, p]
             cut = saturated[light / 8, p]
             shift = light % 8
             unit = scale[frame]
             mean, x, y, z = rows[frame][0], rows[frame][1], rows[frame][2], rows[frame][3]
+            read, told = float_pack(), float_pack()
+            for c in range(3):
+                reading = values[c * lights + light, p]
+                for k in range(pack):
+                    read[k] += grey[c] * float(reading[k])
+                    told[k] += grey[c] * (mean * m0[c, k] + x * mx[c, k] + y * my[c, k] + z * mz[c, k])
             for k in range(pack):
-                read = unit * (grey[0] * float(seen_r[k]) + grey[1] * float(seen_g[k]) + grey[2] * float(seen_b[k]))
-                said = (grey[0] * (mean * r0[k] + x * rx[k] + y * ry[k] + z * rz[k])
-                        + grey[1] * (mean * s0[k] + x * sx[k] + y * sy[k] + z * sz[k])
-                        + grey[2] * (mean * b0[k] + x * bx[k] + y * by[k] + z * bz[k]))
-                off = wp.where(((int(cut[k]) >> shift) & 1) == 0, read - said, 0.0)
+                off = wp.where(((int(cut[k]) >> shift) & 1) == 0, unit * read[k] - told[k], 0.0)
                 squares[k] += wp.where(wp.abs(off) < wp.inf, off * off, 0.0)
         for k in range(pack):
             pixel = p * pack + k
             status[pixel] = code[k]
             if code[k] == OK:
-                level = grey[0] * r0[k] + grey[1] * s0[k] + grey[2] * b0[k]
+                level = grey[0] * m0[0, k] + grey[1] * m0[1, k] + grey[2] * m0[2, k]
                 residual[pixel] = wp.min(wp.sqrt(squares[k] / count[k]) / level, LARGEST_HALF)  # of noise about black: kept as half
-                write_channel(moments, 0, pixel, r0[k], rx[k], ry[k], rz[k])
-                write_channel(moments, 1, pixel, s0[k], sx[k], sy[k], sz[k])
-                write_channel(moments, 2, pixel, b0[k], bx[k], by[k], bz[k])
+                for c in range(3):
+                    moments[4 * c, pixel] = m0[c, k]
+                    moments[4 * c + 1, pixel] = mx[c, k]
+                    moments[4 * c + 2, pixel] = my[c, k]
+                    moments[4 * c + 3, pixel] = mz[c, k]
 
     return moments_kernel

@@ -9,7 +9,6 @@ Source: Levenberg-Marquardt with eliminated linear parameters after Golub and Pe
 Problems 2003; Cauchy weights as in hypotheses.
 """
 
-import math
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -18,7 +17,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.packs import channels_type, pack_type
-from kernels.photometric.hypotheses import LEAST_NZ, Diffuse, SearchOptions, tangents
+from kernels.photometric.hypotheses import LEAST_NZ, Diffuse, SearchOptions, criteria, tangents
 from kernels.photometric.lobes import Reflectance, direction_reflectance
 from kernels.photometric.material_kernel import squared_misfit, weigh
 from kernels.photometric.samples import Samples, per_pixel, to_host
@@ -63,9 +62,8 @@ def refine(samples: Samples, normal: np.ndarray, roughness: np.ndarray, *, shape
     start = np.concatenate([normal, roughness[:, None]], axis=1)
     devices.launch(_refine_kernel(lanes, direction_reflectance(lanes)), packs,
                    [samples.colour, samples.toward, wp.empty((0, 0, 0), dtype=wp.float32, device=device), samples.level, samples.view,
-                    per_pixel(samples, start), wp.vec2(options.noise_floor, options.noise_slope),
-                    wp.vec2(math.expm1(options.shadow_cost), options.shadow_depth), wp.vec2(shape.rough, shape.slope),
-                    samples.light_count, samples.pack_stride, samples.light_stride], [refined], device=device)
+                    per_pixel(samples, start), *criteria(options, shape), samples.light_count, samples.pack_stride, samples.light_stride],
+                   [refined], device=device)
     values = to_host(samples, refined)
     return Refinement(values[:, :3], values[:, 3], values[:, 4] / samples.light_count)
 
