@@ -94,6 +94,28 @@ def step_aside(ranges: wp.array(dtype=wp.float32), status: wp.array(dtype=wp.int
     return largest
 
 
+@wp.func
+def departure(ranges: wp.array(dtype=wp.float32), sigma: wp.array(dtype=wp.float32), status: wp.array(dtype=wp.int32), r: int, c: int,
+              dr: int, dc: int, reach: int, rows: int, cols: int, least: float):
+    """Return how far a pixel departs from the line through the two pixels `reach` steps and one more in a direction, how far from the
+    nearer of the two, and how far from the line it must at least to lie off it; zeros where one of the two is not measured."""
+    found = wp.vec3()
+    r1 = r + reach * dr
+    c1 = c + reach * dc
+    if seen(status, r1, c1, rows, cols) and seen(status, r1 + dr, c1 + dc, rows, cols):
+        p = r * cols + c
+        i = r1 * cols + c1
+        j = i + dr * cols + dc
+        ahead = float(reach)
+        line = ranges[i] + ahead * (ranges[i] - ranges[j])
+        variance = sigma[p] * sigma[p] + (1.0 + ahead) * (1.0 + ahead) * sigma[i] * sigma[i] + ahead * ahead * sigma[j] * sigma[j]
+        rise = wp.max(wp.abs(ranges[i] - ranges[j]),
+                      step_aside(ranges, status, r1, c1, dr, dc, rows, cols, ASIDE * wp.abs(ranges[p] - ranges[i])))
+        most = wp.max(wp.max(SIGMAS * wp.sqrt(variance), least), STEPS * ahead * rise)
+        found = wp.vec3(ranges[p] - line, ranges[p] - ranges[i], most)
+    return found
+
+
 @wp.kernel(module="unique", module_options={"max_unroll": 2})  # unrolled, it is no faster and takes seconds to compile
 def _flying_kernel(first: int,
                    ranges: wp.array(dtype=wp.float32),
@@ -117,30 +139,10 @@ def _flying_kernel(first: int,
             dr = wp.where(direction == 0, 0, 1)
             dc = wp.where(direction == 1, 0, wp.where(direction == 3, -1, 1))
             for reach in range(1, 3):
-                r1 = r - reach * dr
-                c1 = c - reach * dc
-                r2 = r + reach * dr
-                c2 = c + reach * dc
-                if (seen(status, r1, c1, rows, cols) and seen(status, r1 - dr, c1 - dc, rows, cols)
-                        and seen(status, r2, c2, rows, cols) and seen(status, r2 + dr, c2 + dc, rows, cols)):
-                    i1 = r1 * cols + c1
-                    j1 = i1 - dr * cols - dc
-                    i2 = r2 * cols + c2
-                    j2 = i2 + dr * cols + dc
-                    ahead = float(reach)
-                    one = ranges[i1] + ahead * (ranges[i1] - ranges[j1])
-                    other = ranges[i2] + ahead * (ranges[i2] - ranges[j2])
-                    grow = (1.0 + ahead) * (1.0 + ahead)
-                    v1 = s2 + grow * sigma[i1] * sigma[i1] + ahead * ahead * sigma[j1] * sigma[j1]
-                    v2 = s2 + grow * sigma[i2] * sigma[i2] + ahead * ahead * sigma[j2] * sigma[j2]
-                    rise1 = wp.max(wp.abs(ranges[i1] - ranges[j1]),
-                                   step_aside(ranges, status, r1, c1, dr, dc, rows, cols, ASIDE * wp.abs(d - ranges[i1])))
-                    rise2 = wp.max(wp.abs(ranges[i2] - ranges[j2]),
-                                   step_aside(ranges, status, r2, c2, dr, dc, rows, cols, ASIDE * wp.abs(d - ranges[i2])))
-                    away1 = wp.max(wp.max(SIGMAS * wp.sqrt(v1), floor_m), STEPS * ahead * rise1)
-                    away2 = wp.max(wp.max(SIGMAS * wp.sqrt(v2), floor_m), STEPS * ahead * rise2)
-                    if (wp.abs(d - one) > away1 and wp.abs(d - other) > away2 and (d - one) * (d - other) < 0.0
-                            and (d - ranges[i1]) * (d - ranges[i2]) < 0.0):
+                one = departure(ranges, sigma, status, r, c, -dr, -dc, reach, rows, cols, floor_m)
+                if wp.abs(one[0]) > one[2]:
+                    other = departure(ranges, sigma, status, r, c, dr, dc, reach, rows, cols, floor_m)
+                    if wp.abs(other[0]) > other[2] and one[0] * other[0] < 0.0 and one[1] * other[1] < 0.0:
                         flying = True
         if not flying:
             support = wp.int32(0)
