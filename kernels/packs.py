@@ -174,5 +174,5 @@ def place(array: np.ndarray, device: str) -> tuple[wp.array, Any]:
         return view, array
     if short:
         array = np.pad(array, [(0, 0), (0, short)])
-    owner = wp.array(np.ascontiguousarray(array), dtype=dtype, device=device)
+    owner = wp.array(array, dtype=dtype, device=device)
     return as_packs(owner, device), owner

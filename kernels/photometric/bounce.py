@@ -43,8 +43,8 @@ def subtract_bounce(samples: Samples, arriving: np.ndarray, corners: np.ndarray,
         raise ArrayError(f"corners must be from 0 to {patches - 1}")
     device = samples.device
     devices.launch(_bounce_kernel(samples.lanes), samples.packs,
-                   [wp.array(np.ascontiguousarray(arriving, dtype=np.float32), dtype=wp.float32, device=device),
-                    per_pixel(samples, corners), per_pixel(samples, shares), per_pixel(samples, albedo), samples.level,
+                   [wp.array(arriving, dtype=wp.float32, device=device), per_pixel(samples, corners), per_pixel(samples, shares),
+                    per_pixel(samples, albedo), samples.level,
                     wp.vec3(*(float(w) for w in grey_weights)), samples.light_count, samples.pack_stride, samples.light_stride],
                    [samples.grey, samples.colour], device=device)
 

@@ -54,7 +54,7 @@ def run_normal_kernel(make: Any, band: Band, readings: Readings, directions: np.
                     zeros(band.pixel_count, wp.float32, band.device),
                     zeros(band.pixel_count, wp.float32, band.device),
                     zeros(band.pixel_count, wp.int32, band.device))
-    lights = wp.array(np.ascontiguousarray(directions, dtype=np.float32), dtype=wp.vec3, device=band.device)
+    lights = wp.array(directions, dtype=wp.vec3, device=band.device)
     devices.launch(make(devices.pack_width(band.device), near_lights is not None), band.packs,
                    [lights, toward_or_none(near_lights, band.device), readings.pack_stride, readings.light_stride],
                    [readings.values, *fit], device=band.device)

@@ -67,9 +67,9 @@ def fit_moments(band: Band, rows: np.ndarray, scale: np.ndarray, grey_weights: t
     fit = Moments(zeros(count, wp.float32, device, rows=12), *(zeros(count, wp.float32, device) for _ in range(4)),
                   zeros(count, wp.int32, device))
     devices.launch(_moments_kernel(devices.pack_width(device)), band.packs,
-                   [band.values, band.saturated, wp.array(frames.astype(np.int32), dtype=wp.int32, device=device),
-                    wp.array(rows[frames].astype(np.float32), dtype=wp.vec4, device=device),
-                    wp.array(scale[frames].astype(np.float32), dtype=wp.float32, device=device), wp.vec3(*grey_weights)],
+                   [band.values, band.saturated, wp.array(frames, dtype=wp.int32, device=device),
+                    wp.array(rows[frames], dtype=wp.vec4, device=device), wp.array(scale[frames], dtype=wp.float32, device=device),
+                    wp.vec3(*grey_weights)],
                    [fit.values, fit.variance, fit.residual, fit.spare, fit.status], device=device)
     return fit
 

@@ -44,7 +44,7 @@ def reference_table(readings: np.ndarray, device: str) -> wp.array:
         raise ArrayError(f"readings are {readings.shape}: give one row for each of the {GRID * GRID} nodes")
     if not (readings >= 0).all() or not readings.any():
         raise ArrayError("readings of the ball must not be negative, and some must be above zero")
-    return wp.array(readings[..., None].astype(np.float32), dtype=wp.float32, device=device)
+    return wp.array(readings[..., None], dtype=wp.float32, device=device)
 
 
 def solve_reference(samples: Samples, table: wp.array, view: np.ndarray) -> ReferenceFit:

@@ -91,18 +91,16 @@ def gather(band: Band, pixels: np.ndarray, view: np.ndarray, lights: Lights, fac
     level = wp.empty(packs, dtype=lane_type, device=device)
     per_channel = np.divide(lights.scale[:, None], lights.irradiance, out=np.zeros_like(lights.irradiance),
                             where=lights.irradiance > 0)
-    where = wp.array(pixels[order].astype(np.int32), dtype=wp.int32, device=device)
+    where = wp.array(pixels[order], dtype=wp.int32, device=device)
     if field is None:
         near = (wp.empty(0, dtype=wp.vec4, device=device),) * 2 + (wp.empty((3, 0), dtype=float, device=device),)
     else:
-        near = (wp.array(field.places.place, dtype=wp.vec4, device=device),
-                wp.array(field.places.lobe, dtype=wp.vec4, device=device),
-                wp.array(np.ascontiguousarray(field.points[:, order], dtype=np.float32), dtype=float, device=device))
+        near = (wp.array(field.places.place, dtype=wp.vec4, device=device), wp.array(field.places.lobe, dtype=wp.vec4, device=device),
+                wp.array(field.points[:, order], dtype=float, device=device))
     devices.launch(_gather_kernel(lanes, field is not None), packs,
                    [as_pixels(band.values), as_pixels(band.saturated), where, wp.array(factors, dtype=wp.vec3, device=device),
-                    wp.array(per_channel.astype(np.float32), dtype=wp.vec3, device=device),
-                    wp.array(lights.direction, dtype=wp.vec3, device=device), *near, light_count, pack_stride, light_stride],
-                   [grey, colour, toward, level], device=device)
+                    wp.array(per_channel, dtype=wp.vec3, device=device), wp.array(lights.direction, dtype=wp.vec3, device=device),
+                    *near, light_count, pack_stride, light_stride], [grey, colour, toward, level], device=device)
     planes = np.ascontiguousarray(view[order].astype(np.float32).T).reshape(3, packs, lanes)
     return Samples(grey, colour, level, toward, wp.array(planes, dtype=lane_type, device=device), len(pixels), packs, light_count, lanes,
                    pack_stride, light_stride, device)

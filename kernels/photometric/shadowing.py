@@ -37,7 +37,7 @@ def exclude_shadows(samples: Samples, pixels: np.ndarray, height: wp.array, mask
     if len(pixels) != samples.pixel_count or pixels.min() < 0 or pixels.max() >= rows * cols:
         raise ArrayError(f"pixels must be {samples.pixel_count} positions from 0 to {rows * cols - 1}")
     order = np.minimum(np.arange(samples.packs * samples.lanes), samples.pixel_count - 1)
-    where = wp.array(pixels[order].astype(np.int32), dtype=wp.int32, device=samples.device)
+    where = wp.array(pixels[order], dtype=wp.int32, device=samples.device)
     place = np.zeros((samples.light_count, 4), dtype=np.float32) if places is None else places.place
     devices.launch(_exclude_kernel(samples.lanes), samples.packs,
                    [samples.toward, wp.array(place, dtype=wp.vec4, device=samples.device), where, height, mask,

@@ -78,7 +78,7 @@ def nearest_light(grid: SampleGrid, directions: np.ndarray, *, device: str) -> N
     on_rows = np.stack([np.sin(grid.polar), np.cos(grid.polar), corner], axis=1).astype(np.float32)
     east = wp.array(np.sin(azimuth).astype(np.float32).reshape(-1, pack), dtype=float_pack, device=device)
     north = wp.array(-np.cos(azimuth).astype(np.float32).reshape(-1, pack), dtype=float_pack, device=device)
-    lights = wp.array(np.ascontiguousarray(directions, dtype=np.float32), dtype=wp.vec3, device=device)
+    lights = wp.array(directions, dtype=wp.vec3, device=device)
     marked = wp.empty((rows, packs), dtype=pack_type(pack, wp.int32), device=device)
     devices.launch(_nearest_kernel(pack), rows * packs, [wp.array(on_rows, dtype=wp.vec3, device=device), east, north, lights],
                    [marked], device=device)

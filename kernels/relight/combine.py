@@ -42,7 +42,7 @@ def combine(band: Band, weights: np.ndarray) -> wp.array:
     device = band.device
     pack = devices.pack_width(device)
     frame = zeros(band.pixel_count, wp.float32, device, rows=3)
-    on_device = wp.array(np.ascontiguousarray(weights, dtype=np.float32), dtype=wp.float32, device=device)
+    on_device = wp.array(weights, dtype=wp.float32, device=device)
     if device == "cpu":
         chunks = -(-band.packs // CHUNK)
         devices.launch(chunk_kernel(pack), 3 * chunks, [band.values, on_device, chunks], [as_packs(frame, device)], device=device)

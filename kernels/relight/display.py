@@ -37,7 +37,7 @@ def encode(band: Band, gains: np.ndarray, display_from_stack: np.ndarray) -> Ban
     device = band.device
     pack = devices.pack_width(device)
     encoded = zeros(band.pixel_count, wp.float16, device, rows=3 * band.frame_count)
-    on_device = wp.array(np.ascontiguousarray(gains, dtype=np.float32), dtype=wp.float32, device=device)
+    on_device = wp.array(gains, dtype=wp.float32, device=device)
     matrix = wp.mat33(*(float(v) for v in np.asarray(display_from_stack, dtype=np.float32).reshape(-1)))
     packed = as_packs(encoded, device)
     devices.launch(encode_kernel(pack), band.frame_count * band.packs, [band.values, on_device, matrix], [packed], device=device)

@@ -76,10 +76,9 @@ def compare_model(band: Band, surface: Surface, visible: wp.array, direction: np
     sums = wp.empty((2, surface.packs * pack), dtype=wp.float32, device=device)
     devices.launch(_compare_kernel(pack), surface.packs,
                    [band.values, band.frame_count, surface.values, visible,
-                    wp.array(place.astype(np.float32), dtype=wp.vec4, device=device),
-                    wp.array(factor.astype(np.float32), dtype=wp.vec3, device=device),
-                    wp.array(np.ascontiguousarray(neighbours), dtype=wp.vec3i, device=device),
-                    wp.array(np.ascontiguousarray(shares), dtype=wp.vec3, device=device)], [as_packs(sums, device)], device=device)
+                    wp.array(place, dtype=wp.vec4, device=device), wp.array(factor, dtype=wp.vec3, device=device),
+                    wp.array(neighbours, dtype=wp.vec3i, device=device), wp.array(shares, dtype=wp.vec3, device=device)],
+                   [as_packs(sums, device)], device=device)
     return sums
 
 

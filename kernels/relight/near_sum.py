@@ -53,26 +53,22 @@ def sum_near(band: Band, surface: Surface, visible: wp.array, sources: Sources, 
     part = triangles.share[vertex, owner] / np.add.reduceat(triangles.share[vertex, owner], start[:-1])[vertex]
     inward, length = edge_planes(triangles)
     pack = devices.pack_width(device)
-    factor = (scale[:count, None] / irradiance).astype(np.float32)
-    place = np.concatenate([direction, np.zeros((count, 1))], axis=1).astype(np.float32)
+    place = np.concatenate([direction, np.zeros((count, 1))], axis=1)
     weights = wp.zeros((3 * count, surface.packs * pack), dtype=wp.float32, device=device)
     out = wp.empty((6, surface.packs * pack), dtype=wp.float32, device=device)
 
     def upload(values: np.ndarray, dtype: Any) -> wp.array:
-        return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
+        return wp.array(values, dtype=dtype, device=device)
 
-    position = wp.array(np.ascontiguousarray(surface.values.numpy()[12:15].reshape(3, -1)), dtype=wp.float32, device=device)
+    position = wp.array(surface.values.numpy()[12:15].reshape(3, -1), dtype=wp.float32, device=device)
     devices.launch(_weights_kernel, surface.packs * pack,
                    [position, upload(sources.place, wp.vec4), upload(sources.energy, wp.vec3), upload(sources.axis, wp.vec4),
-                    upload(inward.reshape(-1, 3).astype(np.float32), wp.vec3),
-                    upload(length.reshape(-1).astype(np.float32), wp.float32),
-                    upload(triangles.neighbour.reshape(-1).astype(np.int32), wp.int32),
-                    upload(triangles.corner.reshape(-1).astype(np.int32), wp.int32), upload(start.astype(np.int32), wp.int32),
-                    upload(kept[owner].astype(np.int32), wp.int32), upload(part.astype(np.float32), wp.float32), count], [weights],
-                   device=device)
+                    upload(inward.reshape(-1, 3), wp.vec3), upload(length.reshape(-1), wp.float32),
+                    upload(triangles.neighbour.reshape(-1), wp.int32), upload(triangles.corner.reshape(-1), wp.int32),
+                    upload(start, wp.int32), upload(kept[owner], wp.int32), upload(part, wp.float32), count], [weights], device=device)
     devices.launch(_sum_kernel(pack), surface.packs,
-                   [band.values, band.frame_count, surface.values, visible, upload(place, wp.vec4), upload(factor, wp.vec3),
-                    as_packs(weights, device)], [as_packs(out, device)], device=device)
+                   [band.values, band.frame_count, surface.values, visible, upload(place, wp.vec4),
+                    upload(scale[:count, None] / irradiance, wp.vec3), as_packs(weights, device)], [as_packs(out, device)], device=device)
     return out
 
 

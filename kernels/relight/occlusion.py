@@ -35,12 +35,11 @@ def see_lights(place: np.ndarray, pixels: np.ndarray, height: wp.array, mask: wp
         raise ArrayError(f"pixels must be positions from 0 to {mask.shape[0] * mask.shape[1] - 1}, one or more")
     pack = devices.pack_width(device)
     packs = -(-len(pixels) // pack)
-    where = pixels[np.minimum(np.arange(packs * pack), len(pixels) - 1)].astype(np.int32)
+    where = pixels[np.minimum(np.arange(packs * pack), len(pixels) - 1)]
     visible = wp.empty((len(place), packs), dtype=pack_type(pack, wp.uint8), device=device)
     devices.launch(_see_kernel(pack), len(place) * packs,
-                   [wp.array(np.ascontiguousarray(place, dtype=np.float32), dtype=wp.vec4, device=device),
-                    wp.array(where, dtype=wp.int32, device=device), height, mask, projection.perspective, projection.scale,
-                    projection.centre], [visible], device=device, uneven=True)
+                   [wp.array(place, dtype=wp.vec4, device=device), wp.array(where, dtype=wp.int32, device=device), height, mask,
+                    projection.perspective, projection.scale, projection.centre], [visible], device=device, uneven=True)
     return visible
 
 

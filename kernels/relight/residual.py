@@ -37,8 +37,8 @@ def squared_residual(band: Band, gains: np.ndarray, coefficients: np.ndarray, fu
     for name, (array, shape) in wanted.items():
         if array.shape != shape:
             raise ArrayError(f"{name} are {array.shape}, expected {shape}")
-    on_device = wp.array(np.ascontiguousarray(coefficients, dtype=np.float32), dtype=wp.float32, device=device)
-    small = [wp.array(np.ascontiguousarray(a, dtype=np.float32), dtype=wp.float32, device=device) for a in (gains, functions)]
+    on_device = wp.array(coefficients, dtype=wp.float32, device=device)
+    small = [wp.array(a, dtype=wp.float32, device=device) for a in (gains, functions)]
     squares = zeros(band.pixel_count, wp.float32, device, rows=3)
     devices.launch(residual_kernel(pack), 3 * band.packs, [band.values, small[0], as_packs(on_device, device), small[1], low, high],
                    [as_packs(squares, device)], device=device)

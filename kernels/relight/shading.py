@@ -75,7 +75,7 @@ def upload_surface(normal: np.ndarray, diffuse_albedo: np.ndarray, specular: np.
 
 def upload_sources(sources: Sources, device: str) -> SourcesOnDevice:
     """Put samples on the device."""
-    return SourcesOnDevice(*(wp.array(np.ascontiguousarray(values), dtype=dtype, device=device) for values, dtype in
+    return SourcesOnDevice(*(wp.array(values, dtype=dtype, device=device) for values, dtype in
                              zip(sources, (wp.vec4, wp.vec3, wp.vec4, wp.vec3i, wp.vec3), strict=True)))
 
 

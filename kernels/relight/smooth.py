@@ -75,16 +75,16 @@ def locate(grid: SampleGrid, triangles: SphereTriangles, rotation: np.ndarray, *
         device: where; the call waits for it.
     """
     planes, length = edge_planes(triangles)
-    inward = (planes @ rotation).reshape(-1, 3).astype(np.float32)
+    inward = (planes @ rotation).reshape(-1, 3)
     rows, cols = len(grid.polar), len(grid.azimuth)
     runs = -(-cols // RUN)
-    on_rows = np.stack([np.sin(grid.polar), np.cos(grid.polar)], axis=1).astype(np.float32)
-    on_columns = np.stack([np.sin(grid.azimuth), -np.cos(grid.azimuth)], axis=1).astype(np.float32)
+    on_rows = np.stack([np.sin(grid.polar), np.cos(grid.polar)], axis=1)
+    on_columns = np.stack([np.sin(grid.azimuth), -np.cos(grid.azimuth)], axis=1)
     face = wp.empty((rows, cols), dtype=wp.int32, device=device)
     depth = wp.empty((rows, cols), dtype=wp.vec3, device=device)
     inputs = [wp.array(on_rows, dtype=wp.vec2, device=device), wp.array(on_columns, dtype=wp.vec2, device=device),
-              wp.array(inward, dtype=wp.vec3, device=device),
-              wp.array(triangles.neighbour.reshape(-1).astype(np.int32), dtype=wp.int32, device=device), runs]
+              wp.array(inward, dtype=wp.vec3, device=device), wp.array(triangles.neighbour.reshape(-1), dtype=wp.int32, device=device),
+              runs]
     devices.launch(_walk_kernel, rows * runs, inputs, [face, depth], device=device)
     found = face.numpy().reshape(-1)
     share = np.maximum(depth.numpy().reshape(-1, 3), 0) * length[found]

@@ -62,7 +62,7 @@ def refine_edges(decoded: Decoded, frames: Band, bits: Sequence[int], inverses: 
         raise ArrayError(f"the code has {decoded.coordinate.shape[0]} pixels, the frames {frames.pixel_count}: decode the same frames")
     device = frames.device
     number = unwritten(frames.pixel_count, wp.int32, device)
-    rows = wp.array(np.stack([bits, inverses], axis=1).astype(np.int32), dtype=wp.int32, device=device)
+    rows = wp.array(np.stack([bits, inverses], axis=1), dtype=wp.int32, device=device)
     devices.launch(_number_kernel(devices.pack_width(device)), frames.packs, [frames.values, rows], [as_packs(number, device)],
                    device=device)
     coordinate, sigma = (wp.clone(array) for array in decoded[:2])

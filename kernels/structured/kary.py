@@ -74,11 +74,10 @@ def decode_kary(frames: Band, digits: Sequence[int], *, white: int, black: int, 
     if base ** len(digits) > MAX_STRIPES:
         raise ArrayError(f"{len(digits)} digits in base {base} number more than {MAX_STRIPES} stripes: give fewer digits")
     result = unwritten_decoded(frames.pixel_count, frames.device)
-    order = np.array(digits, dtype=np.int32)
     devices.launch(_kary_kernel(devices.pack_width(frames.device), channels), frames.packs,
                    [frames.values, frames.saturated, saturation_masks(frames, [*digits, white, black]),
-                    wp.array(order, dtype=wp.int32, device=frames.device), white, black,
-                    wp.array(expected.astype(np.float32), dtype=wp.float32, device=frames.device), 1 if reflected else 0,
+                    wp.array(digits, dtype=wp.int32, device=frames.device), white, black,
+                    wp.array(expected, dtype=wp.float32, device=frames.device), 1 if reflected else 0,
                     noise.read**2, noise.gain, float(stripe_px), float(extent)],
                    [as_packs(array, frames.device) for array in result], device=frames.device)
     return result

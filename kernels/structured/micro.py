@@ -83,9 +83,8 @@ def decode_micro(frames: Band, numbers: Sequence[int], periods_px: Sequence[floa
     inputs = [as_packs(array, device) for array in (start.phase, start.amplitude, start.offset, start.status)]
     devices.launch(_micro_kernel(pack), frames.packs,
                    [frames.values, frames.saturated, saturation_masks(frames, list(numbers)), *inputs,
-                    wp.array(np.array(numbers, dtype=np.int32)[order], dtype=wp.int32, device=device),
-                    wp.array(table.astype(np.float32), dtype=wp.vec2, device=device),
-                    wp.array(np.stack([np.cos(turns), np.sin(turns)], axis=-1).astype(np.float32), dtype=wp.vec2, device=device),
+                    wp.array(np.array(numbers)[order], dtype=wp.int32, device=device), wp.array(table, dtype=wp.vec2, device=device),
+                    wp.array(np.stack([np.cos(turns), np.sin(turns)], axis=-1), dtype=wp.vec2, device=device),
                     float(reference), float(member.sum()), float(extent), noise.read**2, noise.gain],
                    [as_packs(array, device) for array in (scratch, *result)], device=device)
     return result

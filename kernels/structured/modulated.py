@@ -46,14 +46,12 @@ def decode_modulated(frames: Band, numbers: Sequence[Sequence[int]], *, period_p
     order = [number for row in numbers for number in row]
     require_frames(frames, *order)
     device = frames.device
-    outer, inner = (weights(np.arange(n) / n, period_px).astype(np.float32) for n in (steps, carriers))
+    outer, inner = (weights(np.arange(n) / n, period_px) for n in (steps, carriers))
     rows = [unwritten(frames.pixel_count, dtype, device, rows=1) for dtype in (*[wp.float32] * 4, wp.uint8)]
     devices.launch(_modulated_kernel(devices.pack_width(device)), frames.packs,
-                   [frames.values, frames.saturated, saturation_masks(frames, order),
-                    wp.array(np.array(numbers, dtype=np.int32), dtype=wp.int32, device=device),
+                   [frames.values, frames.saturated, saturation_masks(frames, order), wp.array(numbers, dtype=wp.int32, device=device),
                     wp.array(outer, dtype=wp.vec3, device=device), wp.array(inner, dtype=wp.vec3, device=device),
-                    noise.read**2, noise.gain],
-                   [as_packs(row, device) for row in rows], device=device)
+                    noise.read**2, noise.gain], [as_packs(row, device) for row in rows], device=device)
     return WrappedPhase(*rows, (float(period_px),), frames.pixel_count, device)
 
 

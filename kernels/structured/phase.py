@@ -86,10 +86,8 @@ def decode_phase(frames: Band, numbers: Sequence[int], periods_px: Sequence[floa
     rows = [unwritten(frames.pixel_count, dtype, device, rows=len(periods)) for dtype in (*[wp.float32] * 4, wp.uint8)]
     devices.launch(_phase_kernel(pack, black is not None), frames.packs,
                    [frames.values, frames.saturated, masks,
-                    wp.array(np.array(order, dtype=np.int32), dtype=wp.int32, device=device),
-                    wp.array(np.array(starts, dtype=np.int32), dtype=wp.int32, device=device),
-                    wp.array(np.concatenate(table).astype(np.float32), dtype=wp.vec3, device=device),
-                    black or 0, noise.read**2, noise.gain],
+                    wp.array(order, dtype=wp.int32, device=device), wp.array(starts, dtype=wp.int32, device=device),
+                    wp.array(np.concatenate(table), dtype=wp.vec3, device=device), black or 0, noise.read**2, noise.gain],
                    [as_packs(row, device) for row in rows], device=device)
     return WrappedPhase(*rows, periods, frames.pixel_count, device)
 

@@ -65,7 +65,7 @@ def decode_ramp(frames: Band, *, up: int | None = None, down: int | None = None,
     result = unwritten_decoded(frames.pixel_count, frames.device)
     devices.launch(_ramp_kernel(devices.pack_width(frames.device), pair, black is not None), frames.packs,
                    [frames.values, frames.saturated, saturation_masks(frames, [ramp, other, black]), ramp, other, black or 0,
-                    wp.array(table.astype(np.float32), dtype=wp.float32, device=frames.device), 0 if pair or up is not None else 1,
+                    wp.array(table, dtype=wp.float32, device=frames.device), 0 if pair or up is not None else 1,
                     noise.read**2, noise.gain, float(extent)],
                    [as_packs(array, frames.device) for array in result], device=frames.device)
     return result

@@ -75,8 +75,8 @@ def separate(frames: Band, numbers: Sequence[int], shifts: Sequence[float], *, p
                         unwritten(frames.pixel_count, wp.uint8, device))
     devices.launch(_separation_kernel(pack, black is not None), frames.packs,
                    [frames.values, frames.saturated, saturation_masks(frames, [*numbers, black]),
-                    wp.array(np.array(numbers, dtype=np.int32), dtype=wp.int32, device=device),
-                    wp.array(table.astype(np.float32), dtype=wp.vec3, device=device), black or 0, channels, float(leak)],
+                    wp.array(numbers, dtype=wp.int32, device=device), wp.array(table, dtype=wp.vec3, device=device),
+                    black or 0, channels, float(leak)],
                    [as_packs(array, device) for array in result], device=device)
     return result
 

@@ -211,7 +211,7 @@ def _padded(values: Any, count: int, dtype: Any, device: str) -> wp.array:
     if isinstance(values, wp.array) and values.shape[0] == whole and values.dtype == dtype:
         return values
     padded = wp.zeros(whole, dtype=dtype, device=device)
-    source = values if isinstance(values, wp.array) else wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
+    source = values if isinstance(values, wp.array) else wp.array(values, dtype=dtype, device=device)
     wp.copy(padded, source, count=count)
     return padded
 

@@ -129,7 +129,7 @@ def unwrap_by_code(wrapped: WrappedPhase, coarse: Decoded, *, stripe_px: float, 
 def _inputs(wrapped: WrappedPhase) -> list[Any]:
     rows = [as_packs(array, wrapped.device) for array in (wrapped.phase, wrapped.sigma, wrapped.amplitude, wrapped.status)]
     frequency = 1 / np.array(wrapped.periods_px)
-    return [*rows, wp.array(frequency.astype(np.float32), dtype=wp.float32, device=wrapped.device)]
+    return [*rows, wp.array(frequency, dtype=wp.float32, device=wrapped.device)]
 
 
 @wp.func

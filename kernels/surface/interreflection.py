@@ -44,9 +44,8 @@ def form_factors(points: np.ndarray, normals: np.ndarray, areas: np.ndarray, hei
         raise ArrayError(f"points are {points.shape}, normals {normals.shape}, areas {areas.shape}: give [n, 3], [n, 3] and [n]")
     factors = wp.empty((count, count), dtype=wp.float32, device=device)
     devices.launch(_factor_kernel, count,
-                   [wp.array(points.astype(np.float32), dtype=wp.vec3, device=device),
-                    wp.array(normals.astype(np.float32), dtype=wp.vec3, device=device),
-                    wp.array(areas.astype(np.float32), dtype=wp.float32, device=device), height, mask,
+                   [wp.array(points, dtype=wp.vec3, device=device), wp.array(normals, dtype=wp.vec3, device=device),
+                    wp.array(areas, dtype=wp.float32, device=device), height, mask,
                     projection.perspective, projection.scale, projection.centre], [factors], device=device)
     return factors
 

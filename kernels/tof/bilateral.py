@@ -83,7 +83,7 @@ def smooth(ranges: wp.array, sigma: wp.array, guide: wp.array, status: wp.array,
     falloff = np.exp(-0.5 * (distance[:, None] ** 2 + distance**2) / spatial_px**2)
     devices.launch(smooth_kernel(pack), rows * whole // pack, [
         *(_packs(plane, pack, 1, size - pack + 1) for plane in planes), radius, pitch, whole // pack,
-        wp.array(falloff.astype(np.float32).reshape(-1), dtype=wp.float32, device=device)],
+        wp.array(falloff.reshape(-1), dtype=wp.float32, device=device)],
         [as_packs(array, device) for array in result], device=device)
     return Smoothed(*((array if whole == cols else array[:, :cols].contiguous()).reshape((rows * cols,)) for array in result))
 

@@ -118,10 +118,8 @@ def decode(images: np.ndarray, modulation_hz: Sequence[float] | np.ndarray, refe
     readings, _owner = place(images, device)  # the owner keeps the memory
     outputs = [unwritten(images.shape[1], wp.float32, device, rows=len(frequencies)) for _ in range(6)]
     devices.launch(decode_kernel(devices.pack_width(device)), len(frequencies) * readings.shape[1], [
-        readings,
-        wp.array(order.astype(np.int32), dtype=wp.int32, device=device),
-        wp.array(np.concatenate([[0], np.cumsum(counts)]).astype(np.int32), dtype=wp.int32, device=device),
-        wp.array(basis.astype(np.float32), dtype=wp.float32, device=device),
+        readings, wp.array(order, dtype=wp.int32, device=device),
+        wp.array(np.concatenate([[0], np.cumsum(counts)]), dtype=wp.int32, device=device), wp.array(basis, dtype=wp.float32, device=device),
         float(noise.shot), float(noise.read) ** 2, float("inf") if saturation is None else float(saturation),
     ], [as_packs(array, device) for array in outputs], device=device)
     return Correlation(*outputs, frequencies, counts - LEAST_PHASES)

@@ -10,7 +10,7 @@ from kernels.packs import as_packs, pack_type
 from kernels.status import Status
 from kernels.tof.continuous import Correlation
 from kernels.tof.modulation import radians_per_metre
-from kernels.tof.unwrap import Hypotheses, floats
+from kernels.tof.unwrap import Hypotheses
 
 AGREEMENT_RAD = 0.01
 """Systematic error of a phase that is no sign of multipath: what calibration leaves."""
@@ -64,7 +64,8 @@ def decide(found: Correlation, weighed: Hypotheses, *, light_speed: float, agree
                       for dtype in (wp.float32, wp.float32, wp.float32, wp.int32, wp.int32)))
     devices.launch(decide_kernel(pack), pixels // pack, [
         *(as_packs(array, device) for array in (found.phase, found.sigma, found.evidence)),
-        floats(radians_per_metre(found.modulation_hz, light_speed), device), floats(agree, device), floats(signal, device),
+        *(wp.array(values, dtype=wp.float32, device=device)
+          for values in (radians_per_metre(found.modulation_hz, light_speed), agree, signal)),
         *(as_packs(array, device) for array in (weighed.range, weighed.probability, weighed.sigma)), float(agreement_rad) ** 2,
     ], [as_packs(array, device) for array in result], device=device)
     return result

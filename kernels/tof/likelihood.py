@@ -12,7 +12,6 @@ Source:
     Snyder, "Random Point Processes", 1975, for Poisson counts; the binomial ones are those that Coates (J. Phys. E 1(8), 1968) corrects.
 """
 
-import numpy as np
 import warp as wp
 
 from kernels.tof.pileup import Exposed
@@ -52,8 +51,8 @@ def recorded(exposed: Exposed) -> Recorded:
 def shape(pulse: Pulse, device: str) -> Shape:
     """Return the pulse as the kernels take it."""
     given = Shape()
-    given.cumulative = wp.array(pulse.cumulative.astype(np.float32), dtype=wp.float32, device=device)
-    given.density = wp.array(pulse.density.astype(np.float32), dtype=wp.float32, device=device)
+    given.cumulative = wp.array(pulse.cumulative, dtype=wp.float32, device=device)
+    given.density = wp.array(pulse.density, dtype=wp.float32, device=device)
     given.begin, given.per_step, given.end, given.width = pulse.begin, 1 / pulse.step, pulse.end, pulse.width
     return given
 

@@ -42,7 +42,7 @@ def place(counts: np.ndarray, device: str) -> wp.array:
         raise ArrayError("every histogram is empty: no photon was counted")
     if device == "cpu":  # a thread is one pixel after another: its bins stay together
         return wp.array(values, dtype=wp.float32, device=device).transpose()
-    return wp.array(np.ascontiguousarray(values.T), dtype=wp.float32, device=device)
+    return wp.array(values.T, dtype=wp.float32, device=device)
 
 
 def correct_pileup(counts: wp.array, *, pulses: int) -> Exposed:

@@ -43,7 +43,7 @@ def estimate_pulse(exposed: Exposed, counts: np.ndarray) -> Pulse:
     peak = (total[:, window:] - total[:, :-window]).max(axis=1) - window * np.median(counts, axis=1)
     chosen = np.argsort(-peak, kind="stable")[:WIDTH_PIXELS]
     device = str(exposed.counts.device)
-    some = Exposed(*(wp.array(np.ascontiguousarray(array.numpy()[:, chosen]), dtype=wp.float32, device=device)
+    some = Exposed(*(wp.array(array.numpy()[:, chosen], dtype=wp.float32, device=device)
                      for array in (exposed.counts, exposed.awake)), exposed.pulses)
     totals = []
     for width in WIDTHS:

@@ -63,15 +63,10 @@ def unwrap(found: Correlation, *, nearest_m: float, farthest_m: float, light_spe
     shapes = (HYPOTHESES, pixels), (HYPOTHESES, pixels), (pixels,), (len(per_metre), pixels)
     ranges, probability, sigma, scratch = (wp.empty(shape, dtype=wp.float32, device=device) for shape in shapes)  # the kernel writes all
     devices.launch(unwrap_kernel(pack), pixels // pack, [
-        as_packs(found.phase, device), as_packs(found.sigma, device), floats(per_metre, device), int(np.floor(nearest_m / wave)) - 1,
-        int(np.ceil(farthest_m / wave)), float(nearest_m), float(farthest_m), as_packs(scratch, device)],
-        [as_packs(array, device) for array in (ranges, probability, sigma)], device=device)
+        as_packs(found.phase, device), as_packs(found.sigma, device), wp.array(per_metre, dtype=wp.float32, device=device),
+        int(np.floor(nearest_m / wave)) - 1, int(np.ceil(farthest_m / wave)), float(nearest_m), float(farthest_m),
+        as_packs(scratch, device)], [as_packs(array, device) for array in (ranges, probability, sigma)], device=device)
     return Hypotheses(ranges, probability, sigma, float(wave))
-
-
-def floats(values: Any, device: Any) -> wp.array:
-    """Return a small table on the device, float32."""
-    return wp.array(np.asarray(values, dtype=np.float32), dtype=wp.float32, device=device)
 
 
 @wp.func

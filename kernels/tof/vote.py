@@ -68,18 +68,12 @@ def _vote_kernel(first: int,
                  after: wp.array2d(dtype=wp.float32)):  # [3, pixel]
     p = first + wp.tid()
     if before[0, p] >= CERTAIN:
-        after[0, p] = before[0, p]
-        after[1, p] = before[1, p]
-        after[2, p] = before[2, p]
+        for n in range(HYPOTHESES):
+            after[n, p] = before[n, p]
     elif before[0, p] + before[1, p] + before[2, p] > 0.0:
         r = p // cols
         c = p - r * cols
-        d0 = ranges[0, p]
-        d1 = ranges[1, p]
-        d2 = ranges[2, p]
-        s0 = float(0.0)
-        s1 = float(0.0)
-        s2 = float(0.0)
+        support = wp.vec3()
         voters = float(0.0)
         for i in range(wp.max(r - VOTE_RADIUS, 0), wp.min(r + VOTE_RADIUS + 1, rows)):
             for j in range(wp.max(c - VOTE_RADIUS, 0), wp.min(c + VOTE_RADIUS + 1, cols)):
@@ -88,16 +82,13 @@ def _vote_kernel(first: int,
                     for k in range(HYPOTHESES):
                         w = before[k, q]
                         if w > 1.0e-3:
-                            d = ranges[k, q]
                             voters += w
-                            s0 += w * nearness(d - d0, inverse)
-                            s1 += w * nearness(d - d1, inverse)
-                            s2 += w * nearness(d - d2, inverse)
+                            for n in range(HYPOTHESES):
+                                support[n] += w * nearness(ranges[k, q] - ranges[n, p], inverse)
         prior = STRANGER * wp.max(voters, 1.0)
-        a0 = before[0, p] * (prior + s0)
-        a1 = before[1, p] * (prior + s1)
-        a2 = before[2, p] * (prior + s2)
-        share = 1.0 / (a0 + a1 + a2)
-        after[0, p] = a0 * share
-        after[1, p] = a1 * share
-        after[2, p] = a2 * share
+        odds = wp.vec3()
+        for n in range(HYPOTHESES):
+            odds[n] = before[n, p] * (prior + support[n])
+        share = 1.0 / (odds[0] + odds[1] + odds[2])
+        for n in range(HYPOTHESES):
+            after[n, p] = odds[n] * share

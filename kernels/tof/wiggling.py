@@ -53,7 +53,7 @@ def straighten(found: Correlation, table: np.ndarray) -> Correlation:
     device = found.phase.device
     straight = wp.zeros_like(found.phase)
     devices.launch(_straighten_kernel, found.phase.shape[1],
-                   [found.phase, wp.array(np.ascontiguousarray(table, dtype=np.float32), dtype=wp.float32, device=device)], [straight],
+                   [found.phase, wp.array(table, dtype=wp.float32, device=device)], [straight],
                    device=str(device))
     return found._replace(phase=straight)
 
