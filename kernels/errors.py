@@ -1,4 +1,4 @@
-"""Errors of the kernels floor.
+"""Errors of the kernels package.
 
 KernelError
 ├── ArrayError     an argument has the wrong shape, type or values; raised before any launch

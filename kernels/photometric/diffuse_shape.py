@@ -15,18 +15,18 @@ from kernels.photometric.hypotheses import Diffuse, SearchOptions, search_normal
 from kernels.photometric.samples import Samples
 
 ROUGHNESSES = (-1.0, 0.05, 0.2, 0.35, 0.5, 0.65, 0.8)
-"""Roughnesses of Burley's lobe that are tried; below 0: Lambert's."""
+"""Roughnesses of Burley's lobe that are tried; the value below 0 stands for Lambert's lobe."""
 SLOPES = (-0.3, -0.2, -0.1, 0.0, 0.1)
-"""Further slope of the lobe."""
+"""Slopes of the lobe's further factor that are tried."""
 REFINEMENT = 0.5
-"""Second look: half a step about the best of the first."""
+"""Step of the second search, about the best shape of the first, as a fraction of the first search's step."""
 NEARBY = (((2.0, 4.0, 7.0), 14), (((0.9, 1.8), 8),))
-"""Rings that follow a changed shape from the normals of Lambert's: a few degrees."""
+"""Rings of a search that starts from the normals found under Lambert's lobe: another shape moves normals by a few degrees."""
 
 
 def choose_diffuse(samples: Samples, start: np.ndarray, *,
                    options: SearchOptions | None = None) -> tuple[Diffuse, np.ndarray]:
-    """Choose the shape under which the sampled pixels cost least.
+    """Return the shape under which the sampled pixels have the least cost.
 
     Args:
         samples: some hundreds of pixels, spread over the object.

@@ -18,14 +18,14 @@ from kernels.photometric.moments import Moments
 from kernels.status import DARK, ILL_POSED, OK
 
 MIN_LENGTH = 0.05
-"""Least (3/2)|M|/M₀: below, the pixel is as bright from every side and the direction of M is noise."""
+"""Least (3/2)|M|/M₀ of a diffuse pixel: below it the pixel is equally bright from every side and the direction of M is noise."""
 MAX_LENGTH = 1.5
-"""Largest: (3/2)|M|/M₀ of light from one direction alone; above, the readings contradict each other."""
+"""Largest (3/2)|M|/M₀, that of light from a single direction: above it the readings contradict each other."""
 PRIOR_GRADIENT_RESIDUAL = 0.01
-"""One pseudo-observation with this residual, relative to M₀: four readings leave no residual, yet are not certain. Smaller than
-that of single lights, because a gradient's reading is a mean over every lamp."""
+"""Residual, relative to M₀, of one pseudo-observation that is added because four readings leave no residual, yet have noise. It is smaller
+than that of single lights, because a gradient's reading is a mean over every lamp."""
 ROUNDING = 2.0**-12
-"""Relative rounding of a half reading: what the length of M may be off by although the fit leaves no residual."""
+"""Relative rounding of a half reading: it may change the length of M although the fit leaves no residual."""
 
 
 class GradientFit(NamedTuple):

@@ -8,7 +8,7 @@ roughness, a better angle, and so on; then F₀ = (M₀ - B)/A in each channel.
 
 Source: the responses are those of Ma et al. 2007, section 3.2; the inversion of a lobe's moments for its width as in Ghosh et
 al., "Estimating Specular Roughness and Anisotropy from Second Order Spherical Gradient Illumination", EGSR 2009, here from the
-first order and for the contract's lobe.
+first order and for the lobe of Relit's BRDF.
 """
 
 from functools import cache
@@ -22,26 +22,28 @@ from kernels.packs import zeros
 from kernels.photometric.separation import SeparatedMoments, upload_view
 
 MIN_HIGHLIGHT = 0.01
-"""Least specular over diffuse response: half rounding of the readings alone leaves a tenth of it."""
+"""Least ratio of the specular to the diffuse response: rounding to half of the readings alone causes a tenth of it."""
 MIN_LOBE, MAX_LOBE = 0.1, 1.1
-"""|M|/M₀ of a highlight: 1 for a mirror, near 0.6 for the roughest lobe; outside these it is noise."""
+"""Least and largest |M|/M₀ of a highlight: a mirror has 1, the roughest lobe about 0.6, and values outside are noise."""
 MIN_HALFWAY = 0.02
-"""Least |r + v|: a mirror direction opposite the view is beyond grazing."""
+"""Least |r + v| of a mirror direction r and the view v: a mirror direction opposite the view is beyond grazing."""
 ROUNDS = 10
-"""Rounds of angle and roughness in turn: each leaves at most half of the error of the angle, for the roughest lobe."""
+"""Rounds in which angle and roughness are updated in turn: each leaves at most half of the angle's error, for the roughest lobe."""
 BISECTIONS = 10
-"""Steps of the bisection for the roughness, to 2⁻¹⁰ of its range."""
+"""Steps of the bisection for the roughness, down to 2⁻¹⁰ of its range."""
 
 
 MIN_ROUGHNESS, MAX_ROUGHNESS = 0.05, 1.0
-"""Below, a lobe under a gradient is a mirror to four digits."""
+"""Range of roughness in the table: below it, a lobe under a gradient equals a mirror to four digits."""
 MAX_ANGLE = np.radians(85.0)
-"""Between normal and view; beyond, a pixel's width covers every angle."""
+"""Largest angle between normal and view in the table, radians: beyond it, one pixel's width covers every angle."""
 ROUGHNESS_STEPS, ANGLE_STEPS = 39, 69
-"""Steps of 0.025 and 1.25°: linear interpolation is then good to 0.003 of a response."""
+"""Numbers of table entries over roughness and angle, 0.025 and 1.25° apart: linear interpolation then errs by at most 0.003 of a
+response."""
 _NODES, _TURNS = 40, 48
+"""Numbers of integration nodes over the half vector's u and over half a turn."""
 _ANGLE_CHUNK = 6
-"""Angles of view integrated at one time: bounds the memory."""
+"""Number of view angles that are integrated at one time: it bounds the memory."""
 
 
 class Highlights(NamedTuple):
@@ -184,7 +186,7 @@ def _look_up(table: wp.array(dtype=_Row), roughness: float, angle: float) -> _Ro
 
 @wp.func
 def _vector_at(row: _Row, s0: float) -> wp.vec2:
-    # (Mx, Mz) of the lobe of which M₀ is s0
+    # (Mx, Mz) of the lobe whose M₀ is s0
     f0 = wp.max((s0 - row[3]) / wp.max(row[0], 1.0e-6), 0.0)
     return wp.vec2(f0 * row[1] + row[4], f0 * row[2] + row[5]) / wp.max(f0 * row[0] + row[3], 1.0e-12)
 

@@ -1,11 +1,11 @@
 """Normals by hypothesis and test: each candidate normal is judged by how well a non-negative mixture of lobes explains the
 readings.
 
-For a candidate the readings are expected to be Σ x_k f_k(l), x ≥ 0, with f_0 a diffuse lobe and the others GGX lobes of fixed
-widths. The mixture is fitted by re-weighted non-negative least squares with Cauchy weights relative to the noise σ = s0 + s1 ·
-reading, and the candidate's cost is Σ log(1 + r²/σ²) over the lights. A light that reads far below its prediction is in cast
-shadow, which costs a fixed sum: any normal may be shadowed, none may be brighter than its lobes. Candidates are rings about the
-best normal so far, coarse to fine.
+For a candidate the readings are expected to be Σ x_k f_k(l), x ≥ 0, with f_0 a diffuse lobe and the others GGX lobes of fixed widths. The
+mixture is fitted by re-weighted non-negative least squares with Cauchy weights relative to the noise σ = s0 + s1 · reading, and the
+candidate's cost is Σ log(1 + r²/σ²) over the lights. A light that reads far below its prediction is in cast shadow, which has a fixed cost:
+any candidate may be shadowed, but no reading may be brighter than the lobes of the candidate. Candidates are rings about the best normal so
+far, coarse to fine.
 
 Source: hypothesised normals after Hui and Sankaranarayanan, "Shape and spatially-varying reflectance estimation from virtual
 exemplars", TPAMI 2017; here with analytic lobes in place of measured materials, and robust.
@@ -27,7 +27,7 @@ from kernels.photometric.samples import Samples, per_pixel, to_host
 from kernels.photometric.tabulated_lobes import tabulated_lobes
 
 SHADOW_TRUST = 0.1
-"""Weight that a reading of zero, or far below its prediction, keeps in the fit: it bounds the radiance and hardly measures it."""
+"""Weight in the fit of a reading that is zero or far below its prediction: such a reading bounds the radiance and hardly measures it."""
 LEAST_NZ = 0.02
 """Least cosine between a candidate and the viewer: a visible surface faces the viewer."""
 
@@ -37,9 +37,9 @@ class Diffuse:
     """Shape of the diffuse lobe, shared by the pixels of a material."""
 
     rough: float = -1.0
-    """Roughness of Burley's lobe, 0…1; below 0: Lambert's."""
+    """Roughness of Burley's lobe, 0…1; a value below 0 selects Lambert's lobe."""
     slope: float = 0.0
-    """Further factor 1 + slope · (1 - n·l)."""
+    """Slope s of a further factor 1 + s · (1 - n·l)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,17 +47,17 @@ class SearchOptions:
     """How candidates are judged."""
 
     noise_floor: float = 0.1
-    """s0, relative to the pixel's level: what the lobes cannot explain on a good pixel."""
+    """Noise s0 of every reading, relative to the pixel's level: it covers the part of a good pixel that the lobes cannot explain."""
     noise_slope: float = 0.02
-    """s1: relative noise of bright readings."""
+    """Relative noise s1 of bright readings."""
     reweightings: int = 5
-    """Rounds of the robust fit; three lose 0.1° on real data."""
+    """Rounds of the robust fit; with three, normals are 0.1° worse on real data."""
     sweeps: int = 12
     """Coordinate sweeps of each non-negative solve."""
     shadow_cost: float = 1.0
-    """What a cast shadow costs, in units of the cost of a residual (1.0: of 1.3 σ)."""
+    """Cost of a reading that counts as cast shadow; 1.0 is the cost of a residual of 1.3 σ."""
     shadow_depth: float = 0.3
-    """A reading below this fraction of its prediction may be a cast shadow."""
+    """Fraction of its prediction below which a reading may be a cast shadow."""
 
 
 def criteria(options: SearchOptions, shape: Diffuse) -> list[Any]:
@@ -67,9 +67,9 @@ def criteria(options: SearchOptions, shape: Diffuse) -> list[Any]:
 
 
 WIDE = ((5.0, 10.0, 16.0, 24.0, 34.0, 46.0), 30)
-"""First rings, degrees from the start, and how many candidates the last one has."""
+"""Radii of the first rings about the start, degrees, and the number of candidates on the last of them."""
 FINE = (((2.5, 5.0), 10), ((0.9, 1.8), 8), ((0.4,), 6), ((0.2,), 6), ((0.06,), 6))
-"""The rings that follow, each about the best so far."""
+"""Radii, in degrees, and candidates of the rings that follow, each about the best candidate so far."""
 
 
 class Search(NamedTuple):

@@ -9,14 +9,14 @@ import warp as wp
 from kernels.status import DARK, ILL_POSED, OK, TOO_FEW_LIGHTS
 
 MIN_DETERMINANT = 1.0e-6
-"""Least 27·det(G)/tr(G)³ (1 for evenly spread lights): lights within about one degree of a point fall below."""
+"""Least 27·det(G)/tr(G)³, which is 1 for evenly spread lights: lights within about one degree of a point have less."""
 MIN_OFF_CIRCLE = 7.6e-5
 """Least det(g) over the sum of its principal minors, g = G/tr(G): the mean square sine by which lights leave a great circle, here
 half a degree. Float32 sums leave up to 1e-7 of exactly coplanar lights, and noise leaves nothing of such a normal."""
 MIN_EXPLAINED = 1.0e-6
-"""Least part of Σ w y² that b·l explains: below, as bright from every side, the readings have no direction."""
+"""Least part of Σ w y² that b·l explains: a pixel with less is equally bright from every side, and its readings give no direction."""
 PRIOR_RESIDUAL = 0.05
-"""One pseudo-observation with this residual, relative to |b|: three lights leave no residual, yet are not certain."""
+"""Residual, relative to |b|, of one pseudo-observation that is added because three lights leave no residual, yet have noise."""
 CONFIDENCE_HALF = 0.01745329
 """Standard error of the normal, radians (one degree), at which confidence is one half."""
 

@@ -1,5 +1,4 @@
-"""Readings that the search and the material fit expect under a light: parts that their kernels close over, here for lights of one
-direction.
+"""Readings that the normal search and the material fit expect under lights of one direction each: Warp functions that their kernels call.
 
 `tabulated_lobes` has the same parts for lights of any extent, looked up in a table, so that one kernel body serves both.
 """
@@ -15,12 +14,13 @@ from kernels.packs import pack_type
 LOBES = (0.08, 0.15, 0.25, 0.4, 0.6)
 """Widths α of the GGX lobes of the mixture: roughness 0.28 to 0.77, a factor of 1.5 to 2 apart, as wide as the lobes are."""
 MIXTURE = 1 + len(LOBES)
+"""Number of lobes in the mixture: the diffuse one and the GGX lobes."""
 MIXTURE_F0 = 0.04
-"""Reflectance at normal incidence whose Fresnel rise the lobes have; readings at grazing half vectors hardly tell it."""
+"""Reflectance at normal incidence that the Fresnel rise of the lobes assumes: readings at grazing half vectors hardly depend on it."""
 LOBE_SCALE = 0.1 / MIXTURE_F0
-"""Scale of the GGX lobes beside the diffuse one, so that their weights are of one order."""
+"""Scale of the GGX lobes relative to the diffuse one, chosen so that their weights are of one order of magnitude."""
 GEOMETRY = 2
-"""Scratch beside the lobes for each light: 1 / |l + v| and (1 - h·v)⁵."""
+"""Number of values that the scratch memory holds for each light besides the lobes: 1 / |l + v| and (1 - h·v)⁵."""
 
 
 class Lobes(NamedTuple):
@@ -101,7 +101,7 @@ def direction_lobes(lanes: int) -> Lobes:
 
 @cache
 def direction_reflectance(lanes: int) -> Reflectance:
-    """Return the contract's BRDF under lights of one direction each."""
+    """Return Relit's BRDF under lights of one direction each."""
     lane_type = pack_type(lanes, wp.float32)
 
     @wp.func

@@ -1,4 +1,4 @@
-"""Material of pixels with known normals: diffuse albedo, F0 and roughness of the contract's BRDF, by a search over roughness.
+"""Material of pixels with known normals: diffuse albedo, F0 and roughness of Relit's BRDF, by a search over roughness.
 
 For each roughness the readings of a channel are linear in albedo ρ and F0: y = ρ f_d + F0 (1 - s) f_s + s f_s, with f_d the
 diffuse lobe, f_s the GGX lobe without Fresnel and s Schlick's rise; both are fitted by re-weighted non-negative least squares.
@@ -30,20 +30,20 @@ from kernels.photometric.samples import Samples, per_pixel, to_host
 from kernels.photometric.tabulated_lobes import tabulated_reflectance
 
 NEUTRAL_RISE = 1.25
-"""A shared F0 of the channels may cost this much more than one each: coloured metals rise at least 1.3 fold and mostly several fold,
-dielectrics hardly at all (95 % of their pixels below 1.1)."""
+"""Factor by which the cost may rise when the channels share one F0: on coloured metals it rises at least 1.3 fold and mostly several fold,
+on dielectrics hardly at all (95 % of their pixels below 1.1)."""
 BRIGHTEST_DIELECTRIC = 0.2
-"""F0 of diamond is 0.17, and no coat is brighter: what shines more is a metal."""
+"""Largest F0 of a dielectric: that of diamond is 0.17, and no coat is brighter, so that a surface with more is a metal."""
 METAL_DIFFUSE = 0.25
-"""Metals have no diffuse reflection; dirt and light from around may look like this part of their F0. With more of it, a bright lobe
-stands for what the diffuse one misses, at the rim above all."""
+"""Largest diffuse albedo of a metal, as a fraction of its F0. A metal has no diffuse reflection, but dirt and interreflection may look like
+this much; with more, a bright lobe replaces what the diffuse one misses, above all at the rim."""
 SHARED_RISE = 1.4
-"""A material shared with other pixels may cost this much more than one of a pixel's own."""
+"""Factor by which the cost of a shared material may exceed that of the pixel's own material."""
 COST_FLOOR = 0.005
-"""Costs closer than this are alike: a residual of 0.07 σ at every light."""
+"""Costs per light whose difference is below this count as equal: it is the cost of a residual of 0.07 σ at every light."""
 BLEND = 0.02
-"""Shared materials mix by exp(-(cost - best) / (blend · (best + floor))): those that explain a pixel within a few per cent of the
-best."""
+"""Temperature of the mixture of shared materials, whose weights are exp(-(cost - best) / (blend · (best + floor))): materials whose cost is
+within a few per cent of the best contribute."""
 
 
 class Material(NamedTuple):
@@ -78,7 +78,7 @@ def fit_material(samples: Samples, normal: np.ndarray, *, shape: Diffuse, option
     """
     options = options or SearchOptions()
     tinted = _fit(samples, normal, shape, options, table, TINTED)
-    bound = BRIGHTEST_DIELECTRIC if table is None else 1.0  # extended lights show the whole of a lobe: nothing is left to guess
+    bound = BRIGHTEST_DIELECTRIC if table is None else 1.0  # extended lights show the whole lobe, so that F0 needs no bound
     neutral = _fit(samples, normal, shape, options, table, NEUTRAL, np.full(4, bound))
     metal = neutral.cost > NEUTRAL_RISE * tinted.cost + COST_FLOOR
     if table is None:
@@ -129,12 +129,12 @@ def _fit(samples: Samples, normal: np.ndarray, shape: Diffuse, options: SearchOp
 
 
 def _where(first: np.ndarray, a: Material, b: Material) -> Material:
-    """`a` where asked for, else `b`."""
+    """Return the first material where `first` is true, else the second."""
     return Material(*(np.where(first if x.ndim == 1 else first[:, None], x, y) for x, y in zip(a, b, strict=True)))
 
 
 def _blend(fits: list[Material]) -> Material:
-    """Mean of fits, each weighted by how close its cost is to the pixel's best; the cost is the best one."""
+    """Return the mean of the fits, each weighted by how close its cost is to the pixel's best; the cost returned is the best one."""
     costs = np.stack([fit.cost for fit in fits])
     best = costs.min(axis=0)
     weights = np.exp(-(costs - best) / (BLEND * (best + COST_FLOOR)))

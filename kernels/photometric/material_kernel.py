@@ -11,21 +11,23 @@ from kernels.photometric.hypotheses import SHADOW_TRUST
 from kernels.photometric.lobes import Reflectance
 
 ROUGHNESS_FIRST, ROUGHNESS_STEP, ROUGHNESS_COUNT = 0.1, 0.075, 13
-"""Grid of roughness, 0.1 to 1; below 0.1 a lobe is narrower than lights of any rig are apart."""
+"""First value, step and length of the grid of roughness, 0.1 to 1: a lobe below 0.1 is narrower than the spacing of the lights of any
+rig."""
 HALVINGS = 3
-"""Halvings of the step about the best: to a resolution of 0.01."""
+"""Number of times that the step about the best roughness is halved: to a resolution of 0.01."""
 REWEIGHTINGS = 4
 """Rounds of the robust fit at each roughness."""
 COMMON_ROUNDS = 3
-"""Turns in which it settles which channels have albedo above 0, where the three share one F0."""
+"""Rounds of the fit of an F0 that the channels share. Each round fixes which channels have an albedo above 0; after three this no longer
+changes."""
 
 
 TINTED = wp.constant(0)
-"""F0 of each channel and the roughness are free, as on metals."""
+"""Fit mode with free roughness and an own F0 for each channel, as metals need."""
 NEUTRAL = wp.constant(1)
-"""One F0 up to a bound, and roughness: dielectrics, whose highlights have the colour of the light."""
+"""Fit mode with free roughness and one F0 up to a bound, for dielectrics, whose highlights have the colour of the light."""
 GIVEN = wp.constant(2)
-"""Nothing: F0 and roughness are given, and albedo alone is fitted."""
+"""Fit mode in which F0 and roughness are given and the albedo alone is fitted."""
 
 
 @wp.func
@@ -153,7 +155,7 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
                     for k in range(lanes):
                         common = float(0.0)
                         for _ in range(wp.where(freedom == NEUTRAL, COMMON_ROUNDS, 0)):
-                            # a channel with albedo above 0 leaves to F0 what its diffuse lobe cannot explain, others leave all
+                            # F0 explains what the diffuse lobe cannot in channels with albedo above 0, and everything in the others
                             top, bottom, whole = float(0.0), float(0.0), float(0.0)
                             for c in range(3):
                                 shared = wp.where(rd[c, k] > common * ds[c, k], ds[c, k] / wp.max(dd[c, k], 1.0e-20), 0.0)

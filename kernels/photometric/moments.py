@@ -21,9 +21,10 @@ from kernels.packs import Band, channels_type, pack_type, zeros
 from kernels.status import DARK, OK, TOO_FEW_LIGHTS
 
 LARGEST_HALF = 65504.0
-"""The largest half: a stored value above it, or one that does not compare, is not a number that was measured."""
+"""Largest half: a stored value above it, or a NaN, was not measured."""
 MIN_PIVOT = 0.1
-"""What elimination leaves of M₀'s equation: at least 1/2 (a pair of opposites, or a full frame), 0 when it is not determined."""
+"""Least pivot of M₀'s equation after elimination: it is at least 1/2 with a pair of opposite gradients or a full frame, and 0 when M₀ is
+not determined."""
 
 
 class Moments(NamedTuple):

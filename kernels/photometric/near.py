@@ -20,7 +20,8 @@ from kernels.packs import Band, pack_type
 from kernels.photometric.readings import Readings
 
 LEAST_LOBE = 0.01
-"""Below this part of the radiation along its axis a light gives no reading: noise would be raised a hundredfold."""
+"""Least radiation towards a point, relative to that along the light's axis, at which the light gives a reading: less would amplify the
+noise a hundredfold."""
 
 
 class Places(NamedTuple):

@@ -16,9 +16,9 @@ from kernels.errors import ArrayError
 from kernels.packs import Band, pack_type
 
 UNIT_TOLERANCE = 1e-3
-"""How far a light direction's length may be from one."""
+"""Largest difference of a light direction's length from one."""
 LARGEST = 1.0e15
-"""A grey reading above this counts as infinite: the solvers square readings and add them up in float32."""
+"""Grey reading above which a reading counts as infinite: the solvers square readings and add them up in float32."""
 
 
 class Lights(NamedTuple):

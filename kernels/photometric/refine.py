@@ -1,7 +1,7 @@
 """Joint refinement of normal, roughness, albedo and F0 by Levenberg-Marquardt, on readings that one GGX lobe explains.
 
 The search's mixture of fixed lobes is safe on surfaces of any kind, and as coarse as its lobes: on a surface whose one lobe is that of
-the contract's BRDF, a metal above all, that lobe with the roughness of the pixel is sharper. So the whole model is fitted from
+Relit's BRDF, a metal above all, that lobe with the roughness of the pixel is sharper. So the whole model is fitted from
 where the search ended: two tilts of the normal and the roughness by Gauss-Newton steps on the readings re-weighted as in the search,
 with the six linear unknowns, albedo and F0 of three channels, eliminated from every step (variable projection).
 
@@ -25,13 +25,15 @@ from kernels.photometric.samples import Samples, per_pixel, to_host
 LINEAR_TURNS = 4
 """Rounds of the robust linear fit before the first step."""
 STEPS = 12
-"""Steps, those that are taken back included."""
+"""Number of steps, including those that are undone."""
 TILT, BEND = 0.002, 0.01
-"""Differences of normal, radians, and of roughness, from which derivatives are taken."""
+"""Finite differences of the normal, radians, and of the roughness, from which derivatives are taken."""
 LONGEST_TILT, LONGEST_BEND = 0.05, 0.1
-"""Largest change in one step."""
+"""Largest change of the normal, radians, and of the roughness in one step."""
 DAMPING, DAMPING_UP, DAMPING_DOWN = 0.01, 8.0, 0.3
+"""Initial damping of Levenberg-Marquardt, and the factors on it after a step that raised and one that lowered the cost."""
 LEAST_ROUGHNESS = 0.05
+"""Least roughness: a narrower lobe falls between the lights of any rig."""
 
 
 class Refinement(NamedTuple):

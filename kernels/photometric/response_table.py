@@ -29,24 +29,27 @@ from kernels.microfacet import INVERSE_PI, ggx, schlick
 from kernels.packs import pack_type
 
 GRID = 96
-"""Nodes of a side: 0.9° apart at the pole, at most 1.7°, so that a lamp 15° across is tabulated to 0.3 % of its peak."""
+"""Nodes along a side of the table: 0.9° apart at the pole and at most 1.7°, so that a lamp 15° across is tabulated to 0.3 % of its peak."""
 WIDTH_COUNT = 10
+"""Number of GGX widths in the table."""
 NARROWEST, WIDTH_RATIO = 1 / 15, 15.0 ** (1 / (WIDTH_COUNT - 1))
-"""GGX widths α of the table, from 0.067 (narrower ones fall between the samples of a source at grazing angles) to 1 in even
-ratios."""
+"""Narrowest GGX width α of the table and the ratio of each width to the one before, from 0.067 to 1: a narrower lobe falls between the
+samples of a source at grazing angles."""
 WIDTHS = tuple(NARROWEST * WIDTH_RATIO**j for j in range(WIDTH_COUNT))
+"""GGX widths α of the table, ascending."""
 MIRROR_ALPHA = 0.01
-"""Width that the mirror stands at: roughness 0.1, where an extended light can no longer tell."""
+"""Width α that the mirror stands for: roughness 0.1, below which an extended light no longer resolves the lobe."""
 SEARCH_WIDTHS = (2, 4, 6)
-"""Which of WIDTHS the mixture of the search has beside the mirror, α = 0.12, 0.22 and 0.41: over a wide light a narrower lobe is
-a sum of the mirror's and the next, and a wider one of the last and the diffuse one."""
+"""Indices in WIDTHS of the lobes that the mixture of the search has besides the mirror, α = 0.12, 0.22 and 0.41. Over a wide light a
+narrower lobe is a sum of the mirror's and the next, and a wider one of the last and the diffuse one."""
 SPECULAR_SCALE = 0.1
-"""Scale of a specular lobe of the search beside the diffuse one, so that their weights are of one order."""
+"""Scale of the specular lobes of the search relative to the diffuse one, so that their weights are of one order of magnitude."""
 COLUMNS = 3 + 2 * WIDTH_COUNT
+"""Number of columns: one for Lambert's lobe, and A and B of the mirror and of each width."""
 SEARCH_LOBES = 2 + len(SEARCH_WIDTHS)
-"""Diffuse, mirror, GGX lobes."""
+"""Number of lobes of the search: diffuse, mirror and the GGX lobes."""
 LEAST_NZ = 0.02
-"""Cosine to the viewer of the nodes at the rim."""
+"""Least cosine between a node's normal and the viewer; the nodes at the rim are raised to it."""
 JOIN = 0.36
 """Variance of a mirrored sample over its solid angle: Gaussians 0.6 of a lattice step wide add up to a constant within 0.2 %."""
 MIRROR_SPREAD = 0.026

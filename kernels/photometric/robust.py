@@ -23,25 +23,28 @@ from kernels.photometric.near import NearLights, directions_in
 from kernels.photometric.readings import Readings
 
 BRIGHT_FRACTION = 0.1
-"""The bright end of a pixel is the reading that this fraction of the lights exceed: above single highlights."""
+"""Fraction of the lights whose readings exceed the bright end of a pixel, so that single highlights lie above it."""
 SHADOW_FRACTION = 0.1
-"""Readings under this fraction of the bright end are shadow, attached or cast."""
+"""Fraction of the bright end below which a reading is in shadow, attached or cast."""
 DARK_RANKS = 0.2
 """Fraction of the lit lights set aside at the dark end."""
 BRIGHT_RANKS = 0.3
 """Fraction of the lit lights set aside at the bright end."""
 KEPT_AT_LEAST = 8
-"""Ranks are set aside only while this many lights stay: fewer determine the normal too loosely."""
+"""Least number of lights that are kept when ranks are set aside: fewer determine the normal too loosely."""
 CAUCHY_SCALE = 0.05
-"""Residual, relative to |b|, at which a reading's weight is halved; relative noise of a good capture is below it."""
+"""Residual, relative to |b|, at which a reading's weight is halved; the relative noise of a good capture is below it."""
 REWEIGHTINGS = 5
-"""Rounds of re-weighting; the normal moves under 0.01° after five on real data."""
+"""Rounds of re-weighting; after five, the normal moves by less than 0.01° on real data."""
 RANGE = 2.0**-26
-"""Least value that the bright end can have, as a part of the brightest reading. A lamp mirrored in black is 2²⁰ times brighter."""
+"""Least value that the bright end can have, as a part of the brightest reading: a lamp mirrored in a black surface is 2²⁰ times brighter
+than it."""
 HALVINGS_OF_RATIO = 6
-"""Steps that halve the ratio between the bounds of a rank's value: 2²⁶ becomes 1.33, whatever the highlight."""
+"""Bisection steps that halve the logarithm of the ratio between the bounds of a rank's value: 2²⁶ becomes 1.33, however bright the
+highlight."""
 BISECTIONS = 18
-"""Steps in all; the others halve the difference, and find the value to a relative 10⁻⁴, under the rounding of half values."""
+"""Number of all bisection steps. Those after HALVINGS_OF_RATIO halve the difference and find the value to a relative 10⁻⁴, below the
+rounding of half values."""
 
 
 def solve_robust(band: Band, readings: Readings, directions: np.ndarray, near_lights: NearLights | None = None) -> NormalFit:
@@ -64,13 +67,14 @@ def solve_robust(band: Band, readings: Readings, directions: np.ndarray, near_li
 
 @wp.func
 def middle_of(low: float, high: float, step: int) -> float:
-    """Return where step number `step` of a bisection divides the range: the geometric mean first, lest a highlight take all steps."""
+    """Return where a bisection divides the range at step `step`: the first steps take the geometric mean, so that a highlight does not use
+    up all of them."""
     return wp.where(step < HALVINGS_OF_RATIO, wp.sqrt(low) * wp.sqrt(high), 0.5 * (low + high))
 
 
 @wp.func
 def halve(middle: float, above: bool, low: wp.ref[float], high: wp.ref[float]):
-    """Keep the part of the range above its middle, or the part below."""
+    """Keep the part of the range above its middle where `above` is true, else the part below."""
     low = wp.where(above, middle, low)
     high = wp.where(above, high, middle)
 

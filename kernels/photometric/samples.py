@@ -13,9 +13,10 @@ from kernels.photometric.near import NearField, falloff, near_direction
 from kernels.photometric.readings import LARGEST, Lights
 
 LANES_CUDA = 1
-"""Pixels of one thread on CUDA: it keeps the dozens of sums of one pixel in registers. On the CPU they are a whole pack."""
+"""Number of pixels of one thread on CUDA, which keeps the dozens of sums of a pixel in registers. On the CPU a thread takes a whole
+pack."""
 SHADOW_FRACTION = 0.1
-"""Readings under this fraction of the level of all are left out of the level."""
+"""Fraction of the level of all readings below which a reading counts as shadow and is left out of the pixel's level."""
 
 
 class Samples(NamedTuple):

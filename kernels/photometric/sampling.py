@@ -2,7 +2,7 @@
 
 The search of `hypotheses` with its lobes looked up in a response table. It begins with a grid over the whole visible hemisphere,
 because a mirror has no Lambertian start, and ends with rings about the best, once under lobes with the Fresnel rise of a
-dielectric and once under those of a metal; a pixel keeps the kind whose normal lets the contract's BRDF explain it better.
+dielectric and once under those of a metal; a pixel keeps the kind whose normal lets Relit's BRDF explain it better.
 The mixture and the material found say which regime the pixel is in.
 
 Source: Nayar, Ikeuchi and Kanade, "Determining shape and reflectance of hybrid surfaces by photometric sampling", IEEE
@@ -23,25 +23,27 @@ from kernels.photometric.response_table import SPECULAR_SCALE, search_table
 from kernels.photometric.samples import Samples
 
 DIELECTRIC, METAL = 0.04, 0.8
-"""F0 of the two kinds of lobes: over a wide light their Fresnel rises tell a normal apart by degrees."""
+"""F0 of the two kinds of lobes. Their Fresnel rises differ, and over a wide light this moves the estimated normal by degrees."""
 OPTIONS = SearchOptions(noise_floor=0.05, noise_slope=0.05, sweeps=30)
-"""Wide lights leave no outlying highlights, so that less is left unexplained on a dim reading than under single lamps; on a
-bright one the table is good to a few percent."""
+"""Search options for wide lights. They cause no isolated highlights, so that a dim reading has less unexplained light than under single
+lamps; for bright readings the table is accurate to a few per cent."""
 HEMISPHERE, HEMISPHERE_OPTIONS = ((tuple(float(d) for d in range(7, 90, 7)), 52),), replace(
     OPTIONS, noise_floor=0.1, noise_slope=0.6, reweightings=2, sweeps=12)
-"""First a grid over the visible hemisphere, 7° apart, with a cost as wide as its steps: readings of a mirror change by half from
-one to the next, and a narrow cost would see nothing between."""
+"""Rings and options of the first search, a grid of candidates over the visible hemisphere, 7° apart. The noise assumed is as wide as the
+grid's steps: readings of a mirror change by half from one candidate to the next, and a narrower cost would miss the minimum between
+them."""
 AROUND, AROUND_OPTIONS = (((2.0, 4.0, 6.0), 16), ((1.0, 2.0), 8)), replace(
     OPTIONS, noise_floor=0.1, noise_slope=0.3, reweightings=2, sweeps=12)
-"""Then rings about its best."""
+"""Rings and options of the second search, about the best candidate of the first."""
 FINE = (((1.2, 2.4, 4.0), 14), ((0.6,), 6), ((0.3,), 6), ((0.15,), 6))
-"""Then rings for each kind of lobes."""
+"""Rings, in degrees, of the last search, which each kind of lobes makes about the best candidate."""
 RING_DEGREES = FINE[-1][0][-1]
-"""Radius of the last ring, whose rise in cost gives the standard error."""
+"""Radius of the last ring, degrees; the rise of the cost towards it gives the standard error."""
 LEAST_DIFFUSE, LEAST_SPECULAR = 0.1, 0.05
-"""Share of the reflected light below which a part is not counted in the regime: plastic of albedo 0.5 has 0.07 specular."""
+"""Least share of the reflected light that a diffuse and a specular part must have to be counted in the regime: plastic of albedo 0.5 has
+0.07 specular."""
 SHARP = 0.2
-"""Roughness below which a specular pixel is a mirror: the lobe is then 5° wide, less than an extended light can tell."""
+"""Roughness below which a specular pixel is called a mirror: its lobe is less than 5° wide, which an extended light cannot resolve."""
 
 
 class Regime(IntEnum):
@@ -123,7 +125,7 @@ def _choose(second: np.ndarray, a: tuple[np.ndarray, ...], b: tuple[np.ndarray, 
 
 
 def regimes(weights: np.ndarray, f0: np.ndarray, facing: np.ndarray, material: Material) -> np.ndarray:
-    """Tell regimes apart: a part of the light counts where both the mixture and the material have it.
+    """Return the regime of each pixel: a part of the light counts where both the mixture and the material contain it.
 
     Args:
         weights: [n, lobes] of the mixture.
@@ -135,7 +137,7 @@ def regimes(weights: np.ndarray, f0: np.ndarray, facing: np.ndarray, material: M
         [n] uint8 codes of Regime.
     """
     fresnel = f0 + (1 - f0) * np.clip(1 - facing, 0, 1) ** 5
-    mixed = SPECULAR_SCALE / f0 * fresnel * weights[:, 1:].sum(axis=1)  # of an even surround, as π times the diffuse weight is
+    mixed = SPECULAR_SCALE / f0 * fresnel * weights[:, 1:].sum(axis=1)  # under even light, as π times the diffuse weight is
     mixed /= np.maximum(mixed + np.pi * weights[:, 0], 1e-20)
     plain = material.specular.mean(axis=1)
     plain = plain / np.maximum(plain + material.diffuse_albedo.mean(axis=1), 1e-20)

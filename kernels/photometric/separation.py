@@ -26,12 +26,13 @@ from kernels.photometric.moments import Moments
 from kernels.status import OK
 
 MIN_CHROMA = 0.1
-"""Least part of a colour that is perpendicular to white: below, noise would be multiplied by more than ten."""
+"""Least fraction of a colour that is perpendicular to white: below it, noise would be multiplied by more than ten."""
 MIN_SHADING = 0.2
-"""Least 1 - r·t: at least 1/3 on any surface, since a response to light from one hemisphere has |t| ≤ 2/3 when it is diffuse."""
+"""Least 1 - r·t that is divided by. On any surface it is at least 1/3, because a diffuse response to light from one hemisphere has |t| ≤
+2/3."""
 HIDDEN_TILT = 0.1
-"""Radians: a highlight of F₀ 0.04 on diffuse grey of 0.5, its mirror direction 60° off the normal, adds 0.04·sin 60° across to
-(2/3)·0.5 + 0.04·cos 60° along: what an unseen highlight may tilt a normal by."""
+"""Angle in radians by which an unseen highlight may tilt a normal: a highlight of F₀ 0.04 on diffuse grey of 0.5, its mirror direction 60°
+off the normal, adds 0.04·sin 60° across to (2/3)·0.5 + 0.04·cos 60° along."""
 
 
 class SeparatedMoments(NamedTuple):
@@ -134,7 +135,7 @@ def _colour_kernel(first: int,
     white = (m0[0] + m0[1] + m0[2]) / 3.0
     across = m0 - wp.vec3(white, white, white)
     chroma = wp.length(across) / wp.max(wp.length(m0), 1.0e-30)
-    axis = wp.normalize(across)  # perpendicular to white: what it takes of a colour is diffuse
+    axis = wp.normalize(across)  # perpendicular to white: the component of a colour along it is diffuse
     t = wp.vec3(wp.dot(axis, mx), wp.dot(axis, my), wp.dot(axis, mz)) / wp.max(wp.length(across), 1.0e-30)
     n = wp.normalize(t)
     v = wp.vec3(view[0, p], view[1, p], view[2, p])

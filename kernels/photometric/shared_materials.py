@@ -5,7 +5,7 @@ pixel of the same material can. Candidates are materials that pixels found for t
 is taken, then the one that lowers it most beside the first, and so on while it pays.
 
 Source: materials as few and mixed per pixel, after Goldman et al., "Shape and spatially-varying BRDFs from photometric stereo",
-TPAMI 2010; here lobes of the contract's BRDF with an albedo free in every pixel.
+TPAMI 2010; here lobes of Relit's BRDF with an albedo free in every pixel.
 """
 
 import numpy as np
@@ -15,11 +15,11 @@ from kernels.photometric.material import fit_given, fit_material
 from kernels.photometric.samples import Samples, evenly
 
 CANDIDATES = 100
-"""Pixels whose materials are candidates."""
+"""Number of pixels whose materials are candidates."""
 MOST = 8
-"""Largest number of materials."""
+"""Largest number of shared materials."""
 LEAST_GAIN = 0.01
-"""Part of the total cost that one more must save."""
+"""Fraction of the total cost that a further material must save."""
 
 
 def choose_materials(samples: Samples, normal: np.ndarray, *, shape: Diffuse, options: SearchOptions | None = None) -> np.ndarray:

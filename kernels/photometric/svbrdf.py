@@ -3,7 +3,7 @@
 Normals come from the hypothesis search under the diffuse shape that the object shares and under shapes close to it, and from the joint
 fit of a single lobe; they are averaged, each weighted by how well it explains the pixel. The material then follows for the normal found.
 
-Sources: the contract's BRDF is GGX (Walter et al., "Microfacet models for refraction through rough surfaces", EGSR 2007) with Smith's
+Sources: Relit's BRDF is GGX (Walter et al., "Microfacet models for refraction through rough surfaces", EGSR 2007) with Smith's
 height-correlated masking (Heitz, "Understanding the masking-shadowing function", JCGT 2014), Schlick's Fresnel ("An inexpensive BRDF
 model for physically-based rendering", Computer Graphics Forum 1994) and Burley's diffuse lobe (2012); the search for normals is that of
 `hypotheses`, after Hui and Sankaranarayanan, TPAMI 2017. Averaging the normals of several models is ours.
@@ -19,15 +19,17 @@ from kernels.photometric.refine import refine
 from kernels.photometric.samples import Samples
 
 NEIGHBOURS = ((-0.15, 0.0), (0.15, 0.0), (0.0, -0.1), (0.0, 0.1))
-"""Shapes close to the shared one, differences in roughness and slope: what a material varies by over an object."""
+"""Differences in roughness and slope of the shapes that are tried besides the shared one: a material varies by as much over an object."""
 NEAR = (((0.7, 1.5, 2.5), 10), (((0.4,), 6),))
-"""Rings that follow a changed shape from the normal of the shared one."""
+"""Rings of the search under another shape, which starts from the normal of the shared shape."""
 TEMPERATURE = 0.4
-"""A model whose cost is this fraction above the best has 1/e of its weight: costs a third apart cannot be told from misfit."""
+"""Softmax temperature of the average over models, relative to the best cost: a model whose cost is this fraction above the best has 1/e of
+its weight. Costs a third apart may differ by misfit alone."""
 SINGLE_LOBE_CHARGE = 1.5
-"""Factor on the cost of the single lobe: it must explain a pixel clearly better than the mixture, as it does on metals, to replace it."""
+"""Factor on the cost of the single lobe: to replace the mixture, the single lobe must explain a pixel clearly better, as it does on
+metals."""
 RING_DEGREES = FINE[-1][0][-1]
-"""Radius of the last ring of the search, whose rise in cost gives the standard error."""
+"""Radius of the last ring of the search, degrees; the rise of the cost towards it gives the standard error."""
 
 
 class SvbrdfFit(NamedTuple):

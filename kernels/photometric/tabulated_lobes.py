@@ -25,6 +25,7 @@ from kernels.photometric.response_table import (
 RELAXATION = 1.6
 """Over-relaxation of the non-negative solve: lobes integrated over wide lights are much alike, and plain sweeps would converge slowly."""
 LOG_MIRROR, LOG_NARROWEST, LOG_RATIO = math.log(MIRROR_ALPHA), math.log(NARROWEST), math.log(WIDTH_RATIO)
+"""Natural logarithms of the mirror's width, of the narrowest width of the table and of the ratio between two widths."""
 
 
 @wp.func
@@ -96,7 +97,7 @@ def tabulated_lobes(lanes: int, count: int) -> Lobes:
 
 @cache
 def tabulated_reflectance(lanes: int) -> Reflectance:
-    """Return the contract's BRDF from a response table; a roughness of 0 stands for no specular lobe at all."""
+    """Return Relit's BRDF from a response table; a roughness of 0 stands for a surface without a specular lobe."""
     lane_type = pack_type(lanes, wp.float32)
 
     @wp.func

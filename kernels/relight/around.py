@@ -1,5 +1,5 @@
-"""The captured lights around a direction: what the shadows of light between them are taken from, and what a captured image is
-predicted from when it is left out."""
+"""The three captured lights around a direction. The visibility of light between captured lights is interpolated from them, and a captured
+image that is left out is predicted from them."""
 
 import itertools
 
@@ -54,7 +54,7 @@ def left_out(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     shares = np.zeros((len(directions), 3), np.float32)
     for vertex in range(real):
         ring = {other for other in around[vertex] if other < real}
-        for imaginary in (other for other in around[vertex] if other >= real):  # what lies beyond a middle that is no light
+        for imaginary in (other for other in around[vertex] if other >= real):  # replace an imaginary vertex by its real neighbours
             ring |= {other for other in around[imaginary] if other < real and other != vertex}
         triples = np.array(list(itertools.combinations(sorted(ring), 3)), dtype=int).reshape(-1, 3)
         corners = triangles.vertex[triples]

@@ -19,11 +19,11 @@ from kernels.errors import ArrayError
 from kernels.packs import Band, as_packs, pack_type
 
 TILE = 4
-"""Lights down and across whose products one thread sums: 16 sums in registers; divides the light padding of 8."""
+"""Number of lights down and across whose products one thread sums: 16 sums fit into registers, and 4 divides the light padding of 8."""
 THREADS = 1 << 16
-"""Approximate threads of one launch: enough to fill a large device, with 16 MB of partial sums."""
+"""Approximate number of threads in one launch: they fill a large device, and their partial sums take 16 MB."""
 MAX_CHUNKS = 64
-"""Pixel ranges with sums of their own: on the CPU those of one range are in the cache for all tiles."""
+"""Most pixel ranges that have sums of their own: on the CPU the pixels of one range stay in the cache for all tiles."""
 
 
 class Basis(NamedTuple):

@@ -15,12 +15,13 @@ from kernels.packs import Band, as_packs, pack_type
 from kernels.relight.combine import check_weights
 
 BLOCK_BYTES = 16 << 20
-"""Bytes of float32 that one BLAS call reads: bounds the scratch memory, and large enough that starting BLAS threads costs nothing."""
+"""Bytes of float32 that one BLAS call reads: they bound the scratch memory, and are so many that the start of the BLAS threads costs
+nothing."""
 GROUP = 32
-"""Frames of every BLAS call, made up with frames of nothing: with another number BLAS may sum in another order, and a frame in the same
-place shall be the same to the last bit, whichever others there are."""
+"""Number of frames in every BLAS call; missing ones are padded with zero frames. BLAS may sum in another order when the number changes, and
+a frame at the same position must be identical to the last bit whichever other frames are made."""
 REGISTER_FRAMES = 8
-"""Frames of one CUDA thread: 8 · 4 pixels are 32 register sums."""
+"""Number of frames that one CUDA thread computes: 8 frames of 4 pixels are 32 sums, which fit into registers."""
 
 
 def combine_batch(band: Band, weights: np.ndarray) -> wp.array:
@@ -55,7 +56,7 @@ def combine_batch(band: Band, weights: np.ndarray) -> wp.array:
 
 
 def _product(band: Band, weights: np.ndarray, frames: np.ndarray, pack: int) -> None:
-    """frames[f, c] = weights[f, c] @ stack[c], block by block and GROUP frames at a time."""
+    """Compute frames[f, c] = weights[f, c] @ stack[c], block by block and GROUP frames at a time."""
     groups = -(-len(weights) // GROUP)
     padded = np.zeros((groups * GROUP, *weights.shape[1:]), dtype=np.float32)
     padded[: len(weights)] = weights

@@ -1,4 +1,4 @@
-"""Parts of a small sample of the sphere that lie in the cells of the lights.
+"""The shares of a small sample of the sphere that lie in the cells of different lights.
 
 In the plane that touches the sphere in the sample's middle, the border between two cells is a straight line, as every great circle
 is, and so are the meridians at the sample's sides. Its top and bottom bend a little, by 5e-6 of a radian at the ends of half a
@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 MOST_CELLS = 16
-"""Cells that share one sample before it is cut in four; the work grows with their square."""
+"""Most cells that share one sample; a sample with more is cut in four, because the work grows with the square of the number."""
 QUARTERINGS = 4
-"""What is left then, a thirty-second of a degree, goes whole to its nearest light."""
+"""How often a sample may be cut in four. What is left then is a thirty-second of a degree wide and goes whole to its nearest light."""
 
 
 class LatLongSamples(NamedTuple):
@@ -77,14 +77,14 @@ def reach(polar: np.ndarray, half_polar: float, half_azimuth: float) -> np.ndarr
 
 
 def _frames(samples: LatLongSamples) -> np.ndarray:
-    """[samples, 3, 3]: unit vectors to the middle, and from there east (rightwards) and north."""
+    """Return [samples, 3, 3] unit vectors to the middle of each sample, and from there east (rightwards) and north."""
     sine, cosine, x, z = np.sin(samples.polar), np.cos(samples.polar), np.sin(samples.azimuth), -np.cos(samples.azimuth)
     return np.stack([np.stack([x * sine, cosine, z * sine], axis=1), np.stack([-z, np.zeros_like(x), x], axis=1),
                      np.stack([-x * cosine, sine, -z * cosine], axis=1)], axis=1)
 
 
 def _rivals(middle: np.ndarray, radius: np.ndarray, nearest: np.ndarray, lights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of samples, ascending, and lights whose border with the sample's nearest one passes within the radius."""
+    """Return pairs of a sample, in ascending order, and a light whose border with the sample's nearest light passes within the radius."""
     order = np.argsort(nearest, kind="stable")
     cells = np.unique(nearest)
     begins, ends = (np.searchsorted(nearest[order], cells, side=side) for side in ("left", "right"))
@@ -115,7 +115,7 @@ def _quarter(samples: LatLongSamples, chosen: np.ndarray, lights: np.ndarray, qu
 
 
 def _areas(axes: np.ndarray, top: np.ndarray, bottom: np.ndarray, height: float) -> np.ndarray:
-    """[samples, cells] part of each trapezoid that is nearest to each light.
+    """Return the [samples, cells] share of each trapezoid that is nearest to each light.
 
     Args:
         axes: [samples, cells, 3] of each light along the middle, east and north.
@@ -140,7 +140,7 @@ def _areas(axes: np.ndarray, top: np.ndarray, bottom: np.ndarray, height: float)
 def _clip(polygon: np.ndarray, line: np.ndarray) -> np.ndarray:
     """Cut convex polygons [n, corners, 2] along lines [n, 3]: what stays has line · (1, x, y) ≥ 0.
 
-    A polygon with fewer corners repeats its last one; of one that is cut away, a point stays."""
+    A polygon with fewer corners repeats its last corner; a polygon that is cut away whole shrinks to a point."""
     here = line[:, None, 0] + np.einsum("nkx,nx->nk", polygon, line[:, 1:])
     there = np.roll(here, -1, axis=1)
     inside, crossed = here >= 0, (here >= 0) != (there >= 0)

@@ -20,7 +20,7 @@ from kernels.relight.borders import LatLongSamples, Shares, divide, reach
 from kernels.relight.latlong import LightEnergy, SampleGrid, check, first_of_equals, gather
 
 COSINE_STEP = 1e-6
-"""Cosines in float32, and their differences, are right to within this."""
+"""Largest error of a cosine, or of the difference of two cosines, in float32."""
 
 
 class Nearest(NamedTuple):

@@ -18,10 +18,11 @@ from kernels.errors import ArrayError
 from kernels.packs import Band, as_packs, pack_type, zeros
 
 CHUNK = 1024
-"""Packs of one CPU thread: 64 KiB of each light's row, so that the memory's own prefetching gets going; its sums, 128 KiB, stay in
-the second-level cache. At 64 packs, whose sums would fit the first level, one core is 1.6 times slower."""
+"""Packs that one CPU thread sums. They are 64 KiB of each light's row, long enough for the hardware prefetcher, and their sums, 128 KiB,
+stay in the second-level cache. With 64 packs, whose sums would fit the first level, one core is 1.6 times slower."""
 LIGHTS_PER_PASS = 4
-"""Divides the light padding of 8."""
+"""Number of lights that one pass adds, so that the accumulator is read and written a quarter as often; it divides the light padding of
+8."""
 
 
 def combine(band: Band, weights: np.ndarray) -> wp.array:

@@ -13,8 +13,9 @@ from kernels.relight.latlong import first_of_equals
 from kernels.relight.triangulation import find_faces, triangulate_sphere
 
 SAMPLE_PITCH_DEGREES = 1.0
+"""Largest distance between two samples of a disc, degrees: finer than captured lights are apart."""
 MIN_SAMPLES = 256
-"""Least number of samples of a disc, so that it passes from one light to the next in steps of 0.4 % of it."""
+"""Least number of samples of a disc, so that a disc passes from one light to the next in steps of 0.4 % of its energy."""
 
 
 def integrate_discs(middles: np.ndarray, angles_degrees: np.ndarray, directions: np.ndarray, *, weighting: Weighting) -> np.ndarray:

@@ -20,9 +20,10 @@ class Weighting(StrEnum):
     """Ways to share a direction of the environment out over the lights."""
 
     CELLS = "cells"
-    """Whole to the nearest light: shadows and highlights as sharp as a light's own, a moving sun steps from light to light."""
+    """The nearest light gets all of it: shadows and highlights are as sharp as a light's own, and a moving sun steps from light to
+    light."""
     SMOOTH = "smooth"
-    """To the three lights around it: a moving sun fades from light to light, and shadows of three show at once."""
+    """The three lights around the direction share it: a moving sun fades from light to light, and the shadows of three show at once."""
 
 
 def integrate(environment: np.ndarray, directions: np.ndarray, rotations: np.ndarray, *, weighting: Weighting,

@@ -20,17 +20,17 @@ from kernels.packs import Band, as_packs, pack_type
 from kernels.relight.shading import Surface, lobes, modelled, require_same
 
 POOL = 2
-"""Neighbours on each side whose sums count too."""
+"""Half-width, in pixels, of the window over which the sums of β are pooled."""
 LEAST_ALPHA = 0.3
-"""Width α of the narrowest lobe, of the angle between neighbouring lights: α is about half a lobe's width at half its height, and between
-two lights the half vector moves by half of what they are apart (docs/figures.md)."""
+"""Width α of the narrowest lobe, as a fraction of the angle between neighbouring lights: α is about half a lobe's width at half its height,
+and between two lights the half vector moves by half of the angle between them (docs/figures.md)."""
 
 
 def seen_lobes(specular: np.ndarray, roughness: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Make lobes as wide as the captured lights can tell.
+    """Widen lobes that are narrower than the captured lights can resolve.
 
-    A lobe much narrower than the lights are apart is not seen but from afar, where it is as strong as F0 · α²: the same in a wider
-    and fainter lobe, which is what this gives.
+    The captured lights see only the tail of a lobe that is much narrower than their spacing, and its strength is F0 · α². The wider and
+    fainter lobe that is returned has the same tail.
 
     Args:
         specular: […, 3] F0.
@@ -100,7 +100,7 @@ def fit_trust(sums: np.ndarray, pixels: np.ndarray, shape: tuple[int, int]) -> n
     for plane in sums:
         table = np.zeros((shape[0] + 2 * POOL, shape[1] + 2 * POOL))
         table[rows + POOL, cols + POOL] = plane
-        across = sum(table[:, k : k + shape[1]] for k in range(2 * POOL + 1))  # no running sums: they keep what is bright or no number
+        across = sum(table[:, k : k + shape[1]] for k in range(2 * POOL + 1))  # no running sums: they would spread a NaN to later pixels
         pooled.append(sum(across[k : k + shape[0]] for k in range(2 * POOL + 1))[rows, cols])
     top, bottom = pooled
     return np.clip(np.divide(top, bottom, out=np.zeros(len(pixels)), where=bottom > 1e-12), 0, 1).astype(np.float32)

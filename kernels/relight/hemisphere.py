@@ -9,8 +9,9 @@ import numpy as np
 from kernels.errors import ArrayError
 
 PTM_TERMS = 6
+"""Number of functions of a polynomial texture map: u², v², u·v, u, v and 1."""
 HSH_TERMS = (4, 9, 16)
-"""Orders two, three and four: n² functions."""
+"""Possible numbers of hemispherical harmonics: order n, from two to four, has n² functions."""
 MIN_SPREAD = 1e-3
 """Least ratio of the smallest to the largest singular value of the functions over the lights: below, a coefficient holds a
 thousand times the error of a reading."""

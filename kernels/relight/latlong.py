@@ -15,17 +15,18 @@ from kernels.errors import ArrayError
 from kernels.relight.borders import Shares
 
 SAMPLE_PITCH_DEGREES = 0.5
-"""A sample is small enough to be flat: the areas of its parts are off by 3e-5 of it."""
+"""Largest width of a sample, degrees: a sample is then so nearly flat that the areas of its parts are off by 3e-5 of its area."""
 UNIT_TOLERANCE = 1e-3
-"""How far a light direction's length may be from one; within it, directions are normalised."""
+"""Largest difference of a light direction's length from one; directions within it are normalised."""
 EQUAL_RADIANS = 1e-4
-"""Lights closer than this, 0.006 degrees, stand in one place; the first of them gets its energy."""
+"""Lights closer than this angle in radians, 0.006 degrees, count as one place; the first of them gets the energy."""
 BAND_SAMPLES = 1 << 19
-"""Samples that are summed at one time: bounds the memory of a large map, and the sums find them in the cache."""
+"""Number of samples that are summed at one time: it bounds the memory of a large map, and the samples stay in the cache."""
 
 
 EQUAL_COLUMNS = 1e-6
-"""Turns that differ from whole columns by this part of one, less than a thousandth of a second of arc, differ by whole ones."""
+"""Rotations whose difference is a whole number of columns to within this part of one column, less than a thousandth of a second of arc,
+share one split of the samples."""
 
 
 class LightEnergy(NamedTuple):
@@ -46,7 +47,7 @@ class SampleGrid(NamedTuple):
     solid_angle: np.ndarray  # [rows] steradians of one sample
     texel_row: np.ndarray  # [rows] row of the map
     across: int
-    """Samples of a texel side by side."""
+    """Number of samples side by side in a texel."""
 
     def bands(self) -> Iterator["SampleGrid"]:
         """Return the same grid, some rows at a time."""
@@ -57,18 +58,18 @@ class SampleGrid(NamedTuple):
 
 
 class Turn(NamedTuple):
-    """Frames whose turned maps differ by a move sideways alone."""
+    """Frames whose rotated maps differ by a sideways shift alone."""
 
     rotation: np.ndarray  # [3, 3] float64, of the map before it is moved
     frames: tuple[int, ...]
     columns: tuple[int, ...]
-    """For each frame: the map turned is the map whose columns are taken from so much further right, then turned by `rotation`."""
+    """For each frame, the number of columns by which the map is shifted before `rotation` turns it: column c is taken from c + columns."""
 
 
 def cut(rows: int, cols: int) -> SampleGrid:
     """Cut the texels of a lat-long map of this size into samples.
 
-    A texel keeps the solid angle of the contract, sin(πv) · (π/H) · (2π/W), and its rows of samples have it by their sines.
+    A texel keeps its solid angle sin(πv) · (π/H) · (2π/W), which its rows of samples share in proportion to their sines.
     """
     across = max(1, math.ceil(360.0 / SAMPLE_PITCH_DEGREES / cols))
     down = max(1, math.ceil(180.0 / SAMPLE_PITCH_DEGREES / rows))

@@ -8,8 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 ROUNDS = 8
-"""Rounds of the power iteration for the colour: it converges by the ratio of the squared eigenvalues, ten or more on real surfaces."""
+"""Rounds of the power iteration for the colour. It converges by the ratio of the squared eigenvalues, which is ten or more on real
+surfaces."""
 WHITE = 255.0
+"""Value of white in the files, which store a colour in 8 bits."""
 
 
 class Luminance(NamedTuple):

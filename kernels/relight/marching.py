@@ -1,6 +1,8 @@
-"""Groups of light samples that share one visibility: a small bright light casts sharp shadows, and a few marches serve all its samples.
+"""Groups of light samples that share one visibility, so that a small bright light casts sharp shadows with few marches.
 
-Marching takes most of the time of shading. So the samples that need it are put together in groups, and each group is marched to one place.
+To march to a light is to follow the line from a pixel towards it over the height map and look for surface that stands above the line
+(kernels.surface.shadows). This takes most of the time of shading, so the samples are put together in groups, and one march to the
+middle of a group serves all its samples.
 
 Source: one visibility for a cluster of lights, as in Dong, Grosch, Ritschel, Kautz and Seidel, "Real-time indirect illumination with
 clustered visibility", VMV 2009.

@@ -20,7 +20,8 @@ from kernels.relight.sources import Sources
 from kernels.relight.triangulation import edge_planes, triangulate_sphere
 
 LEAST_PART = 1e-3
-"""Least part of the energy of an imaginary light: lights far from a hole that would get less get none, the others have it."""
+"""Least share of an imaginary light's energy that a captured light receives. A light so far from the hole that its share is smaller
+receives nothing, and the other lights receive its share."""
 
 
 def sum_near(band: Band, surface: Surface, visible: wp.array, sources: Sources, direction: np.ndarray, irradiance: np.ndarray,
@@ -83,8 +84,8 @@ def _weights_kernel(first: int,
                     neighbour: wp.array(dtype=int),  # [3 · faces] face beyond that edge
                     corner: wp.array(dtype=int),  # [3 · faces] vertex at the corner
                     start: wp.array(dtype=int),  # [vertices + 1] where the lights of a vertex begin; a light's own is the only one
-                    owner: wp.array(dtype=int),  # lights of the vertices
-                    part: wp.array(dtype=float),  # of a vertex's energy, that they get
+                    owner: wp.array(dtype=int),  # the lights that share the energy of each vertex
+                    part: wp.array(dtype=float),  # share of the vertex's energy that each of these lights receives
                     count: int,  # lights
                     # outputs
                     weights: wp.array2d(dtype=float)):  # [3 · lights, pixels padded], 0

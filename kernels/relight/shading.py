@@ -1,4 +1,4 @@
-"""Solved surfaces under samples of light: the contract's BRDF, diffuse and specular apart.
+"""Solved surfaces under samples of light, shaded by Relit's BRDF with its diffuse and specular parts apart.
 
 Radiance = Σ over the samples of V · E · (ρ/π + D V F) · n·l, with E the energy of a far sample or intensity · cos^μ / distance² of a
 near one, and V the visibility that the caller gives by rows.
@@ -17,11 +17,11 @@ from kernels.packs import Band, as_packs, channels_type, pack_type
 from kernels.relight.sources import Sources
 
 LEAST_ROUGHNESS = 0.05
-"""Below it a lobe is narrower than any sample of a light."""
+"""Least roughness that is shaded: a smoother lobe is narrower than any sample of a light."""
 LEAST_FACING = 0.02
-"""Least n·v: normals of pixels at the rim may look away from the viewer by a little."""
+"""Least n·v that is used: normals of pixels at the rim may point a little away from the viewer."""
 PLANES = 16
-"""Values of a pixel: normal, albedo, F0, view, position (3 each), roughness."""
+"""Number of values of a pixel: normal, albedo, F0, view and position (3 each), and roughness."""
 
 
 class Surface(NamedTuple):

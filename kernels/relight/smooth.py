@@ -19,9 +19,10 @@ from kernels.relight.latlong import LightEnergy, SampleGrid, check, first_of_equ
 from kernels.relight.triangulation import SphereTriangles, edge_planes, triangulate_sphere
 
 RUN = 64
-"""Neighbouring samples of one thread: it seeks the first one's triangle over the whole sphere, the others' from the one before."""
+"""Number of neighbouring samples that one thread locates: it seeks the triangle of the first over the whole sphere, and that of each other
+from the sample before."""
 BESIDE_RADIANS = 1e-6
-"""A direction this far beyond an edge counts as on it: float32 does not tell more. Seeking cannot go in circles then."""
+"""A direction this many radians beyond an edge counts as on it, because float32 resolves no less; the search can then not go in circles."""
 
 
 class Located(NamedTuple):

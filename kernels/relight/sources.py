@@ -12,12 +12,14 @@ import numpy as np
 from kernels.errors import ArrayError
 
 SPHERE_SAMPLES = 512
-"""Half of them face away from any point: 256 serve it."""
+"""Samples of a spherical light: half of them face away from any point, so that 256 light it."""
 RECTANGLE_SAMPLES = 256
+"""Samples of a rectangular light, as many as of a spherical light reach a point."""
 FEW = 64
-"""Samples of a light for sums in which the error of having few is in both terms of a difference."""
+"""Samples of a light in model-guided sums. The images and the model are summed over the same samples and only the difference is used, so
+that the error of few samples cancels."""
 NEVER = -1
-"""Row of an occluder that is none."""
+"""Occluder row of a sample that nothing hides."""
 
 
 class Sources(NamedTuple):

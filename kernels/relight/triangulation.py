@@ -18,24 +18,27 @@ import numpy as np
 from kernels.errors import ArrayError
 
 SHIFT = 1e-10
-"""Lights are shifted by at most this along all axes, so that no four lie in one plane to the last digit: a million times the rounding
-of float64, and less than a light stands out between neighbours a ten-thousandth of a radian away."""
+"""Largest random shift of a light along each axis, in the unit of its direction, so that no four lights lie exactly in one plane. It is a
+million times the rounding of float64, and less than a light stands out between neighbours a ten-thousandth of a radian away."""
 FLAT = 1e-3
-"""Lights as near to one plane as this lie in it; the measured directions of a ring scatter more."""
+"""Lights within this distance of one plane, in the unit of their directions, count as in it; the measured directions of a ring scatter
+more."""
 BEND = 0.1
-"""Faces that meet at an angle below this part of their radius are one polygon: directions measured to half a degree, 15 degrees apart,
-are off their circle by as much."""
+"""Faces whose normals differ by less than this part of their radius, in radians, are one polygon: directions that are 15 degrees apart and
+measured to half a degree are off their circle by as much."""
 HOLE = 3.0
+"""A face between lights is a hole when its radius is this many times the median radius of the faces."""
 SMALLEST_HOLE_DEGREES = 20.0
-"""A face between lights is a hole when it is this many times as wide as the usual one, and not below this radius."""
+"""Least radius of a hole in degrees."""
 LARGEST_FACE_DEGREES = 80.0
-"""Radius of any face's circle. At 90 degrees the centre would lie in the face; the faces of a regular tetrahedron have 70.5 degrees."""
+"""Largest radius of a face's circle, degrees. At 90 degrees the centre would lie in the face; the faces of a regular tetrahedron have 70.5
+degrees."""
 
 
 REMEMBERED = 4
-"""Sets of lights whose triangles are kept."""
+"""Number of sets of lights whose triangles are kept in memory."""
 CHUNK = 4096
-"""Directions that are held against all faces at one time: bounds the memory."""
+"""Number of directions that are compared with all faces at one time: it bounds the memory."""
 
 
 class SphereTriangles(NamedTuple):
@@ -71,9 +74,9 @@ def triangulate_sphere(directions: np.ndarray) -> SphereTriangles:
 
 @lru_cache(maxsize=REMEMBERED)
 def _remembered(directions_bytes: bytes, count: int) -> SphereTriangles:
-    """The triangles of lights that are asked for again and again: by every frame, every batch of pixels."""
+    """Return the triangles of lights; the result is kept, because every frame and every batch of pixels asks for the same ones."""
     directions = np.frombuffer(directions_bytes).reshape(count, -1)
-    random = np.random.default_rng(0)  # the same each time
+    random = np.random.default_rng(0)  # a fixed seed, so that the shift is the same each time
 
     def shifted(unit: np.ndarray) -> np.ndarray:
         return unit + random.uniform(-SHIFT, SHIFT, unit.shape)
@@ -132,7 +135,7 @@ def find_faces(triangles: SphereTriangles, directions: np.ndarray) -> tuple[np.n
 
 
 def _start(points: np.ndarray) -> tuple[_Faces, list[int]]:
-    """A tetrahedron of four points far apart, and the indices of the others."""
+    """Return a tetrahedron of four points far apart, and the indices of the other points."""
     if len(points) < 4:
         raise ArrayError(f"smooth weighting needs lights in four different places, got {len(points)}: choose cells")
     second = int(np.argmax(np.linalg.norm(points - points[0], axis=1)))
@@ -155,12 +158,13 @@ def _planes(points: np.ndarray, corner: np.ndarray) -> _Faces:
 
 
 def _insert(faces: _Faces, points: np.ndarray, added: range | list[int]) -> _Faces:
-    """Add points outside, one by one: the faces that a point sees give way to a fan from it to their outline."""
+    """Add points one by one that lie outside the hull: the faces that a point sees are replaced by a fan from the point to their
+    outline."""
     for index in added:
         seen = faces.normal @ points[index] > faces.height
         away = faces.corner[seen]
         begin, end = away.reshape(-1), np.roll(away, -1, axis=1).reshape(-1)
-        outline = ~np.isin(begin * len(points) + end, end * len(points) + begin)  # an edge inside is there both ways round
+        outline = ~np.isin(begin * len(points) + end, end * len(points) + begin)  # an inner edge occurs in both directions
         fan = np.stack([begin[outline], end[outline], np.full(int(outline.sum()), index)], axis=1)
         if len(fan) != int(seen.sum()) + 2:  # after Euler; a bug, or lights that defy rounding
             raise ArrayError(f"no triangles were found between {len(points)} lights: choose cells")
@@ -169,7 +173,7 @@ def _insert(faces: _Faces, points: np.ndarray, added: range | list[int]) -> _Fac
 
 
 def _polygons(faces: _Faces, lights: int, hole: float) -> np.ndarray:
-    """[polygons, lights]: 1 / corners at the corners of each polygon of several faces in one plane, holes left out."""
+    """Return [polygons, lights]: 1 / corners at the corners of each polygon that several faces in one plane form; holes are left out."""
     radius = _radius(faces)
     neighbour = _neighbours(faces.corner)
     bend = np.linalg.norm(faces.normal[:, None] - faces.normal[neighbour], axis=2)
@@ -185,7 +189,7 @@ def _polygons(faces: _Faces, lights: int, hole: float) -> np.ndarray:
 
 
 def _radius(faces: _Faces) -> np.ndarray:
-    """[faces] radians, of the corners' circle."""
+    """Return the [faces] angular radius of each face's circumscribed circle, radians."""
     return np.arccos(np.clip(faces.height, -1, 1))
 
 

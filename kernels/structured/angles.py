@@ -1,14 +1,18 @@
-"""Angles, sines and cosines by arithmetic alone, so that a loop over a pack becomes SIMD instructions; libm's is a call a lane."""
+"""Angles, sines and cosines by arithmetic alone: a loop over a pack then becomes SIMD instructions, where libm would be called once for
+each lane."""
 
 import math
 
 import warp as wp
 
 EIGHTH = 0.41421356237
-"""tan(π/8): above, the quotient is turned by π/4 first."""
+"""tan(π/8): a larger quotient is first turned by π/4, so that the polynomial stays accurate."""
 QUARTER_TURN = 0.5 * math.pi
+"""A quarter of a turn in radians."""
 HALF_TURN = math.pi
+"""Half a turn in radians."""
 TURN = 2.0 * math.pi
+"""A turn in radians."""
 
 
 @wp.func

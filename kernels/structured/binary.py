@@ -24,15 +24,17 @@ from kernels.structured.decoded import Decoded, place_stripe, unwritten_decoded
 from kernels.structured.frames import NoiseModel, check_noise, check_stripes, cut_in, require_frames, saturation_masks
 
 SHADOW_SIGMAS = 5.0
-"""Contrast (white minus black, or the largest difference of a pair) over its deviation: below, the projector does not reach the pixel."""
+"""Least contrast (white minus black, or the largest difference of a pair), in its standard deviations; a pixel with less is not reached by
+the projector."""
 DOUBT_SIGMAS = 3.0
-"""Difference over its deviation below which a bit may be wrong: one pixel in 740 by noise alone at the limit."""
+"""Least difference, in its standard deviations, of a bit that is certain: at the limit, noise alone makes one pixel in 740 wrong."""
 DOUBT_PART = 0.05
-"""Part of the contrast that a difference must have: with less, a bit is a mixture of both stripes, and blur rather than noise decides."""
+"""Least difference of a bit that is certain, as a part of the contrast: a smaller one is a mixture of two stripes, whose sign blur rather
+than noise decides."""
 LARGEST = 1.0e15
-"""A contrast above this counts as infinite: it is squared in float32."""
+"""Contrast above which a reading counts as infinite, because contrast is squared in float32."""
 MAX_BITS = 24
-"""Stripes are counted in float32 at the end, exact up to here."""
+"""Largest number of bits: stripes are counted in float32 at the end, which is exact up to 2²⁴."""
 
 
 def decode_binary(frames: Band, bits: Sequence[int], inverses: Sequence[int] | None = None, *, white: int | None = None,

@@ -1,4 +1,4 @@
-"""Result of every decoder of projected codes."""
+"""The result that every decoder of projected codes returns."""
 
 from math import sqrt
 from typing import NamedTuple
@@ -11,7 +11,7 @@ from kernels.status import OK, Status
 STRIPE_DEVIATION = 1.0 / sqrt(12.0)
 """Standard deviation of a place evenly distributed over a stripe of width one."""
 MAX_SPREAD = 1
-"""Stripes that the readings of a pixel with doubtful digits may lie apart."""
+"""Largest distance, in stripes, between the readings of a pixel with doubtful digits that still give a place."""
 
 _SATURATED, _SHADOWED, _UNDECIDED, _OUT_OF_RANGE = (int(s) for s in (Status.SATURATED, Status.SHADOWED, Status.UNDECIDED,
                                                                     Status.OUT_OF_RANGE))

@@ -24,10 +24,10 @@ from kernels.structured.decoded import Decoded
 from kernels.structured.frames import NoiseModel, check_noise, check_stripes, require_frames
 
 REACH = 48
-"""Camera pixels that are searched to either side for an edge; a stripe wider than that is not interpolated."""
+"""Distance in camera pixels within which an edge is searched on either side; a wider stripe is not interpolated."""
 EDGE_ERROR = 0.065
-"""Camera pixels, RMS: how far linear interpolation misses an edge where a pixel sees a sharp square of the surface; less under blur.
-Counted as the same at both edges, as it is where stripes are a whole number of pixels wide."""
+"""RMS error, in camera pixels, of an edge found by linear interpolation where a pixel sees a sharp square of the surface; blur makes it
+smaller. Both edges of a stripe count with the same error, as they have where stripes are a whole number of pixels wide."""
 
 
 def refine_edges(decoded: Decoded, frames: Band, bits: Sequence[int], inverses: Sequence[int], *, columns: int, down: bool,

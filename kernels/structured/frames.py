@@ -15,9 +15,9 @@ class NoiseModel(NamedTuple):
     """Variance of a reading I: read² + gain · max(I, 0), in the unit of the images."""
 
     read: float
-    """Standard deviation in the dark: read noise and quantisation."""
+    """Standard deviation of a reading in the dark: read noise and quantisation."""
     gain: float
-    """Gain of photon noise: full scale over the electrons that fill it."""
+    """Gain of photon noise: full scale divided by the electrons that fill a pixel."""
 
 
 def require_frames(frames: Band, *numbers: int | None, channels: int = 1) -> None:
@@ -118,7 +118,7 @@ def cut_in(pack: int) -> Any:
 
 
 def check_noise(noise: NoiseModel) -> None:
-    """Refuse a noise model without noise: certainty would be infinite.
+    """Refuse a noise model without read noise: the weight of a dark reading would be infinite.
 
     Raises:
         ArrayError: read noise that is not above zero, or a negative gain.

@@ -25,20 +25,23 @@ from kernels.structured.decoded import Decoded, place_stripe, unwritten_decoded
 from kernels.structured.frames import NoiseModel, check_noise, check_stripes, cut_in, require_frames, saturation_masks
 
 SHADOW_SIGMAS = 5.0
-"""White minus black over its deviation (all channels together): below, the projector does not reach the pixel."""
+"""Least white minus black, in its standard deviations over all channels; a pixel with less is not reached by the projector."""
 LEVEL_ERROR = 0.02
-"""Part of white minus black by which a level may be off beyond noise: responses, and light from other surfaces."""
+"""Error of a level beyond noise, as a part of white minus black: the camera's and projector's responses and light from other surfaces cause
+it."""
 DOUBT_CHI2 = 9.0
-"""χ² between the best and the second-best level that noise alone leaves (three standard deviations)."""
+"""Largest χ² between the best and the second-best level that noise alone explains (three standard deviations)."""
 DOUBT_RATIO = 0.44
-"""χ² of the best over that of the second-best: above, the reading lies more than two fifths of the way to the next level."""
+"""Largest ratio of the best level's χ² to the second-best's: above it, the reading lies more than two fifths of the way to the next
+level."""
 MAX_STRIPES = 1 << 24
-"""Stripes are counted in float32 at the end, exact up to here."""
+"""Largest number of stripes: they are counted in float32 at the end, which is exact up to here."""
 MIN_LEVEL_STEP = 1.0e-3
-"""Between two levels, of white minus black: with less they are the same."""
+"""Least difference of two levels, as a part of white minus black; closer levels count as equal."""
 LARGEST = 1.0e15
-"""A signal above this counts as infinite: it is squared in float32."""
+"""Signal above which a reading counts as infinite, because the signal is squared in float32."""
 FAR = 1.0e30
+"""Sentinel χ² of a slot that holds no level."""
 
 
 def decode_kary(frames: Band, digits: Sequence[int], *, white: int, black: int, levels: np.ndarray, reflected: bool,

@@ -1,8 +1,8 @@
 """Micro phase shifting: three shifts of one short period, one frame of each of several periods close to it.
 
-The reference period gives offset A, amplitude B and a phase; all other frames share A and B, because no period is long enough to
-be bounced about and all are dimmed alike by defocus. Every wrap of the reference predicts their readings, and the one whose
-misfit χ² is least is refined by Gauss-Newton steps on A, B and u over all frames, weighted by their variance.
+The reference period gives offset A, amplitude B and a phase. All other frames share A and B: the periods are so short that interreflection
+averages every pattern out, and so similar that defocus dims all of them alike. Every wrap of the reference predicts their readings, and the
+one whose misfit χ² is least is refined by Gauss-Newton steps on A, B and u over all frames, weighted by their variance.
 
 Source: Gupta and Nayar, "Micro Phase Shifting", CVPR 2012, equations 5 to 10.
 """
@@ -26,13 +26,14 @@ from kernels.structured.phase import decode_phase
 from kernels.structured.unwrap import FAR, judge, keep_better
 
 LEVEL_ERROR = 0.02
-"""Part of the amplitude by which a reading may be off beyond noise: responses, and amplitudes that are not quite alike."""
+"""Error of a reading beyond noise, as a part of the amplitude: the camera's and projector's responses and unequal amplitudes cause it."""
 MIN_SEPARATION = 0.05
-"""Part of the amplitude by which the readings at two places must differ, all frames together."""
+"""Least distance between the readings at two places, as a part of the amplitude and over all frames together, so that the periods tell the
+places apart."""
 BORDER_PX = 0.5
-"""How far outside the projector a place may seem to lie."""
+"""Distance in projector pixels by which a decoded place may lie outside the projector."""
 STEPS = 3
-"""Gauss-Newton steps; the start is off by the noise of three readings, and each step squares the error."""
+"""Number of Gauss-Newton steps: the start has the noise of three readings, and each step squares the error."""
 
 _SATURATED, _MULTIPATH, _OUT_OF_RANGE = int(Status.SATURATED), int(Status.MULTIPATH), int(Status.OUT_OF_RANGE)
 

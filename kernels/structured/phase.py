@@ -24,12 +24,13 @@ from kernels.structured.angles import angle_of
 from kernels.structured.frames import NoiseModel, check_noise, cut_in, require_frames, saturation_masks
 
 SIGNAL_SIGMAS = 5.0
-"""Light of the projector over its deviation, below which a pixel is SHADOWED; amplitude over its deviation, below which it has
-LOW_MODULATION: the phase would be uncertain by more than 0.2 radians."""
+"""Least light of the projector in its standard deviations, below which a pixel is SHADOWED, and least amplitude in its standard deviations,
+below which it has LOW_MODULATION: the phase would be uncertain by more than 0.2 radians."""
 MIN_MODULATION = 0.02
-"""Amplitude over offset, ambient taken off: below, the pattern is blurred or outshone by its own bounces, and harmonics decide."""
+"""Least ratio of the amplitude to the offset without ambient light: below it, the pattern is blurred or outshone by interreflection, and
+harmonics decide the phase."""
 MIN_SPREAD = 1.0e-3
-"""Smallest singular value of the fit over the root of the frames: 0.7 for even shifts, 0 for two shifts."""
+"""Least singular value of the fit, divided by the root of the number of frames: even shifts have 0.7, two shifts 0."""
 
 _SATURATED, _SHADOWED, _LOW_MODULATION = int(Status.SATURATED), int(Status.SHADOWED), int(Status.LOW_MODULATION)
 

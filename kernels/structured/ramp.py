@@ -20,14 +20,16 @@ from kernels.structured.decoded import Decoded, unwritten_decoded
 from kernels.structured.frames import NoiseModel, check_noise, cut_in, require_frames, saturation_masks
 
 SHADOW_SIGMAS = 5.0
-"""Light of the projector over its deviation, below which a pixel is SHADOWED."""
+"""Least light of the projector in its standard deviations; a pixel with less is SHADOWED."""
 LARGEST = 1.0e15
-"""Light above this counts as infinite."""
+"""Light above which a reading counts as infinite."""
 BORDER_SIGMAS = 4.0
-"""Deviations by which a place may seem to lie outside the projector."""
+"""Standard deviations by which a place may lie outside the projector."""
 HALVINGS = 12
-"""Halvings that search the table of 4096 steps, between which a response as bent as level^2.2 is straight to 1e-7 of full scale."""
+"""Number of halvings that search the table of 4096 steps; between two of them a response as bent as level^2.2 is straight to 1e-7 of full
+scale."""
 TABLE = 2**HALVINGS
+"""Number of steps in the table."""
 MIN_STEP = 1.0e-12
 """Least rise of the ratio between two places of the table, so that its slope can be divided by."""
 

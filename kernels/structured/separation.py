@@ -1,4 +1,4 @@
-"""Direct and global light from shifted sinusoids that are finer than what bounces and scatters.
+"""Direct and global light from shifted sinusoids whose period is shorter than the distance over which light bounces and scatters.
 
 A pixel's own (direct) light follows the sinusoid; light that comes by way of other places (global) averages over its periods and stays at
 half of what the projector gives full on. With the ambient light taken off a pixel reads A + B cos(φ - δ) under the shift δ, so it would

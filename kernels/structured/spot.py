@@ -12,19 +12,19 @@ import numpy as np
 from kernels.status import Status
 
 LEVEL = 0.15
-"""Part of the peak above which a pixel counts to the first centre and the width."""
+"""Part of the peak above which a pixel counts towards the first centre and the width."""
 MIN_WINDOW_PX = 1.5
-"""Least standard deviation of the Gaussian: a narrower one is not sampled well by whole pixels."""
+"""Least standard deviation of the Gaussian window, pixels: whole pixels do not sample a narrower one well."""
 STEPS = 10
-"""Newton steps; a Gaussian spot takes one, a saturated one about four."""
+"""Number of Newton steps; a Gaussian spot takes one, a saturated one about four."""
 LEAST_GAIN = 0.1
-"""Floor of 1 - variance under the window / variance of the window, the slope of Newton's step: 0.5 for a Gaussian spot."""
+"""Least slope of Newton's step, 1 - variance under the window / variance of the window, that is divided by: a Gaussian spot has 0.5."""
 NOISE_FACTOR = 8.0
-"""How many standard deviations of the noise a spot must stand out: among 10⁷ pixels the largest of noise alone reaches 5.3."""
+"""Least height of a spot, in standard deviations of the noise: among 10⁷ pixels noise alone reaches 5.3."""
 REACH_PX = 64
-"""Half the side of the window in which a spot lies: a larger blot is no spot."""
+"""Half the side of the window in which a spot lies, pixels: a larger blot is not a spot."""
 PARALLEL = 1e-6
-"""Squared sine of the least angle between two rays that meet in a point: 0.06 degrees."""
+"""Least squared sine of the angle between two rays that meet in a point: 0.06 degrees."""
 
 
 class Spot(NamedTuple):
@@ -128,14 +128,14 @@ def nearest_points(origins_a: np.ndarray, directions_a: np.ndarray, origins_b: n
 
 
 def _blurred(values: np.ndarray) -> np.ndarray:
-    """Mean of 3×3 pixels, zeros outside: a hot pixel stands back behind a spot."""
+    """Return the mean of 3×3 pixels, with zeros outside: it lowers a hot pixel below a spot."""
     padded = np.pad(values, 1)
     rows = padded[:-2] + padded[1:-1] + padded[2:]
     return np.asarray((rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]) / 9)
 
 
 def _hanging_together(above: np.ndarray, row: int, col: int) -> np.ndarray:
-    """The part of a mask that hangs together with a place and its neighbours, over corners too."""
+    """Return the connected part of a mask that contains a place or one of its neighbours; pixels that touch at a corner are connected."""
     inside = np.zeros_like(above)
     inside[max(row - 1, 0):row + 2, max(col - 1, 0):col + 2] = True
     inside &= above

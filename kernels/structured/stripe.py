@@ -16,23 +16,23 @@ from kernels.errors import ArrayError
 from kernels.status import OK, Status
 
 LEVEL = 0.2
-"""Part of the peak above which a pixel counts to the stripe's width."""
+"""Part of the peak above which a pixel counts towards the stripe's width."""
 MIN_WINDOW_PX = 1.5
-"""Least standard deviation of the Gaussian: a narrower one is not sampled well by whole pixels."""
+"""Least standard deviation of the Gaussian window, pixels: whole pixels do not sample a narrower one well."""
 REACH = 4.0
-"""Standard deviations at which the Gaussian ends: what is left out is 6e-5 of it."""
+"""Half-width of the Gaussian window in standard deviations: 6e-5 of the Gaussian lies outside."""
 STEPS = 8
-"""Newton steps; a Gaussian profile takes one, a saturated one about four."""
+"""Number of Newton steps; a Gaussian profile takes one, a saturated one about four."""
 NOISE_FACTOR = 6.0
-"""How many standard deviations of the noise a stripe must stand out."""
+"""Least height of a stripe, in standard deviations of the noise."""
 MAX_WIDTH_PX = 96
-"""Half the longest run of pixels that is one stripe: what is broader is a lit area."""
+"""Half the length of the longest run of pixels that counts as one stripe: a broader run is a lit area."""
 LEAST_GAIN = 0.1
-"""Floor of 1 - variance under the window / variance of the window, the slope of Newton's step: 0.5 for a Gaussian stripe."""
+"""Least slope of Newton's step, 1 - variance under the window / variance of the window, that is divided by: a Gaussian stripe has 0.5."""
 RIVAL = 0.7
-"""Part of the peak from which a second bright place leaves open which of the two is the stripe."""
+"""Part of the peak from which a second bright place on the line makes the stripe undecided."""
 GRAZING = 0.02
-"""Least sine between a line of sight and the plane (1.1 degrees) that says where they meet."""
+"""Least sine of the angle between a line of sight and the plane of light, 1.1 degrees: at less, where they meet is too uncertain."""
 
 _LOW, _UNDECIDED = int(Status.LOW_MODULATION), int(Status.UNDECIDED)
 

@@ -20,16 +20,17 @@ from kernels.status import OK, Status
 from kernels.structured.decoded import Decoded
 
 STEPS = 6
-"""Gauss-Newton steps; with lenses of ordinary strength (k1 = -0.3) float32 is reached in four."""
+"""Number of Gauss-Newton steps; with lenses of ordinary strength (k1 = -0.3) four reach the precision of float32."""
 MIN_PARALLAX_PX = 1.0
-"""Least way, in projector pixels, that a point would move were it twice as far: below, the line of sight lies almost in the sheet of
-light, and the coordinate does not say where on it."""
+"""Least distance, in projector pixels, by which a point's image would move if the point were twice as far. With less, the line of sight
+lies almost in the sheet of light, and the coordinate does not determine the depth."""
 EDGE_MARGIN = 0.01
-"""Part of the projector's size by which a point may seem to lie outside: calibrations are that good, the image is not cut there."""
+"""Part of the projector's size by which a point's image may lie outside the projector: calibrations err by as much."""
 MISSED_PX = 0.05
-"""With one axis there is a point that fits; steps that end farther than this from it have not found it."""
+"""Largest residual, in projector pixels, of a point found from one axis. With one axis an exact point exists, so that steps with a larger
+residual have not converged."""
 MIN_SIGMA_PX = 1.0e-3
-"""Floor of the given standard deviations, so that one of zero does not take all the weight."""
+"""Least standard deviation of a coordinate, projector pixels, so that a given one of zero does not take all the weight."""
 
 _OUT_OF_RANGE, _ILL_POSED, _AMBIGUOUS = int(Status.OUT_OF_RANGE), int(Status.ILL_POSED), int(Status.AMBIGUOUS)
 
@@ -117,7 +118,7 @@ def locate(g: Projection, a: wp.vec3, u: float, v: float, weight_u: float, weigh
            limit: float) -> Found:
     """Return the point on a line of sight that is decoded as (u, v); a weight (1/variance) of zero leaves that axis out."""
     found = Found()
-    # the lens aside, the axis along which the point moves farther says where to begin
+    # without distortion, the axis along which the point moves farther gives the start
     x, y = (u - g.principal[0]) / g.focal[0], (v - g.principal[1]) / g.focal[1]
     by_u, by_v = g.shift[0] - x * g.shift[2], g.shift[1] - y * g.shift[2]
     moves_u = wp.where(weight_u > 0.0, wp.abs(by_u) * g.focal[0], 0.0)
@@ -136,7 +137,7 @@ def locate(g: Projection, a: wp.vec3, u: float, v: float, weight_u: float, weigh
     slope = weight_u * at.du * at.du + weight_v * at.dv * at.dv
     way_u, way_v = wp.where(weight_u > 0.0, at.du, 0.0), wp.where(weight_v > 0.0, at.dv, 0.0)
     parallax = wp.abs(s) * wp.sqrt(way_u * way_u + way_v * way_v)
-    if not parallax >= MIN_PARALLAX_PX:  # also where it is not a number
+    if not parallax >= MIN_PARALLAX_PX:  # true for NaN too
         found.status = wp.where(s > 0.0, _ILL_POSED, _OUT_OF_RANGE)
         return found
     edge_u, edge_v = EDGE_MARGIN * g.size[0], EDGE_MARGIN * g.size[1]

@@ -24,24 +24,25 @@ from kernels.structured.decoded import Decoded, unwritten_decoded
 from kernels.structured.phase import WrappedPhase
 
 MODEL_PHASE_ERROR = 0.02
-"""Radians that a phase may be off beyond noise, from what is left of responses and blur: noise alone would be too sure of a wrap."""
+"""Error of a phase beyond noise, radians: imperfect responses and blur cause it, and with noise alone a wrap would seem too certain."""
 UNDECIDED_CHI2 = 9.0
-"""χ² of the second-best candidate that is not enough to rule it out (three standard deviations) …"""
+"""The second-best candidate leaves a pixel UNDECIDED when its χ² is at most this (three standard deviations) …"""
 UNDECIDED_RATIO = 2.0
-"""… beyond so many times that of the best, which grows where something unmodelled disturbs the phases."""
+"""… plus this many times the χ² of the best candidate, which is large where something unmodelled disturbs the phases."""
 MULTIPATH_CHI2 = 225.0
-"""χ² of the best candidate beyond which the phases contradict each other: 15 deviations, 0.3 radians where noise is low."""
+"""Largest χ² of the best candidate whose phases agree: beyond 15 standard deviations, 0.3 radians where noise is low, they contradict each
+other."""
 MIN_SEPARATION = 0.02
-"""Radians by which the phases of two places must differ, so that the periods tell them apart at all."""
+"""Least distance between the phases of two places, radians, so that the periods tell the places apart."""
 MIN_COVER = 0.75
-"""Part of the projector that the periods must tell apart. Where they repeat just within it, the places at its two ends that look alike are
-UNDECIDED and the rest is not; with less than this, most places would be."""
+"""Least part of the projector over which the periods are unambiguous. Where they repeat just within it, only the places at its two ends
+look alike and are UNDECIDED; with less than this part, most places would be."""
 BORDER_SIGMAS = 4.0
-"""Deviations by which a place may seem to lie outside the projector."""
+"""Standard deviations by which a place may lie outside the projector."""
 WRAP_MARGIN = 0.375
-"""Largest part of a period between a phase and its stripe; at one half the next wrap would fit as well."""
+"""Largest distance between a place and the centre of its stripe, as a part of the period: at one half, the next wrap would fit as well."""
 FAR = 1.0e30
-"""χ² of what is no candidate."""
+"""Sentinel χ² of a slot that holds no candidate."""
 
 _OUT_OF_RANGE, _UNDECIDED, _MULTIPATH = int(Status.OUT_OF_RANGE), int(Status.UNDECIDED), int(Status.MULTIPATH)
 

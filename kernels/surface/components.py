@@ -60,7 +60,7 @@ def label_runs(
 
 
 def _join(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The smallest member of each node's component, given the pairs (a, b)."""
+    """Return the smallest member of each node's component, given the pairs (a, b) of connected nodes."""
     root = np.arange(count)
     while a.size:
         low, high = np.minimum(root[a], root[b]), np.maximum(root[a], root[b])

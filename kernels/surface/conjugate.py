@@ -21,7 +21,7 @@ from kernels.surface.slopes import Slopes
 wp.set_module_options({"enable_backward": False})
 
 CHECK_EVERY = 4
-"""Iterations between readings of the residual on CUDA, where each reading waits for the device."""
+"""Number of iterations between two readings of the residual on CUDA, where each reading waits for the device."""
 
 
 class Convergence(NamedTuple):
@@ -41,7 +41,7 @@ def _descent(first: int,
              h: wp.array(dtype=wp.float32),
              # outputs
              residual: wp.array(dtype=wp.float32)):
-    """Minus half the gradient of the least squares at h."""
+    """Compute minus half the gradient of the least-squares sum at h."""
     t = first + wp.tid()
     pitch = weights.pitch
     for i in range(first_cell(walk, t), end_cell(walk, t), walk.step):
@@ -58,7 +58,7 @@ def _multiply(first: int,
               # outputs
               q: wp.array(dtype=wp.float32),
               partial: wp.array(dtype=wp.float64)):
-    """q = A·p, and each thread's part of p·q."""
+    """Compute q = A·p, and each thread's part of p·q."""
     t = first + wp.tid()
     pitch = weights.pitch
     total = wp.float64(0.0)
@@ -87,7 +87,7 @@ def _dot(first: int,
 
 @wp.func
 def _ratio(over: wp.array(dtype=wp.float64), i: int, under: wp.array(dtype=wp.float64), j: int):
-    """over[i] / under[j], and 0 once the iteration has nothing left to do."""
+    """Compute over[i] / under[j], and 0 once the iteration has converged fully."""
     return wp.where(under[j] > wp.float64(0.0), wp.float32(over[i] / under[j]), 0.0)
 
 
@@ -117,7 +117,7 @@ def _turn(first: int,
           z: wp.array(dtype=wp.float32),
           # outputs
           p: wp.array(dtype=wp.float32)):
-    """The next direction of search."""
+    """Compute the next direction of search."""
     t = first + wp.tid()
     beta = _ratio(rz, step + 1, rz, step)
     for i in range(first_cell(walk, t), end_cell(walk, t), walk.step):

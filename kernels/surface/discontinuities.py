@@ -22,22 +22,22 @@ from kernels.surface.slopes import Slopes
 wp.set_module_options({"enable_backward": False})
 
 LEAST_TRUST = 1.0e-5
-"""Part of its weight that an edge across a break keeps, so that a part broken off all around keeps some depth."""
+"""Part of its weight that an edge across a break keeps, so that a part that is broken off all around keeps some depth."""
 LEAST_LOOP = 0.01
-"""Loop sums below this, in pixels of height, break nothing: half-precision normals alone make 0.002."""
+"""Least loop sum, in pixels of height, that breaks edges: half-precision normals alone make 0.002."""
 NOISE_LOOPS = 2.0
-"""Loop sums break edges from this many standard deviations of their noise."""
+"""Least loop sum that breaks edges, in standard deviations of the loops' noise."""
 SAMPLES = 1 << 18
-"""Loops that the noise is estimated from."""
+"""Number of loops from which the noise is estimated."""
 MAD_TO_SIGMA = 1.4826
-"""From the median of the magnitudes of Gaussian values to their standard deviation."""
+"""Ratio of the standard deviation of Gaussian values to the median of their magnitudes."""
 
 _TRUST = wp.constant(wp.float32(LEAST_TRUST))
 
 
 @wp.func
 def _loop_sum(right: wp.array(dtype=wp.float32), down: wp.array(dtype=wp.float32), weights: EdgeWeights, i: int):
-    """Weighted squared sum of the slopes around cell i and the three right of and below it; −1 where one is missing."""
+    """Return the weighted squared sum of the slopes around cell i and the three cells right of and below it; −1 where one is missing."""
     below = i + weights.pitch
     least = wp.min(wp.min(weights.right[i], weights.right[below]), wp.min(weights.down[i], weights.down[i + 1]))
     c = right[i] + down[i + 1] - right[below] - down[i]
@@ -59,7 +59,7 @@ def _sample_loops(first: int,
 
 @wp.func
 def _loop_trust(one: float, other: float, scale: float):
-    """What two loops leave of the edge between them: the better one decides, and where one is missing, the other."""
+    """Return the factor on the weight of the edge between two loops: the better loop decides, and where one is missing, the other."""
     e = wp.min(one, other)
     if e < 0.0:
         e = wp.max(one, other)

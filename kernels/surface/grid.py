@@ -16,11 +16,11 @@ from kernels import device as devices
 wp.set_module_options({"enable_backward": False})
 
 CPU_RUN = 8192
-"""Cells that one CPU thread takes in a row: 32 KB of float32, so that the cost of a thread disappears."""
+"""Number of cells that one CPU thread takes in a row: 32 KB of float32, so that the cost of starting a thread is negligible."""
 CUDA_SUM_THREADS = 65536
-"""Threads of a sum on CUDA: enough to fill the largest device, few enough for their partial sums to be cheap."""
+"""Number of threads of a sum on CUDA: enough to fill the largest device, and few enough for their partial sums to be cheap."""
 FOLD_THREADS = 256
-"""Threads of the second stage of a long sum; the third stage is one thread."""
+"""Number of threads in the second stage of a long sum; the third stage is one thread."""
 
 
 @wp.struct

@@ -117,7 +117,7 @@ def _check(normal: Any, mask: Any, x: Any, y: Any, *, perspective: bool, mean_z:
 
 
 def _spacing(x: np.ndarray | wp.array, y: np.ndarray | wp.array) -> float:
-    """Mean distance between neighbours along the middle row (or column, where the picture is one pixel wide)."""
+    """Return the mean distance between neighbours along the middle row (or column, where the picture is one pixel wide)."""
     rows, cols = x.shape
 
     def line(a: np.ndarray | wp.array) -> np.ndarray:
@@ -131,7 +131,7 @@ def _spacing(x: np.ndarray | wp.array, y: np.ndarray | wp.array) -> float:
 
 
 def _upload(a: np.ndarray | wp.array, dtype: type, device: str) -> wp.array:
-    """The array on the device, without a copy where it is there already."""
+    """Return the array on the device, without a copy where it is there already."""
     if isinstance(a, np.ndarray):
         kind = np.uint8 if dtype is wp.uint8 else np.float32
         flat = (a != 0).view(np.uint8) if kind is np.uint8 else np.ascontiguousarray(a, dtype=kind)

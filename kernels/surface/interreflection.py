@@ -12,11 +12,12 @@ from kernels.errors import ArrayError
 from kernels.surface.shadows import Projection, project
 
 LEAST_FACTOR = 1.0e-4
-"""Pairs below are not looked at for what stands between them: all of them together move a reading by under a part in a thousand."""
+"""Least form factor of a pair that is tested for an obstacle between its patches: all smaller ones together change a reading by less than a
+part in a thousand."""
 SIGHT_STEPS = 8
-"""Points of the way between two patches where the height is looked up."""
+"""Number of points on the line between two patches at which the height is looked up."""
 SIGHT_MARGIN_PIXELS = 1.0
-"""How far the surface must stand above the way to hide it: patches are coarse."""
+"""Distance, in pixels, by which the surface must stand above the line between two patches to hide it: patches are coarse."""
 
 
 def form_factors(points: np.ndarray, normals: np.ndarray, areas: np.ndarray, height: wp.array, mask: wp.array,

@@ -25,9 +25,9 @@ from kernels.surface.grid import EdgeWeights, Grid, Walk, end_cell, first_cell, 
 wp.set_module_options({"enable_backward": False})
 
 COARSEST = 2
-"""Levels stop at this many pixels a side, where smoothing alone solves."""
+"""Side, in pixels, of the coarsest level: smoothing alone solves it."""
 COARSEST_SWEEPS = 4
-"""Smoothing passes there, each way."""
+"""Number of smoothing passes on the coarsest level, in each direction."""
 
 
 class Level(NamedTuple):
@@ -88,7 +88,7 @@ def _scaled_residual(first: int,
                      value: wp.array(dtype=wp.float32),
                      # outputs
                      scaled: wp.array(dtype=wp.float32)):
-    """Residual over diagonal; a cell without edges has the value 0."""
+    """Return the residual divided by the diagonal; for a cell without edges, 0."""
     t = first + wp.tid()
     for i in range(first_cell(walk, t), end_cell(walk, t), walk.step):
         scaled[i] = relaxed(weights, target, value, i) - value[i]
@@ -110,7 +110,7 @@ def _restrict(first: int,
               coarse_pitch: int,
               # outputs
               target: wp.array(dtype=wp.float32)):
-    """The transpose of _prolong: a red pixel's residual goes to the cells of its neighbours. Black residuals are 0."""
+    """Apply the transpose of _prolong: a red pixel's residual goes to the cells of its neighbours. Black residuals are 0."""
     pitch = weights.pitch
     k, coarse = halved_cell(first + wp.tid(), cols, pitch, coarse_pitch)  # k is always even: the cell's black pixels are this one
     j = k + pitch + 1  # and the one diagonally below
@@ -190,7 +190,7 @@ class Multigrid:
         run(_smooth, level.grid.colour(parity), [level.weights, level.target], [level.value])
 
     def _start(self, level: Level) -> None:
-        """Red (odd) cells from a guess of zero, then black."""
+        """Smooth the red (odd) cells from a guess of zero, then the black ones."""
         run(_smooth_from_zero, level.grid.odd, [level.weights, level.target], [level.value])
         self._smooth(level, 0)
 

@@ -1,7 +1,8 @@
-"""Cast shadows on a height field: the way from a surface point to a light is marched over the picture, pixel by pixel.
+"""Cast shadows on a height field: the line from a surface point to a light is marched, that is, followed over the picture pixel by pixel,
+and the height of the surface is compared with it.
 
-A point is in shadow when the surface stands above the way by more than a margin: a part of a pixel, and a slope that a
-height integrated from normals may be wrong by. Only what the camera sees can throw a shadow here.
+A point is in shadow when the surface stands above the line by more than a margin: a part of a pixel, and a slope by which a
+height integrated from normals may err. Only surface that the camera sees can cast a shadow here.
 """
 
 from typing import NamedTuple
@@ -9,14 +10,14 @@ from typing import NamedTuple
 import warp as wp
 
 MARGIN_PIXELS = 0.3
-"""How far, in pixels, the surface must stand above the way."""
+"""Height above the marched line, in pixels, that the surface must exceed to hide the light."""
 MARGIN_SLOPE = 0.02
-"""And how far more for each unit of the way: heights drift by about a degree."""
+"""Growth of that height with the distance from the point, per unit of the picture's plane: integrated heights drift by about a degree."""
 FIRST_STEP = 1.5
-"""In pixels: the point's own neighbours say nothing about cast shadows."""
+"""Distance from the point, in pixels, at which the march begins: the point's own neighbours cannot tell cast shadow."""
 
 NO_REACH = 1.0e30
-"""The reach of a distant light."""
+"""Reach of the march to a distant light: a length beyond every scene."""
 
 
 class Projection(NamedTuple):

@@ -33,9 +33,9 @@ from kernels.surface.grid import EdgeWeights, Grid
 wp.set_module_options({"enable_backward": False})
 
 STEEPEST = 0.02
-"""Cosine of the steepest usable tilt, 88.9°: the rim of a sphere of 2500 pixels radius, beyond what normals resolve."""
+"""Cosine of the steepest usable tilt, 88.9°: that of the rim of a sphere of 2500 pixels radius, which normals do not resolve."""
 SHORTEST_NORMAL = 0.5
-"""A normal shorter than this is no normal: half storage shortens one by 0.001, an unsolved pixel holds zeros."""
+"""Least length of a vector that counts as a normal: half storage shortens one by 0.001, and an unsolved pixel holds zeros."""
 
 _FLOOR = wp.constant(wp.float32(STEEPEST))
 _LEAST = wp.constant(wp.float32(STEEPEST**2))
@@ -112,7 +112,7 @@ def _normal_at(normal: wp.array3d(dtype=wp.float32), r: int, c: int):
 
 @cache
 def _edge_kernel(perspective: bool) -> Any:
-    """The kernel over all edges, for one projection."""
+    """Return the kernel over all edges for one projection."""
     pair = perspective_slope if perspective else orthographic_slope
 
     @wp.func

@@ -1,4 +1,4 @@
-"""Joint bilateral filter: a plane through neighbours that look the same and lie near, weighed by how well each is known.
+"""Joint bilateral filter: a plane is fitted through neighbours that look the same and lie near, each weighted by its precision.
 
 The plain filter averages; where an edge of the guide cuts the window in two, the average of a slope lies to one side of the pixel and the
 edge is drawn into the depth. A plane has no such error.
@@ -18,19 +18,22 @@ from kernels.status import Status
 from kernels.tof.flying import require_image
 
 GUIDE_RELATIVE = 0.15
-"""Relative difference of the guide at which a neighbour counts exp(-½): albedo edges differ by more, noise by less."""
+"""Relative difference of the guide at which a neighbour's weight is exp(-½): albedo edges differ by more, noise by less."""
 RANGE_SIGMAS = 3.0
-"""Standard deviations of the difference of two ranges at which a neighbour counts exp(-½)."""
+"""Difference of two ranges, in its standard deviations, at which a neighbour's weight is exp(-½)."""
 LEAST_STEP = 0.02
-"""Part of the range at which it does so however well both are known: slopes are surfaces too."""
+"""Least difference of two ranges, as a part of the range, at which a neighbour's weight is exp(-½), however precise both are: neighbours on
+a slope differ too."""
 LEAST_DETERMINANT = 1e-3
-"""Least determinant of the plane's matrix over that of independent unit spreads: below it the neighbours lie on a line and are averaged."""
+"""Least determinant of the plane's matrix, relative to that of independent unit spreads: below it the neighbours lie on a line and are
+averaged."""
 LEAST_VARIANCE = 1e-12
-"""m²: a micrometre, so that noise-free pixels have a weight."""
+"""Least variance of a range, m²: that of a micrometre, so that noise-free pixels have a finite weight."""
 LEAST_GUIDE = 1e-30
-"""So that one over the guide is a number where nothing was measured."""
+"""Least value of the guide, so that its reciprocal is finite where nothing was measured."""
 CUTOFF = 32.0
-"""(1 - u/32)^16 stands for exp(-u/2), which it is but for the tail, at most 2 % of a weight: a few operations for a whole pack."""
+"""Distance u at which a weight becomes 0: (1 - u/32)^16 replaces exp(-u/2) and differs from it by 2 % of a weight at most. It takes a few
+operations for a whole pack."""
 
 _OK = int(Status.OK)
 

@@ -17,10 +17,11 @@ from kernels.packs import as_packs, pack_type, place, unwritten
 from kernels.tof.modulation import require_frequencies
 
 LEAST_PHASES = 3
+"""Least number of different reference phases of a frequency: the fit has three unknowns."""
 WORST_CONDITION = 100.0
-"""Largest over smallest singular value of the least-squares matrix: beyond it the phases lie too close together."""
+"""Largest ratio of the largest to the smallest singular value of the least-squares matrix: beyond it the phases lie too close together."""
 ROUNDING = 2e-7
-"""Relative error of a reading kept in float32: the least noise of an image."""
+"""Relative rounding of a reading kept in float32: it is the least noise of an image."""
 
 
 class Noise(NamedTuple):

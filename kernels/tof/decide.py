@@ -1,4 +1,4 @@
-"""The most probable wrap of each pixel, and why where it is not good enough."""
+"""The most probable wrap of each pixel, and a status that tells why a wrap is not good enough."""
 
 from functools import cache
 from typing import Any, NamedTuple
@@ -13,15 +13,16 @@ from kernels.tof.modulation import radians_per_metre
 from kernels.tof.unwrap import Hypotheses
 
 AGREEMENT_RAD = 0.01
-"""Systematic error of a phase that is no sign of multipath: what calibration leaves."""
+"""Systematic phase error, in radians, that remains after calibration: frequencies that disagree by no more are no sign of multipath."""
 UNCALIBRATED_RAD = 0.04
-"""The same of a camera whose wiggling is not known: a third harmonic of 8 % bends phases by up to 0.1 rad."""
+"""Systematic phase error, in radians, of a camera whose wiggling is not calibrated: a third harmonic of 8 % bends phases by up to 0.1
+rad."""
 MULTIPATH_Z = 3.72
-"""Standard normal quantile: one pixel in ten thousand with a single return is called multipath."""
+"""Standard normal quantile of the multipath test: one pixel in ten thousand with a single return is called multipath."""
 SIGNAL_Z = 4.75
-"""One pixel in a million without signal is taken to have one."""
+"""Standard normal quantile of the signal test: one pixel in a million without signal is taken to have one."""
 DECIDED = 2 / 3
-"""Probability that the chosen wrap must have."""
+"""Least probability of the chosen wrap; a pixel below it is UNDECIDED."""
 
 _OK, _UNDECIDED, _MULTIPATH = int(Status.OK), int(Status.UNDECIDED), int(Status.MULTIPATH)
 _LOW, _SATURATED, _OUT = int(Status.LOW_MODULATION), int(Status.SATURATED), int(Status.OUT_OF_RANGE)

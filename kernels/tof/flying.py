@@ -15,17 +15,21 @@ from kernels.errors import ArrayError
 from kernels.status import Status
 
 SIGMAS = 4.0
-"""Standard deviations by which a range must depart from what both sides predict."""
+"""Least departure of a flying pixel from what both sides predict, in standard deviations of the difference."""
 RELATIVE = 0.01
-"""Part of the range by which it must depart at least: curved surfaces depart from their tangents too."""
+"""Least departure of a flying pixel, as a part of its range: curved surfaces depart from their tangents too."""
 STEPS = 1.5
-"""By which it must depart, in steps from pixel to pixel of that side: a surface that curves away at its rim bends by less than a step."""
+"""The departure must exceed this many times the side's own pixel-to-pixel step: a surface that curves away at its rim bends by less than a
+step."""
 STEEPEST = 10.0
-"""Departures by which neighbours on one surface may differ: a slope of a tenth of the range a pixel."""
+"""Neighbours are on one surface when their ranges differ by less than this many times the least departure: a slope of a tenth of the range
+per pixel."""
 ASIDE = 0.9
-"""Part of a pixel's own departure below which a step across the line counts as the slope of that side; one as far off may fly too."""
+"""A step across the line counts as slope only if it is smaller than this fraction of the pixel's departure; a larger one may be a flying
+pixel."""
 LEAST_SUPPORT = 2
-"""Least number of the eight neighbours on the same surface: a wire one pixel wide has two; of fewer neighbours one in three."""
+"""Least number of the eight neighbours that lie on the same surface: a wire one pixel wide has two. Where fewer than six are measured, a
+third of them suffices."""
 
 _OK, _FLYING = int(Status.OK), int(Status.FLYING)
 

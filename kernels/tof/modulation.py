@@ -8,9 +8,9 @@ import numpy as np
 from kernels.errors import ArrayError
 
 REPEAT_TURNS = 0.02
-"""Phases that differ by less than this part of a turn are the same again: nearer than noise of 0.1 rad tells apart."""
+"""Phases that differ by less than this part of a turn count as equal: noise of 0.1 rad cannot tell closer ones apart."""
 MOST_TURNS = 1000
-"""Turns of the lowest frequency within which a repeat is looked for: 7.5 km at 20 MHz."""
+"""Largest number of turns of the lowest frequency within which a repeat is searched: 7.5 km at 20 MHz."""
 
 
 def radians_per_metre(modulation_hz: Sequence[float] | np.ndarray, light_speed: float) -> np.ndarray:

@@ -9,13 +9,15 @@ from kernels.errors import ArrayError
 from kernels.tof.continuous import LEAST_PHASES, Noise, weights
 
 BINS = 24
-"""Bins of equal numbers of pixels over the level."""
+"""Number of bins over the level, each with the same number of pixels."""
 LEAST_IN_BIN = 32
-"""Readings of a bin; of fewer than three bins no line is drawn, and all noise counts as read noise."""
+"""Least number of readings in a bin. With fewer than three bins no line is fitted, and all noise counts as read noise."""
 LEAST_READ_ELECTRONS = 5.0
-"""Read noise that is assumed where every part of the image is too bright to show it: black pixels must not pass for certain ones."""
+"""Read noise in electrons that is assumed where every part of the image is too bright to show it: black pixels must not pass for noise-free
+ones."""
 HIDDEN = 4.0
-"""Shot noise of the darkest bin over that read noise, as variances, from which it cannot be seen."""
+"""The read noise cannot be measured when the variance of shot noise in the darkest bin is more than this many times that of
+LEAST_READ_ELECTRONS."""
 CHI_SQUARED_MEDIAN = 0.4549
 """Median of chi-squared with one degree of freedom."""
 
@@ -58,7 +60,7 @@ def estimate_noise(images: np.ndarray, modulation_hz: Sequence[float] | np.ndarr
         mine = images[index == f].astype(np.float64)
         if len(mine) > LEAST_PHASES:
             matrix = np.stack([np.ones(len(mine)), np.cos(delta[index == f]), np.sin(delta[index == f])], axis=1)
-            matrix /= factor[index == f, None]  # what an exposure of its own records
+            matrix /= factor[index == f, None]  # in units of what the exposure records
             left = np.linalg.svd(matrix)[0][:, LEAST_PHASES:]  # unit vectors that no (P, a, b) reaches: each sees pure noise
             fitted.add(((left**2).T @ mine)[:, keep], (left.T @ mine)[:, keep] ** 2)
             continue
@@ -80,7 +82,7 @@ def estimate_noise(images: np.ndarray, modulation_hz: Sequence[float] | np.ndarr
 
 
 class _Pairs(NamedTuple):
-    """Levels and squared noise at them, of one way to see noise alone."""
+    """Levels and the squared noise at them, from one estimator."""
 
     levels: list[np.ndarray]
     squares: list[np.ndarray]
@@ -94,7 +96,8 @@ class _Pairs(NamedTuple):
 
 
 def _fit(level: np.ndarray, squared: np.ndarray) -> Noise:
-    """Return the line through the medians of squared noise over bins of level; neither coefficient below zero."""
+    """Return the noise model whose line passes through the medians of squared noise over bins of level; neither coefficient is below
+    zero."""
     bins = min(BINS, len(level) // LEAST_IN_BIN)
     if bins < 3:
         return Noise(0.0, float(squared.mean()) ** 0.5)

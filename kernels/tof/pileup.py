@@ -11,9 +11,10 @@ from kernels.errors import ArrayError
 wp.set_module_options({"enable_backward": False})
 
 LEFT_OVER = 0.5
-"""Pulses that count as left where a bin took them all: the logarithm of none has no value, and without the bin the return would move."""
+"""Number of pulses that count as left after a bin that took them all: the logarithm of zero is not finite, and dropping the bin would move
+the return."""
 EXHAUSTED = 1e-3
-"""Part of the pulses that must be left for a bin to be used: with fewer the correction is division by chance."""
+"""Least part of the pulses that must be left for a bin to be used: with fewer, the correction divides by a number that is mostly chance."""
 
 
 class Exposed(NamedTuple):

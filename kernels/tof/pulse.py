@@ -10,9 +10,11 @@ from kernels.errors import ArrayError
 from kernels.tof.modulation import require_ascending
 
 REACH_SIGMAS = 4.5
-"""Half width of the table of a Gaussian, in standard deviations: 7 in a million of its light lie outside."""
+"""Half width of the table of a Gaussian pulse, in standard deviations: 7 in a million of its light lie outside."""
 STEPS_PER_SIGMA = 24
+"""Steps of the table of a Gaussian pulse in a standard deviation."""
 STEPS_PER_BIN = 32
+"""Steps of the table of a measured pulse in a bin."""
 
 
 class Pulse(NamedTuple):

@@ -1,4 +1,4 @@
-"""The width of the pulse, from the histograms: the Gaussian under which the brightest of them are likeliest."""
+"""The width of the pulse, estimated from the histograms: the Gaussian under which the brightest of them are most likely."""
 
 import numpy as np
 import warp as wp
@@ -9,16 +9,16 @@ from kernels.tof.pulse import Pulse, gaussian
 from kernels.tof.returns import find_returns, threshold
 
 WIDTHS = np.geomspace(0.25, 4.0, 13)
-"""Standard deviations of Gaussian pulses that are tried, in bins."""
+"""Standard deviations, in bins, of the Gaussian pulses that are tried."""
 WIDTH_PIXELS = 512
-"""The brightest pixels, which decide on the width."""
+"""Number of brightest pixels that decide on the width."""
 WIDTH_WINDOW = 8
-"""Bins in which their photons are counted: the highest bin alone would prefer histograms that are narrow by chance."""
+"""Number of neighbouring bins whose photons rank a pixel: the highest bin alone would prefer histograms that are narrow by chance."""
 WIDTH_RETURNS = 3
-"""A pixel when the width is looked for; each costs likelihood, or narrow pulses could pile up to any shape."""
+"""Most returns fitted per pixel in the width search; each extra one is penalised, because narrow pulses could imitate any shape."""
 
 LEAST_SIGMA = 1e-6
-"""Bins: float32 holds no smaller deviation of a time."""
+"""Least standard deviation of a return's time that enters the cost, in bins: float32 resolves no smaller one."""
 
 
 def estimate_pulse(exposed: Exposed, counts: np.ndarray) -> Pulse:

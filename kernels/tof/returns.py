@@ -33,21 +33,23 @@ from kernels.tof.pulse import Pulse
 from kernels.tof.times import peak_reach, return_times
 
 FALSE_ALARMS = 1e-3
-"""Part of the pixels without a return in which one is found."""
+"""Fraction of the pixels without a return in which noise alone is taken for one."""
 POSITIONS_PER_BIN = 2
-"""Positions that the search tries in a bin: the refinement starts at most a quarter of a bin away."""
+"""Positions that the search tries in a bin: the refinement then starts at most a quarter of a bin away."""
 POSITIONS_PER_WIDTH = 2
-"""At least: of a pulse narrower than a bin, light at the edge that tells on which side of the bin it lies must not be missed."""
+"""Minimum number of search positions per pulse width, so that a pulse narrower than a bin is placed on the right side of it."""
 LEAST_SHARE = 0.05
-"""Least part of a return that must fall into the histogram."""
+"""Least share of a return's photons that must fall into the histogram."""
 ROUNDS, ROUNDS_TOGETHER = 2, 8
-"""Rounds of background and refinement, each return in turn: for returns alone, and for returns that overlap."""
+"""Rounds of background and refinement over all returns, for returns that do not overlap and for returns that do."""
 LEAST_OUTSIDE = 4
-"""Bins without a return that the background is taken from; with fewer it stays at what the search took it for."""
+"""Least number of bins outside all returns from which the background is measured; with fewer, the background keeps the value that the
+search assumed."""
 SCORING_STEPS = 8
-"""With steps of at most half a bin it settles to a thousandth of its deviation in five."""
+"""Steps of Fisher scoring: with steps of at most half a bin, five of them settle the time to a thousandth of its deviation."""
 KNOWN_TO_A_BIN = 12.0
-"""Information about a time that is known to a bin: keeps steps short where the pulse hides in one."""
+"""Fisher information, in 1/bin², about a time that is evenly distributed over one bin: it keeps steps short where a bin holds the whole
+pulse."""
 
 _OK, _LOW, _SATURATED = int(Status.OK), int(Status.LOW_MODULATION), int(Status.SATURATED)
 
@@ -119,7 +121,8 @@ def threshold(bins: int) -> float:
 @wp.func
 def _added_at(given: Recorded, pulse: Shape, t: float, b: float, p: int, found: int,
               position: wp.array2d(dtype=wp.float32), photons: wp.array2d(dtype=wp.float32)):
-    """Log likelihood that a return at t would add to those found, and its photons; both 0 where none would."""
+    """Return the log likelihood that a return at t would add to those found, and its photons; both are 0 where a return would add
+    nothing."""
     low = first_bin_of(pulse, t)
     high = end_bin_of(pulse, t, given.counts.shape[0])
     excess = float(0.0)
@@ -256,7 +259,7 @@ def _returns_kernel(first: int,
                 going = 0
             else:
                 evidence[found, p] = 2.0 * gain
-                # how much of it lies at this peak, and what the photons would be as background
+                # the part of the evidence that lies at this peak, and the evidence if the photons were background
                 here = float(0.0)
                 for j in range(int(wp.ceil(wp.max(place - peak_reach(pulse), first_bin) * float(per_bin))),
                                int(wp.min(place + peak_reach(pulse), last_bin) * float(per_bin)) + 1):

@@ -33,17 +33,20 @@ from kernels.tof.pileup import Exposed
 from kernels.tof.pulse import Pulse
 
 NODES = 4
-"""Intervals of a segment of the integral, by Simpson's rule."""
+"""Number of intervals in a segment of the integral, which Simpson's rule sums."""
 LONGEST_PART = 0.25
-"""Longest segment, as a part of one side of the peak. The first is as long as the bound, each next one twice as long."""
+"""Longest segment, as a part of one side of the peak. The first segment is as long as the bound on the deviation, and each next one is
+twice as long."""
 NEGLIGIBLE = 12.0
-"""Log likelihood under the top at which a side of the peak ends: what lies beyond adds a hundred-thousandth."""
+"""Log likelihood below the top at which a side of the peak ends: everything beyond adds a hundred-thousandth."""
 HIGHEST = 30.0
-"""Log likelihood over the top that float32 holds: where the search stopped short of it."""
+"""Largest log likelihood above the found maximum whose exponential float32 sums can hold; it occurs where the search stopped short of the
+maximum."""
 STRENGTH_STEPS, SMALL_CHANGE = 6, 0.2
-"""Newton steps towards the best strength, and the part of it from which the rest of the likelihood is that of a parabola."""
+"""Most Newton steps towards the best strength, and the relative step size below which the remaining gain is taken from the parabola."""
 LEAST_DETERMINANT = 1e-9
-"""Least determinant of two returns' information, in units of their photons: with less, float32 cannot tell one from the other."""
+"""Least determinant of the information matrix of two returns, in units of their photons: below it, float32 cannot tell the returns
+apart."""
 
 wp.set_module_options({"enable_backward": False})
 
@@ -95,7 +98,7 @@ def peak_reach(pulse: Shape):
 
 @wp.func
 def _slopes(pulse: Shape, i: int, t: float, s: float):
-    """Derivatives of the mean of a bin by the time of a return and by the logarithm of its strength."""
+    """Return the derivatives of the mean of a bin by the time of a return and by the logarithm of its strength."""
     return wp.vec2f(s * (density_at(pulse, float(i) - t) - density_at(pulse, float(i + 1) - t)),
                     s * (share_before(pulse, float(i + 1) - t) - share_before(pulse, float(i) - t)))
 
@@ -103,8 +106,8 @@ def _slopes(pulse: Shape, i: int, t: float, s: float):
 @wp.func
 def _bounds(given: Recorded, pulse: Shape, k: int, p: int, found: int, b: float,
             position: wp.array2d(dtype=wp.float32), photons: wp.array2d(dtype=wp.float32)):
-    """Return the information about the time of return k, how the logarithm of its best strength changes with it, and how much larger its
-    variance is because its nearest neighbour is unknown too."""
+    """Return three numbers about return k: the Fisher information about its time, the derivative of the logarithm of its best strength by
+    its time, and the factor by which its variance grows because its nearest neighbour is unknown too."""
     t = position[k, p]
     s = photons[k, p]
     near = wp.int32(-1)
@@ -136,7 +139,8 @@ def _bounds(given: Recorded, pulse: Shape, k: int, p: int, found: int, b: float,
 @wp.func
 def _best_gain(given: Recorded, pulse: Shape, t: float, along: float, k: int, p: int, found: int, b: float,
                position: wp.array2d(dtype=wp.float32), photons: wp.array2d(dtype=wp.float32)):
-    """Log likelihood of return k at t with its best strength, less that where it was found: a difference that float32 can hold."""
+    """Return the log likelihood of return k at t with its best strength, less the log likelihood at the position where it was found;
+    float32 can hold this difference."""
     top = position[k, p]
     s = photons[k, p]
     strength = s * wp.exp(wp.clamp(along * (t - top), -2.0, 2.0))

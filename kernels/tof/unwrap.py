@@ -17,14 +17,15 @@ from kernels.tof.continuous import Correlation
 from kernels.tof.modulation import radians_per_metre, require_span
 
 HYPOTHESES = 3
-"""Kept a pixel: a fourth has had no influence on the result in the simulated scenes."""
+"""Number of hypotheses kept for a pixel: a fourth has had no influence on the result in the simulated scenes."""
 FLOOR_RAD = 1e-3
-"""Phases are not trusted further than this, however bright: 0.3 mm at 80 MHz."""
+"""Least standard deviation of a phase, in radians, however bright the pixel is: 0.3 mm at 80 MHz."""
 FAR = 1e20
-"""Cost of what is no hypothesis."""
+"""Sentinel cost of a slot that holds no hypothesis."""
 END_SIGMAS = 3.0
-"""Standard deviations beyond either end of the span at which a hypothesis is still one."""
+"""Standard deviations by which a hypothesis may lie beyond either end of the span."""
 TURN = 2 * np.pi
+"""One turn in radians."""
 
 
 class Hypotheses(NamedTuple):

@@ -1,4 +1,4 @@
-"""A vote of the neighbourhood on the wraps that a pixel leaves open."""
+"""A vote of the neighbours on the wraps that a pixel leaves undecided."""
 
 
 import warp as wp
@@ -8,14 +8,17 @@ from kernels.errors import ArrayError
 from kernels.tof.unwrap import HYPOTHESES, Hypotheses
 
 VOTE_RADIUS = 2
-"""Pixels: 24 neighbours."""
+"""Half-width of the voting window, pixels: it holds 24 neighbours."""
 VOTE_ROUNDS = 2
+"""Number of votes: in the second, neighbours vote with the probabilities that the first gave them."""
 SAME_SURFACE = 0.3
-"""Neighbours within this part of the wrap distance count as the same surface."""
+"""Largest difference of two ranges on the same surface, as a part of the wrap distance."""
 CERTAIN = 1 - 1e-5
-"""Probability from which a pixel is not asked again: two rounds multiply the odds of another wrap by at most 1 / STRANGER²."""
+"""Probability of the best hypothesis from which a pixel keeps it without a vote: two rounds multiply the odds of another wrap by at most 1
+/ STRANGER²."""
 STRANGER = 0.02
-"""Prior of a pixel on a surface that none of its neighbours is on: how far they can outvote its own measurement."""
+"""Prior weight of a pixel on a surface that none of its neighbours is on: it limits how far they can outvote the pixel's own
+measurement."""
 
 wp.set_module_options({"enable_backward": False})
 

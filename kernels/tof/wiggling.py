@@ -1,4 +1,4 @@
-"""Harmonic (wiggling) correction: a light source that is no pure cosine bends the phase; a table says by how much at each phase.
+"""Harmonic (wiggling) correction: a light source that is not a pure cosine bends the phase, and a table holds the error at each phase.
 
 Source: Lindner and Kolb, "Lateral and depth calibration of PMD-distance sensors", ISVC 2006.
 """
@@ -12,7 +12,8 @@ from kernels.errors import ArrayError
 from kernels.tof.continuous import Correlation
 
 ENTRIES = 512
-"""Entries of the table: between two, the eighth harmonic of a correction departs from a straight line by less than 0.2 % of it."""
+"""Number of entries in the table: between two of them, the eighth harmonic of a correction departs from a straight line by less than 0.2 %
+of its amplitude."""
 
 wp.set_module_options({"enable_backward": False})
 

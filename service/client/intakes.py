@@ -16,9 +16,10 @@ from service.views.intakes import IntakePage, IntakeView
 from service.views.states import CHECKING, READY, RECEIVING, REFUSED
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 2.0
-"""Between two requests for the state of an intake that is being checked; each pause is half as long again as the one before."""
+"""First and longest pause, in seconds, between two requests for the state of an intake that is being checked; each pause is 1.5 times the
+one before."""
 GENERATIONS = 100
-"""How often the same files may have been uploaded and deleted again before they are uploaded without looking for an earlier upload."""
+"""Number of earlier uploads of the same files, each deleted since, that are looked for before the files are uploaded without a token."""
 
 
 class Intakes:

@@ -36,13 +36,13 @@ class CodeRow(NamedTuple):
     """What the commands need to know about one code."""
 
     decoder: Callable[[AxisCodes], AxisDecoder | None]
-    """Returns how the frames of an axis are decoded, or None if they hold no such code."""
+    """Returns the decoder of an axis's frames, or None if they hold no such code."""
     patterns: Callable[[PatternsRequest, Axis, int], Sequence[Pattern]]
-    """Returns the frames to project along an axis of so many pixels; raises ValueError if an option cannot be used."""
+    """Returns the frames to project along an axis whose extent in pixels is given; raises ValueError if an option cannot be used."""
     options: tuple[str, ...]
     """The options of `relit patterns` that belong to the code."""
     cost: Callable[[PlanRequest, int], Cost] | None
-    """Returns the line of the planner's table for so many columns; None if the line of another code stands for this one too."""
+    """Returns the line of the planner's table for a given number of columns; None if the line of another code stands for this one too."""
 
 
 def _phase_frames(request: PatternsRequest, axis: Axis, extent: int) -> Sequence[Pattern]:

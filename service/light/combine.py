@@ -11,7 +11,8 @@ from service.requests.relight import CHUNK_FRAMES
 from stage.stack import Stack
 
 CHUNK_BYTES = 256 << 20
-"""Most bytes of linear frames, in float32, in a chunk. Two chunks are held at one time: one is computed while the one before is written."""
+"""Most bytes of linear frames, in float32, in a chunk. Two chunks are in memory at one time: one is computed while the previous one is
+written."""
 
 
 def chunk_frames(stack: Stack) -> int:
@@ -26,9 +27,9 @@ def linear_frames(stack: Stack, weights: np.ndarray, places: Sequence[int] | Non
     Args:
         stack: the images.
         weights: [frames, 3, lights padded] float32.
-        places: the position of each frame in its chunk of chunk_frames, the same whichever of them are made: BLAS may sum in another
-            order in another row, and frames that are made later must be the same to the last bit. None: a single frame that is the
-            whole job, for which a faster product is used.
+        places: the row of each frame in the full chunk, also when only some of its frames are made: BLAS sums may differ by row, and
+            frames that are made later must be identical to the last bit. None: a single frame that is the whole job, for which a
+            faster product is used.
         device: where.
 
     Returns:

@@ -1,4 +1,5 @@
-"""Environment maps: one for all frames or one for each, checked by their headers at once and read when their frame comes."""
+"""Environment maps, one for all frames or one for each: the headers of all are checked at the start, and a map is read when its first frame
+is made."""
 
 import re
 from collections.abc import Iterable
@@ -26,7 +27,7 @@ class EnvironmentMap:
 
     @cached_property
     def samples(self) -> EnvironmentSamples:
-        """The map as samples for a model of a surface."""
+        """The samples of the map, for a model of a surface."""
         return sample_environment(self.radiance)
 
 

@@ -22,9 +22,10 @@ from stage import exr, fingerprint
 from stage.errors import StageError, StorageError
 
 ARITHMETIC = 1
-"""Raised when frames of the same request come out otherwise, so that older ones are made anew."""
+"""Version of the arithmetic, part of every request hash. It is raised when the same request gives other pixels, so that older frames are
+made again."""
 REQUEST_ATTRIBUTE = "relit:request"
-"""Attribute of a frame: the hash of all that its pixels depend on."""
+"""Attribute of a frame's file: the hash of everything that the frame's pixels depend on."""
 
 
 def frame_path(pattern: str, number: int) -> Path:
@@ -99,12 +100,13 @@ def is_complete(path: Path, request_hash: str) -> bool:
         return False
     try:
         return bool(exr.read_header(path).metadata.get(REQUEST_ATTRIBUTE) == request_hash)
-    except StageError:  # not an EXR, cut short, unreadable: made anew
+    except StageError:  # not an EXR, truncated or unreadable: the frame is made again
         return False
 
 
 def _hash(**parts: Any) -> str:
-    """Return a hash of these parts and of the version of this program; frames carry it, so that the names of the parts stay."""
+    """Return a hash of named parts and the program's version. Files on disk carry it, so renaming a part makes every existing frame be made
+    again."""
     text = json.dumps({"arithmetic": ARITHMETIC, "version": __version__, **parts}, sort_keys=True)
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 

@@ -29,8 +29,9 @@ from stage.point_lights import DistantLights
 from stage.stack import Stack
 
 NOTHING = np.zeros((0, 4), dtype=np.float32)
+"""An empty list of places to march to."""
 KEPT_BYTES = 1 << 30
-"""Most bytes of visibility of the captured lights that are kept between chunks; of larger pictures it is marched anew."""
+"""Most bytes of the captured lights' visibility that are kept between chunks; for larger pictures it is computed again."""
 
 
 class Guide:

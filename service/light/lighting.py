@@ -26,18 +26,18 @@ from stage.point_lights import DistantLights
 from stage.stack import Stack
 
 RUN = 256
-"""Frames under one map whose weights are computed together: turns of the map that differ by whole samples share most of the work."""
+"""Number of frames under one map whose weights are computed together: rotations that differ by whole samples share most of the work."""
 SHARP_RADIUS_DEGREES = 2.0
-"""Samples of a map as small as this come from where it is bright; light from there throws shadows of its own. Other samples are shadowed as
-the captured lights around them are."""
+"""Largest angular radius of a map's sample that casts shadows of its own: small samples lie where the map is bright. The visibility of
+other samples is interpolated from the captured lights around them."""
 FAR_MARCHES = 24
-"""Most directions that shadows are marched in for one frame: for a sun of 3°, steps of a penumbra of 4 %."""
+"""Most directions in which shadows are marched for one frame: for a sun of 3°, its penumbra has steps of 4 %."""
 FAR_REACH_DEGREES = 2.0
 """Largest angle between a sample and the direction that is marched for it."""
 NEAR_MARCHES = 48
-"""Places of an area light that shadows are marched from: a penumbra of 2 % steps."""
+"""Number of places on an area light to which shadows are marched: its penumbra has steps of 2 %."""
 ANYWHERE = 1e30
-"""A reach beyond every scene: each sample of an area light takes the nearest marched place."""
+"""Reach beyond every scene: each sample of an area light takes the nearest marched place."""
 
 NearLight = PointLight | SphereLight | RectangleLight
 
@@ -48,7 +48,7 @@ class FarLight(NamedTuple):
     environment: EnvironmentMap | None
     rotation: np.ndarray  # [3, 3] float64 of the environment: turned = rotation @ direction
     gain: float
-    """What the radiance of the environment is multiplied by."""
+    """Factor on the radiance of the environment."""
     discs: tuple[Disc, ...]
 
 
@@ -56,11 +56,12 @@ class ModelLight(NamedTuple):
     """The light of one frame as samples, for a model of the surface."""
 
     wanted: Sources
-    """The environment and the discs."""
+    """The light that the frame should show: the environment and the discs."""
     captured: Sources
-    """The captured lights with the energy that the weights of the images give them for the environment and the discs."""
+    """The light that the weighted sum of images already contains for the environment and the discs: the captured lights, with the energy
+    that the weights give each."""
     added: Sources | None
-    """The captured lights of the images that the frame adds as they were captured; None: it adds none."""
+    """The captured lights of the images that light keys of type captured add; None: the frame adds none."""
     marched: np.ndarray  # [groups, 4] directions whose visibility follows after that of the captured lights
 
 
@@ -69,7 +70,7 @@ class FrameLight(NamedTuple):
 
     weights: np.ndarray  # [3, lights padded] float32: what each stored image is multiplied by
     model: ModelLight | None
-    """None where no model of the surface is lit."""
+    """The same light for a model of the surface; None: no model is lit."""
 
 
 class NearLights(NamedTuple):

@@ -1,4 +1,4 @@
-"""The plan of a relight: its captures and frames, checked as far as that is cheap before an image is read or anything is written."""
+"""The plan of a relight: its captures and frames. All cheap checks are done before an image is read or anything is written."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,7 +21,7 @@ class PlannedFrame(NamedTuple):
     path: Path
     lighting: ScheduledFrame
     position: int
-    """Its position in the whole range, from 0."""
+    """Position of the frame in the whole range, from 0."""
 
 
 class Plan(NamedTuple):

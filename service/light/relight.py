@@ -103,7 +103,7 @@ def relight(request: RelightRequest, progress: Progress | None = None) -> Religh
 
 def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]], request: RelightRequest, plan: Plan,
                      writer: FrameWriter, device: str, timings: Timings) -> None:
-    """Make frames of one capture: (frame, its request hash)."""
+    """Make frames of one capture; `todo` holds each frame with the hash of its request."""
     maps = None if opened.maps is None else read_maps(opened.maps, opened.capture)
     layers = still_layers(request.aov, opened.capture, maps, opened.maps)
     environment = todo[0][0].lighting.environment
@@ -129,7 +129,7 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
                                device=device, with_model=guide is not None)
     lights = lighting.frames([frame.lighting for frame, _ in todo])
     size = chunk_frames(stack)
-    alone = plan.total == 1 or plan.is_sequence  # of the whole range: a part of it is the same to the last bit
+    alone = plan.total == 1 or plan.is_sequence  # decided from the whole range, so that --only gives bit-identical frames
     for _, members in groupby(todo, key=lambda item: item[0].position // size):
         chunk = list(members)
         with timings.part("weights"):

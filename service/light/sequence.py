@@ -1,4 +1,5 @@
-"""The captures that are relit: one, or a sequence with one a time step, in order of name, each opened only while its frame is made."""
+"""The captures that are relit: one, or a sequence with one capture for each time step, in order of name. Each is opened only while its
+frame is made."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path

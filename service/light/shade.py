@@ -1,6 +1,6 @@
 """Light solved maps with near lights, area lights and an environment, with the shadows that the height throws.
 
-The maps alone are shaded by the contract's model, diffuse and GGX (kernels.relight.shading); with the capture, a sum of its images is
+The maps alone are shaded by Relit's BRDF, diffuse and GGX (kernels.relight.shading); with the capture, a sum of its images is
 guided by that model (service.light.guide).
 """
 
@@ -35,7 +35,8 @@ from stage.lighting import lights_from_centre
 from stage.maps import MAPS_FILE, SurfaceMaps
 
 SHADOW_DIRECTIONS = 64
-"""Directions in which shadows of even light are marched where there are no captured lights; between them they are interpolated."""
+"""Number of directions in which the shadows of broad light are marched where there are no captured lights; between them, visibility is
+interpolated."""
 
 
 class ShadeResult(NamedTuple):

@@ -17,13 +17,13 @@ TILE = 320
 FRAME_TILE = 180
 """Height of one frame on a contact sheet, pixels."""
 MOST_FRAMES = 60
-"""Frames on a contact sheet; of more, evenly chosen ones are shown, the first among them."""
+"""Most frames on a contact sheet; of a longer range, evenly spaced frames are shown, beginning with the first."""
 GAP, TITLE, MARGIN = 12, 26, 20
-"""Pixels between pictures, above each for its title, and around all."""
+"""Pixels between two pictures, above each picture for its title, and around all pictures."""
 BACKGROUND = np.array([0.055, 0.058, 0.065], dtype=np.float32)
 INK = (0.82, 0.84, 0.87)
 DISPLAY, VIEW = "sRGB - Display", "ACES 2.0 - SDR 100 nits (Rec.709)"
-"""Names in OpenColorIO's built-in configuration."""
+"""Display and view, by their names in OpenColorIO's built-in configuration."""
 
 
 def contact_sheet(path: Path, frames: Sequence[Path]) -> None:

@@ -1,6 +1,6 @@
 """Solved maps as a surface that can be lit: its pixels in batches on a device, and which lights they see over its height.
 
-The surface reflects by the contract's model, Lambert and GGX (kernels.relight.shading cites its equations).
+The surface reflects by Relit's BRDF, Lambert and GGX (kernels.relight.shading cites its equations).
 """
 
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ from stage.errors import ResultError
 from stage.maps import SurfaceMaps
 
 BATCH_PIXELS = 1 << 17
-"""Pixels that are lit at one time: 8 MB of maps, and a byte for each pixel and light whose visibility is kept."""
+"""Number of pixels that are lit at one time: 8 MB of maps, and a byte for each pixel and light whose visibility is kept."""
 
 
 class ModelBatch(NamedTuple):

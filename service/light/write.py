@@ -1,4 +1,5 @@
-"""Linear frames become half EXR files: exposure, output space, clipping, layers and metadata; on threads, while the next are computed."""
+"""Linear frames become half EXR files with exposure, output space, clipping, layers and metadata; threads write them while the next frames
+are computed."""
 
 import threading
 import time
@@ -24,12 +25,12 @@ class FrameFormat(NamedTuple):
 
     resolution: tuple[int, int]
     space: str
-    """The scene-linear space that they are written in."""
+    """Scene-linear colour space of the written frames."""
     matrix: np.ndarray | None  # [3, 3] float32 from the space that they are computed in to `space`; None: they are the same
     compression: FrameCompression
     layers: Mapping[str, np.ndarray]  # further channels of every frame, [rows, cols] float16
     parts: tuple[Layer, ...]
-    """Those of the diffuse and specular layers, which add up to the frame, that are wanted."""
+    """The wanted ones of the two layers diffuse and specular, which add up to the frame."""
 
     @classmethod
     def of(cls, options: PictureOptions, resolution: tuple[int, int], space: str, layers: Mapping[str, np.ndarray]) -> "FrameFormat":
@@ -44,7 +45,7 @@ class FrameFile(NamedTuple):
 
     path: Path
     gain: float
-    """What its exposure multiplies it by."""
+    """Factor of the frame's exposure."""
     metadata: dict[str, str]
 
 
@@ -55,9 +56,9 @@ class Written(NamedTuple):
     clipped: int
     """Pixels beyond the largest half value, stored as that value."""
     half_s: float
-    """Seconds that threads took from float to half."""
+    """Seconds that threads spent on converting float to half."""
     file_s: float
-    """Seconds that threads took to compress and write files."""
+    """Seconds that threads spent on compressing and writing files."""
 
 
 class FrameWriter:

@@ -31,8 +31,8 @@ TOKEN_S = DAY_S
 UNFINISHED_S = DAY_S
 """Seconds without a write after which an unfinished image stack is deleted."""
 FORGET_S = HOUR_S
-"""Seconds after which a worker that was not seen is forgotten, in the second round that finds it so: after a database was away for as long,
-its workers are seen again between the two rounds."""
+"""Seconds after which a worker that has not been seen is forgotten. Two rounds in a row must find it so: after the database was unreachable
+for as long, its workers are seen again between the two rounds."""
 
 
 class Housekeeper:

@@ -17,15 +17,17 @@ from service.solve.surface import integrate, mean_height, whole_surface
 from stage.point_lights import PlacedLights
 
 SETTLED = 1e-3
-"""The rounds end when heights change by less than this part of the relief: a tenth of the error that we hold them to."""
+"""The rounds end when heights change by less than this part of the relief, a tenth of the error that the tests allow."""
 SETTLED_PERCENT = 99.5
-"""Percentage of the pixels that must have settled: one at the rim may go to and fro between lights that it does and does not see."""
+"""Percentage of the pixels that must have settled: a pixel at the rim may alternate between two heights, because a light sees it in one
+round and not in the next."""
 ROUNDS = 20
 """Most rounds; five to seven are usual with lights at 1.3 object radii, twelve with a rim seen edge on, three at three radii."""
 STALLED = 4
-"""The rounds end too when so many in a row moved the surface no less than one before: noise then decides what is shadow."""
+"""Number of rounds in a row without a smaller change of the surface after which the rounds end too: noise then decides which pixels are in
+shadow."""
 MATERIAL_ROUNDS = 3
-"""Most rounds of `svbrdf`, on a surface that is nearly settled: a round leaves about a tenth of the change before it."""
+"""Most rounds of `svbrdf`, which start on a surface that has nearly settled: a round leaves about a tenth of the change before it."""
 
 
 def solve_near(given: SolveInput, lights: PlacedLights, *, method: Method) -> Solution:

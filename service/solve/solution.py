@@ -19,18 +19,20 @@ from stage.stack import Stack
 LOOSE_CONFIDENCE = 1.0 / (1.0 + 5.0)
 """Confidence of a normal whose standard error is five degrees."""
 PIXELS_AT_ONCE = 1 << 16
-"""Pixels whose saturation bits are counted in one piece: bounds the memory."""
+"""Number of pixels whose saturation bits are counted in one piece: it bounds the memory."""
 
 SUSPECT_PIXELS = 512
-"""Pixels, spread over the object, by which the lights are compared."""
+"""Number of pixels, spread over the object, on which the lights are compared."""
 LEAST_COSINE = 0.25
-"""Lights lower over the surface are not compared: shadows and grazing reflection are no fault of theirs."""
+"""Least n·l of a reading that is compared: below it, shadows and grazing reflection cause misfits that are not the light's fault."""
 LEAST_TOWARDS = 0.4
-"""Lights further round than this cosine to the view axis are not judged: rims reflect them like mirrors, and most pixels are hidden."""
+"""Least cosine between a light and the view axis at which the light is judged: lights further round are mirrored by rims and hidden from
+most pixels."""
 LEAST_PIXELS = 20
-"""A light that fewer of these pixels see is not judged."""
+"""Least number of these pixels that must see a light for it to be judged."""
 SUSPECT_OFF, SUSPECT_TIMES = 0.1, 4.0
-"""A light is suspect when its median relative misfit is above the first, and above the second times that of all lights."""
+"""A light is suspect when its median relative misfit is above the first number, and above the second number times the median of all
+lights."""
 
 
 @dataclass(frozen=True)

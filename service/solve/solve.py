@@ -106,7 +106,7 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
     balls = [] if request.reference_ball is None else [Capture.open(request.reference_ball)]
     lights = METHODS[method].read_lights(capture, *balls)
     solver = METHODS[method].solvers.get(type(lights))
-    if solver is None:  # every method for lights takes distant and near ones
+    if solver is None:  # only extended lights can be missing here: every method takes distant and near ones
         raise ManifestError(f"{capture.folder / FILE_NAME}: frames[].light: some are extended: --method svbrdf solves these, "
                             f"{method} needs lights of one direction each")
     mask = capture.mask()

@@ -54,8 +54,8 @@ uploads = sa.Table(
     sa.UniqueConstraint("intake", "folded", name="relit_uploads_of_path"))
 
 jobs = sa.Table(
-    # DBOS records a workflow for each attempt of a job: its queue, the worker that took it, its priority and whether it has ended. A fact
-    # is here although DBOS has one like it for the reason beside it; the tests named are in tests/service/server.
+    # DBOS records a workflow for each attempt of a job: its queue, the worker that took it, its priority and whether it has ended. Where a
+    # column repeats a fact that DBOS records too, its comment gives the reason; the tests named are in tests/service/server.
     "relit_jobs", metadata, _id(), _project(),
     sa.Column("key", sa.String(32)),  # identifier of the API key that submitted it; NULL: anonymous, or the service
     sa.Column("request", sa.JSON, nullable=False),  # of service.requests.jobs

@@ -18,10 +18,11 @@ from service.server.log import logger
 from service.views.states import QUEUED
 
 GRACE_ROUNDS = 2
-"""Rounds without a takeover after this worker took its lock anew: a restart of the database took the locks of the others as well."""
+"""Rounds without a takeover after this worker had to take its lock again: a restart of the database released the locks of all other workers
+as well, and they need time to take them again."""
 FORGOTTEN_ROUNDS = 3
-"""Rounds after which a workflow goes back that DBOS says this worker has and that does not run here: the database stopped after it had
-given the workflow and before this worker got the answer."""
+"""Rounds after which a workflow is put back that DBOS assigns to this worker but that does not run here. This happens when the database
+stops after it has assigned the workflow and before this worker receives the answer."""
 
 
 class Takeover:
