@@ -12,7 +12,7 @@ from service.requests.demo import BenchRequest, DemoRequest
 SERVICE = "service"
 """The folder of the demo's service, inside the folder of the demo."""
 
-ServeOption = Annotated[bool, typer.Option("--serve", help="Then open the service on it, for this machine alone.")]
+ServeOption = Annotated[bool, typer.Option("--serve", help="Afterwards run the service with the sample, for this machine only.")]
 
 
 def register(app: typer.Typer) -> None:

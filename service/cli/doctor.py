@@ -9,7 +9,7 @@ from service.cli.server import ConfigOption, DataOption, settings_of
 
 ROOTS = ("stage", "kernels", "service")
 
-DoctorDevice = Annotated[str | None, typer.Option("--device", help="Check this device; without it all.", show_default=False)]
+DoctorDevice = Annotated[str | None, typer.Option("--device", help="Check only this device; without it all.", show_default=False)]
 
 
 def register(app: typer.Typer) -> None:
@@ -18,7 +18,7 @@ def register(app: typer.Typer) -> None:
 
 
 def doctor(only: DoctorDevice = None, data: DataOption = None, config: ConfigOption = None) -> None:
-    """Check this installation: versions, shadowed packages, devices, a kernel, a writable kernel cache; and the service that is here.
+    """Check this installation: versions, shadowed packages, devices, a kernel, a writable temporary folder; and the service here.
 
     The service is that of --data or --config, or of RELIT_DATA or ./relit-data where there is such a folder.
     """

@@ -17,18 +17,19 @@ if TYPE_CHECKING:
 JobOption = Annotated[Path, typer.Option(
     "--job", metavar="FILE.yaml|DIR", show_default=False,
     help="A template, with its values in FILE.values.yaml beside it; or a folder, as Deadline Cloud takes it.")]
-GpuOption = Annotated[bool, typer.Option("--gpu", help="Tasks go to workers with a GPU alone, and work on it.")]
+GpuOption = Annotated[bool, typer.Option("--gpu", help="Require workers with a GPU, and work on it.")]
 ChunkOption = Annotated[int, typer.Option("--chunk-frames", min=1, help="Frames of a task; may be changed when the job is submitted.")]
 TurnsOption = Annotated[int | None, typer.Option(
     "--turns", min=1, show_default=False,
-    help="So many pictures, a task each, in which the environment turns once around; with #### in --out for the number.")]
+    help="Number of pictures, one task for each, over which the environment turns once around; needs #### in --out for the number.")]
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     farm = typer.Typer(name="farm", no_args_is_help=True, help="Jobs for render farms; docs/farm.md.")
     kinds = typer.Typer(name="template", no_args_is_help=True,
-                        help="Write an Open Job Description template whose tasks are calls of the command; options are as of it.")
+                        help="Write an Open Job Description template whose tasks run relit relight or relit shade, with the options "
+                             "of that command.")
     command(kinds, "relight", relight, without=frozenset({Role.RUN}))
     command(kinds, "shade", shade, without=frozenset({Role.RUN}))
     farm.add_typer(kinds)
@@ -36,7 +37,7 @@ def register(app: typer.Typer) -> None:
 
 
 def relight(given: Given[RelightRequest], job: JobOption, chunk_frames: ChunkOption = CHUNK_FRAMES, gpu: GpuOption = False) -> None:
-    """Frames under new light, a task a chunk of them: bit by bit those of one run."""
+    """Frames under new light, one task for each chunk of frames; the frames equal those of a single run bit by bit."""
     from service.farm.jobs import relight_job
     from service.light.plan import make_plan
 
@@ -47,7 +48,7 @@ def relight(given: Given[RelightRequest], job: JobOption, chunk_frames: ChunkOpt
 
 
 def shade(request: ShadeRequest, job: JobOption, turns: TurnsOption = None, gpu: GpuOption = False) -> None:
-    """A picture of solved maps, or a turn of the environment in pictures, a task each."""
+    """A picture of solved maps, or pictures of one turn of the environment, one task for each picture."""
     from service.farm.jobs import shade_job
     from service.light.shade import check
 

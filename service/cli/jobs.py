@@ -15,14 +15,15 @@ if TYPE_CHECKING:
     from service.client import Client
     from service.views.jobs import JobView
 
-JobArgument = Annotated[str, typer.Argument(metavar="JOB", help="Its identifier: job_….", show_default=False)]
+JobArgument = Annotated[str, typer.Argument(metavar="JOB", help="Identifier of the job: job_….", show_default=False)]
 OutOption = Annotated[Path | None, typer.Option(
     "--out", metavar="DIR", show_default=False, help="Fetch the files into this folder; without it they are listed.")]
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
-    group = typer.Typer(no_args_is_help=True, help="Look at the jobs of a service, wait for them, steer them, fetch what they made.")
+    group = typer.Typer(no_args_is_help=True,
+                        help="List the jobs of a service, wait for them, cancel, retry or resume them, and fetch their results.")
     group.command("list")(list_)
     for command in (show, wait, cancel, retry, resume, results):
         group.command(command.__name__)(command)
@@ -30,14 +31,14 @@ def register(app: typer.Typer) -> None:
 
 
 def list_(server: ServerOption = DEFAULT_SERVER, key: KeyOption = None) -> None:
-    """Jobs of the project, the newest first."""
+    """List the jobs of the project, the newest first."""
     with connected(server, key) as client:
         for job in client.jobs.all():
             print(f"{job.id}  {job.state:<9}  {_moment(job.created_at)}  {job.request.kind:<8}  {job.request.name}")
 
 
 def show(job: JobArgument, server: ServerOption = DEFAULT_SERVER, key: KeyOption = None) -> None:
-    """One job: its state, where it is, and why it failed."""
+    """Show a job: its state, its progress, and why it failed."""
     with connected(server, key) as client:
         _print(client.jobs.get(job))
 
@@ -50,22 +51,22 @@ def wait(job: JobArgument, out: ResultsOption = None, cancel_on_interrupt: Cance
 
 
 def cancel(job: JobArgument, server: ServerOption = DEFAULT_SERVER, key: KeyOption = None) -> None:
-    """Stop a job; what it has made stays."""
+    """Cancel a job; its finished steps are kept."""
     _steer(lambda client: client.jobs.cancel(job), server, key)
 
 
 def retry(job: JobArgument, server: ServerOption = DEFAULT_SERVER, key: KeyOption = None) -> None:
-    """Begin a failed job again; what is done stays."""
+    """Queue a failed job again; its finished steps are kept."""
     _steer(lambda client: client.jobs.retry(job), server, key)
 
 
 def resume(job: JobArgument, server: ServerOption = DEFAULT_SERVER, key: KeyOption = None) -> None:
-    """Go on with a cancelled job."""
+    """Queue a cancelled job again; its finished steps are kept."""
     _steer(lambda client: client.jobs.resume(job), server, key)
 
 
 def results(job: JobArgument, out: OutOption = None, server: ServerOption = DEFAULT_SERVER, key: KeyOption = None) -> None:
-    """What a job has made: listed, or fetched."""
+    """List the results of a job, or fetch them."""
     with connected(server, key) as client:
         if out is not None:
             download(client, job, out)

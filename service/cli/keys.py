@@ -34,7 +34,7 @@ def _create(wanted: NewKey, data: DataOption = None, config: ConfigOption = None
 
 
 def list_(
-    project: Annotated[str | None, typer.Option("--project", help="Of this project alone.", show_default=False)] = None,
+    project: Annotated[str | None, typer.Option("--project", help="List only the keys of this project.", show_default=False)] = None,
     data: DataOption = None,
     config: ConfigOption = None,
 ) -> None:
@@ -55,11 +55,11 @@ def list_(
 
 
 def revoke(
-    key: Annotated[str, typer.Argument(metavar="KEY_ID", help="As `relit keys list` shows it.")],
+    key: Annotated[str, typer.Argument(metavar="KEY_ID", help="Identifier of the key, as relit keys list shows it.")],
     data: DataOption = None,
     config: ConfigOption = None,
 ) -> None:
-    """Take a key back: the next request with it is refused."""
+    """Revoke a key: requests with it are refused from now on."""
     from service.errors import RequestError
     from service.server.database import keys
 

@@ -18,7 +18,8 @@ option of the command alone, written for Typer in the usual way. A function that
 was typed, to change or look at it before the model is built; several models share the options that they have in common.
 
 To add a command: write its model in service/requests, its function here in service/cli, and register it. To add an option: write
-the field. `relit submit`, `relit farm template`, the API and the records of results follow.
+the field. `relit submit` and the API follow for the work that they do, `relit farm template` for relight and shade, and the records of
+results for every option whose role is CHOICE.
 """
 
 import inspect
@@ -50,7 +51,7 @@ def _known(name: str | None) -> str | None:
 
 HostOption = Annotated[str | None, typer.Option(
     "--device", callback=_known, show_default=False,
-    help="Taken by every command, so that scripts can name it once; this one works on the CPU in any case.")]
+    help="Taken by every command that works on images, so that scripts can use one device for all; this one always works on the CPU.")]
 
 
 class Given(Generic[Model]):

@@ -5,10 +5,11 @@ from typing import Annotated, Any
 
 import typer
 
-ConfigOption = Annotated[Path | None, typer.Option("--config", metavar="FILE.toml", show_default=False,
-                                                   help="Settings; docs/service.md lists them. RELIT_… in the environment goes first.")]
+ConfigOption = Annotated[Path | None, typer.Option(
+    "--config", metavar="FILE.toml", show_default=False,
+    help="File of settings, which docs/service.md lists. A variable RELIT_… of the environment overrides it.")]
 DataOption = Annotated[Path | None, typer.Option("--data", metavar="DIR", show_default=False,
-                                                 help="Folder of the service; without it ./relit-data.")]
+                                                 help="Folder of the service; without it RELIT_DATA, else ./relit-data.")]
 
 
 def register(app: typer.Typer) -> None:
@@ -23,9 +24,9 @@ def serve(
     host: Annotated[str | None, typer.Option("--host", help="Address to listen on.", show_default=False)] = None,
     port: Annotated[int | None, typer.Option("--port", help="Port to listen on; 0 takes a free one.", show_default=False)] = None,
     anonymous: Annotated[bool | None, typer.Option(
-        "--anonymous/--keys-only", show_default=False, help="Let requests without a key in, on loopback addresses alone.")] = None,
+        "--anonymous/--keys-only", show_default=False, help="Accept requests without a key; only on loopback addresses.")] = None,
     device: Annotated[list[str] | None, typer.Option(
-        "--device", help="A worker on this device, again for more; none: no worker. Without it every GPU, else the CPU.",
+        "--device", help="Start a worker on this device; may be repeated; none: no worker. Without it one on every GPU, else on the CPU.",
         show_default=False)] = None,
 ) -> None:
     """Run the service: the API, and a worker on each device."""
@@ -35,12 +36,12 @@ def serve(
 
 
 def worker(
-    device: Annotated[str | None, typer.Option("--device", help="cpu, cuda:1, …; without it the first GPU, else the CPU.",
-                                               show_default=False)] = None,
+    device: Annotated[str | None, typer.Option(
+        "--device", help="cpu, cuda:1, …; without it the first CUDA device, else the CPU.", show_default=False)] = None,
     data: DataOption = None,
     config: ConfigOption = None,
 ) -> None:
-    """Run one more worker, on any machine that sees the database and the storage."""
+    """Run one more worker, on any machine that reaches the database and the storage."""
     from service.server.serve import work as run
 
     run(settings_of(config, data=data), device)

@@ -11,13 +11,13 @@ if TYPE_CHECKING:
     from service.client import Client
 
 ServerOption = Annotated[str, typer.Option(
-    "--server", metavar="URL", envvar="RELIT_SERVER", help="The service, as relit serve prints it.")]
+    "--server", metavar="URL", envvar="RELIT_SERVER", help="Address of the service, as relit serve prints it.")]
 KeyOption = Annotated[str | None, typer.Option(
     "--key", metavar="KEY", envvar="RELIT_KEY", show_default=False,
-    help="Of relit keys create; better in the environment, where other users of this machine cannot see it.")]
-WaitOption = Annotated[bool, typer.Option("--wait", help="Until the job has ended: exit code 0 if it succeeded, else 1.")]
+    help="Key that relit keys create printed; set it in the environment, as other users of this machine see command lines.")]
+WaitOption = Annotated[bool, typer.Option("--wait", help="Wait until the job has ended; the exit code is 0 if it succeeded, else 1.")]
 ResultsOption = Annotated[Path | None, typer.Option(
-    "--out", metavar="DIR", show_default=False, help="Wait, then fetch what the job made into this folder.")]
+    "--out", metavar="DIR", show_default=False, help="Wait until the job has ended, then fetch its results into this folder.")]
 CancelOption = Annotated[bool, typer.Option(
     "--cancel-on-interrupt", help="Cancel the job when Ctrl-C ends the waiting; without it the job goes on.")]
 

@@ -32,12 +32,12 @@ if TYPE_CHECKING:
 JOBS: dict[str, type[JobRequest]] = {"solve": SolveJob, "depth": DepthJob, "relight": RelightJob, "shade": ShadeJob, "export": ExportJob,
                                      "pipeline": PipelineJob}
 REGISTERED = "server:"
-SOURCES = "A path of this machine, which is uploaded; an identifier, {prefix}_…; or server:/path, which is registered."
+SOURCES = "Give a path of this machine, which is uploaded; an identifier, {prefix}_…; or server:/path, which is registered."
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
-    group = typer.Typer(no_args_is_help=True, help="Hand work to a service; what may be chosen is as in the commands that do it here.")
+    group = typer.Typer(no_args_is_help=True, help="Submit work to a service, with the options of the commands that do it on this machine.")
     for name, job in JOBS.items():
         command(group, name, _submission(job), words=_words)
     app.add_typer(group, name="submit")

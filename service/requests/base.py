@@ -41,7 +41,8 @@ class Role(StrEnum):
     """What the value of a field is; written into `Annotated`, CHOICE where nothing is written."""
 
     CHOICE = "choice"
-    """A choice about the work: it is recorded with the results, and a service or a farm takes it too."""
+    """A choice about the work: it is recorded with the results, and `relit submit` and `relit farm template` have it too, for the commands
+    that they do."""
     INPUT = "input"
     """A file or folder that is read."""
     OUTPUT = "output"
@@ -118,7 +119,7 @@ class StackOptions(Options):
     align: bool = False
     """The subject moves: warp every frame to the time of the middle tracking frame (light type full). The mask belongs to that time."""
     align_to: Annotated[str | None, Spelling(metavar="IMAGE")] = None
-    """Align, to the time of this tracking frame."""
+    """As `align`, but to the time of this tracking frame."""
 
     @property
     def aligned(self) -> bool:

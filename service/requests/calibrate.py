@@ -81,45 +81,46 @@ class BallRequest(LightsRequest):
     """Base of the kinds that look at balls: circles first, then masks."""
 
     circles: Annotated[tuple[Annotated[Circle, BeforeValidator(_circle)], ...], Role.INPUT, Spelling(flag="--ball", metavar="U,V,R")] = ()
-    """Outline of a ball: centre and radius in pixels. Once for each ball."""
+    """Outline of a ball: centre and radius in pixels. Give one for each ball."""
     masks: Annotated[tuple[Path, ...], Role.INPUT, Spelling(flag="--ball-mask")] = ()
-    """Mask image of a ball, in place of `ball`; better for a perspective camera. Once for each ball."""
+    """Mask image of a ball, in place of `ball`; better for a perspective camera. Give one for each ball."""
 
 
 class MirrorBallRequest(BallRequest):
     """Directions of far lights from one mirror ball."""
 
     level: Annotated[float, Field(gt=0, lt=1)] = 0.1
-    """The spot is what is brighter than this part of its peak."""
+    """The highlight on the ball is what is brighter than this fraction of its peak."""
 
 
 class LightPositionsRequest(MirrorBallRequest):
     """Positions of near lights from two or more mirror balls."""
 
     ball_radius_m: tuple[Positive, ...] = ()
-    """Radius in metres, of every ball or once for each; an orthographic camera with pixel_size_m needs none."""
+    """Radius in metres, one for all balls or one for each; an orthographic camera with pixel_size_m needs none."""
     ball_z_m: tuple[Finite, ...] = ()
-    """Camera-frame z of the centres in metres, for an orthographic camera; empty: surface_z_m, or 0."""
+    """Camera-frame z of the centres in metres, for an orthographic camera; without it surface_z_m of the manifest, or 0."""
 
 
 class GreyBallRequest(BallRequest):
     """Brightness of each light from one grey ball."""
 
     albedo: Annotated[tuple[Positive, Positive, Positive] | None, BeforeValidator(_albedo), Spelling(metavar="R,G,B")] = None
-    """Albedo of the ball, one number or three; None: irradiance is relative, mean 1."""
+    """Albedo of the ball, one number or three; None: only ratios of irradiance are measured, and their mean is set to 1."""
     refine_direction: bool = False
     """Take the direction of distant lights from the shading, in place of the manifest."""
     ball_radius_m: Positive | None = None
     """Radius of the ball in metres, for point lights and a perspective camera."""
     ball_z_m: Finite | None = None
-    """Camera-frame z of the ball's centre in metres, for point lights and an orthographic camera; None: surface_z_m, or 0."""
+    """Camera-frame z of the ball's centre in metres, for point lights and an orthographic camera; None: surface_z_m of the
+    manifest, or 0."""
 
 
 class IntensityRequest(LightsRequest):
     """Brightness of lights of known direction from images of the object itself."""
 
     pixels: Annotated[int, Field(ge=100, le=100_000)] = 2000
-    """Pixels of the mask, drawn at random, that take part: 100 to 100000."""
+    """Number of pixels of the mask, drawn at random, that are used: 100 to 100000."""
 
 
 class FramesRequest(Options):
@@ -139,33 +140,33 @@ class FlatFieldRequest(FramesRequest):
     """The capture's flat.exr: mean of images of an evenly lit white card."""
 
     dark_images: Annotated[tuple[Path, ...], Role.INPUT, Spelling(flag="--dark")] = ()
-    """A dark image at the exposure of the white card; may be repeated. Without one the capture's dark is also that of the card."""
+    """A dark image at the exposure of the white card; may be repeated. Without it the dark frame of the capture is used."""
 
 
 class SaturationRequest(Options):
-    """Where the readings of the frames pile up at the top of the histogram."""
+    """The level at which the readings of the frames saturate, from the top of their histogram."""
 
     capture: Annotated[Path, Role.INPUT, CAPTURE]
     """Folder with a capture.json."""
     write: bool = False
-    """Set `saturation` in the manifest, in place of only saying it."""
+    """Set `saturation` in the manifest, in place of only printing it."""
 
 
 class ProcamRequest(Request):
     """Camera, projector and their pose from a chessboard under projected columns and rows."""
 
     captures: Annotated[tuple[Path, ...], Field(min_length=1), Role.INPUT, Spelling(argument=True, metavar="CAPTURE...")]
-    """Folders with a capture.json, one a pose of the board."""
+    """Folders with a capture.json, one for each pose of the board."""
     board: Annotated[tuple[Corners, Corners], BeforeValidator(_board), Spelling(metavar="9x6")]
     """Inner corners of the chessboard, across and down."""
     square_m: Positive
     """Side of a square in metres."""
     projector: Annotated[tuple[Count, Count] | None, WidthHeight, Spelling(metavar="1280x800")] = None
-    """Width and height of the projector in pixels; None: what the captures say."""
+    """Width and height of the projector in pixels; None: as in the manifests."""
     apply_to: Annotated[tuple[Path, ...], Role.INPUT, Spelling(metavar="CAPTURE")] = ()
     """Another capture of the same rig, whose manifest is written too; may be repeated."""
     drop_outliers: bool = False
-    """Leave out views whose error stands out, and fit again."""
+    """Leave out poses whose error is much larger than that of the others, and fit again."""
 
 
 class ResponseRequest(Options):
@@ -176,7 +177,7 @@ class ResponseRequest(Options):
     images: Annotated[tuple[Path, ...], Field(min_length=3), Role.INPUT, IMAGES]
     """Images of evenly grey projections."""
     levels: Annotated[tuple[Annotated[float, Field(ge=0, le=1)], ...], BeforeValidator(_levels), Commas, Spelling(metavar="0,0.25,…")] = ()
-    """Level of each image, 0 to 1; empty: even steps from 0 to 1 in the order of the images."""
+    """Level of each image, 0 to 1; without it even steps from 0 to 1 in the order of the images."""
 
 
 class TofCalibrationRequest(DeviceRequest):

@@ -13,7 +13,7 @@ from stage.model import Positive, Resolution
 class ImportFormat(Choice):
     """Layouts that relit reads."""
 
-    DILIGENT = "diligent", "DiLiGenT's folders"
+    DILIGENT = "diligent", "an object's folder of the DiLiGenT benchmark"
     LP = "lp", "an RTI light list with its images"
     OPENCV_GRAY = "opencv-gray", "images of a Gray code in OpenCV's order"
 
@@ -30,9 +30,10 @@ class ImportRequest(Options):
     projector: Annotated[Resolution | None, WidthHeight, Spelling(metavar="1280x800")] = None
     """opencv-gray: width and height of the projector in pixels."""
     calibration: Annotated[Path | None, Role.INPUT] = None
-    """opencv-gray: OpenCV file (.yml, .xml, .json) with both devices, R and T; without it see relit calibrate procam."""
+    """opencv-gray: OpenCV file (.yml, .xml, .json) with the intrinsics of camera and projector, R and T; relit calibrate procam
+    measures them without such a file."""
     unit_m: Positive = 1.0
-    """opencv-gray: metres of one unit of T: 0.001 for millimetres."""
+    """opencv-gray: metres in one unit of T, such as 0.001 for millimetres."""
 
     @model_validator(mode="after")
     def _options_of_the_format(self) -> Self:

@@ -9,14 +9,14 @@ from service.requests.base import DeviceRequest, Role
 
 
 class DemoRequest(DeviceRequest):
-    """The main job on the shipped sample: solve, export, relight."""
+    """Solve, export and relight the shipped sample."""
 
     out: Annotated[Path, Role.OUTPUT] = Path("relit-demo")
     """Folder for the results."""
 
 
 class BenchRequest(DeviceRequest):
-    """Speed of the kernels against NumPy and against a plain copy, in the same run."""
+    """Measure the speed of the kernels, and in the same run that of NumPy and of a plain copy."""
 
     repeats: Annotated[int, Field(ge=3), Role.RUN] = 9
-    """Timed runs of each, 3 or more; medians are shown."""
+    """Number of timed runs of each, 3 or more; medians are shown."""

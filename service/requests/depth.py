@@ -16,16 +16,16 @@ def _without_blanks(given: Any) -> Any:
 class Ranging(Choice):
     """What a depth is measured with."""
 
-    PATTERN = "pattern", "a projector's patterns, structured light"
-    LASER = "laser", "spots and stripes of a laser"
-    TOF = "tof", "the time that light takes"
+    PATTERN = "pattern", "structured light: frames under projected patterns"
+    LASER = "laser", "frames under spots or stripes of a laser"
+    TOF = "tof", "time of flight: phases or photon histograms"
 
 
 class TofFilter(Choice):
     """Filters, each asked for by name; flying pixels are taken out before anything is smoothed."""
 
-    FLYING = "flying", "takes out mixed pixels, which lie between two surfaces, and changes no other"
-    BILATERAL = "bilateral", "smooths the range within edges of the amplitude, and fills nothing in"
+    FLYING = "flying", "removes mixed pixels, which lie between two surfaces, and changes no other"
+    BILATERAL = "bilateral", "smooths the range, but not across edges of the amplitude, and fills no hole"
 
 
 class WhichReturn(Choice):
@@ -42,11 +42,11 @@ class TofChoices(Options):
     filters: Annotated[tuple[TofFilter, ...], BeforeValidator(_without_blanks), Commas, Spelling(flag="--filter")] = ()
     """Filters of time of flight, as text with commas between."""
     vote: bool = True
-    """Time of flight, continuous wave: let neighbours decide between wraps that a pixel leaves open."""
+    """Continuous-wave time of flight: where the phases of a pixel allow several distances, let its neighbours decide."""
     which: Annotated[WhichReturn, Spelling(flag="--return")] = WhichReturn.STRONGEST
-    """Time of flight, pulsed: the return that is the depth, of several."""
+    """Pulsed time of flight: the return that gives the depth, where a pixel has several."""
     temperature_c: Finite | None = None
-    """Temperature of the camera, for a time-of-flight calibration with a temperature drift."""
+    """Temperature of the camera in °C, for a time-of-flight calibration with a temperature drift."""
 
 
 class TofOptions(TofChoices):
@@ -54,30 +54,31 @@ class TofOptions(TofChoices):
 
     calibration: Annotated[Path | None, Role.INPUT, Spelling(flag="--tof-calibration")] = None
     """Noise, wiggling, offset, drift and pulse of a time-of-flight camera: a relit.tof/1 file; None: noise and pulse are estimated from
-    the capture, nothing is corrected."""
+    the capture, and nothing else is corrected."""
 
 
 class DepthOptions(Options):
     """How depth is decoded, and which depths are kept."""
 
     using: Ranging | None = None
-    """Which frames, where a capture holds several kinds; None: those that there are."""
+    """Which frames to use; needed only where a capture has several kinds."""
     near_m: Positive | None = None
-    """Depths below, in metres, are out of range."""
+    """Nearest depth in metres; pixels below have the status out of range."""
     far_m: Positive | None = None
-    """Depths above, in metres, are out of range."""
+    """Farthest depth in metres; pixels above have the status out of range."""
     max_residual_px: Positive = 4.0
-    """Where column and row are decoded: how far, in projector pixels, they may lie from a place that the line of sight passes."""
+    """Where both column and row are decoded: how many projector pixels the decoded place may be away from where the projector sees the
+    triangulated point."""
     refine: bool = True
     """Interpolate a Gray code with inverses between the edges of its stripes."""
     read_noise: Positive = 0.003
-    """Standard deviation of a reading in the dark, quantisation included, as a part of full scale; patterns only."""
+    """Standard deviation of a reading in the dark, quantisation included, as a fraction of full scale; patterns only."""
     photon_gain: NotNegative = 1e-4
-    """Photon noise: full scale over the electrons that fill a pixel; patterns only."""
+    """Photon noise: 1 / (electrons at full scale); patterns only."""
     tof: TofChoices = TofChoices()
     """How time of flight is solved; `near_m` and `far_m` are ranges along the ray there."""
     normals: bool = False
-    """Write nx ny nz into points.ply too."""
+    """Write normals (nx, ny, nz) into points.ply too."""
 
 
 class DepthRequest(DepthOptions, Request):

@@ -19,13 +19,13 @@ class ExportOptions(Options):
     """What a USD asset is called and made of."""
 
     name: str | None = None
-    """Name of the asset; None: what the maps say, else the file's stem."""
+    """Name of the asset; None: the name that the maps have, else the stem of the file's name."""
     geometry: Geometry | None = None
     """What an asset of a depth (depth.exr in place of maps.exr) is made of; None: mesh."""
 
 
 class ExportRequest(ExportOptions):
-    """A USD asset: solved maps with the estimated material, a depth with its colours."""
+    """A USD asset of solved maps with their material, or of a depth with its colours."""
 
     maps: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="DIR")]
     """Folder with maps.exr or depth.exr, or the file."""

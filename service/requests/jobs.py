@@ -26,9 +26,9 @@ class JobRequest(Options):
     """Base of every job."""
 
     name: Annotated[str, Field(max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$"), Role.RUN, Spelling(flag="--job-name", metavar="TEXT")] = ""
-    """Name of the job, for people; nothing depends on it."""
+    """Name of the job, shown in lists; it need not be unique."""
     priority: Annotated[int, Field(ge=0, le=100), Role.RUN] = 50
-    """0 to 100: higher goes first; equal ones in the order they came."""
+    """0 to 100: jobs of higher priority are done first, those of equal priority in the order of submission."""
 
 
 class CheckJob(JobRequest):
@@ -84,7 +84,7 @@ class ShadeJob(JobRequest):
     environment: Annotated[EnvironmentId | None, Role.INPUT] = None
     """Lat-long environment."""
     capture: Annotated[CaptureId | None, Role.INPUT, Spelling(metavar="CAPTURE")] = None
-    """The capture of the maps: its images give what a model of the maps cannot."""
+    """The capture of the maps: its images add what a model of the maps lacks, such as interreflection."""
     options: ShadeOptions = ShadeOptions()
 
 
@@ -100,8 +100,8 @@ class ExportJob(JobRequest):
 
 
 class PipelineJob(JobRequest):
-    """Solve, then export, then relight, in one job; without light for frames it ends with the asset: maps.exr, report.json, asset.usdz,
-    frame.####.exr."""
+    """Solve, then export, then relight, in one job: maps.exr, report.json, asset.usdz and frame.####.exr; no frames without an environment
+    or light keys."""
 
     kind: Literal["pipeline"]
     capture: Annotated[CaptureId, Role.INPUT, CAPTURE]

@@ -18,15 +18,15 @@ class PatternCode(Choice):
     """What to project."""
 
     BINARY = "binary", "binary numbers of stripes"
-    GRAY = "gray", "Gray code, of which one image changes at an edge"
-    XOR = "xor", "Gray code in narrow stripes, for surfaces that light each other"
+    GRAY = "gray", "Gray code: at each edge of a stripe only one image changes"
+    XOR = "xor", "Gray code whose stripes are all narrow, for surfaces that light each other"
     KARY = "kary", "base-k digits as grey levels"
     COLOR = "color", "base-k digits as colours"
-    RAMP = "ramp", "intensity ratio"
+    RAMP = "ramp", "a ramp of light and its opposite (intensity ratio)"
     PHASE = "phase", "phase shifting"
-    GRAY_PHASE = "gray-phase", "phase shifting of one period, numbered by Gray code"
-    MICRO = "micro", "micro phase shifting"
-    MODULATED = "modulated", "modulated phase shifting"
+    GRAY_PHASE = "gray-phase", "phase shifting of one period, whose repetitions Gray code numbers"
+    MICRO = "micro", "micro phase shifting: many short periods, for surfaces that light each other"
+    MODULATED = "modulated", "modulated phase shifting: a fine carrier separates direct light"
 
 
 class PatternAxis(Choice):
@@ -43,13 +43,14 @@ class CodeOptions(Options):
     projector: Annotated[tuple[Side, Side], WidthHeight, Spelling(metavar="WxH")]
     """Width and height of the projector in pixels; as text 1280x800."""
     axis: PatternAxis = PatternAxis.COLUMN
-    """The projector coordinate to code; the table takes both for column."""
+    """The projector coordinate to code; --plan plans columns for both."""
     base: int = Field(default=3, ge=2)
     """kary, color: base of the digits."""
     periods: Annotated[tuple[Positive, ...], Commas, Spelling(metavar="P,P,…")] | None = None
-    """phase, gray-phase, modulated: periods in pixels; None: three that tell the projector's places apart; 16; 1.1 times its extent."""
+    """phase, gray-phase, modulated: periods in pixels; None: for phase three that together tell all pixels of the projector apart, for
+    gray-phase 16, for modulated 1.1 times the number of pixels."""
     steps: int = Field(default=4, ge=3, le=64)
-    """phase, gray-phase, modulated: images of each period."""
+    """phase, gray-phase, modulated: number of images for each period."""
     micro_periods: int = Field(default=6, ge=3, le=32)
     """micro: number of periods."""
 
@@ -66,7 +67,7 @@ class PatternsRequest(CodeOptions):
     gamma: Positive = 1.0
     """Gamma of the projector: a level of linear light is stored as level^(1/gamma)."""
     stripe: Positive | None = None
-    """binary, gray, xor, kary, color, gray-phase: width of the finest stripe in pixels; None: 1, with gray-phase half a period."""
+    """binary, gray, xor, kary, color, gray-phase: width of the finest stripe in pixels; None: 1, for gray-phase half a period."""
     inverses: bool = True
     """binary, gray, xor, gray-phase: project every image also inverted."""
     base_bit: int = Field(default=0, ge=0)
@@ -74,7 +75,7 @@ class PatternsRequest(CodeOptions):
     reflected: Annotated[bool, Spelling(off="--plain")] = True
     """kary, color: k-ary Gray code, in which neighbours differ in one digit by one."""
     mean_period: Positive = 24.0
-    """micro: the period about which all lie, in pixels."""
+    """micro: mean of the periods, in pixels."""
     carrier: Positive = 8.0
     """modulated: period of the carrier, in pixels."""
 
@@ -83,12 +84,12 @@ class PlanRequest(CodeOptions):
     """The planner's table for one axis of a projector."""
 
     frame_rate: Annotated[Positive, Spelling(flag="--fps")] = 30.0
-    """Plan: images a second."""
+    """--plan: images projected in a second."""
     noise: Positive = 0.02
-    """Plan: standard deviation of a reading over the amplitude of the pattern."""
+    """--plan: standard deviation of a reading, as a fraction of the amplitude of the pattern."""
     baseline: Positive | None = None
-    """Plan: projector to camera, in metres; with `distance` and `focal` the depth's precision is told."""
+    """--plan: distance between projector and camera in metres; with `distance` and `focal` the precision of the depth is printed too."""
     distance: Positive | None = None
-    """Plan: distance of the object, in metres."""
+    """--plan: distance of the object, in metres."""
     focal: Positive | None = None
-    """Plan: focal length of the projector, in pixels."""
+    """--plan: focal length of the projector, in pixels."""

@@ -14,12 +14,12 @@ MAX_STOPS = 32.0
 class Layer(Choice):
     """A layer of a relit frame."""
 
-    BEAUTY = "beauty", "the relit image, always there"
-    DIFFUSE = "diffuse", "the same without the specular layer"
-    SPECULAR = "specular", "what a model of the solved maps reflects as from a gloss"
-    MASK = "mask", "where the object is: of the solved maps, else of the capture"
-    NORMAL = "normal", "of the solved maps"
-    CONFIDENCE = "confidence", "of the solved maps"
+    BEAUTY = "beauty", "the relit image, always written"
+    DIFFUSE = "diffuse", "the relit image less the specular layer"
+    SPECULAR = "specular", "the specular reflection of the model of the solved maps"
+    MASK = "mask", "the pixels of the object: the mask of the solved maps, else of the capture"
+    NORMAL = "normal", "the normals of the solved maps"
+    CONFIDENCE = "confidence", "the confidence of the solved maps"
 
 
 class FrameSpace(Choice):
@@ -30,21 +30,21 @@ class FrameSpace(Choice):
 
 
 class FrameCompression(Choice):
-    """How relit frames are packed."""
+    """Compression of the EXR files of relit frames."""
 
-    ZIP = "zip", "keeps every bit"
-    PIZ = "piz", "keeps every bit"
-    DWAA = "dwaa", "lossy and smaller"
+    ZIP = "zip", "lossless"
+    PIZ = "piz", "lossless"
+    DWAA = "dwaa", "lossy, smaller files"
 
 
 class PictureOptions(Options):
     """How a picture under new light is written."""
 
     exposure: Annotated[float, Spelling(metavar="STOPS")] = Field(default=0.0, ge=-MAX_STOPS, le=MAX_STOPS, allow_inf_nan=False)
-    """Stops: every picture is multiplied by 2 to this power."""
+    """Exposure in stops: every picture is multiplied by 2 to this power."""
     aov: Annotated[tuple[Layer, ...], FirstFault, Commas, Spelling(metavar="LAYERS")] = (Layer.BEAUTY,)
     """Layers of a picture, as text with commas between; diffuse, specular, normal and confidence need solved maps."""
     color_space: FrameSpace | None = None
     """Colour space of the pictures; None: the scene-linear space of the capture or the maps."""
     compression: FrameCompression = FrameCompression.ZIP
-    """How pictures are packed."""
+    """Compression of the EXR files."""

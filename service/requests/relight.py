@@ -13,45 +13,48 @@ later. A task of a render farm makes as many by default: with fewer, images are 
 
 
 class LightWeights(Choice):
-    """How light from between the captured lights is shared out over them."""
+    """How light from a direction between the captured lights is shared out over them."""
 
-    CELLS = "cells", "whole to the nearest light"
-    SMOOTH = "smooth", "to the three lights around it"
+    CELLS = "cells", "all of it to the nearest light"
+    SMOOTH = "smooth", "in parts to the three lights around it"
 
 
 class RelightOptions(PictureOptions, StackOptions):
     """Which frames, and how light is shared out over the captured lights."""
 
     frames: str | None = None
-    """A number, or first-last; None: 1, or 1 to the number of time steps."""
+    """A number, or first-last; None: 1, or for a sequence 1 to the number of its time steps."""
     weights: LightWeights | None = None
-    """How light from between the captured lights is shared out over them; None: cells, with maps smooth."""
+    """How light from a direction between the captured lights is shared out over them; None: smooth where solved maps guide the frames,
+    else cells."""
     spin_degrees: Finite = 0.0
-    """How far the environment turns about +y, +z towards +x, over the whole range; the first frame is unturned, and a full turn closes."""
+    """Degrees by which the environment turns over the range, about +y from +z towards +x; the first frame is not turned, and with 360 the
+    frame after the last would be the first again."""
 
 
 class RelightRequest(RelightOptions, Request):
     """Frames under HDR environments and animated lights."""
 
     capture: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="CAPTURE")]
-    """Folder with a capture.json; or with such folders, one a time step: in order of name, each gives one frame."""
+    """Folder with a capture.json; or a sequence: a folder with such folders, one for each time step, which give one frame each in the order
+    of their names."""
     out: Annotated[str, Role.OUTPUT]
-    """Path of the frames, #### for the number."""
+    """Path of the frames, with #### for the number."""
     environment: Annotated[Path | None, Role.INPUT] = None
-    """Lat-long .exr or .hdr; with #### in its name one a frame."""
+    """Lat-long environment map, .exr or .hdr; with #### in its name, a map for each frame."""
     keys: Annotated[Path | None, Role.INPUT, Spelling(metavar="FILE")] = None
     """Light keys (JSON, schema relit.keys/1): animated lights, environment, captured images and exposure; docs/relight.md."""
     only: Annotated[str | None, Role.RUN, Spelling(metavar="FRAMES")] = None
-    """Make this part of `frames` alone, such as 9-16: what a farm gives to one machine; None: all."""
+    """Make only this part of `frames`, such as 9-16: a farm gives each machine such a part; None: all."""
     maps: Annotated[Path | None, Role.INPUT, Spelling(metavar="DIR")] = None
-    """Folder of the solved maps: what lies between the captured lights is taken from a model of them, as far as it proves right.
-    For a sequence with one folder a capture in it, named as the capture."""
+    """Folder of the solved maps, which guide the frames: light from between the captured lights is taken from a model of the maps, as far
+    as the captured images confirm the model. For a sequence, a folder with one such folder for each capture, of the same name."""
     overwrite: Annotated[bool, Role.RUN] = False
-    """Make every frame; else those that an equal run has made already are kept."""
+    """Make every frame again. Without it, frames are kept that an earlier run made from the same inputs and options."""
     sheet: Annotated[Path | None, Role.RUN, Spelling(metavar="FILE.png")] = None
-    """Contact sheet of the frames, for review."""
+    """Write a contact sheet of the frames, for review."""
     report: Annotated[Path | None, Role.RUN, Spelling(metavar="FILE.json")] = None
-    """A report of what was made, and where the time went."""
+    """Write a report: what was made, and how long each part of the work took."""
 
     @property
     def weighting(self) -> LightWeights:

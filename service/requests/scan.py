@@ -13,10 +13,10 @@ class ScanRequest(DeviceRequest):
     scan: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="SCAN")]
     """A folder with a scan.json, or the file."""
     out: Annotated[Path, Role.OUTPUT]
-    """Folder for points.ply, points.usdc, points.las where it is asked for, and report.json."""
+    """Folder for points.ply, points.usdc and report.json, and points.las if `las` is given."""
     near_m: Positive | None = None
-    """Nearer returns, in metres, are left out."""
+    """Returns nearer than this, in metres, are left out."""
     far_m: Positive | None = None
-    """Farther returns, in metres, are left out."""
+    """Returns farther than this, in metres, are left out."""
     las: bool = False
     """Write points.las (LAS 1.4) too; needs laspy: pip install 'relit[las]'."""

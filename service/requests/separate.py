@@ -17,6 +17,6 @@ class SeparateRequest(Request):
     out: Annotated[Path, Role.OUTPUT]
     """Folder for separation.exr and report.json."""
     period_px: Positive | None = None
-    """Period of the phase frames to use, in projector pixels; None: the shortest, up to 64."""
+    """Period of the phase frames to use, in projector pixels; None: the shortest of the capture, which must not exceed 64."""
     black_level: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = 0.0
-    """Light of the projector's black over that of its white, for a capture without a black frame."""
+    """Light of the projector's black as a fraction of its white, for a capture without a black frame."""

@@ -13,13 +13,14 @@ class ShadeOptions(PictureOptions):
     """Lights near the surface, and how its environment is turned."""
 
     light: Annotated[tuple[GivenPoint, ...], FirstFault, Spelling(metavar=POINT_FORM)] = ()
-    """A point light: place in metres, camera frame, and intensity; with a lobe its axis and exponent. Any number of them."""
+    """A point light: position in the camera frame in metres, and intensity; for a light that shines in a lobe also its axis and exponent.
+    May be repeated."""
     sphere: Annotated[tuple[GivenSphere, ...], FirstFault, Spelling(metavar=SPHERE_FORM)] = ()
-    """A sphere light: centre, radius, radiance. Any number of them."""
+    """A sphere light: centre, radius, radiance. May be repeated."""
     rectangle: Annotated[tuple[GivenRectangle, ...], FirstFault, Spelling(metavar=RECTANGLE_FORM)] = ()
-    """A rectangle light: centre, its two edges, radiance; it shines against u x v, as a USD RectLight does. Any number of them."""
+    """A rectangle light: centre, its two edges, radiance; it shines towards -(u x v), as a UsdLux RectLight does. May be repeated."""
     turn_degrees: Finite = 0.0
-    """How far the environment is turned about +y, +z towards +x."""
+    """Degrees by which the environment is turned, about +y from +z towards +x."""
 
 
 class ShadeRequest(ShadeOptions, Request):
@@ -30,6 +31,6 @@ class ShadeRequest(ShadeOptions, Request):
     out: Annotated[Path, Role.OUTPUT]
     """The picture: .exr."""
     environment: Annotated[Path | None, Role.INPUT] = None
-    """Lat-long .exr or .hdr."""
+    """Lat-long environment map, .exr or .hdr."""
     capture: Annotated[Path | None, Role.INPUT, Spelling(metavar="CAPTURE")] = None
-    """The capture of these maps: its images bring what a model of the maps lacks, such as interreflection."""
+    """The capture of these maps: its images add what a model of the maps lacks, such as interreflection."""

@@ -28,9 +28,9 @@ class SimulateCwRequest(SimulateRequest):
     """Correlation images of a continuous-wave camera."""
 
     modulation_hz: Annotated[tuple[Positive, ...], Commas, Field(min_length=1)] = (20e6, 30e6, 80e6)
-    """Frequencies, as text with commas between."""
+    """Modulation frequencies in Hz, as text with commas between."""
     phases: Annotated[int, Field(ge=3)] = 4
-    """Images a frequency, evenly spaced in phase."""
+    """Number of images for each frequency, evenly spaced in phase."""
     signal_electrons: Positive = 1e5
     """Electrons of a white surface that faces the camera at one metre, in one image."""
     ambient_electrons: NotNegative = 0.0
@@ -38,21 +38,21 @@ class SimulateCwRequest(SimulateRequest):
     read_noise_electrons: NotNegative = 5.0
     """Standard deviation of the read noise, in electrons."""
     full_well: Positive | None = None
-    """Electrons at which a reading saturates; None: none does."""
+    """Electrons at which a reading saturates; None: no reading saturates."""
 
 
 class SimulatePulsedRequest(SimulateRequest):
     """Photon histograms of a pulsed camera."""
 
     bins: Annotated[int, Field(ge=3)] = 64
-    """Bins of a histogram."""
+    """Number of bins of a histogram."""
     bin_s: Positive = 1.5e-9
-    """Seconds a bin."""
+    """Length of a bin, in seconds."""
     pulse_sigma_s: Positive = 1.2e-9
     """Standard deviation of the pulse, in seconds."""
     signal_photons: Positive = 4000.0
     """Photons of a white surface that faces the camera at one metre, all pulses together."""
     background: NotNegative = 0.5
-    """Photons of ambient light a bin, all pulses together."""
+    """Photons of ambient light in each bin, all pulses together."""
     pulses: Count | None = None
     """Number of pulses; with it, only the first photon after each pulse is counted."""

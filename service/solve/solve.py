@@ -13,7 +13,7 @@ from kernels.surface.integrate import Integration
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, metadata, report
-from service.requests.solve import Method, SolveRequest
+from service.requests.solve import SVBRDF_LIGHTS, Method, SolveRequest
 from service.solve.distant import solve_distant
 from service.solve.extended import solve_extended
 from service.solve.gradient import solve_gradients
@@ -35,10 +35,6 @@ from stage.maps import MAPS_FILE, SurfaceMaps
 from stage.motion.tracking import tracking_frames
 from stage.point_lights import DistantLights, PlacedLights
 from stage.reference_ball import ReferenceBall, reference_ball
-
-SVBRDF_LIGHTS = 12
-"""From this many lights on svbrdf is the default: it fits six lobes and a direction to each pixel, and was better than robust on
-every object tried with eight to 96 lights (docs/figures.md)."""
 
 Solver = Callable[[SolveInput, Any], Solution]
 
