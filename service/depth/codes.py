@@ -1,8 +1,18 @@
 """The table of structured-light codes: what `relit patterns` projects for each, what it costs, and which decoder reads it.
 
-To add a code, write one module in stage/patterns/ (manifest entry, level at each place, frames put together, frames to project) and a
-row in stage/patterns/codes.py; then a row here, which names its decoder in service/depth/decoders.py. The kernel that decodes it stands
-in kernels/structured/, and the word that users type in service/requests/patterns.py.
+To add a code:
+
+1. stage/patterns/NEW.py: `NewPattern` (the manifest entry of a frame, with its level at each place), `NewCode` (the frames of a capture
+   that make up the code) and `new_patterns` (the frames to project). In stage/patterns/codes.py: a row of `CODES`, and a member of the
+   unions `Pattern` and `Code`.
+2. stage/patterns/planner.py: a function that gives the standard deviation of the code.
+3. kernels/structured/NEW.py: the kernel that decodes it.
+4. service/depth/decoders.py: `new_decoder`. A code that numbers stripes has no decoder of its own: it goes into `AxisCodes.stripes` and
+   `_decode_stripes`, so that it numbers the periods of phases too.
+5. service/requests/patterns.py: a `PatternCode`, which is what users type, and the options that belong to the code.
+6. Here: a row of `CODES`. Its place is its precedence: if a capture holds several codes, the decoder of the first is used.
+7. docs/structured_light.md and docs/capture.md; tests in tests/stage/patterns, tests/kernels/structured and tests/service/depth, with a
+   float64 twin in tests/reference/structured.py.
 """
 
 from collections.abc import Callable, Sequence

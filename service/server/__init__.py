@@ -1,1 +1,1 @@
-"""The service: API, jobs, storage and store."""
+"""The service: its API, jobs, database and storage."""

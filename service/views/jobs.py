@@ -14,7 +14,7 @@ class ProgressView(View):
     done: int
     total: int
     rate: float | None
-    """Steps a second, since the stage began."""
+    """Units of `done` per second, since the stage began."""
     remaining_s: float | None
     """Of this stage, at that rate."""
 
@@ -25,7 +25,7 @@ class JobView(View):
     id: JobId
     state: JobState
     attempt: int
-    """1, and one more with every retry."""
+    """1, and one more each time the job is retried or resumed."""
     revision: int
     """Grows with every change."""
     priority: int

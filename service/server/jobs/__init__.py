@@ -1,1 +1,20 @@
-"""Durable jobs: the queue, the workers, and how work survives their death. The only place with dbos."""
+"""Durable jobs: the queue, the workers, and how work survives their death. Only this package imports DBOS.
+
+What happens when a worker dies:
+
+Who notices. Each worker holds a lock that is named after it, which the operating system or PostgreSQL releases when the worker's process or
+machine ends (worker_lock). Every `takeover_s` seconds each worker tries the locks of the others that have jobs according to DBOS, and takes
+over where a lock is free (takeover). The supervisor sees that the process ended and starts another on the device. A worker that hangs
+keeps its lock: the supervisor kills it after `stall_s` seconds without a sign of life or of progress (heartbeat, supervisor).
+
+What is recorded. The row of the job says queued again, without a worker, and counts the lost one; then DBOS queues the workflow of the same
+attempt again. A job that loses more than `max_lost` workers without finishing a step or making a new frame fails.
+
+What is done again. The next worker begins the workflow, skips the steps that the row names as finished, and does the step that was under
+way again (runner). A relight keeps each frame that exists with the hash of the same request. With `storage_url`, a worker on another
+machine finds only the files of finished steps, because files are sent at the end of a step.
+
+What is not done twice. A job is changed only by the worker that its row names, in the attempt that it names (database.jobs.Claim). So a
+worker that wakes after another took over its job neither ends a step nor sends files, and it ends when it finds its lock taken. Two
+workers may write the same file for a moment; a file gets its name only when it is complete, and both have the same content.
+"""
