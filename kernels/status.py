@@ -29,7 +29,7 @@ class Status(IntEnum):
     LOW_MODULATION = 10
     """Depth: the projected or emitted signal is too weak to be decoded."""
     OUT_OF_RANGE = 11
-    """Depth: decoded, but to a place that the device cannot have lit, or outside the measured range."""
+    """Depth: decoded, but to a place that the projector or laser cannot have lit, or outside the measured range."""
     UNDECIDED = 12
     """Depth: the readings fit several places about equally well."""
     FLYING = 13

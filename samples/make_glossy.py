@@ -4,8 +4,9 @@
     python samples/make_glossy.py --out glossy_metal --metal 1
 
 A bumpy ball with a half-sunk ring, a knob and a horn: concave seams light each other, the horn and the ring throw shadows, and roughness
-runs from 0.3 to 0.75 over the surface. Not committed: it is made on demand for benchmarks/glossy.py. The diffuse lobe
-of `principled` (Burley 2012) is not Lambertian, so a solver cannot win by assuming the renderer's model.
+runs from 0.3 to 0.75 over the surface. The captures are not committed: make them for benchmarks/figures.py and
+benchmarks/pictures.py. The diffuse lobe of `principled` (Burley 2012) is not Lambertian, so a solver cannot win by assuming the
+renderer's model.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from stage.projector import Projector
 LEAST_BASELINE_M, MOST_BASELINE_M = 1e-4, 20.0
 """The range of plausible distances between camera and projector: outside it the translation is not in metres."""
 GRID = 9
-"""The lines of sight in each direction and the depths in each decade that are searched for a point that both devices see."""
+"""The lines of sight in each direction and the depths in each decade that are searched for a point that camera and projector both see."""
 
 
 def check_perspective(capture: Capture) -> None:

@@ -177,7 +177,7 @@ def triangulate(x: np.ndarray, y: np.ndarray, columns: Decoded | None, rows: Dec
         device: where.
 
     Returns:
-        Depth on the device; not synchronised on CUDA. OUT_OF_RANGE: behind a device, outside the projector's image, or the
+        Depth on the device; not synchronised on CUDA. OUT_OF_RANGE: behind camera or projector, outside the projector's image, or the
         axes contradict each other. ILL_POSED: the coordinate hardly changes with depth. Else the decoder's status.
 
     Raises:

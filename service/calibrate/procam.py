@@ -25,7 +25,7 @@ from stage.planes import frame_planes
 from stage.projector import Projector
 
 LEAST_CORNERS = 0.5
-"""Part of the board's corners that must be found in both devices, for a view to count."""
+"""Part of the board's corners that must be found by camera and projector, for a view to count."""
 
 
 class ProcamResult(NamedTuple):
@@ -41,7 +41,7 @@ class ProcamResult(NamedTuple):
 
 
 def procam(request: ProcamRequest, progress: Progress | None = None) -> ProcamResult:
-    """Calibrate a projector-camera pair, and write both devices and their pose to the manifests.
+    """Calibrate a projector-camera pair, and write camera, projector and their pose to the manifests.
 
     Raises:
         StageError, KernelError: the input is wrong, or too few views show the board; nothing is written.
@@ -86,7 +86,7 @@ def procam(request: ProcamRequest, progress: Progress | None = None) -> ProcamRe
 
 
 def view_of(capture: Capture, size: Resolution, request: ProcamRequest, device: str) -> BoardView | str:
-    """Return the corners of the board in both devices, or a sentence that says why there are none."""
+    """Return the corners of the board as camera and projector see them, or a sentence that says why there are none."""
     frames = [frame for frame in capture.manifest.frames if frame.pattern is not None]
     codes = read_codes(capture, frames, PatternDevice(size))
     columns, rows = codes.columns, codes.rows
@@ -153,7 +153,7 @@ def _write(request: ProcamRequest, targets: list[Capture], found: ProCam, views:
 
 
 def _updated(manifest: Manifest, found: ProCam, size: Resolution) -> Manifest:
-    """Return the manifest with both devices; the camera's place in the world and the projector's radiometry stay."""
+    """Return the manifest with camera and projector; the camera's place in the world and the projector's radiometry stay."""
     old = manifest.camera
     surface = old.surface_z_m if old.projection == "perspective" else None
     camera = Camera(projection="perspective", resolution=old.resolution, focal_px=found.camera.focal,

@@ -19,7 +19,7 @@ SUFFIXES = {".exr", ".hdr"}
 
 
 class EnvironmentMap:
-    """A lat-long map in a working space."""
+    """An environment map in a working space."""
 
     def __init__(self, radiance: np.ndarray) -> None:
         """Args: radiance: [rows, cols, 3] float32, scene-linear."""
@@ -27,12 +27,12 @@ class EnvironmentMap:
 
     @cached_property
     def samples(self) -> EnvironmentSamples:
-        """The samples of the map, for a model of a surface."""
+        """The samples of the environment map, for a model of a surface."""
         return sample_environment(self.radiance)
 
 
 class Environments:
-    """The maps of `--environment`: a file, or a sequence of files where the name has a run of #."""
+    """The environment maps of `--environment`: a file, or a sequence of files where the name has a run of #."""
 
     def __init__(self, pattern: Path) -> None:
         """Args: pattern: the path, as it was given.
@@ -48,16 +48,16 @@ class Environments:
             raise RequestError(f"--environment {pattern}: the file name of a sequence has one run of # for the frame number")
 
     def path(self, number: int) -> Path:
-        """Return the file of a frame's map."""
+        """Return the file of a frame's environment map."""
         return self._pattern.with_name(numbered(self._pattern.name, number)) if self._sequence else self._pattern
 
     def check(self, numbers: Iterable[int]) -> None:
-        """Check the header of the map of every frame.
+        """Check the header of the environment map of every frame.
 
         Raises:
-            RequestError: a map of the sequence is not there; names it and its frame.
+            RequestError: an environment map of the sequence is not there; names it and its frame.
             ImageError: not EXR or HDR, or not twice as wide as high.
-            StorageError: a map cannot be opened.
+            StorageError: an environment map cannot be opened.
         """
         for path, number in {self.path(number): number for number in numbers}.items():
             if path.suffix.lower() not in SUFFIXES:
@@ -69,7 +69,7 @@ class Environments:
                 raise ImageError(f"{path}: is {header.width}x{header.height}: a lat-long map is twice as wide as high")
 
     def read(self, path: Path, space: str) -> EnvironmentMap:
-        """Return one map in a working space; the last one that was read is kept.
+        """Return one environment map in a working space; the last one that was read is kept.
 
         Raises:
             ImageError: impossible values (counted), or a colour space that is not known.
@@ -79,7 +79,7 @@ class Environments:
         return self._last[2]
 
     def content(self, path: Path) -> str:
-        """Return the content hash of a map."""
+        """Return the content hash of an environment map."""
         if path not in self._digests:
             self._digests[path] = fingerprint.digest(path)
         return self._digests[path]

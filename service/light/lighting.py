@@ -1,4 +1,4 @@
-"""What lights a frame, resolved once: the weights of the captured images, and the same light as samples for a model of the surface.
+"""What lights a frame, computed once from its schedule: weights of the captured images, and the same light as samples for a model.
 
 `far_light` reads the environment, turns it and takes discs into the working space. From its result come the weights of the captured
 images (kernels.relight.environment, after Debevec et al., "Acquiring the Reflectance Field of a Human Face", SIGGRAPH 2000, section 3.3)
@@ -26,7 +26,8 @@ from stage.point_lights import DistantLights
 from stage.stack import Stack
 
 RUN = 256
-"""Number of frames under one map whose weights are computed together: rotations that differ by whole samples share most of the work."""
+"""Number of frames under one environment map whose weights are computed together: rotations that differ by whole samples share most of
+the work."""
 SHARP_RADIUS_DEGREES = 2.0
 """Largest angular radius of a map's sample that casts shadows of its own: small samples lie where the map is bright. The visibility of
 other samples is interpolated from the captured lights around them."""
@@ -93,7 +94,7 @@ class CaptureLighting:
         Args:
             lights: the captured lights.
             stack: the captured images.
-            environments: where the maps of frames are read from.
+            environments: where the environment maps of frames are read from.
             space: the scene-linear space of the stack.
             weighting: how light from between the captured lights is shared out over them.
             device: where maps are shared out.
@@ -114,7 +115,7 @@ class CaptureLighting:
                 yield from self._run(members[begin : begin + RUN])
 
     def _run(self, scheduled: Sequence[ScheduledFrame]) -> Iterator[FrameLight]:
-        """Yield the light of frames under one map, or under none."""
+        """Yield the light of frames under one environment map, or under none."""
         resolved = [far_light(frame, self._environments, self._space) for frame in scheduled]
         images = [{self._stack.frames.index(image): weight for image, weight in frame.captured.items()} for frame in scheduled]
         weights = self._weights(resolved)
@@ -162,7 +163,7 @@ def far_light(frame: ScheduledFrame, environments: Environments | None, space: s
 
     Args:
         frame: of a schedule.
-        environments: where its map is read from.
+        environments: where its environment map is read from.
         space: scene-linear.
 
     Raises:

@@ -108,7 +108,7 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
     layers = still_layers(request.aov, opened.capture, maps, opened.maps)
     environment = todo[0][0].lighting.environment
     if environment is not None and plan.environments is not None:
-        plan.environments.read(environment.path, opened.space)  # a bad map is known before the images are read
+        plan.environments.read(environment.path, opened.space)  # a bad environment map is known before the images are read
     if not plan.is_sequence:
         timings.stage("ingest", len(opened.capture.sources()))
     with timings.part("ingest"):

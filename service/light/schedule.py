@@ -1,4 +1,4 @@
-"""What lights each frame, as options and light keys say: which map, how it is turned, which discs and captured images, which exposure."""
+"""What lights each frame, as options and light keys say: environment map and its turn, discs, captured images, exposure."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -68,7 +68,7 @@ def schedule(request: RelightRequest, numbers: Sequence[int], keys: LightKeys | 
         request: with spin and exposure.
         numbers: of the frames.
         keys: the content of `request.keys`.
-        environments: the maps of `request.environment`.
+        environments: the environment maps of `request.environment`.
 
     Raises:
         RequestError: nothing lights the frames, or two options turn the environment, or keys turn one that is not there.

@@ -2,7 +2,8 @@
 
 A projector records no image, but the decoded patterns give the projector coordinates of each camera pixel. Near a corner of the board
 this map is a homography of the plane of the board; fitted to the decoded pixels around the corner it gives the corner in the
-projector with sub-pixel accuracy. With corners in both images, each device is calibrated by Zhang's method, then their relative pose.
+projector with sub-pixel accuracy. With corners in both images, camera and projector are each calibrated by Zhang's method,
+then their relative pose.
 
 Source: Moreno and Taubin, "Simple, accurate, and robust projector-camera calibration", 3DIMPVT 2012 (local homographies);
     Zhang, "A flexible new technique for camera calibration", TPAMI 22(11), 2000, section 3.
@@ -65,7 +66,7 @@ class ProCam(NamedTuple):
     camera_from_projector: np.ndarray  # [4, 4] float64, metres, camera frames
     camera_error_px: np.ndarray  # [views] root mean square of each view in the joint fit
     projector_error_px: np.ndarray  # [views] the same for the projector
-    rms_px: float  # of both devices in the joint fit
+    rms_px: float  # of camera and projector in the joint fit
 
 
 def find_corners(image: np.ndarray, board: tuple[int, int]) -> np.ndarray | None:

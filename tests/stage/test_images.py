@@ -13,7 +13,7 @@ RNG = np.random.default_rng(7)
 UNIT = RNG.random((5, 7, 3))
 
 
-@pytest.mark.parametrize("suffix", ["png", "tif"])
+@pytest.mark.parametrize("suffix", ["png", "tif", "dpx", "jxl"])
 @pytest.mark.parametrize(("dtype", "full"), [(np.uint8, 255), (np.uint16, 65535)])
 def test_integers_are_fractions_of_full_scale(tmp_path, suffix, dtype, full):
     codes = RNG.integers(0, full, (5, 7, 3), endpoint=True).astype(dtype)
