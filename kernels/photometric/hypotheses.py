@@ -159,6 +159,15 @@ def tangents(n: wp.vec3):
     return tangent, wp.cross(n, tangent)
 
 
+@wp.func
+def candidate_at(n: wp.vec3, offset: wp.vec4, v: wp.vec3):
+    """Return the unit normal at an offset of `rings` from n, moved along the view v where it would look away from the viewer."""
+    tangent, other = tangents(n)
+    moved = offset[1] * n + offset[0] * (offset[2] * tangent + offset[3] * other)
+    moved += wp.max(LEAST_NZ - wp.dot(moved, v), 0.0) * v
+    return moved * (1.0 / wp.sqrt(wp.dot(moved, moved)))
+
+
 @cache
 def _search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> Any:
     lane_type = pack_type(lanes, wp.float32)
@@ -193,39 +202,18 @@ def _search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> 
         start = p * pack_stride
         base = p * scratch_pack
         prepare(toward, vx, vy, vz, start, light_count, light_stride, base, scratch_step, scratch)
-        # tangent frame about the start
         cx, cy, cz = normal[0, p], normal[1, p], normal[2, p]
-        tx, ty, tz, ux, uy, uz = lane_type(), lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
-        best, bx, by, bz = lane_type(), lane_type(), lane_type(), lane_type()
+        best, bx, by, bz = lane_type(1.0e30), lane_type(), lane_type(), lane_type()
         centre, ring, slope_x, slope_y = lane_type(), lane_type(), lane_type(), lane_type()
         found = coefficients()
-        for k in range(lanes):
-            n = wp.vec3(cx[k], cy[k], cz[k])
-            tangent, other = tangents(n)
-            tx[k] = tangent[0]
-            ty[k] = tangent[1]
-            tz[k] = tangent[2]
-            ux[k] = other[0]
-            uy[k] = other[1]
-            uz[k] = other[2]
-            best[k] = 1.0e30
-
         for candidate in range(offsets.shape[0]):
             o = offsets[candidate]
             nx, ny, nz = lane_type(), lane_type(), lane_type()
             for k in range(lanes):
-                x = o[1] * cx[k] + o[0] * (o[2] * tx[k] + o[3] * ux[k])
-                y = o[1] * cy[k] + o[0] * (o[2] * ty[k] + o[3] * uy[k])
-                z = o[1] * cz[k] + o[0] * (o[2] * tz[k] + o[3] * uz[k])
-                # back to the visible hemisphere, along the view
-                lack = wp.max(LEAST_NZ - (x * vx[k] + y * vy[k] + z * vz[k]), 0.0)
-                x = x + lack * vx[k]
-                y = y + lack * vy[k]
-                z = z + lack * vz[k]
-                scale = 1.0 / wp.sqrt(x * x + y * y + z * z)
-                nx[k] = x * scale
-                ny[k] = y * scale
-                nz[k] = z * scale
+                n = candidate_at(wp.vec3(cx[k], cy[k], cz[k]), o, wp.vec3(vx[k], vy[k], vz[k]))
+                nx[k] = n[0]
+                ny[k] = n[1]
+                nz[k] = n[2]
             fill(toward, table, form, nx, ny, nz, vx, vy, vz, start, light_count, light_stride, base, scratch_step, scratch)
             # the robust non-negative mixture
             x_best = coefficients()
@@ -297,14 +285,14 @@ def _search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> 
             move_x = -slope_x[k] / (members * wp.max(rise, 1.0e-12))
             move_y = -slope_y[k] / (members * wp.max(rise, 1.0e-12))
             far = wp.max(wp.sqrt(move_x * move_x + move_y * move_y), 1.0)
-            x = cx[k] + radius * (move_x * tx[k] + move_y * ux[k]) / far
-            y = cy[k] + radius * (move_x * ty[k] + move_y * uy[k]) / far
-            z = cz[k] + radius * (move_x * tz[k] + move_y * uz[k]) / far
-            scale = 1.0 / wp.sqrt(x * x + y * y + z * z)
-            stepped = wp.where(radius > 0.0, 1, 0) * wp.where(rise > 0.0, 1, 0)
-            bx[k] = wp.where(stepped == 1, x * scale, bx[k])
-            by[k] = wp.where(stepped == 1, y * scale, by[k])
-            bz[k] = wp.where(stepped == 1, z * scale, bz[k])
+            n = wp.vec3(cx[k], cy[k], cz[k])
+            tangent, other = tangents(n)
+            moved = n + radius * (move_x * tangent + move_y * other) / far
+            moved = moved * (1.0 / wp.sqrt(wp.dot(moved, moved)))
+            if radius > 0.0 and rise > 0.0:
+                bx[k] = moved[0]
+                by[k] = moved[1]
+                bz[k] = moved[2]
             share[k] = best[k] / float(light_count)
             bend[k] = (ring[k] / members - best[k]) / float(light_count)
         normal[0, p] = bx

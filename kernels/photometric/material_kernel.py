@@ -84,10 +84,8 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
         vx, vy, vz = view[0, p], view[1, p], view[2, p]
         nx, ny, nz = normal[0, p], normal[1, p], normal[2, p]
         bright = level[p]
-        best_cost, best_rough = lane_type(), lane_type()
+        best_cost, best_rough = lane_type(1.0e30), lane_type()
         best_rho, best_f0 = channels(), channels()
-        for k in range(lanes):
-            best_cost[k] = 1.0e30
         step = float(ROUGHNESS_STEP)
         trials = wp.where(freedom == GIVEN, 1, searched)
         for trial in range(trials):

@@ -121,27 +121,17 @@ def _refine_kernel(lanes: int, reflectance: Reflectance) -> Any:
         vx, vy, vz = view[0, p], view[1, p], view[2, p]
         nx, ny, nz, rough = start[0, p], start[1, p], start[2, p], start[3, p]
         bright = level[p]
-        best, damping, again = lane_type(), lane_type(), lane_type()
+        best, damping, again = lane_type(1.0e30), lane_type(DAMPING), lane_type()
         best_x, best_y, best_z, best_rough = lane_type(), lane_type(), lane_type(), lane_type()
         rho, f0, best_rho, best_f0 = channels(), channels(), channels(), channels()
-        for k in range(lanes):
-            best[k] = 1.0e30
-            damping[k] = DAMPING
         for turn in range(wp.static(LINEAR_TURNS + STEPS + 1)):
-            # tangents, and the normals and roughness from which derivatives are taken
-            ax, ay, az, bx, by, bz = lane_type(), lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
+            # the normals and roughness from which derivatives are taken
             px, py, pz, qx, qy, qz = lane_type(), lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
             wider = lane_type()
             for k in range(lanes):
                 n = wp.vec3(nx[k], ny[k], nz[k])
                 a, b = tangents(n)
                 plus, aside = wp.normalize(n + TILT * a), wp.normalize(n + TILT * b)
-                ax[k] = a[0]
-                ay[k] = a[1]
-                az[k] = a[2]
-                bx[k] = b[0]
-                by[k] = b[1]
-                bz[k] = b[2]
                 px[k] = plus[0]
                 py[k] = plus[1]
                 pz[k] = plus[2]
@@ -257,8 +247,9 @@ def _refine_kernel(lanes: int, reflectance: Reflectance) -> Any:
                         shine = wp.clamp(s_on * (s_rest - inverse * ds[c, k] * d_rest) / below, 0.0, 1.0)
                         f0[c, k] = shine
                         rho[c, k] = wp.max(inverse * (d_rest - ds[c, k] * shine), 0.0)
-                    n = wp.vec3(nx[k] + move[0] * ax[k] + move[1] * bx[k], ny[k] + move[0] * ay[k] + move[1] * by[k],
-                                nz[k] + move[0] * az[k] + move[1] * bz[k])
+                    n = wp.vec3(nx[k], ny[k], nz[k])
+                    a, b = tangents(n)
+                    n = n + move[0] * a + move[1] * b
                     v = wp.vec3(vx[k], vy[k], vz[k])
                     n = wp.normalize(n + wp.max(LEAST_NZ - wp.dot(n, v), 0.0) * v)
                     nx[k] = n[0]
