@@ -5,10 +5,9 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pydantic import BaseModel
-
 from service.errors import RequestError
-from service.reporting.provenance import versions
+from service.reporting.provenance import requested, versions
+from service.requests.base import Options
 from service.requests.calibrate import LightsRequest
 from stage.calibration.apply import LitFrame, SingleLight, check_same_setup, lit_frames, with_lights
 from stage.capture import Capture
@@ -90,7 +89,7 @@ def leave_out_failures(captures: LightCaptures, results: Sequence[MeasuredLight 
             for result in results]
 
 
-def write_lights(kind: str, request: BaseModel, captures: LightCaptures, results: Sequence[MeasuredLight], *,
+def write_lights(kind: str, request: Options, captures: LightCaptures, results: Sequence[MeasuredLight], *,
                  headings: tuple[str, ...], summary: dict[str, Any]) -> LightCalibration:
     """Write the report, then the manifest, each whole or not at all, and return what was written."""
     manifest = with_lights(captures.target, [result.light for result in results])
@@ -110,15 +109,14 @@ def write_lights(kind: str, request: BaseModel, captures: LightCaptures, results
     return LightCalibration(captures.manifest_path, report, ("frame", *headings, "flags"), rows, text)
 
 
-def write_results(kind: str, request: BaseModel, manifest: Manifest, manifest_path: Path, section: dict[str, Any]) -> Path:
+def write_results(kind: str, request: Options, manifest: Manifest, manifest_path: Path, section: dict[str, Any]) -> Path:
     """Write calibration.json beside the manifest, with the sections of other commands that it held, then the manifest.
 
     Returns:
         The path of the report.
     """
     path = manifest_path.parent / CALIBRATION_FILE
-    options = request.model_dump(mode="json", exclude={"capture", "apply_to", "out"})
-    data = {"schema": SCHEMA, **_earlier(path), kind: {"options": options, **section, "versions": versions()}}
+    data = {"schema": SCHEMA, **_earlier(path), kind: {"options": requested(request), **section, "versions": versions()}}
     write_text(path, json.dumps(data, indent=2) + "\n")
     write_manifest(manifest, manifest_path)
     return path

@@ -14,6 +14,9 @@ from service.requests.shade import ShadeRequest
 if TYPE_CHECKING:
     from service.farm.template import Job
 
+OF_ONE_RUN = frozenset({Role.PART, Role.RUN})
+"""Roles of the options that a job has no use for: its tasks choose them."""
+
 JobOption = Annotated[Path, typer.Option(
     "--job", metavar="FILE.yaml|DIR", show_default=False,
     help="A template, with its values in FILE.values.yaml beside it; or a folder, as Deadline Cloud takes it.")]
@@ -30,8 +33,8 @@ def register(app: typer.Typer) -> None:
     kinds = typer.Typer(name="template", no_args_is_help=True,
                         help="Write an Open Job Description template whose tasks run relit relight or relit shade, with the options "
                              "of that command.")
-    command(kinds, "relight", relight, without=frozenset({Role.RUN}))
-    command(kinds, "shade", shade, without=frozenset({Role.RUN}))
+    command(kinds, "relight", relight, without=OF_ONE_RUN)
+    command(kinds, "shade", shade, without=OF_ONE_RUN)
     farm.add_typer(kinds)
     app.add_typer(farm)
 

@@ -34,7 +34,7 @@ from pydantic import BaseModel, BeforeValidator
 from service.requests.base import Options, Role
 from service.requests.options import Model, Option, build, help_text, options_of, typed
 
-ORDER = (Role.INPUT, Role.OUTPUT, Role.CHOICE, Role.RUN, Role.MACHINE)
+ORDER = (Role.INPUT, Role.OUTPUT, Role.CHOICE, Role.PART, Role.RUN, Role.MACHINE)
 """The order in which the help lists options."""
 READ_BY_TYPER = (bool, int, float, Path, Enum)
 """The types that Typer reads; anything else is a text that the model parses."""

@@ -26,7 +26,7 @@ from stage.capture import Capture
 from stage.depth_maps import DEPTH_FILE, DepthMaps
 from stage.errors import ManifestError
 from stage.files import write_text
-from stage.fingerprint import Fingerprints
+from stage.fingerprint import Fingerprints, digest
 from stage.ingest import CACHE_FOLDER
 from stage.manifest import FILE_NAME, Frame
 from stage.patterns.base import UniformPattern
@@ -97,7 +97,9 @@ def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResul
     cloud = point_cloud(solution, capture.camera, color_space=capture.manifest.color_space, normals=request.normals)
     timings.stage("write", 1)
     content = content_of(capture)
-    sources = metadata(request, capture=capture.name, inputs=content, method=solution.method)
+    calibration = request.tof.calibration
+    sources = metadata(request, capture=capture.name, inputs=content, method=solution.method,
+                       contents={} if calibration is None else {"tof_calibration": digest(calibration)})
     maps = DepthMaps(camera=capture.camera, mask=solution.solved, depth=solution.depth, range=solution.range_m,
                      projector_u=solution.projector_u, projector_v=solution.projector_v, amplitude=solution.amplitude,
                      sigma=solution.sigma, confidence=solution.confidence_map(), status=solution.status, provenance=sources)
@@ -106,10 +108,10 @@ def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResul
     write_ply(cloud, points_path, comments=tuple(f"{key} {value}" for key, value in sources.items()))
     counts = solution.counts(mask)
     write_text(report_path, report(
+        request,
         inputs={"capture": str(request.capture), "name": capture.name, "content": content, "frames": len(capture.manifest.frames),
                 "resolution": list(capture.camera.resolution), "color_space": capture.manifest.color_space},
         method=solution.method,
-        options=request.model_dump(mode="json", exclude={"capture", "out", "device", "cache"}),
         found=solution.facts,
         device=devices.describe(device),
         timings_s=timings.close(),

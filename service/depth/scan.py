@@ -88,8 +88,9 @@ def scan(request: ScanRequest, progress: Progress | None = None) -> ScanResult:
         scales = write_las(points, intensity, shots.time_s[index], index, range_m, las_path, provenance=sources)
         facts["las"] = scales._asdict()
     write_text(report_path, report(
+        request,
         inputs={"scan": str(request.scan), "name": shots.scan.name, "content": hashes, "poses": len(shots.scan.track)},
-        method="scan", options=request.model_dump(mode="json", include={"near_m", "far_m", "las"}), found=facts,
+        method="scan", found=facts,
         device=devices.describe(device), timings_s=timings.close(), shots=counts,
         extent_m={"low": points.min(axis=0).tolist(), "high": points.max(axis=0).tolist()}))
     return ScanResult(cloud, points_path, usd_path, las_path, report_path, counts)

@@ -122,10 +122,10 @@ def separate(request: SeparateRequest, progress: Progress | None = None) -> Sepa
     lit = _lit(total, solved)
     share = statistics(light.indirect.sum(axis=-1)[lit] / total[lit])
     write_text(report_path, report(
+        request,
         inputs={"capture": str(request.capture), "name": capture.name, "content": content, "frames": len(capture.manifest.frames),
                 "resolution": list(capture.camera.resolution), "color_space": capture.manifest.color_space},
         method=METHOD,
-        options={"period_px": request.period_px, "black_level": request.black_level},
         found={"period_px": period_px, "axes": [sinusoid.axis for sinusoid in sinusoids],
                "frames": sum(len(sinusoid.frames) for sinusoid in sinusoids), "ambient": _ambient(capture, collected),
                "sum_over_white": None if ratio is None else float(f"{ratio:.5g}")},

@@ -15,6 +15,7 @@ from service.errors import RequestError
 from service.light.environments import Environments
 from service.light.schedule import ScheduledFrame
 from service.light.sequence import OpenedCapture
+from service.reporting.provenance import choices
 from service.requests.frame_range import numbered
 from service.requests.picture import Layer
 from service.requests.relight import RelightRequest
@@ -26,6 +27,15 @@ ARITHMETIC = 1
 made again."""
 REQUEST_ATTRIBUTE = "relit:request"
 """Attribute of a frame's file: the hash of everything that the frame's pixels depend on."""
+RESOLVED = {
+    "frames": "the schedule, which gives each frame its turn of the environment",
+    "spin_degrees": "the rotation of each frame's environment",
+    "exposure": "the stops of each frame, with those of the light keys",
+    "aov": "the layers in any order",
+    "align": "the key of the stack",
+    "align_to": "the key of the stack",
+}
+"""Choices of a request that the hash of a frame contains in another form, and that form. Every other choice is in it as it is."""
 
 
 def frame_path(pattern: str, number: int) -> Path:
@@ -77,15 +87,22 @@ def frame_hashes(opened: OpenedCapture, request: RelightRequest, frames: Sequenc
                  environments: Environments | None) -> list[str]:
     """Return a hash for each frame of everything that its pixels depend on.
 
+    Args:
+        opened: the capture of the frames.
+        request: with the weights that are used.
+        frames: what lights each.
+        environments: the maps that the frames name.
+
     Raises:
         StorageError: a map cannot be read.
     """
     mask = opened.capture.manifest.mask
     scene = _hash(
         stack=opened.ingest.key, direction=_digits(opened.lights.direction), irradiance=_digits(opened.lights.irradiance),
-        weights=request.weighting, color_space=request.color_space, compression=request.compression, layers=sorted(request.aov),
+        layers=sorted(request.aov),
         maps=None if opened.maps is None else fingerprint.digest(opened.maps),
-        mask=fingerprint.digest(opened.capture.file(mask)) if Layer.MASK in request.aov and mask is not None else None)
+        mask=fingerprint.digest(opened.capture.file(mask)) if Layer.MASK in request.aov and mask is not None else None,
+        **{name: value for name, value in choices(request).items() if name not in RESOLVED})
     return [_hash(
         scene=scene, stops=frame.exposure_stops, captured=frame.captured,
         sky=None if frame.environment is None or environments is None else

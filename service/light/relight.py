@@ -59,6 +59,7 @@ def relight(request: RelightRequest, progress: Progress | None = None) -> Religh
     """
     timings = Timings(progress)
     device = devices.resolve(request.device)
+    request = request.model_copy(update={"weights": request.weighting})  # which is recorded
     timings.stage("open", 1)
     plan = make_plan(request)
     skipped = near_lights = 0
@@ -90,9 +91,8 @@ def relight(request: RelightRequest, progress: Progress | None = None) -> Religh
     result = RelightResult(paths, len(plan.folders), skipped, writer.written.clipped, near_lights)
     if request.report is not None:
         write_text(request.report, report(
+            request,
             inputs={"capture": str(request.capture), "captures": captures},
-            options=request.model_copy(update={"weights": request.weighting}).model_dump(
-                mode="json", exclude={"capture", "device", "cache", "report", "only"}),
             frames={"made": writer.written.frames, "skipped": skipped, "clipped_pixels": writer.written.clipped,
                     "first": str(paths[0]), "last": str(paths[-1])},
             device=devices.describe(device),
@@ -121,11 +121,10 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
     if not plan.is_sequence:
         timings.stage("frames", len(plan.frames))
     form = FrameFormat.of(request, opened.capture.camera.resolution, opened.space, layers)
-    provenance = metadata(request.model_copy(update={"weights": request.weighting}), capture=opened.capture.name, inputs=stack.key,
-                          near_lights=opened.near_lights)
+    provenance = metadata(request, capture=opened.capture.name, inputs=stack.key, near_lights=opened.near_lights)
     if plan.keys is not None and plan.keys.frames_per_second is not None:
         provenance["relit:frames_per_second"] = f"{plan.keys.frames_per_second:g}"
-    lighting = CaptureLighting(opened.lights, stack, plan.environments, opened.space, weighting=Weighting(request.weighting),
+    lighting = CaptureLighting(opened.lights, stack, plan.environments, opened.space, weighting=Weighting[request.weighting.name],
                                device=device, with_model=guide is not None)
     lights = lighting.frames([frame.lighting for frame, _ in todo])
     size = chunk_frames(stack)

@@ -2,6 +2,7 @@
 
 import json
 import platform
+from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -25,7 +26,8 @@ def versions() -> dict[str, str]:
     return found
 
 
-def metadata(request: Options, *, capture: str, inputs: str, method: str | None = None, near_lights: int = 0) -> dict[str, str]:
+def metadata(request: Options, *, capture: str, inputs: str, method: str | None = None, near_lights: int = 0,
+             contents: Mapping[str, str] | None = None) -> dict[str, str]:
     """Return string attributes for result files. They are equal for two runs on the same inputs.
 
     Args:
@@ -35,10 +37,12 @@ def metadata(request: Options, *, capture: str, inputs: str, method: str | None 
         inputs: content hash of the images.
         method: the one that was used, where the request left the choice open.
         near_lights: how many point lights were taken as distant ones.
+        contents: content hash of each file or capture that was read beside the images, by the name of its option.
     """
-    options = {name: value for name, value in _choices(request).items() if value is not None and value is not False}
+    options = {name: value for name, value in choices(request).items() if value is not None and value is not False}
     if method is not None:
         options["method"] = str(method)
+    options.update(contents or {})
     found = {"relit:version": __version__, "relit:capture": capture, "relit:inputs": inputs,
              "relit:options": json.dumps(options, sort_keys=True)}
     if near_lights:
@@ -46,13 +50,20 @@ def metadata(request: Options, *, capture: str, inputs: str, method: str | None 
     return found
 
 
-def _choices(request: Options) -> dict[str, Any]:
+def choices(request: Options) -> dict[str, Any]:
     """Return what a request chooses about the work, as plain data; neither paths nor how the work was carried out."""
     plain = request.model_dump(mode="json")
-    return {name: _choices(value) if isinstance(value := getattr(request, name), Options) else plain[name]
+    return {name: choices(value) if isinstance(value := getattr(request, name), Options) else plain[name]
             for name, field in type(request).model_fields.items() if role_of(field) is Role.CHOICE}
 
 
-def report(**sections: Any) -> str:
-    """Return the text of a report.json: the sections in the order given, then software versions."""
-    return json.dumps({"schema": "relit.report/1", **sections, "versions": versions()}, indent=2) + "\n"
+def requested(request: Options) -> dict[str, Any]:
+    """Return the options of a report, as plain data: the whole request, but for the part of the work that the run did."""
+    parts = {name for name, field in type(request).model_fields.items() if role_of(field) is Role.PART}
+    return request.model_dump(mode="json", exclude=parts)
+
+
+def report(request: Options, *, inputs: Mapping[str, Any], **sections: Any) -> str:
+    """Return the text of a report.json: inputs, options, the other sections in the order given, and software versions."""
+    return json.dumps({"schema": "relit.report/1", "inputs": inputs, "options": requested(request), **sections,
+                       "versions": versions()}, indent=2) + "\n"

@@ -50,7 +50,9 @@ class Role(StrEnum):
     MACHINE = "machine"
     """Where the work is done: the device, and the folder for caches."""
     RUN = "run"
-    """What one run does beside or instead of the whole work: a part of the frames, all frames anew, a report."""
+    """What one run does beside the work: all frames anew, a contact sheet, a report."""
+    PART = "part"
+    """The part of the work that one run does. It is recorded nowhere, so that results do not say how the work was divided."""
 
 
 @dataclass(frozen=True, kw_only=True)

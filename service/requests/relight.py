@@ -44,7 +44,7 @@ class RelightRequest(RelightOptions, Request):
     """Lat-long environment map, .exr or .hdr; with #### in its name, a map for each frame."""
     keys: Annotated[Path | None, Role.INPUT, Spelling(metavar="FILE")] = None
     """Light keys (JSON, schema relit.keys/1): animated lights, environment, captured images and exposure; docs/relight.md."""
-    only: Annotated[str | None, Role.RUN, Spelling(metavar="FRAMES")] = None
+    only: Annotated[str | None, Role.PART, Spelling(metavar="FRAMES")] = None
     """Make only this part of `frames`, such as 9-16: a farm gives each machine such a part; None: all."""
     maps: Annotated[Path | None, Role.INPUT, Spelling(metavar="DIR")] = None
     """Folder of the solved maps, which guide the frames: light from between the captured lights is taken from a model of the maps, as far

@@ -4,8 +4,9 @@ svbrdf walks over the image several times: a first search, the height that its n
 that follow from this height, the materials that pixels share, and the final solve.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import warp as wp
@@ -14,7 +15,7 @@ from kernels.photometric.albedo import fit_albedo
 from kernels.photometric.bounce import subtract_bounce
 from kernels.photometric.diffuse_shape import choose_diffuse
 from kernels.photometric.hypotheses import Diffuse, search_normals
-from kernels.photometric.lambert import solve_lambert
+from kernels.photometric.lambert import NormalFit
 from kernels.photometric.lobes import GEOMETRY, MIXTURE
 from kernels.photometric.material import fit_tinted
 from kernels.photometric.near import NearField
@@ -25,7 +26,6 @@ from kernels.photometric.shadowing import exclude_shadows
 from kernels.photometric.shared_materials import choose_materials
 from kernels.photometric.svbrdf import solve_svbrdf
 from kernels.status import Status
-from service.requests.solve import Method
 from service.solve.batches import Batch, bands, pick_pixels, pixel_batches, view_directions
 from service.solve.interreflection import arriving_light
 from service.solve.solution import Solution, SolveInput, suspect_lights
@@ -54,36 +54,46 @@ class MaterialOptions:
 WHOLE_SOLVER = MaterialOptions()
 
 
-def solve_distant(given: SolveInput, lights: DistantLights, *, method: Method) -> Solution:
+class NormalSolver(Protocol):
+    """Solves the normals of every pixel of the mask from frames with one light each: `solve_diffuse` or `solve_material`."""
+
+    def __call__(self, given: SolveInput, lights: Lights, field: NearField | None = None) -> Solution:
+        """Return the solution.
+
+        Args:
+            given: the images.
+            lights: lights of the stack, padded.
+            field: where the lights are, and the surface point of each pixel, where some light is near.
+        """
+
+
+def solve_distant(given: SolveInput, lights: DistantLights, *, solver: NormalSolver) -> Solution:
     """Solve every pixel of the mask under distant lights, and name the lights that disagree with the others.
 
     Args:
         given: the images.
         lights: lights of the stack.
-        method: lambert, robust or svbrdf.
+        solver: finds the normals.
     """
     padded = pad_lights(lights.direction, lights.irradiance, given.stack.scale)
-    solution = solve_normals(given, padded, method)
+    solution = solver(given, padded)
     solution.suspects = suspect_lights(solution, given.stack, padded)
     return solution
 
 
-def solve_normals(given: SolveInput, lights: Lights, method: Method, field: NearField | None = None) -> Solution:
-    """Solve every pixel of the mask with one of the methods that take one light a frame.
+def solve_diffuse(given: SolveInput, lights: Lights, field: NearField | None = None, *, fit_normals: Callable[..., NormalFit]) -> Solution:
+    """Solve every pixel of the mask for normal and diffuse albedo.
 
     Args:
         given: the images.
         lights: lights of the stack, padded.
-        method: lambert, robust or svbrdf.
         field: where the lights are, and the surface point of each pixel, where some light is near.
+        fit_normals: `solve_lambert` or `solve_robust`, which fits the normals of a band.
     """
-    if method is Method.SVBRDF:
-        return solve_material(given, lights, field)
-    solver = {Method.LAMBERT: solve_lambert, Method.ROBUST: solve_robust}[method]
     given.timings.stage("normals", given.stack.shape[2])
     result = Solution.empty(given.stack.pixel_count)
     for span, inside, band, readings, near in bands(given, lights, field):
-        fit = solver(band, readings, lights.direction, near)
+        fit = fit_normals(band, readings, lights.direction, near)
         result.place(span, inside, fit)
         albedo = fit_albedo(band, readings, fit, lights, near).numpy()[:, : len(inside)]
         result.albedo[:, span] = np.where(inside, albedo, 0)

@@ -5,13 +5,16 @@ the present points and integrates them; the rounds end when the height no longer
 `robust`, which costs a hundredth, has settled.
 """
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 
 from kernels.photometric.near import NearField, pad_places
 from kernels.photometric.readings import pad_lights
 from kernels.status import Status
 from service.requests.solve import Method
-from service.solve.distant import solve_normals
+from service.solve.distant import NormalSolver
 from service.solve.solution import Solution, SolveInput, mark_not_facing
 from service.solve.surface import integrate, mean_height, whole_surface
 from stage.point_lights import PlacedLights
@@ -30,13 +33,21 @@ MATERIAL_ROUNDS = 3
 """Most rounds of `svbrdf`, which start on a surface that has nearly settled: a round leaves about a tenth of the change before it."""
 
 
-def solve_near(given: SolveInput, lights: PlacedLights, *, method: Method) -> Solution:
+class Rounds(NamedTuple):
+    """Rounds in which one solver finds the normals."""
+
+    method: Method
+    solver: NormalSolver
+    most: int = ROUNDS
+
+
+def solve_near(given: SolveInput, lights: PlacedLights, *, series: Sequence[Rounds]) -> Solution:
     """Solve every pixel of the mask under lights of which some are near, and its height with it.
 
     Args:
         given: the images, of a camera with a scale.
         lights: lights of the stack, distant and near.
-        method: lambert, robust or svbrdf.
+        series: the rounds of each solver; a solver begins with the surface on which the one before it has settled.
 
     Returns:
         The last round; the solution's facts say how many there were and how far the last one moved the surface.
@@ -47,15 +58,15 @@ def solve_near(given: SolveInput, lights: PlacedLights, *, method: Method) -> So
     height = np.full(mask.shape, mean_height(camera), dtype=np.float32)
     rounds: dict[str, int] = {}
     change, settled, restless = np.inf, False, np.zeros(mask.size, dtype=bool)
-    for solver in (Method.ROBUST, Method.SVBRDF) if method is Method.SVBRDF else (method,):
+    for method, solver, most in series:
         least, idle = np.inf, 0
-        for number in range(1, (MATERIAL_ROUNDS if solver is Method.SVBRDF else ROUNDS) + 1):
+        for number in range(1, most + 1):
             points = np.moveaxis(camera.points(height), -1, 0).reshape(3, -1)
-            solution = solve_normals(given, padded, solver, NearField(places, points))
+            solution = solver(given, padded, NearField(places, points))
             mark_not_facing(camera, solution)
             solved = (solution.status == Status.OK).reshape(mask.shape)
             integration = integrate(given, solution.normal, solved)
-            rounds[str(solver)] = number
+            rounds[str(method)] = number
             if integration is None:
                 return solution
             found = whole_surface(integration.height.numpy(), solved, mask, mean_z=mean_height(camera),

@@ -35,6 +35,7 @@ def solve_by_reference(given: SolveInput, ball: ReferenceBall) -> Solution:
     view = view_directions(given.camera)
     inside = np.flatnonzero(given.mask.reshape(-1))
     result = Solution.empty(stack.pixel_count)
+    result.contents = {"reference_ball": ball_stack.key}
     result.facts = {"reference": {"capture": str(ball.capture.folder), "content": ball_stack.key,
                                   "radius_px": round(ball.ball.radius_px, 2),
                                   "outline_error_px": round(ball.ball.outline_error_px, 4)}}

@@ -75,6 +75,8 @@ class Solution:
     suspects: list[SuspectLight] = field(default_factory=list)
     facts: dict[str, Any] = field(default_factory=dict)
     """What the report says under `found`."""
+    contents: dict[str, str] = field(default_factory=dict)
+    """Content hash of each capture that was read beside the images, by the name of its option."""
 
     @classmethod
     def empty(cls, pixels: int) -> "Solution":

@@ -8,16 +8,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kernels import device as devices
+from kernels.photometric.lambert import solve_lambert
+from kernels.photometric.robust import solve_robust
 from kernels.status import SOLVED, Status
 from kernels.surface.integrate import Integration
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, metadata, report
 from service.requests.solve import SVBRDF_LIGHTS, Method, SolveRequest
-from service.solve.distant import solve_distant
+from service.solve.distant import solve_diffuse, solve_distant, solve_material
 from service.solve.extended import solve_extended
 from service.solve.gradient import solve_gradients
-from service.solve.near import solve_near
+from service.solve.near import MATERIAL_ROUNDS, Rounds, solve_near
 from service.solve.reference import solve_by_reference
 from service.solve.solution import Solution, SolveInput, SuspectLight, mark_not_facing, refine_status
 from service.solve.surface import integrate
@@ -55,15 +57,20 @@ def _suits_svbrdf(capture: Capture) -> bool:
     return bool(capture.lit_by(ExtendedLight)) or len(capture.sources()) >= SVBRDF_LIGHTS
 
 
-def _single_lights(method: Method) -> dict[type, Solver]:
-    return {DistantLights: partial(solve_distant, method=method), PlacedLights: partial(solve_near, method=method)}
+def _single_lights(*series: Rounds) -> dict[type, Solver]:
+    """Return the functions for lights of one direction each: distant lights are solved by the last solver of those for near ones."""
+    return {DistantLights: partial(solve_distant, solver=series[-1].solver), PlacedLights: partial(solve_near, series=series)}
 
+
+LAMBERT = Rounds(Method.LAMBERT, partial(solve_diffuse, fit_normals=solve_lambert))
+ROBUST = Rounds(Method.ROBUST, partial(solve_diffuse, fit_normals=solve_robust))
+MATERIAL = Rounds(Method.SVBRDF, solve_material, MATERIAL_ROUNDS)
 
 METHODS: Mapping[Method, MethodEntry] = {
     Method.GRADIENT: MethodEntry(gradient_frames, {GradientFrames: solve_gradients}, has_gradients),
-    Method.SVBRDF: MethodEntry(check_solvable, {**_single_lights(Method.SVBRDF), ExtendedLights: solve_extended}, _suits_svbrdf),
-    Method.ROBUST: MethodEntry(check_solvable, _single_lights(Method.ROBUST), is_default=lambda capture: True),
-    Method.LAMBERT: MethodEntry(check_solvable, _single_lights(Method.LAMBERT)),
+    Method.SVBRDF: MethodEntry(check_solvable, {**_single_lights(ROBUST, MATERIAL), ExtendedLights: solve_extended}, _suits_svbrdf),
+    Method.ROBUST: MethodEntry(check_solvable, _single_lights(ROBUST), is_default=lambda capture: True),
+    Method.LAMBERT: MethodEntry(check_solvable, _single_lights(LAMBERT)),
     Method.REFERENCE: MethodEntry(reference_ball, {ReferenceBall: solve_by_reference}),
 }
 """Every method. The default for a capture is the first whose `is_default` says so."""
@@ -118,17 +125,17 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
     if solution.integration is None:  # near lights have found the height with the normals
         solution.integration = integrate(given, solution.normal, solved)
         solution.height = None if solution.integration is None else solution.integration.height.numpy()
-    maps = _maps(solution, solved, method, capture, metadata(request, method=method, capture=capture.name, inputs=stack.key))
+    sources = metadata(request, method=method, capture=capture.name, inputs=stack.key, contents=solution.contents)
+    maps = _maps(solution, solved, method, capture, sources)
     timings.stage("write", 1)
     maps_path, report_path = request.out / MAPS_FILE, request.out / REPORT_FILE
     maps.write(maps_path)
     counts = {s.name.lower(): int(np.count_nonzero(status[mask] == s)) for s in Status}
     write_text(report_path, report(
+        request,
         inputs={"capture": str(request.capture), "name": capture.name, "content": stack.key, "frames": len(stack.frames),
                 "resolution": list(capture.camera.resolution), "color_space": capture.manifest.color_space},
         method=str(method),
-        options=request.model_dump(mode="json", include={"method", *(("reference_ball",) if request.reference_ball else ()),
-                                                         *(("align", "align_to") if request.aligned else ())}),
         found=solution.facts,
         suspect_lights=[suspect._asdict() for suspect in solution.suspects],
         device=devices.describe(device),

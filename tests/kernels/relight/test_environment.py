@@ -12,10 +12,10 @@ from tests.kernels.scenes import cap
 from tests.reference.relight import texel_solid_angles
 
 
-@pytest.mark.parametrize("name, function", [("cells", integrate_cells), ("smooth", integrate_smooth)])
-def test_a_weighting_is_chosen_by_name(name, function, device):
+@pytest.mark.parametrize("weighting, function", [(Weighting.CELLS, integrate_cells), (Weighting.SMOOTH, integrate_smooth)])
+def test_a_weighting_chooses_its_function(weighting, function, device):
     environment, rotations = np.random.default_rng(0).random((9, 18, 3)), np.stack([np.eye(3), turn(0)])
-    got = integrate(environment, cap(20, 180), rotations, weighting=Weighting(name), device=device)
+    got = integrate(environment, cap(20, 180), rotations, weighting=weighting, device=device)
     expected = function(environment, cap(20, 180), rotations, device=device)
     np.testing.assert_array_equal(got.energy, expected.energy)
     np.testing.assert_array_equal(got.solid_angle, expected.solid_angle)

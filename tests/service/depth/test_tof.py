@@ -10,6 +10,7 @@ from service.depth.depth import depth
 from service.requests.depth import DepthRequest, TofOptions
 from stage.camera import Camera
 from stage.depth_maps import DepthMaps
+from stage.fingerprint import digest
 from stage.ply import read_ply
 from stage.tof.calibration import Temperature, TofCalibration, fit_harmonics, write_calibration
 from tests.reference import tof
@@ -115,6 +116,9 @@ def test_calibration_takes_wiggling_offset_and_drift_out(tmp_path):
     folder = write(tmp_path / "c", cw_frames(tof.correlations(VIEW, 1e5, settings, harmonics=waves), settings))
     _, raw, _ = run(folder)
     _, maps, report = run(folder, calibration=tmp_path / "camera.json", temperature_c=35.0)
+    options = json.loads(maps.provenance["relit:options"])
+    assert options["tof_calibration"] == digest(tmp_path / "camera.json") and "calibration" not in options["tof"]  # no path of this machine
+    assert report["options"]["tof"]["calibration"] == str(tmp_path / "camera.json")
     expected = VIEW.distance - 0.03 - 0.01
     assert np.abs(maps.range - expected)[maps.mask].max() < 1e-3 and maps.mask.mean() > 0.99
     assert np.abs(raw.range - VIEW.distance)[raw.mask].max() > 3e-3 or raw.mask.mean() < 0.99

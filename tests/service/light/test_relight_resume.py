@@ -7,11 +7,18 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import pytest
 
 import service
+from service.light.frames import RESOLVED, frame_hashes
+from service.light.plan import make_plan
+from service.light.sequence import open_capture
+from service.requests.base import Role
+from service.requests.options import role_of
+from service.requests.relight import RelightRequest
 from stage import exr
 from tests.captures import edit_frame, files_in, make_scene, write_capture, write_exr, write_image
 
@@ -65,6 +72,33 @@ def test_another_request_makes_frames_anew(made, options):
 def test_turned_frames_are_made_and_the_unturned_one_is_kept(made):
     made()
     assert made("--spin-degrees", "40") == FRAMES - {"a.1.exr"}
+
+
+def hashes(request: RelightRequest) -> list[str]:
+    plan = make_plan(request)
+    scheduled = [frame.lighting for frame in plan.frames]
+    return frame_hashes(open_capture(plan.folders[0], request, 1, scheduled), request, scheduled, plan.environments)
+
+
+def test_a_choice_that_is_added_makes_frames_anew_by_itself(tmp_path):
+    class Later(RelightRequest):
+        strength: float = 1.0
+        """A new choice."""
+
+    class Report(RelightRequest):
+        strength: Annotated[float, Role.RUN] = 1.0
+        """No choice about the work."""
+
+    given = {"capture": write_capture(tmp_path / "cap", SCENE), "out": str(tmp_path / "a.#.exr"), "frames": "1-2",
+             "environment": write_exr(tmp_path / "sky.exr", np.ones((8, 16, 3)))}
+    assert len({*hashes(Later(**given)), *hashes(Later(**given, strength=2.0))}) == 2  # unturned frames are equal
+    assert hashes(Report(**given)) == hashes(Report(**given, strength=2.0)) == hashes(RelightRequest(**given))
+
+
+def test_what_the_hash_holds_in_another_form_is_a_choice():
+    """The other choices are in it as they are; those in another form change it, as the tests here and in test_align show."""
+    assert RESOLVED.keys() <= {name for name, field in RelightRequest.model_fields.items() if role_of(field) is Role.CHOICE}
+    assert RESOLVED.keys() == {"frames", "spin_degrees", "exposure", "aov", "align", "align_to"}
 
 
 @pytest.mark.parametrize("change", ["image", "light", "environment", "mask"])

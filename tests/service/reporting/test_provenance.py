@@ -1,0 +1,63 @@
+"""Options in reports and in result files: they come from the fields of a request, so that a new option is recorded by itself."""
+
+import ast
+import importlib
+import pkgutil
+from pathlib import Path
+from typing import Annotated
+
+import pytest
+
+import service
+import service.requests
+from service.reporting.provenance import choices, requested
+from service.requests.base import DeviceRequest, Options, Role
+from service.requests.calibrate import LightsRequest
+from service.requests.depth import DepthRequest, TofOptions
+from service.requests.export import ExportRequest
+from service.requests.options import role_of
+
+
+def requests() -> dict[str, type[Options]]:
+    """Every model of service.requests that a command takes whole."""
+    found = {}
+    for module in pkgutil.iter_modules(service.requests.__path__, "service.requests."):
+        for name, model in vars(importlib.import_module(module.name)).items():
+            if isinstance(model, type) and issubclass(model, DeviceRequest | LightsRequest | ExportRequest) and name.endswith("Request"):
+                found[name] = model
+    return found
+
+
+@pytest.mark.filterwarnings("ignore:Pydantic serializer warnings")  # of the stand-ins for required values
+@pytest.mark.parametrize("name", requests())
+def test_a_new_option_is_recorded_by_itself(name):
+    class Later(requests()[name]):  # type: ignore[misc]
+        strength: float = 2.5
+        """A new choice."""
+        table: Annotated[Path | None, Role.INPUT] = None
+        """A new input."""
+        share: Annotated[str | None, Role.PART] = None
+        """A new way to divide the work."""
+
+    request = Later.model_construct(**{key: "x" for key, field in Later.model_fields.items() if field.is_required()})
+    in_report, in_files = requested(request), choices(request)
+    assert in_report["strength"] == in_files["strength"] == 2.5
+    assert in_report["table"] is None and "table" not in in_files
+    assert "share" not in in_report and "share" not in in_files
+    fields = {key: role_of(field) for key, field in Later.model_fields.items()}
+    assert in_report.keys() == {key for key, role in fields.items() if role is not Role.PART}
+    assert in_files.keys() == {key for key, role in fields.items() if role is Role.CHOICE}
+
+
+def test_a_report_has_the_options_within_an_option_and_files_have_none_of_their_paths():
+    request = DepthRequest(capture=Path("c"), out=Path("o"), tof=TofOptions(calibration=Path("c.json"), vote=False))
+    assert requested(request)["tof"] == {"filters": [], "vote": False, "which": "strongest", "temperature_c": None, "calibration": "c.json"}
+    assert choices(request)["tof"] == {"filters": [], "vote": False, "which": "strongest", "temperature_c": None}
+
+
+def test_no_module_lists_the_options_that_it_records():
+    listed = [f"{path}:{node.lineno}" for path in Path(service.__file__).parent.rglob("*.py") if path.name != "provenance.py"
+              for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+              if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "model_dump"
+              and {"include", "exclude"} & {keyword.arg for keyword in node.keywords}]
+    assert listed == []
