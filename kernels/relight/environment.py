@@ -6,7 +6,7 @@ was given, ∫ w L dω, divided by E.
 Source: Debevec et al., SIGGRAPH 2000, section 3.3.
 """
 
-from enum import StrEnum
+from enum import Enum, auto
 
 import numpy as np
 
@@ -16,14 +16,13 @@ from kernels.relight.latlong import LightEnergy
 from kernels.relight.smooth import integrate_smooth
 
 
-class Weighting(StrEnum):
+class Weighting(Enum):
     """Ways to share a direction of the environment out over the lights."""
 
-    CELLS = "cells"
-    """The nearest light gets all of it: shadows and highlights are as sharp as a light's own, and a moving sun steps from light to
-    light."""
-    SMOOTH = "smooth"
-    """The three lights around the direction share it: a moving sun fades from light to light, and the shadows of three show at once."""
+    CELLS = auto()
+    """As `integrate_cells` does: shadows and highlights are as sharp as a light's own, and a moving sun steps from light to light."""
+    SMOOTH = auto()
+    """As `integrate_smooth` does: a moving sun fades from light to light, and shadows of three lights show at once."""
 
 
 def integrate(environment: np.ndarray, directions: np.ndarray, rotations: np.ndarray, *, weighting: Weighting,
