@@ -184,13 +184,14 @@ def test_references_judge_without_what_they_judge():
 
 
 def test_a_text_and_a_type_of_fields_stand_in_one_module():
-    """Of stage and service: a module-level name whose value is a text or an Annotated type is not declared with the same value twice."""
+    """Of stage and service: a module-level name whose value is a text, an Annotated type or a Spelling is not declared so twice."""
     found: dict[tuple[str, str], set[str]] = {}
     for name, path in FILES.items():
         for node in ast.parse(path.read_text(encoding="utf-8")).body if top(name) != "kernels" else ():
             if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name) and not node.targets[0].id.startswith("__"):
                 text = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
                 annotated = isinstance(node.value, ast.Subscript) and ast.unparse(node.value.value) == "Annotated"
-                if text or annotated:
+                spelling = isinstance(node.value, ast.Call) and ast.unparse(node.value.func) == "Spelling"
+                if text or annotated or spelling:
                     found.setdefault((node.targets[0].id, ast.unparse(node.value)), set()).add(name)
     assert {name: modules for name, modules in found.items() if len(modules) > 1} == {}

@@ -16,6 +16,7 @@ from service.solve.solve import SolveResult, solve
 from service.usd.export import export
 from stage.capture import Capture
 from stage.correction import Correction
+from stage.ingest import CACHE_FOLDER
 from stage.lighting import distant_lights
 
 SAMPLE = "owl"
@@ -54,7 +55,7 @@ def demo(request: DemoRequest, progress: Progress | None = None) -> DemoResult:
         progress: told how far the work is.
     """
     sample, out, device = sample_folder(), request.out, request.device
-    cache = out / ".relit"
+    cache = out / CACHE_FOLDER
     solved = solve(SolveRequest(capture=sample, out=out, device=device, cache=cache), progress)
     asset = export(ExportRequest(maps=out, out=out / "asset.usdz"), progress)
     relit = relight(RelightRequest(capture=sample, environment=sample / "environment.exr", out=str(out / "frame.####.exr"),

@@ -69,6 +69,10 @@ class Spelling:
     """Whether the value is given by its place, without a flag."""
 
 
+CAPTURE = Spelling(argument=True, metavar="CAPTURE")
+"""Marks the capture of a command, which is given by its place."""
+
+
 class Choice(StrEnum):
     """A closed set of values, each with the words that explain it: `ZIP = "zip", "keeps every bit"`."""
 

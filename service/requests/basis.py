@@ -5,7 +5,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from service.requests.base import Choice, Request, Role, Spelling, StackOptions
+from service.requests.base import CAPTURE, Choice, Request, Role, StackOptions
 
 
 class BasisKind(Choice):
@@ -20,7 +20,7 @@ class BasisKind(Choice):
 class BasisRequest(StackOptions, Request):
     """A capture as a few coefficient images, for a browser or for RTI viewers."""
 
-    capture: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="CAPTURE")]
+    capture: Annotated[Path, Role.INPUT, CAPTURE]
     """Folder with a capture.json."""
     out: Annotated[Path, Role.OUTPUT]
     """The file: .exr, .ptm or .rti; a .json that describes it is written beside it."""

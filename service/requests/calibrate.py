@@ -6,11 +6,10 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, Field
 
 from service.errors import RequestError
-from service.requests.base import Commas, DeviceRequest, Options, Request, Role, Spelling, WidthHeight
+from service.requests.base import CAPTURE, Commas, DeviceRequest, Options, Request, Role, Spelling, WidthHeight
 from stage.model import Count, Finite, Positive
 
 Corners = Annotated[int, Field(ge=3)]
-CAPTURE = Spelling(argument=True, metavar="CAPTURE")
 IMAGES = Spelling(argument=True, metavar="IMAGE...")
 
 

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator
 
-from service.requests.base import Choice, Commas, Options, Request, Role, Spelling
+from service.requests.base import CAPTURE, Choice, Commas, Options, Request, Role, Spelling
 from stage.model import Finite, NotNegative, Positive
 
 
@@ -84,7 +84,7 @@ class DepthOptions(Options):
 class DepthRequest(DepthOptions, Request):
     """Depth from projected patterns, a laser or time of flight."""
 
-    capture: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="CAPTURE")]
+    capture: Annotated[Path, Role.INPUT, CAPTURE]
     """Folder with a capture.json."""
     out: Annotated[Path, Role.OUTPUT]
     """Folder for depth.exr, points.ply and report.json."""

@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, TypeAdapter
 
-from service.requests.base import Options, Role, Spelling
+from service.requests.base import CAPTURE, Options, Role, Spelling
 from service.requests.depth import DepthOptions
 from service.requests.export import AssetFormat, ExportOptions
 from service.requests.identifiers import CaptureId, EnvironmentId, JobId
@@ -17,7 +17,6 @@ DEFAULT_PORT = 8470
 DEFAULT_SERVER = f"http://127.0.0.1:{DEFAULT_PORT}"
 """The address at which a client looks for the service if it is given no other."""
 
-CAPTURE = Spelling(argument=True, metavar="CAPTURE")
 MAPS = Spelling(argument=True, metavar="JOB")
 KEYS = Spelling(metavar="FILE")
 

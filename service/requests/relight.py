@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
-from service.requests.base import Choice, Request, Role, Spelling, StackOptions
+from service.requests.base import CAPTURE, Choice, Request, Role, Spelling, StackOptions
 from service.requests.picture import PictureOptions
 from stage.model import Finite
 
@@ -35,7 +35,7 @@ class RelightOptions(PictureOptions, StackOptions):
 class RelightRequest(RelightOptions, Request):
     """Frames under HDR environments and animated lights."""
 
-    capture: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="CAPTURE")]
+    capture: Annotated[Path, Role.INPUT, CAPTURE]
     """Folder with a capture.json; or a sequence: a folder with such folders, one for each time step, which give one frame each in the order
     of their names."""
     out: Annotated[str, Role.OUTPUT]

@@ -5,14 +5,14 @@ from typing import Annotated
 
 from pydantic import Field
 
-from service.requests.base import Request, Role, Spelling
+from service.requests.base import CAPTURE, Request, Role
 from stage.model import Positive
 
 
 class SeparateRequest(Request):
     """Direct and global light of a capture under fine, shifted phase patterns."""
 
-    capture: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="CAPTURE")]
+    capture: Annotated[Path, Role.INPUT, CAPTURE]
     """Folder with a capture.json."""
     out: Annotated[Path, Role.OUTPUT]
     """Folder for separation.exr and report.json."""

@@ -5,7 +5,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from service.requests.base import Choice, Request, Role, Spelling, StackOptions
+from service.requests.base import CAPTURE, Choice, Request, Role, Spelling, StackOptions
 
 SVBRDF_LIGHTS = 12
 """From this many lights on svbrdf is the default: it fits six lobes and a direction to each pixel, and was better than robust on
@@ -33,7 +33,7 @@ class SolveOptions(StackOptions):
 class SolveRequest(SolveOptions, Request):
     """Normals, albedo and height of a light-stage capture."""
 
-    capture: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="CAPTURE")]
+    capture: Annotated[Path, Role.INPUT, CAPTURE]
     """Folder with a capture.json."""
     out: Annotated[Path, Role.OUTPUT]
     """Folder for maps.exr and report.json."""

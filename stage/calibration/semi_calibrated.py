@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stage.calibration.grey_ball import WEIGHT_SCALE
 from stage.errors import CalibrationError
 
 MIN_LIGHTS = 4
@@ -22,8 +23,6 @@ MIN_DETERMINED = 1e-3
 """The least relative singular value of the equations for the ambiguity: below it the brightness is not determined."""
 SHADOW = 0.1
 """A reading below this part of the bright readings of the pixel, or of |b|, is in shadow or grazing light."""
-WEIGHT_SCALE = 2.385
-"""The scale of the Cauchy weights, as in grey_ball."""
 BRIGHT_END = 0.9
 """The quantile of the readings of a pixel that stands for its brightest one."""
 ROUNDS = 60
