@@ -1,4 +1,4 @@
-"""The floors of the house, read from the imports of every module."""
+"""The layers of the packages, read from the imports of every module."""
 
 import ast
 import subprocess
@@ -68,13 +68,13 @@ def test_the_imports_are_read():
     assert any(i.importer == "kernels.device" and i.target == "warp" for i in IMPORTS)
 
 
-@pytest.mark.parametrize(("floor", "allowed"), [
+@pytest.mark.parametrize(("layer", "allowed"), [
     ("stage", {"stage", "numpy", "pydantic", "OpenEXR", "OpenImageIO", "cv2", "laspy"}),
     ("kernels", {"kernels", "numpy", "warp"}),
 ])
-def test_a_floor_knows_only_its_own_libraries(floor, allowed):
-    """So neither knows the other, nor the roof; and stage knows no Warp."""
-    others = {i for i in IMPORTS if top(i.importer) == floor and top(i.target) not in allowed | sys.stdlib_module_names}
+def test_a_layer_imports_only_its_own_libraries(layer, allowed):
+    """So stage and kernels import neither each other nor service, and stage does not import Warp."""
+    others = {i for i in IMPORTS if top(i.importer) == layer and top(i.target) not in allowed | sys.stdlib_module_names}
     assert not others
 
 

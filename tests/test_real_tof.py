@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kernels.tof.pileup import place, unhurried
+from kernels.tof.pileup import place, without_pileup
 from kernels.tof.pulse_width import estimate_pulse
 from kernels.tof.returns import find_returns
 from stage.tof.calibration import TofCalibration, fit_line
@@ -24,8 +24,8 @@ def test_a_plane_at_159_poses_is_within_two_millimetres():
     poses = json.loads(DATA.read_text())
     truth = np.array([pose["dist_to_plane"] for pose in poses])
     counts = np.array([pose["hists"] for pose in poses], dtype=np.float32).sum(axis=1)  # the nine zones look at one plane
-    exposed = unhurried(place(counts, "cpu"))
-    measured = find_returns(exposed, estimate_pulse(exposed, counts)).position.numpy()[0] * BIN_M
+    histograms = without_pileup(place(counts, "cpu"))
+    measured = find_returns(histograms, estimate_pulse(histograms, counts)).position.numpy()[0] * BIN_M
     for half in (0, 1):
         fitted = np.arange(len(poses)) % 2 == half
         scale, offset = fit_line(measured[fitted], truth[fitted])

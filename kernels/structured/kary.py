@@ -40,7 +40,7 @@ MIN_LEVEL_STEP = 1.0e-3
 """Least difference of two levels, as a part of white minus black; closer levels count as equal."""
 LARGEST = 1.0e15
 """Signal above which a reading counts as infinite, because the signal is squared in float32."""
-FAR = 1.0e30
+EMPTY_CHI2 = 1.0e30
 """Sentinel χ² of a slot that holds no level."""
 
 
@@ -163,7 +163,7 @@ def _kary_kernel(pack: int, channels: Literal[1, 3] = 1) -> Any:
         sum0, sum1, sum2, sum3 = int_pack(), int_pack(), int_pack(), int_pack()
         for back in range(order.shape[0]):
             frame = order[order.shape[0] - 1 - back]
-            best, second, nearest, next_nearest = float_pack(FAR), float_pack(FAR), int_pack(), int_pack()
+            best, second, nearest, next_nearest = float_pack(EMPTY_CHI2), float_pack(EMPTY_CHI2), int_pack(), int_pack()
             for digit in range(base):
                 cost = float_pack()
                 for channel in range(channels):

@@ -23,7 +23,7 @@ from kernels.structured.angles import TURN, cosine_of_turns, sine_of_turns
 from kernels.structured.decoded import Decoded, unwritten_decoded
 from kernels.structured.frames import NoiseModel, cut_in, require_frames, saturation_masks
 from kernels.structured.phase import decode_phase
-from kernels.structured.unwrap import FAR, judge, keep_better
+from kernels.structured.unwrap import EMPTY_CHI2, judge, keep_better
 
 LEVEL_ERROR = 0.02
 """Error of a reading beyond noise, as a part of the amplitude: the camera's and projector's responses and unequal amplitudes cause it."""
@@ -149,7 +149,7 @@ def _micro_kernel(pack: int) -> Any:
             turned[2 * f + 1, p] = sine
 
         # every wrap of the reference, and how well the other frames fit there
-        best, second, place, trust, known = float_pack(FAR), float_pack(FAR), float_pack(), float_pack(), float_pack()
+        best, second, place, trust, known = float_pack(EMPTY_CHI2), float_pack(EMPTY_CHI2), float_pack(), float_pack(), float_pack()
         for k in range(pack):
             trust[k] = 1.0 / (2.0 * (read_variance + gain * wp.max(mean[k], 0.0)) + wp.static(LEVEL_ERROR**2) * swing[k] * swing[k])
             slope_reference = swing[k] * TURN / period
@@ -171,7 +171,7 @@ def _micro_kernel(pack: int) -> Any:
             for k in range(pack):
                 shift = slopes[k] / (stiffness[k] + known[k])
                 u = (angle[k] * wp.static(1.0 / TURN) + float(wrap - 1)) * period + shift
-                outside = wp.where(wp.abs(u - 0.5 * extent) > 0.5 * extent + BORDER_PX, FAR, 0.0)
+                outside = wp.where(wp.abs(u - 0.5 * extent) > 0.5 * extent + BORDER_PX, EMPTY_CHI2, 0.0)
                 cost = wp.max(squares[k] - slopes[k] * shift, 0.0) * trust[k] + outside
                 keep_better(cost, u, best[k], second[k], place[k])
 

@@ -41,7 +41,7 @@ BORDER_SIGMAS = 4.0
 """Standard deviations by which a place may lie outside the projector."""
 WRAP_MARGIN = 0.375
 """Largest distance between a place and the centre of its stripe, as a part of the period: at one half, the next wrap would fit as well."""
-FAR = 1.0e30
+EMPTY_CHI2 = 1.0e30
 """Sentinel χ² of a slot that holds no candidate."""
 
 _OUT_OF_RANGE, _UNDECIDED, _MULTIPATH = int(Status.OUT_OF_RANGE), int(Status.UNDECIDED), int(Status.MULTIPATH)
@@ -153,7 +153,7 @@ def keep_better(cost: float, candidate: float, best: wp.ref[float], second: wp.r
 def judge(best: float, second: float) -> int:
     """Return the status of the candidate that costs least from the two lowest costs, in χ²."""
     code = OK
-    if best >= FAR:
+    if best >= EMPTY_CHI2:
         code = _OUT_OF_RANGE
     elif best > MULTIPATH_CHI2:
         code = _MULTIPATH
@@ -200,7 +200,7 @@ def _joint_kernel(pack: int) -> Any:
 
         # every wrap of the reference, and how well the others fit there
         base = phase[reference, p]
-        best, second, place, border, inverse = float_pack(FAR), float_pack(FAR), float_pack(), float_pack(), float_pack()
+        best, second, place, border, inverse = float_pack(EMPTY_CHI2), float_pack(EMPTY_CHI2), float_pack(), float_pack(), float_pack()
         for k in range(pack):
             inverse[k] = 1.0 / stiffness[k]
             border[k] = wp.static(BORDER_SIGMAS) * wp.sqrt(inverse[k])
@@ -219,7 +219,7 @@ def _joint_kernel(pack: int) -> Any:
             for k in range(pack):
                 middle = (base[k] * turn + float(wrap)) * step
                 u = middle - slopes[k] * inverse[k]
-                outside = wp.where(wp.abs(u - 0.5 * extent) > 0.5 * extent + border[k], FAR, 0.0)
+                outside = wp.where(wp.abs(u - 0.5 * extent) > 0.5 * extent + border[k], EMPTY_CHI2, 0.0)
                 cost = wp.max(squares[k] - slopes[k] * slopes[k] * inverse[k], 0.0) + outside
                 keep_better(cost, middle, best[k], second[k], place[k])
 

@@ -1,8 +1,8 @@
 """Likelihood of a histogram: what each bin is expected to hold, and what its count says about that.
 
-A bin of mean λ (background and returns, all pulses together) that was awake for the part a of the pulses counts n photons: a Poisson
-variable of mean a·λ; or, where each of N pulses counts one photon at most, binomial: a·N pulses of probability 1 - exp(-λ/N). Both are
-one formula in r = (1 - e^-x)/x with x = λ/N, which is 1 where N has no limit:
+A bin of mean λ (background and returns, all pulses together) in which the detector was live for the part a of the pulses counts n photons:
+a Poisson variable of mean a·λ; or, where each of N pulses counts one photon at most, binomial: a·N pulses of probability 1 - exp(-λ/N).
+Both are one formula in r = (1 - e^-x)/x with x = λ/N, which is 1 where N has no limit:
 
     log likelihood   n·log(λ·r) - (a - n/N)·λ
     its slope in λ   n/(λ·r) - a
@@ -14,7 +14,7 @@ Source:
 
 import warp as wp
 
-from kernels.tof.pileup import Exposed
+from kernels.tof.pileup import LiveCounts
 from kernels.tof.pulse import Pulse
 
 wp.set_module_options({"enable_backward": False})
@@ -25,7 +25,7 @@ class Recorded:
     """Histograms on the device."""
 
     counts: wp.array2d(dtype=wp.float32)  # [bin, pixel] corrected for pile-up
-    awake: wp.array2d(dtype=wp.float32)  # [bin, pixel] 0…1
+    live: wp.array2d(dtype=wp.float32)  # [bin, pixel] 0…1
     per_pulse: float  # 1/N, 0 for Poisson counts
 
 
@@ -41,10 +41,10 @@ class Shape:
     width: float  # bins: nearer than this two returns are one
 
 
-def recorded(exposed: Exposed) -> Recorded:
+def recorded(histograms: LiveCounts) -> Recorded:
     """Return the histograms as the kernels take them."""
     given = Recorded()
-    given.counts, given.awake, given.per_pulse = exposed.counts, exposed.awake, 1 / exposed.pulses
+    given.counts, given.live, given.per_pulse = histograms.counts, histograms.live, 1 / histograms.pulses
     return given
 
 
@@ -122,8 +122,8 @@ def counted_part(x: float):
 def counted(given: Recorded, i: int, p: int):
     """Return n, the photons that were counted, from what Coates's correction made of them."""
     count = given.counts[i, p]
-    if given.per_pulse > 0.0 and given.awake[i, p] > 0.0:
-        count = count * counted_part(count * given.per_pulse / given.awake[i, p])
+    if given.per_pulse > 0.0 and given.live[i, p] > 0.0:
+        count = count * counted_part(count * given.per_pulse / given.live[i, p])
     return count
 
 
@@ -131,7 +131,7 @@ def counted(given: Recorded, i: int, p: int):
 def likelihood_gain(given: Recorded, i: int, p: int, old: float, new: float):
     """Return the log likelihood of a bin of mean `new`, less that of mean `old`."""
     count = counted(given, i, p)
-    gain = -(given.awake[i, p] - count * given.per_pulse) * (new - old)
+    gain = -(given.live[i, p] - count * given.per_pulse) * (new - old)
     if count > 0.0:
         gain += count * wp.log(new * counted_part(new * given.per_pulse) / (old * counted_part(old * given.per_pulse)))
     return gain
@@ -140,11 +140,11 @@ def likelihood_gain(given: Recorded, i: int, p: int, old: float, new: float):
 @wp.func
 def likelihood_slope(given: Recorded, i: int, p: int, mean: float):
     """Return the derivative of the log likelihood of a bin by its mean."""
-    return counted(given, i, p) / (mean * counted_part(mean * given.per_pulse)) - given.awake[i, p]
+    return counted(given, i, p) / (mean * counted_part(mean * given.per_pulse)) - given.live[i, p]
 
 
 @wp.func
 def information(given: Recorded, i: int, p: int, mean: float):
     """Return the Fisher information of a bin about its mean."""
     x = mean * given.per_pulse
-    return given.awake[i, p] / (mean * counted_part(x) * wp.exp(x))
+    return given.live[i, p] / (mean * counted_part(x) * wp.exp(x))

@@ -17,11 +17,12 @@ EXHAUSTED = 1e-3
 """Least part of the pulses that must be left for a bin to be used: with fewer, the correction divides by a number that is mostly chance."""
 
 
-class Exposed(NamedTuple):
-    """Counts, and the part of all pulses for which the detector was still awake; [bin, pixel] on the device."""
+class LiveCounts(NamedTuple):
+    """Photon counts and the fraction of all pulses for which the detector was still live, that is, had not yet counted a photon; [bin,
+    pixel] on the device."""
 
     counts: wp.array  # float32: expected photons of the pulses that were left
-    awake: wp.array  # float32, 0…1
+    live: wp.array  # float32, 0…1: fraction of the pulses without an earlier photon
     pulses: float = np.inf  # of each histogram; finite where a pulse counts one photon at most: counts are binomial then, else Poisson
 
 
@@ -46,8 +47,8 @@ def place(counts: np.ndarray, device: str) -> wp.array:
     return wp.array(values.T, dtype=wp.float32, device=device)
 
 
-def correct_pileup(counts: wp.array, *, pulses: int) -> Exposed:
-    """Undo pile-up: return the photons that each bin would have counted.
+def correct_pileup(counts: wp.array, *, pulses: int) -> LiveCounts:
+    """Undo pile-up: return the photons that a detector without dead time would have counted in each bin.
 
     Of `pulses`, those without a photon in bins before i are left at bin i; of these the counted part q had at least one photon in the
     bin, so that the expected number is -ln(1 - q) a pulse.
@@ -57,8 +58,8 @@ def correct_pileup(counts: wp.array, *, pulses: int) -> Exposed:
         pulses: laser pulses of each histogram.
 
     Returns:
-        Expected photons of the pulses that were left, of mean awake · flux whatever was lost, their part of all, and `pulses`.
-        Bins with fewer than EXHAUSTED of the pulses left count as blind.
+        The photons that the pulses left at each bin would have counted, whose mean is live · flux, the fraction of the pulses left, and
+        `pulses`. A bin with less than EXHAUSTED of the pulses left has live 0.
 
     Raises:
         ArrayError: pulses is not above zero.
@@ -68,14 +69,14 @@ def correct_pileup(counts: wp.array, *, pulses: int) -> Exposed:
     """
     if pulses < 1:
         raise ArrayError(f"pulses is {pulses}: pile-up is corrected with the number of laser pulses, one or more")
-    corrected, awake = wp.zeros_like(counts), wp.zeros_like(counts)
-    devices.launch(_coates_kernel, counts.shape[1], [counts, float(pulses)], [corrected, awake], device=str(counts.device))
-    return Exposed(corrected, awake, float(pulses))
+    corrected, live = wp.zeros_like(counts), wp.zeros_like(counts)
+    devices.launch(_coates_kernel, counts.shape[1], [counts, float(pulses)], [corrected, live], device=str(counts.device))
+    return LiveCounts(corrected, live, float(pulses))
 
 
-def unhurried(counts: wp.array) -> Exposed:
-    """Return the counts of a detector that is always awake, as correct_pileup returns them."""
-    return Exposed(counts, wp.full(counts.shape, 1.0, dtype=wp.float32, device=counts.device))
+def without_pileup(counts: wp.array) -> LiveCounts:
+    """Return the counts of a detector without dead time, which is always live, in the form of correct_pileup."""
+    return LiveCounts(counts, wp.full(counts.shape, 1.0, dtype=wp.float32, device=counts.device))
 
 
 @wp.kernel(module="unique")
@@ -84,7 +85,7 @@ def _coates_kernel(first: int,
                    pulses: float,
                    # outputs
                    corrected: wp.array2d(dtype=wp.float32),
-                   awake: wp.array2d(dtype=wp.float32)):
+                   live: wp.array2d(dtype=wp.float32)):
     p = first + wp.tid()
     left = float(pulses)
     for i in range(counts.shape[0]):
@@ -95,5 +96,5 @@ def _coates_kernel(first: int,
             if q < 1.0e-3:  # the logarithm of nearly one loses its digits
                 rate = q + 0.5 * q * q
             corrected[i, p] = left * rate
-            awake[i, p] = left / pulses
+            live[i, p] = left / pulses
         left = wp.max(left - n, 0.0)

@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from kernels.errors import ArrayError
-from kernels.tof.pileup import Exposed
+from kernels.tof.pileup import LiveCounts
 from kernels.tof.pulse import Pulse, gaussian
 from kernels.tof.returns import find_returns, threshold
 
@@ -21,11 +21,11 @@ LEAST_SIGMA = 1e-6
 """Least standard deviation of a return's time that enters the cost, in bins: float32 resolves no smaller one."""
 
 
-def estimate_pulse(exposed: Exposed, counts: np.ndarray) -> Pulse:
+def estimate_pulse(histograms: LiveCounts, counts: np.ndarray) -> Pulse:
     """Return the Gaussian pulse under which the brightest histograms are likeliest; waits for the device.
 
     Args:
-        exposed: of all pixels.
+        histograms: of all pixels.
         counts: [pixel, bin] the same as recorded, to pick the brightest.
 
     Raises:
@@ -42,14 +42,14 @@ def estimate_pulse(exposed: Exposed, counts: np.ndarray) -> Pulse:
     window = min(WIDTH_WINDOW, counts.shape[1] - 1)
     peak = (total[:, window:] - total[:, :-window]).max(axis=1) - window * np.median(counts, axis=1)
     chosen = np.argsort(-peak, kind="stable")[:WIDTH_PIXELS]
-    device = str(exposed.counts.device)
-    some = Exposed(*(wp.array(array.numpy()[:, chosen], dtype=wp.float32, device=device)
-                     for array in (exposed.counts, exposed.awake)), exposed.pulses)
+    device = str(histograms.counts.device)
+    some = LiveCounts(*(wp.array(array.numpy()[:, chosen], dtype=wp.float32, device=device)
+                     for array in (histograms.counts, histograms.live)), histograms.pulses)
     totals = []
     for width in WIDTHS:
         found = find_returns(some, gaussian(float(width)), most=WIDTH_RETURNS)
         sigma = found.sigma.numpy()[found.photons.numpy() > 0].astype(np.float64)
-        cost = len(sigma) * 0.5 * threshold(exposed.counts.shape[0]) - np.log((2 * np.pi) ** 0.5 * np.maximum(sigma, LEAST_SIGMA)).sum()
+        cost = len(sigma) * 0.5 * threshold(histograms.counts.shape[0]) - np.log((2 * np.pi) ** 0.5 * np.maximum(sigma, LEAST_SIGMA)).sum()
         totals.append(float(found.likelihood.numpy().sum(dtype=np.float64) - cost) if len(sigma) else -np.inf)
     best = int(np.argmax(totals))
     if not np.isfinite(totals[best]):

@@ -1,6 +1,6 @@
 """Photon histograms → returns: background, matched filter, and maximum likelihood of time and strength, several returns a pixel.
 
-Counts are Poisson variables of mean awake · (b + Σ s·p(t)): background b, and for each return its photons s spread over the bins by the
+Counts are Poisson variables of mean live · (b + Σ s·p(t)): background b, and for each return its photons s spread over the bins by the
 pulse p at time t (pile-up: kernels.tof.likelihood). A return is looked for where it adds most to the likelihood, which is the matched
 filter of low counts as well as of high ones; then time and strength are moved to the maximum by Fisher scoring, and so between the bins.
 What the histogram leaves open about the time is worked out in kernels.tof.times.
@@ -28,7 +28,7 @@ from kernels.tof.likelihood import (
     shape,
     share_before,
 )
-from kernels.tof.pileup import Exposed
+from kernels.tof.pileup import LiveCounts
 from kernels.tof.pulse import Pulse
 from kernels.tof.times import peak_reach, return_times
 
@@ -69,11 +69,11 @@ class Returns(NamedTuple):
     status: wp.array  # [pixel] int32: of the first return
 
 
-def find_returns(exposed: Exposed, pulse: Pulse, *, most: int = 1, first_bin: float = 0.0, last_bin: float | None = None) -> Returns:
+def find_returns(histograms: LiveCounts, pulse: Pulse, *, most: int = 1, first_bin: float = 0.0, last_bin: float | None = None) -> Returns:
     """Find the returns of each histogram.
 
     Args:
-        exposed: counts, and the part of the pulses that saw each bin.
+        histograms: counts, and the part of the pulses that saw each bin.
         pulse: shape of a return.
         most: returns to look for, 1 to 4; later ones only where they are as significant as the first must be.
         first_bin, last_bin: where returns may be, in bins from the start; None: to the end.
@@ -95,21 +95,21 @@ def find_returns(exposed: Exposed, pulse: Pulse, *, most: int = 1, first_bin: fl
         Poisson regime", IEEE Trans. Information Theory 15(1), 1969. Price of a fitted number: Schwarz, "Estimating the dimension of a
         model", Annals of Statistics 6(2), 1978.
     """
-    bins, pixels = exposed.counts.shape
+    bins, pixels = histograms.counts.shape
     last = float(bins) if last_bin is None else min(float(last_bin), float(bins))
     if not 1 <= most <= 4:
         raise ArrayError(f"{most} returns are asked for: 1 to 4 can be")
     first_bin = max(first_bin, 0.0)
     if not first_bin < last:
         raise ArrayError(f"returns from bin {first_bin:g} to bin {last:g} leave no place: the histogram has {bins} bins")
-    device = str(exposed.counts.device)
+    device = str(histograms.counts.device)
     position, photons, evidence, confidence = (wp.zeros((most, pixels), dtype=wp.float32, device=device) for _ in range(4))
     background, likelihood = (wp.zeros(pixels, dtype=wp.float32, device=device) for _ in range(2))
     status = wp.zeros(pixels, dtype=wp.int32, device=device)
     per_bin = max(POSITIONS_PER_BIN, int(np.ceil(POSITIONS_PER_WIDTH / pulse.width)))
-    devices.launch(_returns_kernel, pixels, [recorded(exposed), shape(pulse, device), per_bin, first_bin, last, threshold(bins)],
+    devices.launch(_returns_kernel, pixels, [recorded(histograms), shape(pulse, device), per_bin, first_bin, last, threshold(bins)],
                    [position, photons, evidence, confidence, background, likelihood, status], device=device, uneven=True)
-    times = return_times(exposed, pulse, position, photons, background, first_bin=first_bin, last_bin=last)
+    times = return_times(histograms, pulse, position, photons, background, first_bin=first_bin, last_bin=last)
     return Returns(times.position, times.sigma, photons, evidence, confidence, background, likelihood, status)
 
 
@@ -130,8 +130,8 @@ def _added_at(given: Recorded, pulse: Shape, t: float, b: float, p: int, found: 
     before = share_before(pulse, float(low) - t)
     for i in range(low, high):
         after = share_before(pulse, float(i + 1) - t)
-        excess += given.counts[i, p] - given.awake[i, p] * mean_of_bin(pulse, i, p, -1, found, b, position, photons)
-        share += given.awake[i, p] * (after - before)
+        excess += given.counts[i, p] - given.live[i, p] * mean_of_bin(pulse, i, p, -1, found, b, position, photons)
+        share += given.live[i, p] * (after - before)
         before = after
     added = float(0.0)
     s = float(0.0)
@@ -206,9 +206,9 @@ def _returns_kernel(first: int,
     top_bin = wp.int32(0)
     for i in range(bins):
         everything += given.counts[i, p]
-        exposure += given.awake[i, p]
-        if given.counts[i, p] > top * wp.max(given.awake[i, p], 1.0e-6):
-            top = given.counts[i, p] / wp.max(given.awake[i, p], 1.0e-6)
+        exposure += given.live[i, p]
+        if given.counts[i, p] > top * wp.max(given.live[i, p], 1.0e-6):
+            top = given.counts[i, p] / wp.max(given.live[i, p], 1.0e-6)
             top_bin = i
     code = int(_LOW)
     if exposure < float(LEAST_OUTSIDE):
@@ -218,16 +218,16 @@ def _returns_kernel(first: int,
         # background without the highest bin and what a pulse about it covers
         inside = float(0.0)
         hidden = float(0.0)
-        awake_bins = wp.int32(0)
+        live_bins = wp.int32(0)
         reach = int(wp.ceil(pulse.end - pulse.begin))
         for i in range(bins):
             if wp.abs(i - top_bin) <= reach:
                 inside += given.counts[i, p]
-                hidden += given.awake[i, p]
-            elif given.awake[i, p] > 0.0:
-                awake_bins += 1
+                hidden += given.live[i, p]
+            elif given.live[i, p] > 0.0:
+                live_bins += 1
         b = everything / exposure
-        if awake_bins >= LEAST_OUTSIDE:
+        if live_bins >= LEAST_OUTSIDE:
             b = wp.min((everything - inside) / (exposure - hidden), b)
         b = wp.max(b, least)
         found = wp.int32(0)
@@ -280,7 +280,7 @@ def _returns_kernel(first: int,
                     # background: what lies outside all returns
                     outside = float(0.0)
                     seen = float(0.0)
-                    awake_bins = wp.int32(0)
+                    live_bins = wp.int32(0)
                     for i in range(bins):
                         covered = wp.int32(0)
                         for m in range(found):
@@ -288,9 +288,9 @@ def _returns_kernel(first: int,
                                 covered = 1
                         if covered == 0:
                             outside += given.counts[i, p]
-                            seen += given.awake[i, p]
-                            awake_bins += wp.where(given.awake[i, p] > 0.0, 1, 0)
-                    if awake_bins >= LEAST_OUTSIDE:
+                            seen += given.live[i, p]
+                            live_bins += wp.where(given.live[i, p] > 0.0, 1, 0)
+                    if live_bins >= LEAST_OUTSIDE:
                         b = wp.max(outside / seen, least)
                     for k in range(found):
                         at = scored(given, pulse, k, p, found, b, first_bin, last_bin, position, photons)

@@ -29,7 +29,7 @@ from kernels.tof.likelihood import (
     shape,
     share_before,
 )
-from kernels.tof.pileup import Exposed
+from kernels.tof.pileup import LiveCounts
 from kernels.tof.pulse import Pulse
 
 NODES = 4
@@ -58,12 +58,12 @@ class Times(NamedTuple):
     sigma: wp.array  # [return, pixel] float32 bins
 
 
-def return_times(exposed: Exposed, pulse: Pulse, position: wp.array, photons: wp.array, background: wp.array, *, first_bin: float,
+def return_times(histograms: LiveCounts, pulse: Pulse, position: wp.array, photons: wp.array, background: wp.array, *, first_bin: float,
                  last_bin: float) -> Times:
     """Return the mean and the standard deviation of the time of each return.
 
     Args:
-        exposed: the histograms.
+        histograms: the histograms.
         pulse: shape of a return.
         position: [return, pixel] float32 times of greatest likelihood, bins.
         photons: [return, pixel] float32 their strengths; the first 0 ends the list.
@@ -80,9 +80,9 @@ def return_times(exposed: Exposed, pulse: Pulse, position: wp.array, photons: wp
         its bound, and the threshold. Van Trees, "Detection, Estimation, and Modulation Theory" I, 1968, section 2.4: the posterior's mean
         as the estimate of least squared error, and its variance as that error.
     """
-    device = str(exposed.counts.device)
+    device = str(histograms.counts.device)
     mean, sigma = (wp.zeros(position.shape, dtype=wp.float32, device=device) for _ in range(2))
-    devices.launch(_times_kernel, exposed.counts.shape[1], [recorded(exposed), shape(pulse, device), first_bin, last_bin, position,
+    devices.launch(_times_kernel, histograms.counts.shape[1], [recorded(histograms), shape(pulse, device), first_bin, last_bin, position,
                                                             photons, background], [mean, sigma], device=device, uneven=True)
     return Times(mean, sigma)
 

@@ -20,7 +20,7 @@ HYPOTHESES = 3
 """Number of hypotheses kept for a pixel: a fourth has had no influence on the result in the simulated scenes."""
 FLOOR_RAD = 1e-3
 """Least standard deviation of a phase, in radians, however bright the pixel is: 0.3 mm at 80 MHz."""
-FAR = 1e20
+NO_HYPOTHESIS_COST = 1e20
 """Sentinel cost of a slot that holds no hypothesis."""
 END_SIGMAS = 3.0
 """Standard deviations by which a hypothesis may lie beyond either end of the span."""
@@ -127,9 +127,9 @@ def unwrap_kernel(pack: int) -> Any:
             spread[k] = wp.sqrt(variance[k])
             low[k] = nearest - END_SIGMAS * spread[k]
             high[k] = farthest + END_SIGMAS * spread[k]
-            c0[k] = FAR
-            c1[k] = FAR
-            c2[k] = FAR
+            c0[k] = NO_HYPOTHESIS_COST
+            c1[k] = NO_HYPOTHESIS_COST
+            c2[k] = NO_HYPOTHESIS_COST
         for n in range(lowest, highest + 1):
             d, moved, cost = float_pack(), float_pack(), float_pack()
             for k in range(pack):
@@ -148,7 +148,7 @@ def unwrap_kernel(pack: int) -> Any:
                 step = TURN * moved[k] * variance[k]
                 here = d[k] + step
                 c = TURN * (TURN * cost[k] - moved[k] * step)
-                c = wp.where(here < low[k], FAR, wp.where(here > high[k], FAR, c))
+                c = wp.where(here < low[k], NO_HYPOTHESIS_COST, wp.where(here > high[k], NO_HYPOTHESIS_COST, c))
                 below0 = c < c0[k]
                 below1 = c < c1[k]
                 below2 = c < c2[k]
@@ -160,9 +160,9 @@ def unwrap_kernel(pack: int) -> Any:
                 c0[k] = wp.where(below0, c, c0[k])
         p0, p1, p2, kept = float_pack(), float_pack(), float_pack(), float_pack()
         for k in range(pack):
-            one = wp.where(c0[k] < FAR, wp.where(total[k] > 0.0, 1.0, 0.0), 0.0)
-            two = one * wp.where(c1[k] < FAR, decay(0.5 * (c1[k] - c0[k])), 0.0)
-            three = one * wp.where(c2[k] < FAR, decay(0.5 * (c2[k] - c0[k])), 0.0)
+            one = wp.where(c0[k] < NO_HYPOTHESIS_COST, wp.where(total[k] > 0.0, 1.0, 0.0), 0.0)
+            two = one * wp.where(c1[k] < NO_HYPOTHESIS_COST, decay(0.5 * (c1[k] - c0[k])), 0.0)
+            three = one * wp.where(c2[k] < NO_HYPOTHESIS_COST, decay(0.5 * (c2[k] - c0[k])), 0.0)
             share = 1.0 / wp.max(one + two + three, 1.0)
             p0[k] = one * share
             p1[k] = two * share

@@ -15,10 +15,9 @@ SAME_SURFACE = 0.3
 """Largest difference of two ranges on the same surface, as a part of the wrap distance."""
 CERTAIN = 1 - 1e-5
 """Probability of the best hypothesis from which a pixel keeps it without a vote: two rounds multiply the odds of another wrap by at most 1
-/ STRANGER²."""
-STRANGER = 0.02
-"""Prior weight of a pixel on a surface that none of its neighbours is on: it limits how far they can outvote the pixel's own
-measurement."""
+/ UNSEEN_SURFACE²."""
+UNSEEN_SURFACE = 0.02
+"""Prior weight of a surface that none of the pixel's neighbours is on: it limits how far they can outvote the pixel's own measurement."""
 
 wp.set_module_options({"enable_backward": False})
 
@@ -88,7 +87,7 @@ def _vote_kernel(first: int,
                             voters += w
                             for n in range(HYPOTHESES):
                                 support[n] += w * nearness(ranges[k, q] - ranges[n, p], inverse)
-        prior = STRANGER * wp.max(voters, 1.0)
+        prior = UNSEEN_SURFACE * wp.max(voters, 1.0)
         odds = wp.vec3()
         for n in range(HYPOTHESES):
             odds[n] = before[n, p] * (prior + support[n])

@@ -39,12 +39,12 @@ def open_service(data: Path, device: str | None) -> None:
     """Run a service for this machine alone, with the sample in it."""
     from service.cli.server import settings_of
     from service.demo.demo import sample_folder
-    from service.server.sample import greet
+    from service.server.sample import show_sample
     from service.server.serve import serve
 
     sample = sample_folder()
     serve(settings_of(None, data=data, host="127.0.0.1", anonymous=True, roots=(sample,), devices=(device,) if device else None),
-          greet=lambda address, database, queue: greet(address, database, queue, sample))
+          before_answering=lambda address, database, queue: show_sample(address, database, queue, sample))
 
 
 def _bench(request: BenchRequest) -> None:

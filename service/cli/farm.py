@@ -44,9 +44,9 @@ def relight(given: Given[RelightRequest], job: JobOption, chunk_frames: ChunkOpt
     from service.farm.jobs import relight_job
     from service.light.plan import make_plan
 
-    request = given.build(out=str(Path(given.values["out"]).absolute()))  # as its tasks are asked
+    request = given.build(out=str(Path(given.values["out"]).absolute()))  # absolute, as in the requests of its tasks
     frames = make_plan(request).frames
-    spelled = request.model_copy(update={"frames": f"{frames[0].lighting.number}-{frames[-1].lighting.number}"})
+    spelled = request.model_copy(update={"frames": f"{frames[0].scheduled.number}-{frames[-1].scheduled.number}"})
     _write(relight_job(spelled, chunk_frames=chunk_frames, gpu=gpu), job)
 
 

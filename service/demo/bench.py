@@ -65,7 +65,7 @@ def bench(request: BenchRequest, progress: Progress | None = None) -> list[str]:
         rows.append(f"| {what} | {1e3 * ours:.2f} | {rate:.1f} | {peer} | {1e3 * theirs:.2f} | {theirs / ours:.2f} |")
         timings.advance(len(rows))
 
-    # one channel, as the target says: a single plane of the stack as a band of its own
+    # the one-channel row: a single plane of the stack as a band of its own
     one = packs.upload(np.ascontiguousarray(np.broadcast_to(stack[:1], (1, LIGHTS, pixels))), device=name)
     single = _one_channel(one, weights[0, :1], name)
     row("relight, one frame, one channel", timed(single), "NumPy float32 BLAS", timed(lambda: weights[0, 0] @ dense[0]))

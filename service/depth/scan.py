@@ -7,7 +7,7 @@ import numpy as np
 
 from kernels import device as devices
 from kernels.status import SOLVED
-from kernels.tof.pileup import correct_pileup, place, unhurried
+from kernels.tof.pileup import correct_pileup, place, without_pileup
 from kernels.tof.pulse import STEPS_PER_SIGMA
 from kernels.tof.pulse_width import estimate_pulse
 from kernels.tof.returns import find_returns
@@ -105,9 +105,9 @@ def _returns(shots: Shots, device: str) -> tuple[np.ndarray, np.ndarray, np.ndar
     waveforms = shots.scan.waveforms
     assert waveforms is not None
     counts = place(shots.waveforms, device)
-    exposed = correct_pileup(counts, pulses=waveforms.pulses or 1) if waveforms.first_photon_only else unhurried(counts)
-    pulse = estimate_pulse(exposed, shots.waveforms)
-    found = find_returns(exposed, pulse, most=MOST_RETURNS)
+    histograms = correct_pileup(counts, pulses=waveforms.pulses or 1) if waveforms.first_photon_only else without_pileup(counts)
+    pulse = estimate_pulse(histograms, shots.waveforms)
+    found = find_returns(histograms, pulse, most=MOST_RETURNS)
     there = (found.photons.numpy() > 0) & np.isin(found.status.numpy(), SOLVED)
     number, index = np.nonzero(there)
     time_s = waveforms.start_s + found.position.numpy()[number, index].astype(np.float64) * waveforms.bin_s

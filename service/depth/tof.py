@@ -19,7 +19,7 @@ from kernels.tof.decide import AGREEMENT_RAD, UNCALIBRATED_RAD, decide
 from kernels.tof.flying import mark_flying
 from kernels.tof.modulation import common_range_m, require_span
 from kernels.tof.noise import estimate_noise
-from kernels.tof.pileup import Exposed, correct_pileup, place, unhurried
+from kernels.tof.pileup import LiveCounts, correct_pileup, place, without_pileup
 from kernels.tof.pulse import STEPS_PER_SIGMA, Pulse, gaussian, measured
 from kernels.tof.pulse_width import estimate_pulse
 from kernels.tof.returns import Returns, find_returns
@@ -188,11 +188,11 @@ def solve_histograms(frames: Histograms, options: TofOptions, calibration: TofCa
     counts = place(frames.counts, device)
     if frames.first_photon_only:
         assert frames.pulses is not None  # the reader saw to it
-        exposed = correct_pileup(counts, pulses=frames.pulses)
+        histograms = correct_pileup(counts, pulses=frames.pulses)
     else:
-        exposed = unhurried(counts)
-    pulse, source = _pulse(frames, calibration, exposed, usable)
-    found = find_returns(exposed, pulse, most=MOST_RETURNS, first_bin=(nearest - start_m) / bin_m, last_bin=(farthest - start_m) / bin_m)
+        histograms = without_pileup(counts)
+    pulse, source = _pulse(frames, calibration, histograms, usable)
+    found = find_returns(histograms, pulse, most=MOST_RETURNS, first_bin=(nearest - start_m) / bin_m, last_bin=(farthest - start_m) / bin_m)
     chosen = _choose(found, options.which)
     position, sigma, photons, confidence = (np.take_along_axis(array.numpy(), chosen[None], axis=0)[0]
                                             for array in (found.position, found.sigma, found.photons, found.confidence))
@@ -215,14 +215,14 @@ def solve_histograms(frames: Histograms, options: TofOptions, calibration: TofCa
                     photons, np.where(solved, confidence, 0).astype(np.float32), status, facts)
 
 
-def _pulse(frames: Histograms, calibration: TofCalibration, exposed: Exposed, usable: np.ndarray) -> tuple[Pulse, dict[str, Any]]:
+def _pulse(frames: Histograms, calibration: TofCalibration, histograms: LiveCounts, usable: np.ndarray) -> tuple[Pulse, dict[str, Any]]:
     """Return the pulse in bins, and where it is known from."""
     if calibration.pulse is not None:
         shape = measured(np.array(calibration.pulse.time_s) / frames.bin_s, calibration.pulse.power)
         return shape, {"from": "calibration", "width_s": shape.width * frames.bin_s}
     if calibration.pulse_sigma_s is not None:
         return gaussian(calibration.pulse_sigma_s / frames.bin_s), {"from": "calibration", "sigma_s": calibration.pulse_sigma_s}
-    shape = estimate_pulse(exposed, np.where(usable[:, None], frames.counts, 0))
+    shape = estimate_pulse(histograms, np.where(usable[:, None], frames.counts, 0))
     return shape, {"from": "histograms", "sigma_s": float(f"{shape.step * STEPS_PER_SIGMA * frames.bin_s:.4g}")}
 
 

@@ -16,10 +16,10 @@ from service.requests.relight import RelightRequest
 
 
 class PlannedFrame(NamedTuple):
-    """A frame that will be made."""
+    """A frame that will be made, and what lights it."""
 
     path: Path
-    lighting: ScheduledFrame
+    scheduled: ScheduledFrame
     position: int
     """Position of the frame in the whole range, from 0."""
 
@@ -88,4 +88,4 @@ def make_plan(request: RelightRequest) -> Plan:
 
     check_outputs(outputs, inputs())
     planned = (PlannedFrame(*frame) for frame in zip(paths, scheduled, range(len(paths)), strict=True))
-    return Plan(tuple(folders), tuple(frame for frame in planned if frame.lighting.number in made), len(numbers), environments, keys)
+    return Plan(tuple(folders), tuple(frame for frame in planned if frame.scheduled.number in made), len(numbers), environments, keys)

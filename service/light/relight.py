@@ -69,7 +69,7 @@ def relight(request: RelightRequest, progress: Progress | None = None) -> Religh
     with FrameWriter(lambda written: timings.advance(skipped + written)) as writer:
         for folder, frames in plan.captures():
             with timings.part("open"):
-                scheduled = [frame.lighting for frame in frames]
+                scheduled = [frame.scheduled for frame in frames]
                 opened = open_capture(folder, request, len(plan.folders), scheduled)
                 hashes = frame_hashes(opened, request, scheduled, plan.environments)
                 todo = [(frame, request_hash) for frame, request_hash in zip(frames, hashes, strict=True)
@@ -106,7 +106,7 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
     """Make frames of one capture; `todo` holds each frame with the hash of its request."""
     maps = None if opened.maps is None else read_maps(opened.maps, opened.capture)
     layers = still_layers(request.aov, opened.capture, maps, opened.maps)
-    environment = todo[0][0].lighting.environment
+    environment = todo[0][0].scheduled.environment
     if environment is not None and plan.environments is not None:
         plan.environments.read(environment.path, opened.space)  # a bad environment map is known before the images are read
     if not plan.is_sequence:
@@ -126,7 +126,7 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
         provenance["relit:frames_per_second"] = f"{plan.keys.frames_per_second:g}"
     lighting = CaptureLighting(opened.lights, stack, plan.environments, opened.space, weighting=Weighting[request.weighting.name],
                                device=device, with_model=guide is not None)
-    lights = lighting.frames([frame.lighting for frame, _ in todo])
+    lights = lighting.frames([frame.scheduled for frame, _ in todo])
     size = chunk_frames(stack)
     alone = plan.total == 1 or plan.is_sequence  # decided from the whole range, so that --only gives bit-identical frames
     for _, members in groupby(todo, key=lambda item: item[0].position // size):
@@ -140,7 +140,7 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
         if guide is not None:
             with timings.part("guide"):
                 specular = guide.correct(frames, [each.model for each in light if each.model is not None], specular=bool(form.parts))
-        files = [FrameFile(frame.path, 2.0**frame.lighting.exposure_stops,
-                           {**provenance, **frame.lighting.metadata, REQUEST_ATTRIBUTE: request_hash}) for frame, request_hash in chunk]
+        files = [FrameFile(frame.path, 2.0**frame.scheduled.exposure_stops,
+                           {**provenance, **frame.scheduled.metadata, REQUEST_ATTRIBUTE: request_hash}) for frame, request_hash in chunk]
         with timings.part("waiting for files"):
             writer.put(files, frames, form, specular)

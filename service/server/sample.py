@@ -14,7 +14,7 @@ from service.server.jobs.queue import JobQueue
 from service.views.states import REFUSED
 
 
-def greet(address: str, database: Database, queue: JobQueue, sample: Path) -> None:
+def show_sample(address: str, database: Database, queue: JobQueue, sample: Path) -> None:
     """Register the sample and its environment, and print commands that use them.
 
     Args:

@@ -44,12 +44,12 @@ SAME_S = 1.0
 """Seconds within which signals count as one: terminals, `timeout` and supervisors signal a process and its group."""
 
 
-def serve(settings: Settings, *, greet: Callable[[str, Database, JobQueue], None] | None = None) -> None:
+def serve(settings: Settings, *, before_answering: Callable[[str, Database, JobQueue], None] | None = None) -> None:
     """Serve until SIGTERM or SIGINT; then let steps and requests end.
 
     Args:
         settings: of the service.
-        greet: called before the service answers, with its address, its database and its queue.
+        before_answering: called before the service answers, with its address, its database and its queue.
 
     Raises:
         RequestError: the address, the data folder or the database cannot be used, or a device is not on this machine.
@@ -70,8 +70,8 @@ def serve(settings: Settings, *, greet: Callable[[str, Database, JobQueue], None
     address = _address(settings.host, listening.getsockname()[1])
     print(f"relit    {address}/v1", flush=True)
     print(f"data     {settings.data}", flush=True)
-    if greet is not None:
-        greet(address, database, app.state.service.queue)
+    if before_answering is not None:
+        before_answering(address, database, app.state.service.queue)
 
     def end() -> None:
         asked.get()

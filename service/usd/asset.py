@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from service.usd.files import check_suffix, define_layer, workshop_beside
+from service.usd.files import check_suffix, define_layer, temporary_folder_beside
 from service.usd.mesh import height_mesh
 from service.usd.scene import define_asset
 from service.usd.textures import FILE_NAMES, write_textures
@@ -49,21 +49,21 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, progress: Pro
 
     tell("mesh", 0.0)
     mesh = height_mesh(maps)
-    with workshop_beside(target) as workshop:
-        folder = workshop / f"{target.stem}_textures"
+    with temporary_folder_beside(target) as temporary:
+        folder = temporary / f"{target.stem}_textures"
         folder.mkdir()
         textures = write_textures(maps, mesh, folder, progress=lambda layer, done: tell(
             f"texture {layer}", TEXTURES_START + (TEXTURES_END - TEXTURES_START) * done))
         tell("layer", TEXTURES_END)
         files = [folder / texture.file_name for texture in textures.values()]
-        written = define_layer(workshop, target, lambda usd_stage: define_asset(
+        written = define_layer(temporary, target, lambda usd_stage: define_asset(
             usd_stage, maps, mesh, textures, name=name, texture_folder=f"./{folder.name}"), files)
         if packed:
             os.replace(written, target)
             files = []
         else:
             _install(written, folder, target)
-    installed = tuple(target.parent / file.relative_to(workshop) for file in files)
+    installed = tuple(target.parent / file.relative_to(temporary) for file in files)
     return AssetReport(target, installed, len(mesh.points), len(mesh.face_counts), mesh.step,
                        {layer: texture.clipped_pixels for layer, texture in textures.items()})
 

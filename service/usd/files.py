@@ -52,15 +52,15 @@ def write_layer(target: Path, define: Callable[[Usd.Stage], None]) -> None:
         StorageError: the disk refuses; what was there before is left as it was.
     """
     check_suffix(target)
-    with workshop_beside(target) as workshop:
-        os.replace(define_layer(workshop, target, define), target)
+    with temporary_folder_beside(target) as temporary:
+        os.replace(define_layer(temporary, target, define), target)
 
 
-def define_layer(workshop: Path, target: Path, define: Callable[[Usd.Stage], None], files: Sequence[Path] = ()) -> Path:
+def define_layer(temporary: Path, target: Path, define: Callable[[Usd.Stage], None], files: Sequence[Path] = ()) -> Path:
     """Write a layer into a temporary folder, packed with the files that it refers to where the target is a .usdz.
 
     Args:
-        workshop: of workshop_beside; the files lie in it at any depth.
+        temporary: the folder of temporary_folder_beside; the files lie in it at any depth.
         target: names the file and chooses its format.
         define: fills the empty stage.
         files: that the layer refers to.
@@ -69,13 +69,13 @@ def define_layer(workshop: Path, target: Path, define: Callable[[Usd.Stage], Non
         The file to be put in place of the target; it and, unless packed, `files` are flushed to the disk.
     """
     suffix = check_suffix(target)
-    layer = workshop / f"{target.stem}{'.usdc' if suffix == '.usdz' else suffix}"
+    layer = temporary / f"{target.stem}{'.usdc' if suffix == '.usdz' else suffix}"
     usd_stage = Usd.Stage.CreateNew(str(layer))
     define(usd_stage)
     usd_stage.Save()
     del usd_stage
     if suffix == ".usdz":
-        package = workshop / f"{target.stem}.usdz"
+        package = temporary / f"{target.stem}.usdz"
         _pack(package, layer, files)
         layer, files = package, ()
     for file in (layer, *files):
@@ -85,18 +85,18 @@ def define_layer(workshop: Path, target: Path, define: Callable[[Usd.Stage], Non
 
 
 @contextmanager
-def workshop_beside(target: Path) -> Iterator[Path]:
+def temporary_folder_beside(target: Path) -> Iterator[Path]:
     """Yield a temporary folder beside the target, removed at the end; errors of disk and USD become StorageErrors about the target."""
     with storage("write", target):
         target.parent.mkdir(parents=True, exist_ok=True)
-        workshop = Path(tempfile.mkdtemp(prefix=f".{target.stem}.", dir=target.parent))
+        temporary = Path(tempfile.mkdtemp(prefix=f".{target.stem}.", dir=target.parent))
     try:
         with storage("write", target):
-            yield workshop
+            yield temporary
     except Tf.ErrorException as error:
         raise StorageError(f"cannot write {target}: {_reason(error)}") from error
     finally:
-        shutil.rmtree(workshop, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _pack(package: Path, layer: Path, files: Sequence[Path]) -> None:

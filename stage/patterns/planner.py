@@ -1,7 +1,7 @@
 """Before projecting: how many images a code takes, how long that lasts, and how precise the depth will be.
 
-The counts are those of the lecture, in which code 0 (no light) is not used: N stripes need ⌈log2(N + 1)⌉ binary images. What
-is projected here numbers stripes from 0 and may add inverses and white and black; both counts are given. The line of each code stands
+The minimum counts are those of Nayar's lecture 3-5, in which code 0 (no light) is not used: N stripes need ⌈log2(N + 1)⌉ binary images.
+What is projected here numbers stripes from 0 and may add inverses and white and black; both counts are given. The line of each code stands
 in service/depth/codes.py.
 
 Depth: a projector column is a plane; a camera beside it at baseline b, both of focal length f projector pixels, sees depth
@@ -39,7 +39,7 @@ class Cost(NamedTuple):
 
     name: str
     minimum: int
-    """Images of one axis as the lecture counts."""
+    """Images of one axis by the count of Nayar's lecture 3-5."""
     images: int
     """Images as projected here."""
     column_sigma_px: float
@@ -51,7 +51,7 @@ class Plan(NamedTuple):
 
     name: str
     minimum: int
-    """Images of one axis as the lecture counts."""
+    """Images of one axis by the count of Nayar's lecture 3-5."""
     images: int
     """Images as projected here."""
     seconds: float

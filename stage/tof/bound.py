@@ -39,8 +39,8 @@ def range_bound_m(scene: TofScene, camera: HistogramCamera) -> np.ndarray:
         if camera.pulses is None:
             weight = 1 / mean
         else:
-            awake = np.exp(-(np.cumsum(mean, axis=-1) - mean) / camera.pulses)
-            weight = awake / (camera.pulses * np.expm1(mean / camera.pulses))
+            live = np.exp(-(np.cumsum(mean, axis=-1) - mean) / camera.pulses)
+            weight = live / (camera.pulses * np.expm1(mean / camera.pulses))
         weight = np.where(mean > 0, weight, 0)
         tt, ts, ss = ((a * b * weight).sum(axis=-1) for a, b in ((by_time, by_time), (by_time, only), (only, only)))
         sigma_s = 1 / np.sqrt(np.maximum(tt - np.where(ss > 0, ts**2 / ss, 0), 0))

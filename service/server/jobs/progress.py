@@ -25,18 +25,19 @@ class JobProgress:
     While the database does not answer, the step continues and nothing is recorded.
     """
 
-    def __init__(self, database: Database, claim: Claim, *, alive: Callable[[], None], before: int = 0, of: int | None = None) -> None:
+    def __init__(self, database: Database, claim: Claim, *, alive: Callable[[], None], frame_offset: int = 0,
+                 frame_count: int | None = None) -> None:
         """Create the progress of a step.
 
         Args:
             database: of the service.
             claim: of the worker.
             alive: called at every sign of progress.
-            before: frames of the steps before this one.
-            of: frames of the whole job; None: it makes no frames.
+            frame_offset: frames of the steps before this one.
+            frame_count: frames of the whole job; None: it makes no frames.
         """
         self._database, self._claim = database, claim
-        self._alive, self._before, self._of = alive, before, of
+        self._alive, self._frame_offset, self._frame_count = alive, frame_offset, frame_count
         self._lock = threading.Lock()  # several threads of a step may report
         self._record_at = 0.0
         self._stage, self._offset, self._total, self._began = "begin", 0, 0, time.monotonic()
@@ -48,10 +49,10 @@ class JobProgress:
         with self._lock:
             self._began, self._record_at = time.monotonic(), 0.0
             if self._stage == FRAMES and name != FRAMES:  # the frames of this step are made
-                self._before += self._counted
-            self._opening = self._of is not None and name != FRAMES and self._before > 0
-            if self._of is not None and (name == FRAMES or self._before > 0):  # so that frames are never counted backwards
-                self._stage, self._offset, self._total = FRAMES, self._before, self._of
+                self._frame_offset += self._counted
+            self._opening = self._frame_count is not None and name != FRAMES and self._frame_offset > 0
+            if self._frame_count is not None and (name == FRAMES or self._frame_offset > 0):  # so that frames are never counted backwards
+                self._stage, self._offset, self._total = FRAMES, self._frame_offset, self._frame_count
             else:
                 self._stage, self._offset, self._total = name, 0, total
         self.advance(0)

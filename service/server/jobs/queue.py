@@ -43,7 +43,7 @@ def workflow_id(job: str, attempt: int) -> str:
     return f"{job}.{attempt}"
 
 
-def job_of(workflow: str) -> tuple[str, int]:
+def job_and_attempt(workflow: str) -> tuple[str, int]:
     """Return the job and the attempt of a workflow."""
     job, _, attempt = workflow.rpartition(".")
     return job, int(attempt)
@@ -95,7 +95,7 @@ class JobQueue:
 
     def return_job(self, workflow: str, worker: str) -> None:
         """Queue a workflow again that the calling worker had taken and does not finish."""
-        job, attempt = job_of(workflow)
+        job, attempt = job_and_attempt(workflow)
         if self._database.transact(lambda connection: jobs.release(connection, Claim(job, attempt, worker))):
             self.requeue(workflow)
         else:
@@ -103,7 +103,7 @@ class JobQueue:
 
     def requeue(self, workflow: str) -> None:
         """Queue a workflow again that a worker had taken; its place in the queue is the one that it had."""
-        job, _ = job_of(workflow)
+        job, _ = job_and_attempt(workflow)
         row = jobs.find(self._database, job)
         if row is not None:
             self._client.resume_workflow(workflow, queue_name=_queue(row["request"]["kind"] == "check"))

@@ -39,8 +39,8 @@ class JobRunner:
         Args:
             context: what the steps need.
             worker: name of the worker.
-            alive: called at every sign of progress with the time (monotonic seconds) of the oldest last sign of the running steps; with 0
-                when no step runs.
+            alive: called at every sign of progress. Its argument is the time, in monotonic seconds, since which the step that has been
+                silent longest has given no sign; 0 when no step runs.
         """
         self._context, self._worker, self._alive = context, worker, alive
         self._draining = threading.Event()
@@ -127,7 +127,8 @@ class JobRunner:
             return DONE
         job = Job.of(dict(row))
         step = next(step for step in steps_of(job, self._context) if step.name == name)
-        progress = JobProgress(database, claim, alive=lambda: self._sign(claim), before=step.before, of=step.of)
+        progress = JobProgress(database, claim, alive=lambda: self._sign(claim), frame_offset=step.frame_offset,
+                               frame_count=step.frame_count)
         log = logger.bind(job=job.id, project=job.project, step=name, attempt=claim.attempt, worker=self._worker)
         log.info("step begins")
         try:

@@ -41,10 +41,10 @@ class JobStep(NamedTuple):
 
     name: str
     run: Callable[[Progress], None]
-    before: int = 0
-    """Frames of the job before those of this step."""
-    of: int | None = None
-    """Frames of the whole job; None: the step makes no frames."""
+    frame_offset: int = 0
+    """Number of frames that the steps before this one make."""
+    frame_count: int | None = None
+    """Number of frames of the whole job; None: the step makes no frames."""
 
 
 class Job(NamedTuple):

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from service.server.database import jobs, workers
 from service.server.database.engine import UNANSWERED, Database, message_of
 from service.server.database.jobs import Claim
-from service.server.jobs.queue import JobQueue, job_of
+from service.server.jobs.queue import JobQueue, job_and_attempt
 from service.server.jobs.worker_lock import LockState, WorkerLock
 from service.server.log import logger
 from service.views.states import QUEUED
@@ -29,7 +29,7 @@ class Takeover:
     """A thread that keeps the worker's own lock and takes over from workers that died."""
 
     def __init__(self, database: Database, queue: JobQueue, lock: WorkerLock, worker: str, *, every_s: float, max_lost: int,
-                 running: Callable[[], frozenset[str]], beat: Callable[[], None], deposed: Callable[[], None]) -> None:
+                 running: Callable[[], frozenset[str]], beat: Callable[[], None], lock_lost: Callable[[], None]) -> None:
         """Create the thread; `start` starts it.
 
         Args:
@@ -40,11 +40,11 @@ class Takeover:
             max_lost: workers that a job may lose in one step.
             running: returns the workflows that run in this process.
             beat: called every round.
-            deposed: called when another process has this worker's lock for good.
+            lock_lost: called when another process has this worker's lock for good.
         """
         self._database, self._queue, self._lock, self._worker = database, queue, lock, worker
         self._every_s, self._max_lost = every_s, max_lost
-        self._running, self._beat, self._deposed = running, beat, deposed
+        self._running, self._beat, self._lock_lost = running, beat, lock_lost
         self.state = workers.READY
         """State of this worker for the table of workers."""
         self._ended = threading.Event()
@@ -66,7 +66,7 @@ class Takeover:
         held = self._lock.hold()
         self._refused = self._refused + 1 if held is LockState.REFUSED else 0
         if self._refused > GRACE_ROUNDS:  # a worker that takes over from this one holds the lock for a moment only
-            self._deposed()
+            self._lock_lost()
         if held is LockState.REFUSED:
             return
         if held is LockState.TAKEN:
@@ -97,14 +97,14 @@ class Takeover:
     def _take_over(self, worker: str) -> None:
         workflows = self._queue.taken_by().get(worker, [])  # read again under the worker's lock: another may have been faster
         if workflows:
-            logger.warning("worker died", dead=worker, jobs=[job_of(workflow)[0] for workflow in workflows])
+            logger.warning("worker died", dead=worker, jobs=[job_and_attempt(workflow)[0] for workflow in workflows])
         for workflow in workflows:
             self._take(workflow, worker)
         workers.remove(self._database, worker)
 
     def _take(self, workflow: str, worker: str) -> None:
         """Queue a workflow of a dead worker again, or end its job if it has lost too many workers."""
-        job, attempt = job_of(workflow)
+        job, attempt = job_and_attempt(workflow)
         row = jobs.find(self._database, job)
         sentence = f"lost {self._max_lost + 1} workers in one step ({row['stage'] or 'begin' if row else ''}): " \
                    "it may need more memory than they have"
@@ -120,5 +120,5 @@ class Takeover:
         self._unknown = Counter({workflow: self._unknown[workflow] + 1 for workflow in unknown})
         for workflow, rounds in self._unknown.items():
             if rounds >= FORGOTTEN_ROUNDS:
-                logger.warning("job is put back: this worker had it and did not begin", job=job_of(workflow)[0])
+                logger.warning("job is put back: this worker had it and did not begin", job=job_and_attempt(workflow)[0])
                 self._queue.return_job(workflow, self._worker)

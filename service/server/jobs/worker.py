@@ -27,7 +27,7 @@ from service.server.storage.open import open_storage
 POLL_S = 0.25
 """Seconds between two looks into a queue."""
 APPLICATION = "relit"
-DEPOSED = 3
+LOCK_LOST = 3
 """Exit code of a worker that lost its lock."""
 NICENESS = 5
 """Niceness of a worker, which fills every core for minutes: the API on the same machine answers first, and alone a worker is as fast."""
@@ -67,7 +67,7 @@ def run_worker(settings: Settings, device: str, heartbeat: Heartbeat) -> None:
     log.adopt("dbos", without=dbos_error.DBOSAwaitedWorkflowCancelledError)  # DBOS reports it for every job that is cancelled while it runs
     runner.register()
     takeover = Takeover(database, queue, lock, name, every_s=settings.takeover_s, max_lost=settings.max_lost,
-                        running=lambda: runner.running, beat=heartbeat.beat, deposed=_depose)
+                        running=lambda: runner.running, beat=heartbeat.beat, lock_lost=_end_without_lock)
     DBOS.launch()
     for waiting in (WORK, CHECKS):
         DBOS.register_queue(waiting, worker_concurrency=1, polling_interval_sec=POLL_S)
@@ -112,9 +112,9 @@ def _prepared(database: Database, settings: Settings, ending: threading.Event) -
             os._exit(0)
 
 
-def _depose() -> None:
+def _end_without_lock() -> None:
     logger.error("another has taken over: this worker ends")
-    os._exit(DEPOSED)
+    os._exit(LOCK_LOST)
 
 
 def _end_with_parent(ending: threading.Event) -> None:

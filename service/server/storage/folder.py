@@ -151,14 +151,14 @@ def is_shown(name: str) -> bool:
 
 
 def drop_folder(folder: Path) -> None:
-    """Delete a folder, if there is one; it is hidden first, so that nobody finds a part of it."""
-    doomed = folder.with_name(f".{folder.name}.removed")
-    shutil.rmtree(doomed, ignore_errors=True)  # left by a process that was killed here
+    """Delete a folder if it exists; it is renamed to a hidden name first, so that nobody finds it half deleted."""
+    removed = folder.with_name(f".{folder.name}.removed")
+    shutil.rmtree(removed, ignore_errors=True)  # left by a process that was killed here
     try:
-        folder.rename(doomed)
+        folder.rename(removed)
     except FileNotFoundError:
         return
-    shutil.rmtree(doomed, ignore_errors=True)
+    shutil.rmtree(removed, ignore_errors=True)
 
 
 def drop_hidden(root: Path) -> None:

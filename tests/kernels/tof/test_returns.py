@@ -5,7 +5,7 @@ import pytest
 
 from kernels.errors import ArrayError
 from kernels.status import Status
-from kernels.tof.pileup import correct_pileup, place, unhurried
+from kernels.tof.pileup import correct_pileup, place, without_pileup
 from kernels.tof.pulse import gaussian, measured
 from kernels.tof.pulse_width import estimate_pulse
 from kernels.tof.returns import find_returns
@@ -19,8 +19,8 @@ PULSE = gaussian(SIGMA_S / BIN_S)
 def solve(counts, device, *, pulses=None, pulse=PULSE, **options):
     flat = counts.reshape(-1, counts.shape[-1])
     placed = place(flat, device)
-    exposed = unhurried(placed) if pulses is None else correct_pileup(placed, pulses=pulses)
-    found = find_returns(exposed, pulse, **options)
+    histograms = without_pileup(placed) if pulses is None else correct_pileup(placed, pulses=pulses)
+    found = find_returns(histograms, pulse, **options)
     return {name: getattr(found, name).numpy() for name in found._fields}
 
 
@@ -69,8 +69,8 @@ def test_pile_up_with_noise_has_no_bias(device):
 
 def test_coates_is_that_of_the_twin(device):
     counts = tof.histogram(flat_view(np.array([1.0, 3.0])), 4000, pulses=1000, seed=0).reshape(2, -1)
-    exposed = correct_pileup(place(counts, device), pulses=1000)
-    flux = exposed.counts.numpy() / np.maximum(exposed.awake.numpy(), 1e-9)
+    histograms = correct_pileup(place(counts, device), pulses=1000)
+    flux = histograms.counts.numpy() / np.maximum(histograms.live.numpy(), 1e-9)
     for pixel in range(2):
         np.testing.assert_allclose(flux[:, pixel], tof.first_photon_flux(counts[pixel], 1000), rtol=1e-4, atol=1e-3)
 
@@ -121,9 +121,9 @@ def test_an_empty_histogram_is_a_status_and_all_of_them_an_error(device):
 @pytest.mark.parametrize("sigma_s", [0.7e-9, 1.2e-9, 3e-9])
 def test_the_pulse_is_estimated(sigma_s, device):
     counts = tof.histogram(tof.room(24, 32), 20000, sigma_s=sigma_s, seed=5).reshape(-1, 64)
-    exposed = unhurried(place(counts, device))
+    histograms = without_pileup(place(counts, device))
     truth = gaussian(sigma_s / BIN_S)
-    assert estimate_pulse(exposed, counts).step == pytest.approx(truth.step, rel=0.06)
+    assert estimate_pulse(histograms, counts).step == pytest.approx(truth.step, rel=0.06)
 
 
 @pytest.mark.parametrize("photons", [6, 20])
@@ -132,7 +132,7 @@ def test_few_photons_do_not_make_the_pulse_narrow(photons, device):
     view = flat_view(np.linspace(3.0, 4.0, 2000))
     scaled = tof.View(view.distance, view.albedo / tof.signal(view, 1.0), view.cosine)
     counts = tof.histogram(scaled, photons / 0.8, background=0.01, seed=8).reshape(-1, 64)
-    estimated = estimate_pulse(unhurried(place(counts, device)), counts)
+    estimated = estimate_pulse(without_pileup(place(counts, device)), counts)
     assert estimated.step == pytest.approx(PULSE.step, rel=0.04)  # 512 histograms of six: 1.3 %, and the brightest are not just any
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from kernels.tof.pileup import correct_pileup, place, unhurried
+from kernels.tof.pileup import correct_pileup, place, without_pileup
 from kernels.tof.pulse import gaussian
 from kernels.tof.returns import find_returns
 from tests.reference import tof
@@ -27,7 +27,8 @@ def draw(photons, sigma_bins, background, *, seed, pulses=None, second=None):
 
 def solve(counts, sigma_bins, device, *, pulses=None, most=1):
     placed = place(counts, device)
-    found = find_returns(unhurried(placed) if pulses is None else correct_pileup(placed, pulses=pulses), gaussian(sigma_bins), most=most)
+    histograms = without_pileup(placed) if pulses is None else correct_pileup(placed, pulses=pulses)
+    found = find_returns(histograms, gaussian(sigma_bins), most=most)
     return {name: getattr(found, name).numpy() for name in found._fields}
 
 

@@ -18,7 +18,7 @@ from service.demo.demo import sample_folder
 from service.requests.keys import Scope
 from service.server.database.engine import connect
 from service.server.jobs.queue import JobQueue, prepare
-from service.server.sample import greet
+from service.server.sample import show_sample
 from service.server.settings import Settings
 
 HOME = Path(__file__).parents[3]
@@ -87,7 +87,7 @@ def test_the_sample_is_registered_once(tmp_path, capsys):
     database = connect(settings.sqlalchemy_url)
     prepare(settings, database)
     for _ in range(2):
-        greet("http://x", database, JobQueue(database), sample_folder())
+        show_sample("http://x", database, JobQueue(database), sample_folder())
     first, second = capsys.readouterr().out.split("capture ")[1:]
     assert first == second
     database.close()

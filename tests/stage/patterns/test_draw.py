@@ -1,4 +1,4 @@
-"""Patterns are what their manifest entries say, and the lecture's own examples come out."""
+"""Patterns are what their manifest entries say, and the examples of Nayar's lecture 3-5 come out."""
 
 import numpy as np
 import pytest

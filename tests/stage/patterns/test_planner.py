@@ -1,4 +1,4 @@
-"""Counts of the lecture, and formulae against simulated noise."""
+"""Counts of Nayar's lecture 3-5, and formulae against simulated noise."""
 
 import numpy as np
 import pytest

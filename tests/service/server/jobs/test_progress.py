@@ -31,7 +31,7 @@ def told(made, claim):
 
 def test_frames_are_counted_over_all_steps(claim):
     made, claim = claim
-    step = JobProgress(made.database, claim, alive=lambda: None, before=5, of=10)
+    step = JobProgress(made.database, claim, alive=lambda: None, frame_offset=5, frame_count=10)
     step.stage("open", 1)
     assert told(made, claim) == ("frames", 5, 10)
     step.advance(1)
@@ -47,7 +47,7 @@ def test_a_database_that_does_not_answer_does_not_end_the_step(claim):
     gone = Database(sa.create_engine(f"sqlite:///{made.folder / 'nowhere' / 'relit.sqlite'}"))
     with pytest.raises(OperationalError):
         jobs.is_claimed(gone, claim)
-    step = JobProgress(gone, claim, alive=lambda: signs.append(1), of=10)
+    step = JobProgress(gone, claim, alive=lambda: signs.append(1), frame_count=10)
     step.stage("frames", 10)
     step.advance(3)
     assert len(signs) == 2  # the deadline is renewed all the same
@@ -56,7 +56,7 @@ def test_a_database_that_does_not_answer_does_not_end_the_step(claim):
 @pytest.mark.parametrize("end", ["cancel", "another"])
 def test_a_step_that_is_not_wanted_stops_and_stays_so(claim, end):
     made, claim = claim
-    step = JobProgress(made.database, claim, alive=lambda: None, of=10)
+    step = JobProgress(made.database, claim, alive=lambda: None, frame_count=10)
     step.stage("frames", 10)
     if end == "cancel":
         made.database.transact(lambda connection: jobs.cancel(connection, claim.job))

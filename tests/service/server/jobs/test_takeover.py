@@ -8,7 +8,7 @@ import sqlalchemy as sa
 from service.requests.identifiers import CAPTURE, ENVIRONMENT, new_id
 from service.server.database import jobs
 from service.server.database.jobs import Claim, StageProgress
-from service.server.jobs.queue import job_of, workflow_id
+from service.server.jobs.queue import job_and_attempt, workflow_id
 from service.server.jobs.takeover import FORGOTTEN_ROUNDS, GRACE_ROUNDS, Takeover
 from service.server.jobs.worker_lock import LockState, open_worker_lock
 from tests.service.server.jobs.harness import harness
@@ -25,11 +25,11 @@ def job(idle_harness):
     return job
 
 
-def takeover(made, name, *, running=frozenset(), deposed=lambda: None):
+def takeover(made, name, *, running=frozenset(), lock_lost=lambda: None):
     lock = open_worker_lock(made.database, made.settings.locks, name)
     assert lock.hold() is LockState.TAKEN
     return lock, Takeover(made.database, made.queue, lock, name, every_s=1, max_lost=MAX_LOST, running=lambda: frozenset(running),
-                          beat=lambda: None, deposed=deposed)
+                          beat=lambda: None, lock_lost=lock_lost)
 
 
 def let_go(made, lock, name):
@@ -121,7 +121,7 @@ def test_a_changed_priority_is_that_of_the_queue(idle_harness):
     def order():
         sorted_as_dbos_does = sorted((idle_harness.workflow(job) for job in (first, second, third)),
                                      key=lambda status: (status.priority, status.created_at))
-        return [job_of(status.workflow_id)[0] for status in sorted_as_dbos_does]
+        return [job_and_attempt(status.workflow_id)[0] for status in sorted_as_dbos_does]
 
     assert order() == [first, second, third]
     idle_harness.database.transact(lambda connection: change(connection, third, before["priority"] + 1))
@@ -233,7 +233,7 @@ def test_what_a_worker_goes_on_with_stays(idle_harness, job):
 
 def test_a_worker_whose_lock_is_another_s_for_good_ends(idle_harness, job):
     ends = []
-    lock, one = takeover(idle_harness, "one", deposed=lambda: ends.append("one"))
+    lock, one = takeover(idle_harness, "one", lock_lost=lambda: ends.append("one"))
     other = let_go(idle_harness, lock, "one")
     for _ in range(GRACE_ROUNDS):
         one.round()
