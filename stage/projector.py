@@ -29,7 +29,7 @@ class Projector(Strict):
             raise ValueError("response must rise: each value above the one before")
         return self
 
-    def device_from_camera(self) -> np.ndarray:
+    def projector_from_camera(self) -> np.ndarray:
         """Return the transform from the camera frame to the frame of the projector with OpenCV's axes, x right, y down, z forward.
 
         Returns:
@@ -48,7 +48,7 @@ class Projector(Strict):
         Returns:
             [..., 2] continuous column and row, and [...] bool: True for points in front of the projector.
         """
-        matrix = self.device_from_camera()
+        matrix = self.projector_from_camera()
         point_device = points @ matrix[:, :3].T + matrix[:, 3]
         ahead = point_device[..., 2] > 0
         z = np.where(ahead, point_device[..., 2], 1.0)

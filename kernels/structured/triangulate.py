@@ -43,7 +43,7 @@ class ProjectorModel(NamedTuple):
     principal: tuple[float, float]  # continuous coordinates, pixels
     k: tuple[float, float, float]  # radial distortion, OpenCV's k1 k2 k3
     p: tuple[float, float]  # tangential distortion, OpenCV's p1 p2
-    device_from_camera: np.ndarray  # [3, 4] float64: x right, y down, z forward of the projector, from the camera frame
+    projector_from_camera: np.ndarray  # [3, 4] float64: x right, y down, z forward of the projector, from the camera frame
 
 
 class Triangulation(NamedTuple):
@@ -221,8 +221,8 @@ def _projection(model: ProjectorModel) -> Any:
     g = Projection()
     g.size, g.focal, g.principal = wp.vec2(*model.size), wp.vec2(*model.focal), wp.vec2(*model.principal)
     g.k, g.p = wp.vec3(*model.k), wp.vec2(*model.p)
-    g.turn = wp.mat33(*model.device_from_camera[:, :3].ravel().tolist())
-    g.shift = wp.vec3(*model.device_from_camera[:, 3].tolist())
+    g.turn = wp.mat33(*model.projector_from_camera[:, :3].ravel().tolist())
+    g.shift = wp.vec3(*model.projector_from_camera[:, 3].tolist())
     return g
 
 

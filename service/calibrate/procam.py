@@ -9,7 +9,7 @@ from kernels import device as devices
 from kernels.status import SOLVED
 from kernels.structured.frames import NoiseModel
 from service.calibrate.results import digits, write_results
-from service.depth.decoders import PatternDevice
+from service.depth.decoders import PatternProjector
 from service.depth.patterns import decoded_bands, full_scale, read_codes, scene_colour
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import ProcamRequest
@@ -88,7 +88,7 @@ def procam(request: ProcamRequest, progress: Progress | None = None) -> ProcamRe
 def view_of(capture: Capture, size: Resolution, request: ProcamRequest, device: str) -> BoardView | str:
     """Return the corners of the board as camera and projector see them, or a sentence that says why there are none."""
     frames = [frame for frame in capture.manifest.frames if frame.pattern is not None]
-    codes = read_codes(capture, frames, PatternDevice(size))
+    codes = read_codes(capture, frames, PatternProjector(size))
     columns, rows = codes.columns, codes.rows
     if columns is None or rows is None:
         raise ManifestError(f"{capture.folder / FILE_NAME}: frames: no {'column' if columns is None else 'row'} code: "

@@ -22,7 +22,7 @@ from kernels.structured.unwrap import unwrap_range
 from service.depth.decoders import (
     AxisCodes,
     AxisDecoder,
-    PatternDevice,
+    PatternProjector,
     micro_decoder,
     modulated_decoder,
     phase_decoder,
@@ -153,7 +153,7 @@ CODES_OF_OPTION = {option: tuple(code for code in PatternCode if option in CODES
 """The codes that each option of `relit patterns` belongs to; with another code the option is refused."""
 
 
-def choose_decoder(collected: Collected, axis: Axis, projector: PatternDevice, *,
+def choose_decoder(collected: Collected, axis: Axis, projector: PatternProjector, *,
                    refine: bool = False) -> tuple[AxisDecoder | None, tuple[str, ...]]:
     """Choose the most precise way to decode an axis from the codes of a capture: phases, else stripes, else digits, else a ramp.
 

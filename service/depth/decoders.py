@@ -32,7 +32,7 @@ from stage.patterns.phase import PhaseCode
 from stage.patterns.ramp import RampCode
 
 
-class PatternDevice(NamedTuple):
+class PatternProjector(NamedTuple):
     """The properties of a projector that decoding needs; its lens and pose are needed by triangulation alone."""
 
     resolution: Resolution
@@ -74,12 +74,12 @@ class AxisCodes:
     codes: tuple[Code, ...]
     white: int | None
     black: int | None
-    projector: PatternDevice
+    projector: PatternProjector
     refine: bool
     """Interpolate a Gray code with inverses between the edges of its stripes."""
 
     @classmethod
-    def of(cls, collected: Collected, axis: Axis, projector: PatternDevice, *, refine: bool) -> "AxisCodes":
+    def of(cls, collected: Collected, axis: Axis, projector: PatternProjector, *, refine: bool) -> "AxisCodes":
         """Return the codes of the axis that lack no frame."""
         ready = tuple(code for code in collected.codes if code.axis == axis and code.lacks(collected.white, collected.black) is None)
         return cls(axis, ready, collected.white, collected.black, projector, refine)

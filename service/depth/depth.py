@@ -141,7 +141,7 @@ def _ranging(capture: Capture, wanted: Ranging | None) -> Ranging:
 
 
 def _check_plausible(solution: DepthSolution, capture: Capture, using: Ranging) -> None:
-    """Refuse a solution without any depth, or with depths that no such device measures.
+    """Refuse a solution without any depth, or with depths that cannot be in metres.
 
     Raises:
         ManifestError: says what most often is the cause.
@@ -164,7 +164,7 @@ def _advice(reasons: dict[str, int], using: Ranging) -> str:
     if most == Status.OUT_OF_RANGE.name.lower():
         return "check the pose of the projector and its units, and --near-m and --far-m"
     if most in (Status.LOW_MODULATION.name.lower(), Status.SHADOWED.name.lower()):
-        return "the light of the device is not seen in the images"
+        return "the projected light is not seen in the images"
     return f"check the {using} frames"
 
 

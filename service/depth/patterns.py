@@ -12,7 +12,7 @@ from kernels.structured.frames import NoiseModel, saturated_bits, upload
 from kernels.structured.join import cropped
 from kernels.structured.triangulate import ProjectorModel, triangulate
 from service.depth.codes import choose_decoder
-from service.depth.decoders import AxisDecoder, PatternDevice, Readings
+from service.depth.decoders import AxisDecoder, PatternProjector, Readings
 from service.depth.solution import DepthSolution
 from service.reporting.progress import Timings
 from service.requests.depth import DepthRequest
@@ -66,7 +66,8 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
     """
     projector = check_projector(capture)
     frames = [frame for frame in capture.manifest.frames if frame.pattern is not None]
-    codes = read_codes(capture, frames, PatternDevice(projector.resolution, projector.response, projector.crosstalk), refine=request.refine)
+    codes = read_codes(capture, frames, PatternProjector(projector.resolution, projector.response, projector.crosstalk),
+                       refine=request.refine)
     timings.stage("frames", len(frames))
     with frame_planes(capture, frames, colour=codes.colour, cache=request.cache, progress=timings.advance) as planes:
         full = full_scale(planes, capture, frames)
@@ -79,7 +80,7 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
     return solution
 
 
-def read_codes(capture: Capture, frames: list[Frame], projector: PatternDevice, *, refine: bool = False) -> PatternCodes:
+def read_codes(capture: Capture, frames: list[Frame], projector: PatternProjector, *, refine: bool = False) -> PatternCodes:
     """Return the codes of a capture and how each axis is decoded.
 
     Raises:
@@ -176,7 +177,7 @@ def projector_model(projector: Projector) -> ProjectorModel:
     lens = projector.distortion
     return ProjectorModel((width, height), projector.focal_px, projector.principal_px or (width / 2, height / 2),
                           lens.k if lens is not None else (0.0, 0.0, 0.0), lens.p if lens is not None else (0.0, 0.0),
-                          projector.device_from_camera())
+                          projector.projector_from_camera())
 
 
 def full_scale(planes: Planes, capture: Capture, frames: list[Frame]) -> float:

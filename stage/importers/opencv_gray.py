@@ -55,7 +55,7 @@ def import_folder(source: Path, destination: Path, *, projector: tuple[int, int]
         "camera": {"projection": "orthographic", "resolution": resolution},
     }
     if calibration is not None:
-        data |= devices(calibration, resolution, projector, unit_m)
+        data |= camera_and_projector(calibration, resolution, projector, unit_m)
     data["frames"] = [{"image": name, "pattern": pattern} for name, pattern in zip(names, patterns, strict=True)]
     return write_capture(data, source / names[0], destination)
 
@@ -70,7 +70,7 @@ def gray_order(width: int, height: int) -> list[dict[str, Any]]:
     return [*entries, {"code": "white"}, {"code": "black"}]
 
 
-def devices(path: Path, resolution: tuple[int, int], projector: tuple[int, int], unit_m: float) -> dict[str, Any]:
+def camera_and_projector(path: Path, resolution: tuple[int, int], projector: tuple[int, int], unit_m: float) -> dict[str, Any]:
     """Return the camera and the projector of the manifest from an OpenCV calibration file.
 
     Raises:
