@@ -13,10 +13,10 @@ import numpy as np
 
 from kernels.errors import ArrayError
 from kernels.packs import Band
-from kernels.relight.batch import combine_batch
 from kernels.relight.display import encode
 from kernels.relight.hemisphere import HSH_TERMS, PTM_TERMS, biquadratic, fit_weights, hemispherical_harmonics
 from kernels.relight.luminance import WHITE, separate
+from kernels.relight.many_frames import combine_batch
 from kernels.relight.residual import squared_residual
 from service.basis.capture import BasisCapture, BasisResult, stack_bands
 from service.errors import RequestError

@@ -7,7 +7,7 @@ matrix by another of lower rank", Psychometrika 1, 1936 (kernels.relight.basis).
 import numpy as np
 
 from kernels.relight.basis import gram, principal, projection
-from kernels.relight.batch import combine_batch
+from kernels.relight.many_frames import combine_batch
 from kernels.relight.residual import squared_residual
 from service.basis.capture import BasisCapture, BasisResult, stack_bands
 from service.errors import RequestError

@@ -44,7 +44,7 @@ def doctor(only: DoctorDevice = None, data: DataOption = None, config: ConfigOpt
         import numpy as np
 
         from kernels import device, packs
-        from kernels.relight.combine import combine
+        from kernels.relight.one_frame import combine
 
         for name in [device.resolve(only)] if only else device.names():
             band = packs.upload(np.ones((3, 8, 64), dtype=np.float16), device=name)

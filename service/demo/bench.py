@@ -12,8 +12,8 @@ from kernels.photometric.albedo import fit_albedo
 from kernels.photometric.lambert import solve_lambert
 from kernels.photometric.readings import grey_factors, grey_readings, pad_lights
 from kernels.photometric.robust import solve_robust
-from kernels.relight.batch import combine_batch
-from kernels.relight.combine import combine
+from kernels.relight.many_frames import combine_batch
+from kernels.relight.one_frame import combine
 from service.reporting.progress import Progress, Timings
 from service.requests.demo import BenchRequest
 from stage.colour import GREY_WEIGHTS
@@ -91,7 +91,7 @@ def bench(request: BenchRequest, progress: Progress | None = None) -> list[str]:
 
 def _one_channel(band: packs.Band, weights: np.ndarray, device: str) -> Callable[[], object]:
     """Return a launch of the combine kernel on a stack of one channel."""
-    from kernels.relight import combine as module
+    from kernels.relight import one_frame as module
 
     pack = devices.pack_width(device)
     out = packs.zeros(band.pixel_count, wp.float32, device, rows=1)

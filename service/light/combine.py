@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from kernels import packs
-from kernels.relight.batch import combine_batch
-from kernels.relight.combine import combine
+from kernels.relight.many_frames import combine_batch
+from kernels.relight.one_frame import combine
 from service.requests.relight import CHUNK_FRAMES
 from stage.stack import Stack
 

@@ -21,7 +21,6 @@ import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from service.errors import RequestError
-from service.reporting.memory import keep_freed_blocks
 from service.server import log, telemetry
 from service.server.api.app import create_app
 from service.server.database.engine import Database, open_database
@@ -29,6 +28,7 @@ from service.server.housekeeping import Housekeeper
 from service.server.jobs.queue import JobQueue, prepare
 from service.server.jobs.supervisor import Supervisor
 from service.server.log import logger
+from service.server.malloc import keep_freed_blocks
 from service.server.settings import NO_WORKER, Settings, unknown_variables
 from service.server.storage.open import open_storage
 

@@ -11,9 +11,7 @@ from fastapi import APIRouter, Header, Query, Request, Response
 from service.requests.identifiers import ENVIRONMENT, UPLOAD, CaptureId, EnvironmentId, UploadId, new_id
 from service.server.api.context import FOR_UPLOAD, IdempotencyKey, Reader, Service, ServiceDep, Writer, create_once, require_space
 from service.server.api.intakes import row_of
-from service.server.api.patch import UploadPatch, being_written, received_of, settled
 from service.server.api.problems import ApiError, responses
-from service.server.api.receive import BodyBroken, RunningHashes, TooLong, write_body
 from service.server.api.tus import (
     ALGORITHMS,
     CHECKSUM_PATTERN,
@@ -28,6 +26,8 @@ from service.server.api.tus import (
     metadata_header,
     state_headers,
 )
+from service.server.api.upload_body import BodyBroken, RunningHashes, TooLong, write_body
+from service.server.api.upload_patch import UploadPatch, being_written, received_of, settled
 from service.server.database import idempotency, intakes, uploads
 from service.server.database.keys import Caller
 from service.server.database.uploads import Row

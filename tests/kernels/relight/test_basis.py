@@ -9,7 +9,7 @@ from kernels import packs
 from kernels.errors import ArrayError
 from kernels.packs import pack_type
 from kernels.relight.basis import MAX_CHUNKS, gram, gram_kernel, principal, projection
-from kernels.relight.batch import combine_batch
+from kernels.relight.many_frames import combine_batch
 from kernels.relight.residual import residual_kernel, squared_residual
 from tests.kernels.scenes import HALF_ROUNDING, store
 from tests.reference.light_basis import truncation

@@ -7,8 +7,8 @@ import time
 
 from service.server.api.context import FOR_UPLOAD, Service, require_space
 from service.server.api.problems import ApiError
-from service.server.api.receive import PartFileWriter, RunningHashes
 from service.server.api.tus import Checksum
+from service.server.api.upload_body import PartFileWriter, RunningHashes
 from service.server.database import uploads
 from service.server.database.uploads import Row
 from service.server.log import logger

@@ -12,7 +12,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.packs import Band, as_packs, pack_type
-from kernels.relight.combine import check_weights
+from kernels.relight.one_frame import check_weights
 
 BLOCK_BYTES = 16 << 20
 """Bytes of float32 that one BLAS call reads: they bound the scratch memory, and are so many that the start of the BLAS threads costs
