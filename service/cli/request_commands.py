@@ -19,7 +19,7 @@ was typed, to change or look at it before the model is built; several models sha
 
 To add a command: write its model in service/requests, its function here in service/cli, and register it. To add an option: write
 the field. `relit submit` and the API follow for the work that they do, `relit farm template` for relight and shade, and the records of
-results for every option whose role is CHOICE.
+results by the role of the field.
 """
 
 import inspect

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 from service.errors import RequestError
 from service.light.environments import Environments
-from service.light.frames import check_outputs, frame_path
 from service.light.layers import check_layers, maps_file
+from service.light.outputs import check_outputs, frame_path
 from service.light.schedule import ScheduledFrame, schedule
 from service.light.sequence import capture_files, time_steps
 from service.requests.frame_range import frame_numbers, part_of

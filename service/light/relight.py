@@ -13,10 +13,10 @@ import numpy as np
 from kernels import device as devices
 from kernels.relight.environment import Weighting
 from service.light.combine import chunk_frames, linear_frames
-from service.light.frames import REQUEST_ATTRIBUTE, frame_hashes, is_complete
 from service.light.guide import Guide
 from service.light.layers import read_maps, still_layers
 from service.light.lighting import CaptureLighting
+from service.light.outputs import REQUEST_ATTRIBUTE, frame_hashes, is_complete
 from service.light.plan import Plan, PlannedFrame, make_plan
 from service.light.sequence import OpenedCapture, open_capture
 from service.light.sheet import contact_sheet

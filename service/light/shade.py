@@ -16,10 +16,10 @@ from kernels.relight.sources import join
 from service.errors import RequestError
 from service.light.combine import linear_frames
 from service.light.environments import Environments
-from service.light.frames import check_outputs
 from service.light.guide import Guide
 from service.light.layers import read_maps, still_layers
 from service.light.lighting import CaptureLighting, NearLight, far_light, light_samples, near_lights
+from service.light.outputs import check_outputs
 from service.light.schedule import UPRIGHT, ScheduledFrame, TurnedEnvironment
 from service.light.sequence import capture_files
 from service.light.surface_model import SurfaceModel

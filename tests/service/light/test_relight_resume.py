@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import service
-from service.light.frames import RESOLVED, frame_hashes
+from service.light.outputs import RESOLVED, frame_hashes
 from service.light.plan import make_plan
 from service.light.sequence import open_capture
 from service.requests.base import Role

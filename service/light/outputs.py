@@ -1,4 +1,4 @@
-"""The files of frames: where they go, which files they may replace, and which of them an equal request has made already."""
+"""The output files of frames: their paths, which files they may replace, and which of them an equal request has made already."""
 
 import hashlib
 import json
