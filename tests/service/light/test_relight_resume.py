@@ -76,7 +76,7 @@ def test_turned_frames_are_made_and_the_unturned_one_is_kept(made):
 
 def hashes(request: RelightRequest) -> list[str]:
     plan = make_plan(request)
-    scheduled = [frame.lighting for frame in plan.frames]
+    scheduled = [frame.scheduled for frame in plan.frames]
     return frame_hashes(open_capture(plan.folders[0], request, 1, scheduled), request, scheduled, plan.environments)
 
 
