@@ -14,6 +14,9 @@ REPORTED = ("relit", "warp-lang", "numpy", "OpenEXR", "OpenImageIO", "opencv-pyt
 """The distributions whose versions a report names."""
 REPORT_FILE = "report.json"
 
+UNREPORTED = (Role.OUTPUT, Role.MACHINE, Role.PART)
+"""Roles of fields that a report does not repeat."""
+
 
 def versions() -> dict[str, str]:
     """Return the versions of this program and of the libraries that its results depend on."""
@@ -58,9 +61,12 @@ def choices(request: Options) -> dict[str, Any]:
 
 
 def requested(request: Options) -> dict[str, Any]:
-    """Return the options of a report, as plain data: the whole request, but for the part of the work that the run did."""
-    parts = {name for name, field in type(request).model_fields.items() if role_of(field) is Role.PART}
-    return request.model_dump(mode="json", exclude=parts)
+    """Return the options of a report, as plain data: the request without where it was carried out and the part of the work done.
+
+    The folders of a service are nobody's business who reads a report; the device has an entry of its own.
+    """
+    left_out = {name for name, field in type(request).model_fields.items() if role_of(field) in UNREPORTED}
+    return request.model_dump(mode="json", exclude=left_out)
 
 
 def report(request: Options, *, inputs: Mapping[str, Any], **sections: Any) -> str:

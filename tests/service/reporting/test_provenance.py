@@ -10,7 +10,7 @@ import pytest
 
 import service
 import service.requests
-from service.reporting.provenance import choices, requested
+from service.reporting.provenance import UNREPORTED, choices, requested
 from service.requests.base import DeviceRequest, Options, Role
 from service.requests.calibrate import LightsRequest
 from service.requests.depth import DepthRequest, TofOptions
@@ -38,14 +38,16 @@ def test_a_new_option_is_recorded_by_itself(name):
         """A new input."""
         share: Annotated[str | None, Role.PART] = None
         """A new way to divide the work."""
+        scratch: Annotated[Path | None, Role.MACHINE] = None
+        """A new folder of the machine."""
 
     request = Later.model_construct(**{key: "x" for key, field in Later.model_fields.items() if field.is_required()})
     in_report, in_files = requested(request), choices(request)
     assert in_report["strength"] == in_files["strength"] == 2.5
     assert in_report["table"] is None and "table" not in in_files
-    assert "share" not in in_report and "share" not in in_files
+    assert not {"share", "scratch"} & (in_report.keys() | in_files.keys())
     fields = {key: role_of(field) for key, field in Later.model_fields.items()}
-    assert in_report.keys() == {key for key, role in fields.items() if role is not Role.PART}
+    assert in_report.keys() == {key for key, role in fields.items() if role not in UNREPORTED}
     assert in_files.keys() == {key for key, role in fields.items() if role is Role.CHOICE}
 
 
