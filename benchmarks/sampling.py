@@ -17,7 +17,7 @@ from benchmarks.accuracy import angles_deg
 from service.requests.solve import SolveRequest
 from service.solve.solve import solve
 from tests.reference import sampling as twin
-from tests.sampling_captures import COLOUR, SHARPNESS, VIEW, Ball, ball, light, write_sampling
+from tests.scenes.extended_lights import COLOUR, SHARPNESS, VIEW, Ball, ball, light, write_sampling
 
 LIGHTS, SIDE, NOISE = 24, 48, 0.01
 LAMBERTIAN, GLOSSY, MIRROR, MIXTURE = 1, 2, 3, 4

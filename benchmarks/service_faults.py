@@ -23,7 +23,7 @@ import numpy as np
 
 from service.requests.identifiers import CAPTURE, ENVIRONMENT
 from service.server.database import jobs, workers
-from tests.captures import make_scene, write_capture, write_exr
+from tests.scenes.captures import make_scene, write_capture, write_exr
 from tests.service.postgres import Postgres, binaries, postgres
 from tests.service.server.jobs.harness import Harness, digests, harness, relit_relight
 

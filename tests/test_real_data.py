@@ -10,7 +10,7 @@ from service.requests.solve import Method, SolveRequest
 from service.solve.solve import solve
 from stage.capture import Capture
 from stage.importers import diligent
-from tests.captures import angles_degrees
+from tests.scenes.captures import angles_degrees
 
 DATA = Path(os.environ.get("RELIT_TEST_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 

@@ -10,7 +10,7 @@ import numpy as np
 import service
 from stage import exr, images
 from stage.maps import SurfaceMaps
-from tests.captures import angles_degrees, write_exr, write_image, write_manifest
+from tests.scenes.captures import angles_degrees, write_exr, write_image, write_manifest
 
 OWL = Path(service.__file__).parents[1] / "samples" / "owl"
 

@@ -6,7 +6,7 @@ import pytest
 from stage.capture import Capture
 from stage.errors import ImageError, ManifestError, StorageError
 from stage.lighting import check_solvable, distant_lights
-from tests.captures import edit_frame, make_scene, ring, write_capture, write_exr, write_image
+from tests.scenes.captures import edit_frame, make_scene, ring, write_capture, write_exr, write_image
 
 SCENE = make_scene(size=6, lights=4)
 

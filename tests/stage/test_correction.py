@@ -6,7 +6,7 @@ import pytest
 from stage.capture import Capture
 from stage.correction import Correction
 from stage.errors import ImageError
-from tests.captures import (
+from tests.scenes.captures import (
     edit_frame,
     edit_manifest,
     make_scene,

@@ -5,8 +5,8 @@ import pytest
 
 from stage.camera import Camera
 from stage.depth_normals import depth_normals
-from tests.captures import angles_degrees
 from tests.reference import projector as reference
+from tests.scenes.captures import angles_degrees
 
 SHAPE = reference.Device(60, 44, 90.0, (-0.1, 0.02, 0.0), (0.001, -0.001))
 CAMERA = Camera.model_validate({

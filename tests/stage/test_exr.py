@@ -8,7 +8,7 @@ import pytest
 
 from stage import exr
 from stage.errors import ImageError, StorageError
-from tests.captures import files_in, write_exr
+from tests.scenes.captures import files_in, write_exr
 
 PIXELS = np.random.default_rng(3).random((37, 23, 3)).astype(np.float32)
 """Rows that fill no chunk of any compression evenly."""

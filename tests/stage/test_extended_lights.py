@@ -7,7 +7,7 @@ from stage.capture import Capture
 from stage.errors import ManifestError
 from stage.extended_lights import ExtendedLights, extended_lights
 from stage.lighting import check_solvable
-from tests.captures import write_exr, write_manifest
+from tests.scenes.captures import write_exr, write_manifest
 
 TILT = np.eye(3)[[2, 0, 1]]
 

@@ -8,7 +8,7 @@ import pytest
 
 from stage.errors import StorageError
 from stage.files import replacing, write_text
-from tests.captures import files_in
+from tests.scenes.captures import files_in
 
 
 def test_the_temporary_lies_beside_the_target_and_keeps_its_suffix(tmp_path):

@@ -7,7 +7,7 @@ from stage.capture import Capture
 from stage.errors import ManifestError
 from stage.gradients import gradient_frames, has_gradients
 from stage.lighting import distant_lights
-from tests.captures import edit_frame, make_scene, write_capture, write_exr, write_manifest
+from tests.scenes.captures import edit_frame, make_scene, write_capture, write_exr, write_manifest
 
 FULL = {"type": "full"}
 

@@ -7,7 +7,7 @@ import pytest
 from stage.errors import ImageError, StorageError
 from stage.images import check_radiance, check_resolution, read_header, read_mask, read_pixels
 from stage.integrity import check_jpeg
-from tests.captures import write_exr, write_image
+from tests.scenes.captures import write_exr, write_image
 
 RNG = np.random.default_rng(7)
 UNIT = RNG.random((5, 7, 3))

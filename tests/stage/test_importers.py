@@ -8,7 +8,7 @@ import pytest
 from stage.capture import Capture
 from stage.errors import ImageError, ManifestError, StorageError
 from stage.importers import diligent, lp
-from tests.captures import files_in, write_exr, write_image
+from tests.scenes.captures import files_in, write_exr, write_image
 
 NAMES = ["001.png", "002.png", "003.png", "004.png"]
 DIRECTIONS = [(0, 0, 1), (0.5, 0, 1), (0, 0.5, 1), (-0.5, -0.25, 1)]

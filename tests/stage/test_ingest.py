@@ -16,7 +16,7 @@ from stage.capture import Capture
 from stage.correction import Radiance
 from stage.errors import ImageError, ManifestError, StorageError
 from stage.ingest import Ingest, open_stack
-from tests.captures import edit_frame, edit_manifest, files_in, make_scene, write_capture, write_exr
+from tests.scenes.captures import edit_frame, edit_manifest, files_in, make_scene, write_capture, write_exr
 
 SCENE = make_scene(size=9, lights=5)
 PIXELS, LIGHTS = 81, 5
@@ -142,7 +142,7 @@ def change_dark(folder):
 
 
 def change_mask(folder):
-    from tests.captures import write_image
+    from tests.scenes.captures import write_image
 
     write_image(folder / "mask.png", np.full((9, 9), 255, np.uint8))
 

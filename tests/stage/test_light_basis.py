@@ -7,7 +7,7 @@ import pytest
 
 from stage import exr
 from stage.light_basis import facts_path, layer_types, numbers, write_facts, write_layers
-from tests.captures import files_in
+from tests.scenes.captures import files_in
 
 
 def test_layers_are_named_masked_and_of_their_type(tmp_path):

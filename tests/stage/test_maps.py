@@ -8,7 +8,7 @@ from stage import exr
 from stage.camera import Camera, Distortion
 from stage.errors import ImageError, ResultError
 from stage.maps import LAYERS, SurfaceMaps
-from tests.captures import files_in
+from tests.scenes.captures import files_in
 
 ROWS, COLS = 5, 7
 RNG = np.random.default_rng(13)

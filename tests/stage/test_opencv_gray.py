@@ -9,7 +9,7 @@ import pytest
 from stage.capture import Capture
 from stage.errors import ManifestError
 from stage.importers.opencv_gray import gray_order, import_folder
-from tests.captures import write_image
+from tests.scenes.captures import write_image
 
 K1, D1 = np.array([[800.0, 0, 319.5], [0, 810, 239.5], [0, 0, 1]]), np.array([-0.1, 0.02, 0.001, -0.002, 0.003])
 K2, D2 = np.array([[1100.0, 0, 400], [0, 1090, 299], [0, 0, 1]]), np.array([-0.05, 0.01, 0.0, 0.001, 0.0])

@@ -8,7 +8,7 @@ from stage.capture import Capture
 from stage.colour import GREY_WEIGHTS
 from stage.errors import StorageError
 from stage.planes import frame_planes
-from tests.captures import files_in, write_capture, write_exr
+from tests.scenes.captures import files_in, write_capture, write_exr
 
 
 @pytest.fixture

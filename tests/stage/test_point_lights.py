@@ -7,7 +7,7 @@ from stage.capture import Capture
 from stage.errors import ManifestError
 from stage.lighting import check_solvable, lights_from_centre
 from stage.point_lights import place_lights
-from tests.captures import edit_frame, edit_manifest, make_scene, ring, write_capture
+from tests.scenes.captures import edit_frame, edit_manifest, make_scene, ring, write_capture
 
 SIZE, PIXEL = 6, 0.01
 CAMERA = {"projection": "orthographic", "resolution": [SIZE, SIZE], "pixel_size_m": PIXEL, "surface_z_m": 0.02}

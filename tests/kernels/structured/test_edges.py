@@ -10,7 +10,7 @@ from kernels.structured.edges import refine_edges
 from kernels.structured.frames import NoiseModel, upload
 from stage.patterns.binary import binary_patterns
 from stage.patterns.codes import collect
-from tests.structured_scenes import NOISE, frames_of, result, view
+from tests.scenes.patterns import NOISE, frames_of, result, view
 
 WIDTH, ROWS, COLUMNS = 1280, 40, 300
 QUIET = NoiseModel(0.001, 0.0)

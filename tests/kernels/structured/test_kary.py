@@ -10,7 +10,7 @@ from kernels.structured.kary import decode_kary, expected_levels
 from stage.patterns.codes import collect
 from stage.patterns.kary import kary_patterns, palette
 from tests.reference import structured as reference
-from tests.structured_scenes import NOISE, frames_of, places, result, view
+from tests.scenes.patterns import NOISE, frames_of, places, result, view
 
 WIDTH = 1280
 CROSSTALK = np.array([[0.8, 0.25, 0.02], [0.15, 0.9, 0.2], [0.05, 0.3, 0.7]])

@@ -14,7 +14,7 @@ from stage.patterns.binary import binary_patterns
 from stage.patterns.codes import collect
 from stage.patterns.phase import PhaseCode, phase_patterns
 from tests.reference import structured as reference
-from tests.structured_scenes import NOISE, frames_of, places, result, view
+from tests.scenes.patterns import NOISE, frames_of, places, result, view
 
 WIDTH = 1000
 FLOAT32_RADIANS = 5e-6

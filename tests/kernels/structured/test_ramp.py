@@ -9,7 +9,7 @@ from kernels.structured.frames import NoiseModel, saturated_bits, upload
 from kernels.structured.ramp import decode_ramp
 from stage.patterns.ramp import ramp_patterns
 from tests.reference import structured as reference
-from tests.structured_scenes import NOISE, frames_of, places, result, view
+from tests.scenes.patterns import NOISE, frames_of, places, result, view
 
 WIDTH = 1280
 PATTERNS = ramp_patterns("column")

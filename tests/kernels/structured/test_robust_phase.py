@@ -13,7 +13,7 @@ from kernels.structured.unwrap import unwrap_jointly
 from stage.patterns.codes import collect
 from stage.patterns.modulated import modulated_patterns
 from stage.patterns.phase import micro_patterns, phase_patterns
-from tests.structured_scenes import NOISE, frames_of, places, result, view
+from tests.scenes.patterns import NOISE, frames_of, places, result, view
 
 WIDTH = 1280
 MICRO = micro_patterns(WIDTH, "column", periods=6, mean_period_px=24)

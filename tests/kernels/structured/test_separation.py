@@ -8,7 +8,7 @@ from kernels.status import Status
 from kernels.structured.frames import saturated_bits, upload
 from kernels.structured.separation import separate
 from stage.patterns.phase import phase_patterns
-from tests.structured_scenes import frames_of, places, view
+from tests.scenes.patterns import frames_of, places, view
 
 WIDTH = 1024
 SHIFTS = (0.0, 0.25, 0.5, 0.75)

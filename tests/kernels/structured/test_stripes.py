@@ -10,7 +10,7 @@ from kernels.structured.frames import NoiseModel, saturated_bits, stack, upload
 from stage.patterns.binary import binary_patterns, xor_patterns
 from stage.patterns.codes import collect
 from tests.reference import structured as reference
-from tests.structured_scenes import NOISE, frames_of, places, result, view
+from tests.scenes.patterns import NOISE, frames_of, places, result, view
 
 WIDTH = 1280
 DECODERS = {"binary": decode_binary, "gray": decode_gray, "xor": decode_xor}

@@ -12,8 +12,8 @@ import pytest
 
 import service
 from stage import exr
-from tests.captures import edit_frame, edit_manifest, files_in, make_scene, render, write_capture, write_exr
 from tests.reference.light_basis import relative_rms, render_ptm, render_rti, srgb, truncation
+from tests.scenes.captures import edit_frame, edit_manifest, files_in, make_scene, render, write_capture, write_exr
 
 SCENE = make_scene(size=16, lights=9)
 LAMBERT = Path(service.__file__).parents[1] / "samples" / "lambert"

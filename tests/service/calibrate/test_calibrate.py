@@ -9,7 +9,8 @@ import pytest
 from stage.capture import Capture
 from stage.correction import Correction
 from stage.light import DistantLight, PointLight
-from tests.captures import (
+from tests.reference.balls import lambertian, lambertian_near, mirror_of_far, mirror_of_near, render
+from tests.scenes.captures import (
     angles_degrees,
     edit_frame,
     edit_manifest,
@@ -20,7 +21,6 @@ from tests.captures import (
     write_image,
     write_manifest,
 )
-from tests.reference.balls import lambertian, lambertian_near, mirror_of_far, mirror_of_near, render
 
 WIDTH, HEIGHT = 96, 80
 GEOMETRY = {"centre": np.array([0.0031, -0.0022, 0.0]), "radius": 0.03, "pixel_size": 0.001, "width": WIDTH, "height": HEIGHT}

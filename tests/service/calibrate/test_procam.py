@@ -9,9 +9,9 @@ import pytest
 
 from stage.capture import Capture
 from stage.depth_maps import DepthMaps
-from tests.captures import edit_manifest, write_image, write_manifest
-from tests.depth_captures import BLACK_WHITE
 from tests.reference import projector as reference
+from tests.scenes.captures import edit_manifest, write_image, write_manifest
+from tests.scenes.depth import BLACK_WHITE
 from tests.stage.calibration import test_procam as boards
 
 CAMERA = boards.CAMERA

@@ -7,7 +7,7 @@ import pytest
 
 from service.captures.admit import admit_capture, admit_environment, environment_file, recheck_capture
 from stage.errors import ImageError, ManifestError
-from tests.captures import edit_manifest, make_scene, write_capture, write_exr, write_manifest
+from tests.scenes.captures import edit_manifest, make_scene, write_capture, write_exr, write_manifest
 from tests.service.recording import Recording
 
 SCENE = make_scene(size=16, lights=4)

@@ -3,9 +3,9 @@
 import numpy as np
 
 from service.captures.inspect import inspect
-from tests import near_scenes
-from tests.captures import edit_frame, make_scene, write_capture, write_exr, write_image, write_manifest
-from tests.near_scenes import lamps
+from tests.scenes import near_lights
+from tests.scenes.captures import edit_frame, make_scene, write_capture, write_exr, write_image, write_manifest
+from tests.scenes.near_lights import lamps
 from tests.service.recording import Recording
 
 SCENE = make_scene(size=16, lights=6)
@@ -48,8 +48,8 @@ def test_lights_that_cannot_be_solved_are_a_fault(tmp_path):
 
 
 def test_near_lights_have_a_distance(tmp_path):
-    dome = near_scenes.dome(size=16)
-    facts = dict(inspect(near_scenes.write(tmp_path, dome, lamps(dome, 5, 2.0))).facts)
+    dome = near_lights.dome(size=16)
+    facts = dict(inspect(near_lights.write(tmp_path, dome, lamps(dome, 5, 2.0))).facts)
     assert facts["near lights"].startswith("5, ") and facts["near lights"].endswith("m from the object's centre")
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import service
-from tests.captures import edit_frame, edit_manifest, files_in, make_scene, write_capture, write_exr, write_image
+from tests.scenes.captures import edit_frame, edit_manifest, files_in, make_scene, write_capture, write_exr, write_image
 
 SCENE = make_scene(size=8, lights=5)
 MEMORY = ".relit/files.json"

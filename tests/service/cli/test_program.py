@@ -10,7 +10,7 @@ import pytest
 
 import service
 from stage.capture import Capture
-from tests.captures import edit_manifest, make_scene, write_capture, write_exr, write_image
+from tests.scenes.captures import edit_manifest, make_scene, write_capture, write_exr, write_image
 
 COMMANDS = ["demo", "import", "info", "calibrate", "solve", "depth", "separate", "relight", "basis", "export", "doctor", "bench", "serve",
             "worker", "keys"]

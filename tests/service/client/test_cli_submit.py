@@ -11,7 +11,7 @@ import pytest
 
 from service.client import Client
 from service.requests.relight import RelightOptions
-from tests.captures import write_capture
+from tests.scenes.captures import write_capture
 from tests.service.client.conftest import OWL, SKY
 
 

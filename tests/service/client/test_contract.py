@@ -17,7 +17,7 @@ from service.requests.relight import RelightOptions
 from service.requests.solve import Method, SolveOptions
 from service.views import intakes, jobs
 from service.views.base import View
-from tests.captures import write_capture
+from tests.scenes.captures import write_capture
 from tests.service.client.conftest import SKY, Between
 
 OF_HTTP = {"host", "accept", "accept-encoding", "connection", "user-agent", "authorization", "content-length", "content-type",

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from service.client import Client
-from tests.captures import write_capture
+from tests.scenes.captures import write_capture
 from tests.service.client.conftest import HOME, OWL, SKY
 
 TEXT = (HOME / "docs" / "client.md").read_text(encoding="utf-8")

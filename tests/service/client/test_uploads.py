@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from service.client import Client, ClientError, FileError, IntakeRefused, Invalid, NotFound
-from tests.captures import edit_manifest, files_in, write_capture, write_exr
+from tests.scenes.captures import edit_manifest, files_in, write_capture, write_exr
 from tests.service.client.conftest import OWL, SKY, Between, Cut
 from tests.service.server_process import Server
 

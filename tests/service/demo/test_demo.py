@@ -10,7 +10,7 @@ import pytest
 import service.demo.demo
 from stage import exr
 from stage.maps import SurfaceMaps
-from tests.captures import files_in
+from tests.scenes.captures import files_in
 from tests.service.owl import OWL, owl_errors, write_small_owl
 
 SMALL_SIDE = 8

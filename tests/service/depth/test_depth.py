@@ -7,8 +7,9 @@ import pytest
 
 from stage.depth_maps import DepthMaps
 from stage.ply import read_ply
-from tests.captures import angles_degrees, edit_frame, edit_manifest, files_in, write_image
-from tests.depth_captures import (
+from tests.reference import projector as reference
+from tests.scenes.captures import angles_degrees, edit_frame, edit_manifest, files_in, write_image
+from tests.scenes.depth import (
     AMBIENT,
     BLACK_WHITE,
     NORMAL,
@@ -20,7 +21,6 @@ from tests.depth_captures import (
     phase_patterns,
     write_patterns,
 )
-from tests.reference import projector as reference
 
 SCENE = make_scene()
 LIT = (SCENE.uv > 0).all(axis=-1) & (SCENE.uv < (PROJECTOR.width, PROJECTOR.height)).all(axis=-1)

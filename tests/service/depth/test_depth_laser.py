@@ -8,9 +8,9 @@ import pytest
 
 from stage.depth_maps import DepthMaps
 from stage.ply import read_ply
-from tests.captures import edit_frame, files_in
-from tests.depth_captures import CENTRE, NORMAL, PLANE, RADIUS, make_scene, write_lasers
 from tests.reference import projector as reference
+from tests.scenes.captures import edit_frame, files_in
+from tests.scenes.depth import CENTRE, NORMAL, PLANE, RADIUS, make_scene, write_lasers
 
 CAMERA = reference.Device(300, 220, 1500.0, (-0.1, 0.02, 0.0), (0.001, -0.001))
 """A narrow view: at 1.4 m a pixel is 0.9 mm, as with an ordinary lens on a sensor of two megapixels."""

@@ -11,7 +11,7 @@ from service.requests.separate import SeparateRequest
 from stage import exr
 from stage.capture import Capture
 from stage.depth_normals import depth_normals
-from tests.captures import edit_manifest, files_in, write_exr, write_image, write_manifest
+from tests.scenes.captures import edit_manifest, files_in, write_exr, write_image, write_manifest
 from tests.service.recording import Recording
 
 RIG = Path(__file__).parents[3] / "samples" / "rig"

@@ -21,8 +21,8 @@ from service.requests.options import options_of
 from service.requests.relight import RelightRequest
 from service.requests.shade import ShadeRequest
 from stage import exr
-from tests.captures import files_in, make_scene, write_capture, write_exr
-from tests.glossy_captures import dome, write_dome, write_maps
+from tests.scenes.captures import files_in, make_scene, write_capture, write_exr
+from tests.scenes.glossy import dome, write_dome, write_maps
 
 ROOT = Path(__file__).parents[3]
 BIN = Path(sys.executable).parent

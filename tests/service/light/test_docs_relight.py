@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from stage import exr
-from tests.captures import make_scene, write_capture, write_exr
+from tests.scenes.captures import make_scene, write_capture, write_exr
 
 TEXT = (Path(__file__).parents[3] / "docs" / "relight.md").read_text(encoding="utf-8")
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from stage import exr
-from tests.captures import write_exr
-from tests.glossy_captures import dome, lat_long, reflect, write_dome, write_maps
+from tests.scenes.captures import write_exr
+from tests.scenes.glossy import dome, lat_long, reflect, write_dome, write_maps
 
 SURFACE = dome()
 MIDDLE = np.array([0.35, 0.45, 0.82]) / np.linalg.norm([0.35, 0.45, 0.82])

@@ -9,7 +9,7 @@ import pytest
 
 from stage import exr
 from stage.maps import SurfaceMaps
-from tests.captures import files_in, make_scene, write_capture, write_exr
+from tests.scenes.captures import files_in, make_scene, write_capture, write_exr
 
 SCENE = make_scene(size=16, lights=7)
 

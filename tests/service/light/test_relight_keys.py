@@ -8,7 +8,7 @@ import pytest
 from service.light.schedule import key_interval, slerp
 from service.requests.light_keys import SCHEMA, LightKeys
 from stage import exr
-from tests.captures import files_in, make_scene, write_capture, write_exr
+from tests.scenes.captures import files_in, make_scene, write_capture, write_exr
 
 SCENE = make_scene(size=4, lights=4)
 DIRECTIONS = [[0, 0, 1], [1, 0, 0], [0, 1, 0], [-0.48, -0.6, -0.64]]

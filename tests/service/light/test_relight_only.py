@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from stage import exr
-from tests.captures import files_in, make_scene, write_capture, write_exr
-from tests.glossy_captures import dome, write_dome, write_maps
+from tests.scenes.captures import files_in, make_scene, write_capture, write_exr
+from tests.scenes.glossy import dome, write_dome, write_maps
 
 SCENE = make_scene(size=64, lights=12)
 """Large enough that sums in another order round to another half somewhere."""

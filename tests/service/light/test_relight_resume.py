@@ -20,7 +20,7 @@ from service.requests.base import Role
 from service.requests.options import role_of
 from service.requests.relight import RelightRequest
 from stage import exr
-from tests.captures import edit_frame, files_in, make_scene, write_capture, write_exr, write_image
+from tests.scenes.captures import edit_frame, files_in, make_scene, write_capture, write_exr, write_image
 
 SCENE = make_scene(size=8, lights=5)
 FRAMES = {f"a.{number}.exr" for number in range(1, 5)}

@@ -7,7 +7,7 @@ import pytest
 
 from stage import exr
 from stage.capture import Capture
-from tests.captures import edit_manifest, files_in, make_scene, write_capture, write_exr
+from tests.scenes.captures import edit_manifest, files_in, make_scene, write_capture, write_exr
 
 SCENE = make_scene(size=8, lights=5)
 

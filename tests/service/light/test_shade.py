@@ -6,8 +6,8 @@ import pytest
 from stage import exr
 from stage.camera import Camera
 from stage.maps import MAPS_FILE, SurfaceMaps
-from tests.captures import files_in, write_exr
-from tests.glossy_captures import ALBEDO, PIXEL_M, dome, reflect, write_dome, write_maps
+from tests.scenes.captures import files_in, write_exr
+from tests.scenes.glossy import ALBEDO, PIXEL_M, dome, reflect, write_dome, write_maps
 
 SURFACE = dome()
 

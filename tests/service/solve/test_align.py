@@ -7,8 +7,8 @@ import pytest
 
 from stage import exr
 from stage.maps import SurfaceMaps
-from tests.captures import angles_degrees, files_in, write_exr
-from tests.moving import RADIUS, Subject, write_moving
+from tests.scenes.captures import angles_degrees, files_in, write_exr
+from tests.scenes.moving import RADIUS, Subject, write_moving
 
 GLIDING = Subject(shift_px=(0.43, -0.31))
 TURNING = Subject(turn_degrees=0.4)

@@ -8,7 +8,7 @@ import pytest
 from kernels.status import Status
 from service.requests.solve import Method, SolveRequest
 from service.solve.solve import solve
-from tests import captures
+from tests.scenes import captures
 
 
 def solved(folder, out, method=Method.ROBUST):

@@ -7,8 +7,8 @@ import pytest
 
 from stage import exr
 from stage.maps import SurfaceMaps
-from tests.captures import angles_degrees, make_scene, write_exr, write_image, write_manifest
 from tests.reference import gradient as reference
+from tests.scenes.captures import angles_degrees, make_scene, write_exr, write_image, write_manifest
 
 SIZE, ROUGHNESS = 12, 0.2
 PAIRS = [(axis, sign) for axis in "xyz" for sign in (1, -1)]

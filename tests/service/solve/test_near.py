@@ -8,14 +8,14 @@ import pytest
 from kernels import device as devices
 from stage import exr
 from stage.maps import SurfaceMaps
-from tests import near_scenes
-from tests.captures import angles_degrees, edit_manifest, write_exr
-from tests.near_scenes import Lamp, far, lamps
+from tests.scenes import near_lights
+from tests.scenes.captures import angles_degrees, edit_manifest, write_exr
+from tests.scenes.near_lights import Lamp, far, lamps
 
 RADII = 1.3
 """Of the sphere about whose centre the lamps stand: 0.3 radii above the surface that they light."""
-ORTHOGRAPHIC, PERSPECTIVE = near_scenes.dome(), near_scenes.dome(perspective=True)
-SMALL, SMALL_PERSPECTIVE = near_scenes.dome(32), near_scenes.dome(32, perspective=True)
+ORTHOGRAPHIC, PERSPECTIVE = near_lights.dome(), near_lights.dome(perspective=True)
+SMALL, SMALL_PERSPECTIVE = near_lights.dome(32), near_lights.dome(32, perspective=True)
 """The same with less than half the pixels, for the solver that works hard on each."""
 DOMES = pytest.mark.parametrize("dome", [ORTHOGRAPHIC, PERSPECTIVE], ids=["orthographic", "perspective"])
 
@@ -43,12 +43,12 @@ def assert_solved(maps, dome, *, angle: float, albedo: float):
 def test_height_at_1_3_radii_where_distant_lights_make_a_bowl(relit, tmp_path, dome, method):
     """The promise: within 1 % of the relief, where the same images taken as distant light are off by more than 10 %."""
     lights = lamps(dome, 32, RADII)
-    near_scenes.write(tmp_path / "near", dome, lights, cast_steps=60)
+    near_lights.write(tmp_path / "near", dome, lights, cast_steps=60)
     maps, report = solve(relit, tmp_path / "near", method)
     assert_solved(maps, dome, angle=0.06, albedo=0.003)  # half rounding of three to ten readings, and the part not yet settled
     near = report["found"]["near"]
     assert near["settled"] and near["rounds"][method] <= 8 and near["last_change_of_relief"] < 1e-3
-    near_scenes.write(tmp_path / "far", dome, lights, told=[far(lamp, dome) for lamp in lights], cast_steps=60)
+    near_lights.write(tmp_path / "far", dome, lights, told=[far(lamp, dome) for lamp in lights], cast_steps=60)
     maps, report = solve(relit, tmp_path / "far", method)
     assert "near" not in report["found"]
     assert np.sqrt((height_error(maps, dome) ** 2).mean()) > 0.1
@@ -56,7 +56,7 @@ def test_height_at_1_3_radii_where_distant_lights_make_a_bowl(relit, tmp_path, d
 
 @pytest.mark.parametrize("dome", [SMALL, SMALL_PERSPECTIVE], ids=["orthographic", "perspective"])
 def test_the_general_solver(relit, tmp_path, dome):
-    near_scenes.write(tmp_path, dome, lamps(dome, 48, RADII))
+    near_lights.write(tmp_path, dome, lamps(dome, 48, RADII))
     maps, report = solve(relit, tmp_path, "svbrdf")
     assert_solved(maps, dome, angle=0.1, albedo=0.02)  # the last ring is 0.2 degrees; a lobe takes a little albedo
     assert report["found"]["near"]["rounds"]["svbrdf"] <= 2
@@ -64,7 +64,7 @@ def test_the_general_solver(relit, tmp_path, dome):
 
 def test_cast_shadows_end_at_the_lamp(relit, tmp_path):
     """The general solver leaves out what the height hides from a lamp, and no more."""
-    near_scenes.write(tmp_path, SMALL, lamps(SMALL, 48, RADII, widest=85), cast_steps=200)
+    near_lights.write(tmp_path, SMALL, lamps(SMALL, 48, RADII, widest=85), cast_steps=200)
     maps, _ = solve(relit, tmp_path, "svbrdf")
     assert height_error(maps, SMALL).max() < 0.005
     angle = angles_degrees(maps.normal, SMALL.normal)[maps.mask]
@@ -75,17 +75,17 @@ def test_cast_shadows_end_at_the_lamp(relit, tmp_path):
 def test_lamps_that_shine_forward(relit, tmp_path, exponent):
     """Anisotropy: lamps aimed beside the centre; taken as the same all round, the height is wrong."""
     lights = lamps(ORTHOGRAPHIC, 32, RADII, exponent=exponent)
-    maps, _ = solve(relit, near_scenes.write(tmp_path / "aimed", ORTHOGRAPHIC, lights), "lambert")
+    maps, _ = solve(relit, near_lights.write(tmp_path / "aimed", ORTHOGRAPHIC, lights), "lambert")
     assert_solved(maps, ORTHOGRAPHIC, angle=0.15, albedo=0.004)  # half rounding where three lamps at grazing angles are left
     round_about = [lamp._replace(axis=None, exponent=0.0) for lamp in lights]
-    maps, _ = solve(relit, near_scenes.write(tmp_path / "round", ORTHOGRAPHIC, lights, told=round_about), "lambert")
+    maps, _ = solve(relit, near_lights.write(tmp_path / "round", ORTHOGRAPHIC, lights, told=round_about), "lambert")
     assert height_error(maps, ORTHOGRAPHIC).max() > 0.02
 
 
 @DOMES
 def test_near_and_distant_lights_together(relit, tmp_path, dome):
     lights = [far(lamp, dome) if index % 2 else lamp for index, lamp in enumerate(lamps(dome, 32, RADII))]
-    maps, _ = solve(relit, near_scenes.write(tmp_path, dome, lights), "lambert")
+    maps, _ = solve(relit, near_lights.write(tmp_path, dome, lights), "lambert")
     assert_solved(maps, dome, angle=0.05, albedo=0.003)
 
 
@@ -93,10 +93,10 @@ def test_near_and_distant_lights_together(relit, tmp_path, dome):
 def test_lamps_at_a_thousand_radii_are_distant_lights(relit, tmp_path, method):
     """Their directions over the object differ by 0.06 degrees and their irradiance by 0.2 %."""
     lights = lamps(SMALL, 24, 1000.0)
-    maps, report = solve(relit, near_scenes.write(tmp_path / "near", SMALL, lights), method)
+    maps, report = solve(relit, near_lights.write(tmp_path / "near", SMALL, lights), method)
     assert report["found"]["near"]["settled"] and max(report["found"]["near"]["rounds"].values()) <= 2
     told = [far(lamp, SMALL) for lamp in lights]
-    distant, _ = solve(relit, near_scenes.write(tmp_path / "far", SMALL, told), method)
+    distant, _ = solve(relit, near_lights.write(tmp_path / "far", SMALL, told), method)
     assert np.array_equal(maps.mask, distant.mask)
     assert angles_degrees(maps.normal, distant.normal)[maps.mask].max() < 0.1  # two searches of 0.2 degrees; half rounding 0.02
     assert np.abs(maps.height - distant.height)[maps.mask].max() < 1e-3 * SMALL.relief
@@ -107,14 +107,14 @@ def test_lamps_at_a_thousand_radii_are_distant_lights(relit, tmp_path, method):
 def test_every_device_and_a_rim_that_few_lamps_reach(relit, tmp_path, device):
     """Pixels without three lamps stay unsolved, and do not pull the others away."""
     lights = lamps(ORTHOGRAPHIC, 9, RADII, widest=45)
-    maps, report = solve(relit, near_scenes.write(tmp_path, ORTHOGRAPHIC, lights), "lambert", device)
-    lit = sum(near_scenes.render(ORTHOGRAPHIC, lamp)[..., 1] > 0 for lamp in lights) * ORTHOGRAPHIC.mask
+    maps, report = solve(relit, near_lights.write(tmp_path, ORTHOGRAPHIC, lights), "lambert", device)
+    lit = sum(near_lights.render(ORTHOGRAPHIC, lamp)[..., 1] > 0 for lamp in lights) * ORTHOGRAPHIC.mask
     assert 0 < report["pixels"]["shadowed"] == ((lit < 3) & (lit > 0)).sum()
     assert abs(height_error(maps, ORTHOGRAPHIC)).mean() < 0.02  # the depth of the unlit rim, a ninth of the mask, is guessed
 
 
 def test_info_says_how_far_the_lamps_are(relit, tmp_path):
-    near_scenes.write(tmp_path, PERSPECTIVE, lamps(PERSPECTIVE, 6, 2.0))
+    near_lights.write(tmp_path, PERSPECTIVE, lamps(PERSPECTIVE, 6, 2.0))
     outcome = relit("info", tmp_path)
     assert outcome.code == 0 and "6 point light" in outcome.out
     centre = PERSPECTIVE.points[PERSPECTIVE.mask].mean(axis=0)
@@ -123,7 +123,7 @@ def test_info_says_how_far_the_lamps_are(relit, tmp_path):
 
 
 def test_a_camera_without_scale_is_refused_in_one_sentence(relit, tmp_path):
-    near_scenes.write(tmp_path, PERSPECTIVE, lamps(PERSPECTIVE, 6, RADII))
+    near_lights.write(tmp_path, PERSPECTIVE, lamps(PERSPECTIVE, 6, RADII))
     camera = json.loads((tmp_path / "capture.json").read_text())["camera"]
     edit_manifest(tmp_path, camera={key: value for key, value in camera.items() if key != "surface_z_m"})
     for command in (["info", tmp_path], ["solve", tmp_path, "--out", tmp_path / "out"]):
@@ -137,8 +137,8 @@ def test_relight_takes_near_lights_as_the_centre_sees_them_and_says_so(relit, tm
     centre = ORTHOGRAPHIC.points[ORTHOGRAPHIC.mask].mean(axis=0)
     ways = [lamp.position - centre for lamp in lights]
     told = [Lamp(None, lamp.strength / (way @ way), direction=way) for lamp, way in zip(lights, ways, strict=True)]
-    near_scenes.write(tmp_path / "near", ORTHOGRAPHIC, lights)
-    near_scenes.write(tmp_path / "far", ORTHOGRAPHIC, lights, told=told)
+    near_lights.write(tmp_path / "near", ORTHOGRAPHIC, lights)
+    near_lights.write(tmp_path / "far", ORTHOGRAPHIC, lights, told=told)
     sky = write_exr(tmp_path / "sky.exr", np.linspace(0, 1, 8 * 16 * 3).reshape(8, 16, 3))
     frames = {}
     for name in ("near", "far"):

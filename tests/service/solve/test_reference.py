@@ -7,7 +7,7 @@ import pytest
 
 from stage import exr
 from stage.maps import SurfaceMaps
-from tests.captures import angles_degrees, edit_frame, edit_manifest, write_exr, write_image, write_manifest
+from tests.scenes.captures import angles_degrees, edit_frame, edit_manifest, write_exr, write_image, write_manifest
 
 LIGHTS, SIDE = 24, 40
 RNG = np.random.default_rng(5)

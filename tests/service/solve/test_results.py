@@ -7,7 +7,7 @@ import pytest
 
 from stage import exr
 from stage.maps import SurfaceMaps
-from tests.captures import angles_degrees, files_in, make_scene, write_capture
+from tests.scenes.captures import angles_degrees, files_in, make_scene, write_capture
 
 SCENE = make_scene(size=16, lights=7)
 

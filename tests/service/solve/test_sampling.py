@@ -7,9 +7,9 @@ import pytest
 
 from stage import exr
 from stage.maps import SurfaceMaps
-from tests.captures import angles_degrees
 from tests.reference import sampling as twin
-from tests.sampling_captures import COLOUR, SHARPNESS, VIEW, ball, light, write_sampling
+from tests.scenes.captures import angles_degrees
+from tests.scenes.extended_lights import COLOUR, SHARPNESS, VIEW, ball, light, write_sampling
 
 SIDE, LIGHTS = 16, 20
 CENTRES = twin.lattice(LIGHTS)

@@ -7,7 +7,7 @@ from stage.calibration.apply import as_direction, as_position, check_same_setup,
 from stage.capture import Capture
 from stage.errors import ManifestError
 from stage.light import DistantLight, PointLight
-from tests.captures import edit_frame, edit_manifest, make_scene, write_capture
+from tests.scenes.captures import edit_frame, edit_manifest, make_scene, write_capture
 
 FAR = DistantLight(type="distant", direction=(0, 0, 1), irradiance=(1, 2, 3))
 NEAR = PointLight(type="point", position_m=(0, 0, 2), intensity=(1, 2, 3), axis=(0, 0, -1), anisotropy=1.5)

@@ -7,8 +7,8 @@ from stage.calibration.ball import Ball, view_ball
 from stage.calibration.grey_ball import fit_brightness, fit_direction, received
 from stage.errors import CalibrationError
 from stage.light import DistantLight, PointLight
-from tests.captures import angles_degrees
 from tests.reference.balls import lambertian, lambertian_near, render
+from tests.scenes.captures import angles_degrees
 from tests.stage.calibration.balls import HEIGHT, SCENES, WIDTH, box, spread, unit
 
 

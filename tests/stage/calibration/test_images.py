@@ -9,7 +9,7 @@ from stage.calibration.saturation import ChannelSaturation, TopHistogram, captur
 from stage.capture import Capture
 from stage.correction import Correction
 from stage.errors import CalibrationError, ImageError
-from tests.captures import edit_manifest, make_scene, write_capture, write_exr, write_image
+from tests.scenes.captures import edit_manifest, make_scene, write_capture, write_exr, write_image
 
 SIZE = 8
 

@@ -7,8 +7,8 @@ from stage.calibration.ball import Ball, project, view_ball
 from stage.calibration.mirror_ball import SpotOptions, find_spot, reflect
 from stage.calibration.outline import ball_from_mask
 from stage.errors import CalibrationError
-from tests.captures import angles_degrees
 from tests.reference.balls import mirror_of_far, render
+from tests.scenes.captures import angles_degrees
 from tests.stage.calibration.balls import HEIGHT, SCENES, WIDTH, box, spread, unit
 
 

@@ -9,8 +9,8 @@ from stage.capture import Capture
 from stage.errors import ImageError, ManifestError
 from stage.ingest import open_stack
 from stage.motion.tracking import tracking_frames
-from tests.captures import edit_frame, edit_manifest, files_in, write_exr, write_image
-from tests.moving import Subject, write_moving
+from tests.scenes.captures import edit_frame, edit_manifest, files_in, write_exr, write_image
+from tests.scenes.moving import Subject, write_moving
 
 GLIDING = Subject(size=48, shift_px=(0.43, -0.31))
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stage.motion.flow import Flow, display, extrapolate, find_flow, white_level
-from tests.moving import Subject
+from tests.scenes.moving import Subject
 
 APART = 5
 """Steps of time between the two frames."""

@@ -5,7 +5,7 @@ import pytest
 from stage.capture import Capture
 from stage.errors import ManifestError
 from stage.motion.tracking import Interval, intervals, tracking_frames
-from tests.moving import Subject, write_moving
+from tests.scenes.moving import Subject, write_moving
 
 SMALL = Subject(size=16)
 

@@ -6,8 +6,8 @@ import pytest
 from stage.errors import ImageError, StorageError
 from stage.rti import hsh, ptm
 from stage.rti.quantization import Quantization, dequantize, quantization_of_range
-from tests.captures import files_in
 from tests.reference.light_basis import harmonics, polynomial, render_ptm, render_rti
+from tests.scenes.captures import files_in
 
 ROWS, COLS = 3, 4
 RNG = np.random.default_rng(5)

@@ -8,7 +8,7 @@ import pytest
 from stage.capture import Capture
 from stage.errors import ImageError, ManifestError
 from stage.tof.frames import is_pulsed, read_correlations, read_histograms
-from tests.captures import write_exr
+from tests.scenes.captures import write_exr
 
 ROWS, COLS = 3, 4
 CAMERA = {"projection": "perspective", "resolution": [COLS, ROWS], "focal_px": [5, 5]}

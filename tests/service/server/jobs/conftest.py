@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from tests.captures import make_scene, write_capture, write_exr
+from tests.scenes.captures import make_scene, write_capture, write_exr
 from tests.service.server.jobs.harness import harness, relit_relight
 
 FRAMES = 36

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.server.storage import layout
-from tests.captures import files_in, make_scene, write_capture, write_exr
+from tests.scenes.captures import files_in, make_scene, write_capture, write_exr
 from tests.service.server.api.tus import Tus
 from tests.service.server_process import serving
 

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tests.captures import ring, write_exr, write_image, write_manifest
+from tests.scenes.captures import ring, write_exr, write_image, write_manifest
 
 WAVES = 60
 RADIUS = 0.38

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tests.captures import write_exr, write_image, write_manifest
+from tests.scenes.captures import write_exr, write_image, write_manifest
 
 CAP = 0.8
 """Radius of the visible cap in sphere radii."""

@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tests.captures import write_exr, write_image, write_manifest
 from tests.reference import sampling as twin
+from tests.scenes.captures import write_exr, write_image, write_manifest
 
 SHARPNESS = 6.0
 VIEW = np.array([0.0, 0.0, 1.0])

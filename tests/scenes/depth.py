@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tests.captures import write_exr, write_image, write_manifest
 from tests.reference import projector as reference
+from tests.scenes.captures import write_exr, write_image, write_manifest
 
 CAMERA = reference.Device(96, 72, 140.0, (-0.12, 0.03, 0.0), (0.001, -0.0015))
 PROJECTOR = reference.Device(128, 96, 150.0, (-0.15, 0.04, -0.01), (0.002, -0.001))

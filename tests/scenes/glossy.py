@@ -9,8 +9,8 @@ import numpy as np
 
 from stage.camera import Camera
 from stage.maps import MAPS_FILE, SurfaceMaps
-from tests.captures import write_exr, write_image
 from tests.reference import microfacet
+from tests.scenes.captures import write_exr, write_image
 
 VIEW = np.array([0.0, 0.0, 1.0])
 PIXEL_M = 0.001
