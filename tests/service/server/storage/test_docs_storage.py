@@ -35,7 +35,7 @@ def test_frames_are_not_counted_backwards_while_they_are_sent(monkeypatch):
     told = []
     monkeypatch.setattr(progresses, "EVERY_S", 0.0)
     monkeypatch.setattr(progresses.jobs, "advance", lambda database, claim, progress: told.append(progress[:3]) or True)
-    progress = JobProgress(None, None, alive=lambda: None, before=4, of=10)
+    progress = JobProgress(None, None, alive=lambda: None, frame_offset=4, frame_count=10)
     progress.stage("open", 1)
     for stage, total in ((FRAMES, 2), ("upload", 2)):
         progress.stage(stage, total)
