@@ -47,9 +47,9 @@ class Fault(NamedTuple):
     kind: str
     times: int
     frames: int
-    """Of the jobs that were disturbed; all have to be there, once, in full."""
+    """Frames that the disturbed jobs made; each has to exist once, complete."""
     identical: int
-    """Of these, bit by bit as `relit relight` makes them."""
+    """How many of them equal those of `relit relight`, bit by bit."""
     takeovers_s: Sequence[float]
     """From the fault until another worker has the job."""
     lost: int

@@ -30,7 +30,7 @@ from service.requests.relight import RelightOptions
 
 OWL, SKY = SAMPLES / "owl", SAMPLES / "owl" / "environment.exr"
 FRAMES = 400
-"""Of a job: it runs for several seconds."""
+"""Frames of one job, which then runs for several seconds."""
 WAITING = 3
 """Jobs that are kept in the queue, so that the worker is never idle."""
 ENDED = ("succeeded", "failed", "cancelled")

@@ -29,7 +29,7 @@ class Pair(NamedTuple):
     submitted: float
     """From before the job was handed in to when the client knew that it had ended."""
     started: float
-    """Of the job alone, as the service counts."""
+    """Seconds of the job alone, from its start to its end as the service records them."""
 
 
 def command(folder: Path, frames: int) -> float:

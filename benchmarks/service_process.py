@@ -21,7 +21,7 @@ class Running(NamedTuple):
     url: str
     key: str
     pid: int
-    """Of the process with the API."""
+    """Identifier of the process that runs the API."""
 
 
 @contextmanager

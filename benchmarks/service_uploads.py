@@ -31,9 +31,9 @@ class Way(NamedTuple):
 
     title: str
     piece_mib: int | None
-    """Of a request; None: the whole file in one."""
+    """Bytes that one request sends; None: one request sends the whole file."""
     algorithm: str | None = None
-    """Of the checksum of each request."""
+    """Algorithm of the checksum that each request carries."""
     whole: bool = False
     """Whether the SHA-256 of the whole file is told, and compared at its end."""
 

@@ -10,7 +10,7 @@ TEXT = (HOME / "CONTRIBUTING.md").read_text(encoding="utf-8")
 WAYS = {title: re.findall(r"^\d\. `([^`]+)`( \(another process\))?", body, re.MULTILINE)
         for title, body in re.findall(r"^\*\*([^*]+)\*\*: .*\n\n((?:\d\. .*\n)+)", TEXT, re.MULTILINE)}
 MOST_FILES = 8
-"""Of a way: more is not seen at once."""
+"""The most files of one way: a reader cannot keep more in view."""
 
 
 def test_the_ways_are_read():

@@ -70,7 +70,7 @@ class Projection:
 
 @wp.struct
 class Image:
-    """Where a point falls in the projector, and how fast that changes with the inverse depth."""
+    """The projector pixel that a point is imaged at, and its derivative by the inverse depth."""
 
     u: float
     v: float

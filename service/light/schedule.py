@@ -127,7 +127,7 @@ def _captured(tracks: Sequence[CapturedTrack], number: int) -> dict[str, float]:
 
 
 class KeyInterval(NamedTuple):
-    """Where a frame lies between two neighbouring keys."""
+    """The place of a frame between two neighbouring keys."""
 
     first: int
     second: int

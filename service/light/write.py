@@ -41,7 +41,7 @@ class FrameFormat(NamedTuple):
 
 
 class FrameFile(NamedTuple):
-    """Where a frame goes, its exposure and its metadata."""
+    """The path, exposure and metadata of one frame."""
 
     path: Path
     gain: float

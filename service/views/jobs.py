@@ -16,7 +16,7 @@ class ProgressView(View):
     rate: float | None
     """Units of `done` per second, since the stage began."""
     remaining_s: float | None
-    """Of this stage, at that rate."""
+    """Seconds until this stage ends, at that rate."""
 
 
 class JobView(View):

@@ -31,7 +31,7 @@ class Rig(NamedTuple):
     baseline_m: float
     distance_m: float
     focal_px: float
-    """Of the projector, in its pixels."""
+    """Focal length of the projector, in its pixels."""
 
 
 class Cost(NamedTuple):

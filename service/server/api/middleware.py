@@ -16,7 +16,7 @@ REQUEST_ID = b"x-request-id"
 QUIET = ("/healthz", "/readyz", "/metrics")
 """Paths that are asked for every few seconds; their requests are logged at the level debug."""
 MAX_BYTES = 1 << 20
-"""Of a JSON body; the light keys of a long film have some hundred kilobytes."""
+"""Most bytes of a JSON body; the light keys of a long film have some hundred kilobytes."""
 UPLOADS = "/v1/uploads/"
 """Path of the bodies that are not JSON, which are written to the disk piece by piece."""
 TOO_LARGE = f"the body is larger than {MAX_BYTES} bytes"
