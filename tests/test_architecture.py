@@ -184,7 +184,7 @@ def test_references_judge_without_what_they_judge():
 
 
 def test_a_text_and_a_type_of_fields_stand_in_one_module():
-    """Of stage and service: a module-level name whose value is a text, an Annotated type or a Spelling is not declared so twice."""
+    """No two modules of stage and service give one name the same text, Annotated type or Spelling."""
     found: dict[tuple[str, str], set[str]] = {}
     for name, path in FILES.items():
         for node in ast.parse(path.read_text(encoding="utf-8")).body if top(name) != "kernels" else ():

@@ -14,7 +14,7 @@ from stage.patterns.binary import binary_patterns
 from stage.patterns.codes import collect
 
 EIGHT_BIT = NoiseModel(0.003, 1.0e-4)
-"""Of full scale 1: an ordinary camera of eight bits whose pixels hold ten thousand electrons."""
+"""Noise of an ordinary camera of eight bits whose pixels hold ten thousand electrons, as parts of full scale."""
 
 DATA = Path(os.environ.get("RELIT_TEST_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")) / "graycode_chessboard"
 PROJECTOR = (1024, 768)

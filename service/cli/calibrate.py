@@ -1,10 +1,10 @@
 """relit calibrate KIND: lights, dark frame, flat field and saturation, projector and camera, time of flight from images."""
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import typer
 
+from service.cli.printing import print_table
 from service.cli.progress import ProgressBar
 from service.cli.request_commands import local_command
 from service.requests.calibrate import (
@@ -110,8 +110,7 @@ def _procam(request: ProcamRequest) -> None:
         print(f"capture  {path}")
     print(f"report   {result.report_path}")
     print(f"error    {result.rms_px:.3f} px RMS, baseline {result.baseline_m:.4f} m")
-    rows = [("view", "camera, px", "projector, px", "remark"), *result.rows[:VIEW_ROWS]]
-    _table(rows)
+    print_table([("view", "camera, px", "projector, px", "remark"), *result.rows[:VIEW_ROWS]])
 
 
 def _response(request: ResponseRequest) -> None:
@@ -143,8 +142,7 @@ def _print_lights(result: "LightCalibration") -> None:
     print(f"capture  {result.manifest_path}")
     print(f"report   {result.report_path}")
     print(f"lights   {result.summary}")
-    rows = [result.headings, *result.rows[:LIGHT_ROWS]]
-    _table(rows)
+    print_table([result.headings, *result.rows[:LIGHT_ROWS]])
     if len(result.rows) > LIGHT_ROWS:
         print(f"… and {len(result.rows) - LIGHT_ROWS} that are surer")
 
@@ -153,9 +151,3 @@ def _print_image(name: str, result: "ImageCalibration") -> None:
     print(f"{name:<8} {result.image_path}")
     print(f"capture  {result.manifest_path}")
     print(f"report   {result.report_path}")
-
-
-def _table(rows: Sequence[Sequence[str]]) -> None:
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    for row in rows:
-        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())

@@ -4,6 +4,7 @@ from typing import Annotated
 
 import typer
 
+from service.cli.printing import counted
 from service.cli.progress import ProgressBar
 from service.cli.request_commands import Given, local_command
 from service.errors import RequestError
@@ -37,7 +38,7 @@ def _depth(request: DepthRequest) -> None:
     print(f"points   {result.points_path}")
     print(f"report   {result.report_path}")
     print(f"method   {result.method}, {result.points} points")
-    print(f"pixels   {', '.join(f'{count} {name}' for name, count in result.counts.items() if count)}")
+    print(f"pixels   {counted(result.counts)}")
 
 
 def _separate(request: SeparateRequest) -> None:
@@ -48,7 +49,7 @@ def _separate(request: SeparateRequest) -> None:
     print(f"parts    {result.separation_path}")
     print(f"report   {result.report_path}")
     print(f"global   {100 * result.global_share.get('median', 0.0):.3g} % of the light (median), period of {result.period_px:g} px")
-    print(f"pixels   {', '.join(f'{count} {name}' for name, count in result.counts.items() if count)}")
+    print(f"pixels   {counted(result.counts)}")
 
 
 def _scan(request: ScanRequest) -> None:
@@ -61,7 +62,7 @@ def _scan(request: ScanRequest) -> None:
     if result.las_path is not None:
         print(f"las      {result.las_path}")
     print(f"report   {result.report_path}")
-    print(f"shots    {', '.join(f'{count} {name}' for name, count in result.counts.items() if count)}")
+    print(f"shots    {counted(result.counts)}")
 
 
 def _cw(request: SimulateCwRequest) -> None:

@@ -4,6 +4,7 @@ from typing import Annotated, Any
 
 import typer
 
+from service.cli.printing import print_table
 from service.cli.request_commands import command
 from service.cli.server import ConfigOption, DataOption, settings_of
 from service.requests.keys import NewKey
@@ -49,9 +50,7 @@ def list_(
     rows = [("KEY", "PROJECT", "SCOPE", "CREATED (UTC)", "REVOKED", "NAME")]
     rows += [(row["id"], row["project"], row["scope"], day(row["created_at"]), "" if row["revoked_at"] is None else day(row["revoked_at"]),
               row["name"]) for row in keys.listing(_open(settings_of(config, data=data)), project)]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        print("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip())
+    print_table(rows)
 
 
 def revoke(

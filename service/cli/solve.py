@@ -2,6 +2,7 @@
 
 import typer
 
+from service.cli.printing import counted
 from service.cli.progress import ProgressBar
 from service.cli.request_commands import local_command
 from service.requests.basis import BasisRequest
@@ -23,7 +24,7 @@ def _solve(request: SolveRequest) -> None:
         result = solve(request, bar)
     print(f"maps     {result.maps_path}")
     print(f"report   {result.report_path}")
-    print(f"pixels   {', '.join(f'{count} {name}' for name, count in result.counts.items() if count)}")
+    print(f"pixels   {counted(result.counts)}")
     if result.suspects:
         worst = ", ".join(f"{suspect.image} by {100 * suspect.misfit:.0f} %" for suspect in result.suspects[:5])
         more = f" and {len(result.suspects) - 5} more" if len(result.suspects) > 5 else ""

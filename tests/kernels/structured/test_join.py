@@ -11,7 +11,7 @@ from kernels.structured.join import cropped, join_periods
 from kernels.structured.phase import decode_phase
 
 EIGHT_BIT = NoiseModel(0.003, 1.0e-4)
-"""Of full scale 1: an ordinary camera of eight bits whose pixels hold ten thousand electrons."""
+"""Noise of an ordinary camera of eight bits whose pixels hold ten thousand electrons, as parts of full scale."""
 
 
 def test_joined_periods_are_those_decoded_together(device):
