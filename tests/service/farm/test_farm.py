@@ -13,9 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.cli import farm
 from service.farm.template import Job, write_job
-from service.light import combine
 from service.requests.base import Role
 from service.requests.options import options_of
 from service.requests.relight import RelightRequest
@@ -141,10 +139,6 @@ def test_every_template_is_valid(relit, tmp_path, command):
     named = {word.partition("Param.")[2].partition("}}")[0] for word in (run["command"], *run["args"]) if "{{Param." in word}
     named |= {part.partition("}}")[0] for word in run["args"] for part in word.split("{{Param.")[2:]}
     assert named | {"ChunkFrames"} >= {each["name"] for each in template["parameterDefinitions"]}  # none is asked for and not used
-
-
-def test_a_chunk_is_as_many_frames_as_a_product_makes():
-    assert combine.CHUNK_FRAMES is farm.CHUNK_FRAMES
 
 
 @pytest.mark.parametrize(("words", "sentence"), [
