@@ -112,8 +112,8 @@ def test_the_posterior_is_that_of_the_twin(sigma_bins, photons, pulses, device):
                                                                             (2.0, 3, 80, 30, 250000)])
 def test_confidence_is_how_often_the_peak_is_right(background, low, high, clear, pixels, device):
     """Every other pixel has no return: those that are accepted and wrong are as many as confidence says. There are more than 30 of them,
-    whose number scatters by a sixth, and how bright returns are is not known beforehand: within a factor of two. Pixels are solved one by one,
-    and brighter ones than `clear`, which are never wrong, are left out."""
+    whose number scatters by a sixth, and how bright returns are is not known beforehand: within a factor of two. Pixels are solved one
+    by one, and brighter ones than `clear`, which are never wrong, are left out."""
     photons = log_uniform(low, high, pixels)
     photons[::2] = 0
     photons = photons[photons < clear]
