@@ -2,9 +2,11 @@
 
 from enum import IntEnum
 
+import numpy as np
+
 
 class Status(IntEnum):
-    """Why a pixel has, or has not, a result. Only the codes of SOLVED carry values; an unwritten pixel is never among them."""
+    """Why a pixel has, or has not, a result. Only the codes of ESTIMATED carry values; an unwritten pixel is never among them."""
 
     UNSOLVED = 0
     """Never reached by a solver (outside the mask)."""
@@ -36,10 +38,14 @@ class Status(IntEnum):
     """Depth: a mixture of two surfaces, taken out by a filter that was asked for."""
     MULTIPATH = 14
     """Depth: frequencies or codes disagree: light came over several ways."""
+    UNSURE = 15
+    """Estimated, but less surely than was asked for: the value and its standard deviation are kept, outside the mask of the result."""
 
 
 SOLVED = (Status.OK, Status.AMBIGUOUS, Status.NOT_CONVERGED)
-"""Codes of pixels that carry values."""
+"""Codes of pixels that count as solved: the mask of a result."""
+ESTIMATED = (*SOLVED, Status.UNSURE, Status.UNDECIDED, Status.MULTIPATH, Status.FLYING)
+"""Codes of pixels that may carry values. A solver that has no estimate at a pixel of the last three leaves it 0."""
 
 
 UNSOLVED = int(Status.UNSOLVED)
@@ -48,3 +54,22 @@ TOO_FEW_LIGHTS = int(Status.TOO_FEW_LIGHTS)
 DARK = int(Status.DARK)
 ILL_POSED = int(Status.ILL_POSED)
 NOT_FACING = int(Status.NOT_FACING)
+
+
+def refuse_unsure(status: np.ndarray, sigma: np.ndarray | None, confidence: np.ndarray | None, *, max_sigma: float | None,
+                  least_confidence: float) -> None:
+    """Set the status UNSURE, in place, where a solved pixel is less sure than was asked for.
+
+    Args:
+        status: codes of this module, of any shape.
+        sigma: standard deviation of each pixel's value; None: not known, and nothing is refused for it.
+        confidence: 0…1 of each pixel; None: not known, and nothing is refused for it.
+        max_sigma: largest standard deviation of a solved pixel, in the unit of `sigma`; None: any.
+        least_confidence: least confidence of a solved pixel.
+    """
+    unsure = np.zeros(status.shape, dtype=bool)
+    if sigma is not None and max_sigma is not None:
+        unsure |= ~(sigma.astype(np.float32) <= max_sigma)
+    if confidence is not None:
+        unsure |= ~(confidence.astype(np.float32) >= least_confidence)
+    status[unsure & np.isin(status, SOLVED)] = Status.UNSURE

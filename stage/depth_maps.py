@@ -40,6 +40,7 @@ class DepthMaps:
     sigma: np.ndarray | None = None  # [rows, cols] float32 metres: standard deviation of the depth
     confidence: np.ndarray | None = None  # [rows, cols] 0…1
     status: np.ndarray | None = None  # [rows, cols] uint8, codes of the report
+    estimated: np.ndarray | None = None  # [rows, cols] bool, where values are kept though they may not count as solved; None: the mask
     provenance: dict[str, str] = field(default_factory=dict)
 
     def layers(self) -> dict[str, np.ndarray]:
@@ -47,21 +48,26 @@ class DepthMaps:
         return {name: getattr(self, name) for name in LAYERS if getattr(self, name) is not None}
 
     def write(self, path: str | Path) -> None:
-        """Write depth.exr whole or not at all, with pixels outside the mask 0 in every layer but `status`.
+        """Write depth.exr whole or not at all, with pixels that are not estimated 0 in every layer but `status`.
 
         Raises:
             StorageError: the file cannot be written.
         """
+        estimated = self.mask if self.estimated is None else self.mask | self.estimated
         channels = {}
         for name, values in self.layers().items():
             channel, dtype = LAYERS[name]
-            kept = values if name == "status" else np.where(self.mask, values, 0)
+            kept = values if name == "status" else np.where(estimated, values, 0)
             channels[channel] = kept.astype(dtype)
         exr.write(path, channels, color_space="lin_rec709_scene", metadata=result_metadata(self.camera, self.provenance))
 
     @classmethod
-    def read(cls, path: str | Path) -> "DepthMaps":
+    def read(cls, path: str | Path, *, unsure: bool = False) -> "DepthMaps":
         """Read a depth.exr that Relit wrote.
+
+        Args:
+            path: the file.
+            unsure: keep the values of pixels that are estimated and do not count as solved; else they are 0.
 
         Raises:
             ResultError: the layer of the mask or of the depth is missing, or the metadata holds no camera.
@@ -74,5 +80,10 @@ class DepthMaps:
             if name not in found:
                 raise ResultError(f"{path}: has no layer {LAYERS[name][0]}")
         status = found.pop("status", None)
-        return cls(camera=camera, mask=found.pop("mask") > 0.5, provenance=provenance,
+        mask = found.pop("mask") > 0.5
+        estimated = mask | (found["depth"] != 0) if unsure else None
+        if not unsure:
+            for values in found.values():
+                values[~mask] = 0
+        return cls(camera=camera, mask=mask, estimated=estimated, provenance=provenance,
                    status=None if status is None else status.astype(np.uint8), **found)

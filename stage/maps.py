@@ -21,7 +21,9 @@ LAYERS: dict[str, tuple[tuple[str, ...], type[np.floating[Any]]]] = {
     "regime": (("Y",), np.float16),
     "specular_normal": (_XYZ, np.float32),
     "height": (("Z",), np.float32),
+    "sigma": (("Y",), np.float16),
     "confidence": (("Y",), np.float16),
+    "status": (("Y",), np.float16),
     "mask": (("Y",), np.float16),
 }
 """The channels and the stored type of each layer: geometry is stored as float, the rest as half."""
@@ -40,7 +42,10 @@ class SurfaceMaps:
     regime: np.ndarray | None = None  # [rows, cols] 1 Lambertian, 2 glossy, 3 mirror, 4 mixture of diffuse and specular
     specular_normal: np.ndarray | None = None  # [rows, cols, 3] float32, unit, of the highlight; 0 where none was found
     height: np.ndarray | None = None  # [rows, cols] float32, camera-frame z; metres, or pixels without a scale
+    sigma: np.ndarray | None = None  # [rows, cols] standard error of the normal, degrees
     confidence: np.ndarray | None = None  # [rows, cols] 0…1
+    status: np.ndarray | None = None  # [rows, cols] uint8, codes of the report
+    estimated: np.ndarray | None = None  # [rows, cols] bool, where values are kept though they may not count as solved; None: the mask
     color_space: str = "lin_rec709_scene"
     provenance: dict[str, str] = field(default_factory=dict)
 
@@ -49,22 +54,28 @@ class SurfaceMaps:
         return {name: getattr(self, name) for name in LAYERS if getattr(self, name) is not None}
 
     def write(self, path: str | Path) -> None:
-        """Write maps.exr whole or not at all, with pixels outside the mask 0 in every layer.
+        """Write maps.exr whole or not at all, with pixels that are not estimated 0 in every layer but `status`.
 
         Raises:
             StorageError: the file cannot be written.
         """
+        kept = self.mask if self.estimated is None else self.mask | self.estimated
         channels: dict[str, np.ndarray] = {}
         for name, values in self.layers().items():
             suffixes, dtype = LAYERS[name]
-            masked = np.where(self.mask if values.ndim == 2 else self.mask[..., None], values, 0).astype(dtype)
+            known = values if name == "status" else np.where(kept if values.ndim == 2 else kept[..., None], values, 0)
+            masked = known.astype(dtype)
             for c, suffix in enumerate(suffixes):
                 channels[f"{name}.{suffix}"] = masked if masked.ndim == 2 else masked[..., c]
         exr.write(path, channels, color_space=self.color_space, metadata=result_metadata(self.camera, self.provenance))
 
     @classmethod
-    def read(cls, path: str | Path) -> "SurfaceMaps":
+    def read(cls, path: str | Path, *, unsure: bool = False) -> "SurfaceMaps":
         """Read a maps.exr that Relit wrote.
+
+        Args:
+            path: the file.
+            unsure: keep the values of pixels that are estimated and do not count as solved; else they are 0.
 
         Raises:
             ResultError: a layer is incomplete or not finite, or the metadata holds no camera.
@@ -89,6 +100,15 @@ class SurfaceMaps:
         mask = found.pop("mask") > 0.5
         if mask.shape != (camera.height, camera.width):
             raise ResultError(f"{path}: is {mask.shape[1]}x{mask.shape[0]}, its camera {camera.width}x{camera.height}")
-        return cls(camera=camera, mask=mask, color_space=exr.color_space_of(metadata), provenance=provenance, **found)
+        estimated = None
+        if unsure:
+            estimated = mask | (found["normal"].any(axis=-1) if "normal" in found else False)
+        else:
+            for name, values in found.items():
+                if name != "status":
+                    values[~mask] = 0
+        if "status" in found:
+            found["status"] = found["status"].astype(np.uint8)
+        return cls(camera=camera, mask=mask, estimated=estimated, color_space=exr.color_space_of(metadata), provenance=provenance, **found)
 
 

@@ -49,6 +49,8 @@ Rgb = tuple[NotNegative, NotNegative, NotNegative]
 LitRgb = Annotated[Rgb, AfterValidator(_lit)]
 """The colour of a light: red, green and blue, none of them negative and not all of them zero."""
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Fraction = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+"""A number from 0 to 1."""
 Count = Annotated[int, Field(ge=1)]
 Resolution = tuple[Count, Count]
 """The width and height of an image in pixels."""

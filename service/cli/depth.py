@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli.printing import counted
+from service.cli.printing import counted, print_warnings
 from service.cli.progress import ProgressBar
 from service.cli.request_commands import Given, local_command
 from service.errors import RequestError
@@ -39,6 +39,7 @@ def _depth(request: DepthRequest) -> None:
     print(f"report   {result.report_path}")
     print(f"method   {result.method}, {result.points} points")
     print(f"pixels   {counted(result.counts)}")
+    print_warnings(result.warnings)
 
 
 def _separate(request: SeparateRequest) -> None:

@@ -8,6 +8,12 @@ def counted(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{count} {name}" for name, count in counts.items() if count)
 
 
+def print_warnings(warnings: Sequence[str]) -> None:
+    """Print a line for each thing that does not fit."""
+    for sentence in warnings:
+        print(f"warning  {sentence}")
+
+
 def print_table(rows: Sequence[Sequence[str]]) -> None:
     """Print rows of equally many cells, in columns as wide as their widest cell."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]

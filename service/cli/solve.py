@@ -2,7 +2,7 @@
 
 import typer
 
-from service.cli.printing import counted
+from service.cli.printing import counted, print_warnings
 from service.cli.progress import ProgressBar
 from service.cli.request_commands import local_command
 from service.requests.basis import BasisRequest
@@ -25,6 +25,7 @@ def _solve(request: SolveRequest) -> None:
     print(f"maps     {result.maps_path}")
     print(f"report   {result.report_path}")
     print(f"pixels   {counted(result.counts)}")
+    print_warnings(result.warnings)
     if result.suspects:
         worst = ", ".join(f"{suspect.image} by {100 * suspect.misfit:.0f} %" for suspect in result.suspects[:5])
         more = f" and {len(result.suspects) - 5} more" if len(result.suspects) > 5 else ""

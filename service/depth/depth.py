@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kernels import device as devices
-from kernels.status import Status
+from kernels.status import Status, refuse_unsure
 from service.depth.laser import solve_laser
 from service.depth.patterns import solve_patterns
 from service.depth.points import point_cloud
@@ -70,6 +70,8 @@ class DepthResult(NamedTuple):
     points: int
     counts: dict[str, int]
     """Number of pixels of the mask with each status."""
+    warnings: tuple[str, ...]
+    """A sentence for each thing that does not fit on the whole scene."""
 
 
 def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResult:
@@ -92,6 +94,8 @@ def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResul
         raise RequestError("--normals: needs a perspective camera, that of the capture is orthographic")
     mask = capture.mask()
     solution = KINDS[using].solve(capture, mask, request, device, timings)
+    least = solution.least_confidence if request.least_confidence is None else request.least_confidence
+    refuse_unsure(solution.status, solution.sigma, solution.confidence_map(), max_sigma=request.max_sigma, least_confidence=least)
     _check_plausible(solution, capture, using)
     timings.stage("points", 1)
     cloud = point_cloud(solution, capture.camera, color_space=capture.manifest.color_space, normals=request.normals)
@@ -100,9 +104,10 @@ def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResul
     calibration = request.tof.calibration
     sources = metadata(request, capture=capture.name, inputs=content, method=solution.method,
                        contents={} if calibration is None else {"tof_calibration": digest(calibration)})
-    maps = DepthMaps(camera=capture.camera, mask=solution.solved, depth=solution.depth, range=solution.range_m,
-                     projector_u=solution.projector_u, projector_v=solution.projector_v, amplitude=solution.amplitude,
-                     sigma=solution.sigma, confidence=solution.confidence_map(), status=solution.status, provenance=sources)
+    maps = DepthMaps(
+        camera=capture.camera, mask=solution.solved, estimated=solution.estimated, depth=solution.depth, range=solution.range_m,
+        projector_u=solution.projector_u, projector_v=solution.projector_v, amplitude=solution.amplitude, sigma=solution.sigma,
+        confidence=solution.confidence_map(), status=solution.status, provenance=sources)
     depth_path, points_path, report_path = (request.out / name for name in (DEPTH_FILE, POINTS_FILE, REPORT_FILE))
     maps.write(depth_path)
     write_ply(cloud, points_path, comments=tuple(f"{key} {value}" for key, value in sources.items()))
@@ -113,6 +118,7 @@ def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResul
                 "resolution": list(capture.camera.resolution), "color_space": capture.manifest.color_space},
         method=solution.method,
         found=solution.facts,
+        warnings=solution.warnings,
         device=devices.describe(device),
         timings_s=timings.close(),
         pixels={"mask": int(mask.sum()), **counts},
@@ -120,7 +126,8 @@ def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResul
         depth_m=statistics(solution.depth[solution.solved]),
         sigma_m=statistics(solution.sigma[solution.solved]) if solution.sigma is not None else {},
     ))
-    return DepthResult(maps, depth_path, points_path, report_path, solution.method, len(cloud.points), counts)
+    return DepthResult(maps, depth_path, points_path, report_path, solution.method, len(cloud.points), counts,
+                       tuple(solution.warnings))
 
 
 def _ranging(capture: Capture, wanted: Ranging | None) -> Ranging:

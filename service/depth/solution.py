@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from kernels.status import SOLVED, Status
+from kernels.status import ESTIMATED, SOLVED, Status
 
 HALF_SURE = 1e-3
 """Standard deviation of the depth over the depth, at which confidence is one half."""
@@ -13,7 +13,7 @@ HALF_SURE = 1e-3
 
 @dataclass
 class DepthSolution:
-    """Depth at every pixel of the image; only pixels with a status of kernels.status.SOLVED have values."""
+    """Depth at every pixel of the image; only pixels with a status of kernels.status.ESTIMATED have values."""
 
     method: str
     """What was decoded, in words for the report."""
@@ -28,6 +28,10 @@ class DepthSolution:
     colour: np.ndarray | None = None  # [rows, cols, 3] float32 linear, of the scene under even light; None: the amplitude's grey
     points: np.ndarray | None = None  # [n, 3] float32: measured places between pixel centres, in place of a point a pixel
     pixels: np.ndarray | None = None  # [n, 2] int: row and column of each of these, for its colour
+    least_confidence: float = 0.0
+    """Least confidence of a depth that counts as solved, where the request names none."""
+    warnings: list[str] = field(default_factory=list)
+    """A sentence for each thing that does not fit on the whole scene: what it is, and what to try."""
     facts: dict[str, Any] = field(default_factory=dict)
     """What was found out on the way, for the report."""
 
@@ -36,12 +40,17 @@ class DepthSolution:
         """Return where there is a depth, [rows, cols] bool."""
         return np.isin(self.status, SOLVED)
 
+    @property
+    def estimated(self) -> np.ndarray:
+        """Return where there is a value, however unsure, [rows, cols] bool."""
+        return np.isin(self.status, ESTIMATED) & (self.depth != 0)
+
     def confidence_map(self) -> np.ndarray | None:
         """Return confidence 0…1, [rows, cols]: the method's own, or 1 / (1 + σ / (depth / 1000)) from the standard deviation."""
         if self.confidence is not None or self.sigma is None:
             return self.confidence
         relative = self.sigma / np.maximum(self.depth * HALF_SURE, 1e-12)
-        return np.where(self.solved, 1 / (1 + relative), 0).astype(np.float32)
+        return np.where(self.estimated, 1 / (1 + relative), 0).astype(np.float32)
 
     def counts(self, mask: np.ndarray) -> dict[str, int]:
         """Return how many pixels of the mask have each status, by name."""

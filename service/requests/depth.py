@@ -6,7 +6,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator
 
 from service.requests.base import CAPTURE, Choice, Commas, Options, Request, Role, Spelling
-from stage.model import Finite, NotNegative, Positive
+from stage.model import Finite, Fraction, NotNegative, Positive
 
 
 def _without_blanks(given: Any) -> Any:
@@ -77,6 +77,12 @@ class DepthOptions(Options):
     """Photon noise: 1 / (electrons at full scale); patterns only."""
     tof: TofChoices = TofChoices()
     """How time of flight is solved; `near_m` and `far_m` are ranges along the ray there."""
+    max_sigma: Positive | None = None
+    """Largest standard deviation, in metres, of a depth that counts as solved; less certain ones are kept outside the mask, with the
+    status unsure. None: any."""
+    least_confidence: Fraction | None = None
+    """Least confidence, 0 to 1, of a depth that counts as solved; less certain ones are kept outside the mask, with the status unsure.
+    None: that of the method."""
     normals: bool = False
     """Write normals (nx, ny, nz) into points.ply too."""
 

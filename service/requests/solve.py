@@ -6,10 +6,15 @@ from typing import Annotated
 from pydantic import Field
 
 from service.requests.base import CAPTURE, Choice, Request, Role, Spelling, StackOptions
+from stage.model import Fraction, Positive
 
 SVBRDF_LIGHTS = 12
 """From this many lights on svbrdf is the default: it fits six lobes and a direction to each pixel, and was better than robust on
 every object tried with eight to 96 lights (docs/figures.md)."""
+
+MAX_SIGMA = 30.0
+"""Largest standard error, in degrees, of a normal that counts as solved, unless the request says otherwise: a normal this far off says
+little more than that the surface faces the camera."""
 
 
 class Method(Choice):
@@ -28,6 +33,12 @@ class SolveOptions(StackOptions):
     method: Method | None = Field(default=None, description=(
         "How normals are solved; None: gradient where there are gradient frames; else svbrdf where there are extended lights, or "
         f"{SVBRDF_LIGHTS} lights or more; else robust."))
+    max_sigma: Positive | None = Field(default=None, description=(
+        "Largest standard error, in degrees, of a normal that counts as solved; less certain ones are kept outside the mask, with the "
+        f"status unsure. None: {MAX_SIGMA:g}; 180 refuses none."))
+    least_confidence: Fraction | None = None
+    """Least confidence, 0 to 1, of a normal that counts as solved; less certain ones are kept outside the mask, with the status unsure.
+    None: any."""
 
 
 class SolveRequest(SolveOptions, Request):

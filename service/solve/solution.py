@@ -9,7 +9,7 @@ import numpy as np
 from kernels.photometric.lambert import NormalFit
 from kernels.photometric.readings import Lights, channel_weights
 from kernels.photometric.samples import evenly
-from kernels.status import Status
+from kernels.status import Status, refuse_unsure
 from kernels.surface.integrate import Integration
 from service.reporting.progress import Timings
 from stage.camera import Camera
@@ -18,6 +18,8 @@ from stage.stack import Stack
 
 LOOSE_CONFIDENCE = 1.0 / (1.0 + 5.0)
 """Confidence of a normal whose standard error is five degrees."""
+LARGEST_ERROR = 90.0
+"""Degrees: a normal that is not known at all is this far off at most, on average."""
 PIXELS_AT_ONCE = 1 << 16
 """Number of pixels whose saturation bits are counted in one piece: it bounds the memory."""
 
@@ -58,7 +60,7 @@ class SuspectLight(NamedTuple):
 
 @dataclass
 class Solution:
-    """What a solver found at every pixel of the image; only pixels with a status of kernels.status.SOLVED have values."""
+    """What a solver found at every pixel of the image; only pixels with a status of kernels.status.ESTIMATED have values."""
 
     normal: np.ndarray  # [3, pixels] float32
     albedo: np.ndarray  # [3, pixels] float16
@@ -73,10 +75,22 @@ class Solution:
     integration: Integration | None = None
     """The last integration of the normals, from which the height came."""
     suspects: list[SuspectLight] = field(default_factory=list)
+    sigma: np.ndarray | None = None  # [pixels] float16, standard error of the normal in degrees; None: that of the confidence
+    warnings: list[str] = field(default_factory=list)
+    """A sentence for each thing that does not fit on the whole object: what it is, and what to try."""
     facts: dict[str, Any] = field(default_factory=dict)
     """What the report says under `found`."""
     contents: dict[str, str] = field(default_factory=dict)
     """Content hash of each capture that was read beside the images, by the name of its option."""
+
+    def standard_error(self) -> np.ndarray:
+        """Return the standard error of the normals in degrees, [pixels] float32.
+
+        Without one of its own a solver's confidence is 1 / (1 + standard error / 1°).
+        """
+        if self.sigma is not None:
+            return self.sigma.astype(np.float32)
+        return np.minimum(1 / np.maximum(self.confidence.astype(np.float32), 1e-6) - 1, LARGEST_ERROR)
 
     @classmethod
     def empty(cls, pixels: int) -> "Solution":
@@ -108,11 +122,17 @@ def mark_not_facing(camera: Camera, solution: Solution) -> None:
     solution.status[(solution.status == Status.OK) & (toward <= 0)] = Status.NOT_FACING
 
 
-def refine_status(solution: Solution, stack: Stack) -> None:
+def refine_status(solution: Solution, stack: Stack, *, max_sigma: float, least_confidence: float) -> None:
     """Say why pixels have too few lights, and which normals are uncertain, by the status of these pixels.
 
-    Pixels with too few lights become SATURATED where one reading or more saturates, else SHADOWED; solved pixels with a
-    confidence under 1/6 become AMBIGUOUS and keep their values.
+    Pixels with too few lights become SATURATED where one reading or more saturates, else SHADOWED. Solved pixels with a confidence
+    under 1/6 become AMBIGUOUS, and those that are less sure than was asked for UNSURE; both keep their values.
+
+    Args:
+        solution: of the whole image; its status is changed.
+        stack: the images.
+        max_sigma: largest standard error of a solved normal, degrees.
+        least_confidence: least confidence of a solved normal.
     """
     few = np.flatnonzero(solution.status == Status.TOO_FEW_LIGHTS)
     for first in range(0, len(few), PIXELS_AT_ONCE):
@@ -122,6 +142,7 @@ def refine_status(solution: Solution, stack: Stack) -> None:
         solution.status[part] = np.where(saturated >= 1, int(Status.SATURATED), int(Status.SHADOWED))
     loose = (solution.status == Status.OK) & (solution.confidence.astype(np.float32) < LOOSE_CONFIDENCE)
     solution.status[loose] = Status.AMBIGUOUS
+    refuse_unsure(solution.status, solution.standard_error(), solution.confidence, max_sigma=max_sigma, least_confidence=least_confidence)
 
 
 def suspect_lights(solution: Solution, stack: Stack, lights: Lights) -> list[SuspectLight]:

@@ -10,12 +10,12 @@ import numpy as np
 from kernels import device as devices
 from kernels.photometric.lambert import solve_lambert
 from kernels.photometric.robust import solve_robust
-from kernels.status import SOLVED, Status
+from kernels.status import ESTIMATED, SOLVED, Status
 from kernels.surface.integrate import Integration
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, metadata, report
-from service.requests.solve import SVBRDF_LIGHTS, Method, SolveRequest
+from service.requests.solve import MAX_SIGMA, SVBRDF_LIGHTS, Method, SolveRequest
 from service.solve.distant import solve_diffuse, solve_distant, solve_material
 from service.solve.extended import solve_extended
 from service.solve.gradient import solve_gradients
@@ -86,6 +86,8 @@ class SolveResult(NamedTuple):
     """Pixels of the mask by the name of their status."""
     suspects: tuple[SuspectLight, ...]
     """Distant lights that disagree with the others."""
+    warnings: tuple[str, ...]
+    """A sentence for each thing that does not fit on the whole object."""
 
 
 def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResult:
@@ -119,14 +121,15 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
     given = SolveInput(stack, capture.camera, mask, device, timings, request.cache)
     solution = solver(given, lights)
     mark_not_facing(capture.camera, solution)
-    refine_status(solution, stack)
+    refine_status(solution, stack, max_sigma=MAX_SIGMA if request.max_sigma is None else request.max_sigma,
+                  least_confidence=request.least_confidence or 0.0)
     status = solution.status.reshape(mask.shape)
-    solved = np.isin(status, SOLVED)
+    solved, estimated = np.isin(status, SOLVED), np.isin(status, ESTIMATED)
     if solution.integration is None:  # near lights have found the height with the normals
-        solution.integration = integrate(given, solution.normal, solved)
+        solution.integration = integrate(given, solution.normal, estimated)
         solution.height = None if solution.integration is None else solution.integration.height.numpy()
     sources = metadata(request, method=method, capture=capture.name, inputs=stack.key, contents=solution.contents)
-    maps = _maps(solution, solved, method, capture, sources)
+    maps = _maps(solution, solved, estimated, method, capture, sources)
     timings.stage("write", 1)
     maps_path, report_path = request.out / MAPS_FILE, request.out / REPORT_FILE
     maps.write(maps_path)
@@ -137,6 +140,7 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
                 "resolution": list(capture.camera.resolution), "color_space": capture.manifest.color_space},
         method=str(method),
         found=solution.facts,
+        warnings=solution.warnings,
         suspect_lights=[suspect._asdict() for suspect in solution.suspects],
         device=devices.describe(device),
         timings_s=timings.close(),
@@ -146,10 +150,11 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
         height=_height_report(solution.integration, capture),
         **({} if stack.motion is None else {"motion": stack.motion}),
     ))
-    return SolveResult(maps, maps_path, report_path, counts, tuple(solution.suspects))
+    return SolveResult(maps, maps_path, report_path, counts, tuple(solution.suspects), tuple(solution.warnings))
 
 
-def _maps(solution: Solution, solved: np.ndarray, method: Method, capture: Capture, provenance: dict[str, str]) -> SurfaceMaps:
+def _maps(solution: Solution, solved: np.ndarray, estimated: np.ndarray, method: Method, capture: Capture,
+          provenance: dict[str, str]) -> SurfaceMaps:
     """Return a solution as images; what the method does not estimate is absent."""
     def image(values: np.ndarray | None) -> np.ndarray | None:
         if values is None:
@@ -159,6 +164,7 @@ def _maps(solution: Solution, solved: np.ndarray, method: Method, capture: Captu
     return SurfaceMaps(
         camera=capture.camera,
         mask=solved,
+        estimated=estimated,
         normal=image(solution.normal),
         diffuse_albedo=None if method is Method.REFERENCE else image(solution.albedo),
         specular=image(solution.specular),
@@ -166,7 +172,9 @@ def _maps(solution: Solution, solved: np.ndarray, method: Method, capture: Captu
         regime=image(solution.regime),
         specular_normal=image(solution.specular_normal),
         height=solution.height,
+        sigma=image(solution.standard_error()),
         confidence=image(solution.confidence),
+        status=image(solution.status),
         color_space=linear_space(capture.manifest.color_space),
         provenance=provenance,
     )

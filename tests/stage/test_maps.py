@@ -20,7 +20,8 @@ CAMERA = Camera(projection="perspective", resolution=(COLS, ROWS), focal_px=(9.0
 def make_maps(**changes) -> SurfaceMaps:
     three, one = (lambda: RNG.random((ROWS, COLS, 3)).astype(np.float32)), (lambda: RNG.random((ROWS, COLS)).astype(np.float32))
     layers = {"normal": three(), "diffuse_albedo": three(), "specular": three(), "roughness": one(), "height": one() - 1,
-              "confidence": one(), "specular_normal": three(), "regime": one()}
+              "confidence": one(), "specular_normal": three(), "regime": one(), "sigma": one(),
+              "status": MASK.astype(np.uint8)}
     return SurfaceMaps(**{"camera": CAMERA, "mask": MASK, "provenance": {"relit:capture": "owl"}, **layers, **changes})
 
 
@@ -43,7 +44,7 @@ def test_the_channels_are_those_of_the_contract(tmp_path):
         types = {name: channel.pixels.dtype.name for name, channel in file.channels().items()}
         header = dict(file.header())
     half = [f"{layer}.{c}" for layer in ("diffuse_albedo", "specular") for c in "RGB"]
-    half += [f"{layer}.Y" for layer in ("roughness", "regime", "confidence", "mask")]
+    half += [f"{layer}.Y" for layer in ("roughness", "regime", "sigma", "confidence", "status", "mask")]
     floats = [f"{layer}.{c}" for layer in ("normal", "specular_normal") for c in "XYZ"] + ["height.Z"]
     assert types == {**dict.fromkeys(half, "float16"), **dict.fromkeys(floats, "float32")}
     assert header["colorInteropID"] == "lin_rec709_scene" and "chromaticities" in header and "relit:camera" in header
@@ -65,6 +66,18 @@ def test_a_layer_that_was_not_estimated_is_absent_not_zero(tmp_path, absent):
     channels, _ = exr.read(tmp_path / "maps.exr")
     assert {name.split(".")[0] for name in channels} == set(LAYERS) - {absent}
     assert getattr(SurfaceMaps.read(tmp_path / "maps.exr"), absent) is None
+
+
+def test_what_is_unsure_is_kept_outside_the_mask(tmp_path):
+    unsure = ~MASK & (RNG.random((ROWS, COLS)) > 0.5)
+    status = np.where(MASK, 1, np.where(unsure, 15, 6)).astype(np.uint8)
+    maps = make_maps(estimated=MASK | unsure, status=status)
+    maps.write(tmp_path / "maps.exr")
+    back = SurfaceMaps.read(tmp_path / "maps.exr", unsure=True)
+    assert np.array_equal(back.mask, MASK) and np.array_equal(back.status, status) and np.array_equal(back.estimated, MASK | unsure)
+    assert np.array_equal(back.normal[unsure], maps.normal[unsure]) and not back.normal[~MASK & ~unsure].any()
+    plain = SurfaceMaps.read(tmp_path / "maps.exr")
+    assert not plain.normal[~MASK].any() and not plain.sigma[~MASK].any() and np.array_equal(plain.status, status)
 
 
 def write(path, channels, **metadata):

@@ -8,11 +8,12 @@ import pytest
 from kernels.status import Status
 from service.requests.solve import Method, SolveRequest
 from service.solve.solve import solve
+from stage.maps import SurfaceMaps
 from tests.scenes import captures
 
 
-def solved(folder, out, method=Method.ROBUST):
-    result = solve(SolveRequest(capture=folder, out=out, method=method, device="cpu"))
+def solved(folder, out, method=Method.ROBUST, **options):
+    result = solve(SolveRequest(capture=folder, out=out, method=method, device="cpu", **options))
     return result, json.loads((out / "report.json").read_text())
 
 
@@ -68,7 +69,7 @@ def test_saturation_and_shadow_are_told_apart(tmp_path, scene):
 
 
 def test_loose_normals_are_counted_and_kept(tmp_path, scene):
-    """Noise as strong as the light: the normals are given, as ambiguous."""
+    """Noise as strong as the light: the normals are given, as ambiguous, and as unsure where σ is above what was asked for."""
     folder = captures.write_capture(tmp_path / "capture", scene)
     rng = np.random.default_rng(1)
     from stage import images
@@ -76,6 +77,16 @@ def test_loose_normals_are_counted_and_kept(tmp_path, scene):
     for frame in json.loads((folder / "capture.json").read_text())["frames"]:
         pixels = images.read_pixels(folder / frame["image"]).astype(np.float32)
         captures.write_exr(folder / frame["image"], pixels * rng.uniform(0.05, 3, pixels.shape[:2] + (1,)).astype(np.float32))
-    result, report = solved(folder, tmp_path / "out")
-    assert report["pixels"]["ambiguous"] > 0.3 * report["pixels"]["mask"]
-    assert result.maps.mask.sum() == report["pixels"]["ok"] + report["pixels"]["ambiguous"]
+    every, report = solved(folder, tmp_path / "all", max_sigma=180)
+    assert report["pixels"]["ambiguous"] > 0.3 * report["pixels"]["mask"] and report["pixels"]["unsure"] == 0
+    assert every.maps.mask.sum() == report["pixels"]["ok"] + report["pixels"]["ambiguous"]
+
+    limit = float(np.median(every.maps.sigma[every.maps.mask]))
+    some, report = solved(folder, tmp_path / "some", max_sigma=limit)
+    written = SurfaceMaps.read(tmp_path / "some" / "maps.exr", unsure=True)
+    unsure = written.status == Status.UNSURE
+    assert 0 < unsure.sum() == report["pixels"]["unsure"] < report["pixels"]["mask"]
+    half = 1 + 2**-11  # the rounding of sigma in the file
+    assert (written.sigma[unsure] > limit / half).all() and (written.sigma[written.mask] < limit * half).all()
+    assert not written.mask[unsure].any() and np.array_equal(written.normal[unsure], every.maps.normal[unsure])
+    assert np.array_equal(some.maps.mask, written.mask)

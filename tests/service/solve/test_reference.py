@@ -90,7 +90,7 @@ def test_normals_of_a_material_without_a_model(relit, captures):
 def test_what_is_not_estimated_is_absent(relit, captures):
     solve(relit, captures, "--method", "reference", "--reference-ball", captures / "ball")
     channels, _ = exr.read(captures / "out" / "maps.exr")
-    assert {name.partition(".")[0] for name in channels} == {"normal", "height", "confidence", "mask"}
+    assert {name.partition(".")[0] for name in channels} == {"normal", "height", "sigma", "confidence", "status", "mask"}
     report = json.loads((captures / "out" / "report.json").read_text())
     assert report["found"]["reference"]["radius_px"] == pytest.approx(70 / 1.06, abs=0.5)
     assert report["options"]["reference_ball"] == str(captures / "ball")

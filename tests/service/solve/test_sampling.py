@@ -45,7 +45,7 @@ def test_half_painted_half_metallic(relit, tmp_path, half_painted):
     assert np.median(roughness[~PAINTED]) == pytest.approx(ALPHA**0.5, abs=0.03)
     channels, _ = exr.read(tmp_path / "out" / "maps.exr")
     layers = {name.partition(".")[0] for name in channels}
-    assert layers == {"normal", "diffuse_albedo", "specular", "roughness", "regime", "height", "confidence", "mask"}
+    assert layers == {"normal", "diffuse_albedo", "specular", "roughness", "regime", "height", "sigma", "confidence", "status", "mask"}
     assert all(np.isfinite(plane).all() for plane in channels.values())
     found = report["found"]
     assert sum(found["regimes"].values()) == BALL.mask.sum() and found["views"] == 1 and found["light_samples"] > 1000
