@@ -65,7 +65,8 @@ def test_polarised_frames_give_both_normals(relit, tmp_path, diffuse, highlight)
     assert np.allclose(maps.diffuse_albedo[inside], SCENE.albedo[inside], rtol=2e-3)
     channels, _ = exr.read(tmp_path / "out" / "maps.exr")
     layers = {name.partition(".")[0] for name in channels}
-    assert layers == {"normal", "specular_normal", "diffuse_albedo", "specular", "roughness", "height", "sigma", "confidence", "status", "mask"}
+    assert layers == {"normal", "specular_normal", "diffuse_albedo", "specular", "roughness", "height", "sigma", "confidence", "status",
+                      "mask"}
     assert np.allclose(maps.specular[inside], 0.04, atol=0.002) and np.allclose(maps.roughness[inside], ROUGHNESS, atol=0.03)
     assert all(np.isfinite(plane).all() for plane in channels.values())
     assert report["method"] == "gradient" and report["found"]["separation"] == "polarisation"
