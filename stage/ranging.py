@@ -28,7 +28,15 @@ Laser = Annotated[LaserRay | LaserPlane, Field(discriminator="type")]
 """A laser ray or plane; the key `type` tells which."""
 
 
-class ContinuousWave(Strict):
+class Emitter(Strict):
+    """What every kind of time-of-flight frame says of the light: where it comes from."""
+
+    source_m: Vector | None = None
+    """The place of the light source in the camera frame, metres; None: at the camera. Light then goes |p - source| + |p| to a point p and
+    back."""
+
+
+class ContinuousWave(Emitter):
     """The source of one correlation image of a continuous-wave camera: I(δ) = P + Q·cos(φ - δ) at modulation frequency f."""
 
     type: Literal["cw"]
@@ -36,7 +44,7 @@ class ContinuousWave(Strict):
     reference_phase_rad: Annotated[float, Field(ge=-4 * math.pi, le=4 * math.pi)]
 
 
-class Pulsed(Strict):
+class Pulsed(Emitter):
     """The source of photon histograms, an array of (rows, cols, bins)."""
 
     type: Literal["pulsed"]

@@ -15,7 +15,8 @@ from service.requests.calibrate import TofCalibrationRequest
 from service.requests.depth import TofOptions
 from stage.capture import Capture
 from stage.tof.calibration import Harmonics, TofCalibration, fit_harmonics, fit_line, fit_temperature, write_calibration
-from stage.tof.frames import is_pulsed, read_correlations
+from stage.tof.frames import is_pulsed, read_correlations, read_source
+from stage.tof.source import SourcePath
 from stage.tof.sweep import Sweep, SweepDistance, read_sweep
 
 STEP_PIXELS = 400
@@ -73,24 +74,30 @@ def calibrate_tof(request: TofCalibrationRequest, progress: Progress | None = No
 
 
 def _range_errors(plan: Sweep, captures: list[Capture], calibration: TofCalibration | None, device: str, timings: Timings) -> np.ndarray:
-    """Return [steps] the median of measured less true range, metres."""
+    """Return [steps] the median of measured less true half path of light, metres."""
     errors = []
     for step, capture in zip(plan.steps, captures, strict=True):
         solved = solve_tof(capture, TofOptions(), calibration=calibration, device=device, timings=timings)
         if not solved.solved.any() or solved.range_m is None:
             raise RequestError(f"{capture.folder}: no pixel of this step is solved: check its frames and its mask")
-        errors.append(float(np.median((solved.range_m - _true_range(step, capture))[solved.solved])))
+        off = _half_path(solved.range_m.astype(np.float64), capture) - _true_half_path(step, capture)
+        errors.append(float(np.median(off[solved.solved])))
     return np.array(errors)
 
 
-def _true_range(step: SweepDistance, capture: Capture) -> np.ndarray:
-    """Return [rows, cols] the range along each ray to the plane of the target."""
-    return step.depth_m / z_per_range(capture.camera)
+def _true_half_path(step: SweepDistance, capture: Capture) -> np.ndarray:
+    """Return [rows, cols] half the path of light by way of the target; with the source at the camera, the range along each ray."""
+    return _half_path(step.depth_m / z_per_range(capture.camera), capture)
+
+
+def _half_path(range_m: np.ndarray, capture: Capture) -> np.ndarray:
+    path = SourcePath.of(capture.camera, read_source(capture))
+    return range_m if path is None else path.half_path_m(range_m)
 
 
 def _scale_and_offset(plan: Sweep, captures: list[Capture], errors: np.ndarray) -> dict[str, Any]:
-    """Return scale and offset, fitted to the median ranges of the steps."""
-    true = np.array([float(np.median(_true_range(step, capture)[capture.mask()]))
+    """Return scale and offset, fitted to the median half paths of the steps."""
+    true = np.array([float(np.median(_true_half_path(step, capture)[capture.mask()]))
                      for step, capture in zip(plan.steps, captures, strict=True)])
     scale, offset = fit_line(true + errors, true)
     return {"scale": scale, "offset_m": offset}
@@ -111,7 +118,7 @@ def _harmonics(plan: Sweep, captures: list[Capture], device: str, timings: Timin
                                scale=frames.scale)
         found = decode(frames.images, frames.modulation_hz, frames.reference_phase_rad, noise=noise,
                        saturation=capture.manifest.saturation, scale=frames.scale, device=device)
-        true = _true_range(step, capture).reshape(-1)[some]
+        true = _true_half_path(step, capture).reshape(-1)[some]
         phase, sigma = found.phase.numpy()[:, some], found.sigma.numpy()[:, some]
         for row, hz in enumerate(found.modulation_hz.tolist()):
             good = (sigma[row] > 0) & (sigma[row] < SHARPEST_RAD)

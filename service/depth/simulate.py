@@ -18,6 +18,7 @@ from stage.tof.simulate import (
     write_correlations,
     write_histograms,
 )
+from stage.tof.source import SourcePath
 
 
 def simulate_tof(request: SimulateCwRequest | SimulatePulsedRequest) -> Path:
@@ -41,26 +42,33 @@ def simulate_tof(request: SimulateCwRequest | SimulatePulsedRequest) -> Path:
         sensor = CorrelationCamera(modulation_hz=request.modulation_hz, phases=request.phases, signal_electrons=request.signal_electrons,
                                    ambient_electrons=request.ambient_electrons, read_noise_electrons=request.read_noise_electrons,
                                    full_well=request.full_well)
-        return write_correlations(request.out, name, correlation_images(scene, sensor, random), camera, sensor)
+        return write_correlations(request.out, name, correlation_images(scene, sensor, random), camera, sensor, request.source_m)
     counter = HistogramCamera(bins=request.bins, bin_s=request.bin_s, pulse_sigma_s=request.pulse_sigma_s,
                               signal_photons=request.signal_photons, background=request.background, pulses=request.pulses)
-    return write_histograms(request.out, name, histograms(scene, counter, random), camera, counter)
+    return write_histograms(request.out, name, histograms(scene, counter, random), camera, counter, request.source_m)
 
 
 def _scene(maps: DepthMaps, request: SimulateRequest) -> TofScene:
     """Return ranges, and cosines from the normals of the depth; pixels without a depth are black, unknown normals face the camera."""
     range_m = np.where(maps.mask, maps.depth / z_per_range(maps.camera), 1.0)
-    rays = _rays(maps.camera)
+    origins, rays = _lines_of_sight(maps.camera)
     normal = depth_normals(maps.depth, maps.mask, maps.camera).astype(np.float64)
     known = np.linalg.norm(normal, axis=-1) > 0.5
-    cosine = np.where(known, np.clip(-(normal * rays).sum(axis=-1), 0, 1), 1.0)
-    return TofScene(range_m=range_m, albedo=np.where(maps.mask, request.albedo, 0.0), cosine=cosine)
+    path = SourcePath.of(maps.camera, request.source_m)
+    if path is None or request.source_m is None:
+        to_source, source_range = -rays, None
+    else:
+        source_range = path.source_range_m(range_m)
+        to_source = (np.array(request.source_m) - origins - rays * range_m[..., None]) / source_range[..., None]
+    cosine = np.where(known, np.clip((normal * to_source).sum(axis=-1), 0, 1), 1.0)
+    return TofScene(range_m=range_m, albedo=np.where(maps.mask, request.albedo, 0.0), cosine=cosine, source_range_m=source_range)
 
 
-def _rays(camera: Camera) -> np.ndarray:
-    """Return unit directions away from the camera, [rows, cols, 3]."""
+def _lines_of_sight(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Return where each line of sight begins, and its unit direction away from the camera, [rows, cols, 3] each."""
     x, y = camera.plane_coordinates()
-    away = -np.ones_like(x)
+    flat = np.zeros_like(x)
     if camera.projection == "orthographic":
-        x, y = np.zeros_like(x), np.zeros_like(y)
-    return np.stack([x, y, away], axis=-1) / np.sqrt(x * x + y * y + 1)[..., None]
+        return np.stack([x, y, flat], axis=-1), np.stack([flat, flat, flat - 1], axis=-1)
+    rays = np.stack([x, y, flat - 1], axis=-1) / np.sqrt(x * x + y * y + 1)[..., None]
+    return np.zeros_like(rays), rays

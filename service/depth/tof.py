@@ -1,12 +1,12 @@
 """Range and depth of each pixel from the time-of-flight frames of a capture.
 
-Continuous wave: correlation images → noise, phases, wiggling, wraps. Pulsed: photon histograms → pile-up, pulse, returns. Either way
-the range is then corrected with the camera's calibration, filtered, and turned into depth. The sources stand with the kernels of each
-step (kernels/tof).
+Continuous wave: continuous_wave.py. Pulsed: photon histograms → pile-up, pulse, returns. Either way half the path of light is then
+corrected with the camera's calibration, turned into the range if the light source stands beside the camera, filtered, and turned into
+depth. The papers are named with the kernels of each step (kernels/tof).
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,18 +14,15 @@ import warp as wp
 
 from kernels.status import SOLVED, Status
 from kernels.tof.bilateral import smooth
-from kernels.tof.continuous import Correlation, Noise, decode, weights
-from kernels.tof.decide import AGREEMENT_RAD, UNCALIBRATED_RAD, decide
 from kernels.tof.flying import mark_flying
 from kernels.tof.modulation import common_range_m, require_span
-from kernels.tof.noise import estimate_noise
 from kernels.tof.pileup import LiveCounts, correct_pileup, place, without_pileup
 from kernels.tof.pulse import STEPS_PER_SIGMA, Pulse, gaussian, measured
 from kernels.tof.pulse_width import estimate_pulse
 from kernels.tof.returns import Returns, find_returns
-from kernels.tof.unwrap import unwrap
-from kernels.tof.vote import vote
-from kernels.tof.wiggling import ENTRIES, sample_harmonics, straighten
+from kernels.tof.unwrap import END_SIGMAS
+from service.depth.continuous_wave import solve_correlations
+from service.depth.range_image import RangeImage
 from service.depth.solution import DepthSolution
 from service.errors import RequestError
 from service.reporting.progress import Timings
@@ -33,24 +30,12 @@ from service.requests.depth import TofFilter, TofOptions, WhichReturn
 from stage.camera import Camera
 from stage.capture import Capture
 from stage.tof.calibration import TofCalibration, read_calibration
-from stage.tof.frames import CorrelationImages, Histograms, is_pulsed, read_correlations, read_histograms
+from stage.tof.frames import Histograms, is_pulsed, read_correlations, read_histograms
 from stage.tof.light_time import SPEED_OF_LIGHT, range_of_delay_m
+from stage.tof.source import SourcePath
 
 MOST_RETURNS = 3
 """Returns that are looked for in a histogram."""
-
-
-@dataclass(frozen=True)
-class RangeImage:
-    """Ranges along the rays, before correction and filters; only pixels with a status of kernels.status.SOLVED have values that count."""
-
-    method: str
-    range_m: np.ndarray  # [pixel] float32
-    sigma_m: np.ndarray  # [pixel] float32
-    amplitude: np.ndarray  # [pixel] float32
-    confidence: np.ndarray  # [pixel] float32
-    status: np.ndarray  # [pixel] int32
-    facts: dict[str, Any]
 
 
 def solve_tof(capture: Capture, options: TofOptions, *, near_m: float | None = None, far_m: float | None = None,
@@ -82,82 +67,32 @@ def solve_tof(capture: Capture, options: TofOptions, *, near_m: float | None = N
     limit = capture.manifest.saturation
     if pulsed:
         histograms = read_histograms(capture)
+        path = SourcePath.of(capture.camera, histograms.source_m)
+        near_path_m, far_path_m = _half_path_span(path, mask, near_m, far_m)
         timings.stage("returns", 1)
-        found = solve_histograms(histograms, options, calibration, near_m=near_m, far_m=far_m, limit=limit, usable=mask.reshape(-1),
-                                 device=device)
+        found = solve_histograms(histograms, options, calibration, near_m=near_path_m, far_m=far_path_m, limit=limit,
+                                 usable=mask.reshape(-1), device=device)
     else:
         correlations = read_correlations(capture)
+        path = SourcePath.of(capture.camera, correlations.source_m)
+        near_path_m, far_path_m = _half_path_span(path, mask, near_m, far_m)
+        if far_m is not None and far_path_m is not None:  # seen from the source, the span may be a little longer than from the camera
+            require_span(correlations.modulation_hz, near_m or 0.0, far_m, SPEED_OF_LIGHT)
+            far_path_m = min(far_path_m, (near_path_m or 0.0) + common_range_m(correlations.modulation_hz, SPEED_OF_LIGHT))
         timings.stage("phases", 1)
-        found = solve_correlations(correlations, options, calibration, near_m=near_m, far_m=far_m, limit=limit, usable=mask,
+        found = solve_correlations(correlations, options, calibration, near_m=near_path_m, far_m=far_path_m, limit=limit, usable=mask,
                                    device=device)
-    return _depth_of(found, options, calibration, capture.camera, mask, device=device, timings=timings)
+    found = _corrected(found, options, calibration, path, near_m, far_m)
+    return _depth_of(found, options, capture.camera, mask, device=device, timings=timings)
 
 
-def solve_correlations(frames: CorrelationImages, options: TofOptions, calibration: TofCalibration, *, near_m: float | None,
-                       far_m: float | None, limit: float | None, usable: np.ndarray, device: str) -> RangeImage:
-    """Return the range of each pixel from correlation images.
-
-    Args:
-        frames: the images of a capture.
-        options: vote.
-        calibration: noise and wiggling, where they are known.
-        near_m, far_m: the span of ranges; None: 0, and as far as the frequencies tell apart.
-        limit: saturation, in recorded values.
-        usable: [rows, cols] bool mask.
-        device: where to run.
-
-    Raises:
-        ArrayError: the phases or frequencies cannot give the range that is asked for.
-    """
-    rows, cols = usable.shape
-    weights(frames.modulation_hz, frames.reference_phase_rad, frames.scale)  # faults of the frames come before those of the options
-    nearest = near_m or 0.0
-    farthest = far_m or nearest + common_range_m(frames.modulation_hz, SPEED_OF_LIGHT)
-    require_span(frames.modulation_hz, nearest, farthest, SPEED_OF_LIGHT)
-    noise, source = _noise(frames, calibration, limit, usable)
-    found = decode(frames.images, frames.modulation_hz, frames.reference_phase_rad, noise=noise, saturation=limit, scale=frames.scale,
-                   device=device)
-    found = _straighten(found, calibration)
-    hypotheses = unwrap(found, nearest_m=nearest, farthest_m=farthest, light_speed=SPEED_OF_LIGHT)
-    if options.vote:
-        hypotheses = vote(hypotheses, rows, cols)
-    straight = [hz for hz in found.modulation_hz.tolist() if calibration.of_frequency(hz) is not None]
-    agreement = AGREEMENT_RAD if len(straight) == len(found.modulation_hz) else UNCALIBRATED_RAD
-    ranges = decide(found, hypotheses, light_speed=SPEED_OF_LIGHT, agreement_rad=agreement)
-    facts = {
-        "modulation_hz": found.modulation_hz.tolist(),
-        "images": len(frames.images),
-        "span_m": [nearest, round(farthest, 4)],
-        "common_range_m": round(common_range_m(frames.modulation_hz, SPEED_OF_LIGHT), 4),
-        "vote": options.vote,
-        "noise": {"electrons_per_unit": 1 / noise.shot if noise.shot > 0 else None, "read_units": noise.read, "from": source},
-        "wiggling": straight,
-        "agreement_rad": agreement,
-    }
-    pixels = rows * cols
-    return RangeImage("time of flight, continuous wave", ranges.range.numpy()[:pixels], ranges.sigma.numpy()[:pixels],
-                    found.amplitude.numpy()[:, :pixels].mean(axis=0), ranges.confidence.numpy()[:pixels], ranges.status.numpy()[:pixels],
-                    facts)
-
-
-def _noise(frames: CorrelationImages, calibration: TofCalibration, limit: float | None, usable: np.ndarray) -> tuple[Noise, str]:
-    """Return the noise of a reading, and where it is known from."""
-    if calibration.electrons_per_unit is not None and calibration.read_noise_electrons is not None:
-        unit = calibration.electrons_per_unit
-        return Noise(1 / unit, calibration.read_noise_electrons / unit), "calibration"
-    keep = usable.reshape(-1)
-    if limit is not None:
-        keep = keep & (frames.images < limit).all(axis=0)
-    return estimate_noise(frames.images, frames.modulation_hz, frames.reference_phase_rad, cols=usable.shape[1], scale=frames.scale,
-                          usable=keep), "images"
-
-
-def _straighten(found: Correlation, calibration: TofCalibration) -> Correlation:
-    known = [calibration.of_frequency(hz) for hz in found.modulation_hz.tolist()]
-    if not any(known):
-        return found
-    table = np.stack([np.zeros(ENTRIES) if h is None else sample_harmonics(np.array(h.cos), np.array(h.sin)) for h in known])
-    return straighten(found, table)
+def _half_path_span(path: SourcePath | None, mask: np.ndarray, near_m: float | None, far_m: float | None
+                    ) -> tuple[float | None, float | None]:
+    """Return the half paths of light between which every pixel of the mask has its ranges from near to far."""
+    if path is None or not mask.any():
+        return near_m, far_m
+    return (None if near_m is None else float(path.half_path_m(near_m)[mask].min()),
+            None if far_m is None else float(path.half_path_m(far_m)[mask].max()))
 
 
 def solve_histograms(frames: Histograms, options: TofOptions, calibration: TofCalibration, *, near_m: float | None,
@@ -236,13 +171,27 @@ def _choose(found: Returns, which: WhichReturn) -> np.ndarray:
     return np.zeros(position.shape[1], dtype=np.int64)
 
 
-def _depth_of(found: RangeImage, options: TofOptions, calibration: TofCalibration, camera: Camera, mask: np.ndarray, *, device: str,
+def _corrected(found: RangeImage, options: TofOptions, calibration: TofCalibration, path: SourcePath | None, near_m: float | None,
+               far_m: float | None) -> RangeImage:
+    """Return ranges from measured half paths: corrected with the calibration, then seen from the camera in place of the source."""
+    half_path = calibration.correct(found.range_m.astype(np.float64), options.temperature_c)
+    sigma = found.sigma_m * calibration.scale
+    if path is None:
+        return replace(found, range_m=half_path.astype(np.float32), sigma_m=sigma.astype(np.float32))
+    range_m, per_metre = (values.reshape(-1) for values in path.range_of(half_path.reshape(path.along_m.shape)))
+    sigma = sigma * per_metre
+    inside = ((range_m > 0) & (range_m >= (near_m or 0.0) - END_SIGMAS * sigma)
+              & (range_m <= (math.inf if far_m is None else far_m) + END_SIGMAS * sigma))
+    status = np.where(np.isin(found.status, SOLVED) & ~inside, int(Status.OUT_OF_RANGE), found.status)
+    return replace(found, range_m=range_m.astype(np.float32), sigma_m=sigma.astype(np.float32), status=status)
+
+
+def _depth_of(found: RangeImage, options: TofOptions, camera: Camera, mask: np.ndarray, *, device: str,
               timings: Timings) -> DepthSolution:
-    """Correct and filter ranges and turn them into depth; arguments and result as those of `solve_tof`."""
+    """Filter ranges and turn them into depth; arguments and result as those of `solve_tof`."""
     rows, cols = mask.shape
     solved = np.isin(found.status, SOLVED)
-    range_m = np.where(solved, calibration.correct(found.range_m.astype(np.float64), options.temperature_c), 0).astype(np.float32)
-    sigma = (found.sigma_m * calibration.scale).astype(np.float32)
+    range_m, sigma = np.where(solved, found.range_m, 0).astype(np.float32), found.sigma_m
     status = np.where(mask.reshape(-1), found.status, int(Status.UNSOLVED)).astype(np.int32)
     if options.filters:
         timings.stage("filter", 1)

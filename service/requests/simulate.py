@@ -6,7 +6,7 @@ from typing import Annotated
 from pydantic import Field
 
 from service.requests.base import Commas, Options, Role, Spelling
-from stage.model import Count, NotNegative, Positive
+from stage.model import Count, NotNegative, Positive, Vector
 
 
 class SimulateRequest(Options):
@@ -18,6 +18,8 @@ class SimulateRequest(Options):
     """Folder of the capture."""
     albedo: Annotated[float, Field(gt=0, le=1)] = 0.5
     """Albedo of every surface."""
+    source_m: Annotated[Vector | None, Commas] = None
+    """Place of the light source in the camera frame in metres, x,y,z; None: at the camera."""
     seed: int = 0
     """Seed of the noise."""
     noise: bool = True

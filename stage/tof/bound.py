@@ -19,7 +19,8 @@ def range_bound_m(scene: TofScene, camera: HistogramCamera) -> np.ndarray:
     counts one photon at most, a is the part of the pulses without an earlier photon, and w is a/(N·(e^(λ/N) - 1)).
 
     Args:
-        scene: range, albedo and cosine; the bound is that of the first return, when the second return is known.
+        scene: range, albedo and cosine; the bound is that of the first return, when the second return is known, and that of half the
+            path of light where the source is not at the camera.
         camera: bins, pulse, photons, background (which is known) and pulses.
 
     Returns:
@@ -31,8 +32,8 @@ def range_bound_m(scene: TofScene, camera: HistogramCamera) -> np.ndarray:
     """
     mean = histograms(scene, replace(camera, pulses=None))
     edges = camera.start_s + camera.bin_s * np.arange(camera.bins + 1)
-    range_m, signal = scene.returns(camera.signal_photons)[0]
-    away = (edges - 2 * range_m[..., None] / SPEED_OF_LIGHT) / camera.pulse_sigma_s
+    half_path, signal = scene.returns(camera.signal_photons)[0]
+    away = (edges - 2 * half_path[..., None] / SPEED_OF_LIGHT) / camera.pulse_sigma_s
     by_time = -signal[..., None] * np.diff(np.exp(-0.5 * away**2), axis=-1) / (camera.pulse_sigma_s * (2 * np.pi) ** 0.5)
     only = histograms(replace(scene, second_part=0.0), replace(camera, pulses=None, background=0.0))
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -11,6 +11,7 @@ from stage import images
 from stage.capture import Capture
 from stage.errors import ImageError, ManifestError, storage
 from stage.manifest import FILE_NAME, Frame
+from stage.model import Vector
 from stage.ranging import ContinuousWave, Pulsed
 
 SAME_TIME = 1e-6
@@ -27,6 +28,8 @@ class CorrelationImages:
     modulation_hz: np.ndarray  # [images] float64
     reference_phase_rad: np.ndarray  # [images] float64
     scale: np.ndarray  # [images] float64, factors that bring recorded values to the mean exposure
+    source_m: Vector | None = None
+    """The place of the light source in the camera frame; None: at the camera."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,8 @@ class Histograms:
     """The time of flight at which the first bin begins."""
     pulses: int | None
     first_photon_only: bool
+    source_m: Vector | None = None
+    """The place of the light source in the camera frame; None: at the camera."""
 
 
 def is_pulsed(capture: Capture) -> bool:
@@ -67,7 +72,8 @@ def read_correlations(capture: Capture) -> CorrelationImages:
     values = np.stack([_plane(capture, frame).reshape(-1) for frame, _ in frames])
     exposures = np.array([frame.exposure_s or 1.0 for frame, _ in frames])
     return CorrelationImages(values, np.array([tof.modulation_hz for _, tof in frames]),
-                             np.array([tof.reference_phase_rad for _, tof in frames]), exposures.mean() / exposures)
+                             np.array([tof.reference_phase_rad for _, tof in frames]), exposures.mean() / exposures,
+                             read_source(capture))
 
 
 def read_histograms(capture: Capture) -> Histograms:
@@ -99,7 +105,22 @@ def read_histograms(capture: Capture) -> Histograms:
         total = counts if total is None else total + counts
     assert total is not None
     given = [tof.pulses for _, tof in frames if tof.pulses is not None]
-    return Histograms(total, first.bin_s, first.start_s, sum(given) if len(given) == len(frames) else None, first.first_photon_only)
+    return Histograms(total, first.bin_s, first.start_s, sum(given) if len(given) == len(frames) else None, first.first_photon_only,
+                      read_source(capture))
+
+
+def read_source(capture: Capture) -> Vector | None:
+    """Return the place of the light source of the time-of-flight frames in the camera frame, metres; None: at the camera.
+
+    Raises:
+        ManifestError: frames have different sources.
+    """
+    places = {frame.tof.source_m: frame.image for frame in capture.manifest.frames if frame.tof is not None}
+    if len(places) > 1:
+        one, other = list(places.values())[:2]
+        raise ManifestError(f"{capture.folder / FILE_NAME}: frames[].tof.source_m: {one} and {other} have different sources: "
+                            "give all frames the same, or one capture for each source")
+    return next(iter(places), None)
 
 
 def _frames(capture: Capture, kind: type[Kind]) -> list[tuple[Frame, Kind]]:

@@ -1,8 +1,9 @@
 """Simulation of raw time-of-flight frames, for tests and for the planning of captures.
 
-Forward model, at each pixel with range d, albedo ρ and cos θ between the surface normal and the ray:
+Forward model, at each pixel with range r, distance e from the source, half path d = (r + e)/2, albedo ρ and cos θ between the surface
+normal and the direction to the source; a source at the camera has r = e = d:
 
-    signal       A = signal_electrons · ρ · cos θ / d²                         electrons (photons) of one return
+    signal       A = signal_electrons · ρ · cos θ / e²                         electrons (photons) of one return
     correlation  I(δ) = ambient · ρ + Σ_returns A·(1 + contrast · w(φ - δ)),   φ = 4πf·d/c
                  w(ψ) = cos ψ + Σ_h harmonics[h]·cos(hψ), h from 2              wiggling: the light is not a pure cosine
     histogram    λ_i = background + Σ_returns A·(C(t_{i+1} - τ) - C(t_i - τ)),  τ = 2d/c, C the cumulative Gaussian of pulse_sigma_s
@@ -25,6 +26,7 @@ from stage.camera import Camera
 from stage.errors import CalibrationError
 from stage.files import replacing
 from stage.manifest import FILE_NAME, SCHEMA, Frame, Manifest, write_manifest
+from stage.model import Vector
 from stage.ranging import ContinuousWave, Pulsed
 from stage.tof.light_time import SPEED_OF_LIGHT
 
@@ -35,7 +37,9 @@ class TofScene:
 
     range_m: np.ndarray  # [rows, cols] metres along the ray, above zero
     albedo: np.ndarray  # [rows, cols] 0…1
-    cosine: np.ndarray  # [rows, cols] 0…1, between normal and ray
+    cosine: np.ndarray  # [rows, cols] 0…1, between normal and direction to the source
+    source_range_m: np.ndarray | None = None
+    """[rows, cols] metres from the light source to the surface, above zero; None: the source is at the camera."""
     second_m: float = 1.0
     second_part: float = 0.0
     """The signal of the second return relative to the first; 0 means one return."""
@@ -47,13 +51,18 @@ class TofScene:
                                    "must be one image: give [rows, cols] each")
         if not (np.isfinite(self.range_m).all() and self.range_m.min() > 0):
             raise CalibrationError("the scene has ranges that are not above zero")
+        if self.source_range_m is not None and not (self.source_range_m.shape == self.range_m.shape and self.source_range_m.min() > 0):
+            raise CalibrationError(f"the distances from the source are {self.source_range_m.shape}, or not above zero: "
+                                   f"give {self.range_m.shape}")
         if self.second_part < 0 or self.second_m <= 0:
             raise CalibrationError("the second return must lie behind the first, with no negative part of its signal")
 
     def returns(self, signal: float) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return the range and the signal of each return, [rows, cols] each, for the signal of a white surface at one metre."""
-        first = signal * self.albedo * self.cosine / self.range_m**2
-        both = [(self.range_m, first), (self.range_m + self.second_m, self.second_part * first)]
+        """Return the half path and the signal of each return, [rows, cols] each, for the signal of a white surface at one metre."""
+        source_range = self.range_m if self.source_range_m is None else self.source_range_m
+        first = signal * self.albedo * self.cosine / source_range**2
+        half_path = 0.5 * (self.range_m + source_range)
+        both = [(half_path, first), (half_path + self.second_m, self.second_part * first)]
         return both if self.second_part > 0 else both[:1]
 
 
@@ -135,8 +144,9 @@ def histograms(scene: TofScene, camera: HistogramCamera, random: np.random.Gener
     return counts
 
 
-def write_correlations(folder: str | Path, name: str, images: np.ndarray, camera: Camera, sensor: CorrelationCamera) -> Path:
-    """Write images of `correlation_images` as a capture.
+def write_correlations(folder: str | Path, name: str, images: np.ndarray, camera: Camera, sensor: CorrelationCamera,
+                       source_m: Vector | None = None) -> Path:
+    """Write images of `correlation_images` as a capture, with the place of the light source in the camera frame (None: at the camera).
 
     Returns:
         The path of its capture.json.
@@ -146,13 +156,15 @@ def write_correlations(folder: str | Path, name: str, images: np.ndarray, camera
     """
     frames = []
     for index, (image, (hz, delta)) in enumerate(zip(images, sensor.settings(), strict=True)):
-        frames.append(Frame(image=f"{index:03d}.npy", tof=ContinuousWave(type="cw", modulation_hz=hz, reference_phase_rad=delta)))
+        frames.append(Frame(image=f"{index:03d}.npy", tof=ContinuousWave(type="cw", modulation_hz=hz, reference_phase_rad=delta,
+                                                                          source_m=source_m)))
         _save(Path(folder) / frames[-1].image, image)
     return _manifest(folder, name, camera, frames, sensor.full_well)
 
 
-def write_histograms(folder: str | Path, name: str, counts: np.ndarray, camera: Camera, sensor: HistogramCamera) -> Path:
-    """Write counts of `histograms` as a capture.
+def write_histograms(folder: str | Path, name: str, counts: np.ndarray, camera: Camera, sensor: HistogramCamera,
+                     source_m: Vector | None = None) -> Path:
+    """Write counts of `histograms` as a capture, with the place of the light source in the camera frame (None: at the camera).
 
     Returns:
         The path of its capture.json.
@@ -162,7 +174,7 @@ def write_histograms(folder: str | Path, name: str, counts: np.ndarray, camera: 
     """
     _save(Path(folder) / "histograms.npy", counts)
     tof = Pulsed(type="pulsed", bin_s=sensor.bin_s, start_s=sensor.start_s, pulses=sensor.pulses,
-                 first_photon_only=sensor.pulses is not None)
+                 first_photon_only=sensor.pulses is not None, source_m=source_m)
     return _manifest(folder, name, camera, [Frame(image="histograms.npy", tof=tof)], None)
 
 

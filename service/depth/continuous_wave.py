@@ -1,0 +1,86 @@
+"""Ranges from the correlation images of a continuous-wave camera: noise, phases, wiggling, wraps.
+
+The sources stand with the kernels of each step (kernels/tof).
+"""
+
+import numpy as np
+
+from kernels.tof.continuous import Correlation, Noise, decode, weights
+from kernels.tof.decide import AGREEMENT_RAD, UNCALIBRATED_RAD, decide
+from kernels.tof.modulation import common_range_m, require_span
+from kernels.tof.noise import estimate_noise
+from kernels.tof.unwrap import unwrap
+from kernels.tof.vote import vote
+from kernels.tof.wiggling import ENTRIES, sample_harmonics, straighten
+from service.depth.range_image import RangeImage
+from service.requests.depth import TofOptions
+from stage.tof.calibration import TofCalibration
+from stage.tof.frames import CorrelationImages
+from stage.tof.light_time import SPEED_OF_LIGHT
+
+
+def solve_correlations(frames: CorrelationImages, options: TofOptions, calibration: TofCalibration, *, near_m: float | None,
+                       far_m: float | None, limit: float | None, usable: np.ndarray, device: str) -> RangeImage:
+    """Return the range of each pixel from correlation images.
+
+    Args:
+        frames: the images of a capture.
+        options: vote.
+        calibration: noise and wiggling, where they are known.
+        near_m, far_m: the span of ranges; None: 0, and as far as the frequencies tell apart.
+        limit: saturation, in recorded values.
+        usable: [rows, cols] bool mask.
+        device: where to run.
+
+    Raises:
+        ArrayError: the phases or frequencies cannot give the range that is asked for.
+    """
+    rows, cols = usable.shape
+    weights(frames.modulation_hz, frames.reference_phase_rad, frames.scale)  # faults of the frames come before those of the options
+    nearest = near_m or 0.0
+    farthest = far_m or nearest + common_range_m(frames.modulation_hz, SPEED_OF_LIGHT)
+    require_span(frames.modulation_hz, nearest, farthest, SPEED_OF_LIGHT)
+    noise, source = _noise(frames, calibration, limit, usable)
+    found = decode(frames.images, frames.modulation_hz, frames.reference_phase_rad, noise=noise, saturation=limit, scale=frames.scale,
+                   device=device)
+    found = _straighten(found, calibration)
+    hypotheses = unwrap(found, nearest_m=nearest, farthest_m=farthest, light_speed=SPEED_OF_LIGHT)
+    if options.vote:
+        hypotheses = vote(hypotheses, rows, cols)
+    straight = [hz for hz in found.modulation_hz.tolist() if calibration.of_frequency(hz) is not None]
+    agreement = AGREEMENT_RAD if len(straight) == len(found.modulation_hz) else UNCALIBRATED_RAD
+    ranges = decide(found, hypotheses, light_speed=SPEED_OF_LIGHT, agreement_rad=agreement)
+    facts = {
+        "modulation_hz": found.modulation_hz.tolist(),
+        "images": len(frames.images),
+        "span_m": [nearest, round(farthest, 4)],
+        "common_range_m": round(common_range_m(frames.modulation_hz, SPEED_OF_LIGHT), 4),
+        "vote": options.vote,
+        "noise": {"electrons_per_unit": 1 / noise.shot if noise.shot > 0 else None, "read_units": noise.read, "from": source},
+        "wiggling": straight,
+        "agreement_rad": agreement,
+    }
+    pixels = rows * cols
+    return RangeImage("time of flight, continuous wave", ranges.range.numpy()[:pixels], ranges.sigma.numpy()[:pixels],
+                    found.amplitude.numpy()[:, :pixels].mean(axis=0), ranges.confidence.numpy()[:pixels], ranges.status.numpy()[:pixels],
+                    facts)
+
+
+def _noise(frames: CorrelationImages, calibration: TofCalibration, limit: float | None, usable: np.ndarray) -> tuple[Noise, str]:
+    """Return the noise of a reading, and where it is known from."""
+    if calibration.electrons_per_unit is not None and calibration.read_noise_electrons is not None:
+        unit = calibration.electrons_per_unit
+        return Noise(1 / unit, calibration.read_noise_electrons / unit), "calibration"
+    keep = usable.reshape(-1)
+    if limit is not None:
+        keep = keep & (frames.images < limit).all(axis=0)
+    return estimate_noise(frames.images, frames.modulation_hz, frames.reference_phase_rad, cols=usable.shape[1], scale=frames.scale,
+                          usable=keep), "images"
+
+
+def _straighten(found: Correlation, calibration: TofCalibration) -> Correlation:
+    known = [calibration.of_frequency(hz) for hz in found.modulation_hz.tolist()]
+    if not any(known):
+        return found
+    table = np.stack([np.zeros(ENTRIES) if h is None else sample_harmonics(np.array(h.cos), np.array(h.sin)) for h in known])
+    return straighten(found, table)
