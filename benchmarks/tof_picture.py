@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.pictures import heat
-from kernels.status import Status
+from kernels.status import Status, refuse_unsure
 from service.depth.tof import solve_tof
 from service.light.sheet import write_sheet
 from service.reporting.progress import Timings
@@ -31,7 +31,7 @@ from tests.reference.tof import room
 TARGET = Path(__file__).parents[1] / "docs" / "tof.png"
 ROWS, COLS, FARTHEST_M, ERROR_M = 96, 128, 12.0, 0.05
 STATUS_COLOURS = {Status.OK: (0.12, 0.3, 0.5), Status.LOW_MODULATION: (0, 0, 0), Status.FLYING: (1, 0.3, 0.1),
-                  Status.MULTIPATH: (0.9, 0.8, 0.1), Status.UNDECIDED: (0.7, 0.2, 0.8)}
+                  Status.MULTIPATH: (0.9, 0.8, 0.1), Status.UNSURE: (0.7, 0.2, 0.8)}
 
 
 def main() -> None:
@@ -55,6 +55,7 @@ def main() -> None:
     def solve(folder: str, **options: object) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         solved = solve_tof(Capture.open(folder), TofOptions.model_validate(options), device="cpu", timings=Timings())
         assert solved.range_m is not None and solved.confidence is not None
+        refuse_unsure(solved.status, solved.sigma, solved.confidence, max_sigma=None, least_confidence=solved.least_confidence)
         return solved.range_m, solved.confidence, solved.status, solved.solved
 
     rows = []

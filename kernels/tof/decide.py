@@ -1,4 +1,4 @@
-"""The most probable wrap of each pixel, and a status that tells why a wrap is not good enough."""
+"""The most probable wrap of each pixel, and a status that tells why there is none, or why it cannot be trusted."""
 
 from functools import cache
 from typing import Any, NamedTuple
@@ -8,6 +8,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.packs import as_packs, pack_type
 from kernels.status import Status
+from kernels.tof.chi_squared import quantile, signal_limits
 from kernels.tof.continuous import Correlation
 from kernels.tof.modulation import radians_per_metre
 from kernels.tof.unwrap import Hypotheses
@@ -19,29 +20,21 @@ UNCALIBRATED_RAD = 0.04
 rad."""
 MULTIPATH_Z = 3.72
 """Standard normal quantile of the multipath test: one pixel in ten thousand with a single return is called multipath."""
-SIGNAL_Z = 4.75
-"""Standard normal quantile of the signal test: one pixel in a million without signal is taken to have one."""
 DECIDED = 2 / 3
-"""Least probability of the chosen wrap; a pixel below it is UNDECIDED."""
+"""Least probability of a wrap that counts as solved, unless another one is asked for."""
 
-_OK, _UNDECIDED, _MULTIPATH = int(Status.OK), int(Status.UNDECIDED), int(Status.MULTIPATH)
+_OK, _MULTIPATH = int(Status.OK), int(Status.MULTIPATH)
 _LOW, _SATURATED, _OUT = int(Status.LOW_MODULATION), int(Status.SATURATED), int(Status.OUT_OF_RANGE)
 
 
 class Ranges(NamedTuple):
     """Range of each pixel, on the device; pixels are padded to whole packs."""
 
-    range: wp.array  # [pixel] float32 metres along the ray; kept for UNDECIDED and MULTIPATH too, else 0
+    range: wp.array  # [pixel] float32 metres along the ray; kept for MULTIPATH too, else 0
     sigma: wp.array  # [pixel] float32 metres
     confidence: wp.array  # [pixel] float32: probability of the wrap
     wraps: wp.array  # [pixel] int32: whole turns of the highest frequency in the range
     status: wp.array  # [pixel] int32, kernels.status.Status
-
-
-def quantile(freedom: int, z: float) -> float:
-    """Return a quantile of the chi-squared distribution, by Wilson and Hilferty's approximation (PNAS 1931): error below 3 % here."""
-    a = 2 / (9 * freedom)
-    return float(freedom * (1 - a + z * a**0.5) ** 3)
 
 
 def decide(found: Correlation, weighed: Hypotheses, *, light_speed: float, agreement_rad: float = AGREEMENT_RAD) -> Ranges:
@@ -54,13 +47,12 @@ def decide(found: Correlation, weighed: Hypotheses, *, light_speed: float, agree
 
     Returns:
         Ranges, on the device. LOW_MODULATION: no more amplitude than noise has; SATURATED: no frequency is left; OUT_OF_RANGE: nothing
-        in the span of `unwrap` fits; MULTIPATH: frequencies disagree by more than noise and `agreement_rad` explain; UNDECIDED: the
-        wrap is less probable than DECIDED.
+        in the span of `unwrap` fits; MULTIPATH: frequencies disagree by more than noise and `agreement_rad` explain.
     """
     device, pixels = str(weighed.range.device), weighed.range.shape[1]
     pack, count = devices.pack_width(device), len(found.modulation_hz)
     agree = [float("inf"), *(quantile(freedom, MULTIPATH_Z) for freedom in range(1, count))]
-    signal = [float("inf"), *(quantile(2 * used, SIGNAL_Z) for used in range(1, count + 1))]
+    signal = [float("inf"), *signal_limits(count)]
     result = Ranges(*(wp.empty(pixels, dtype=dtype, device=device)  # the kernel writes every pixel
                       for dtype in (wp.float32, wp.float32, wp.float32, wp.int32, wp.int32)))
     devices.launch(decide_kernel(pack), pixels // pack, [
@@ -127,12 +119,11 @@ def decide_kernel(pack: int) -> Any:
                 least[k] = wp.where(used[k] == float(n), low, least[k])
                 most[k] = wp.where(used[k] == float(n), high, most[k])
         for k in range(pack):
-            code = wp.where(best[k] < DECIDED, _UNDECIDED, _OK)
-            code = wp.where(cost[k] > most[k], _MULTIPATH, code)
+            code = wp.where(cost[k] > most[k], _MULTIPATH, _OK)
             code = wp.where(best[k] == 0.0, _OUT, code)
             code = wp.where(sure[k] < least[k], _LOW, code)
             codes[k] = wp.where(used[k] == 0.0, wp.where(blind[k] > 0.0, _SATURATED, _LOW), code)
-            kept = wp.where(codes[k] == _OK or codes[k] == _UNDECIDED or codes[k] == _MULTIPATH, 1.0, 0.0)
+            kept = wp.where(codes[k] == _OK or codes[k] == _MULTIPATH, 1.0, 0.0)
             d[k] *= kept
             spread[k] *= kept
             best[k] *= kept

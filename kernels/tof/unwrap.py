@@ -18,8 +18,8 @@ from kernels.tof.modulation import radians_per_metre, require_span
 
 HYPOTHESES = 3
 """Number of hypotheses kept for a pixel: a fourth has had no influence on the result in the simulated scenes."""
-FLOOR_RAD = 1e-3
-"""Least standard deviation of a phase, in radians, however bright the pixel is: 0.3 mm at 80 MHz."""
+FLOOR_RAD = 3e-4
+"""Least standard deviation of a phase, in radians, however bright the pixel is: 0.1 mm at 80 MHz."""
 NO_HYPOTHESIS_COST = 1e20
 """Sentinel cost of a slot that holds no hypothesis."""
 END_SIGMAS = 3.0

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from kernels.status import SOLVED, Status
+from kernels.status import ESTIMATED, SOLVED, Status, refuse_unsure
 from kernels.tof.bilateral import smooth
 from kernels.tof.flying import mark_flying
 from kernels.tof.modulation import common_range_m, require_span
@@ -53,7 +53,8 @@ def solve_tof(capture: Capture, options: TofOptions, *, near_m: float | None = N
 
     Returns:
         Depth, range, standard deviations of the depth, amplitude (mean over the frequencies; pulsed: photons of the return), confidence
-        (probability of the wrap, or that the return is one) and status of each pixel; 0 where not solved. Facts say what was assumed.
+        (probability of the wrap, or that the return is one) and status of each pixel; 0 where nothing was estimated. Facts say what was
+        assumed.
 
     Raises:
         ManifestError, ImageError, CalibrationError: the frames or the calibration cannot be used.
@@ -182,7 +183,7 @@ def _corrected(found: RangeImage, options: TofOptions, calibration: TofCalibrati
     sigma = sigma * per_metre
     inside = ((range_m > 0) & (range_m >= (near_m or 0.0) - END_SIGMAS * sigma)
               & (range_m <= (math.inf if far_m is None else far_m) + END_SIGMAS * sigma))
-    status = np.where(np.isin(found.status, SOLVED) & ~inside, int(Status.OUT_OF_RANGE), found.status)
+    status = np.where(np.isin(found.status, ESTIMATED) & ~inside, int(Status.OUT_OF_RANGE), found.status)
     return replace(found, range_m=range_m.astype(np.float32), sigma_m=sigma.astype(np.float32), status=status)
 
 
@@ -190,17 +191,20 @@ def _depth_of(found: RangeImage, options: TofOptions, camera: Camera, mask: np.n
               timings: Timings) -> DepthSolution:
     """Filter ranges and turn them into depth; arguments and result as those of `solve_tof`."""
     rows, cols = mask.shape
-    solved = np.isin(found.status, SOLVED)
-    range_m, sigma = np.where(solved, found.range_m, 0).astype(np.float32), found.sigma_m
+    estimated = np.isin(found.status, ESTIMATED)
+    range_m, sigma = np.where(estimated, found.range_m, 0).astype(np.float32), found.sigma_m
     status = np.where(mask.reshape(-1), found.status, int(Status.UNSOLVED)).astype(np.int32)
     if options.filters:
         timings.stage("filter", 1)
-        range_m, sigma, status = _filter(range_m, sigma, found.amplitude, status, rows, cols, options.filters, device)
-    solved = np.isin(status, SOLVED)
+        sure = status.copy()
+        refuse_unsure(sure, None, found.confidence, max_sigma=None, least_confidence=found.least_confidence)
+        range_m, sigma, filtered = _filter(range_m, sigma, found.amplitude, sure, rows, cols, options.filters, device)
+        status = np.where(filtered == Status.FLYING, filtered, status)
+    estimated = np.isin(status, ESTIMATED)
     z = z_per_range(camera).reshape(-1)
 
     def image(values: np.ndarray) -> np.ndarray:
-        return np.where(solved, values, 0).astype(np.float32).reshape(rows, cols)
+        return np.where(estimated, values, 0).astype(np.float32).reshape(rows, cols)
 
     facts: dict[str, Any] = {**found.facts, "filters": [str(name) for name in options.filters],
                              "calibration": None if options.calibration is None else str(options.calibration)}
@@ -212,6 +216,8 @@ def _depth_of(found: RangeImage, options: TofOptions, camera: Camera, mask: np.n
         range_m=image(range_m),
         amplitude=image(found.amplitude),
         confidence=image(found.confidence),
+        least_confidence=found.least_confidence,
+        warnings=list(found.warnings),
         facts=facts,
     )
 

@@ -40,9 +40,9 @@ def pulsed_frames(counts, **more):
     return [(counts, {"type": "pulsed", "bin_s": 1.5e-9, "start_s": 0.0, **more})]
 
 
-def run(folder, near_m=None, far_m=None, **options):
-    result = depth(DepthRequest(capture=folder, out=folder / "out", near_m=near_m, far_m=far_m, tof=TofOptions.model_validate(options),
-                                device="cpu"))
+def run(folder, near_m=None, far_m=None, least_confidence=None, **options):
+    result = depth(DepthRequest(capture=folder, out=folder / "out", near_m=near_m, far_m=far_m, least_confidence=least_confidence,
+                                tof=TofOptions.model_validate(options), device="cpu"))
     return result, DepthMaps.read(result.depth_path), json.loads(result.report_path.read_text())
 
 
@@ -73,6 +73,49 @@ def test_noisy_frames_are_as_good_as_published(part, median_m, wrong, tmp_path):
     z_error = (maps.depth - VIEW.distance * along())[np.abs(error) < 0.9]
     assert np.sqrt(np.mean((z_error / maps.sigma[np.abs(error) < 0.9]) ** 2)) == pytest.approx(1, abs=0.1)
     assert report["found"]["noise"]["electrons_per_unit"] == pytest.approx(1, rel=0.1)
+
+
+def test_what_is_unsure_is_kept_and_the_request_says_what_counts(tmp_path):
+    """A room with mixed edges under little light: of all pixels, a plain decode has 0.75 within 5 cm, and 0.69 were kept at all."""
+    settings, fine = tof.even((50e6, 60e6), 4), tof.room(3 * ROWS, 3 * COLS)
+    mean = tof.correlations(fine, 4000, settings, ambient=40).reshape(8, ROWS, 3, COLS, 3).mean(axis=(2, 4))
+    random = np.random.default_rng(6)
+    folder = write(tmp_path / "c", cw_frames(random.poisson(mean) + random.normal(0, 5, mean.shape), settings))
+    truth = np.median(fine.distance.reshape(ROWS, 3, COLS, 3).transpose(0, 2, 1, 3).reshape(ROWS, COLS, 9), axis=-1)
+    result, _, report = run(folder)
+    maps = DepthMaps.read(result.depth_path, unsure=True)
+    _, every, _ = run(folder, least_confidence=0.0)
+    unsure = maps.status == Status.UNSURE
+    assert unsure.mean() > 0.1 and not maps.mask[unsure].any() and (maps.range[unsure] > 0).all() and (maps.sigma[unsure] > 0).all()
+    assert (maps.confidence[unsure] < 2 / 3).all() and (maps.confidence[maps.mask] >= 2 / 3 - 1e-3).all()  # rounded to half
+    assert report["found"]["with_neighbours"] > 0.1 * ROWS * COLS
+    np.testing.assert_array_equal(every.mask, maps.mask | unsure)
+    np.testing.assert_array_equal(every.range, np.where(every.mask, maps.range, 0))
+    assert np.mean((np.abs(maps.range - truth) < 0.05) & (maps.range > 0)) > 0.79
+    share = (np.abs(maps.range - truth) * maps.depth / np.maximum(maps.range, 1e-9))[maps.mask] / maps.sigma[maps.mask]
+    assert 0.6 < np.median(share) < 1.0
+
+
+def test_no_vote_leaves_dark_pixels_alone(tmp_path):
+    settings = tof.even(tof.HZ, 4)
+    folder = write(tmp_path / "c", cw_frames(tof.correlations(VIEW, 1500, settings, ambient=40, seed=2), settings))
+    assert run(folder)[2]["found"]["with_neighbours"] > 0
+    _, maps, report = run(folder, vote=False)
+    assert report["found"]["with_neighbours"] == 0 and (maps.range[maps.status == Status.LOW_MODULATION] == 0).all()
+
+
+def test_two_returns_keep_a_range_whose_deviation_covers_the_disagreement(tmp_path):
+    settings, near = tof.even(tof.HZ, 4), tof.View(np.clip(VIEW.distance, 0.5, 6), VIEW.albedo, VIEW.cosine)
+    images = tof.correlations(near, 1e5, settings, seed=1, second=(1.3, 0.3))
+    images[:, :, :30] = tof.correlations(near, 1e5, settings, seed=1)[:, :, :30]
+    result, _, report = run(write(tmp_path / "c", cw_frames(images, settings)))
+    maps = DepthMaps.read(result.depth_path, unsure=True)
+    found = maps.status == Status.MULTIPATH
+    assert found.mean() > 0.3 and (maps.range[found] > 0).all() and not maps.mask[found].any()
+    error = (np.abs(maps.range - near.distance) * along())[found & (np.abs(maps.range - near.distance) < 0.9)]
+    sigma = maps.sigma[found & (np.abs(maps.range - near.distance) < 0.9)]
+    assert np.median(error / sigma) < 3  # both returns pull one way; with noise alone it is above 20
+    assert any("disagree by" in warning and "frames[].tof" in warning for warning in report["warnings"])
 
 
 def test_three_phases_and_images_in_other_units(tmp_path):
@@ -156,6 +199,7 @@ def test_pixels_in_trouble_have_a_status(tmp_path):
     images[:, 10:12] = 2e6
     images[:, 20:22] = 300 + np.random.default_rng(0).normal(0, 18, images[:, 20:22].shape)
     _, maps, report = run(write(tmp_path / "c", cw_frames(images, settings), saturation=2e6))
+    assert report["warnings"] == []
     assert (maps.status[10:12] == Status.SATURATED).all()
     assert np.mean(maps.status[20:22] == Status.LOW_MODULATION) > 0.99
     assert report["pixels"]["saturated"] == 2 * COLS
