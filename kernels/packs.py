@@ -34,6 +34,12 @@ def channels_type(length: int) -> Any:
     return wp.types.matrix(shape=(3, length), dtype=wp.float32)
 
 
+@wp.func
+def bit_of(byte: wp.uint8, frame: int) -> int:
+    """Return the bit of a frame, 0 or 1, from the byte of Band.saturated that has it."""
+    return (int(byte) >> (frame % 8)) & 1
+
+
 class Band(NamedTuple):
     """Readings of a pixel range on a device, as packs, and which of them saturate.
 

@@ -9,8 +9,7 @@ import numpy as np
 
 from kernels.errors import ArrayError
 from kernels.relight.environment import Weighting
-from kernels.relight.latlong import first_of_equals
-from kernels.relight.triangulation import find_faces, triangulate_sphere
+from kernels.relight.sample_energy import share_samples
 
 SAMPLE_PITCH_DEGREES = 1.0
 """Largest distance between two samples of a disc, degrees: finer than captured lights are apart."""
@@ -42,18 +41,11 @@ def integrate_discs(middles: np.ndarray, angles_degrees: np.ndarray, directions:
         raise ArrayError(f"directions are {directions.shape}: give [lights, 3], one light or more")
     if middles.ndim != 2 or middles.shape[1] != 3 or np.shape(angles_degrees) != (len(middles),):
         raise ArrayError(f"middles are {middles.shape}, angles {np.shape(angles_degrees)}: give [discs, 3] and [discs]")
-    kept = first_of_equals(directions)
     energy = np.zeros((len(middles), len(directions)))
-    triangles = triangulate_sphere(directions[kept]) if weighting is Weighting.SMOOTH and len(middles) else None
     for disc, (middle, angle) in enumerate(zip(middles, angles_degrees, strict=True)):
         samples = disc_samples(middle, float(angle))
-        if triangles is None:
-            shares = np.bincount((samples @ directions[kept].T).argmax(axis=1), minlength=len(kept)).astype(np.float64)
-        else:
-            face, part = find_faces(triangles, samples)
-            at_vertices = np.bincount(triangles.corner[face].reshape(-1), weights=part.reshape(-1), minlength=len(triangles.vertex))
-            shares = at_vertices @ triangles.share
-        energy[disc, kept] = shares * (2 / (1 + math.cos(math.radians(angle / 2))) / len(samples))
+        shares = share_samples(samples, np.ones((len(samples), 1)), directions, weighting=weighting)[:, 0]
+        energy[disc] = shares * (2 / (1 + math.cos(math.radians(angle / 2))) / len(samples))
     return energy
 
 

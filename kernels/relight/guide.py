@@ -16,7 +16,8 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
-from kernels.packs import Band, as_packs, pack_type
+from kernels.packs import Band, as_packs, bit_of, pack_type
+from kernels.relight.beyond import spacing
 from kernels.relight.shading import Surface, lobes, modelled, require_same
 
 POOL = 2
@@ -40,10 +41,8 @@ def seen_lobes(specular: np.ndarray, roughness: np.ndarray, direction: np.ndarra
     Returns:
         F0 and roughness, float32.
     """
-    cosine = direction @ direction.T - 2 * np.eye(len(direction))
-    spacing = float(np.median(np.arccos(np.clip(cosine.max(axis=1), -1, 1))))
     alpha = np.asarray(roughness, dtype=np.float32) ** 2
-    wider = np.maximum(alpha, np.float32(LEAST_ALPHA * spacing))
+    wider = np.maximum(alpha, np.float32(LEAST_ALPHA * spacing(direction)))
     return specular * ((alpha / wider) ** 2)[..., None], np.where(alpha > 0, np.sqrt(wider), 0)
 
 
@@ -52,7 +51,8 @@ def compare_model(band: Band, surface: Surface, visible: wp.array, direction: np
     """Compare the model with the captured images, each left out and predicted from its neighbours.
 
     Args:
-        band: captured images of the same pixels as the surface.
+        band: captured images of the same pixels as the surface; where one of the four readings of a comparison is clipped, the comparison
+            does not count.
         surface: solved maps.
         visible: [lights, P] uint8 packs of occlusion.see_lights.
         direction: [lights, 3] unit vectors to the captured lights.
@@ -75,7 +75,7 @@ def compare_model(band: Band, surface: Surface, visible: wp.array, direction: np
     place = np.concatenate([direction, np.zeros((count, 1))], axis=1)
     sums = wp.empty((2, surface.packs * pack), dtype=wp.float32, device=device)
     devices.launch(_compare_kernel(pack), surface.packs,
-                   [band.values, band.frame_count, surface.values, visible,
+                   [band.values, band.saturated, band.frame_count, surface.values, visible,
                     wp.array(place, dtype=wp.vec4, device=device), wp.array(factor, dtype=wp.vec3, device=device),
                     wp.array(neighbours, dtype=wp.vec3i, device=device), wp.array(shares, dtype=wp.vec3, device=device)],
                    [as_packs(sums, device)], device=device)
@@ -114,6 +114,7 @@ def _compare_kernel(pack: int) -> Any:
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
     def compare_kernel(first: int,
                      captured: wp.array2d(dtype=half_pack),  # [3 · lights padded, P]
+                     clipped: wp.array2d(dtype=byte_pack),  # [lights padded / 8, P] bits
                      padded: int,  # lights
                      values: wp.array2d(dtype=lane_type),  # [16, P]
                      visible: wp.array2d(dtype=byte_pack),  # [lights, P]
@@ -133,6 +134,7 @@ def _compare_kernel(pack: int) -> Any:
                 near = neighbours[light]
                 missing_r, missing_g, missing_b = lane_type(), lane_type(), lane_type()
                 told_r, told_g, told_b = lane_type(), lane_type(), lane_type()
+                counts = lane_type(1.0)
                 for corner in range(4):
                     at = wp.where(corner == 0, light, wp.where(corner == 1, near[0], wp.where(corner == 2, near[1], near[2])))
                     weight = wp.where(corner == 0, 1.0, -wp.where(corner == 1, parts[0], wp.where(corner == 2, parts[1], parts[2])))
@@ -140,7 +142,9 @@ def _compare_kernel(pack: int) -> Any:
                     lit = visible[at, p]
                     factor = factors[at] * weight
                     red, green, blue = captured[at, p], captured[padded + at, p], captured[2 * padded + at, p]
+                    bits = clipped[at / 8, p]
                     for k in range(pack):
+                        counts[k] = wp.where(bit_of(bits[k], at) == 1, 0.0, counts[k])
                         seen = weight * float(lit[k]) * wp.static(1.0 / 255.0)
                         missing_r[k] += factor[0] * float(red[k])
                         missing_g[k] += factor[1] * float(green[k])
@@ -149,8 +153,8 @@ def _compare_kernel(pack: int) -> Any:
                         told_g[k] += modelled(seen, albedo_g[k], f0_g[k], facing[k], shine[k], rise[k])
                         told_b[k] += modelled(seen, albedo_b[k], f0_b[k], facing[k], shine[k], rise[k])
                 for k in range(pack):
-                    top[k] += missing_r[k] * told_r[k] + missing_g[k] * told_g[k] + missing_b[k] * told_b[k]
-                    bottom[k] += told_r[k] * told_r[k] + told_g[k] * told_g[k] + told_b[k] * told_b[k]
+                    top[k] += counts[k] * (missing_r[k] * told_r[k] + missing_g[k] * told_g[k] + missing_b[k] * told_b[k])
+                    bottom[k] += counts[k] * (told_r[k] * told_r[k] + told_g[k] * told_g[k] + told_b[k] * told_b[k])
         sums[0, p] = top
         sums[1, p] = bottom
 

@@ -7,8 +7,9 @@ each pixel is fitted to the captured images (kernels.relight.guide).
 Source: a control variate with a regression coefficient, Glasserman, "Monte Carlo Methods in Financial Engineering", section 4.1.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +18,11 @@ import warp as wp
 from kernels import packs
 from kernels.errors import ArrayError
 from kernels.relight.around import left_out
+from kernels.relight.beyond import compare_beyond, followed, inward_pairs
 from kernels.relight.guide import compare_model, fit_trust, seen_lobes
 from kernels.relight.near_sum import sum_near
 from kernels.relight.shading import shade
+from kernels.relight.sources import Sources
 from service.light.lighting import ModelLight, NearLights
 from service.light.surface_model import ModelBatch, SurfaceModel
 from service.reporting.progress import Timings
@@ -72,17 +75,28 @@ class Guide:
         self._seen: dict[int, wp.array] = {}
         if progress is not None:
             progress.stage("guide", len(self._model.pixels))
+        self.trust = self._fit(lambda band, batch: compare_model(
+            band, batch.surface, self._visible(batch), lights.direction, lights.irradiance, stack.scale, neighbours, shares), progress)
+        """[n] β of the model's pixels between the captured lights, 0…1."""
+
+    @cached_property
+    def trust_beyond(self) -> np.ndarray:
+        """Return [n] β of the model's pixels for light from beyond the captured lights, 0…1."""
+        lights, stack = self._lights, self._stack
+        pairs = inward_pairs(lights.direction)
+        return self._fit(lambda band, batch: compare_beyond(band, batch.surface, self._visible(batch), lights.direction, lights.irradiance,
+                                                            stack.scale, pairs), None)
+
+    def _fit(self, compare: Callable[[packs.Band, ModelBatch], wp.array], progress: Timings | None) -> np.ndarray:
+        """Return [n] β from sums [2, pixels] that a comparison takes of every batch."""
         sums, done = np.zeros((2, len(self._model.pixels)), dtype=np.float32), 0
         for batch in self._model.batches():
-            band = packs.upload(*stack.pick(batch.pixels), device=device)
-            compared = compare_model(band, batch.surface, self._visible(batch), lights.direction, lights.irradiance, stack.scale,
-                                     neighbours, shares)
+            compared = compare(packs.upload(*self._stack.pick(batch.pixels), device=self._model.device), batch)
             sums[:, done : done + len(batch.pixels)] = compared.numpy()[:, : len(batch.pixels)]
             done += len(batch.pixels)
             if progress is not None:
                 progress.advance(done)
-        self.trust = fit_trust(sums, self._model.pixels, maps.mask.shape)
-        """[n] β of the model's pixels, 0…1."""
+        return fit_trust(sums, self._model.pixels, self._model.maps.mask.shape)
 
     def correct(self, frames: np.ndarray, lights: Sequence[ModelLight], *, specular: bool) -> np.ndarray | None:
         """Add to plain frames what the model says they miss.
@@ -98,22 +112,33 @@ class Guide:
         mirrored = np.zeros(frames.shape, dtype=np.float32) if specular else None
         done = 0
         for batch in self._model.batches():
-            count = len(batch.pixels)
-            trust = self.trust[done : done + count]
+            part = slice(done, done + len(batch.pixels))
             for index, light in enumerate(lights):
                 visible = self._visible(batch, light.marched)
-                wanted = shade(batch.surface, light.wanted, visible).numpy()[:, :count]
-                given = shade(batch.surface, light.captured, visible).numpy()[:, :count]
                 plain = frames[index][:, batch.pixels]
-                guided = np.maximum(plain + trust * (wanted - given).reshape(2, 3, count).sum(axis=0), np.minimum(plain, 0))
+                correction, mirror = self._correction(batch, part, light, visible, plain)
+                guided = np.maximum(plain + correction, np.minimum(plain, 0))
                 frames[index][:, batch.pixels] = guided
                 if mirrored is not None:
-                    part = wanted[3:]
-                    if light.added is not None:
-                        part = part + shade(batch.surface, light.added, visible).numpy()[3:, :count]
-                    mirrored[index][:, batch.pixels] = np.clip(part, 0, np.maximum(guided, 0))
-            done += count
+                    mirrored[index][:, batch.pixels] = np.clip(mirror, 0, np.maximum(guided, 0))
+            done = part.stop
         return mirrored
+
+    def _correction(self, batch: ModelBatch, part: slice, light: ModelLight, visible: wp.array,
+                    plain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return what is added to a plain frame [3, n], and the model's specular part of the frame's light [3, n]."""
+        def lit(sources: Sources) -> np.ndarray:
+            return shade(batch.surface, sources, visible).numpy()[:, : len(batch.pixels)].reshape(2, 3, -1)
+
+        wanted, given = lit(light.wanted), lit(light.captured)
+        correction, mirror = self.trust[part] * (wanted - given).sum(axis=0), wanted[1]
+        added = 0 if light.added is None else lit(light.added)
+        if light.beyond is not None:
+            outside, stands_in = lit(light.beyond.wanted), lit(light.beyond.captured)
+            whole = stands_in + np.maximum(given, 0) + added
+            correction += self.trust_beyond[part] * followed((outside - stands_in).sum(axis=0), plain, whole.sum(axis=0))
+            mirror = mirror + outside[1]
+        return correction, mirror if light.added is None else mirror + added[1]
 
     def add_near(self, frame: np.ndarray, specular: np.ndarray, near: NearLights) -> None:
         """Add near lights to a frame: every pixel's own sum of the captured images, and what the model says that misses.

@@ -13,10 +13,12 @@ import numpy as np
 
 from kernels.relight import sources
 from kernels.relight.around import lights_around
+from kernels.relight.beyond import share_beyond
 from kernels.relight.discs import disc_samples, integrate_discs
 from kernels.relight.environment import Weighting, integrate, light_weights
 from kernels.relight.latlong import LightEnergy
 from kernels.relight.marching import grouped
+from kernels.relight.sample_energy import share_samples
 from kernels.relight.sources import NEVER, Sources, far, join
 from service.light.environments import EnvironmentMap, Environments
 from service.light.schedule import Disc, ScheduledFrame
@@ -57,13 +59,24 @@ class ModelLight(NamedTuple):
     """The light of one frame as samples, for a model of the surface."""
 
     wanted: Sources
-    """The light that the frame should show: the environment and the discs."""
+    """The light that the frame should show, as far as it lies between the captured lights: of the environment and the discs."""
     captured: Sources
-    """The light that the weighted sum of images already contains for the environment and the discs: the captured lights, with the energy
-    that the weights give each."""
+    """The light that the weighted sum of images already contains for it: the captured lights, with the energy that the weights give
+    each."""
+    beyond: "LightBeyond | None"
+    """The rest of the environment and the discs; None: nothing lies beyond the captured lights."""
     added: Sources | None
     """The captured lights of the images that light keys of type captured add; None: the frame adds none."""
     marched: np.ndarray  # [groups, 4] directions whose visibility follows after that of the captured lights
+
+
+class LightBeyond(NamedTuple):
+    """Light from beyond the captured lights (kernels.relight.beyond)."""
+
+    wanted: Sources
+    """The light; what hides it is what hides the captured lights nearest to it, because no image shows shadows of such light."""
+    captured: Sources
+    """What stands in for it in the weighted sum of images."""
 
 
 class FrameLight(NamedTuple):
@@ -72,6 +85,8 @@ class FrameLight(NamedTuple):
     weights: np.ndarray  # [3, lights padded] float32: what each stored image is multiplied by
     model: ModelLight | None
     """The same light for a model of the surface; None: no model is lit."""
+    share_beyond: float
+    """Share of the energy of the environment and the discs, 0…1, that comes from twice the reach of the captured lights and farther."""
 
 
 class NearLights(NamedTuple):
@@ -82,6 +97,19 @@ class NearLights(NamedTuple):
     coarse: Sources
     """Fewer samples, for sums of captured images."""
     marched: np.ndarray  # [rows, 4] places of the rows of visibility
+
+
+class FarSamples(NamedTuple):
+    """Far light as samples."""
+
+    direction: np.ndarray  # [n, 3] float64 unit vectors
+    energy: np.ndarray  # [n, 3] float64 ∫ L dω
+    sharp: np.ndarray  # [n] bool: casts shadows of its own
+
+    def scaled(self, part: np.ndarray) -> "FarSamples":
+        """Return the samples with a part [n] of their energy, without those that have none."""
+        kept = part > 0
+        return FarSamples(self.direction[kept], self.energy[kept] * part[kept, None], self.sharp[kept])
 
 
 class CaptureLighting:
@@ -122,7 +150,10 @@ class CaptureLighting:
         for each, light, captured in zip(weights, resolved, images, strict=True):
             for index, weight in captured.items():
                 each[:, index] += weight * self._stack.scale[index]
-            yield FrameLight(each, self._model_light(light, each, captured) if self._with_model else None)
+            samples = far_samples(light)
+            beyond = share_beyond(self._lights.direction, samples.direction)
+            yield FrameLight(each, self._model_light(samples, beyond, each, captured) if self._with_model else None,
+                             float(samples.energy[beyond >= 1].sum() / max(samples.energy.sum(), np.finfo(float).tiny)))
 
     def _weights(self, run: Sequence[FarLight]) -> np.ndarray:
         """Return [frames, 3, lights padded] float32 weights that stand for environment and discs."""
@@ -143,8 +174,15 @@ class CaptureLighting:
                 energy[index] += share[:, None] * disc.irradiance
         return light_weights(LightEnergy(energy, np.zeros(energy.shape[:2])), self._lights.irradiance, self._stack.scale)
 
-    def _model_light(self, light: FarLight, weights: np.ndarray, captured: Mapping[int, float]) -> ModelLight:
-        """Return the light of one frame for a model; `captured` holds how much of which captured image the frame adds."""
+    def _model_light(self, samples: FarSamples, beyond: np.ndarray, weights: np.ndarray, captured: Mapping[int, float]) -> ModelLight:
+        """Return the light of one frame for a model.
+
+        Args:
+            samples: of the light.
+            beyond: [samples] how far each lies beyond the captured lights.
+            weights: [3, lights padded] of the stored images.
+            captured: how much of which captured image the frame adds.
+        """
         directions, irradiance = self._lights.direction, self._lights.irradiance
         count = len(directions)
         scale = np.asarray(self._stack.scale[:count], dtype=np.float64)
@@ -154,8 +192,15 @@ class CaptureLighting:
         for index, weight in captured.items():
             shares[index] -= weight
             added[index] += weight * irradiance[index]
-        wanted, marched = light_samples(light, directions)
-        return ModelLight(wanted, _captured(directions, shares * irradiance), _captured(directions, added) if captured else None, marched)
+        given = shares * irradiance
+        outside = None
+        if (beyond > 0).any():
+            part = samples.scaled(beyond)
+            stands_in = share_samples(part.direction, part.energy, directions, weighting=self._weighting)
+            outside = LightBeyond(_hidden(part, directions), _captured(directions, stands_in))
+            samples, given = samples.scaled(1 - beyond), given - stands_in
+        wanted, marched = light_samples(samples, directions)
+        return ModelLight(wanted, _captured(directions, given), outside, _captured(directions, added) if captured else None, marched)
 
 
 def far_light(frame: ScheduledFrame, environments: Environments | None, space: str) -> FarLight:
@@ -171,18 +216,35 @@ def far_light(frame: ScheduledFrame, environments: Environments | None, space: s
         StorageError: the map cannot be read.
     """
     discs = tuple(disc._replace(irradiance=np.maximum(rgb_matrix(disc.color_space, space) @ disc.irradiance, 0), color_space=space)
-                  for disc in frame.discs)  # a colour outside the working space's gamut has a negative channel
+                  for disc in frame.discs if any(disc.irradiance))  # a colour outside the working space's gamut has a negative channel
     if frame.environment is None or environments is None:
         return FarLight(None, np.eye(3), 1.0, discs)
     turned = frame.environment
     return FarLight(environments.read(turned.path, space), turned.rotation, 2.0**turned.exposure_stops, discs)
 
 
-def light_samples(light: FarLight, directions: np.ndarray) -> tuple[Sources, np.ndarray]:
-    """Return far light as samples, and the directions in which sharp shadows are marched for them.
+def far_samples(light: FarLight) -> FarSamples:
+    """Return the environment and the discs of one frame as samples."""
+    directions, energy, sharp = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros(0, dtype=bool)]
+    if light.environment is not None:
+        samples = light.environment.samples
+        directions.append(samples.direction @ light.rotation.T)
+        energy.append(samples.energy * light.gain)
+        sharp.append(samples.radius < np.radians(SHARP_RADIUS_DEGREES))
+    for disc in light.discs:
+        towards = disc_samples(disc.direction, disc.angle_degrees)
+        whole = disc.irradiance * 2 / (1 + np.cos(np.radians(disc.angle_degrees / 2)))
+        directions.append(towards)
+        energy.append(np.tile(whole / len(towards), (len(towards), 1)))
+        sharp.append(np.full(len(towards), True))
+    return FarSamples(np.concatenate(directions), np.concatenate(energy), np.concatenate(sharp))
+
+
+def light_samples(samples: FarSamples, directions: np.ndarray) -> tuple[Sources, np.ndarray]:
+    """Return far light for a model, and the directions in which sharp shadows are marched for it.
 
     Args:
-        light: of one frame.
+        samples: of the light of one frame.
         directions: [lights, 3] unit vectors whose visibility has the first rows; samples that throw no sharp shadow take it.
 
     Returns:
@@ -191,20 +253,7 @@ def light_samples(light: FarLight, directions: np.ndarray) -> tuple[Sources, np.
     Raises:
         ArrayError: fewer than four directions, or all in one plane.
     """
-    parts, sharp = [far(np.zeros((0, 3)), np.zeros((0, 3)))], [np.zeros(0, dtype=bool)]
-    if light.environment is not None:
-        samples = light.environment.samples
-        parts.append(far(samples.direction @ light.rotation.T, samples.energy * light.gain))
-        sharp.append(samples.radius < np.radians(SHARP_RADIUS_DEGREES))
-    for disc in light.discs:
-        towards = disc_samples(disc.direction, disc.angle_degrees)
-        whole = disc.irradiance * 2 / (1 + np.cos(np.radians(disc.angle_degrees / 2)))
-        parts.append(far(towards, np.tile(whole / len(towards), (len(towards), 1))))
-        sharp.append(np.full(len(towards), True))
-    wanted = join(parts)
-    around, share = lights_around(directions, wanted.place[:, :3].astype(np.float64))
-    return grouped(wanted._replace(occluder=around, share=share), np.concatenate(sharp), len(directions), most=FAR_MARCHES,
-                   reach=np.radians(FAR_REACH_DEGREES))
+    return grouped(_hidden(samples, directions), samples.sharp, len(directions), most=FAR_MARCHES, reach=np.radians(FAR_REACH_DEGREES))
 
 
 def near_lights(lights: Sequence[NearLight], first_row: int) -> NearLights:
@@ -241,3 +290,10 @@ def _captured(directions: np.ndarray, energy: np.ndarray) -> Sources:
     own_row = np.full((len(energy), 3), NEVER, np.int32)
     own_row[:, 0] = np.arange(len(energy))
     return far(directions, energy)._replace(occluder=own_row)
+
+
+def _hidden(samples: FarSamples, directions: np.ndarray) -> Sources:
+    """Return samples hidden as the captured lights around them are."""
+    sources = far(samples.direction, samples.energy)
+    around, share = lights_around(directions, sources.place[:, :3].astype(np.float64))
+    return sources._replace(occluder=around, share=share)

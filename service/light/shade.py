@@ -18,7 +18,7 @@ from service.light.combine import linear_frames
 from service.light.environments import Environments
 from service.light.guide import Guide
 from service.light.layers import read_maps, still_layers
-from service.light.lighting import CaptureLighting, NearLight, far_light, light_samples, near_lights
+from service.light.lighting import CaptureLighting, NearLight, far_light, far_samples, light_samples, near_lights
 from service.light.outputs import check_outputs
 from service.light.schedule import UPRIGHT, ScheduledFrame, TurnedEnvironment
 from service.light.sequence import capture_files
@@ -117,7 +117,7 @@ def _shade_maps(maps: SurfaceMaps, path: Path, lighting: ScheduledFrame, environ
     """Return [3, pixels] float32 radiance of the maps alone, and its specular part."""
     model = SurfaceModel(maps, path, device)
     around = fibonacci_sphere(SHADOW_DIRECTIONS)
-    wanted, marched = light_samples(far_light(lighting, environments, maps.color_space), around)
+    wanted, marched = light_samples(far_samples(far_light(lighting, environments, maps.color_space)), around)
     places = [np.concatenate([around, np.zeros((SHADOW_DIRECTIONS, 1))], axis=1)] if wanted.count else []
     places.append(marched)
     close = near_lights(near, sum(map(len, places)))
