@@ -12,12 +12,15 @@ from stage.errors import ImageError
 from stage.light import OffLight
 from stage.manifest import Frame
 
+FULL_SCALE = 1.0
+"""The largest integer as `images.read_pixels` gives it."""
+
 
 class Radiance(NamedTuple):
     """The corrected pixels of one image, and which of them saturate."""
 
     pixels: np.ndarray  # [rows, cols, 3] float32, scene-linear; may be below 0 by noise once dark or ambient is taken off
-    saturated: np.ndarray | None  # [rows, cols] bool, any channel at or above the capture's `saturation`
+    saturated: np.ndarray | None  # [rows, cols] bool, any channel at or above the capture's `saturation`, or its largest integer
 
 
 @dataclass(frozen=True)
@@ -31,10 +34,16 @@ class Correction:
     dark: np.ndarray | None  # [rows, cols, 3] float32, linear; taken at the exposure of the frames
     flat: np.ndarray | None  # [rows, cols, 3] float32, mean 1 in each channel
     ambient: np.ndarray | None  # [rows, cols, 3] float32, mean of the `off` frames, corrected
+    full_scale: bool = False
+    """True to mark the largest value of integers as saturated where the capture gives no `saturation`."""
 
     @classmethod
-    def of(cls, capture: Capture) -> "Correction":
+    def of(cls, capture: Capture, *, full_scale: bool = False) -> "Correction":
         """Read the dark, flat and ambient frames of a capture and return its correction.
+
+        Args:
+            capture: an opened capture.
+            full_scale: True to mark the largest value of integers as saturated where the capture gives no `saturation`.
 
         Raises:
             ImageError: a frame is unreadable or holds impossible values, or the flat field is dark inside the mask.
@@ -52,14 +61,14 @@ class Correction:
             if unlit:
                 raise ImageError(f"{capture.file(manifest.flat)}: flat is not above dark at {unlit} of the mask's pixels")
             flat = np.where(flat > 0, flat, 1) / flat[mask].mean(axis=0)
-        partial = cls(capture, dark, flat, None)
+        partial = cls(capture, dark, flat, None, full_scale)
         off = [frame for frame, _ in capture.lit_by(OffLight)]
         if not off:
             return partial
         total = np.zeros((capture.camera.height, capture.camera.width, 3), dtype=np.float32)
         for frame in off:
             total += partial.apply(frame).pixels
-        return cls(capture, dark, flat, total / len(off))
+        return cls(capture, dark, flat, total / len(off), full_scale)
 
     def apply(self, frame: Frame) -> Radiance:
         """Read one frame and correct it.
@@ -70,8 +79,11 @@ class Correction:
         manifest = self.capture.manifest
         recorded = _recorded(self.capture, frame.image)
         saturated: np.ndarray | None = None
-        if manifest.saturation is not None:
-            saturated = np.any(recorded >= manifest.saturation, axis=-1)
+        limit = manifest.saturation
+        if limit is None and self.full_scale and images.read_header(self.capture.file(frame.image)).integer:
+            limit = FULL_SCALE
+        if limit is not None:
+            saturated = np.any(recorded >= limit, axis=-1)
         pixels = linearise(recorded, manifest.color_space)
         if self.dark is not None:
             pixels = pixels - self.dark

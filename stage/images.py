@@ -11,6 +11,7 @@ from stage.errors import ImageError, storage
 
 OIIO_SUFFIXES = {".png", ".tif", ".tiff", ".hdr", ".jpg", ".jpeg", ".jxl", ".dpx"}
 SUFFIXES = {".exr", *OIIO_SUFFIXES}
+FLOATING = {oiio.HALF, oiio.FLOAT, oiio.DOUBLE}
 
 
 class ImageHeader(NamedTuple):
@@ -20,6 +21,7 @@ class ImageHeader(NamedTuple):
     height: int
     channels: int  # 1 for grey, 3 for RGB; alpha is not counted
     stored: int  # the count of all channels in the file, which are decoded together
+    integer: bool  # integers, whose largest value a camera writes for everything brighter too
 
 
 def read_header(path: str | Path) -> ImageHeader:
@@ -32,7 +34,7 @@ def read_header(path: str | Path) -> ImageHeader:
     suffix = Path(path).suffix.lower()
     if suffix == ".exr":
         header = exr.read_header(path)
-        return ImageHeader(header.width, header.height, len(_colour_channels(path, header.channels)), len(header.channels))
+        return ImageHeader(header.width, header.height, len(_colour_channels(path, header.channels)), len(header.channels), False)
     if suffix not in OIIO_SUFFIXES:
         raise ImageError(f"{path}: has an unknown suffix: relit reads {', '.join(sorted(SUFFIXES))}")
     if suffix == ".png":
@@ -40,7 +42,7 @@ def read_header(path: str | Path) -> ImageHeader:
     source = _open(path)
     try:
         spec = source.spec()
-        return ImageHeader(spec.width, spec.height, 1 if spec.nchannels < 3 else 3, spec.nchannels)
+        return ImageHeader(spec.width, spec.height, 1 if spec.nchannels < 3 else 3, spec.nchannels, spec.format.basetype not in FLOATING)
     finally:
         source.close()
 

@@ -34,6 +34,8 @@ DECODE_BYTES = 1 << 30
 """The bytes that all images which are decoded at one time may take."""
 BYTES_PER_PIXEL, ALIGNED_BYTES_PER_PIXEL = 40, 160
 """The bytes of a pixel while its image is corrected (half and float RGB, masks, the planes to write), and while it is warped."""
+FLOATING = {".exr", ".hdr"}
+"""Suffixes of images without integers: no value of theirs is known to be clipped unless the capture says so."""
 TOP_EXPONENT = 15
 """The brightest value of a light is stored in [2^14, 2^15): below 65504, the largest half, with 29 stops of normal values."""
 
@@ -132,6 +134,8 @@ def _key(capture: Capture, frames: list[Frame], tracking: Tracking | None, finge
         "corrections": [manifest.dark, manifest.flat],
         "content": fingerprints.of([*images, *corrections]),
     }
+    if manifest.saturation is None and any(Path(frame.image).suffix.lower() not in FLOATING for frame in frames):
+        inputs["saturation"] = "largest integer"
     if tracking is not None:
         time_of = {frame.image: time for time, frame in enumerate(manifest.frames)}
         inputs["align"] = [VERSION, tracking.times, tracking.reference, [time_of[frame.image] for frame in frames]]
@@ -145,7 +149,7 @@ def _build(capture: Capture, frames: list[Frame], alignment: Alignment | None, f
     lights, pixels = stacks.padded(len(frames), LIGHT_PAD), stacks.padded(pixel_count, PIXEL_PAD)
     scale = np.zeros(lights, dtype=np.float32)
     saturated = np.zeros((lights // 8, pixels), dtype=np.uint8)
-    correction = Correction.of(capture)
+    correction = Correction.of(capture, full_scale=True)
     done = 0
     lock = threading.Lock()
 

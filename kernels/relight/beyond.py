@@ -1,4 +1,4 @@
-"""Light from beyond the captured lights, where there is nothing to interpolate: how far away it is, and how far a model may be followed there.
+"""Light from beyond the captured lights, where nothing can be interpolated: how far away it is, and how far a model may be followed.
 
 Plain sums let the nearest captured lights stand in for such light. A model of the surface says how much brighter or darker it leaves a
 pixel. What it adds is added; what it takes away is taken as a share of the picture, so that a model that is too bright or that misses a

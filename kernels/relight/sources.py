@@ -36,6 +36,12 @@ class Sources(NamedTuple):
         """Number of samples."""
         return len(self.place)
 
+    def scaled(self, part: np.ndarray) -> "Sources":
+        """Return the samples with a part [n] of their energy, without those that have none."""
+        kept = part > 0
+        chosen = Sources(*(values[kept] for values in self))
+        return chosen._replace(energy=(chosen.energy * part[kept, None]).astype(np.float32))
+
 
 def far(direction: np.ndarray, irradiance: np.ndarray) -> Sources:
     """Return far lights as samples.

@@ -11,6 +11,7 @@ from service.errors import RequestError
 from service.reporting.progress import Timings
 from service.reporting.provenance import metadata
 from service.requests.basis import BasisKind, BasisRequest
+from stage.brackets import merge_brackets
 from stage.capture import Capture
 from stage.colour_spaces import linear_space
 from stage.ingest import open_stack
@@ -89,7 +90,8 @@ def open_capture(request: BasisRequest, timings: Timings) -> BasisCapture:
         if path.resolve() in inputs:
             raise RequestError(f"--out {request.out}: {path} is an input: choose another folder or name")
     timings.stage("ingest", len(capture.sources()))
-    stack = open_stack(capture, cache=request.cache, tracking=tracking, progress=lambda done, _: timings.advance(done))
+    stack = merge_brackets(open_stack(capture, cache=request.cache, tracking=tracking, progress=lambda done, _: timings.advance(done)),
+                           capture.sources(), lights)
     inside = np.zeros(stack.shape[2], dtype=bool)
     inside[: stack.pixel_count] = mask.reshape(-1)
     near = len(capture.lit_by(PointLight))

@@ -2,6 +2,7 @@
 
 import typer
 
+from service.cli.printing import print_warnings
 from service.cli.progress import ProgressOption, ProgressStyle, progress_in
 from service.cli.request_commands import local_command
 from service.requests.relight import RelightRequest
@@ -34,6 +35,7 @@ def _relight(request: RelightRequest, progress: ProgressOption = ProgressStyle.B
         print(f"lights   {result.near_lights} near lights are taken as distant, as the object's centre sees them")
     if result.clipped:
         print(f"clipped  {result.clipped} pixels are brighter than half can hold and stand at its largest value")
+    print_warnings(result.warnings)
 
 
 def _shade(request: ShadeRequest, progress: ProgressOption = ProgressStyle.BAR) -> None:
@@ -46,3 +48,4 @@ def _shade(request: ShadeRequest, progress: ProgressOption = ProgressStyle.BAR) 
         print("scale    the maps have none: places of lights are taken in pixels")
     if result.clipped:
         print(f"clipped  {result.clipped} pixels are brighter than half can hold and stand at its largest value")
+    print_warnings(result.warnings)

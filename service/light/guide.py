@@ -2,7 +2,8 @@
 
 frame = Σ w_i I_i + β · (model under the wanted light − Σ w_i · model under captured light i). The captured images bring shadows,
 interreflection and scattering, the model brings what lies between the lights: sharp lobes, and the shadows of small bright lights. β of
-each pixel is fitted to the captured images (kernels.relight.guide).
+each pixel is fitted to the captured images (kernels.relight.guide). Light from beyond the captured lights has a β of its own, and what the
+model takes away there is a share of the sum (kernels.relight.beyond).
 
 Source: a control variate with a regression coefficient, Glasserman, "Monte Carlo Methods in Financial Engineering", section 4.1.
 """
@@ -18,17 +19,19 @@ import warp as wp
 from kernels import packs
 from kernels.errors import ArrayError
 from kernels.relight.around import left_out
-from kernels.relight.beyond import compare_beyond, followed, inward_pairs
+from kernels.relight.beyond import compare_beyond, followed, inward_pairs, share_beyond
 from kernels.relight.guide import compare_model, fit_trust, seen_lobes
 from kernels.relight.near_sum import sum_near
 from kernels.relight.shading import shade
 from kernels.relight.sources import Sources
-from service.light.lighting import ModelLight, NearLights
+from service.light.clipping import Clipping, clipped_channels
+from service.light.lighting import ModelLight, NearLights, captured_lights
 from service.light.surface_model import ModelBatch, SurfaceModel
 from service.reporting.progress import Timings
 from stage.errors import ResultError
 from stage.maps import SurfaceMaps
 from stage.point_lights import DistantLights
+from stage.replaced import ReplacedStack
 from stage.stack import Stack
 
 NOTHING = np.zeros((0, 4), dtype=np.float32)
@@ -40,15 +43,16 @@ KEPT_BYTES = 1 << 30
 class Guide:
     """A model of one capture's surface, and how far each pixel trusts it."""
 
-    def __init__(self, maps: SurfaceMaps, where: Path, stack: Stack, lights: DistantLights, *, space: str, device: str,
+    def __init__(self, maps: SurfaceMaps, where: Path, stack: Stack, lights: DistantLights, clipping: Clipping, *, space: str, device: str,
                  progress: Timings | None) -> None:
-        """Compare the model with every captured image, and fit β.
+        """Compare the model with every captured image, fit β, and estimate the clipped readings.
 
         Args:
             maps: of the capture, in its working space.
             where: their file, for messages.
             stack: the captured images.
             lights: the captured lights.
+            clipping: of the captured images.
             space: the scene-linear space of the stack.
             device: where.
             progress: told of every batch.
@@ -78,6 +82,8 @@ class Guide:
         self.trust = self._fit(lambda band, batch: compare_model(
             band, batch.surface, self._visible(batch), lights.direction, lights.irradiance, stack.scale, neighbours, shares), progress)
         """[n] β of the model's pixels between the captured lights, 0…1."""
+        self.stack = self._unclipped(clipping.level)
+        """The captured images, with clipped readings as bright as the model has them."""
 
     @cached_property
     def trust_beyond(self) -> np.ndarray:
@@ -97,6 +103,31 @@ class Guide:
             if progress is not None:
                 progress.advance(done)
         return fit_trust(sums, self._model.pixels, self._model.maps.mask.shape)
+
+    def _unclipped(self, level: np.ndarray) -> Stack:
+        """Return the captured images, where a reading is clipped at `level` [lights padded] and the model is brighter, by β brighter."""
+        lights, stack, count = self._lights, self._stack, len(self._lights.direction)
+        found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+        done = 0
+        for batch in self._model.batches():
+            part = slice(done, done + len(batch.pixels))
+            done = part.stop
+            if not stack.pick_saturated(batch.pixels).any():
+                continue
+            values, bits = stack.pick(batch.pixels)
+            channels = clipped_channels(values, bits, stack.scale, level)
+            visible = self._visible(batch)
+            for light in np.flatnonzero(channels[:, :count].any(axis=(0, 2))):
+                alone = captured_lights(lights.direction, np.where(np.arange(count)[:, None] == light, lights.irradiance, 0))
+                told = shade(batch.surface, alone, visible).numpy()[:, : len(batch.pixels)].reshape(2, 3, -1).sum(axis=0)
+                read = values[:, light].astype(np.float32) * stack.scale[light]
+                short = np.where(channels[:, light], np.maximum(told - read, 0), 0)
+                at = np.flatnonzero(short.any(axis=0))
+                found.append((batch.pixels[at], np.full(len(at), light), (read + self.trust[part] * short)[:, at]))
+        if not found:
+            return stack
+        pixel, light, radiance = zip(*found, strict=True)
+        return ReplacedStack.of(stack, np.concatenate(pixel), np.concatenate(light), np.concatenate(radiance, axis=1))
 
     def correct(self, frames: np.ndarray, lights: Sequence[ModelLight], *, specular: bool) -> np.ndarray | None:
         """Add to plain frames what the model says they miss.
@@ -132,13 +163,13 @@ class Guide:
 
         wanted, given = lit(light.wanted), lit(light.captured)
         correction, mirror = self.trust[part] * (wanted - given).sum(axis=0), wanted[1]
-        added = 0 if light.added is None else lit(light.added)
+        added = np.zeros_like(wanted) if light.added is None else lit(light.added)
         if light.beyond is not None:
             outside, stands_in = lit(light.beyond.wanted), lit(light.beyond.captured)
             whole = stands_in + np.maximum(given, 0) + added
             correction += self.trust_beyond[part] * followed((outside - stands_in).sum(axis=0), plain, whole.sum(axis=0))
             mirror = mirror + outside[1]
-        return correction, mirror if light.added is None else mirror + added[1]
+        return correction, mirror + added[1]
 
     def add_near(self, frame: np.ndarray, specular: np.ndarray, near: NearLights) -> None:
         """Add near lights to a frame: every pixel's own sum of the captured images, and what the model says that misses.
@@ -150,19 +181,36 @@ class Guide:
         """
         if not near.fine.count:
             return
+        fine, coarse = self._beyond(near.fine), self._beyond(near.coarse)
         done = 0
         for batch in self._model.batches():
-            count = len(batch.pixels)
+            part = slice(done, done + len(batch.pixels))
             visible = self._visible(batch, near.marched)
-            wanted = shade(batch.surface, near.fine, visible).numpy()[:, :count]
-            band = packs.upload(*self._stack.pick(batch.pixels), device=self._model.device)
-            summed = sum_near(band, batch.surface, visible, near.coarse, self._lights.direction, self._lights.irradiance,
-                              self._stack.scale).numpy()[:, :count]
-            missing = wanted[:3] + wanted[3:] - summed[3:]
-            added = np.maximum(summed[:3] + self.trust[done : done + count] * missing, 0)
+            wanted, pictures, told = self._near_part(batch, visible, near.fine.scaled(1 - fine), near.coarse.scaled(1 - coarse))
+            added = pictures + self.trust[part] * (wanted.sum(axis=0) - told)
+            mirror = wanted[1]
+            if fine.any() or coarse.any():
+                wanted, pictures, told = self._near_part(batch, visible, near.fine.scaled(fine), near.coarse.scaled(coarse))
+                added = added + pictures + self.trust_beyond[part] * followed(wanted.sum(axis=0) - told, pictures, told)
+                mirror = mirror + wanted[1]
+            added = np.maximum(added, 0)
             frame[:, batch.pixels] += added
-            specular[:, batch.pixels] += np.clip(wanted[3:], 0, added)
-            done += count
+            specular[:, batch.pixels] += np.clip(mirror, 0, added)
+            done = part.stop
+
+    def _beyond(self, sources: Sources) -> np.ndarray:
+        """Return how far near samples lie beyond the captured lights, as the middle of the surface sees them."""
+        towards = sources.place[:, :3] - sources.place[:, 3:] * self._model.middle
+        return share_beyond(self._lights.direction, towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-20))
+
+    def _near_part(self, batch: ModelBatch, visible: wp.array, fine: Sources, coarse: Sources) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the model under near samples [2, 3, n], diffuse and specular, and the images and the model summed for them [3, n] each."""
+        count = len(batch.pixels)
+        wanted = shade(batch.surface, fine, visible).numpy()[:, :count].reshape(2, 3, -1)
+        band = packs.upload(*self.stack.pick(batch.pixels), device=self._model.device)
+        summed = sum_near(band, batch.surface, visible, coarse, self._lights.direction, self._lights.irradiance, self.stack.scale)
+        pictures, told = summed.numpy()[:, :count].reshape(2, 3, -1)
+        return wanted, pictures, told
 
     def _visible(self, batch: ModelBatch, marched: np.ndarray = NOTHING) -> wp.array:
         """Return which pixels see the captured lights, and the marched places [n, 4] after them."""

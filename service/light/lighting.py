@@ -13,7 +13,7 @@ import numpy as np
 
 from kernels.relight import sources
 from kernels.relight.around import lights_around
-from kernels.relight.beyond import share_beyond
+from kernels.relight.beyond import reach, share_beyond
 from kernels.relight.discs import disc_samples, integrate_discs
 from kernels.relight.environment import Weighting, integrate, light_weights
 from kernels.relight.latlong import LightEnergy
@@ -131,6 +131,11 @@ class CaptureLighting:
         self._lights, self._stack, self._environments, self._space = lights, stack, environments, space
         self._weighting, self._device, self._with_model = weighting, device, with_model
 
+    @property
+    def beyond_degrees(self) -> float:
+        """Return the least angle from every captured light, in degrees, of light that counts in `FrameLight.share_beyond`."""
+        return float(np.degrees(2 * reach(self._lights.direction)))
+
     def frames(self, scheduled: Sequence[ScheduledFrame]) -> Iterator[FrameLight]:
         """Yield the light of each frame; a map is read when its first frame comes.
 
@@ -197,10 +202,11 @@ class CaptureLighting:
         if (beyond > 0).any():
             part = samples.scaled(beyond)
             stands_in = share_samples(part.direction, part.energy, directions, weighting=self._weighting)
-            outside = LightBeyond(_hidden(part, directions), _captured(directions, stands_in))
+            outside = LightBeyond(_hidden(part, directions), captured_lights(directions, stands_in))
             samples, given = samples.scaled(1 - beyond), given - stands_in
         wanted, marched = light_samples(samples, directions)
-        return ModelLight(wanted, _captured(directions, given), outside, _captured(directions, added) if captured else None, marched)
+        return ModelLight(wanted, captured_lights(directions, given), outside,
+                          captured_lights(directions, added) if captured else None, marched)
 
 
 def far_light(frame: ScheduledFrame, environments: Environments | None, space: str) -> FarLight:
@@ -285,8 +291,8 @@ def _near_samples(light: NearLight, count: int | None = None) -> Sources:
     return sources.point(np.array(light.position_m), np.array(light.intensity), axis, light.anisotropy)
 
 
-def _captured(directions: np.ndarray, energy: np.ndarray) -> Sources:
-    """Return the captured lights with these energies [lights, 3], each hidden by what hides it."""
+def captured_lights(directions: np.ndarray, energy: np.ndarray) -> Sources:
+    """Return the captured lights as samples of these energies [lights, 3], each hidden by what hides it."""
     own_row = np.full((len(energy), 3), NEVER, np.int32)
     own_row[:, 0] = np.arange(len(energy))
     return far(directions, energy)._replace(occluder=own_row)
@@ -294,6 +300,6 @@ def _captured(directions: np.ndarray, energy: np.ndarray) -> Sources:
 
 def _hidden(samples: FarSamples, directions: np.ndarray) -> Sources:
     """Return samples hidden as the captured lights around them are."""
-    sources = far(samples.direction, samples.energy)
-    around, share = lights_around(directions, sources.place[:, :3].astype(np.float64))
-    return sources._replace(occluder=around, share=share)
+    whole = far(samples.direction, samples.energy)
+    around, share = lights_around(directions, whole.place[:, :3].astype(np.float64))
+    return whole._replace(occluder=around, share=share)

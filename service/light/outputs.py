@@ -22,7 +22,7 @@ from service.requests.relight import RelightRequest
 from stage import exr, fingerprint
 from stage.errors import StageError, StorageError
 
-ARITHMETIC = 1
+ARITHMETIC = 2
 """Version of the arithmetic, part of every request hash. It is raised when the same request gives other pixels, so that older frames are
 made again."""
 REQUEST_ATTRIBUTE = "relit:request"

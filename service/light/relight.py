@@ -12,7 +12,9 @@ import numpy as np
 
 from kernels import device as devices
 from kernels.relight.environment import Weighting
+from service.light.clipping import Clipping
 from service.light.combine import chunk_frames, linear_frames
+from service.light.findings import FrameFindings
 from service.light.guide import Guide
 from service.light.layers import read_maps, still_layers
 from service.light.lighting import CaptureLighting
@@ -24,6 +26,7 @@ from service.light.write import FrameFile, FrameFormat, FrameWriter
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import metadata, report
 from service.requests.relight import RelightRequest
+from stage.brackets import merge_brackets
 from stage.files import write_text
 
 
@@ -40,6 +43,8 @@ class RelightResult(NamedTuple):
     """Pixels of the frames made now that are beyond the largest half value, stored as that value."""
     near_lights: int
     """Point lights that were taken as distant ones, as the object's centre sees them; in a sequence the largest number of one capture."""
+    warnings: tuple[str, ...]
+    """What does not fit in the frames made now, and what to try."""
 
 
 def relight(request: RelightRequest, progress: Progress | None = None) -> RelightResult:
@@ -64,6 +69,7 @@ def relight(request: RelightRequest, progress: Progress | None = None) -> Religh
     plan = make_plan(request)
     skipped = near_lights = 0
     captures: list[dict[str, object]] = []
+    findings = FrameFindings(guided=request.maps is not None)
     if plan.is_sequence:
         timings.stage("frames", len(plan.frames))
     with FrameWriter(lambda written: timings.advance(skipped + written)) as writer:
@@ -78,7 +84,7 @@ def relight(request: RelightRequest, progress: Progress | None = None) -> Religh
             skipped += len(frames) - len(todo)
             captures.append({"name": opened.capture.name, "content": opened.ingest.key, "frames": len(opened.lights.direction)})
             if todo:
-                _relight_capture(opened, todo, request, plan, writer, device, timings)
+                _relight_capture(opened, todo, request, plan, writer, findings, device, timings)
         with timings.part("waiting for files"):
             writer.wait()
         if plan.is_sequence:
@@ -88,13 +94,14 @@ def relight(request: RelightRequest, progress: Progress | None = None) -> Religh
         timings.stage("sheet", 1)
         contact_sheet(request.sheet, paths)
     timings.close()
-    result = RelightResult(paths, len(plan.folders), skipped, writer.written.clipped, near_lights)
+    result = RelightResult(paths, len(plan.folders), skipped, writer.written.clipped, near_lights, findings.sentences)
     if request.report is not None:
         write_text(request.report, report(
             request,
             inputs={"capture": str(request.capture), "captures": captures},
             frames={"made": writer.written.frames, "skipped": skipped, "clipped_pixels": writer.written.clipped,
                     "first": str(paths[0]), "last": str(paths[-1])},
+            warnings=result.warnings,
             device=devices.describe(device),
             timings_s={**timings.seconds, "of these": {name: round(seconds, 3) for name, seconds in timings.parts.items()},
                        "on writing threads": {"to half": round(writer.written.half_s, 3), "files": round(writer.written.file_s, 3)}}))
@@ -102,7 +109,7 @@ def relight(request: RelightRequest, progress: Progress | None = None) -> Religh
 
 
 def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]], request: RelightRequest, plan: Plan,
-                     writer: FrameWriter, device: str, timings: Timings) -> None:
+                     writer: FrameWriter, findings: FrameFindings, device: str, timings: Timings) -> None:
     """Make frames of one capture; `todo` holds each frame with the hash of its request."""
     maps = None if opened.maps is None else read_maps(opened.maps, opened.capture)
     layers = still_layers(request.aov, opened.capture, maps, opened.maps)
@@ -112,12 +119,15 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
     if not plan.is_sequence:
         timings.stage("ingest", len(opened.capture.sources()))
     with timings.part("ingest"):
-        stack = opened.ingest.stack(None if plan.is_sequence else lambda done, _: timings.advance(done))
+        stack = merge_brackets(opened.ingest.stack(None if plan.is_sequence else lambda done, _: timings.advance(done)),
+                               opened.capture.sources(), opened.lights)
+        clipping = Clipping.of(stack, opened.capture.mask().reshape(-1))
     guide = None
     if maps is not None and opened.maps is not None:
         with timings.part("guide"):
-            guide = Guide(maps, opened.maps, stack, opened.lights, space=opened.space, device=device,
+            guide = Guide(maps, opened.maps, stack, opened.lights, clipping, space=opened.space, device=device,
                           progress=None if plan.is_sequence else timings)
+            stack = guide.stack
     if not plan.is_sequence:
         timings.stage("frames", len(plan.frames))
     form = FrameFormat.of(request, opened.capture.camera.resolution, opened.space, layers)
@@ -133,8 +143,11 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
         chunk = list(members)
         with timings.part("weights"):
             light = list(islice(lights, len(chunk)))
+        weights, numbers = np.stack([each.weights for each in light]), [frame.scheduled.number for frame, _ in chunk]
+        findings.add_beyond(numbers, [each.share_beyond for each in light], lighting.beyond_degrees)
+        findings.add_clipped(numbers, weights, clipping)
         with timings.part("product"):
-            frames = linear_frames(stack, np.stack([each.weights for each in light]),
+            frames = linear_frames(stack, weights,
                                    None if alone else [frame.position % size for frame, _ in chunk], device=device)
         specular = None
         if guide is not None:

@@ -14,8 +14,10 @@ from kernels.relight.environment import Weighting
 from kernels.relight.shading import shade as shade_surface
 from kernels.relight.sources import join
 from service.errors import RequestError
+from service.light.clipping import Clipping
 from service.light.combine import linear_frames
 from service.light.environments import Environments
+from service.light.findings import FrameFindings
 from service.light.guide import Guide
 from service.light.layers import read_maps, still_layers
 from service.light.lighting import CaptureLighting, NearLight, far_light, far_samples, light_samples, near_lights
@@ -27,6 +29,7 @@ from service.light.write import FrameFile, FrameFormat, FrameWriter
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import metadata
 from service.requests.shade import ShadeRequest
+from stage.brackets import merge_brackets
 from stage.capture import Capture
 from stage.errors import ResultError
 from stage.frames import fibonacci_sphere, rotation_about_y
@@ -47,6 +50,8 @@ class ShadeResult(NamedTuple):
     """True where places of lights are metres; else they are pixels, because the maps have no scale."""
     clipped: int
     """Pixels above the largest half value, stored as that value."""
+    warnings: tuple[str, ...]
+    """What does not fit, and what to try."""
 
 
 def shade(request: ShadeRequest, progress: Progress | None = None) -> ShadeResult:
@@ -75,17 +80,18 @@ def shade(request: ShadeRequest, progress: Progress | None = None) -> ShadeResul
     if request.capture is None:
         maps = SurfaceMaps.read(path)
         frame, specular = _shade_maps(maps, path, lighting, environments, near, device, timings)
+        warnings: tuple[str, ...] = ()
     else:
         capture = Capture.open(request.capture)
         maps = read_maps(path, capture)
-        frame, specular = _shade_capture(capture, request.cache, maps, path, lighting, environments, near, device, timings)
+        frame, specular, warnings = _shade_capture(capture, request.cache, maps, path, lighting, environments, near, device, timings)
     timings.stage("write", 1)
     form = FrameFormat.of(request, maps.camera.resolution, maps.color_space, still_layers(request.aov, None, maps, path))
     facts = metadata(request, capture=maps.provenance.get("relit:capture", ""), inputs=maps.provenance.get("relit:inputs", ""))
     with FrameWriter(lambda _: timings.advance(1)) as writer:
         writer.put([FrameFile(request.out, 2.0**request.exposure, facts)], frame[None], form, specular[None] if form.parts else None)
     timings.close()
-    return ShadeResult(request.out, maps.camera.metric, writer.written.clipped)
+    return ShadeResult(request.out, maps.camera.metric, writer.written.clipped, warnings)
 
 
 def check(request: ShadeRequest) -> Path:
@@ -135,20 +141,25 @@ def _shade_maps(maps: SurfaceMaps, path: Path, lighting: ScheduledFrame, environ
 
 def _shade_capture(capture: Capture, cache: Path | None, maps: SurfaceMaps, path: Path, lighting: ScheduledFrame,
                    environments: Environments | None, near: tuple[NearLight, ...], device: str,
-                   timings: Timings) -> tuple[np.ndarray, np.ndarray]:
-    """Return [3, pixels] float32 radiance of the captured images, guided by the maps, and its specular part."""
+                   timings: Timings) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+    """Return [3, pixels] float32 radiance of the captured images, guided by the maps, its specular part, and warnings."""
     lights = lights_from_centre(capture)
     timings.stage("ingest", len(capture.sources()))
-    stack = open_stack(capture, cache=cache, progress=lambda done, _: timings.advance(done))
-    guide = Guide(maps, path, stack, lights, space=maps.color_space, device=device, progress=timings)
+    stack = merge_brackets(open_stack(capture, cache=cache, progress=lambda done, _: timings.advance(done)), capture.sources(), lights)
+    clipping = Clipping.of(stack, capture.mask().reshape(-1))
+    guide = Guide(maps, path, stack, lights, clipping, space=maps.color_space, device=device, progress=timings)
     timings.stage("shade", 2)
-    light, = CaptureLighting(lights, stack, environments, maps.color_space, weighting=Weighting.SMOOTH, device=device,
-                             with_model=True).frames([lighting])
-    frames = linear_frames(stack, light.weights[None], None, device=device)
+    captured = CaptureLighting(lights, guide.stack, environments, maps.color_space, weighting=Weighting.SMOOTH, device=device,
+                               with_model=True)
+    light, = captured.frames([lighting])
+    frames = linear_frames(guide.stack, light.weights[None], None, device=device)
+    findings = FrameFindings(guided=True)
+    findings.add_beyond([0], [light.share_beyond], captured.beyond_degrees)
+    findings.add_clipped([0], light.weights[None], clipping)
     assert light.model is not None
     specular = guide.correct(frames, [light.model], specular=True)
     assert specular is not None
     timings.advance(1)
     guide.add_near(frames[0], specular[0], near_lights(near, len(lights.direction)))
     timings.advance(2)
-    return frames[0], specular[0]
+    return frames[0], specular[0], findings.sentences

@@ -54,6 +54,8 @@ class SurfaceModel:
         if not len(self.pixels):
             raise ResultError(f"{where}: no pixel is solved")
         self._points = maps.camera.points(maps.height).reshape(-1, 3)
+        self.middle = self._points[self.pixels].mean(axis=0)
+        """[3] Mean place of the solved pixels."""
         self._view = view_directions(maps.camera)
         inside = whole.reshape(maps.mask.shape)
         self._height = wp.array(np.where(inside, maps.height, 0).astype(np.float32), dtype=wp.float32, device=device)

@@ -60,13 +60,16 @@ def sphere_directions(count: int) -> np.ndarray:
     return np.stack([ring * np.sin(turn), y, ring * np.cos(turn)], axis=-1)
 
 
-def write_dome(folder: Path, surface: Dome, *, lights: int = 48, irradiance: float = 2.0) -> np.ndarray:
-    """Write the capture; returns the directions of its lights."""
+def write_dome(folder: Path, surface: Dome, *, lights: int = 48, irradiance: float = 2.0, directions: np.ndarray | None = None,
+               noise: float = 0.0) -> np.ndarray:
+    """Write the capture, with noise of this part of the brightest reading; returns the directions of its lights, by default evenly over the
+    sphere."""
     folder.mkdir(parents=True)
-    directions = sphere_directions(lights)
-    frames = []
+    directions = sphere_directions(lights) if directions is None else directions
+    frames, random = [], np.random.default_rng(0)
     for index, direction in enumerate(directions):
         image = reflect(surface.normal, direction) * irradiance * surface.mask[..., None]
+        image = np.maximum(image + noise * image.max() * random.normal(size=image.shape), 0) if noise else image
         write_exr(folder / f"{index:03d}.exr", image)
         frames.append({"image": f"{index:03d}.exr",
                        "light": {"type": "distant", "direction": direction.tolist(), "irradiance": [irradiance] * 3}})

@@ -19,7 +19,7 @@ def test_integers_are_fractions_of_full_scale(tmp_path, suffix, dtype, full):
     codes = RNG.integers(0, full, (5, 7, 3), endpoint=True).astype(dtype)
     codes[0, 0], codes[0, 1] = 0, full
     pixels = read_pixels(write_image(tmp_path / f"a.{suffix}", codes))
-    assert read_header(tmp_path / f"a.{suffix}") == (7, 5, 3, 3)
+    assert read_header(tmp_path / f"a.{suffix}") == (7, 5, 3, 3, True)
     assert pixels.dtype == np.float32
     # codes / full in float32: half a unit in the last place either way
     assert np.allclose(pixels, codes / full, rtol=1.2e-7, atol=0)
@@ -29,6 +29,7 @@ def test_integers_are_fractions_of_full_scale(tmp_path, suffix, dtype, full):
 def test_float_tiff_keeps_its_bits(tmp_path):
     values = (UNIT * 1000).astype(np.float32)
     assert np.array_equal(read_pixels(write_image(tmp_path / "a.tif", values)), values)
+    assert not read_header(tmp_path / "a.tif").integer
 
 
 def test_hdr_is_right_to_its_eight_bit_mantissa(tmp_path):
@@ -53,7 +54,7 @@ def test_grey_repeats_its_channel(tmp_path, name):
     pixels = read_pixels(path)
     assert pixels.shape == (4, 6, 3)
     assert np.allclose(pixels, codes[..., None] / 255, rtol=1.2e-7)
-    assert read_header(path) == (6, 4, 1, 1)
+    assert read_header(path) == (6, 4, 1, 1, not name.endswith("exr"))
 
 
 def test_alpha_is_dropped_and_not_multiplied(tmp_path):
@@ -65,7 +66,7 @@ def test_alpha_is_dropped_and_not_multiplied(tmp_path):
     values = np.concatenate([UNIT, np.full((5, 7, 1), 0.5)], axis=-1).astype(np.float32)
     path = write_exr(tmp_path / "a.exr", values)
     assert np.array_equal(read_pixels(path), values[..., :3])
-    assert read_header(path) == (7, 5, 3, 4)
+    assert read_header(path) == (7, 5, 3, 4, False)
 
 
 def test_channels_that_are_no_colour_are_named(tmp_path):

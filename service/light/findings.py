@@ -1,0 +1,75 @@
+"""Sentences about frames whose light the captured images do not hold: from beyond the captured lights, or clipped."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from service.light.clipping import Clipping
+
+LEAST_BEYOND = 0.05
+"""Least share of a frame's energy from beyond the captured lights that is told: with less, what stands in for it changes the frame by less
+than the captured lights themselves leave open (docs/figures.md)."""
+LEAST_CLIPPED = 0.005
+"""Least share of a channel of a frame from clipped readings that is told."""
+PLAIN_BEYOND = ("there the nearest captured lights stand in, so that shading and shadows are wrong and most pixels too bright; --maps "
+                "corrects the shading, lights captured there correct both")
+GUIDED_BEYOND = ("there the model of --maps is followed, as far as the captured lights confirm it, with the shadows of the nearest "
+                 "captured lights; lights captured there show their own shadows")
+SHORTER = "add shorter exposures of these lights to the capture (exposure_s)"
+PLAIN_CLIPPED = "too dark by an unknown amount; " + SHORTER
+GUIDED_CLIPPED = "taken from the model of --maps where it is brighter; " + SHORTER
+
+
+@dataclass
+class FrameFindings:
+    """The worst of the frames that were made."""
+
+    guided: bool
+    """Whether a model of solved maps guides the frames."""
+    beyond: float = 0.0
+    """Largest share of a frame's energy from beyond the captured lights."""
+    beyond_frame: int = 0
+    """Number of that frame; 0 stands for a single picture without a number."""
+    beyond_degrees: float = 0.0
+    """Least angle of that light from every captured light."""
+    clipped: tuple[float, ...] = (0.0, 0.0, 0.0)
+    """Shares of red, green and blue of a frame from clipped readings, in the frame where the largest is largest."""
+    clipped_frame: int = 0
+    clipped_pixels: float = 0.0
+    """Share of the object's pixels that have clipped readings in that capture."""
+
+    def add_beyond(self, numbers: Sequence[int], shares: Sequence[float], degrees: float) -> None:
+        """Take in the shares of energy of frames that come from more than some degrees beyond the captured lights."""
+        for number, share in zip(numbers, shares, strict=True):
+            if share > self.beyond:
+                self.beyond, self.beyond_frame, self.beyond_degrees = share, number, degrees
+
+    def add_clipped(self, numbers: Sequence[int], weights: np.ndarray, clipping: Clipping) -> None:
+        """Take in frames [frames, 3, lights padded] by the weights of their stored images."""
+        for number, shares in zip(numbers, clipping.share(weights), strict=True):
+            if shares.max() > max(self.clipped):
+                self.clipped, self.clipped_frame = tuple(float(share) for share in shares), number
+                self.clipped_pixels = clipping.pixels
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What does not fit, and what to try."""
+        found = []
+        if self.beyond >= LEAST_BEYOND:
+            found.append(f"{_percent(self.beyond)} of the light of {_picture(self.beyond_frame)} comes from directions more than "
+                         f"{self.beyond_degrees:.0f} degrees from every captured light: {GUIDED_BEYOND if self.guided else PLAIN_BEYOND}")
+        if max(self.clipped) >= LEAST_CLIPPED:
+            red, green, blue = (_percent(share) for share in self.clipped)
+            found.append(f"{red} of the red, {green} of the green and {blue} of the blue of {_picture(self.clipped_frame)} is from "
+                         f"readings that are clipped in every frame of their light, at {_percent(self.clipped_pixels)} of the object's pixels: "
+                         f"it is {GUIDED_CLIPPED if self.guided else PLAIN_CLIPPED}")
+        return tuple(found)
+
+
+def _picture(number: int) -> str:
+    return f"frame {number}" if number else "the picture"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2g} %" if share < 0.995 else "100 %"
