@@ -10,19 +10,26 @@ from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.normal_equations import add_reading, symmetric
 from kernels.packs import Band, pack_type, zeros
-from kernels.photometric.least_squares import confidence_of, fit_pixel
+from kernels.photometric.least_squares import fit_pixel
 from kernels.photometric.near import NearLights, directions_in, toward_or_none
 from kernels.photometric.readings import Readings
 from kernels.status import OK
 
+SHADOW_FRACTION = 0.1
+"""Fraction of the brightest reading below which a reading may be in shadow, and b·l need not predict it."""
+
 
 class NormalFit(NamedTuple):
-    """Normals of a band; the last axis is pixels, padded to whole packs. Only pixels with status OK have values."""
+    """Normals of a band, and what their uncertainty follows from; the last axis is pixels, padded to whole packs. Only pixels with
+    status OK have values. kernels.photometric.misfit makes standard errors and confidence of the last four."""
 
     normal: wp.array  # [3, pixels] float32, unit
-    confidence: wp.array  # [pixels] float32, 0…1: 1 / (1 + standard error of the normal / 1°)
-    residual: wp.array  # [pixels] float32, RMS of (reading - b·l) / |b| over the lit lights
+    residual: wp.array  # [pixels] float32, RMS of (reading - b·l) / |b| over the readings of the fit, by their weights
     status: wp.array  # [pixels] int32, kernels.status.Status
+    across: wp.array  # [pixels] float32, radians²: variance of the normal for independent errors of variance |b|² in the readings
+    squares: wp.array  # [pixels] float32, sum of the squared errors of the readings that the residuals show, in |b|²
+    freedom: wp.array  # [pixels] float32, degrees of freedom of `squares`: the weights of the readings, less the three unknowns
+    agreeing: wp.array  # [pixels] float32, part of the lit readings that b·l predicts; 1 for a solver that rejects none
 
 
 def solve_lambert(band: Band, readings: Readings, directions: np.ndarray, near_lights: NearLights | None = None) -> NormalFit:
@@ -50,30 +57,54 @@ def run_normal_kernel(make: Any, band: Band, readings: Readings, directions: np.
     """Launch a kernel that turns readings into normals; shared by the solvers that differ in the kernel alone."""
     if directions.shape != (band.frame_count, 3):
         raise ArrayError(f"directions are {directions.shape}, the band has {band.frame_count} lights: give a row for each")
-    fit = NormalFit(zeros(band.pixel_count, wp.float32, band.device, rows=3),
-                    zeros(band.pixel_count, wp.float32, band.device),
-                    zeros(band.pixel_count, wp.float32, band.device),
-                    zeros(band.pixel_count, wp.int32, band.device))
+    def floats() -> wp.array:
+        return zeros(band.pixel_count, wp.float32, band.device)
+
+    fit = NormalFit(zeros(band.pixel_count, wp.float32, band.device, rows=3), floats(), zeros(band.pixel_count, wp.int32, band.device),
+                    floats(), floats(), floats(), floats())
     lights = wp.array(directions, dtype=wp.vec3, device=band.device)
     devices.launch(make(devices.pack_width(band.device), near_lights is not None), band.packs,
                    [lights, toward_or_none(near_lights, band.device), readings.pack_stride, readings.light_stride],
-                   [readings.values, *fit], device=band.device)
+                   [readings.values, _as_struct(fit)], device=band.device)
     return fit
 
 
+@wp.struct
+class NormalArrays:
+    """The arrays of a NormalFit, as a kernel writes them."""
+
+    normal: wp.array2d(dtype=float)  # [3, N]
+    residual: wp.array(dtype=float)  # [N], as the others
+    status: wp.array(dtype=int)
+    across: wp.array(dtype=float)
+    squares: wp.array(dtype=float)
+    freedom: wp.array(dtype=float)
+    agreeing: wp.array(dtype=float)
+
+
+def _as_struct(fit: NormalFit) -> Any:
+    arrays = NormalArrays()
+    for name, array in fit._asdict().items():
+        setattr(arrays, name, array)
+    return arrays
+
+
 @wp.func
-def write_normal(b: wp.vec3, across: float, residual: float, count: float, code: int, pixel: int,
-                 normal: wp.array2d(dtype=float), confidence: wp.array(dtype=float), off: wp.array(dtype=float),
-                 status: wp.array(dtype=int)):
-    """Write one pixel of a NormalFit: b and `across` of its LambertFit, `residual` the sum Σ (y - b·l)² / |b|² over `count` readings."""
-    status[pixel] = code
+def write_normal(pixel: int, b: wp.vec3, code: int, residual: float, across: float, squares: float, freedom: float, agreeing: float,
+                 # outputs
+                 fit: NormalArrays):
+    """Write one pixel of a NormalFit; only its status where that is not OK."""
+    fit.status[pixel] = code
     if code == OK:
         n = wp.normalize(b)
-        normal[0, pixel] = n[0]
-        normal[1, pixel] = n[1]
-        normal[2, pixel] = n[2]
-        confidence[pixel] = confidence_of(across, residual, count)
-        off[pixel] = wp.sqrt(residual / count)
+        fit.normal[0, pixel] = n[0]
+        fit.normal[1, pixel] = n[1]
+        fit.normal[2, pixel] = n[2]
+        fit.residual[pixel] = residual
+        fit.across[pixel] = across
+        fit.squares[pixel] = squares
+        fit.freedom[pixel] = freedom
+        fit.agreeing[pixel] = agreeing
 
 
 @cache
@@ -89,13 +120,15 @@ def _lambert_kernel(pack: int, near: bool = False) -> Any:
                        light_stride: int,
                        # outputs
                        readings: wp.array(dtype=float_pack),  # in: readings, out: weights
-                       normal: wp.array2d(dtype=float),  # [3, N]
-                       confidence: wp.array(dtype=float),  # [N]
-                       residual: wp.array(dtype=float),  # [N]
-                       status: wp.array(dtype=int)):  # [N]
+                       fit: NormalArrays):
         p = first + wp.tid()
         xx, xy, xz, yy, yz, zz = float_pack(), float_pack(), float_pack(), float_pack(), float_pack(), float_pack()
         rx, ry, rz, squares, count = float_pack(), float_pack(), float_pack(), float_pack(), float_pack()
+        top, bright = float_pack(), float_pack()
+        for light in range(lights.shape[0]):
+            y = readings[p * pack_stride + light * light_stride]
+            for k in range(pack):
+                top[k] = wp.max(top[k], y[k])
         for light in range(lights.shape[0]):
             at = p * pack_stride + light * light_stride
             y = readings[at]
@@ -104,12 +137,15 @@ def _lambert_kernel(pack: int, near: bool = False) -> Any:
             for k in range(pack):
                 weight[k] = wp.where(y[k] > 0.0, 1.0, 0.0)
                 count[k] += weight[k]
+                bright[k] += wp.where(y[k] > SHADOW_FRACTION * top[k], 1.0, 0.0)
                 add_reading(y[k], weight[k], lx[step * k], ly[step * k], lz[step * k], xx[k], xy[k], xz[k], yy[k], yz[k], zz[k],
                             rx[k], ry[k], rz[k], squares[k])
             readings[at] = weight
         for k in range(pack):
-            fit = fit_pixel(symmetric(xx[k], xy[k], xz[k], yy[k], yz[k], zz[k]), wp.vec3(rx[k], ry[k], rz[k]),
-                            squares[k], int(count[k]))
-            write_normal(fit.b, fit.across, fit.residual, count[k], fit.status, p * pack + k, normal, confidence, residual, status)
+            found = fit_pixel(symmetric(xx[k], xy[k], xz[k], yy[k], yz[k], zz[k]), wp.vec3(rx[k], ry[k], rz[k]),
+                              squares[k], int(count[k]))
+            # three bright readings and dark ones, which may be shadow, leave nothing to check the fit with
+            write_normal(p * pack + k, found.b, found.status, wp.sqrt(found.residual / wp.max(count[k], 1.0)), found.across,
+                         found.residual, wp.where(bright[k] > 3.0, count[k] - 3.0, 0.0), 1.0, fit)
 
     return lambert_kernel

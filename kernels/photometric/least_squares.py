@@ -1,7 +1,7 @@
 """The weighted normal equations of b·l = reading, solved per pixel: shared by every Lambertian solver.
 
-With G = Σ w l lᵀ and r = Σ w y l, b = G⁻¹ r (Woodham 1980, equation 8, overdetermined); the normal is b/|b|. The standard error
-of the normal follows from the residual variance s² through cov(b) = s² G⁻¹, taken across the normal.
+With G = Σ w l lᵀ and r = Σ w y l, b = G⁻¹ r (Woodham 1980, equation 8, overdetermined); the normal is b/|b|. Independent errors of
+variance s² in the readings give b the covariance s² G⁻¹, which is taken across the normal.
 """
 
 import warp as wp
@@ -15,8 +15,6 @@ MIN_OFF_CIRCLE = 7.6e-5
 half a degree. Float32 sums leave up to 1e-7 of exactly coplanar lights, and noise leaves nothing of such a normal."""
 MIN_EXPLAINED = 1.0e-6
 """Least part of Σ w y² that b·l explains: a pixel with less is equally bright from every side, and its readings give no direction."""
-PRIOR_RESIDUAL = 0.05
-"""Residual, relative to |b|, of one pseudo-observation that is added because three lights leave no residual, yet have noise."""
 CONFIDENCE_HALF = 0.01745329
 """Standard error of the normal, radians (one degree), at which confidence is one half."""
 
@@ -59,10 +57,3 @@ def fit_pixel(g: wp.mat33, r: wp.vec3, squares: float, count: int) -> LambertFit
     fit.residual = wp.max(squares - wp.dot(b, r), 0.0) / (length * length)
     fit.status = OK
     return fit
-
-
-@wp.func
-def confidence_of(across: float, residual: float, count: float) -> float:
-    """Return the confidence 1 / (1 + standard error of the normal / 1°); residual is Σ (y - b·l)² / |b|² over `count` readings."""
-    variance = (residual + PRIOR_RESIDUAL * PRIOR_RESIDUAL) / (wp.max(count - 3.0, 0.0) + 1.0)
-    return 1.0 / (1.0 + wp.sqrt(across * variance) / CONFIDENCE_HALF)

@@ -105,6 +105,16 @@ class Readings(NamedTuple):
     pack_stride: int
     light_stride: int
 
+    def on_host(self, packs: wp.array, pixel_count: int) -> np.ndarray:
+        """Return values that lie as these readings do, [..., packs · lights] float packs, as [..., lights, pixels] float32. Waits for the
+        device."""
+        values = packs.numpy()
+        *rows, count, width = values.shape
+        lights = self.pack_stride if self.light_stride == 1 else count // self.light_stride
+        if self.light_stride == 1:
+            values = np.moveaxis(values.reshape(*rows, count // lights, lights, width), -2, -3)
+        return np.ascontiguousarray(values.reshape(*rows, lights, -1)[..., :pixel_count])
+
 
 def grey_readings(band: Band, factors: np.ndarray) -> Readings:
     """Compute the grey readings of a band.

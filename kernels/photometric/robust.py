@@ -3,7 +3,8 @@
 Per pixel: a light whose reading is under a tenth of the bright end is in shadow; of the lit ones the darkest fifth (grazing,
 penumbra, interreflection) and the brightest three tenths (highlights) are set aside; the rest is solved by least squares,
 re-weighted against what still does not fit. On a Lambertian surface the middle ranks are exact; on real materials they are
-the part of the reflectance that is closest to it.
+the part of the reflectance that is closest to it. The variance of such an estimate is Σ ψ² / (mean ψ')² over the number of
+readings, with the influence function ψ = w · residual (Huber and Ronchetti, chapter 6): rejected readings add nothing to it.
 
 Source: position thresholding after Shi, Tan, Matsushita and Ikeuchi, "Bi-polynomial modeling of low-frequency reflectances",
 TPAMI 2014, section 5; Cauchy weights as in robust regression (Huber and Ronchetti, "Robust Statistics", 2009, chapter 7).
@@ -17,7 +18,7 @@ import warp as wp
 
 from kernels.normal_equations import add_reading, symmetric
 from kernels.packs import Band, pack_type
-from kernels.photometric.lambert import NormalFit, run_normal_kernel, write_normal
+from kernels.photometric.lambert import NormalArrays, NormalFit, run_normal_kernel, write_normal
 from kernels.photometric.least_squares import fit_pixel
 from kernels.photometric.near import NearLights, directions_in
 from kernels.photometric.readings import Readings
@@ -34,6 +35,11 @@ KEPT_AT_LEAST = 8
 """Least number of lights that are kept when ranks are set aside: fewer determine the normal too loosely."""
 CAUCHY_SCALE = 0.05
 """Residual, relative to |b|, at which a reading's weight is halved; the relative noise of a good capture is below it."""
+AGREES = 0.15
+"""Largest residual, relative to |b|, of a reading that agrees with the fit: three times the scale of the weights, and small beside a
+highlight or a shadow."""
+LEAST_SLOPE = 0.25
+"""Least mean slope of the influence function that counts: large residuals leave hardly any, and dividing by it amplifies noise."""
 REWEIGHTINGS = 5
 """Rounds of re-weighting; after five, the normal moves by less than 0.01° on real data."""
 RANGE = 2.0**-26
@@ -98,10 +104,7 @@ def _robust_kernel(pack: int, near: bool = False) -> Any:
                       light_stride: int,
                       # outputs
                       readings: wp.array(dtype=float_pack),  # in: readings, out: weights
-                      normal: wp.array2d(dtype=float),  # [3, N]
-                      confidence: wp.array(dtype=float),  # [N]
-                      residual: wp.array(dtype=float),  # [N]
-                      status: wp.array(dtype=int)):  # [N]
+                      fit: NormalArrays):
         p = first + wp.tid()
         light_count = lights.shape[0]
         start = p * pack_stride
@@ -178,17 +181,17 @@ def _robust_kernel(pack: int, near: bool = False) -> Any:
                     add_reading(y[k], kept_weight(y[k], off, dark_low[k], bright_high[k]), lx[apart * k], ly[apart * k], lz[apart * k],
                                 xx[k], xy[k], xz[k], yy[k], yz[k], zz[k], rx[k], ry[k], rz[k], squares[k])
             for k in range(pack):
-                fit = fit_pixel(symmetric(xx[k], xy[k], xz[k], yy[k], yz[k], zz[k]), wp.vec3(rx[k], ry[k], rz[k]),
-                                squares[k], int(count[k]))
-                bx[k] = fit.b[0]
-                by[k] = fit.b[1]
-                bz[k] = fit.b[2]
-                reach[k] = wp.max(CAUCHY_SCALE * wp.length(fit.b), 1.0e-30)
-                across[k] = fit.across
-                code[k] = fit.status
+                found = fit_pixel(symmetric(xx[k], xy[k], xz[k], yy[k], yz[k], zz[k]), wp.vec3(rx[k], ry[k], rz[k]),
+                                  squares[k], int(count[k]))
+                bx[k] = found.b[0]
+                by[k] = found.b[1]
+                bz[k] = found.b[2]
+                reach[k] = wp.max(CAUCHY_SCALE * wp.length(found.b), 1.0e-30)
+                across[k] = found.across
+                code[k] = found.status
 
-        # the weights that the fit used, for the albedo, and how well it predicts every lit light, for the confidence
-        misfit = float_pack()
+        # the weights that the fit used, for the albedo, and what they and the residuals say about the error of the normal
+        weights, slopes, inside, influence, agreeing = float_pack(), float_pack(), float_pack(), float_pack(), float_pack()
         for light in range(light_count):
             at = start + light * light_stride
             y = readings[at]
@@ -196,11 +199,19 @@ def _robust_kernel(pack: int, near: bool = False) -> Any:
             lx, ly, lz = directions_of(lights, toward, light, at)
             for k in range(pack):
                 off = (y[k] - (bx[k] * lx[apart * k] + by[k] * ly[apart * k] + bz[k] * lz[apart * k])) / reach[k]
-                weight[k] = kept_weight(y[k], off, dark_low[k], bright_high[k])
-                misfit[k] += wp.where(y[k] > shadow[k], wp.min(off * off, wp.static(1.0 / CAUCHY_SCALE**2)), 0.0)
+                w = kept_weight(y[k], off, dark_low[k], bright_high[k])
+                weight[k] = w
+                weights[k] += w
+                slopes[k] += w * (2.0 * w - 1.0)
+                inside[k] += w * off * off
+                influence[k] += w * w * off * off
+                agreeing[k] += wp.where(y[k] > shadow[k], 1.0, 0.0) * wp.where(wp.abs(off) < wp.static(AGREES / CAUCHY_SCALE), 1.0, 0.0)
             readings[at] = weight
         for k in range(pack):
-            write_normal(wp.vec3(bx[k], by[k], bz[k]), across[k], misfit[k] * wp.static(CAUCHY_SCALE**2), lit[k], code[k],
-                         p * pack + k, normal, confidence, residual, status)
+            share = wp.max(slopes[k] / wp.max(weights[k], 1.0e-30), LEAST_SLOPE)
+            write_normal(p * pack + k, wp.vec3(bx[k], by[k], bz[k]), code[k],
+                         CAUCHY_SCALE * wp.sqrt(inside[k] / wp.max(weights[k], 1.0e-30)), across[k],
+                         wp.static(CAUCHY_SCALE**2) * influence[k] / (share * share), wp.max(weights[k] - 3.0, 0.0),
+                         agreeing[k] / wp.max(lit[k], 1.0), fit)
 
     return robust_kernel

@@ -63,8 +63,7 @@ class FrameFindings:
             red, green, blue = (_percent(share) for share in self.clipped)
             found.append(f"{red} of the red, {green} of the green and {blue} of the blue of {_picture(self.clipped_frame)} is from "
                          "readings that are clipped in every frame of their light, at "
-                         f"{_percent(self.clipped_pixels)} of the object's pixels: it is "
-                         + (GUIDED_CLIPPED if self.guided else PLAIN_CLIPPED))
+                         f"{_percent(self.clipped_pixels)} of the object's pixels: it is {GUIDED_CLIPPED if self.guided else PLAIN_CLIPPED}")
         return tuple(found)
 
 

@@ -18,6 +18,7 @@ from kernels.photometric.hypotheses import Diffuse, search_normals
 from kernels.photometric.lambert import NormalFit
 from kernels.photometric.lobes import GEOMETRY, MIXTURE
 from kernels.photometric.material import fit_tinted
+from kernels.photometric.misfit import uncertainty_of
 from kernels.photometric.near import NearField
 from kernels.photometric.readings import Lights, channel_weights, pad_lights
 from kernels.photometric.robust import solve_robust
@@ -28,6 +29,7 @@ from kernels.photometric.svbrdf import solve_svbrdf
 from kernels.status import Status
 from service.solve.batches import Batch, bands, pick_pixels, pixel_batches, view_directions
 from service.solve.interreflection import arriving_light
+from service.solve.misfit import object_misfit
 from service.solve.solution import Solution, SolveInput, suspect_lights
 from service.solve.surface import integrate, projection_of
 from stage.colour import GREY_WEIGHTS
@@ -92,9 +94,15 @@ def solve_diffuse(given: SolveInput, lights: Lights, field: NearField | None = N
     """
     given.timings.stage("normals", given.stack.shape[2])
     result = Solution.empty(given.stack.pixel_count)
+    result.sigma = np.zeros(given.stack.pixel_count, np.float16)
+    misfit = object_misfit(given, lights, field, fit_normals=fit_normals)
     for span, inside, band, readings, near in bands(given, lights, field):
         fit = fit_normals(band, readings, lights.direction, near)
         result.place(span, inside, fit)
+        solved = inside & (result.status[span] == Status.OK)
+        evidence = (array.numpy()[: len(inside)] for array in (fit.across, fit.squares, fit.freedom, fit.agreeing))
+        sure = uncertainty_of(*evidence, misfit)
+        result.sigma[span], result.confidence[span] = np.where(solved, sure.sigma, 0), np.where(solved, sure.confidence, 0)
         albedo = fit_albedo(band, readings, fit, lights, near).numpy()[:, : len(inside)]
         result.albedo[:, span] = np.where(inside, albedo, 0)
     return result

@@ -108,7 +108,6 @@ class Solution:
         """
         count = len(inside)
         self.normal[:, span] = np.where(inside, fit.normal.numpy()[:, :count], 0)
-        self.confidence[span] = np.where(inside, fit.confidence.numpy()[:count], 0)
         self.residual[span] = np.where(inside, fit.residual.numpy()[:count], 0)
         self.status[span] = np.where(inside, fit.status.numpy()[:count], int(Status.UNSOLVED))
 

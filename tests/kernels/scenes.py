@@ -6,6 +6,7 @@ import numpy as np
 
 from kernels import packs
 from kernels.photometric.albedo import fit_albedo
+from kernels.photometric.misfit import Misfit, Uncertainty, uncertainty_of
 from kernels.photometric.readings import grey_factors, grey_readings, pad_lights
 
 GREY = (0.2126, 0.7152, 0.0722)
@@ -18,10 +19,17 @@ HALF_STEP = 2.0**-25
 class Solved(NamedTuple):
     normal: np.ndarray  # [pixel, 3]
     albedo: np.ndarray  # [pixel, 3]
-    confidence: np.ndarray  # [pixel]
     residual: np.ndarray  # [pixel]
     status: np.ndarray  # [pixel]
+    across: np.ndarray  # [pixel]
+    squares: np.ndarray  # [pixel]
+    freedom: np.ndarray  # [pixel]
+    agreeing: np.ndarray  # [pixel]
     weights: np.ndarray  # [light, pixel]
+
+    def uncertainty(self, misfit: Misfit = Misfit()) -> Uncertainty:  # noqa: B008  (immutable)
+        """Of the normals, [pixel]."""
+        return uncertainty_of(self.across, self.squares, self.freedom, self.agreeing, misfit)
 
 
 def cap(count: int, largest_degrees: float) -> np.ndarray:
@@ -63,8 +71,8 @@ def solve(solver, radiance: np.ndarray, direction: np.ndarray, irradiance: np.nd
     readings = grey_readings(band, grey_factors(lights, GREY))
     fit = solver(band, readings, lights.direction)
     albedo = fit_albedo(band, readings, fit, lights)
-    return Solved(fit.normal.numpy()[:, :pixels].T, albedo.numpy()[:, :pixels].T, fit.confidence.numpy()[:pixels],
-                  fit.residual.numpy()[:pixels], fit.status.numpy()[:pixels], unpack(readings, band)[:count, :pixels])
+    scalars = (array.numpy()[:pixels] for array in fit[1:])
+    return Solved(fit.normal.numpy()[:, :pixels].T, albedo.numpy()[:, :pixels].T, *scalars, unpack(readings, band)[:count, :pixels])
 
 
 def unpack(readings, band) -> np.ndarray:

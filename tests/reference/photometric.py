@@ -11,10 +11,16 @@ import numpy as np
 
 class Fit(NamedTuple):
     normal: np.ndarray  # [pixel, 3]
-    confidence: np.ndarray  # [pixel]
     residual: np.ndarray  # [pixel]
+    across: np.ndarray  # [pixel]
+    squares: np.ndarray  # [pixel]
+    freedom: np.ndarray  # [pixel]
+    agreeing: np.ndarray  # [pixel]
     status: np.ndarray  # [pixel] names
     weights: np.ndarray  # [light, pixel]
+
+
+NOTHING = (np.zeros(3), 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def grey_readings(radiance, irradiance, grey_weights, saturated=None):
@@ -34,12 +40,6 @@ def grey_readings(radiance, irradiance, grey_weights, saturated=None):
     if saturated is not None:
         measured &= ~saturated
     return np.where(measured, grey, 0.0)
-
-
-def confidence(across, squared_residual, count):
-    """1 / (1 + standard error of the normal in degrees), with one pseudo-observation of residual 5 %."""
-    variance = (squared_residual + 0.05**2) / (max(count - 3, 0) + 1)
-    return 1 / (1 + np.degrees(np.sqrt(across * variance)))
 
 
 def fit_weighted(readings, directions, weights):
@@ -71,10 +71,10 @@ def solve_lambert(readings, directions):
         lit = (y > 0).astype(float)
         b, spread, status = fit_weighted(y, directions, lit)
         if b is None:
-            return np.zeros(3), 0.0, 0.0, status, lit
+            return *NOTHING, status, lit
         squared, count = (lit * (y - directions @ b) ** 2).sum() / (b @ b), lit.sum()
-        sure = confidence(across_normal(spread, b), squared, count)
-        return b / np.linalg.norm(b), sure, np.sqrt(squared / count), status, lit
+        spare = count - 3 if (y > 0.1 * y.max()).sum() > 3 else 0.0
+        return b / np.linalg.norm(b), np.sqrt(squared / count), across_normal(spread, b), squared, spare, 1.0, status, lit
 
     return _per_pixel(one, readings)
 
@@ -84,7 +84,7 @@ def solve_robust(readings, directions, *, rounds=5):
     def one(y):
         given = np.sort(y[y > 0])[::-1]
         if len(given) == 0:
-            return np.zeros(3), 0.0, 0.0, "DARK", np.zeros_like(y)
+            return *NOTHING, "DARK", np.zeros_like(y)
         bright_end = given[max((len(given) - 5) // 10, 0)]
         lit = 10 * y > bright_end * (1 + 1e-12)  # exactly a tenth, as eight bits often are, is shadow: not a matter of rounding
         ranked = np.sort(y[lit])[::-1]
@@ -97,12 +97,15 @@ def solve_robust(readings, directions, *, rounds=5):
         for _ in range(rounds + 1):
             b, spread, status = fit_weighted(y, directions, weights)
             if b is None:
-                return np.zeros(3), 0.0, 0.0, status, np.zeros_like(y)
+                return *NOTHING, status, np.zeros_like(y)
             off = (y - directions @ b) / (0.05 * np.linalg.norm(b))
             weights = kept / (1 + off**2)
-        squared = 0.05**2 * np.minimum(off[lit] ** 2, 1 / 0.05**2).sum()
-        sure = confidence(across_normal(spread, b), squared, count)
-        return b / np.linalg.norm(b), sure, np.sqrt(squared / count), status, weights
+        off, agreeing = 0.05 * off, (np.abs(0.05 * off[lit]) < 0.15).mean()
+        slope = max((weights * (2 * weights - 1)).sum() / weights.sum(), 0.25)  # of the influence function, per weight
+        squares = (weights * off**2 * weights).sum() / slope**2
+        residual = np.sqrt((weights * off**2).sum() / weights.sum())
+        return (b / np.linalg.norm(b), residual, across_normal(spread, b), squares, max(weights.sum() - 3, 0), agreeing, status,
+                weights)
 
     return _per_pixel(one, readings)
 
@@ -122,5 +125,5 @@ def albedo(radiance, normal, directions, irradiance, weights):
 
 
 def _per_pixel(one, readings):
-    normal, sure, residual, status, weights = zip(*(one(y) for y in readings.T), strict=True)
-    return Fit(np.array(normal), np.array(sure), np.array(residual), np.array(status), np.array(weights).T)
+    columns = [np.array(column) for column in zip(*(one(y) for y in readings.T), strict=True)]
+    return Fit(*columns[:-1], columns[-1].T)

@@ -48,7 +48,8 @@ def test_three_lights_determine_the_normal_exactly(device):
     irradiance = 2 * colours(3, seed=3)
     solved = solve(solve_lambert, shade(normal, albedo, direction, irradiance), direction, irradiance, device)
     check_exact(solved, normal, albedo, direction, irradiance)
-    assert ((solved.confidence > 0) & (solved.confidence < 1)).all()  # no residual is left, and it is not certain for that
+    assert (solved.freedom == 0).all()
+    assert (solved.uncertainty().confidence < 0.3).all()  # no residual is left, and nothing that could tell a wrong normal
 
 
 def test_values_are_those_of_the_twin_on_noisy_data(device):
@@ -64,7 +65,8 @@ def test_values_are_those_of_the_twin_on_noisy_data(device):
     np.testing.assert_array_equal(solved.weights, readings > 0)
     np.testing.assert_allclose(solved.normal[ok], fit.normal[ok], atol=1e-5)  # float32 normal equations
     np.testing.assert_allclose(solved.residual[ok], fit.residual[ok], atol=1e-4)  # the cancelling difference of squares
-    np.testing.assert_allclose(solved.confidence[ok], fit.confidence[ok], atol=1e-4)
+    for name in ("across", "squares", "freedom", "agreeing"):  # float32, and the difference of squares
+        np.testing.assert_allclose(getattr(solved, name)[ok], getattr(fit, name)[ok], rtol=1e-3, atol=1e-4, err_msg=name)
     expected = reference.albedo(radiance.astype(float), fit.normal, direction, irradiance, fit.weights)
     np.testing.assert_allclose(solved.albedo, expected, atol=1e-4)
 
@@ -77,7 +79,7 @@ def test_status_by_the_number_of_readings(lit, status, device):
     solved = solve(solve_lambert, radiance, direction, np.ones((5, 3)), device)
     assert solved.status[0] == status
     if status != Status.OK:
-        for values in (solved.normal, solved.albedo, solved.confidence, solved.residual):
+        for values in (solved.normal, solved.albedo, solved.across, solved.squares, solved.freedom, solved.residual):
             assert (values == 0).all()
 
 
@@ -107,7 +109,7 @@ def test_the_same_from_every_side_has_no_direction(device):
     direction = np.concatenate([np.eye(3), -np.eye(3)])
     solved = solve(solve_lambert, np.ones((3, 6, 1)), direction, np.ones((6, 3)), device)
     assert solved.status[0] == Status.ILL_POSED
-    assert np.isfinite(solved.residual).all() and np.isfinite(solved.confidence).all()
+    assert np.isfinite(solved.residual).all() and np.isfinite(solved.squares).all()
 
 
 @pytest.mark.parametrize("garbage", [60000.0, np.inf, np.nan])

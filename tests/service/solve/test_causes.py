@@ -81,7 +81,7 @@ def test_loose_normals_are_counted_and_kept(tmp_path, scene):
     assert report["pixels"]["ambiguous"] > 0.3 * report["pixels"]["mask"] and report["pixels"]["unsure"] == 0
     assert every.maps.mask.sum() == report["pixels"]["ok"] + report["pixels"]["ambiguous"]
 
-    limit = float(np.median(every.maps.sigma[every.maps.mask]))
+    limit = float(np.quantile(every.maps.sigma[every.maps.mask], 0.2))  # that of normals which most readings contradict is a constant
     some, report = solved(folder, tmp_path / "some", max_sigma=limit)
     written = SurfaceMaps.read(tmp_path / "some" / "maps.exr", unsure=True)
     unsure = written.status == Status.UNSURE
