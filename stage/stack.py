@@ -104,6 +104,20 @@ class Stack:
             values[channel, light] = self._map(values_path(self.folder, self.key), self.shape)[channel, light, pixels]
         return values, self.pick_saturated(pixels)
 
+    def radiance(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the radiance of single pixels, and which readings are usable.
+
+        Args:
+            pixels: [n] row-major indices.
+
+        Returns:
+            [lights, n, 3] float64 scene-linear and [lights, n] bool, without padding.
+        """
+        count = self.light_count
+        values, bits = self.pick(pixels)
+        radiance = np.moveaxis(values[:, :count].astype(np.float64), 0, -1) * self.scale[:count, None, None]
+        return radiance, np.unpackbits(bits, axis=0, bitorder="little")[:count] == 0
+
     def pick_saturated(self, pixels: np.ndarray) -> np.ndarray:
         """Return the saturation bits of single pixels.
 

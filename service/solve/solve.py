@@ -16,6 +16,7 @@ from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, metadata, report
 from service.requests.solve import MAX_SIGMA, SVBRDF_LIGHTS, Method, SolveRequest
+from service.solve.diagnosis import diagnose
 from service.solve.distant import solve_diffuse, solve_distant, solve_material
 from service.solve.extended import solve_extended
 from service.solve.gradient import solve_gradients
@@ -121,10 +122,15 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
     given = SolveInput(stack, capture.camera, mask, device, timings, request.cache)
     solution = solver(given, lights)
     mark_not_facing(capture.camera, solution)
+    timings.stage("diagnosis", 1)
+    diagnose(given, capture, lights, solution)
     refine_status(solution, stack, max_sigma=MAX_SIGMA if request.max_sigma is None else request.max_sigma,
                   least_confidence=request.least_confidence or 0.0)
     status = solution.status.reshape(mask.shape)
     solved, estimated = np.isin(status, SOLVED), np.isin(status, ESTIMATED)
+    counts = {s.name.lower(): int(np.count_nonzero(status[mask] == s)) for s in Status}
+    if not solved.any():
+        solution.warnings.append(_nothing_solved(counts))
     if solution.integration is None:  # near lights have found the height with the normals
         solution.integration = integrate(given, solution.normal, estimated)
         solution.height = None if solution.integration is None else solution.integration.height.numpy()
@@ -133,7 +139,6 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
     timings.stage("write", 1)
     maps_path, report_path = request.out / MAPS_FILE, request.out / REPORT_FILE
     maps.write(maps_path)
-    counts = {s.name.lower(): int(np.count_nonzero(status[mask] == s)) for s in Status}
     write_text(report_path, report(
         request,
         inputs={"capture": str(request.capture), "name": capture.name, "content": stack.key, "frames": len(stack.frames),
@@ -178,6 +183,15 @@ def _maps(solution: Solution, solved: np.ndarray, estimated: np.ndarray, method:
         color_space=linear_space(capture.manifest.color_space),
         provenance=provenance,
     )
+
+
+def _nothing_solved(counts: Mapping[str, int]) -> str:
+    """Return the sentence for a result without a solved pixel."""
+    common = max(counts, key=lambda name: counts[name])
+    share = 100 * counts[common] / max(sum(counts.values()), 1)
+    keep = ("; --max-sigma 180 keeps unsure normals" if common == Status.UNSURE.name.lower() else
+            "; check the lights, the exposure and the mask")
+    return f"no pixel is solved: {share:.0f} % of the mask have the status {common}, and the layer status says why for every pixel{keep}"
 
 
 def _residual_statistics(residual: np.ndarray) -> dict[str, float]:

@@ -1,0 +1,109 @@
+"""What is wrong with the manifest of a capture, from what was solved with it: encoding, brightness, order and axes of the lights.
+
+A wrong manifest seldom stops a solver: it finds normals that are wrong everywhere, and as sure as right ones. Every finding here is a
+sentence that names the field, and raises the standard error of every normal by the angle that the finding asks for.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from kernels.photometric.samples import evenly
+from kernels.status import ESTIMATED
+from service.solve.orientation import LightAxes, find_axes, find_inversion
+from service.solve.solution import Solution, SolveInput
+from stage.capture import Capture
+from stage.consistency.explanations import Cause, Explanation, Sample, better_explanation, fit_manifest
+from stage.extended_lights import ExtendedLights
+from stage.gradients import GradientFrames
+from stage.point_lights import DistantLights, PlacedLights
+
+PIXELS = 600
+"""Number of pixels, spread over the object, on which explanations are compared: three times as many change no misfit by a tenth."""
+UNORDERED = (Cause.REVERSED, Cause.SHIFTED, Cause.DIRECTIONS)
+"""Causes after which the normals say nothing about the axes."""
+FIELDS = {DistantLights: "frames[].light.direction", PlacedLights: "frames[].light.position_m",
+          ExtendedLights: "frames[].light.directions", GradientFrames: "frames[].light.axis and sign"}
+"""The field that holds the axes of each kind of lights; else they come from the reference ball."""
+
+
+def diagnose(given: SolveInput, capture: Capture, lights: Any, solution: Solution) -> None:
+    """Add a warning for everything that is wrong with the lights or the encoding, and make the normals less sure by it.
+
+    Args:
+        given: the images.
+        capture: the manifest.
+        lights: the lights with which the normals were solved; readings are examined under distant ones.
+        solution: its warnings, standard errors and confidence are changed.
+    """
+    field = FIELDS.get(type(lights), "the capture of the reference ball")
+    fit = None
+    if isinstance(lights, DistantLights):
+        sample = _sample(given, capture, lights)
+        fit = fit_manifest(sample)
+        found = better_explanation(sample, fit)
+        if found is not None:
+            solution.warnings.append(_sentence(found, sample))
+            _raise_error(solution, found.degrees)
+            if found.cause in UNORDERED:
+                return
+    axes = find_axes(given, solution, lights if isinstance(lights, DistantLights) else None, fit)
+    if axes is None:
+        axes = find_inversion(given, solution, lights if isinstance(lights, DistantLights) else None)
+    if axes is not None:
+        solution.warnings.append(f"{field}: {axes.sentence}")
+        if axes.degrees is not None:
+            _raise_error(solution, axes.degrees)
+        elif axes.matrices:
+            _raise_error(solution, _turned_by(solution.normal, axes))
+
+
+def _sample(given: SolveInput, capture: Capture, lights: DistantLights) -> Sample:
+    """Return the readings of pixels that are spread over the mask."""
+    stack, count = given.stack, given.stack.light_count
+    inside = np.flatnonzero(given.mask)
+    radiance, usable = stack.radiance(inside[evenly(len(inside), PIXELS)])
+    exposure = np.array([frame.exposure_s or 1.0 for frame in capture.sources()])[:count]
+    return Sample(radiance, usable, lights.direction, lights.irradiance, exposure, capture.manifest.color_space)
+
+
+def _raise_error(solution: Solution, degrees: np.ndarray | float) -> None:
+    """Add an independent error to the standard error of every normal; the confidence falls as 1 / (1 + standard error / 1°)."""
+    before = solution.standard_error()
+    after = np.where(np.isin(solution.status, ESTIMATED), np.hypot(before, degrees), before)
+    solution.confidence = (solution.confidence.astype(np.float32) * (1 + before) / (1 + after)).astype(np.float16)
+    solution.sigma = after.astype(np.float16)
+
+
+def _turned_by(normal: np.ndarray, axes: LightAxes) -> np.ndarray:
+    """Return the angle between each normal and its correction, degrees; of two possible corrections the root mean square."""
+    squares = []
+    for matrix in axes.matrices:
+        corrected = matrix.astype(np.float32) @ normal
+        squares.append(np.degrees(np.arccos(np.clip((corrected * normal).sum(axis=0), -1, 1))) ** 2)
+    return np.sqrt(np.mean(squares, axis=0))
+
+
+def _sentence(found: Explanation, sample: Sample) -> str:
+    """Return the sentence for what explains the images better than the manifest."""
+    fits = f"the readings then fit to {100 * found.left:.1f} %, as declared to {100 * found.misfit:.1f} %"
+    alike = " (every light is declared alike)" if np.ptp(sample.irradiance, axis=0).max() < 1e-6 * sample.irradiance.max() else ""
+    measure = "`relit calibrate intensity` measures it"
+    return {
+        Cause.ENCODED: f"color_space: the images look display-encoded, but {sample.color_space} is declared: decoded as sRGB, {fits}; "
+                       "declare srgb_texture if they are",
+        Cause.LINEAR: f"color_space: the images look linear, but {sample.color_space} is declared: taken as linear, {fits}; declare a "
+                      "linear space, such as lin_rec709_scene",
+        Cause.IRRADIANCE: f"frames[].light.irradiance: it is missing or wrong{alike}: with the brightness that the images ask for, "
+                          f"{fits}; {measure} (exposure_s, if it is missing, acts alike)",
+        Cause.ENCODED_OR_IRRADIANCE: f"color_space or frames[].light.irradiance: the images look display-encoded, or the irradiance is "
+                                     f"missing or wrong{alike}: {fits}; declare srgb_texture if they are encoded, else {measure}",
+        Cause.NORMALISED: f"frames[].light.irradiance: the images look as if they were divided by it already: with equal lights, {fits}; "
+                          "declare the same irradiance for every light",
+        Cause.REVERSED: f"frames[].light: the order looks reversed: with the lights from last to first, {fits}; check which light "
+                        "belongs to which image",
+        Cause.SHIFTED: f"frames[].light: the lights look one frame off: with each light one image earlier or later, {fits}; check which "
+                       "light belongs to which image",
+        Cause.DIRECTIONS: f"frames[].light.direction: images and directions do not belong together: with other directions, {fits}; "
+                          "check which light belongs to which image, and the directions",
+    }[found.cause]

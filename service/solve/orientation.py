@@ -1,0 +1,230 @@
+"""Whether the axes of the lights are those of the camera, from the surface that was solved with them.
+
+Mirrored or turned lights explain the images as well as the right ones. What tells them apart: a visible surface faces the camera, its
+slopes are those of one height (stage.consistency.axes), and the outline and the cast shadows of what is not hollow
+(stage.consistency.outline).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from kernels.photometric.samples import evenly
+from kernels.status import ESTIMATED
+from kernels.surface.integrate import IntegrationOptions, integrate_normals
+from service.solve.solution import Solution, SolveInput
+from stage.camera import Camera
+from stage.consistency.axes import Axes, sites, wrong_axes
+from stage.consistency.explanations import grey_readings
+from stage.consistency.lambertian import Fit, fit_lambertian, median_of
+from stage.consistency.outline import EDGE, Outline, cast_shadows, outline
+from stage.point_lights import DistantLights
+
+MAP_SIZE, FIT_SIZE = 120, 64
+"""Pixels across the small map on which the outline and shadows are compared, and of the one whose readings are fitted anew."""
+FACING, FACING_INSTEAD = 0.8, 0.95
+"""Normals of which fewer than the first part face the camera are wrong if at least the second part does with other axes. Bare metal, whose
+Lambertian normals are poor, has as little as 0.64, but then less than 0.8 in any other direction."""
+LEAST_LIGHTS = 4
+"""Fewer lights may lie almost in a plane, and then most normals of noise face away."""
+CLEAR, CLEAR_PART = 0.4, 0.8
+"""An outline is clear where the mean outward component is above the first number, in the same direction on the second part of it."""
+SHADOW_PIXELS, SHADOW_LIGHTS = 1000, 64
+"""Pixels and lights of which cast shadows are compared."""
+LEAST_COSINE, LEVEL_COSINE = 0.1, 0.25
+"""Least n·l of a reading that is compared, and of those whose median gives the level of the pixel."""
+LIT = 0.7
+"""A reading above this part of level · n·l is lit: light from other surfaces in a cast shadow of a white bowl stays below it."""
+LEAST_SHADOWS, LEAST_SHADOWS_ALONE = 60, 200
+"""Least count of readings that the height puts in shadow, for them to speak against an outline, and alone."""
+LIT_WRONG, LIT_WRONG_ALONE, LIT_RIGHT = 0.6, 0.7, 0.3
+"""Part of these readings that is lit: from the first, or alone from the second, the height is wrong; up to the third it is right. On right
+captures it was 0.4 at most, 0.7 to 1 on inverted ones."""
+INVERSE = np.diag([-1.0, -1.0, 1.0])
+"""The turn by 180 degrees about the view axis."""
+
+
+class LightAxes(NamedTuple):
+    """What is wrong with the axes of the lights."""
+
+    sentence: str
+    matrices: tuple[np.ndarray, ...] = ()
+    """[3, 3], what corrects directions and normals: one, or two between which nothing decides; none where nothing is certain."""
+    degrees: float | None = None
+    """How far the normals are off, where the solved ones are not turned with the lights."""
+
+
+class _Map(NamedTuple):
+    """A small map of the surface."""
+
+    normal: np.ndarray  # [3, rows, cols] float32, z towards the viewer of each pixel; 0 outside
+    mask: np.ndarray  # [rows, cols] bool
+    pixels: np.ndarray  # [rows, cols] row-major positions in the image
+
+
+def find_axes(given: SolveInput, solution: Solution, lights: DistantLights | None, fit: Fit | None) -> LightAxes | None:
+    """Return which axes of the lights are exchanged, mirrored or turned, or None.
+
+    Args:
+        given: the images.
+        solution: the normals.
+        lights: the distant lights; None: other lights, whose readings are not fitted again.
+        fit: the fit of some pixels under these lights, or None.
+    """
+    if lights is not None and fit is not None and len(lights.direction) >= LEAST_LIGHTS and fit.facing < FACING:
+        return _exchanged(given, lights, fit)
+    estimated = np.isin(solution.status, ESTIMATED).reshape(given.mask.shape)
+    positions = sites(estimated)
+    flat = solution.normal[:, positions.reshape(-1)]
+    found = wrong_axes(np.moveaxis(_toward_viewer(given.camera, flat, positions.reshape(-1)).reshape(3, *positions.shape), 1, 0))
+    if found is None:
+        return None
+    return _sentence(_choices(found, _map_of(given, solution.normal, estimated, MAP_SIZE), np.eye(3)), found)
+
+
+def find_inversion(given: SolveInput, solution: Solution, lights: DistantLights | None) -> LightAxes | None:
+    """Say whether the surface is inverted, as by lights that are turned by 180 degrees about the view axis.
+
+    Args:
+        given: the images.
+        solution: the normals.
+        lights: the distant lights; None: other lights, whose shadows are not compared.
+    """
+    estimated = np.isin(solution.status, ESTIMATED).reshape(given.mask.shape)
+    if not estimated.any():
+        return None
+    small = _map_of(given, solution.normal, estimated, MAP_SIZE)
+    edge = outline(small.normal, small.mask)
+    if edge.outward >= CLEAR:
+        return None
+    inward = _is_clear(edge)
+    wrong = LightAxes("the surface looks inverted: with x and y negated (turned by 180° about the view axis) it casts the shadows that the "
+                      "images show; check the axes (x right, y up, z towards the camera)", (INVERSE,))
+    if lights is not None:
+        (count, lit), (count_inverse, lit_inverse) = _shadows(given, solution, small, lights)
+        if inward and count >= LEAST_SHADOWS:
+            return wrong if lit >= LIT_WRONG else None
+        if count >= LEAST_SHADOWS_ALONE and lit >= LIT_WRONG_ALONE and count_inverse >= LEAST_SHADOWS and lit_inverse <= LIT_RIGHT:
+            return wrong
+    if not inward:
+        return None
+    return LightAxes("along the outline the normals point inwards: the object is hollow there, or x and y of the lights are both negated "
+                     "(turned by 180° about the view axis); nothing else in the images decides")
+
+
+def _exchanged(given: SolveInput, lights: DistantLights, fit: Fit) -> LightAxes | None:
+    """Return the signed axis that is the view axis, when most normals face away, and what then is wrong in the image plane."""
+    shares = {(axis, sign): float((sign * fit.vector[axis] > 0).mean()) for axis in (2, 1, 0) for sign in (1, -1)}
+    (axis, sign), share = max(shares.items(), key=lambda item: item[1])
+    if share < FACING_INSTEAD:
+        return None
+    exchange = np.eye(3)
+    exchange[[2, axis]] = exchange[[axis, 2]]
+    exchange[2] *= sign
+    normal = np.zeros((3, given.mask.size), dtype=np.float32)
+    coarse = _map_of(given, normal, given.mask, FIT_SIZE)
+    inside = coarse.pixels[coarse.mask]
+    radiance, usable = given.stack.radiance(inside)
+    fitted = fit_lambertian(grey_readings(radiance, lights.irradiance), usable, lights.direction)
+    normal[:, inside] = exchange @ fitted.normal
+    small = _map_of(given, normal, given.mask, FIT_SIZE)
+    positions = sites(small.mask)
+    found = wrong_axes(np.moveaxis(small.normal.reshape(3, -1)[:, positions], 1, 0)) or Axes(np.eye(2), 1 - fit.facing, 1 - share)
+    matrices = _choices(found, small, exchange)
+    if len(matrices) > 1:  # nothing decides: the smaller change is the likelier mistake
+        matrices = (max(matrices, key=lambda matrix: float(np.trace(matrix))),)
+    behind = (f"all {len(lights.direction)} lights are behind the object (z ≤ 0), and yet light what the camera sees"
+              if (lights.direction[:, 2] <= 0).all() else f"{100 * (1 - fit.facing):.0f} % of the normals face away from the camera")
+    turned = np.degrees(np.arccos(np.clip(((matrices[0] @ fit.normal) * fit.normal).sum(axis=0), -1, 1)))
+    return LightAxes(f"{behind}: with {_describe(matrices[0])}, {100 * share:.0f} % face it; check the axes (x right, y up, z towards the "
+                     "camera)", matrices, float(np.median(turned)))
+
+
+def _choices(found: Axes, small: _Map, before: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return the correction whose outline points outwards, of the one that was found and its inverse; both where nothing decides."""
+    matrix = np.eye(3)
+    matrix[:2, :2] = found.matrix
+    edge = outline(np.einsum("ij,jrc->irc", matrix, small.normal), small.mask)
+    both = (matrix @ before, INVERSE @ matrix @ before)
+    return (both[0 if edge.outward > 0 else 1],) if _is_clear(edge) else both
+
+
+def _is_clear(edge: Outline) -> bool:
+    part = edge.inward_part if edge.outward < 0 else 1 - edge.inward_part
+    return abs(edge.outward) >= CLEAR and part >= CLEAR_PART
+
+
+def _shadows(given: SolveInput, solution: Solution, small: _Map, lights: DistantLights) -> tuple[tuple[int, float], tuple[int, float]]:
+    """Return how many readings the height, and its inverse, put in cast shadow, and which part of them is lit."""
+    rows, cols = small.mask.shape
+    across = (np.broadcast_to(np.arange(cols), (rows, cols)), np.broadcast_to(-np.arange(rows)[:, None], (rows, cols)))
+    height = integrate_normals(small.normal, small.mask, *(plane.astype(np.float32) for plane in across), perspective=False, mean_z=0.0,
+                               options=IntegrationOptions(discontinuities=True), device=given.device).height.numpy()
+    surface = np.flatnonzero(small.mask)
+    chosen = surface[evenly(len(surface), SHADOW_PIXELS)]
+    some = evenly(len(lights.direction), SHADOW_LIGHTS)
+    pixels = small.pixels.reshape(-1)[chosen]
+    radiance, usable = given.stack.radiance(pixels)
+    readings = grey_readings(radiance[some], lights.irradiance[some])
+    direction = lights.direction[some]
+    cosine = direction @ solution.normal[:, pixels]
+    level = median_of(readings / np.maximum(cosine, LEVEL_COSINE), (cosine > LEVEL_COSINE) & usable[some])
+    compared = (cosine > LEAST_COSINE) & usable[some] & (level > 0)
+    lit = readings > LIT * level * cosine
+
+    def part_lit(height: np.ndarray, direction: np.ndarray) -> tuple[int, float]:
+        shadow = cast_shadows(height, small.mask, chosen, direction) & compared
+        return int(shadow.sum()), float(lit[shadow].mean()) if shadow.any() else 0.0
+
+    return part_lit(height, direction), part_lit(-height, direction @ INVERSE)
+
+
+def _map_of(given: SolveInput, normal: np.ndarray, mask: np.ndarray, size: int) -> _Map:
+    """Return every n-th pixel of the box around a mask, so that it is `size` pixels across at most."""
+    rows, cols = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    step = max(1, -(-max(int(np.ptp(rows)), int(np.ptp(cols))) // size))
+    margin = step * (3 * size // EDGE + 2)  # of background, so that only the border of the image hides the outline
+    first, last = (max(rows[0] - margin, 0), max(cols[0] - margin, 0)), (rows[-1] + margin + 1, cols[-1] + margin + 1)
+    part = (slice(first[0], last[0], step), slice(first[1], last[1], step))
+    pixels = np.arange(mask.size).reshape(mask.shape)[part]
+    inside = mask[part]
+    flat = _toward_viewer(given.camera, normal[:, pixels.reshape(-1)], pixels.reshape(-1)).reshape(3, *pixels.shape)
+    return _Map(np.where(inside, flat, 0).astype(np.float32), inside, pixels)
+
+
+def _toward_viewer(camera: Camera, normal: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Return normals [3, n] with the component towards each pixel's viewer as z: their slopes are those of the logarithm of depth."""
+    if camera.projection == "orthographic":
+        return normal
+    row, col = np.divmod(pixels, camera.width)
+    right, up = camera.plane_at(col + 0.5, row + 0.5)
+    turned = np.stack([normal[0], normal[1], normal[2] - normal[0] * right - normal[1] * up])
+    return np.asarray(turned / np.maximum(np.linalg.norm(turned, axis=0), 1e-12))
+
+
+def _sentence(matrices: tuple[np.ndarray, ...], found: Axes) -> LightAxes:
+    ways = ", or ".join(_describe(matrix) for matrix in matrices)
+    kind = "mirrored" if np.linalg.det(matrices[0]) < 0 else "turned"
+    return LightAxes(f"the axes look {kind}: with {ways}, the slopes of the surface are those of one height to {100 * found.left:.0f} %, "
+                     f"as declared to {100 * found.misfit:.0f} % (25 % is no order at all); check the axes (x right, y up, z towards the "
+                     "camera), and that no image is flipped", matrices)
+
+
+def _describe(matrix: np.ndarray) -> str:
+    """Return a correction of directions in words."""
+    whole = np.round(matrix)
+    if np.abs(matrix - whole).max() > 1e-6:
+        turn = np.degrees(np.arctan2(matrix[1, 0], matrix[0, 0]))
+        mirrored = "y negated and then all " if np.linalg.det(matrix[:2, :2]) < 0 else "all "
+        return f"{mirrored}turned by {turn:.0f}° about the view axis (from x towards y)"
+    names = ["xyz"[int(np.argmax(np.abs(row)))] for row in whole]
+    signs = [row.sum() < 0 for row in whole]
+    if names == list("xyz"):
+        negated = [name for name, minus in zip(names, signs, strict=True) if minus]
+        if len(negated) == 3:
+            return "every direction negated (they seem to point from the light to the surface)"
+        return f"{' and '.join(negated)} negated"
+    moved = [name for name, own in zip(names, "xyz", strict=True) if name != own]
+    if len(moved) == 2 and not any(signs):
+        return f"{' and '.join(sorted(moved))} swapped"
+    return f"(x, y, z) read as ({', '.join(('-' if minus else '') + name for name, minus in zip(names, signs, strict=True))})"

@@ -1,0 +1,96 @@
+"""Whether a surface is convex towards its outline, and whether cast shadows agree with its height: what tells a surface from its inverse.
+
+Lights that are turned by 180 degrees about the view axis give a surface that fits together as well, with its height inverted: a bump
+becomes a hollow. At the outline of an object that stands free, normals point outwards. A hollow, a bowl or a mould, has normals
+that point inwards there, but it also casts shadows on itself, which the images show or not.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+EDGE = 40
+"""The band along the outline is about a fortieth of the object's size wide."""
+LEAST_EDGE = 20
+"""Fewer pixels of the outline decide nothing."""
+INSIDE = 0.75
+"""The blurred mask is below this in the band."""
+FIRST_STEPS, STEPS = 16, 40
+"""Steps of one pixel along a ray, and all steps, which grow geometrically to the size of the map."""
+LIFT, LIFT_SLOPE = 1.0, 0.05
+"""A surface must stand above a ray by this many pixels, and by this part of the distance: less is the error of the height."""
+
+
+class Outline(NamedTuple):
+    """Where the normals point along the outline of the mask, as far as it lies inside the image."""
+
+    outward: float
+    """Mean component of the unit normals along the outward direction, -1…1; 0 without an outline."""
+    inward_part: float
+    """The part of the outline where it is negative."""
+    pixels: int
+
+
+def outline(normal: np.ndarray, mask: np.ndarray) -> Outline:
+    """Compare the normals along the outline of a mask with its outward direction.
+
+    Free-standing objects have an `outward` of 0.8 to 0.98 (cut coins 0.7), bowls of -0.4 to -0.85.
+
+    Args:
+        normal: [3, rows, cols] unit, x right, y up; 0 where there is none.
+        mask: [rows, cols] bool.
+    """
+    width = max(1, round(np.sqrt(np.count_nonzero(mask)) / EDGE))
+    blurred = _blur(_blur(mask.astype(np.float64), width), width)
+    down, right = np.gradient(blurred)
+    length = np.hypot(down, right)
+    edge = mask & (blurred < INSIDE) & (length > 1e-6) & (np.linalg.norm(normal, axis=0) > 0.5)
+    border = np.ones_like(mask)
+    border[3 * width : -3 * width, 3 * width : -3 * width] = False  # the object may go on outside the image
+    edge &= ~border
+    if np.count_nonzero(edge) < LEAST_EDGE:
+        return Outline(0.0, 0.0, 0)
+    outward = ((normal[1] * down - normal[0] * right)[edge]) / length[edge]
+    return Outline(float(outward.mean()), float((outward < 0).mean()), int(edge.sum()))
+
+
+def cast_shadows(height: np.ndarray, mask: np.ndarray, pixels: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Return which lights a surface hides from its pixels.
+
+    Args:
+        height: [rows, cols] towards the viewer, in pixels.
+        mask: [rows, cols] bool: where there is surface.
+        pixels: [n] row-major.
+        directions: [lights, 3] unit, x right, y up.
+
+    Returns:
+        [lights, n] bool; False for lights behind the image plane, which attached shadows hide.
+    """
+    rows, cols = mask.shape
+    row, col = np.divmod(pixels, cols)
+    start = height.reshape(-1)[pixels]
+    surface = np.where(mask, height, -np.inf)
+    far = float(np.hypot(rows, cols))
+    steps = np.unique(np.round(np.concatenate([
+        np.arange(2, FIRST_STEPS), np.geomspace(FIRST_STEPS, max(far, FIRST_STEPS + 1.0), STEPS - FIRST_STEPS)])))[:, None]
+    hidden = np.zeros((len(directions), len(pixels)), dtype=bool)
+    for light, (x, y, z) in enumerate(directions):
+        across = np.hypot(x, y)
+        if z <= 0 or across < 1e-3:
+            continue
+        at_col = np.round(col + steps * x / across).astype(int)
+        at_row = np.round(row - steps * y / across).astype(int)
+        seen = (at_col >= 0) & (at_col < cols) & (at_row >= 0) & (at_row < rows)
+        met = np.where(seen, surface[np.clip(at_row, 0, rows - 1), np.clip(at_col, 0, cols - 1)], -np.inf)
+        hidden[light] = (met > start + steps * (z / across + LIFT_SLOPE) + LIFT).any(axis=0)
+    return hidden
+
+
+def _blur(image: np.ndarray, radius: int) -> np.ndarray:
+    """Return the mean over a square of 2 radius + 1 pixels; beyond the image its border values go on."""
+    for axis in (0, 1):
+        padding = [(radius + 1, radius) if a == axis else (0, 0) for a in (0, 1)]
+        total = np.cumsum(np.pad(image, padding, mode="edge"), axis=axis)
+        size, last = 2 * radius + 1, total.shape[axis]
+        image = (np.take(total, np.arange(size, last), axis) - np.take(total, np.arange(last - size), axis)) / size
+    return image
