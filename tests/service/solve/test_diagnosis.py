@@ -1,0 +1,134 @@
+"""Wrong manifests end in a sentence that names the cause, and in a low confidence; right ones in neither."""
+
+import json
+
+import numpy as np
+import pytest
+
+from service.requests.solve import Method, SolveRequest
+from service.solve.solve import solve
+from tests.scenes.captures import angles_degrees, make_scene, ring, write_capture, write_exr
+from tests.scenes.ellipsoid import ellipsoid
+
+SCENE = ellipsoid()
+SURE = 0.3
+"""Confidence of the median pixel of a right capture under `robust`: noise and few lights leave two degrees."""
+UNSURE = 0.2
+"""What a wrong capture's median pixel stays below."""
+
+
+def solved(tmp_path, scene, method=Method.ROBUST, **changes):
+    folder = write_capture(tmp_path / "capture", scene, **changes)
+    return solve(SolveRequest(capture=folder, out=tmp_path / "out", method=method, device="cpu"))
+
+
+def confidence(result) -> float:
+    return float(np.median(result.maps.confidence[result.maps.estimated]))
+
+
+def lit_from(matrix):
+    """The scene with directions that the manifest has multiplied by a matrix."""
+    return SCENE._replace(directions=SCENE.directions @ np.asarray(matrix, dtype=float).T)
+
+
+def encoded(linear):
+    return np.where(linear < 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
+
+
+def decoded(values):
+    return np.where(values < 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+
+
+SCALED = SCENE.images / SCENE.images.max()
+TURN = np.radians(137)
+
+
+@pytest.mark.parametrize("method", [Method.LAMBERT, Method.ROBUST])
+@pytest.mark.parametrize("scene", [SCENE, ellipsoid(count=6), ellipsoid(count=4), ellipsoid(largest_degrees=25), ellipsoid(hollow=True),
+                                   ellipsoid(count=6, hollow=True), make_scene(size=48, lights=9)],
+                         ids=["object", "six lights", "four lights", "frontal", "hollow", "hollow, six lights", "cap"])
+def test_a_right_manifest_raises_no_alarm(tmp_path, scene, method):
+    assert solved(tmp_path, scene, method).warnings == ()
+
+
+def test_a_right_manifest_keeps_its_confidence(tmp_path):
+    assert confidence(solved(tmp_path, SCENE)) > SURE
+
+
+@pytest.mark.parametrize(("matrix", "words"), [
+    (np.diag([1, -1, 1]), "with y negated"),
+    (np.diag([-1, 1, 1]), "with x negated"),
+    (np.diag([-1, -1, 1]), "with x and y negated"),
+    ([[0, 1, 0], [1, 0, 0], [0, 0, 1]], "with x and y swapped"),
+    ([[0, -1, 0], [1, 0, 0], [0, 0, 1]], "read as (y, -x, z)"),
+    ([[np.cos(TURN), -np.sin(TURN), 0], [np.sin(TURN), np.cos(TURN), 0], [0, 0, 1]], "turned by -137°"),
+    ([[1, 0, 0], [0, 0, 1], [0, 1, 0]], "with y and z swapped"),
+    ([[0, 0, 1], [1, 0, 0], [0, 1, 0]], "read as (y, z, x)"),
+    (np.diag([1, 1, -1]), "all 16 lights are behind the object (z ≤ 0), and yet light what the camera sees: with z negated"),
+    (-np.eye(3), "every direction negated"),
+], ids=["y", "x", "x and y", "x for y", "quarter turn", "turned", "y for z", "cycle", "behind", "from the light"])
+def test_wrong_axes_are_named_and_doubted(tmp_path, matrix, words):
+    result = solved(tmp_path, lit_from(matrix))
+    assert "frames[].light.direction: " in result.warnings[0] and words in result.warnings[0]
+    assert not result.maps.estimated.any() or confidence(result) < UNSURE
+
+
+def test_the_standard_error_of_mirrored_normals_is_the_error_that_they_have(tmp_path):
+    result = solved(tmp_path, lit_from(np.diag([1, -1, 1])))
+    mask = result.maps.estimated
+    error = angles_degrees(result.maps.normal[mask], SCENE.normal[mask])
+    assert np.median(error / result.maps.sigma[mask]) == pytest.approx(1, abs=0.05)  # noise alone, under two degrees of forty
+
+
+@pytest.mark.parametrize(("scene", "changes", "words"), [
+    (SCENE._replace(irradiance=np.ones_like(SCENE.irradiance)), {},
+     "frames[].light.irradiance: it is missing or wrong (every light is declared alike)"),
+    (SCENE._replace(images=SCENE.images / SCENE.irradiance[:, None, None, :]), {},
+     "frames[].light.irradiance: the images look as if they were divided by it already"),
+    (SCENE._replace(images=encoded(SCALED)), {}, "color_space: the images look display-encoded, but lin_rec709_scene is declared"),
+    (SCENE._replace(images=decoded(encoded(SCALED))), {"color_space": "srgb_texture"},
+     "color_space: the images look linear, but srgb_texture is declared"),
+    (SCENE._replace(directions=SCENE.directions[::-1], irradiance=SCENE.irradiance[::-1]), {}, "frames[].light: the order looks reversed"),
+    (SCENE._replace(directions=np.roll(SCENE.directions, 1, 0), irradiance=np.roll(SCENE.irradiance, 1, 0)), {},
+     "frames[].light: the lights look one frame off"),
+    (SCENE._replace(directions=SCENE.directions[np.random.default_rng(5).permutation(16)]), {},
+     "frames[].light.direction: images and directions do not belong together"),
+], ids=["missing", "divided", "encoded", "linear", "reversed", "shifted", "shuffled"])
+def test_wrong_brightness_encoding_and_order_are_named_and_doubted(tmp_path, scene, changes, words):
+    result = solved(tmp_path, scene, Method.LAMBERT, **changes)
+    assert words in result.warnings[0]
+    assert confidence(result) < UNSURE
+
+
+def test_an_outline_that_points_inwards_is_said_where_nothing_decides(tmp_path):
+    """Lights near the view axis cast no shadow in a hollow, so that an object under inverted lights may be one."""
+    scene = ellipsoid(largest_degrees=12)
+    result = solved(tmp_path, scene._replace(directions=scene.directions * [-1, -1, 1]))
+    assert "the object is hollow there, or x and y of the lights are both negated" in result.warnings[0]
+
+
+def test_mirrored_axes_of_a_relief_that_fills_the_image_leave_two_choices(tmp_path):
+    size, flat = 64, ring(7)
+    y, x = np.mgrid[:size, :size] / size * 4
+    slope_x, slope_y = 0.5 * np.cos(3 * x + y), 0.5 * np.sin(2 * y - 1) + 0.5 / 3 * np.cos(3 * x + y)
+    normal = np.stack([-slope_x, slope_y, np.ones_like(x)], axis=-1)  # rows go down
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    images = np.maximum(np.einsum("rcx,lx->lrc", normal, flat), 0)[..., None] * np.ones(3)
+    scene = make_scene(size=size, lights=7)._replace(normal=normal, mask=np.ones((size, size), bool), directions=flat,
+                                                     irradiance=np.full((7, 3), np.pi), images=images)
+    assert solved(tmp_path / "right", scene).warnings == ()
+    wrong = solved(tmp_path / "wrong", scene._replace(directions=flat * [1, -1, 1]))
+    assert "with y negated, or x negated" in wrong.warnings[0] or "with x negated, or y negated" in wrong.warnings[0]
+    assert confidence(wrong) < UNSURE
+
+
+def test_a_solve_without_a_solved_pixel_says_so_and_exits_1(relit, tmp_path):
+    folder = write_capture(tmp_path / "capture", make_scene(size=16, lights=6))
+    for index in range(6):
+        write_exr(folder / f"{index:03d}.exr", np.zeros((16, 16, 3)))
+    outcome = relit("solve", folder, "--out", tmp_path / "out")
+    assert outcome.code == 1
+    assert "warning  no pixel is solved: 100 % of the mask have the status" in outcome.out
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert any("no pixel is solved" in sentence for sentence in report["warnings"])
+    assert (tmp_path / "out" / "maps.exr").exists()
