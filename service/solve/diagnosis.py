@@ -95,7 +95,7 @@ def _sentence(found: Explanation, sample: Sample) -> str:
         Cause.LINEAR: f"color_space: the images look linear, but {sample.color_space} is declared: taken as linear, {fits}; declare a "
                       "linear space, such as lin_rec709_scene",
         Cause.IRRADIANCE: f"frames[].light.irradiance: it is missing or wrong{alike}: with the brightness that the images ask for, "
-                          f"{fits}; {measure} (exposure_s, if it is missing, acts alike)",
+                          f"{fits}; {measure} (a missing exposure_s, and near lights that are declared distant, act alike)",
         Cause.ENCODED_OR_IRRADIANCE: f"color_space or frames[].light.irradiance: the images look display-encoded, or the irradiance is "
                                      f"missing or wrong{alike}: {fits}; declare srgb_texture if they are encoded, else {measure}",
         Cause.NORMALISED: f"frames[].light.irradiance: the images look as if they were divided by it already: with equal lights, {fits}; "
