@@ -104,7 +104,7 @@ class Stack:
             values[channel, light] = self._map(values_path(self.folder, self.key), self.shape)[channel, light, pixels]
         return values, self.pick_saturated(pixels)
 
-    def radiance(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def pick_radiance(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the radiance of single pixels, and which readings are usable.
 
         Args:

@@ -1,4 +1,4 @@
-"""Wrong manifests: mirrored and exchanged axes, lights behind, missing brightness, wrong encoding and order; and right ones, for comparison.
+"""Wrong manifests, and right ones for comparison: mirrored and exchanged axes, lights behind, missing brightness, wrong encoding and order.
 
 The scene, a ring on a knobbly ball, is sphere-traced here with cast shadows, a highlight and noise, and shares nothing with the
 renderers of the tests. With a data folder, the same mistakes are made with the real lights of the DiLiGenT cat and the UW cat's
@@ -64,10 +64,10 @@ def render() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray
     directions = np.stack([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)], axis=1)
     strengths = random.uniform(0.4, 1.6, LIGHTS)
     albedo = 0.35 + 0.25 * np.sign(np.sin(9 * point[:, 0]) * np.sin(8 * point[:, 1] + 1))
-    images = np.zeros((LIGHTS, x.size))
+    images, toward_viewer = np.zeros((LIGHTS, x.size)), np.array([0.0, 0.0, 1.0])
     for image, light, strength in zip(images, directions, strengths, strict=True):
         lit = ~np.isfinite(march(point + 0.03 * normal, np.tile(light, (len(point), 1))))
-        half = (light + [0, 0, 1]) / np.linalg.norm(light + [0, 0, 1])
+        half = (light + toward_viewer) / np.linalg.norm(light + toward_viewer)
         shade = albedo / np.pi * np.maximum(normal @ light, 0) + 0.15 * np.maximum(normal @ half, 0) ** 40
         image[mask] = strength * shade * lit * (normal @ light > 0)
     images /= images.max()

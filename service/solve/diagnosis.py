@@ -62,7 +62,7 @@ def _sample(given: SolveInput, capture: Capture, lights: DistantLights) -> Sampl
     """Return the readings of pixels that are spread over the mask."""
     stack, count = given.stack, given.stack.light_count
     inside = np.flatnonzero(given.mask)
-    radiance, usable = stack.radiance(inside[evenly(len(inside), PIXELS)])
+    radiance, usable = stack.pick_radiance(inside[evenly(len(inside), PIXELS)])
     exposure = np.array([frame.exposure_s or 1.0 for frame in capture.sources()])[:count]
     return Sample(radiance, usable, lights.direction, lights.irradiance, exposure, capture.manifest.color_space)
 

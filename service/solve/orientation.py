@@ -124,7 +124,7 @@ def _exchanged(given: SolveInput, lights: DistantLights, fit: Fit) -> LightAxes 
     normal = np.zeros((3, given.mask.size), dtype=np.float32)
     coarse = _map_of(given, normal, given.mask, FIT_SIZE)
     inside = coarse.pixels[coarse.mask]
-    radiance, usable = given.stack.radiance(inside)
+    radiance, usable = given.stack.pick_radiance(inside)
     fitted = fit_lambertian(grey_readings(radiance, lights.irradiance), usable, lights.direction)
     normal[:, inside] = exchange @ fitted.normal
     small = _map_of(given, normal, given.mask, FIT_SIZE)
@@ -164,7 +164,7 @@ def _shadows(given: SolveInput, solution: Solution, small: _Map, lights: Distant
     chosen = surface[evenly(len(surface), SHADOW_PIXELS)]
     some = evenly(len(lights.direction), SHADOW_LIGHTS)
     pixels = small.pixels.reshape(-1)[chosen]
-    radiance, usable = given.stack.radiance(pixels)
+    radiance, usable = given.stack.pick_radiance(pixels)
     readings = grey_readings(radiance[some], lights.irradiance[some])
     direction = lights.direction[some]
     cosine = direction @ solution.normal[:, pixels]
