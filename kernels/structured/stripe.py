@@ -4,6 +4,10 @@ First the peak of the line after a short smoothing, which a hot pixel does not w
 it. Then the centre: the peak of the line smoothed by a Gaussian of the stripe's own width, which is where the centre of mass under
 that Gaussian is the Gaussian's middle. Unlike a centre of mass over whole pixels above a threshold it has no cut edges, which would
 pull it by hundredths of a pixel: at 1.4 m a tenth of a millimetre.
+
+Texture bends the profile: a pixel of twice the albedo pulls the centre towards it. Where the albedo of the pixels is known, the profile is
+divided by it. What is left over on one side of the centre and not on the other is no stripe's shape, and adds to the deviation: the odd
+residual of each pixel is taken for an error of its own (White's estimate of variance).
 """
 
 from typing import NamedTuple
@@ -30,7 +34,15 @@ MAX_WIDTH_PX = 96
 LEAST_GAIN = 0.1
 """Least slope of Newton's step, 1 - variance under the window / variance of the window, that is divided by: a Gaussian stripe has 0.5."""
 RIVAL = 0.7
-"""Part of the peak from which a second bright place on the line makes the stripe undecided."""
+"""Part of the peak from which a second bright place on the line makes the stripe undecided, unless another part is given."""
+KNOWN_REACH = 2.5
+"""Standard deviations of the stripe to both sides within which the albedo of all pixels must be known for a division: beyond, profile and
+window together fall to a five-hundredth."""
+MOST_SHARED = 0.75
+"""Largest part of the variance of a reading that cancels when it is divided by the root of the energy that it is part of."""
+ODD_SHARE = 0.72
+"""Part of the noise that odd residuals show: they are halves of differences, interpolated between pixels, of a profile that was fitted to
+the centre."""
 GRAZING = 0.02
 """Least sine of the angle between a line of sight and the plane of light, 1.1 degrees: at less, where they meet is too uncertain."""
 
@@ -42,6 +54,10 @@ class Stripe(NamedTuple):
 
     centre: wp.array  # [lines] float32, continuous coordinate along the line; 0 where there is none
     sigma: wp.array  # [lines] float32, pixels, from the noise
+    uneven: wp.array  # [lines] float32, pixels: the deviation that odd residuals of the profile show, noise included
+    width: wp.array  # [lines] float32, pixels: standard deviation of the stripe's profile
+    level: wp.array  # [lines] float32: mean of the signal under the window of the stripe, in the unit of the image
+    even: wp.array  # [lines] uint8: 1 where the profile was divided by the albedo
     amplitude: wp.array  # [lines] float32, peak in the unit of the image
     status: wp.array  # [lines] uint8: OK, LOW_MODULATION: nothing stands out, UNDECIDED: as bright elsewhere, too broad, or cut
 
@@ -53,7 +69,8 @@ class PlaneMeeting(NamedTuple):
     per_pixel: np.ndarray  # [n] metres of depth for one unit along each line's x or y, whichever was asked for
 
 
-def find_stripe(signal: np.ndarray, *, along: str, noise: float, device: str) -> Stripe:
+def find_stripe(signal: np.ndarray, *, along: str, noise: float, device: str, albedo: np.ndarray | None = None,
+                rival: float = RIVAL) -> Stripe:
     """Find the stripe's centre on each row or column.
 
     Args:
@@ -61,6 +78,9 @@ def find_stripe(signal: np.ndarray, *, along: str, noise: float, device: str) ->
         along: "row": one centre a row, a u; "column": one a column, a v.
         noise: standard deviation of the signal where there is no stripe.
         device: where.
+        albedo: [rows, cols] float32, the root of the energy Σ signal² of each pixel over a sweep that this frame is part of, in
+            proportion to its albedo; 0 where it is not known; None: nowhere.
+        rival: part of the peak from which a second bright place on the line makes the stripe UNDECIDED; inf: it never does.
 
     Returns:
         The stripe on the device; not synchronised on CUDA.
@@ -70,7 +90,8 @@ def find_stripe(signal: np.ndarray, *, along: str, noise: float, device: str) ->
 
     Source:
         Steger, "An unbiased detector of curvilinear structures", TPAMI 1998, section 2: the peak of the smoothed profile; the step is
-        the mean shift of Comaniciu and Meer, TPAMI 2002, equation 20, divided by its slope.
+        the mean shift of Comaniciu and Meer, TPAMI 2002, equation 20, divided by its slope; White, "A heteroskedasticity-consistent
+        covariance matrix estimator", Econometrica 48, 1980 (odd residuals).
     """
     if along not in ("row", "column"):
         raise ArrayError(f"along is {along}: give row or column")
@@ -79,24 +100,43 @@ def find_stripe(signal: np.ndarray, *, along: str, noise: float, device: str) ->
     lines, length = signal.shape if along == "row" else signal.shape[::-1]
     image = wp.array(np.ascontiguousarray(signal, dtype=np.float32).reshape(-1), dtype=wp.float32, device=device)
     steps = (signal.shape[1], 1) if along == "row" else (1, signal.shape[1])
-    found = Stripe(*(wp.zeros(lines, dtype=wp.float32, device=device) for _ in range(3)),
-                   wp.zeros(lines, dtype=wp.uint8, device=device))
-    devices.launch(_stripe_kernel, lines, [image, int(length), *map(int, steps), float(NOISE_FACTOR * noise), float(noise)],
-                   list(found), device=device)
+    known = albedo if albedo is not None else np.zeros((1, 1), np.float32)
+    inverse = np.divide(1.0, known, out=np.zeros(known.shape, np.float32), where=known > 0)
+    found = Stripe(*(wp.zeros(lines, dtype=wp.float32, device=device) for _ in range(5)), wp.zeros(lines, dtype=wp.uint8, device=device),
+                   wp.zeros(lines, dtype=wp.float32, device=device), wp.zeros(lines, dtype=wp.uint8, device=device))
+    devices.launch(_stripe_kernel, lines, [
+        image, wp.array(np.ascontiguousarray(inverse).reshape(-1), dtype=wp.float32, device=device), int(length), *map(int, steps),
+        float(NOISE_FACTOR * noise), float(noise), float(rival)], list(found), device=device)
     return found
+
+
+@wp.func
+def residual(image: wp.array(dtype=wp.float32), inverse: wp.array(dtype=wp.float32), even: bool, at: int, off: float, height: float,
+             width: float):
+    """Return what a pixel's profile, divided by its albedo, is above a Gaussian of this height and width."""
+    value = image[at]
+    if even:
+        value *= inverse[at]
+    return value - height * wp.exp(-0.5 * off * off / (width * width))
 
 
 @wp.kernel(enable_backward=False)
 def _stripe_kernel(first: int,
                    image: wp.array(dtype=wp.float32),  # [pixels]
+                   inverse: wp.array(dtype=wp.float32),  # [pixels] 1 / albedo, 0 where it is not known; or one 0
                    length: int,
                    line_step: int,
                    step: int,
                    least: float,
                    noise: float,
+                   part: float,
                    # outputs
                    centre: wp.array(dtype=wp.float32),  # [lines]
                    sigma: wp.array(dtype=wp.float32),  # [lines]
+                   uneven: wp.array(dtype=wp.float32),  # [lines]
+                   spread: wp.array(dtype=wp.float32),  # [lines]
+                   mean_level: wp.array(dtype=wp.float32),  # [lines]
+                   divided: wp.array(dtype=wp.uint8),  # [lines]
                    amplitude: wp.array(dtype=wp.float32),  # [lines]
                    status: wp.array(dtype=wp.uint8)):  # [lines]
     line = first + wp.tid()
@@ -149,19 +189,41 @@ def _stripe_kernel(first: int,
     if float(place) + middle < width or float(place) + middle > float(length - 1) - width:
         status[line] = wp.uint8(_UNDECIDED)  # the border of the image cuts it
         return
-    error = float(0.0)
+    even = inverse.shape[0] == image.shape[0]
+    if even:
+        near = wp.int32(wp.floor(float(place) + middle - KNOWN_REACH * width))
+        far = wp.int32(wp.ceil(float(place) + middle + KNOWN_REACH * width))
+        even = near >= 0 and far < length
+        for i in range(wp.max(near, 0), wp.min(far, length - 1) + 1):
+            if inverse[start + i * step] <= 0.0:
+                even = False
+    error, gain, low, high = float(0.0), float(1.0), wp.int32(0), wp.int32(0)
+    sum0, sum1, sum2, raw, under = float(0.0), float(0.0), float(0.0), float(0.0), float(0.0)
     for _newton in range(STEPS):
         low = wp.max(int(wp.ceil(float(place) + middle - REACH * width)), 0)
         high = wp.min(int(wp.floor(float(place) + middle + REACH * width)), length - 1)
-        sum0, sum1, sum2, noise2 = float(0.0), float(0.0), float(0.0), float(0.0)
+        noise2 = float(0.0)
+        sum0 = float(0.0)
+        sum1 = float(0.0)
+        sum2 = float(0.0)
+        raw = float(0.0)
+        under = float(0.0)
         for i in range(low, high + 1):
             off = float(i - place) - middle
             window = wp.exp(-0.5 * off * off / (width * width))
+            raw += window * image[start + i * step]
+            under += window
+            shared = float(1.0)
+            if even:
+                window *= inverse[start + i * step]
+                # the frame's own noise is in its pixel's energy too: what both share cancels
+                part_of_energy = image[start + i * step] * inverse[start + i * step]
+                shared -= wp.min(part_of_energy * part_of_energy, MOST_SHARED)
             weight = window * image[start + i * step]
             sum0 += weight
             sum1 += weight * off
             sum2 += weight * off * off
-            noise2 += window * window * off * off
+            noise2 += shared * window * window * off * off
         if sum0 <= 0.0:
             status[line] = wp.uint8(_LOW)
             return
@@ -169,9 +231,35 @@ def _stripe_kernel(first: int,
         gain = wp.max(1.0 - (sum2 / sum0 - off * off) / (width * width), LEAST_GAIN)
         middle += wp.clamp(off / gain, -width, width)
         error = noise * wp.sqrt(noise2) / (sum0 * gain)
+    # residuals from the Gaussian with the same moments under the window, less those mirrored in the centre
+    variance = wp.max(sum2 / sum0, 0.01)
+    own = 1.0 / wp.max(wp.sqrt(wp.max(1.0 / variance - 1.0 / (width * width), 0.0)), 1.0 / float(MAX_WIDTH_PX))
+    total = float(0.0)
+    for i in range(low, high + 1):
+        off = float(i - place) - middle
+        total += wp.exp(-0.5 * off * off * (1.0 / (width * width) + 1.0 / (own * own)))
+    height = sum0 / total
+    odd2 = float(0.0)
+    for i in range(low, high + 1):
+        off = float(i - place) - middle
+        mirrored = float(place) + middle - off
+        floor_place = wp.int32(wp.floor(mirrored))
+        if floor_place >= 0 and floor_place + 1 < length:
+            fraction = mirrored - float(floor_place)
+            here = residual(image, inverse, even, start + i * step, off, height, own)
+            first_pixel = start + floor_place * step
+            there = residual(image, inverse, even, first_pixel, float(floor_place - place) - middle, height, own)
+            after = residual(image, inverse, even, first_pixel + step, float(floor_place + 1 - place) - middle, height, own)
+            there += fraction * (after - there)
+            odd = 0.5 * (here - there) * off * wp.exp(-0.5 * off * off / (width * width))
+            odd2 += odd * odd
     centre[line] = float(place) + middle + 0.5
     sigma[line] = error
-    status[line] = wp.uint8(wp.where(rival > RIVAL * peak, _UNDECIDED, OK))
+    uneven[line] = wp.sqrt(2.0 * odd2) / (ODD_SHARE * sum0 * gain)
+    spread[line] = own
+    mean_level[line] = raw / under
+    divided[line] = wp.uint8(wp.where(even, 1, 0))
+    status[line] = wp.uint8(wp.where(rival > part * peak, _UNDECIDED, OK))
 
 
 def plane_depths(x: np.ndarray, y: np.ndarray, point: np.ndarray, normal: np.ndarray, *, along: str) -> PlaneMeeting:

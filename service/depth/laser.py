@@ -10,9 +10,9 @@ import numpy as np
 
 from kernels.status import Status
 from kernels.structured.spot import find_spot, nearest_points
-from kernels.structured.stripe import find_stripe, plane_depths
-from service.depth.solution import DepthSolution
+from service.depth.solution import HALF_SURE, DepthSolution
 from service.depth.stripe_map import StripeSamples, stripe_map
+from service.depth.stripes import Sweep, along_of, measure_stripe, stripe_signal
 from service.reporting.progress import Timings
 from service.requests.depth import DepthRequest
 from stage.camera import Camera
@@ -28,11 +28,13 @@ MAX_GAP = 0.02
 """Distance between the laser's ray and the line of sight over the distance of the spot, above which the spot is not that ray's."""
 LEAST_FOR_AMBIENT = 3
 """Number of laser frames from which on their least value at each pixel is taken for ambient light, if there is no frame of it."""
+DOUBLED = 0.1
+"""Part of the lines of a frame with two stripes of comparable brightness, from which the frame is named."""
+SECOND_PLANE = 0.3
+"""Part of the frames with two such stripes, from which a second plane is taken to move with the first: then no frame is trusted."""
 LEAST_PART, OF_PERCENTILE = 0.03, 95.0
 """A line whose peak is below this fraction of the brightest lines' peaks over all frames (their 95th percentile) sees the stripe's light by
 way of other surfaces, as in the laser's shadow or when the stripe has left the image; or it sees a surface thirty times darker."""
-NOISE_SAMPLE = 200_000
-"""Number of pixels from which the noise of a frame is estimated."""
 
 
 class _Spot(NamedTuple):
@@ -65,36 +67,69 @@ def solve_laser(capture: Capture, mask: np.ndarray, request: DepthRequest, devic
     correction = Correction.of(capture)
     background, source = _background(capture, correction, frames, timings)
     camera, shape = capture.camera, mask.shape
+    sweeps = _sweeps(frames, correction, background, mask, timings)
     samples: dict[str, list[StripeSamples]] = {"row": [], "column": []}
+    doubled: list[str] = []
     spots: list[_Spot] = []
     seen: Counter[str] = Counter()
     brightest = np.zeros(shape, np.float32)
     timings.stage("laser", len(frames))
     for number, frame in enumerate(frames):
         radiance = correction.apply(frame).pixels - background
-        channel = int(np.argmax(np.where(mask[..., None], radiance, 0).max(axis=(0, 1))))
-        signal = np.where(mask, radiance[..., channel], 0)
-        np.maximum(brightest, signal, out=brightest)
+        signal = stripe_signal(radiance, mask)
+        np.maximum(brightest, np.where(mask, radiance[..., signal.channel], 0), out=brightest)
         if isinstance(frame.laser, LaserRay):
-            spot, status = _measure_spot(np.where(mask, signal, np.nan), frame.laser, camera, near_m, far_m)
+            spot, status = _measure_spot(np.where(mask, radiance[..., signal.channel], np.nan), frame.laser, camera, near_m, far_m)
             seen[status.name.lower()] += 1
             if spot is not None:
                 spots.append(spot)
         elif isinstance(frame.laser, LaserPlane):
-            along = "row" if abs(frame.laser.normal[0]) >= abs(frame.laser.normal[1]) else "column"
-            found = _measure_stripe(signal, mask, frame.laser, along, camera, device, near_m, far_m)
-            samples[along].append(found)
+            along = along_of(frame.laser)
+            found = measure_stripe(signal, mask, frame.laser, sweeps[along], camera, device=device, near_m=near_m, far_m=far_m)
+            samples[along].append(found.samples)
+            if found.doubled > DOUBLED * int(np.isin(found.samples.status, (Status.OK, Status.MULTIPATH)).sum()):
+                doubled.append(frame.image)
         timings.advance(number + 1)
     kept = {along: StripeSamples.joined(parts) for along, parts in samples.items() if parts}
     _refuse_faint(kept)
+    if doubled and len(doubled) >= SECOND_PLANE * sum(len(parts) for parts in samples.values()):
+        for part in kept.values():  # where one stripe of a frame is seen, it may be that of the second plane as well
+            part.status[part.status == Status.OK] = Status.MULTIPATH
     for part in kept.values():
         numbers = np.bincount(part.status)
         seen.update({Status(code).name.lower(): int(numbers[code]) for code in np.flatnonzero(numbers)})
     if not spots and not any((part.status == Status.OK).any() for part in kept.values()):
-        raise ManifestError(f"{capture.folder}: no laser frame has a depth ({_words(seen)}): check that the laser is seen, that "
-                            "origin_m, point_m and directions are in metres in the camera frame, and --near-m and --far-m")
+        advice = _second_stripes(doubled, len(frames)) if doubled else (
+            "check that the laser is seen, that origin_m, point_m and directions are in metres in the camera frame, and --near-m and "
+            "--far-m")
+        raise ManifestError(f"{capture.folder}: no laser frame has a depth ({_words(seen)}): {advice}")
     timings.stage("map", 1)
-    return _combine(capture, shape, kept, spots, brightest, {"laser_frames": len(frames), "ambient": source, "found": dict(seen)})
+    solution = _combine(capture, shape, kept, spots, brightest, {"laser_frames": len(frames), "ambient": source, "found": dict(seen)})
+    if doubled:
+        solution.warnings.append(_second_stripes(doubled, len(frames)))
+    return solution
+
+
+def _second_stripes(doubled: list[str], frames: int) -> str:
+    """Return a sentence about frames that show two stripes."""
+    return (f"frames[].laser: {len(doubled)} of {frames} frames, {doubled[0]} the first of them, show a second stripe about as bright as "
+            "the first, and the manifest declares one plane for each frame: photograph one plane at a time; their doubtful points have the "
+            "status multipath")
+
+
+def _sweeps(frames: list[Frame], correction: Correction, background: np.ndarray, mask: np.ndarray, timings: Timings) -> dict[str, Sweep]:
+    """Return what the sweep of planes across the rows, and across the columns, tells of the albedo."""
+    sweeps = {"row": Sweep(), "column": Sweep()}
+    planes = [(frame, frame.laser) for frame in frames if isinstance(frame.laser, LaserPlane)]
+    if len(planes) < LEAST_FOR_AMBIENT:
+        return sweeps
+    timings.stage("albedo", len(planes))
+    for number, (frame, laser) in enumerate(planes, start=1):
+        sweeps[along_of(laser)].add(stripe_signal(correction.apply(frame).pixels - background, mask))
+        timings.advance(number)
+    for sweep in sweeps.values():
+        sweep.close()
+    return sweeps
 
 
 def _background(capture: Capture, correction: Correction, frames: list[Frame], timings: Timings) -> tuple[np.ndarray, str]:
@@ -136,36 +171,13 @@ def _measure_spot(signal: np.ndarray, laser: LaserRay, camera: Camera, near_m: f
     return _Spot(point, int(spot.v), int(spot.u), across / float(np.tan(met.angle[0])) + across, spot.amplitude, gap), Status.OK
 
 
-def _measure_stripe(signal: np.ndarray, mask: np.ndarray, laser: LaserPlane, along: str, camera: Camera, device: str,
-                    near_m: float, far_m: float) -> StripeSamples:
-    inside = signal[mask]
-    few = inside[:: max(1, len(inside) // NOISE_SAMPLE)]
-    middle = float(np.median(few))
-    noise = max(1.4826 * float(np.median(np.abs(few - middle))), 1e-6 * float(inside.max()), 1e-12)
-    found = find_stripe(np.where(mask, signal - middle, 0), along=along, noise=noise, device=device)
-    centre, sigma, amplitude, status = (array.numpy() for array in found)
-    lines = np.arange(len(centre))
-    status = status.copy()
-    status[~mask.any(axis=1 if along == "row" else 0)] = Status.UNSOLVED
-    u, v = (centre.astype(np.float64), lines + 0.5) if along == "row" else (lines + 0.5, centre.astype(np.float64))
-    x, y = camera.plane_at(u, v)
-    met = plane_depths(x, y, np.array(laser.point_m), np.array(laser.normal), along=along)
-    assert camera.focal_px is not None
-    ok = status == Status.OK
-    with np.errstate(invalid="ignore"):
-        near = np.isfinite(met.depth) & (met.depth >= near_m) & (met.depth <= far_m)
-    status[ok & ~near] = Status.OUT_OF_RANGE
-    spread = sigma * met.per_pixel / camera.focal_px[0 if along == "row" else 1]
-    return StripeSamples(lines, centre, np.nan_to_num(met.depth), np.nan_to_num(spread), amplitude, status)
-
-
 def _refuse_faint(kept: dict[str, StripeSamples]) -> None:
     """Mark stripes that are too faint beside the others to be the laser's own light."""
     found = np.concatenate([part.amplitude[part.status == Status.OK] for part in kept.values()]) if kept else np.zeros(0)
     if len(found):
         least = LEAST_PART * float(np.percentile(found, OF_PERCENTILE))
         for part in kept.values():
-            part.status[(part.status == Status.OK) & (part.amplitude < least)] = Status.LOW_MODULATION
+            part.status[np.isin(part.status, (Status.OK, Status.MULTIPATH)) & (part.amplitude < least)] = Status.LOW_MODULATION
 
 
 def _combine(capture: Capture, shape: tuple[int, ...], kept: dict[str, StripeSamples], spots: list[_Spot], brightest: np.ndarray,
@@ -174,6 +186,8 @@ def _combine(capture: Capture, shape: tuple[int, ...], kept: dict[str, StripeSam
     camera = capture.camera
     maps = [stripe_map(part, shape if along == "row" else shape[::-1], camera, along=along)
             for along, part in kept.items()]
+    doubtful = [stripe_map(part._replace(status=np.where(part.status == Status.MULTIPATH, Status.OK, Status.UNSOLVED)),
+                           shape if along == "row" else shape[::-1], camera, along=along) for along, part in kept.items()]
     depth, sigma, amplitude = np.zeros(shape, np.float32), np.full(shape, np.inf, np.float32), np.zeros(shape, np.float32)
     for found in maps:
         better = found.solved & (found.sigma < sigma)
@@ -189,12 +203,20 @@ def _combine(capture: Capture, shape: tuple[int, ...], kept: dict[str, StripeSam
         gaps = np.array([spot.gap for spot in spots])
         facts["residual_m"] = {"median": float(f"{np.median(gaps):.4g}"), "most": float(f"{gaps.max():.4g}")}
     solved = np.isfinite(sigma)
+    status = np.where(solved, int(Status.OK), int(Status.UNSOLVED)).astype(np.uint8)
+    for found in doubtful:
+        only = found.solved & (status == Status.UNSOLVED)
+        depth[only], sigma[only], amplitude[only] = found.depth[only], found.sigma[only], found.amplitude[only]
+        status[only] = Status.MULTIPATH
+    sigma = np.where(status == Status.UNSOLVED, 0, sigma)
+    likely = np.where(status == Status.MULTIPATH, 0.5, 1.0)  # the other stripe may as well be the laser's
+    with np.errstate(divide="ignore", invalid="ignore"):
+        confidence = np.where(status == Status.UNSOLVED, 0, likely / (1 + sigma / (HALF_SURE * depth))).astype(np.float32)
     x, y = camera.plane_coordinates()
     along_ray = (depth * np.sqrt(x * x + y * y + 1)).astype(np.float32)
     kind = "laser stripe" if kept and not spots else "laser spot" if spots and not kept else "laser spot and stripe"
     return DepthSolution(
-        method=kind, depth=depth, status=np.where(solved, int(Status.OK), int(Status.UNSOLVED)).astype(np.uint8),
-        sigma=np.where(solved, sigma, 0), range_m=along_ray, amplitude=amplitude,
+        method=kind, depth=depth, status=status, sigma=sigma, confidence=confidence, range_m=along_ray, amplitude=amplitude,
         colour=np.repeat(brightest[..., None], 3, axis=-1), points=np.concatenate(points), pixels=np.concatenate(pixels), facts=facts)
 
 

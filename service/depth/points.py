@@ -24,8 +24,9 @@ def point_cloud(solution: DepthSolution, camera: Camera, *, color_space: str, no
     """
     solved = solution.solved
     if solution.points is not None and solution.pixels is not None:
-        rows, cols = solution.pixels.T
-        points = solution.points
+        kept = solved[tuple(solution.pixels.T)]
+        rows, cols = solution.pixels[kept].T
+        points = solution.points[kept]
     else:
         rows, cols = np.nonzero(solved)
         x, y = camera.plane_coordinates()

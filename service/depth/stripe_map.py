@@ -77,7 +77,7 @@ def stripe_map(samples: StripeSamples, shape: tuple[int, ...], camera: Camera, *
         at, here = near[inside], cell[inside]
         part = (here + 0.5 - place[at]) / gap[at]
         out[line[at], here] = 1 / (inverse[at] + part * (inverse[at + 1] - inverse[at]))
-        spread[line[at], here] = np.maximum(sigma[at], sigma[at + 1])
+        spread[line[at], here] = np.hypot((1 - part) * sigma[at], part * sigma[at + 1])
         bright[line[at], here] = np.maximum(amplitude[at], amplitude[at + 1])
         solved[line[at], here] = True
     cell = np.clip(place.astype(int), 0, shape[1] - 1)

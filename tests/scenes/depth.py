@@ -121,8 +121,9 @@ def write_patterns(folder: Path, scene: Scene, patterns: list[dict[str, Any]], *
 
 
 def write_lasers(folder: Path, scene: Scene, lasers: list[dict[str, Any]], *, width: float, noise: float = 0.0, ambient: bool = True,
-                 **changes: Any) -> Path:
-    """A capture of laser frames, the profile a Gaussian of `width` metres about the plane or ray."""
+                 undeclared: list[dict[str, Any] | None] | None = None, strength: float = 1.0, **changes: Any) -> Path:
+    """A capture of laser frames, the profile a Gaussian of `width` metres about the plane or ray; `undeclared` are second planes of the
+    frames that the manifest does not name."""
     rng = np.random.default_rng(3)
     frames = []
     points = scene.points
@@ -135,6 +136,10 @@ def write_lasers(folder: Path, scene: Scene, lasers: list[dict[str, Any]], *, wi
             direction = np.array(laser["direction"]) / np.linalg.norm(laser["direction"])
             off = points - laser["origin_m"]
             glow = np.exp(-((np.cross(off, direction) ** 2).sum(axis=-1)) / (2 * width**2))
+        other = undeclared[number] if undeclared is not None and number < len(undeclared) else None
+        if other is not None:
+            normal = np.array(other["normal"]) / np.linalg.norm(other["normal"])
+            glow = glow + strength * np.exp(-(((points - other["point_m"]) @ normal) ** 2) / (2 * width**2))
         image = AMBIENT * scene.albedo + 0.5 * glow[..., None] * scene.albedo[:, :, :1] * (1.0, 0.05, 0.02)
         image = np.maximum(image + rng.normal(0, noise, image.shape), 0) if noise else image
         write_exr(folder / f"{number:03d}.exr", image)

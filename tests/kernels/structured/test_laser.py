@@ -83,6 +83,47 @@ def test_a_noisy_stripe_is_as_sure_as_it_says(device):
     assert 0.7 < (found.centre.numpy() - truth)[ok].std() / found.sigma.numpy()[ok].mean() < 1.4
 
 
+def patches(shape, contrast, seed):
+    """[rows, cols] an albedo of fields of 2 × 2 pixels."""
+    coarse = np.exp(np.random.default_rng(seed).normal(0, contrast, (shape[0] // 2, shape[1] // 2)))
+    return coarse.repeat(2, axis=0).repeat(2, axis=1)
+
+
+@pytest.mark.parametrize("width", [1.2, 2.0, 4.0])
+def test_uneven_profiles_show_what_texture_does(device, width):
+    truth, rng = 60.0 + 0.013 * np.arange(800), np.random.default_rng(4)
+    plain = np.exp(-((np.arange(120)[None] + 0.5 - truth[:, None]) ** 2) / (2 * width**2))
+    for image, texture in ((plain, False), (plain * np.exp(rng.normal(0, 0.2, plain.shape)), True)):
+        found = find_stripe(image + rng.normal(0, 0.01, image.shape), along="row", noise=0.01, device=device)
+        error = (found.centre.numpy() - truth).std()
+        assert np.sqrt((found.uneven.numpy() ** 2).mean()) == pytest.approx(error, rel=0.2)
+        assert (error > 5 * found.sigma.numpy().mean()) == texture
+    np.testing.assert_allclose(np.median(find_stripe(plain, along="row", noise=1e-4, device=device).width.numpy()), width, rtol=0.02)
+
+
+def test_a_known_albedo_is_divided_out(device):
+    truth = 60.0 + 0.013 * np.arange(800)
+    albedo = patches((800, 120), 0.4, 3)
+    image = albedo * np.exp(-((np.arange(120)[None] + 0.5 - truth[:, None]) ** 2) / (2 * 2.0**2))
+    image += np.random.default_rng(1).normal(0, 0.002, image.shape)
+    raw, divided = (find_stripe(image, along="row", noise=0.002, device=device, albedo=known) for known in (None, albedo))
+    assert (raw.centre.numpy() - truth).std() > 0.3 > 30 * (divided.centre.numpy() - truth).std()
+    assert divided.even.numpy().all() and not raw.even.numpy().any()
+    albedo[::2, 58:62] = 0  # not known in the middle of the stripe
+    assert not find_stripe(image, along="row", noise=0.002, device=device, albedo=albedo).even.numpy()[:200:2].any()
+
+
+def test_a_spot_on_texture_is_as_sure_as_it_says():
+    rng, off, said = np.random.default_rng(5), [], []
+    for number in range(80):
+        u, v = rng.uniform(25, 35, 2)
+        image = spot(u, v, 2.5) * patches((60, 80), 0.2, number) + rng.normal(0, 0.005, (60, 80))
+        found = find_spot(image.astype(np.float32))
+        off += [found.u - u, found.v - v]
+        said += [found.sigma_px] * 2
+    assert 0.7 < np.median(np.abs(off) / np.array(said)) / 0.6745 < 1.5  # 20 from noise alone
+
+
 def test_lines_without_one_stripe_say_so(device):
     image = np.zeros((4, 300), np.float32)
     image[1, 20:23], image[1, 80:83] = 1.0, 0.9  # two

@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 
+from kernels.status import Status
 from stage.depth_maps import DepthMaps
 from stage.ply import read_ply
 from tests.reference import projector as reference
@@ -80,6 +81,75 @@ def test_a_dense_sweep_fills_the_map(relit, tmp_path):
     cols = np.flatnonzero(maps.mask.mean(axis=0) > 0.99)
     assert len(cols) > 25 and (np.diff(cols) == 1).all()
     assert np.abs(maps.depth - scene.depth)[maps.mask].max() < 2e-5
+
+
+def woven(points):
+    """[rows, cols, 3] an albedo of waves, 5 to 20 mm long, and of fields of 8 mm."""
+    x, y = points[..., 0], points[..., 1]
+    waves = 0.4 + 0.14 * np.sin(700 * x + 300 * y) + 0.12 * np.sin(340 * x - 500 * y)
+    fields = np.where((np.floor(x / 0.008) + np.floor(y / 0.008)) % 2 > 0, 1.0, 0.45)
+    return np.repeat((waves * fields)[..., None], 3, axis=-1)
+
+
+@pytest.mark.parametrize(("planes", "span"), [(70, 0.05), (12, 0.09)], ids=["dense", "far apart"])
+def test_texture_is_divided_out_or_in_sigma(relit, tmp_path, planes, span):
+    scene = SCENE._replace(albedo=woven(SCENE.points))
+    write_lasers(tmp_path, scene, [plane(x) for x in np.linspace(-span, span, planes)], width=1.8e-3, noise=0.003, camera=CAMERA)
+    maps, _, _ = solve(relit, tmp_path)
+    rays = reference.pixel_rays(CAMERA)
+    with np.errstate(invalid="ignore"):
+        sphere = np.isfinite(reference.sphere_depth(rays, CENTRE, RADIUS))
+    edge = np.zeros_like(sphere)
+    edge[:, 6:-6] = sphere[:, 12:] != sphere[:, :-12]  # where the outline of the sphere cuts the stripe
+    keep = maps.mask & ~edge
+    share = np.abs(maps.depth - scene.depth)[keep] / maps.sigma[keep]
+    assert keep.sum() > 1000 and 0.45 < np.median(share) < 1.4  # 3 to 6 from noise alone
+    assert np.mean(share > 5) < (0.01 if planes > 50 else 0.02)  # 25 to 60 % from noise alone; far apart, borders of fields are not seen
+    if planes > 50:
+        assert np.median(np.abs(maps.depth - scene.depth)[keep]) < 0.25e-3  # without the division 0.6 mm
+
+
+def test_texture_that_a_sweep_shows_does_not_move_the_stripe(relit, tmp_path):
+    planes = [plane(x) for x in np.linspace(-0.05, 0.05, 70)]
+    medians = []
+    for name, albedo in (("plain", SCENE.albedo), ("woven", woven(SCENE.points))):
+        write_lasers(tmp_path / name, SCENE._replace(albedo=albedo), planes, width=1.8e-3, noise=0.001, camera=CAMERA)
+        _, points, _ = solve(relit, tmp_path / name)
+        medians.append(np.median(off_surface(points)))
+    assert medians[1] < 4 * medians[0]  # a third of the light, and so three times the noise; 12 times without the division
+
+
+def test_a_second_plane_in_every_frame_is_told(relit, tmp_path):
+    planes, others = ([plane(x + step) for x in np.linspace(-0.08, 0.08, 12)] for step in (0.0, 0.05))
+    write_lasers(tmp_path, SCENE, planes, width=1.2e-3, noise=0.003, camera=CAMERA, undeclared=others, strength=0.6)
+    outcome = relit("depth", tmp_path, "--out", tmp_path / "out")
+    assert outcome.code == 2 and "show a second stripe about as bright as the first" in outcome.err and "multipath" in outcome.err
+
+
+def test_a_second_plane_in_one_frame_takes_that_frame_out(relit, tmp_path):
+    planes = [plane(x) for x in np.linspace(-0.08, 0.08, 12)]
+    others = [plane(0.03) if number == 4 else None for number in range(12)]
+    write_lasers(tmp_path, make_scene(sphere=False, camera=CAMERA), planes, width=1.2e-3, noise=0.003, camera=CAMERA, undeclared=others,
+                 strength=0.8)
+    outcome = relit("depth", tmp_path, "--out", tmp_path / "out")
+    assert outcome.code == 0
+    maps = DepthMaps.read(tmp_path / "out" / "depth.exr", unsure=True)
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    truth = make_scene(sphere=False, camera=CAMERA).depth
+    doubtful = maps.status == Status.MULTIPATH
+    assert doubtful.sum() > 150 and (maps.depth[doubtful] > 0).all() and not maps.mask[doubtful].any()
+    assert maps.confidence[doubtful].max() <= 0.5
+    assert np.abs(maps.depth - truth)[maps.mask].max() < 5e-3  # the second plane is 20 mm off and more
+    assert [warning for warning in report["warnings"] if "1 of 12 frames, 004.exr" in warning]
+
+
+def test_a_faint_reflection_takes_nothing_out(relit, tmp_path):
+    planes, others = ([plane(x + step) for x in np.linspace(-0.08, 0.08, 12)] for step in (0.0, 0.05))
+    scene = make_scene(sphere=False, camera=CAMERA)
+    write_lasers(tmp_path, scene, planes, width=1.2e-3, noise=0.003, camera=CAMERA, undeclared=others, strength=0.15)
+    maps, points, report = solve(relit, tmp_path)
+    assert report["warnings"] == [] and len(points) > 0.9 * 12 * 220
+    assert np.quantile(np.abs(maps.depth - scene.depth)[maps.mask], 0.99) < 1e-3
 
 
 def test_spots_and_stripes_together(relit, tmp_path):
