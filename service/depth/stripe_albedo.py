@@ -9,7 +9,6 @@ Source: Curless and Levoy, "Better optical triangulation through spacetime analy
 profile of a pixel.
 """
 
-import cv2
 import numpy as np
 
 LEAST_FRAMES = 2.0
@@ -77,7 +76,16 @@ class SweepEnergy:
 
 def _mean(values: np.ndarray, where: np.ndarray) -> np.ndarray:
     """Return the mean of the values over a window, of those pixels that are marked; 0 where none is."""
-    side = (WINDOW_PX, WINDOW_PX)
-    weight = cv2.blur(where.astype(np.float32), side, borderType=cv2.BORDER_CONSTANT)
-    total = cv2.blur(np.where(where, values, 0).astype(np.float32), side, borderType=cv2.BORDER_CONSTANT)
-    return np.where(weight > 1e-6, total / np.maximum(weight, 1e-6), 0)
+    weight = _sum_around(where.astype(np.float32))
+    return np.where(weight > 0, _sum_around(np.where(where, values, 0).astype(np.float32)) / np.maximum(weight, 1), 0)
+
+
+def _sum_around(values: np.ndarray) -> np.ndarray:
+    """Return the sum over the window about each pixel; beyond the image values count as 0."""
+    for axis in (0, 1):
+        room = [(0, 0), (0, 0)]
+        room[axis] = (WINDOW_PX // 2, WINDOW_PX // 2)
+        padded = np.pad(values, room)
+        length = values.shape[axis]
+        values = np.add.reduce([np.take(padded, range(start, start + length), axis=axis) for start in range(WINDOW_PX)])
+    return values
