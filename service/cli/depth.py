@@ -40,6 +40,8 @@ def _depth(request: DepthRequest) -> None:
     print(f"method   {result.method}, {result.points} points")
     print(f"pixels   {counted(result.counts)}")
     print_warnings(result.warnings)
+    if not result.maps.mask.any():
+        raise typer.Exit(1)
 
 
 def _separate(request: SeparateRequest) -> None:

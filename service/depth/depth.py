@@ -148,17 +148,20 @@ def _ranging(capture: Capture, wanted: Ranging | None) -> Ranging:
 
 
 def _check_plausible(solution: DepthSolution, capture: Capture, using: Ranging) -> None:
-    """Refuse a solution without any depth, or with depths that cannot be in metres.
+    """Refuse a solution without any depth, or with depths that cannot be in metres; warn where every depth is unsure.
 
     Raises:
         ManifestError: says what most often is the cause.
     """
-    solved = solution.solved
-    if not solved.any():
-        reasons = {name: count for name, count in solution.counts(np.ones_like(solved)).items() if count and name != "unsolved"}
+    estimated = solution.estimated
+    if not solution.solved.any():
+        reasons = {name: count for name, count in solution.counts(np.ones_like(estimated)).items() if count and name != "unsolved"}
         text = ", ".join(f"{count} {name}" for name, count in reasons.items()) or "nothing is inside the mask"
-        raise ManifestError(f"{capture.folder}: no pixel has a depth ({text}): {_advice(reasons, using)}")
-    middle, field = float(np.median(solution.depth[solved])), KINDS[using].lengths
+        if not estimated.any():
+            raise ManifestError(f"{capture.folder}: no pixel has a depth ({text}): {_advice(reasons, using)}")
+        solution.warnings.append(f"no depth is sure enough to count as solved ({text}): depth.exr keeps the values outside the mask; "
+                                 "--least-confidence 0 counts unsure ones as solved")
+    middle, field = float(np.median(solution.depth[estimated])), KINDS[using].lengths
     if field is not None and not PLAUSIBLE_M[0] <= middle <= PLAUSIBLE_M[1]:
         raise ManifestError(f"{capture.folder / FILE_NAME}: {field}: the median depth comes out as {middle:.3g} m: give lengths in metres")
 

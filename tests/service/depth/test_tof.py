@@ -96,6 +96,17 @@ def test_what_is_unsure_is_kept_and_the_request_says_what_counts(tmp_path):
     assert 0.6 < np.median(share) < 1.0
 
 
+def test_depths_that_are_all_unsure_are_written_and_the_command_says_so(relit, tmp_path):
+    settings = tof.even(tof.HZ, 4)
+    folder = write(tmp_path / "c", cw_frames(tof.correlations(VIEW, 1e5, settings, ambient=20, seed=5), settings))
+    outcome = relit("depth", folder, "--out", tmp_path / "out", "--max-sigma", "1e-6")
+    assert outcome.code == 1 and "warning  no depth is sure enough to count as solved" in outcome.out
+    maps = DepthMaps.read(tmp_path / "out" / "depth.exr", unsure=True)
+    assert not maps.mask.any() and maps.estimated.mean() > 0.9
+    assert np.median(np.abs(maps.range - VIEW.distance)[maps.estimated]) < 0.01  # the first row of the figures above
+    assert len(read_ply(tmp_path / "out" / "points.ply").points) == 0
+
+
 def test_no_vote_leaves_dark_pixels_alone(tmp_path):
     settings = tof.even(tof.HZ, 4)
     folder = write(tmp_path / "c", cw_frames(tof.correlations(VIEW, 1500, settings, ambient=40, seed=2), settings))
