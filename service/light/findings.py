@@ -61,9 +61,10 @@ class FrameFindings:
                          f"{self.beyond_degrees:.0f} degrees from every captured light: {GUIDED_BEYOND if self.guided else PLAIN_BEYOND}")
         if max(self.clipped) >= LEAST_CLIPPED:
             red, green, blue = (_percent(share) for share in self.clipped)
+            known = GUIDED_CLIPPED if self.guided else PLAIN_CLIPPED
             found.append(f"{red} of the red, {green} of the green and {blue} of the blue of {_picture(self.clipped_frame)} is from "
                          "readings that are clipped in every frame of their light, at "
-                         f"{_percent(self.clipped_pixels)} of the object's pixels: it is {GUIDED_CLIPPED if self.guided else PLAIN_CLIPPED}")
+                         f"{_percent(self.clipped_pixels)} of the object's pixels: it is {known}")
         return tuple(found)
 
 
