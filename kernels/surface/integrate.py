@@ -13,6 +13,7 @@ from kernels.surface.conjugate import Solver
 from kernels.surface.discontinuities import distrust_loops
 from kernels.surface.grid import make_grid
 from kernels.surface.slopes import pair_slopes, usable_pixels
+from kernels.surface.support import supported_normals
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +47,7 @@ def integrate_normals(
     *,
     perspective: bool,
     mean_z: float,
+    sigma: np.ndarray | wp.array | None = None,  # [rows, cols] float32, radians
     options: IntegrationOptions | None = None,
     device: str,
     progress: Callable[[float], None] | None = None,
@@ -61,6 +63,7 @@ def integrate_normals(
         y: the same, upwards.
         perspective: which of the two the camera is.
         mean_z: mean camera-frame z of the surface; negative for a perspective camera.
+        sigma: standard errors of the normals; None: all are sure.
         options: None for the defaults.
         device: "cpu" or "cuda:0".
         progress: told the fraction done, 0…1.
@@ -77,15 +80,20 @@ def integrate_normals(
         every few iterations. Needs eleven float32 per pixel beyond the inputs (15 with discontinuities).
     """
     options = options or IntegrationOptions()
-    _check(normal, mask, x, y, perspective=perspective, mean_z=mean_z)
+    _check(normal, mask, x, y, sigma, perspective=perspective, mean_z=mean_z)
     rows, cols = mask.shape
     grid = make_grid(rows, cols, device)
     spacing = _spacing(x, y)
     inputs = [_upload(a, wp.float32, device) for a in (normal, x, y)]
     usable = usable_pixels(inputs[0], _upload(mask, wp.uint8, device), *inputs[1:], device=device)
-    slopes = pair_slopes(inputs[0], usable, *inputs[1:], grid=grid, perspective=perspective, spacing=spacing)
+    if sigma is None:
+        trust = wp.ones((rows, cols), dtype=wp.float32, device=device)
+    else:
+        inputs[0], trust = supported_normals(inputs[0], _upload(sigma, wp.float32, device), *inputs[1:], perspective=perspective,
+                                             device=device)
+    slopes = pair_slopes(inputs[0], usable, *inputs[1:], trust, grid=grid, perspective=perspective, spacing=spacing)
     runs = label_runs(usable.numpy())
-    del inputs, usable
+    del inputs, usable, trust
 
     h = grid.zeros()
     if options.discontinuities:
@@ -97,15 +105,15 @@ def integrate_normals(
     return Integration(height, runs.count, done.iterations, done.residual, done.converged)
 
 
-def _check(normal: Any, mask: Any, x: Any, y: Any, *, perspective: bool, mean_z: float) -> None:
+def _check(normal: Any, mask: Any, x: Any, y: Any, sigma: Any, *, perspective: bool, mean_z: float) -> None:
     if len(mask.shape) != 2:
         raise ArrayError(f"mask has shape {tuple(mask.shape)}: give [rows, cols]")
     if tuple(normal.shape) != (3, *mask.shape):
         raise ArrayError(f"normal has shape {tuple(normal.shape)}, mask {tuple(mask.shape)}: give [3, rows, cols]")
-    for name, a in (("x", x), ("y", y)):
+    for name, a in (("x", x), ("y", y), ("sigma", x if sigma is None else sigma)):
         if tuple(a.shape) != tuple(mask.shape):
             raise ArrayError(f"{name} has shape {tuple(a.shape)}, mask {tuple(mask.shape)}: give one value per pixel")
-    for name, a in (("normal", normal), ("x", x), ("y", y)):
+    for name, a in (("normal", normal), ("x", x), ("y", y), ("sigma", sigma)):
         if isinstance(a, wp.array) and a.dtype is not wp.float32:
             raise ArrayError(f"{name} holds {a.dtype.__name__}: give float32")
     if not np.isfinite(mean_z):

@@ -117,13 +117,16 @@ def _edge_kernel(perspective: bool) -> Any:
 
     @wp.func
     def edge_to(normal: wp.array3d(dtype=wp.float32), usable: wp.array2d(dtype=wp.uint8), x: wp.array2d(dtype=wp.float32),
-                y: wp.array2d(dtype=wp.float32), n: wp.vec3, ri: wp.vec3, r: int, c: int, spacing: float):
-        """Return (slope, weight) of the edge from a pixel of normal n on the ray ri to pixel (r, c), zeros where that is not usable."""
+                y: wp.array2d(dtype=wp.float32), trust: wp.array2d(dtype=wp.float32), n: wp.vec3, ri: wp.vec3, own: float,
+                r: int, c: int, spacing: float):
+        """Return (slope, weight) of the edge from a pixel of normal n and trust `own` on the ray ri to pixel (r, c), zeros where that is
+        not usable."""
         edge = wp.vec2()
         # nested, because a kernel evaluates both sides of `and`
         if r < usable.shape[0] and c < usable.shape[1]:  # noqa: SIM102
             if usable[r, c] != wp.uint8(0):
                 edge = pair(n + _normal_at(normal, r, c), ri, wp.vec3(x[r, c], y[r, c], -1.0), spacing)
+                edge[1] *= 2.0 / (1.0 / own + 1.0 / trust[r, c])
         return edge
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -132,6 +135,7 @@ def _edge_kernel(perspective: bool) -> Any:
                     usable: wp.array2d(dtype=wp.uint8),
                     x: wp.array2d(dtype=wp.float32),
                     y: wp.array2d(dtype=wp.float32),
+                    trust: wp.array2d(dtype=wp.float32),
                     spacing: float,
                     # outputs
                     right: wp.array(dtype=wp.float32),
@@ -144,10 +148,10 @@ def _edge_kernel(perspective: bool) -> Any:
             return
         i = (r + 1) * weights.pitch + c + 1
         n, ri = _normal_at(normal, r, c), wp.vec3(x[r, c], y[r, c], -1.0)
-        edge = edge_to(normal, usable, x, y, n, ri, r, c + 1, spacing)
+        edge = edge_to(normal, usable, x, y, trust, n, ri, trust[r, c], r, c + 1, spacing)
         right[i] = edge[0]
         weights.right[i] = edge[1]
-        edge = edge_to(normal, usable, x, y, n, ri, r + 1, c, spacing)
+        edge = edge_to(normal, usable, x, y, trust, n, ri, trust[r, c], r + 1, c, spacing)
         down[i] = edge[0]
         weights.down[i] = edge[1]
 
@@ -159,6 +163,7 @@ def pair_slopes(
     usable: wp.array,  # [rows, cols] uint8
     x: wp.array,  # [rows, cols] float32, right, in the plane of the projection
     y: wp.array,  # [rows, cols] float32, up
+    trust: wp.array,  # [rows, cols] float32, 0…1 exclusive of 0
     *,
     grid: Grid,
     perspective: bool,
@@ -168,6 +173,7 @@ def pair_slopes(
 
     Args:
         normal, usable, x, y: as above.
+        trust: the weight of each pixel; that of a pair is its pixels' harmonic mean, times the cosines.
         grid: the layout of the result.
         perspective: whether x and y are the slopes of the rays (z = −1) rather than positions.
         spacing: mean distance of neighbouring pixels in the plane of x and y.
@@ -176,6 +182,6 @@ def pair_slopes(
         Slopes in units of the spacing, growing towards the viewer: of z (orthographic) or of −log d (perspective).
     """
     slopes = Slopes(grid.zeros(), grid.zeros(), grid.no_edges())
-    inputs = [normal, usable, x, y, spacing]
+    inputs = [normal, usable, x, y, trust, spacing]
     devices.launch(_edge_kernel(perspective), grid.rows * grid.cols, inputs, list(slopes), device=grid.device)
     return slopes

@@ -81,6 +81,10 @@ def solve_near(given: SolveInput, lights: PlacedLights, *, series: Sequence[Roun
                 break
     if not settled:
         solution.status[restless & (solution.status == Status.OK)] = Status.NOT_CONVERGED
+    integration = integrate(given, solution.normal, solved, sigma=solution.standard_error())
+    assert integration is not None  # a round without a solved pixel has returned
+    height = whole_surface(integration.height.numpy(), solved, mask, mean_z=mean_height(camera),
+                           perspective=camera.projection == "perspective")
     solution.facts = {**solution.facts, "near": {"rounds": rounds, "last_change_of_relief": round(change, 6), "settled": settled}}
     solution.height, solution.integration = np.where(solved, height, 0).astype(np.float32), integration
     return solution

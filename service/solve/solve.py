@@ -23,7 +23,7 @@ from service.solve.gradient import solve_gradients
 from service.solve.near import MATERIAL_ROUNDS, Rounds, solve_near
 from service.solve.reference import solve_by_reference
 from service.solve.solution import Solution, SolveInput, SuspectLight, mark_not_facing, refine_status
-from service.solve.surface import integrate
+from service.solve.surface import guessed_part, height_warnings, integrate
 from stage.capture import Capture
 from stage.colour_spaces import linear_space
 from stage.errors import ManifestError
@@ -131,9 +131,12 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
     counts = {s.name.lower(): int(np.count_nonzero(status[mask] == s)) for s in Status}
     if not solved.any():
         solution.warnings.append(_nothing_solved(counts))
+    sigma = solution.standard_error()
     if solution.integration is None:  # near lights have found the height with the normals
-        solution.integration = integrate(given, solution.normal, estimated)
+        solution.integration = integrate(given, solution.normal, estimated, sigma=sigma)
         solution.height = None if solution.integration is None else solution.integration.height.numpy()
+    guessed = guessed_part(sigma, estimated)
+    solution.warnings += height_warnings(guessed, method)
     sources = metadata(request, method=method, capture=capture.name, inputs=stack.key, contents=solution.contents)
     maps = _maps(solution, solved, estimated, method, capture, sources)
     timings.stage("write", 1)
@@ -152,7 +155,7 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
         pixels={"mask": int(mask.sum()), **counts},
         residual=_residual_statistics(solution.residual.reshape(mask.shape)[solved]),
         albedo_above_one=int((maps.diffuse_albedo[solved] > 1).any(axis=-1).sum()) if maps.diffuse_albedo is not None else 0,
-        height=_height_report(solution.integration, capture),
+        height=_height_report(solution.integration, guessed, capture),
         **({} if stack.motion is None else {"motion": stack.motion}),
     ))
     return SolveResult(maps, maps_path, report_path, counts, tuple(solution.suspects), tuple(solution.warnings))
@@ -202,8 +205,9 @@ def _residual_statistics(residual: np.ndarray) -> dict[str, float]:
     return {"median": round(float(values[0]), 5), "p95": round(float(values[1]), 5)}
 
 
-def _height_report(integration: Integration | None, capture: Capture) -> dict[str, Any]:
+def _height_report(integration: Integration | None, guessed: float, capture: Capture) -> dict[str, Any]:
     if integration is None:
         return {}
     return {"unit": "m" if capture.camera.metric else "pixel", "iterations": integration.iterations,
-            "relative_residual": float(integration.residual), "converged": bool(integration.converged)}
+            "relative_residual": float(integration.residual), "converged": bool(integration.converged),
+            "guessed_part": round(guessed, 4)}

@@ -6,22 +6,29 @@ import warp as wp
 from kernels.surface.components import label_runs
 from kernels.surface.integrate import Integration, IntegrationOptions, integrate_normals
 from kernels.surface.shadows import Projection
+from service.requests.solve import Method
 from service.solve.solution import SolveInput
 from stage.camera import Camera
 
 OPTIONS = IntegrationOptions(discontinuities=True)
 """The surface may break where slopes around a pixel contradict each other: objects hide parts of themselves."""
+GUESSED_SIGMA = 30.0
+"""Standard error, in degrees, of a normal above which its slope is a guess."""
+GUESSED_PART = 0.1
+"""Part of the surface that may rest on such normals before it is said."""
 RINGS = 8
 """Unsolved pixels this near to solved ones are filled from their neighbours; farther ones, which few solves have, by blocks."""
 
 
-def integrate(given: SolveInput, normal: np.ndarray, solved: np.ndarray, *, stage: str = "height") -> Integration | None:
+def integrate(given: SolveInput, normal: np.ndarray, solved: np.ndarray, *, sigma: np.ndarray | None = None,
+              stage: str = "height") -> Integration | None:
     """Integrate the normals of the solved pixels.
 
     Args:
         given: the camera and the device.
         normal: [3, pixels] float32.
         solved: [rows, cols] bool.
+        sigma: [pixels] standard errors of the normals, degrees; None: all are sure.
         stage: what the progress calls this work.
 
     Returns:
@@ -39,8 +46,33 @@ def integrate(given: SolveInput, normal: np.ndarray, solved: np.ndarray, *, stag
 
     x, y = camera.plane_coordinates()
     return integrate_normals(normal.reshape(3, *solved.shape), solved, x.astype(np.float32), y.astype(np.float32),
-                             perspective=camera.projection == "perspective", mean_z=mean_height(camera), options=OPTIONS,
+                             perspective=camera.projection == "perspective", mean_z=mean_height(camera),
+                             sigma=None if sigma is None else np.radians(sigma, dtype=np.float32).reshape(solved.shape), options=OPTIONS,
                              device=given.device, progress=tell)
+
+
+def guessed_part(sigma: np.ndarray, estimated: np.ndarray) -> float:
+    """Return the part of the surface whose height rests on normals that are hardly known; 0 without a surface.
+
+    Args:
+        sigma: [pixels] standard errors of the normals, degrees.
+        estimated: [rows, cols] bool, the surface.
+    """
+    return float((sigma.reshape(estimated.shape)[estimated] > GUESSED_SIGMA).mean()) if estimated.any() else 0.0
+
+
+def height_warnings(guessed: float, method: Method) -> list[str]:
+    """Return a sentence where much of the height is a guess.
+
+    Args:
+        guessed: that part, of guessed_part.
+        method: that of the normals.
+    """
+    if guessed <= GUESSED_PART:
+        return []
+    cure = "try --method svbrdf, which knows highlights and metals" if method in (Method.LAMBERT, Method.ROBUST) else "try more lights"
+    return [f"height: {guessed:.0%} of the surface rests on normals with a standard error above {GUESSED_SIGMA:g} degrees, so its shape "
+            f"is a guess there: {cure}"]
 
 
 def mean_height(camera: Camera) -> float:

@@ -9,7 +9,7 @@ from kernels.surface.integrate import IntegrationOptions, integrate_normals
 from tests.kernels.surface import shapes
 
 
-def solve(shape, device, *, perspective=False, mean_z=None, **options):
+def solve(shape, device, *, perspective=False, mean_z=None, sigma=None, **options):
     if mean_z is None:
         mean_z = float(shape.z[shape.mask].mean())
     return integrate_normals(
@@ -19,6 +19,7 @@ def solve(shape, device, *, perspective=False, mean_z=None, **options):
         shape.y,
         perspective=perspective,
         mean_z=mean_z,
+        sigma=sigma,
         options=IntegrationOptions(**options),
         device=device,
     )
@@ -215,6 +216,7 @@ def test_progress_rises_to_one(device):
     [
         ({"normal": np.zeros((8, 9, 3), dtype=np.float32)}, r"normal has shape \(8, 9, 3\)"),
         ({"x": np.zeros((9, 8), dtype=np.float32)}, r"x has shape \(9, 8\)"),
+        ({"sigma": np.zeros((9, 8), dtype=np.float32)}, r"sigma has shape \(9, 8\)"),
         ({"mask": np.zeros((8, 9), dtype=bool)}, "mask is empty"),
         ({"mask": np.ones(9, dtype=bool)}, "mask has shape"),
         ({"mean_z": 0.5, "perspective": True}, "mean_z is 0.5"),
