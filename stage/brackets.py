@@ -1,24 +1,27 @@
 """Frames of one light at several exposures, merged: each reading is the mean of those that are not clipped.
 
-Weights of images must not use a clipped reading while another exposure of the same light has the whole value. Solvers take every
-frame as it is and leave the clipped readings out.
+Neither a sum of images nor a solver should take a clipped reading, or a noisy one for as much as a sure one, while another exposure of the
+same light has the whole value.
 
 Source: the maximum-likelihood weight of an exposure under photon noise is the light that it gathers, Hasinoff, Durand and Freeman,
 "Noise-optimal capture for high dynamic range photography", CVPR 2010, section 3; readings that saturate have weight 0.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from stage.manifest import Frame
-from stage.point_lights import DistantLights
-from stage.stack import Stack
+from stage.point_lights import DistantLights, PlacedLights
+from stage.stack import LIGHT_PAD, Stack, padded
 
-SAME_PLACE_RADIANS = 1e-4
-"""Lights closer than this angle, 0.006 degrees, are one light: as close as the weights of images take them for one."""
+SAME_PLACE = 1e-4
+"""Lights closer together than this part of their distance, 0.006 degrees, are one light: as close as the weights of images take them for
+one."""
+
+Lights = TypeVar("Lights", bound=DistantLights | PlacedLights)
 
 
 class Bracket(NamedTuple):
@@ -37,8 +40,11 @@ class BracketedStack(Stack):
     exceeds.
     """
 
+    kept: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # [lights padded] rows, of the recorded stack
     recorded: Stack | None = None
     """The stack of the frames as they were recorded."""
+    whole_scale: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.float32))
+    """[recorded lights padded] Radiance of a stored 1.0 in every row of the recorded stack once it is merged."""
     brackets: tuple[Bracket, ...] = ()
 
     def band(self, start: int, stop: int) -> np.ndarray:
@@ -65,6 +71,8 @@ class BracketedStack(Stack):
         clipped = np.unpackbits(bits, axis=0, bitorder="little")
         for bracket in self.brackets:
             clipped[bracket.rows] = clipped[bracket.rows].all(axis=0)
+        clipped = clipped[self.kept]
+        clipped[self.light_count :] = 0
         return np.packbits(clipped, axis=0, bitorder="little")
 
     def _merge(self, values: np.ndarray, bits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -78,11 +86,13 @@ class BracketedStack(Stack):
             total = counted.sum(axis=0)
             mean = (readings * counted).sum(axis=1) / np.where(total > 0, total, 1)
             mean = np.where(total > 0, mean, readings.max(axis=1))
-            merged[:, rows] = mean[:, None] * (irradiance / self.scale[rows, None]).T[..., None].astype(np.float32)
+            merged[:, rows] = mean[:, None] * (irradiance / self.whole_scale[rows, None]).T[..., None].astype(np.float32)
+        merged = merged[:, self.kept]
+        merged[:, self.light_count :] = 0
         return merged, self._clipped(bits)
 
 
-def merge_brackets(stack: Stack, frames: Sequence[Frame], lights: DistantLights) -> Stack:
+def merge_brackets(stack: Stack, frames: Sequence[Frame], lights: DistantLights | PlacedLights) -> Stack:
     """Return a stack whose frames of one light at several exposures are merged; without such frames, the stack as it is.
 
     Args:
@@ -91,8 +101,7 @@ def merge_brackets(stack: Stack, frames: Sequence[Frame], lights: DistantLights)
         lights: of the frames.
     """
     exposure = np.array([frame.exposure_s or 1.0 for frame in frames])
-    close = lights.direction @ lights.direction.T > 1 - SAME_PLACE_RADIANS**2 / 2
-    owner = close.argmax(axis=1)  # the first light in the same place
+    owner = _first_in_place(lights)
     brackets, scale = [], stack.scale.copy()
     for first in np.unique(owner):
         rows = np.flatnonzero(owner == first)
@@ -105,4 +114,32 @@ def merge_brackets(stack: Stack, frames: Sequence[Frame], lights: DistantLights)
             scale[row] = np.exp2(np.ceil(np.log2((stack.scale[rows] * (strength / irradiance).max(axis=1)).max())))
     if not brackets:
         return stack
-    return BracketedStack(stack.folder, stack.key, stack.frames, scale, stack.pixel_count, stack.motion, stack, tuple(brackets))
+    return BracketedStack(stack.folder, stack.key, stack.frames, scale, stack.pixel_count, stack.motion, kept=np.arange(len(scale)),
+                          recorded=stack, whole_scale=scale, brackets=tuple(brackets))
+
+
+def one_frame_a_light(stack: Stack, lights: Lights) -> tuple[Stack, Lights]:
+    """Return the first frame of each bracket of a merged stack, with the frames outside brackets, and their lights.
+
+    Args:
+        stack: of merge_brackets.
+        lights: of its frames.
+    """
+    if not isinstance(stack, BracketedStack):
+        return stack, lights
+    first = np.ones(stack.light_count, dtype=bool)
+    for bracket in stack.brackets:
+        first[bracket.rows[1:]] = False
+    chosen = np.flatnonzero(first)
+    kept = np.pad(chosen, (0, padded(len(chosen), LIGHT_PAD) - len(chosen)))
+    scale = np.where(np.arange(len(kept)) < len(chosen), stack.scale[kept], 0)
+    picked = {name: values if name == "centre" else values[chosen] for name, values in lights._asdict().items()}
+    frames = tuple(stack.frames[row] for row in chosen)
+    return replace(stack, frames=frames, scale=scale.astype(np.float32), kept=kept), type(lights)(**picked)
+
+
+def _first_in_place(lights: DistantLights | PlacedLights) -> np.ndarray:
+    """Return [lights] the first light in the place of each."""
+    place = lights.place if isinstance(lights, PlacedLights) else lights.direction
+    distance = np.linalg.norm(place[:, None] - place, axis=2)
+    return np.asarray((distance < SAME_PLACE * np.linalg.norm(place[:, :3], axis=1)).argmax(axis=1))

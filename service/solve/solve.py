@@ -24,6 +24,7 @@ from service.solve.near import MATERIAL_ROUNDS, Rounds, solve_near
 from service.solve.reference import solve_by_reference
 from service.solve.solution import Solution, SolveInput, SuspectLight, mark_not_facing, refine_status
 from service.solve.surface import guessed_part, height_warnings, integrate
+from stage.brackets import merge_brackets, one_frame_a_light
 from stage.capture import Capture
 from stage.colour_spaces import linear_space
 from stage.errors import ManifestError
@@ -119,6 +120,8 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
     tracking = tracking_frames(capture, to=request.align_to) if request.aligned else None
     timings.stage("ingest", len(capture.sources()))
     stack = open_stack(capture, cache=request.cache, tracking=tracking, progress=lambda done, _: timings.advance(done))
+    if isinstance(lights, DistantLights | PlacedLights):
+        stack, lights = one_frame_a_light(merge_brackets(stack, capture.sources(), lights), lights)
     given = SolveInput(stack, capture.camera, mask, device, timings, request.cache)
     solution = solver(given, lights)
     mark_not_facing(capture.camera, solution)
@@ -144,7 +147,7 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
     maps.write(maps_path)
     write_text(report_path, report(
         request,
-        inputs={"capture": str(request.capture), "name": capture.name, "content": stack.key, "frames": len(stack.frames),
+        inputs={"capture": str(request.capture), "name": capture.name, "content": stack.key, "frames": len(capture.sources()),
                 "resolution": list(capture.camera.resolution), "color_space": capture.manifest.color_space},
         method=str(method),
         found=solution.facts,

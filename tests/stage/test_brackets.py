@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stage.brackets import merge_brackets
+from stage.brackets import merge_brackets, one_frame_a_light
 from stage.capture import Capture
 from stage.ingest import open_stack
 from stage.lighting import distant_lights
@@ -89,3 +89,13 @@ def test_a_capture_without_brackets_is_left_as_it_is(tmp_path):
     capture = Capture.open(tmp_path)
     stack = open_stack(capture)
     assert merge_brackets(stack, capture.sources(), distant_lights(capture)) is stack
+
+
+def test_one_frame_a_light_is_left_for_solvers(tmp_path):
+    stack = bracketed(tmp_path)
+    one, lights = one_frame_a_light(stack, distant_lights(Capture.open(tmp_path)))
+    assert one.frames == ("b00.exr", "b10.exr", "b20.exr", "b30.exr") and one.shape == (3, 8, 192)
+    np.testing.assert_allclose(lights.direction, SCENE.directions)
+    np.testing.assert_allclose(radiance(one), SCENE.images, rtol=2 * HALF, atol=1e-6)
+    assert not one.band(0, 192)[:, 4:].any() and one.saturated(0, 192).shape == (1, 192)
+    assert not one.scale[4:].any()

@@ -111,3 +111,16 @@ def test_basis_of_brackets_holds_whole_readings(relit, capture):
     brightest = np.einsum("ck,ckyx->yxc", matrix[:, :, 0], layers)
     image = rgb(capture / "cap" / "000.exr")
     assert off(brightest, image) < 0.01 or image.max() < 0.01
+
+
+def test_solving_brackets_is_solving_whole_frames(relit, capture):
+    """Each light counts once, with its merged reading; to the half rounding of the images."""
+    def solve(name):
+        outcome = relit("solve", capture / "cap", "--method", "lambert", "--out", capture / name)
+        assert outcome.code == 0 and "suspect" not in outcome.out
+        channels, _ = exr.read(capture / name / "maps.exr")
+        return np.stack([channels[f"normal.{axis}"] for axis in "XYZ"], axis=-1)[SURFACE.mask]
+
+    whole = solve("a")
+    clip(capture / "cap", 0.15, exposures=(4.0, 1.0, 0.25))
+    assert np.abs(solve("b") - whole).max() < 2e-3
