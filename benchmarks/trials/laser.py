@@ -39,6 +39,8 @@ class Case:
     """Strength of a second, undeclared plane beside the first."""
     second_rad: float = 0.06
     """Angle between the two planes."""
+    second_every: int = 1
+    """The second plane is on in every so many frames."""
 
 
 def grey(points: np.ndarray) -> np.ndarray:
@@ -73,6 +75,8 @@ CASES = (
     Case("stripes far apart on grain", grain, planes=14),
     Case("a second plane as bright", grey, planes=24, in_model=False, second=0.9),
     Case("a second plane, brighter, on a chessboard", board, planes=24, in_model=False, second=1.4, second_rad=-0.09),
+    Case("a second plane in every eighth frame", cloth, planes=60, in_model=False, second=0.7, second_every=8),
+    Case("a faint second plane in every fifth frame", grain, planes=60, in_model=False, second=0.2, second_every=5),
     Case("a second plane of a half on grain", grain, planes=40, in_model=False, second=0.5, second_rad=0.03),
 )
 
@@ -128,7 +132,7 @@ def swept(case: Case, seed: int = 5) -> Trial:
         folder, frames = Path(name), []
         for index, angle in enumerate([*np.linspace(first, last, case.planes), None]):
             image = 0.03 * albedo
-            for turn, strength in ((0.0, 1.0), (case.second_rad, case.second)):
+            for turn, strength in ((0.0, 1.0), (case.second_rad, case.second if index % case.second_every == 0 else 0.0)):
                 if angle is not None and strength > 0:
                     off = (away @ plane_normal(angle + turn)) / distance / BEAM_RAD
                     image = image + 0.6 * strength * albedo * cosine * np.exp(-0.5 * off**2)

@@ -11,6 +11,8 @@ import numpy as np
 from kernels.status import Status
 from kernels.structured.spot import find_spot, nearest_points
 from service.depth.solution import HALF_SURE, DepthSolution
+from service.depth.stripe_conflicts import contradicted
+from service.depth.stripe_curves import WHOLE
 from service.depth.stripe_map import StripeSamples, stripe_map
 from service.depth.stripes import Sweep, along_of, measure_stripe, stripe_signal
 from service.reporting.progress import Timings
@@ -30,6 +32,8 @@ LEAST_FOR_AMBIENT = 3
 """Number of laser frames from which on their least value at each pixel is taken for ambient light, if there is no frame of it."""
 DOUBLED = 0.1
 """Part of the lines of a frame with two stripes of comparable brightness, from which the frame is named."""
+CURVES_OF_A_FRAME = 1_000_000
+"""More curves than the stripes of one frame can be, so that numbers of different frames differ."""
 SECOND_PLANE = 0.3
 """Part of the frames with two such stripes, from which a second plane is taken to move with the first: then no frame is trusted."""
 LEAST_PART, OF_PERCENTILE = 0.03, 95.0
@@ -69,6 +73,7 @@ def solve_laser(capture: Capture, mask: np.ndarray, request: DepthRequest, devic
     camera, shape = capture.camera, mask.shape
     sweeps = _sweeps(frames, correction, background, mask, timings)
     samples: dict[str, list[StripeSamples]] = {"row": [], "column": []}
+    curves: dict[str, list[np.ndarray]] = {"row": [], "column": []}
     doubled: list[str] = []
     spots: list[_Spot] = []
     seen: Counter[str] = Counter()
@@ -87,11 +92,15 @@ def solve_laser(capture: Capture, mask: np.ndarray, request: DepthRequest, devic
             along = along_of(frame.laser)
             found = measure_stripe(signal, mask, frame.laser, sweeps[along], camera, device=device, near_m=near_m, far_m=far_m)
             samples[along].append(found.samples)
-            if found.doubled > DOUBLED * int(np.isin(found.samples.status, (Status.OK, Status.MULTIPATH)).sum()):
+            curves[along].append(np.where(found.curve >= 0, found.curve + number * CURVES_OF_A_FRAME, -1))
+            lines = int(np.isin(found.samples.status, (Status.OK, Status.MULTIPATH)).sum())
+            if found.doubled > DOUBLED * lines or found.second > WHOLE * lines:
                 doubled.append(frame.image)
         timings.advance(number + 1)
     kept = {along: StripeSamples.joined(parts) for along, parts in samples.items() if parts}
     _refuse_faint(kept)
+    for along, part in kept.items():
+        part.status[contradicted(part, np.concatenate(curves[along]), camera, doubled=bool(doubled))] = Status.MULTIPATH
     if doubled and len(doubled) >= SECOND_PLANE * sum(len(parts) for parts in samples.values()):
         for part in kept.values():  # where one stripe of a frame is seen, it may be that of the second plane as well
             part.status[part.status == Status.OK] = Status.MULTIPATH
@@ -112,8 +121,8 @@ def solve_laser(capture: Capture, mask: np.ndarray, request: DepthRequest, devic
 
 def _second_stripes(doubled: list[str], frames: int) -> str:
     """Return a sentence about frames that show two stripes."""
-    return (f"frames[].laser: {len(doubled)} of {frames} frames, {doubled[0]} the first of them, show a second stripe about as bright as "
-            "the first, and the manifest declares one plane for each frame: photograph one plane at a time; their doubtful points have the "
+    return (f"frames[].laser: {len(doubled)} of {frames} frames, {doubled[0]} the first of them, show a second stripe beside the "
+            "first, and the manifest declares one plane for each frame: photograph one plane at a time; their doubtful points have the "
             "status multipath")
 
 

@@ -16,6 +16,8 @@ PEAKS = 3
 RIVAL = 0.3
 """Brightness of a second stripe over that of the first, from which it may be a second laser: a diffuse wall that is lit by another one
 returns less than a third of the other's light to any place."""
+GHOST = 0.1
+"""Brightness of a second stripe over that of the first, below which it may be a reflection that follows the stripe in every frame."""
 LEAST_OVERLAP = 3
 """Lines on which two curves must lie side by side to be compared: a single line may hold a hot pixel."""
 WHOLE = 1 / 3
@@ -33,6 +35,8 @@ class Chosen(NamedTuple):
     peak: np.ndarray  # [lines] int, which of the stripes found on the line
     status: np.ndarray  # [lines] uint8: as it was found, or MULTIPATH
     doubled: np.ndarray  # [lines] bool, where two stripes of comparable brightness lie side by side
+    second: np.ndarray  # [lines] bool, where a second stripe of GHOST times the brightness or more lies beside the first
+    curve: np.ndarray  # [lines] int, number of the curve of the stripe, -1 where there is none
 
 
 def choose_curves(place: np.ndarray, brightness: np.ndarray, status: np.ndarray) -> Chosen:
@@ -46,20 +50,23 @@ def choose_curves(place: np.ndarray, brightness: np.ndarray, status: np.ndarray)
     lines = place.shape[1]
     there = status == Status.OK
     several = there.sum(axis=0) > 1
-    if np.count_nonzero(several) < LEAST_OVERLAP:
-        return Chosen(np.zeros(lines, int), status[0].copy(), np.zeros(lines, bool))
     curve = link(place, there)
+    if np.count_nonzero(several) < LEAST_OVERLAP:
+        return Chosen(np.zeros(lines, int), status[0].copy(), np.zeros(lines, bool), np.zeros(lines, bool), curve[0])
     count = int(curve.max()) + 1
     length = np.bincount(curve[there], minlength=count)
     foreign, doubtful = np.zeros(count, bool), np.zeros(count, bool)
-    doubled = np.zeros(lines, bool)
-    comparable = []
+    doubled, second = np.zeros(lines, bool), np.zeros(lines, bool)
+    comparable, unequal = [], []
     for one, other, at in _overlaps(curve, several):
         ratio = float(np.median(_of(brightness, curve, other, at) / np.maximum(_of(brightness, curve, one, at), 1e-30)))
         if RIVAL <= ratio <= 1 / RIVAL:
             comparable.append((one, other, at))
         else:
             foreign[other if ratio < RIVAL else one] = True
+            unequal.append((one if ratio < RIVAL else other, at, GHOST <= ratio <= 1 / GHOST))
+    for brighter, at, seen_well in unequal:
+        second[at] |= seen_well and not foreign[brighter]
     for one, other, at in comparable:
         if not (foreign[one] or foreign[other]):  # two reflections say nothing of the stripe that they reflect
             doubled[at] = True
@@ -75,7 +82,7 @@ def choose_curves(place: np.ndarray, brightness: np.ndarray, status: np.ndarray)
     if np.count_nonzero(doubled) >= WHOLE * seen:
         doubt[:] = True
     found[doubt & (found == Status.OK)] = Status.MULTIPATH
-    return Chosen(peak, found, doubled)
+    return Chosen(peak, found, doubled, second | doubled, curve[peak, at])
 
 
 def link(place: np.ndarray, there: np.ndarray) -> np.ndarray:

@@ -84,8 +84,12 @@ class Stripes(NamedTuple):
     """What one frame shows."""
 
     samples: StripeSamples
+    curve: np.ndarray
+    """[lines] int, number of the curve of the stripe on each line, -1 where there is none."""
     doubled: int
     """Number of lines with two stripes of comparable brightness."""
+    second: int
+    """Number of lines with a second stripe, of a tenth of the brightness or more."""
 
 
 def measure_stripe(signal: Signal, mask: np.ndarray, laser: LaserPlane, sweep: Sweep, camera: Camera, *, device: str, near_m: float,
@@ -117,8 +121,8 @@ def measure_stripe(signal: Signal, mask: np.ndarray, laser: LaserPlane, sweep: S
         near = np.isfinite(met.depth) & (met.depth >= near_m) & (met.depth <= far_m)
     code[found & ~near] = Status.OUT_OF_RANGE
     spread = spread_px * met.per_pixel / camera.focal_px[0 if along == "row" else 1]
-    return Stripes(StripeSamples(lines, centre, np.nan_to_num(met.depth), np.nan_to_num(spread), peak, code),
-                   int(chosen.doubled.sum()))
+    return Stripes(StripeSamples(lines, centre, np.nan_to_num(met.depth), np.nan_to_num(spread), peak, code), chosen.curve,
+                   int(chosen.doubled.sum()), int(chosen.second.sum()))
 
 
 def _peaks(signal: Signal, mask: np.ndarray, along: str, sweep: Sweep, device: str) -> tuple[np.ndarray, ...]:
