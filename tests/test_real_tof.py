@@ -25,7 +25,7 @@ def test_a_plane_at_159_poses_is_within_two_millimetres():
     truth = np.array([pose["dist_to_plane"] for pose in poses])
     counts = np.array([pose["hists"] for pose in poses], dtype=np.float32).sum(axis=1)  # the nine zones look at one plane
     histograms = without_pileup(place(counts, "cpu"))
-    measured = find_returns(histograms, estimate_pulse(histograms, counts)).position.numpy()[0] * BIN_M
+    measured = find_returns(histograms, estimate_pulse(histograms, counts).pulse).position.numpy()[0] * BIN_M
     for half in (0, 1):
         fitted = np.arange(len(poses)) % 2 == half
         scale, offset = fit_line(measured[fitted], truth[fitted])

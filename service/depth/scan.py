@@ -8,7 +8,6 @@ import numpy as np
 from kernels import device as devices
 from kernels.status import SOLVED
 from kernels.tof.pileup import correct_pileup, place, without_pileup
-from kernels.tof.pulse import STEPS_PER_SIGMA
 from kernels.tof.pulse_width import estimate_pulse
 from kernels.tof.returns import find_returns
 from service.depth.points import srgb_bytes, white_of
@@ -106,11 +105,11 @@ def _returns(shots: Shots, device: str) -> tuple[np.ndarray, np.ndarray, np.ndar
     assert waveforms is not None
     counts = place(shots.waveforms, device)
     histograms = correct_pileup(counts, pulses=waveforms.pulses or 1) if waveforms.first_photon_only else without_pileup(counts)
-    pulse = estimate_pulse(histograms, shots.waveforms)
-    found = find_returns(histograms, pulse, most=MOST_RETURNS)
+    shape = estimate_pulse(histograms, shots.waveforms)
+    found = find_returns(histograms, shape.pulse, most=MOST_RETURNS)
     there = (found.photons.numpy() > 0) & np.isin(found.status.numpy(), SOLVED)
     number, index = np.nonzero(there)
     time_s = waveforms.start_s + found.position.numpy()[number, index].astype(np.float64) * waveforms.bin_s
-    facts = {"ranges": "from waveforms", "pulse_sigma_s": float(f"{pulse.step * STEPS_PER_SIGMA * waveforms.bin_s:.4g}"),
+    facts = {"ranges": "from waveforms", "pulse_sigma_s": float(f"{shape.sigma * waveforms.bin_s:.4g}"),
              "shots_with_several_returns": int(there[1].sum())}
     return index, range_of_delay_m(time_s), found.photons.numpy()[number, index], facts

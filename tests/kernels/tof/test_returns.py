@@ -123,7 +123,7 @@ def test_the_pulse_is_estimated(sigma_s, device):
     counts = tof.histogram(tof.room(24, 32), 20000, sigma_s=sigma_s, seed=5).reshape(-1, 64)
     histograms = without_pileup(place(counts, device))
     truth = gaussian(sigma_s / BIN_S)
-    assert estimate_pulse(histograms, counts).step == pytest.approx(truth.step, rel=0.06)
+    assert estimate_pulse(histograms, counts).pulse.step == pytest.approx(truth.step, rel=0.06)
 
 
 @pytest.mark.parametrize("photons", [6, 20])
@@ -133,7 +133,7 @@ def test_few_photons_do_not_make_the_pulse_narrow(photons, device):
     scaled = tof.View(view.distance, view.albedo / tof.signal(view, 1.0), view.cosine)
     counts = tof.histogram(scaled, photons / 0.8, background=0.01, seed=8).reshape(-1, 64)
     estimated = estimate_pulse(without_pileup(place(counts, device)), counts)
-    assert estimated.step == pytest.approx(PULSE.step, rel=0.04)  # 512 histograms of six: 1.3 %, and the brightest are not just any
+    assert estimated.pulse.step == pytest.approx(PULSE.step, rel=0.04)  # 512 histograms of six: 1.3 %, and the brightest are not just any
 
 
 def test_bad_pulses_and_options_are_refused(device):
