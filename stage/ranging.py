@@ -52,6 +52,8 @@ class Pulsed(Emitter):
     start_s: float
     pulses: Count | None = None
     first_photon_only: bool = False
+    count_scale: Positive | None = None
+    """Recorded units of one photon, where counts were multiplied, averaged or divided; None: estimated from the counts."""
 
 
 TimeOfFlight = Annotated[ContinuousWave | Pulsed, Field(discriminator="type")]

@@ -44,6 +44,8 @@ class Histograms:
     first_photon_only: bool
     source_m: Vector | None = None
     """The place of the light source in the camera frame; None: at the camera."""
+    count_scale: float | None = None
+    """Recorded units of one photon; None: not declared."""
 
 
 def is_pulsed(capture: Capture) -> bool:
@@ -91,9 +93,9 @@ def read_histograms(capture: Capture) -> Histograms:
     first = frames[0][1]
     for frame, tof in frames:
         if (abs(tof.bin_s - first.bin_s) > SAME_TIME * first.bin_s or abs(tof.start_s - first.start_s) > SAME_TIME * first.bin_s
-                or tof.first_photon_only != first.first_photon_only):
-            raise ManifestError(f"{manifest}: frames[].tof: the bins of {frame.image} are others than those of {frames[0][0].image}: "
-                                "give one capture for each")
+                or tof.first_photon_only != first.first_photon_only or tof.count_scale != first.count_scale):
+            raise ManifestError(f"{manifest}: frames[].tof: the bins of {frame.image} are others than those of {frames[0][0].image}, or "
+                                "its counts have another scale: give one capture for each")
         if tof.first_photon_only and tof.pulses is None:
             raise ManifestError(f"{manifest}: frames[].tof.pulses: is missing for {frame.image}: pile-up of a detector that counts first "
                                 "photons only is corrected with it")
@@ -106,7 +108,7 @@ def read_histograms(capture: Capture) -> Histograms:
     assert total is not None
     given = [tof.pulses for _, tof in frames if tof.pulses is not None]
     return Histograms(total, first.bin_s, first.start_s, sum(given) if len(given) == len(frames) else None, first.first_photon_only,
-                      read_source(capture))
+                      read_source(capture), first.count_scale)
 
 
 def read_source(capture: Capture) -> Vector | None:
