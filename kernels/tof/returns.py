@@ -106,8 +106,8 @@ def find_returns(histograms: LiveCounts, pulse: Pulse, *, most: int = 1, first_b
     position, photons, evidence, confidence = (wp.zeros((most, pixels), dtype=wp.float32, device=device) for _ in range(4))
     background, likelihood = (wp.zeros(pixels, dtype=wp.float32, device=device) for _ in range(2))
     status = wp.zeros(pixels, dtype=wp.int32, device=device)
-    per_bin = max(POSITIONS_PER_BIN, int(np.ceil(POSITIONS_PER_WIDTH / pulse.width)))
-    devices.launch(_returns_kernel, pixels, [recorded(histograms), shape(pulse, device), per_bin, first_bin, last, threshold(bins)],
+    devices.launch(_returns_kernel, pixels, [recorded(histograms), shape(pulse, device), positions_per_bin(pulse), first_bin, last,
+                                             threshold(bins)],
                    [position, photons, evidence, confidence, background, likelihood, status], device=device, uneven=True)
     times = return_times(histograms, pulse, position, photons, background, first_bin=first_bin, last_bin=last)
     return Returns(times.position, times.sigma, photons, evidence, confidence, background, likelihood, status)
@@ -118,8 +118,13 @@ def threshold(bins: int) -> float:
     return float(2 * np.log(bins / FALSE_ALARMS))
 
 
+def positions_per_bin(pulse: Pulse) -> int:
+    """Return the positions that the search tries in a bin."""
+    return max(POSITIONS_PER_BIN, int(np.ceil(POSITIONS_PER_WIDTH / pulse.width)))
+
+
 @wp.func
-def _added_at(given: Recorded, pulse: Shape, t: float, b: float, p: int, found: int,
+def added_at(given: Recorded, pulse: Shape, t: float, b: float, p: int, found: int,
               position: wp.array2d(dtype=wp.float32), photons: wp.array2d(dtype=wp.float32)):
     """Return the log likelihood that a return at t would add to those found, and its photons; both are 0 where a return would add
     nothing."""
@@ -246,7 +251,7 @@ def _returns_kernel(first: int,
                     if wp.abs(position[m, p] - t) < pulse.width:
                         free = 0
                 if free == 1:
-                    added = _added_at(given, pulse, t, b, p, found, position, photons)
+                    added = added_at(given, pulse, t, b, p, found, position, photons)
                     if added[0] > gain:
                         everywhere *= wp.exp(gain - added[0])
                         gain = added[0]
@@ -263,7 +268,7 @@ def _returns_kernel(first: int,
                 here = float(0.0)
                 for j in range(int(wp.ceil(wp.max(place - peak_reach(pulse), first_bin) * float(per_bin))),
                                int(wp.min(place + peak_reach(pulse), last_bin) * float(per_bin)) + 1):
-                    here += wp.exp(_added_at(given, pulse, float(j) / float(per_bin), b, p, found, position, photons)[0] - gain)
+                    here += wp.exp(added_at(given, pulse, float(j) / float(per_bin), b, p, found, position, photons)[0] - gain)
                 none = float(0.0)
                 for i in range(bins):
                     mean = mean_of_bin(pulse, i, p, -1, found, b, position, photons)
