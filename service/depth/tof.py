@@ -1,6 +1,6 @@
 """Range and depth of each pixel from the time-of-flight frames of a capture.
 
-Continuous wave: continuous_wave.py. Pulsed: photon histograms → pile-up, pulse, returns. Either way half the path of light is then
+Continuous wave: continuous_wave.py. Pulsed: histograms.py. Either way half the path of light is then
 corrected with the camera's calibration, turned into the range if the light source stands beside the camera, filtered, and turned into
 depth. The papers are named with the kernels of each step (kernels/tof).
 """
@@ -12,30 +12,23 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from kernels.status import ESTIMATED, SOLVED, Status, refuse_unsure
+from kernels.status import ESTIMATED, Status, refuse_unsure
 from kernels.tof.bilateral import smooth
 from kernels.tof.flying import mark_flying
 from kernels.tof.modulation import common_range_m, require_span
-from kernels.tof.pileup import LiveCounts, correct_pileup, place, without_pileup
-from kernels.tof.pulse import STEPS_PER_SIGMA, Pulse, gaussian, measured
-from kernels.tof.pulse_width import estimate_pulse
-from kernels.tof.returns import Returns, find_returns
 from kernels.tof.unwrap import END_SIGMAS
 from service.depth.continuous_wave import solve_correlations
+from service.depth.histograms import solve_histograms
 from service.depth.range_image import RangeImage
 from service.depth.solution import DepthSolution
-from service.errors import RequestError
 from service.reporting.progress import Timings
-from service.requests.depth import TofFilter, TofOptions, WhichReturn
+from service.requests.depth import TofFilter, TofOptions
 from stage.camera import Camera
 from stage.capture import Capture
 from stage.tof.calibration import TofCalibration, read_calibration
-from stage.tof.frames import Histograms, is_pulsed, read_correlations, read_histograms
-from stage.tof.light_time import SPEED_OF_LIGHT, range_of_delay_m
+from stage.tof.frames import is_pulsed, read_correlations, read_histograms
+from stage.tof.light_time import SPEED_OF_LIGHT
 from stage.tof.source import SourcePath
-
-MOST_RETURNS = 3
-"""Returns that are looked for in a histogram."""
 
 
 def solve_tof(capture: Capture, options: TofOptions, *, near_m: float | None = None, far_m: float | None = None,
@@ -72,7 +65,7 @@ def solve_tof(capture: Capture, options: TofOptions, *, near_m: float | None = N
         near_path_m, far_path_m = _half_path_span(path, mask, near_m, far_m)
         timings.stage("returns", 1)
         found = solve_histograms(histograms, options, calibration, near_m=near_path_m, far_m=far_path_m, limit=limit,
-                                 usable=mask.reshape(-1), device=device)
+                                 usable=mask, device=device)
     else:
         correlations = read_correlations(capture)
         path = SourcePath.of(capture.camera, correlations.source_m)
@@ -94,82 +87,6 @@ def _half_path_span(path: SourcePath | None, mask: np.ndarray, near_m: float | N
         return near_m, far_m
     return (None if near_m is None else float(path.half_path_m(near_m)[mask].min()),
             None if far_m is None else float(path.half_path_m(far_m)[mask].max()))
-
-
-def solve_histograms(frames: Histograms, options: TofOptions, calibration: TofCalibration, *, near_m: float | None,
-                     far_m: float | None, limit: float | None, usable: np.ndarray, device: str) -> RangeImage:
-    """Return the range of each pixel from photon histograms.
-
-    Args:
-        frames: the histograms of a capture.
-        options: which return.
-        calibration: the pulse, where it is known.
-        near_m, far_m: the span of ranges; None: that of the histogram.
-        limit: counts at or above it are a full counter.
-        usable: [pixel] bool mask: the others do not decide on the width of the pulse.
-        device: where to run.
-
-    Raises:
-        ArrayError: the histograms hold nothing.
-        RequestError: the span lies outside the histogram.
-    """
-    bin_m = range_of_delay_m(frames.bin_s)
-    start_m = range_of_delay_m(frames.start_s)
-    end_m = start_m + bin_m * frames.counts.shape[1]
-    nearest = start_m if near_m is None else near_m
-    farthest = end_m if far_m is None else far_m
-    if not max(nearest, start_m) < min(farthest, end_m):
-        raise RequestError(f"ranges from {nearest:g} to {farthest:g} m lie outside the histogram, "
-                           f"which covers {start_m:.4g} to {end_m:.4g} m")
-    counts = place(frames.counts, device)
-    if frames.first_photon_only:
-        assert frames.pulses is not None  # the reader saw to it
-        histograms = correct_pileup(counts, pulses=frames.pulses)
-    else:
-        histograms = without_pileup(counts)
-    pulse, source = _pulse(frames, calibration, histograms, usable)
-    found = find_returns(histograms, pulse, most=MOST_RETURNS, first_bin=(nearest - start_m) / bin_m, last_bin=(farthest - start_m) / bin_m)
-    chosen = _choose(found, options.which)
-    position, sigma, photons, confidence = (np.take_along_axis(array.numpy(), chosen[None], axis=0)[0]
-                                            for array in (found.position, found.sigma, found.photons, found.confidence))
-    status = found.status.numpy()
-    if limit is not None:
-        status[(frames.counts >= limit).any(axis=1)] = int(Status.SATURATED)
-    solved = np.isin(status, SOLVED)
-    several = (found.photons.numpy() > 0).sum(axis=0)
-    facts: dict[str, Any] = {
-        "bins": frames.counts.shape[1],
-        "bin_s": frames.bin_s,
-        "span_m": [round(nearest, 4), round(farthest, 4)],
-        "pulse": source,
-        "pile_up": {"corrected": frames.first_photon_only, "pulses": frames.pulses},
-        "return": str(options.which),
-        "returns_found": {str(n): int((several[usable] == n).sum()) for n in range(1, MOST_RETURNS + 1)},
-        "background_photons_a_bin": float(np.median(found.background.numpy()[usable])),
-    }
-    return RangeImage("time of flight, pulsed", (start_m + position * bin_m).astype(np.float32), (sigma * bin_m).astype(np.float32),
-                    photons, np.where(solved, confidence, 0).astype(np.float32), status, facts)
-
-
-def _pulse(frames: Histograms, calibration: TofCalibration, histograms: LiveCounts, usable: np.ndarray) -> tuple[Pulse, dict[str, Any]]:
-    """Return the pulse in bins, and where it is known from."""
-    if calibration.pulse is not None:
-        shape = measured(np.array(calibration.pulse.time_s) / frames.bin_s, calibration.pulse.power)
-        return shape, {"from": "calibration", "width_s": shape.width * frames.bin_s}
-    if calibration.pulse_sigma_s is not None:
-        return gaussian(calibration.pulse_sigma_s / frames.bin_s), {"from": "calibration", "sigma_s": calibration.pulse_sigma_s}
-    shape = estimate_pulse(histograms, np.where(usable[:, None], frames.counts, 0))
-    return shape, {"from": "histograms", "sigma_s": float(f"{shape.step * STEPS_PER_SIGMA * frames.bin_s:.4g}")}
-
-
-def _choose(found: Returns, which: WhichReturn) -> np.ndarray:
-    """Return the index of the return to take, [pixel]; 0 where there is none."""
-    position, there = found.position.numpy(), found.photons.numpy() > 0
-    if which is WhichReturn.FIRST:
-        return np.argmin(np.where(there, position, math.inf), axis=0)
-    if which is WhichReturn.LAST:
-        return np.argmax(np.where(there, position, -math.inf), axis=0)
-    return np.zeros(position.shape[1], dtype=np.int64)
 
 
 def _corrected(found: RangeImage, options: TofOptions, calibration: TofCalibration, path: SourcePath | None, near_m: float | None,

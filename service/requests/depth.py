@@ -43,7 +43,8 @@ class TofChoices(Options):
     """Filters of time of flight, as text with commas between."""
     vote: bool = True
     """Continuous-wave time of flight: where the phases of a pixel allow several distances, let its neighbours decide, and decode pixels
-    that are too dark alone together with the dark pixels around them."""
+    that are too dark alone together with the dark pixels around them. Photon histograms: where several times are possible, let the
+    neighbours' returns decide."""
     which: Annotated[WhichReturn, Spelling(flag="--return")] = WhichReturn.STRONGEST
     """Pulsed time of flight: the return that gives the depth, where a pixel has several."""
     temperature_c: Finite | None = None

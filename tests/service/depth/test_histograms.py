@@ -1,0 +1,146 @@
+"""What nobody declared about photon histograms: pile-up, units of the counts, tails of the pulse, the camera's own light."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+from service.depth.depth import depth
+from service.requests.depth import DepthRequest, TofOptions
+from tests.reference import tof
+
+ROWS, COLS = 24, 32
+VIEW = tof.room(ROWS, COLS)
+BIN_S = 1.5e-9
+BIN_M = tof.LIGHT * BIN_S / 2
+
+
+def solve(folder, counts, least_confidence=None, options=None, near_m=None, **declared):
+    folder.mkdir(parents=True, exist_ok=True)
+    rows, cols = counts.shape[:2]
+    np.save(folder / "h.npy", counts.astype(np.float32))
+    (folder / "capture.json").write_text(json.dumps({
+        "schema": "relit.capture/1", "name": "room",
+        "camera": {"projection": "perspective", "resolution": [cols, rows], "focal_px": [1e4, 1e4]},  # depth is range
+        "frames": [{"image": "h.npy", "tof": {"type": "pulsed", "bin_s": BIN_S, "start_s": 0.0, **declared}}]}))
+    return depth(DepthRequest(capture=folder, out=folder / "out", device="cpu", least_confidence=least_confidence, near_m=near_m,
+                              tof=TofOptions.model_validate(options or {})))
+
+
+def ratios(result, view=VIEW):
+    """Error over sigma where solved."""
+    maps = result.maps
+    return np.abs(maps.range - view.distance)[maps.mask] / maps.sigma[maps.mask]
+
+
+def is_calibrated(part):
+    """Medians of 700 errors scatter by 5 %; a sigma that covers what is not known may be larger than the error."""
+    assert 0.5 < 1.4826 * np.median(part) < 1.4
+    assert np.mean(part > 5) < 0.01
+
+
+@pytest.mark.parametrize(("pulses", "background"), [(600, 0.5), (2000, 4.0)])
+def test_pile_up_that_is_not_declared_is_found(pulses, background, tmp_path):
+    """Taken for Poisson counts, these ranges are wrong by many sigma at confidence 1."""
+    counts = tof.histogram(VIEW, 4000, background=background, pulses=pulses, seed=1)
+    result = solve(tmp_path / "c", counts)
+    assert any("tof.pulses" in sentence for sentence in result.warnings)
+    found = json.loads(result.report_path.read_text())["found"]["pile_up"]
+    assert found["from"] == "histograms"
+    assert found["pulses"] == pytest.approx(pulses, rel=0.15)
+    is_calibrated(ratios(result))
+    assert result.maps.mask.mean() > 0.85  # the nearest pixels are saturated
+
+
+@pytest.mark.parametrize("background", [0.02, 0.5, 8.0])
+@pytest.mark.parametrize("second", [None, (2.0, 0.4)])
+def test_right_captures_raise_no_alarm(background, second, tmp_path):
+    result = solve(tmp_path / "c", tof.histogram(VIEW, 4000, background=background, second=second, seed=2))
+    assert result.warnings == ()
+    is_calibrated(ratios(result))
+
+
+@pytest.mark.parametrize("factor", [10.0, 0.02, 3.7])
+def test_counts_in_other_units_have_the_same_sigma(factor, tmp_path):
+    counts = tof.histogram(VIEW, 1500, background=2.0, seed=3)
+    plain, scaled = solve(tmp_path / "plain", counts), solve(tmp_path / "scaled", factor * counts)
+    assert plain.warnings == ()
+    assert any("tof.count_scale" in sentence for sentence in scaled.warnings)
+    both = plain.maps.mask & scaled.maps.mask
+    assert (plain.maps.mask ^ scaled.maps.mask).mean() < 0.02
+    np.testing.assert_allclose(scaled.maps.range[both], plain.maps.range[both], atol=1e-2)
+    np.testing.assert_allclose(scaled.maps.sigma[both], plain.maps.sigma[both], rtol=0.05)  # the estimate of the scale
+    declared = solve(tmp_path / "declared", factor * counts, count_scale=factor)
+    assert declared.warnings == ()
+
+
+def test_smoothed_histograms_are_told(tmp_path):
+    counts = tof.histogram(VIEW, 1500, background=3.0, seed=4)
+    smooth = 0.5 * counts + 0.25 * np.roll(counts, 1, axis=2) + 0.25 * np.roll(counts, -1, axis=2)
+    result = solve(tmp_path / "c", smooth)
+    assert any("neighbouring bins vary together" in sentence for sentence in result.warnings)
+    is_calibrated(ratios(result))
+
+
+@pytest.mark.parametrize(("background", "plain"), [(0.02, 0.87), (0.5, 0.81)])
+def test_nothing_that_a_plain_decode_finds_is_refused(background, plain, tmp_path):
+    """A matched filter with a parabola has `plain` of all pixels within 10 cm here at a fifth of the light; significance alone kept .65."""
+    view = tof.room(72, 96)
+    counts = tof.histogram(view, 800, background=background, seed=11)
+    everything, default = solve(tmp_path / "all", counts, 0.0), solve(tmp_path / "default", counts)
+    near = np.abs(everything.maps.range - view.distance) < 0.1
+    assert (near & everything.maps.mask).mean() > plain
+    assert everything.maps.mask.mean() > 0.95  # the others show nothing
+    assert default.maps.mask.mean() > 0.8
+    wrong = np.abs(default.maps.range - view.distance)[default.maps.mask] > 0.6
+    assert wrong.mean() < 2e-3
+    unsure = default.maps.status == 15
+    assert unsure.any() and (default.maps.range[unsure] > 0).mean() > 0.99
+    is_calibrated(ratios(default, view))
+
+
+def test_empty_walls_do_not_appear(tmp_path):
+    """Half of the image has a return, the other half background alone: one pixel in some hundreds of it may count as solved."""
+    counts = np.random.default_rng(5).poisson(0.5, (72, 96, 64)).astype(float)
+    counts[:, :48] = tof.histogram(tof.View(*(array[:, :48] for array in tof.room(72, 96))), 4000, seed=5)
+    result = solve(tmp_path / "c", counts)
+    assert result.maps.mask[:, 52:].mean() < 5e-3
+    assert result.maps.mask[:, :48].mean() > 0.99
+
+
+def test_a_tail_that_is_not_declared_is_found(tmp_path):
+    """Gaussian: 6 cm late, 10 sigma and more. Time 0 is that of the highest power, and sigma covers that it may be elsewhere."""
+    edges = np.arange(65)
+    late = np.linspace(0, 12, 400)
+    weight = np.exp(-late / 1.5) / np.exp(-late / 1.5).sum()
+    times = VIEW.distance[..., None] / BIN_M
+    spread = sum(w * np.diff(ndtr((edges - times - delay) / 0.8)) for delay, w in zip(late, weight, strict=True))
+    mean = 0.5 + tof.signal(VIEW, 8000)[..., None] * (0.4 * np.diff(ndtr((edges - times) / 0.8)) + 0.6 * spread)
+    result = solve(tmp_path / "c", np.random.default_rng(6).poisson(mean))
+    assert any("has a tail" in sentence for sentence in result.warnings)
+    assert json.loads(result.report_path.read_text())["found"]["pulse"]["tail_s"] == pytest.approx(1.5 * BIN_S, rel=0.3)
+    part = ratios(result)
+    assert np.median(part) < 1.4 and np.mean(part > 5) < 0.01
+    error = (result.maps.range - VIEW.distance)[result.maps.mask]
+    assert np.median(np.abs(error - np.median(error))) < 0.03
+
+
+def test_light_of_the_camera_itself_is_no_surface(tmp_path):
+    far = tof.View(VIEW.distance + 1.0, VIEW.albedo, VIEW.cosine)
+    counts = tof.histogram(far, 9000, seed=7)
+    counts[..., 0:3] += np.random.default_rng(8).poisson([2000, 5000, 1500], (ROWS, COLS, 3))
+    result = solve(tmp_path / "c", counts)
+    assert any("same pulse" in sentence for sentence in result.warnings)
+    is_calibrated(ratios(result, far))
+    assert result.maps.mask.mean() > 0.9
+
+
+def test_rows_that_disagree_in_turn_are_unsure(tmp_path):
+    """Every second row of the left half was recorded five bins late."""
+    counts = tof.histogram(VIEW, 9000, seed=9)
+    counts[1::2, :16] = np.roll(counts, 5, axis=2)[1::2, :16]
+    result = solve(tmp_path / "c", counts)
+    assert any("every second row" in sentence for sentence in result.warnings)
+    assert result.maps.mask[2:-2, 1:15].mean() < 0.1
+    assert result.maps.mask[:, 17:].mean() > 0.95
