@@ -1,7 +1,8 @@
 """Normals from a table of readings measured on a ball of the same material.
 
 The search of `hypotheses` with one lobe, the ball's, at every candidate normal; its weight is how bright the pixel is beside the
-ball, so albedo may vary and the kind of reflectance may not.
+ball, so albedo may vary and the kind of reflectance may not. What the ball leaves unexplained on all pixels is the noise of the posterior:
+a ball of another material widens it.
 
 Source: Woodham, "Photometric method for determining surface orientation from multiple images", Optical Engineering 1980
 (lookup table from a calibration sphere); Hertzmann and Seitz, "Example-based photometric stereo", TPAMI 2005.
@@ -14,17 +15,21 @@ import warp as wp
 
 from kernels.errors import ArrayError
 from kernels.photometric.hypotheses import Diffuse, search_normals
+from kernels.photometric.modes import find_modes, weigh
+from kernels.photometric.posterior import Group, bounded, measure_noise, normal_posterior
 from kernels.photometric.response_table import GRID
 from kernels.photometric.samples import Samples
-from kernels.photometric.sampling import AROUND, AROUND_OPTIONS, FINE, HEMISPHERE, HEMISPHERE_OPTIONS, OPTIONS, RING_DEGREES
+from kernels.photometric.sampling import AROUND, AROUND_OPTIONS, FINE, OPTIONS
 
 
 class ReferenceFit(NamedTuple):
     """Normal of each sampled pixel, on the host."""
 
     normal: np.ndarray  # [n, 3] float32, unit
-    confidence: np.ndarray  # [n] float32: 1 / (1 + standard error of the normal / 1°)
+    confidence: np.ndarray  # [n] float32: probability of the mode / (1 + its standard deviation / 1°)
+    sigma: np.ndarray  # [n] float32: standard deviation of the normal over its modes, degrees
     residual: np.ndarray  # [n] float32: root of the mean cost per light, in units of the noise
+    excess: np.ndarray  # [n] float32: the square of what the ball leaves unexplained over the noise of the object's readings
 
 
 def reference_table(readings: np.ndarray, device: str) -> wp.array:
@@ -61,9 +66,14 @@ def solve_reference(samples: Samples, table: wp.array, view: np.ndarray) -> Refe
     Raises:
         ArrayError: shapes that do not fit.
     """
-    normal = view
-    for rings, options in ((HEMISPHERE, HEMISPHERE_OPTIONS), (AROUND, AROUND_OPTIONS), (FINE, OPTIONS)):
-        found = search_normals(samples, normal, shape=Diffuse(), options=options, wide=rings[0], fine=rings[1:], table=table)
-        normal = found.normal
-    variance = found.variance(samples.light_count, RING_DEGREES)
-    return ReferenceFit(normal, (1 / (1 + np.sqrt(variance))).astype(np.float32), np.sqrt(found.cost))
+    model = bounded(table, samples)
+    starts = find_modes(samples, model, view)
+    near = [search_normals(samples, start, shape=Diffuse(), options=AROUND_OPTIONS, wide=AROUND[0], fine=AROUND[1:], table=table).normal
+            for start in starts]
+    found = search_normals(samples, near[0], shape=Diffuse(), options=OPTIONS, wide=FINE[0], fine=FINE[1:], table=table)
+    first = Group(samples, model, found.normal)
+    noise = measure_noise([first])
+    modes = weigh(normal_posterior(first, noise), normal_posterior(first._replace(normal=near[1]), noise))
+    normal = np.where(modes.close_to(found.normal)[:, None], found.normal, modes.normal)
+    return ReferenceFit(normal, (modes.probability / (1 + modes.sigma)).astype(np.float32), modes.spread, np.sqrt(found.cost),
+                        modes.excess)

@@ -122,6 +122,55 @@ def to_host(samples: Samples, packs: wp.array) -> np.ndarray:
     return flat[0] if packs.ndim == 1 else flat.T
 
 
+def readings_of(samples: Samples) -> np.ndarray:
+    """Return [n, lights] grey readings radiance over irradiance; below 0 where there is none; waits for the device."""
+    values, level = samples.grey.numpy().reshape(_planes(samples)), samples.level.numpy()
+    scaled = values * level[:, None] if samples.light_stride == 1 else values * level
+    pixels_last = scaled.transpose(1, 0, 2) if samples.light_stride == 1 else scaled
+    return pixels_last.reshape(samples.light_count, -1).T[: samples.pixel_count]
+
+
+def choose(samples: Samples, chosen: np.ndarray) -> Samples:
+    """Return the samples of some of the sampled pixels.
+
+    Args:
+        samples: of n pixels.
+        chosen: [n] bool, or positions among them; one or more.
+
+    Returns:
+        The samples on the same device. Waits for the device.
+    """
+    positions = np.flatnonzero(chosen) if chosen.dtype == bool else chosen
+    lanes, packs = samples.lanes, -(-len(positions) // samples.lanes)
+    order = positions[np.minimum(np.arange(packs * lanes), len(positions) - 1)]
+    by_pixel = samples.light_stride == 1  # [packs, lights, lanes]; else [lights, packs, lanes]
+    lane_type = pack_type(lanes, wp.float32)
+
+    def lit(values: np.ndarray) -> np.ndarray:
+        planes = values.reshape(_planes(samples))
+        if by_pixel:
+            picked = planes[order // lanes, :, order % lanes].reshape(packs, lanes, -1).transpose(0, 2, 1)
+        else:
+            picked = planes[:, order // lanes, order % lanes].reshape(-1, packs, lanes)
+        return picked.reshape(-1, lanes)
+
+    def upload(values: np.ndarray) -> wp.array:
+        return wp.array(np.ascontiguousarray(values), dtype=lane_type, device=samples.device)
+
+    colour, toward = (upload(np.stack([lit(plane) for plane in planes.numpy()])) for planes in (samples.colour, samples.toward))
+    level = samples.level.numpy()[order // lanes, order % lanes].reshape(packs, lanes)
+    view = samples.view.numpy()[:, order // lanes, order % lanes].reshape(3, packs, lanes)
+    strides = (samples.light_count, 1) if by_pixel else (1, packs)
+    return Samples(upload(lit(samples.grey.numpy())), colour, upload(level), toward, upload(view), len(positions), packs,
+                   samples.light_count, lanes, *strides, samples.device)
+
+
+def _planes(samples: Samples) -> tuple[int, int, int]:
+    """Return the shape of readings on the host: packs, lights and lanes where the lights of a pack follow each other."""
+    lights, packs = samples.light_count, samples.packs
+    return (packs, lights, samples.lanes) if samples.light_stride == 1 else (lights, packs, samples.lanes)
+
+
 @cache
 def _gather_kernel(lanes: int, near: bool = False) -> Any:
     lane_type = pack_type(lanes, wp.float32)

@@ -1,9 +1,10 @@
 """Photometric sampling: normal, material and regime of pixels under lights of any extent, mirrors included.
 
-The search of `hypotheses` with its lobes looked up in a response table. It begins with a grid over the whole visible hemisphere,
+The search of `hypotheses` with its lobes looked up in a response table. It begins with a grid over the whole visible hemisphere (`modes`),
 because a mirror has no Lambertian start, and ends with rings about the best, once under lobes with the Fresnel rise of a
-dielectric and once under those of a metal; a pixel keeps the kind whose normal lets Relit's BRDF explain it better.
-The mixture and the material found say which regime the pixel is in.
+dielectric and once under those of a metal; a pixel keeps the kind whose normal lets Relit's BRDF explain it better. The posterior around
+that normal, and around the second-best minimum of the grid, says how far the readings leave the normal open (`posterior`). The mixture
+and the material found say which regime the pixel is in.
 
 Source: Nayar, Ikeuchi and Kanade, "Determining shape and reflectance of hybrid surfaces by photometric sampling", IEEE
 Transactions on Robotics and Automation 1990; here with GGX lobes beside the Lambertian and the mirror one, and a robust
@@ -19,26 +20,21 @@ import warp as wp
 
 from kernels.photometric.hypotheses import Diffuse, Search, SearchOptions, search_normals
 from kernels.photometric.material import Material, fit_material
-from kernels.photometric.response_table import SPECULAR_SCALE, search_table
-from kernels.photometric.samples import Samples
+from kernels.photometric.modes import Modes, find_modes, weigh
+from kernels.photometric.posterior import Group, bounded, measure_noise, normal_posterior
+from kernels.photometric.response_table import POSTERIOR_WIDTHS, SEARCH_WIDTHS, SPECULAR_SCALE, search_table
+from kernels.photometric.samples import Samples, choose
 
 DIELECTRIC, METAL = 0.04, 0.8
 """F0 of the two kinds of lobes. Their Fresnel rises differ, and over a wide light this moves the estimated normal by degrees."""
 OPTIONS = SearchOptions(noise_floor=0.05, noise_slope=0.05, sweeps=30)
 """Search options for wide lights. They cause no isolated highlights, so that a dim reading has less unexplained light than under single
 lamps; for bright readings the table is accurate to a few per cent."""
-HEMISPHERE, HEMISPHERE_OPTIONS = ((tuple(float(d) for d in range(7, 90, 7)), 52),), replace(
-    OPTIONS, noise_floor=0.1, noise_slope=0.6, reweightings=2, sweeps=12)
-"""Rings and options of the first search, a grid of candidates over the visible hemisphere, 7° apart. The noise assumed is as wide as the
-grid's steps: readings of a mirror change by half from one candidate to the next, and a narrower cost would miss the minimum between
-them."""
 AROUND, AROUND_OPTIONS = (((2.0, 4.0, 6.0), 16), ((1.0, 2.0), 8)), replace(
     OPTIONS, noise_floor=0.1, noise_slope=0.3, reweightings=2, sweeps=12)
-"""Rings and options of the second search, about the best candidate of the first."""
+"""Rings and options of the search about a mode of the grid over the hemisphere."""
 FINE = (((1.2, 2.4, 4.0), 14), ((0.6,), 6), ((0.3,), 6), ((0.15,), 6))
 """Rings, in degrees, of the last search, which each kind of lobes makes about the best candidate."""
-RING_DEGREES = FINE[-1][0][-1]
-"""Radius of the last ring, degrees; the rise of the cost towards it gives the standard error."""
 LEAST_DIFFUSE, LEAST_SPECULAR = 0.1, 0.05
 """Least share of the reflected light that a diffuse and a specular part must have to be counted in the regime: plastic of albedo 0.5 has
 0.07 specular."""
@@ -68,7 +64,8 @@ class SamplingFit(NamedTuple):
     specular: np.ndarray  # [n, 3] float32, F0
     roughness: np.ndarray  # [n] float32
     regime: np.ndarray  # [n] uint8, codes of Regime
-    confidence: np.ndarray  # [n] float32: 1 / (1 + standard error of the normal / 1°)
+    confidence: np.ndarray  # [n] float32: probability of the mode / (1 + its standard deviation / 1°)
+    sigma: np.ndarray  # [n] float32: standard deviation of the normal over its modes, degrees
     residual: np.ndarray  # [n] float32: root of the mean cost per light, in units of the noise
 
 
@@ -76,13 +73,16 @@ class SamplingTables(NamedTuple):
     """Tables of one set of lights."""
 
     responses: wp.array
-    dielectric: wp.array
-    metal: wp.array
+    search: tuple[wp.array, wp.array]
+    """Lobes of the search, with the Fresnel rise of a dielectric and of a metal."""
+    posterior: tuple[wp.array, wp.array]
+    """Lobes of the posterior, of the same two."""
 
 
 def sampling_tables(responses: wp.array) -> SamplingTables:
-    """Return the tables of the search, from response_table. Waits for the device."""
-    return SamplingTables(responses, search_table(responses, DIELECTRIC), search_table(responses, METAL))
+    """Return the tables of the search and of the posterior, from response_table. Waits for the device."""
+    return SamplingTables(responses, *((search_table(responses, DIELECTRIC, widths), search_table(responses, METAL, widths))
+                                       for widths in (SEARCH_WIDTHS, POSTERIOR_WIDTHS)))
 
 
 def solve_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, *,
@@ -93,7 +93,7 @@ def solve_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, *
         samples: their readings, radiance over the irradiance of each light.
         tables: of the same lights.
         view: [n, 3] unit directions to the viewer.
-        options: how candidates are judged in the end.
+        options: how candidates are judged by the search.
 
     Returns:
         The fit. Waits for the device.
@@ -102,21 +102,34 @@ def solve_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, *
         ArrayError: shapes that do not fit.
     """
     lambert = Diffuse()
-    start = view
-    for rings, loose in ((HEMISPHERE, HEMISPHERE_OPTIONS), (AROUND, AROUND_OPTIONS)):
-        start = search_normals(samples, start, shape=lambert, options=loose, wide=rings[0], fine=rings[1:],
-                               table=tables.dielectric).normal
+    starts = find_modes(samples, bounded(tables.search[0], samples), view)
+    start = search_normals(samples, starts[0], shape=lambert, options=AROUND_OPTIONS, wide=AROUND[0], fine=AROUND[1:],
+                           table=tables.search[0]).normal
     searches = [search_normals(samples, start, shape=lambert, options=options, wide=FINE[0], fine=FINE[1:], table=table)
-                for table in (tables.dielectric, tables.metal)]
+                for table in tables.search]
     materials = [fit_material(samples, search.normal, shape=lambert, options=options, table=tables.responses)
                  for search in searches]
     metallic = materials[1].cost < materials[0].cost
     found, material = Search(*_choose(metallic, *searches)), Material(*_choose(metallic, *materials))
-    facing = (found.normal * view).sum(axis=1)
-    variance = found.variance(samples.light_count, RING_DEGREES)
-    return SamplingFit(found.normal, material.diffuse_albedo, material.specular, material.roughness,
+    kinds = [kind for kind in (False, True) if (metallic == kind).any()]
+    groups = [Group(choose(samples, metallic == kind), bounded(tables.posterior[kind], samples), found.normal[metallic == kind])
+              for kind in kinds]
+    noise = measure_noise(groups)
+    modes = Modes.empty(samples.pixel_count)
+    for kind, group in zip(kinds, groups, strict=True):
+        other = search_normals(group.samples, starts[1][metallic == kind], shape=lambert, options=AROUND_OPTIONS, wide=AROUND[0],
+                               fine=AROUND[1:], table=tables.search[kind]).normal
+        modes.place(metallic == kind, weigh(normal_posterior(group, noise), normal_posterior(group._replace(normal=other), noise)))
+    kept = modes.close_to(found.normal)
+    normal = np.where(kept[:, None], found.normal, modes.normal)
+    if not kept.all():
+        again = fit_material(choose(samples, ~kept), normal[~kept], shape=lambert, options=options, table=tables.responses)
+        for values, better in zip(material, again, strict=True):
+            values[~kept] = better
+    facing = (normal * view).sum(axis=1)
+    return SamplingFit(normal, material.diffuse_albedo, material.specular, material.roughness,
                        regimes(found.weights, np.where(metallic, METAL, DIELECTRIC), facing, material),
-                       (1 / (1 + np.sqrt(variance))).astype(np.float32), np.sqrt(found.cost))
+                       (modes.probability / (1 + modes.sigma)).astype(np.float32), modes.spread, np.sqrt(found.cost))
 
 
 def _choose(second: np.ndarray, a: tuple[np.ndarray, ...], b: tuple[np.ndarray, ...]) -> list[np.ndarray]:

@@ -5,18 +5,22 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from kernels.photometric.modes import GRID_FLOATS
 from kernels.photometric.readings import pad_lights
 from kernels.photometric.response_table import SEARCH_LOBES, response_table
 from kernels.photometric.sampling import Regime, sampling_tables, solve_sampling
 from kernels.status import Status
+from service.requests.solve import MAX_SIGMA
 from service.solve.batches import pixel_batches, readable, view_directions
-from service.solve.solution import Solution, SolveInput
+from service.solve.solution import LARGEST_ERROR, Solution, SolveInput
 from stage.camera import Camera
 from stage.extended_lights import ExtendedLights
 
 PART_DEGREES = 8.0
 """Width of a part of a perspective view that shares a table: at its edge, 4° from its middle, the normal of a metal of roughness
 0.5 or 0.7 is off by another 0.3°, that of anything else by less than 0.1°."""
+MOSTLY_OPEN = 0.25
+"""Fraction of pixels with an open normal above which the sources do not suit the object."""
 
 
 def solve_extended(given: SolveInput, lights: ExtendedLights) -> Solution:
@@ -31,7 +35,7 @@ def solve_extended(given: SolveInput, lights: ExtendedLights) -> Solution:
     view = view_directions(given.camera)
     result = Solution.empty(stack.pixel_count)
     result.specular, result.roughness = np.zeros((3, stack.pixel_count), np.float16), np.zeros(stack.pixel_count, np.float16)
-    result.regime = np.zeros(stack.pixel_count, np.uint8)
+    result.regime, result.sigma = np.zeros(stack.pixel_count, np.uint8), np.zeros(stack.pixel_count, np.float16)
     given.timings.stage("normals", int(mask.sum()))
     parts = done = 0
     for inside in view_parts(given.camera, mask):
@@ -43,7 +47,7 @@ def solve_extended(given: SolveInput, lights: ExtendedLights) -> Solution:
         def turned_view(pixels: np.ndarray, rotation: np.ndarray = rotation) -> np.ndarray:
             return (view(pixels) @ rotation.T).astype(np.float32)
 
-        for pixels, samples in pixel_batches(given, padded, turned_view, inside, lobes=SEARCH_LOBES):
+        for pixels, samples in pixel_batches(given, padded, turned_view, inside, lobes=SEARCH_LOBES + GRID_FLOATS // count):
             found = solve_sampling(samples, tables, turned_view(pixels))
             status = readable(samples)
             ok = status == Status.OK
@@ -55,12 +59,18 @@ def solve_extended(given: SolveInput, lights: ExtendedLights) -> Solution:
             result.roughness[kept] = found.roughness[ok]
             result.regime[kept] = found.regime[ok]
             result.confidence[kept] = found.confidence[ok]
+            result.sigma[kept] = np.minimum(found.sigma[ok], LARGEST_ERROR)
             result.residual[kept] = found.residual[ok]
             done += len(pixels)
             given.timings.advance(done)
     codes = np.bincount(result.regime[mask.reshape(-1)], minlength=len(Regime))
     result.facts = {"light_samples": len(lights.share), "views": parts,
                     "regimes": {regime.name.lower(): int(codes[regime]) for regime in Regime if regime is not Regime.UNSOLVED}}
+    found = result.status == Status.OK
+    open_share = float((result.sigma[found] > MAX_SIGMA).mean()) if found.any() else 0.0
+    if open_share > MOSTLY_OPEN:
+        result.warnings.append(f"frames[].light: at {100 * open_share:.0f} % of the pixels the readings leave the normal open by more than "
+                               f"{MAX_SIGMA:g}°, as a mirror does that sees hardly any of the sources: give wider sources, or more of them")
     return result
 
 

@@ -17,9 +17,9 @@ CENTRES = twin.lattice(LIGHTS)
 VIEW = np.array([0.0, 0.0, 1.0])
 
 
-def table_of(device: str, *, count: int = 2500, turn: np.ndarray | None = None) -> wp.array:
+def table_of(device: str, *, count: int = 2500, turn: np.ndarray | None = None, sharpness: float = SHARPNESS) -> wp.array:
     """The response table of the sources, from samples on an even lattice of `count` directions of the sphere."""
-    parts = [twin.samples_of(centre, SHARPNESS, count=count) for centre in CENTRES]
+    parts = [twin.samples_of(centre, sharpness, count=count) for centre in CENTRES]
     direction = np.concatenate([part[0] for part in parts])
     return response_table(direction if turn is None else direction @ turn.T,
                           np.concatenate([np.full(len(part[1]), part[2]) for part in parts]),
@@ -35,10 +35,10 @@ def sphere(side: int, limit: float = 0.97) -> np.ndarray:
     return np.stack([x[inside], y[inside], np.sqrt(1 - x[inside] ** 2 - y[inside] ** 2)], axis=1)
 
 
-def readings_of(radiance: np.ndarray, device: str, *, view: np.ndarray = VIEW) -> Samples:
+def readings_of(radiance: np.ndarray, device: str, *, view: np.ndarray = VIEW, sharpness: float = SHARPNESS) -> Samples:
     """Samples of pixels [n, lights] or [n, lights, 3], stored as half."""
     radiance = radiance if radiance.ndim == 3 else np.repeat(radiance[..., None], 3, axis=2)
     count = len(radiance)
-    lights = pad_lights(np.tile(VIEW, (LIGHTS, 1)), np.full((LIGHTS, 3), twin.irradiance(SHARPNESS)))
+    lights = pad_lights(np.tile(VIEW, (LIGHTS, 1)), np.full((LIGHTS, 3), twin.irradiance(sharpness)))
     band = packs.upload(store(np.moveaxis(radiance, (2, 1, 0), (0, 1, 2))), device=device)
     return gather(band, np.arange(count), np.broadcast_to(view, (count, 3)), lights, grey_factors(lights, GREY), LIGHTS)

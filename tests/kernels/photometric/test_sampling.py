@@ -105,9 +105,9 @@ def test_the_rings_find_the_diffuse_lobe_whatever_the_start(device, tables):
     found = search_normals(samples, np.broadcast_to(VIEW, NORMALS.shape), shape=Diffuse(),
                            options=replace(OPTIONS, noise_slope=0.3), wide=(tuple(float(d) for d in range(7, 90, 7)), 52),
                            fine=(((2.0, 4.0), 12), ((1.0,), 6)),
-                           table=tables[device].dielectric)
+                           table=tables[device].search[0])
     assert angle_degrees(found.normal, NORMALS).max() < 2
-    assert found.weights.shape == (len(NORMALS), tables[device].dielectric.shape[2])
+    assert found.weights.shape == (len(NORMALS), tables[device].search[0].shape[2])
     assert (found.weights[:, 0] > 0).all() and found.weights.min() >= 0
 
 
@@ -124,7 +124,7 @@ def test_roughness_between_the_widths_of_the_table(device, tables, alpha):
 def test_a_table_of_other_lights_is_refused(device, tables):
     solve(LAMBERT[:3], device, tables)
     samples = readings_of(LAMBERT[:3], device)
-    for table in (tables[device].dielectric, tables[device].responses):
+    for table in (tables[device].search[0], tables[device].responses):
         fewer = wp.array(table.numpy()[:, 1:], dtype=float, device=device)
         with pytest.raises(ArrayError, match="lights"):
             search_normals(samples, NORMALS[:3], shape=Diffuse(), table=fewer)

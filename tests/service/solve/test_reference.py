@@ -43,8 +43,9 @@ def surface(side: int, stretch: float) -> tuple[np.ndarray, np.ndarray]:
     return normal / np.linalg.norm(normal, axis=-1, keepdims=True), mask
 
 
-def write(folder, normal, mask, albedo, **changes):
-    radiance = velvet(normal[mask])[..., None] * STRENGTH * albedo
+def write(folder, normal, mask, albedo, *, shade=velvet, noise=0.0, **changes):
+    radiance = shade(normal[mask])[..., None] * STRENGTH * albedo
+    radiance = radiance * (1 + noise * np.random.default_rng(7).normal(size=radiance.shape))
     frames = []
     for index, direction in enumerate(DIRECTIONS):
         image = np.zeros((*mask.shape, 3))
@@ -85,6 +86,44 @@ def test_normals_of_a_material_without_a_model(relit, captures):
     solve(relit, captures, "--method", "svbrdf")
     by_model = angles_degrees(SurfaceMaps.read(captures / "out" / "maps.exr").normal, normal)[mask]
     assert by_model.mean() > 5 * error.mean()
+
+
+def chrome(normal: np.ndarray) -> np.ndarray:
+    """[n, lights] of polished metal: a sharp highlight alone."""
+    half = DIRECTIONS + [0.0, 0.0, 1.0]
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    return np.maximum(normal @ half.T, 0) ** 60 * (normal @ DIRECTIONS.T > 0) + 1e-3
+
+
+def test_a_ball_of_another_material_is_named_and_widens_sigma(relit, captures):
+    write(captures / "ball", *surface(140, 1.0), 0.5, shade=chrome)
+    outcome = solve(relit, captures, "--method", "reference", "--reference-ball", captures / "ball")
+    report = json.loads((captures / "out" / "report.json").read_text())
+    assert "the ball is of another material" in report["warnings"][0]
+    assert report["found"]["reference"]["unexplained_over_noise"] > 2
+    assert "another material" in outcome.out
+    maps = SurfaceMaps.read(captures / "out" / "maps.exr")
+    normal, mask = surface(SIDE, 0.6)
+    error, sigma = angles_degrees(maps.normal, normal), maps.sigma
+    assert error[mask].mean() > 10  # the wrong ball gives wrong normals
+    kept = maps.mask
+    assert not kept.any() or 0.3 < np.median(error[kept] / sigma[kept]) < 1.6  # and says so at each pixel
+    assert (error[kept] > np.maximum(5 * sigma[kept], 5)).sum() <= 0.01 * mask.sum()
+    assert maps.confidence[mask].max() < 0.5
+
+
+def test_the_right_ball_raises_no_alarm_under_noise(relit, captures):
+    for folder, shape in (("object", surface(SIDE, 0.6)), ("ball", surface(140, 1.0))):
+        write(captures / folder, *shape, 0.5, noise=0.02)
+    solve(relit, captures, "--method", "reference", "--reference-ball", captures / "ball")
+    report = json.loads((captures / "out" / "report.json").read_text())
+    assert report["warnings"] == [] and report["found"]["reference"]["unexplained_over_noise"] < 1.3
+    maps = SurfaceMaps.read(captures / "out" / "maps.exr")
+    normal, mask = surface(SIDE, 0.6)
+    inner = mask & (normal[..., 2] > 0.3)  # further out the ball has no pixels
+    ratio = angles_degrees(maps.normal, normal)[inner] / maps.sigma[inner]
+    assert 0.4 < np.median(ratio) < 1.4 and (ratio > 5).mean() < 0.01
+    assert np.median(maps.confidence[inner]) > 0.6
 
 
 def test_what_is_not_estimated_is_absent(relit, captures):
