@@ -4,9 +4,15 @@ A bit is the sign of d = I - Ī (with inverses) or d = I - (white + black)/2. It
 own noise or DOUBT_PART of the contrast: at edges, and where stripes are finer than camera or projector resolve. Up to two
 doubtful bits are tried both ways; where all readings lie within MAX_SPREAD + 1 neighbouring stripes (at an edge of a Gray code
 always: there one bit changes) their middle is the result, with the deviation of the whole range; otherwise the pixel is UNDECIDED.
+Up to MAX_OPEN of the finest bits of a Gray code may be in doubt besides: the stripes that they tell apart are then one wide stripe.
+
+Light that reaches the pixel by other ways (fog, bounces, light below the surface) follows wide stripes as direct light does, and narrow ones
+hardly. So the two finest bits measure the direct part D of the contrast C, and a bit is proven where |d| > C - 2 D: other light, C - D at
+most, could not have turned it. Where more than two bits are not proven, the pixel is MULTIPATH.
 
 Sources: Posdamer and Altschuler, CGIP 1982 (binary); Inokuchi, Sato and Matsuda, ICPR 1984 (Gray); Gupta, Agrawal,
-Veeraraghavan and Narasimhan, CVPR 2011, section 4 (XOR).
+Veeraraghavan and Narasimhan, CVPR 2011, section 4 (XOR); Xu and Aliaga, "Robust pixel classification for 3D modeling with structured light",
+Graphics Interface 2007 (bits that direct light proves).
 """
 
 from collections.abc import Sequence
@@ -20,7 +26,7 @@ from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.packs import Band, as_packs, pack_type
 from kernels.status import OK
-from kernels.structured.decoded import Decoded, place_stripe, unwritten_decoded
+from kernels.structured.decoded import MAX_SPREAD, Decoded, place_stripe, unwritten_decoded
 from kernels.structured.frames import NoiseModel, check_noise, check_stripes, cut_in, require_frames, saturation_masks
 
 SHADOW_SIGMAS = 5.0
@@ -31,6 +37,11 @@ DOUBT_SIGMAS = 3.0
 DOUBT_PART = 0.05
 """Least difference of a bit that is certain, as a part of the contrast: a smaller one is a mixture of two stripes, whose sign blur rather
 than noise decides."""
+MAX_OPEN = 2
+"""Number of the finest bits that may be in doubt without the pixel being refused: a camera that resolves stripes a quarter as fine as those
+that are shown sees no more."""
+XOR_STRAY = 0.5
+"""Largest part of the contrast, minus twice the direct light, with which bits of an XOR code count: a quarter of the light is direct then."""
 LARGEST = 1.0e15
 """Contrast above which a reading counts as infinite, because contrast is squared in float32."""
 MAX_BITS = 24
@@ -52,7 +63,8 @@ def decode_binary(frames: Band, bits: Sequence[int], inverses: Sequence[int] | N
 
     Returns:
         Stripe centres on the device; not synchronised on CUDA. SATURATED: a frame that decides a bit is. SHADOWED: the contrast
-        is not above noise. UNDECIDED: doubtful bits leave stripes far apart. OUT_OF_RANGE: a code beyond the projector.
+        is not above noise. UNDECIDED: doubtful bits leave stripes far apart. MULTIPATH: light of other ways may have decided them.
+        OUT_OF_RANGE: a code beyond the projector.
 
     Raises:
         ArrayError: a frame is missing, does not exist or is given twice; a value that cannot be.
@@ -101,7 +113,7 @@ def _decode(make: Any, code: str, frames: Band, bits: Sequence[int], inverses: S
     devices.launch(kernel, frames.packs,
                    [frames.values, frames.saturated, saturation_masks(frames, used), wp.array(rows, dtype=wp.int32, device=frames.device),
                     white if references else 0, black if references else 0, noise.read**2, noise.gain, float(stripe_px), float(extent),
-                    int(base_bit), (1 << len(bits)) - (2 << base_bit)],
+                    int(base_bit), (1 << len(bits)) - (2 << base_bit), min(MAX_OPEN, {"binary": 0, "gray": len(bits) - 1, "xor": base_bit}[code])],
                    [as_packs(array, frames.device) for array in result], device=frames.device)
     return result
 
@@ -134,13 +146,33 @@ def number_xor(shown: int, base_bit: int, above: int) -> int:
     return gray_to_binary(shown ^ (above & (-((shown >> base_bit) & 1))))
 
 
-_NUMBERS = {"binary": number_binary, "gray": number_gray, "xor": number_xor}
+@wp.func
+def proven_gray(d: float, stray: float, finest: float, contrast: float, limit: float) -> bool:
+    """Return whether other light, `stray` at most, cannot have turned a bit whose difference is d."""
+    return d >= stray
+
+
+@wp.func
+def proven_binary(d: float, stray: float, finest: float, contrast: float, limit: float) -> bool:
+    """Return the same for plain binary code, where at a carry all bits that change are as faint as the finest, whose difference is given."""
+    off = d - finest
+    return d >= stray or off * off < 4.0 * wp.max(limit, 0.01 * contrast * contrast)
+
+
+@wp.func
+def proven_xor(d: float, stray: float, finest: float, contrast: float, limit: float) -> bool:
+    """Return the same for XOR code: its stripes are all narrow and other light hardly follows them, unless nearly all light is other light."""
+    return stray < XOR_STRAY * contrast
+
+
+_NUMBERS = {"binary": (number_binary, proven_binary), "gray": (number_gray, proven_gray), "xor": (number_xor, proven_xor)}
 
 
 @cache
 def _stripe_kernel(pack: int, code: Literal["binary", "gray", "xor"] = "gray", inverses: bool = True, references: bool = True) -> Any:
     float_pack, int_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32), pack_type(pack, wp.uint8)
-    number_of = _NUMBERS[code]
+    number_of, proven = _NUMBERS[code]
+    narrow = code == "xor"
     cut_of = cut_in(pack)
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -157,6 +189,7 @@ def _stripe_kernel(pack: int, code: Literal["binary", "gray", "xor"] = "gray", i
                       extent: float,
                       base_bit: int,
                       above: int,  # mask of the bits that it lies over
+                      free: int,  # number of the finest bits that may stay open
                       # outputs
                       coordinate: wp.array(dtype=float_pack),
                       sigma: wp.array(dtype=float_pack),
@@ -179,13 +212,23 @@ def _stripe_kernel(pack: int, code: Literal["binary", "gray", "xor"] = "gray", i
                 for k in range(pack):
                     contrast[k] = wp.max(contrast[k], wp.abs(one[k] - other[k]))
                     spread[k] = 2.0 * read_variance + gain * wp.max(one[k] + other[k], 0.0)
+        # the light that may have come by other ways: all but twice the direct light, which the finest bits show
+        stray, finest = float_pack(), float_pack()
+        fine = wp.where(wp.static(narrow), rows.shape[0], wp.min(rows.shape[0], 2))
+        for bit in range(fine):
+            one = values[rows[bit, 0], p]
+            other = values[rows[bit, 1], p]
+            for k in range(pack):
+                d = wp.abs(one[k] - other[k])
+                if wp.static(not inverses):
+                    d = 2.0 * wp.abs(one[k] - middle[k])
+                finest[k] = wp.where(bit == 0, d, finest[k])
+                stray[k] = wp.where(wp.static(narrow), wp.max(stray[k], d), stray[k] + d / float(fine))
+        for k in range(pack):
+            stray[k] = wp.max(contrast[k] - 2.0 * stray[k], 0.0)
         noise_part = wp.static(2.0 * DOUBT_SIGMAS**2) * read_variance
         gain_part = wp.static(DOUBT_SIGMAS**2) * gain
-        small = float_pack()
-        for k in range(pack):
-            part = wp.static(DOUBT_PART) * contrast[k]
-            small[k] = wp.max(part * part, noise_part)
-        shown, doubt = int_pack(), int_pack()
+        shown, doubt, open = int_pack(), int_pack(), int_pack()
         for bit in range(rows.shape[0]):
             flag = 1 << bit
             one = values[rows[bit, 0], p]
@@ -193,9 +236,11 @@ def _stripe_kernel(pack: int, code: Literal["binary", "gray", "xor"] = "gray", i
                 other = values[rows[bit, 1], p]
                 for k in range(pack):
                     d = one[k] - other[k]
-                    limit = wp.max(noise_part + gain_part * (one[k] + other[k]), small[k])
+                    part = wp.static(DOUBT_PART) * contrast[k]
+                    limit = wp.max(noise_part + gain_part * wp.max(one[k] + other[k], 0.0), part * part)
                     shown[k] = shown[k] + wp.where(d > 0.0, flag, 0)
                     doubt[k] = doubt[k] + wp.where(d * d >= limit, 0, flag)
+                    open[k] = open[k] + wp.where(proven(wp.abs(d), stray[k], finest[k], contrast[k], limit), 0, flag)
             else:
                 for k in range(pack):
                     d = one[k] - middle[k]
@@ -204,19 +249,36 @@ def _stripe_kernel(pack: int, code: Literal["binary", "gray", "xor"] = "gray", i
                     limit = wp.max(wp.static(DOUBT_SIGMAS**2) * variance, part * part)
                     shown[k] = shown[k] + wp.where(d > 0.0, flag, 0)
                     doubt[k] = doubt[k] + wp.where(d * d >= limit, 0, flag)
+                    open[k] = open[k] + wp.where(proven(2.0 * wp.abs(d), stray[k], finest[k], contrast[k], 4.0 * limit), 0, flag)
         u, error, signal, result = float_pack(), float_pack(), float_pack(), byte_pack()
         for k in range(pack):
-            low = doubt[k] & (-doubt[k])
-            rest = doubt[k] & (doubt[k] - 1)
+            doubtful = doubt[k] | open[k]
+            left = int(0)  # noqa: RUF046 - declares a variable that a Warp loop may change
+            for bit in range(free):
+                left = left + wp.where(left == bit, (doubtful >> bit) & 1, 0)
+            above_left = (doubtful >> left) << left
+            low = above_left & (-above_left)
+            rest = above_left & (above_left - 1)
             second = rest & (-rest)
+            more = (open[k] >> left) << left
+            more = more & (more - 1)
+            read = number_of(shown[k], base_bit, above)
+            least, most = int(read), int(read)
+            for bit in range(rows.shape[0]):
+                turned = number_of(shown[k] ^ (doubtful & (1 << bit)), base_bit, above)
+                least = wp.min(least, turned)
+                most = wp.max(most, turned)
             lit = contrast[k] > 0.0 and contrast[k] < LARGEST and (  # False for NaN too
                 contrast[k] * contrast[k] >= wp.static(SHADOW_SIGMAS**2) * spread[k])
+            loose = wp.min(wp.max(wp.static(DOUBT_SIGMAS) * wp.sqrt(spread[k]), stray[k]) / wp.max(contrast[k], 1.0e-20), 1.0)
             code, place, deviation = place_stripe(
-                cut[k], lit, (rest & (rest - 1)) == 0, number_of(shown[k], base_bit, above), number_of(shown[k] ^ low, base_bit, above),
-                number_of(shown[k] ^ second, base_bit, above), number_of(shown[k] ^ low ^ second, base_bit, above), stripe, extent)
+                cut[k], lit, (rest & (rest - 1)) == 0, (more & (more - 1)) != 0, read >> left,
+                number_of(shown[k] ^ low, base_bit, above) >> left, number_of(shown[k] ^ second, base_bit, above) >> left,
+                number_of(shown[k] ^ low ^ second, base_bit, above) >> left, 1 << left, MAX_SPREAD, loose,
+                most - least + 1, stripe, extent)
             u[k] = place
             error[k] = deviation
-            signal[k] = wp.where(code == OK, 0.5 * contrast[k], 0.0)
+            signal[k] = wp.where(deviation > 0.0, 0.5 * contrast[k], 0.0)
             result[k] = wp.uint8(code)
         coordinate[p] = u
         sigma[p] = error

@@ -13,12 +13,15 @@ STRIPE_DEVIATION = 1.0 / sqrt(12.0)
 MAX_SPREAD = 1
 """Largest distance, in stripes, between the readings of a pixel with doubtful digits that still give a place."""
 
-_SATURATED, _SHADOWED, _UNDECIDED, _OUT_OF_RANGE = (int(s) for s in (Status.SATURATED, Status.SHADOWED, Status.UNDECIDED,
-                                                                    Status.OUT_OF_RANGE))
+_SATURATED, _SHADOWED, _UNDECIDED, _MULTIPATH, _OUT_OF_RANGE = (
+    int(s) for s in (Status.SATURATED, Status.SHADOWED, Status.UNDECIDED, Status.MULTIPATH, Status.OUT_OF_RANGE))
 
 
 class Decoded(NamedTuple):
-    """One coordinate of the projector at each camera pixel, on the device; pixels are padded to whole packs."""
+    """One coordinate of the projector at each camera pixel, on the device; pixels are padded to whole packs.
+
+    UNDECIDED and MULTIPATH pixels carry the most likely coordinate and its deviation where there is one; else both are 0.
+    """
 
     coordinate: wp.array  # [pixels] float32: continuous u or v, projector pixels (discrete codes: of the stripe centre), or 0
     sigma: wp.array  # [pixels] float32: standard deviation of the coordinate, projector pixels; 0 where not decoded
@@ -32,32 +35,44 @@ def unwritten_decoded(pixels: int, device: str) -> Decoded:
 
 
 @wp.func
-def place_stripe(cut: int, lit: bool, settled: bool, read: int, one: int, other: int, both: int, stripe: float, extent: float):
-    """Return the status of a pixel, the middle of the stripes that it may show and its deviation: 0 and 0 where the status is not OK.
+def place_stripe(cut: int, lit: bool, settled: bool, mixed: bool, read: int, one: int, other: int, both: int, block: int, reach: int,
+                 loose: float, spread: int, stripe: float, extent: float):
+    """Return the status of a pixel, the middle of the stripes that it may show and its deviation.
+
+    UNDECIDED and MULTIPATH have a place too: the stripe as read, with the deviation of `spread` stripes. The others that are not OK have 0.
 
     Args:
         cut: not 0 where a frame saturates.
         lit: whether the projector reaches the pixel.
-        settled: whether two digits at most are in doubt.
-        read, one, other, both: number of the stripe as read, with the other choice of either doubtful digit, and of both.
+        settled: whether two digits at most are in doubt, beside the finest that `block` leaves open.
+        mixed: whether light of other ways may have decided more than these.
+        read, one, other, both: number of the block as read, with the other choice of either doubtful digit, and of both.
+        block: number of stripes that the finest digits leave open; numbers count blocks.
+        reach: largest distance, in blocks, between these numbers that still gives a place.
+        loose: part of a stripe, 0…1, that noise or other light adds to the width of a pixel at an edge.
+        spread: how many stripes the single choices of all doubtful digits span.
         stripe: width of a stripe, projector pixels.
         extent: projector pixels along the axis.
     """
     least = wp.min(wp.min(read, one), wp.min(other, both))
     most = wp.max(wp.max(read, one), wp.max(other, both))
-    start = float(least) * stripe
+    width = float(block) * stripe
+    start = float(least) * width
     middle, deviation = float(0.0), float(0.0)
     code = OK
     if cut != 0:
         code = _SATURATED
     elif not lit:
         code = _SHADOWED
-    elif not settled or most - least > MAX_SPREAD:
-        code = _UNDECIDED
+    elif mixed or not settled or most - least > reach:
+        code = wp.where(mixed, _MULTIPATH, _UNDECIDED)
+        middle = wp.min((float(read) + 0.5) * width, extent)
+        deviation = STRIPE_DEVIATION * wp.min(float(spread) * stripe, extent)
     elif start >= extent:
         code = _OUT_OF_RANGE
     else:
-        end = wp.min((float(most) + 1.0) * stripe, extent)
+        end = wp.min((float(most) + 1.0) * width, extent)
         middle = 0.5 * (start + end)
-        deviation = STRIPE_DEVIATION * (end - start)
+        # a pixel that mixes two stripes lies within half a stripe of their edge, or it would mix others too
+        deviation = STRIPE_DEVIATION * wp.where((most - least + 1) * block == 2, wp.min((1.0 + loose) * stripe, end - start), end - start)
     return code, middle, deviation

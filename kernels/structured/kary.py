@@ -3,7 +3,10 @@
 A reading under the pattern colour c is black + e(c) · (white - black), channel by channel, with e(c) = (X c) / (X 1) for a projector
 and camera whose channels mix by the matrix X: the object's reflectance cancels. Digits are the candidates of least χ². A digit is
 in doubt where the second-best is nearly as near (a mixture at an edge, or noise); up to two doubtful digits are tried both ways,
-and where that changes the stripe by one at most, as it does at every edge of a reflected code, the middle is the result.
+and where that changes the stripe by one at most, as it does at every edge of a reflected code, the middle is the result. Readings that lie
+between levels make all digits of the pixel doubtful sooner: the mean misfit of its nearest levels is the scale of its errors. At a carry of
+a plain code several digits are mixed at once (carry.py): where a carry explains the readings better than the nearest levels do, its edge
+is the result; where about as well, and it lies elsewhere, the pixel is UNDECIDED.
 
 Sources: Er (reflected k-ary), The Computer Journal 1984; Horn and Kiryati, "Toward optimal structured light patterns", Image and
 Vision Computing 1999 (grey levels); Caspi, Kiryati and Shamir, "Range imaging with adaptive color structured light", TPAMI 1998
@@ -19,18 +22,17 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
-from kernels.packs import Band, as_packs, pack_type
-from kernels.status import OK
-from kernels.structured.decoded import Decoded, place_stripe, unwritten_decoded
+from kernels.packs import Band, as_packs, pack_type, unwritten
+from kernels.structured.carry import EMPTY_CHI2, LEVEL_ERROR, NO_EDGE, carry_kernel, weight_of_reading
+from kernels.structured.decoded import MAX_SPREAD, Decoded, place_stripe, unwritten_decoded
 from kernels.structured.frames import NoiseModel, check_noise, check_stripes, cut_in, require_frames, saturation_masks
 
 SHADOW_SIGMAS = 5.0
 """Least white minus black, in its standard deviations over all channels; a pixel with less is not reached by the projector."""
-LEVEL_ERROR = 0.02
-"""Error of a level beyond noise, as a part of white minus black: the camera's and projector's responses and light from other surfaces cause
-it."""
 DOUBT_CHI2 = 9.0
 """Largest χ² between the best and the second-best level that noise alone explains (three standard deviations)."""
+NEAR_CHI2 = 2.0
+"""The same for a carry whose edge lies within the reach of the finest digit: a choice that is wrong there is wrong by few stripes."""
 DOUBT_RATIO = 0.44
 """Largest ratio of the best level's χ² to the second-best's: above it, the reading lies more than two fifths of the way to the next
 level."""
@@ -40,8 +42,6 @@ MIN_LEVEL_STEP = 1.0e-3
 """Least difference of two levels, as a part of white minus black; closer levels count as equal."""
 LARGEST = 1.0e15
 """Signal above which a reading counts as infinite, because the signal is squared in float32."""
-EMPTY_CHI2 = 1.0e30
-"""Sentinel χ² of a slot that holds no level."""
 
 
 def decode_kary(frames: Band, digits: Sequence[int], *, white: int, black: int, levels: np.ndarray, reflected: bool,
@@ -76,13 +76,16 @@ def decode_kary(frames: Band, digits: Sequence[int], *, white: int, black: int, 
                          f"{stripe_px:g} px, the projector has {extent:g}: a digit is missing")
     if base ** len(digits) > MAX_STRIPES:
         raise ArrayError(f"{len(digits)} digits in base {base} number more than {MAX_STRIPES} stripes: give fewer digits")
-    result = unwritten_decoded(frames.pixel_count, frames.device)
-    devices.launch(_kary_kernel(devices.pack_width(frames.device), channels), frames.packs,
-                   [frames.values, frames.saturated, saturation_masks(frames, [*digits, white, black]),
-                    wp.array(digits, dtype=wp.int32, device=frames.device), white, black,
-                    wp.array(expected, dtype=wp.float32, device=frames.device), 1 if reflected else 0,
-                    noise.read**2, noise.gain, float(stripe_px), float(extent)],
-                   [as_packs(array, frames.device) for array in result], device=frames.device)
+    device, pack, pixels = frames.device, devices.pack_width(frames.device), frames.pixel_count
+    result = unwritten_decoded(pixels, device)
+    fitted = [unwritten(pixels, dtype, device) for dtype in (wp.float32, wp.float32, wp.int32)]
+    fits = [as_packs(array, device) for array in fitted]
+    order, table = wp.array(digits, dtype=wp.int32, device=device), wp.array(expected, dtype=wp.float32, device=device)
+    code = [order, white, black, table, 1 if reflected else 0, noise.read**2, noise.gain]
+    devices.launch(carry_kernel(pack, channels), frames.packs, [frames.values, *code], fits, device=device)
+    devices.launch(_kary_kernel(pack, channels), frames.packs,
+                   [frames.values, frames.saturated, saturation_masks(frames, [*digits, white, black]), *code, *fits, float(stripe_px),
+                    float(extent)], [as_packs(array, device) for array in result], device=device)
     return result
 
 
@@ -138,6 +141,9 @@ def _kary_kernel(pack: int, channels: Literal[1, 3] = 1) -> Any:
                     reflected: int,
                     read_variance: float,
                     gain: float,
+                    misfit: wp.array(dtype=float_pack),  # [P] of carry_kernel
+                    carry_misfit: wp.array(dtype=float_pack),  # [P]
+                    edge: wp.array(dtype=int_pack),  # [P]
                     stripe: float,
                     extent: float,
                     # outputs
@@ -159,6 +165,12 @@ def _kary_kernel(pack: int, channels: Literal[1, 3] = 1) -> Any:
         # the number under every choice of up to two doubtful digits, most significant digit first
         base = expected.shape[0]
         doubts = int_pack()
+        poor = misfit[p]
+        carried = carry_misfit[p]
+        carry = edge[p]
+        scale = float_pack()
+        for k in range(pack):
+            scale[k] = wp.max(wp.min(poor[k], carried[k]) / float(order.shape[0] * channels), 1.0)
         code0, code1, code2, code3 = int_pack(), int_pack(), int_pack(), int_pack()
         sum0, sum1, sum2, sum3 = int_pack(), int_pack(), int_pack(), int_pack()
         for back in range(order.shape[0]):
@@ -172,11 +184,8 @@ def _kary_kernel(pack: int, channels: Literal[1, 3] = 1) -> Any:
                     reading = values[frame * channels + channel, p]
                     level = expected[digit, channel]
                     for k in range(pack):
-                        contrast = wp.max(on[k] - off[k], 0.0)
-                        variance = 3.0 * read_variance + wp.static(LEVEL_ERROR**2) * contrast * contrast + gain * (
-                            wp.max(on[k], 0.0) + wp.max(off[k], 0.0) + wp.max(reading[k], 0.0))
-                        miss = reading[k] - off[k] - level * contrast
-                        cost[k] = cost[k] + miss * miss / variance
+                        miss = reading[k] - off[k] - level * wp.max(on[k] - off[k], 0.0)
+                        cost[k] = cost[k] + miss * miss * weight_of_reading(on[k], off[k], reading[k], LEVEL_ERROR, read_variance, gain)
                 for k in range(pack):
                     first_is = wp.where(cost[k] < best[k], 1, 0)
                     second_is = (1 - first_is) * wp.where(cost[k] < second[k], 1, 0)
@@ -185,7 +194,7 @@ def _kary_kernel(pack: int, channels: Literal[1, 3] = 1) -> Any:
                     second[k] = wp.min(second[k], wp.max(cost[k], best[k]))
                     best[k] = wp.min(cost[k], best[k])
             for k in range(pack):
-                sure = wp.where(second[k] - best[k] > DOUBT_CHI2, 1, 0) * wp.where(best[k] < DOUBT_RATIO * second[k], 1, 0)
+                sure = wp.where(second[k] - best[k] > DOUBT_CHI2 * scale[k], 1, 0) * wp.where(best[k] < DOUBT_RATIO * second[k], 1, 0)
                 other = next_nearest[k] - nearest[k]
                 one = (1 - sure) * wp.where(doubts[k] == 0, 1, 0)
                 two = (1 - sure) * wp.where(doubts[k] == 1, 1, 0)
@@ -201,10 +210,26 @@ def _kary_kernel(pack: int, channels: Literal[1, 3] = 1) -> Any:
         u, error, result = float_pack(), float_pack(), byte_pack()
         for k in range(pack):
             reached = lit[k] >= wp.static(SHADOW_SIGMAS**2) and signal[k] < LARGEST  # False for NaN too
-            code, place, deviation = place_stripe(cut[k], reached, doubts[k] <= 2, code0[k], code1[k], code2[k], code3[k], stripe, extent)
+            least = wp.min(wp.min(code0[k], code1[k]), wp.min(code2[k], code3[k]))
+            most = wp.max(wp.max(code0[k], code1[k]), wp.max(code2[k], code3[k]))
+            settled = doubts[k] <= 2
+            reach = wp.where(reflected == 1, MAX_SPREAD, base)  # a plain code's next digit is at most so far
+            if carry[k] != NO_EDGE:
+                away = wp.max(wp.abs(carry[k] - code0[k]), wp.abs(carry[k] - 1 - code0[k]))
+                margin = wp.where(away > reach, DOUBT_CHI2, NEAR_CHI2) * scale[k]
+                if carried[k] + margin < poor[k]:
+                    settled = True
+                    least = carry[k] - 1
+                    most = carry[k]
+                elif carried[k] < poor[k] + margin:
+                    least = wp.min(least, carry[k] - 1)
+                    most = wp.max(most, carry[k])
+            loose = wp.min(wp.static(DOUBT_CHI2) / wp.sqrt(wp.max(lit[k], 1.0)), 1.0)
+            code, place, deviation = place_stripe(cut[k], reached, settled, False, wp.clamp(code0[k], least, most), least, most, most, 1,
+                                                  reach, loose, most - least + 1, stripe, extent)
             u[k] = place
             error[k] = deviation
-            signal[k] = wp.where(code == OK, signal[k], 0.0)
+            signal[k] = wp.where(deviation > 0.0, signal[k], 0.0)
             result[k] = wp.uint8(code)
         coordinate[p] = u
         sigma[p] = error

@@ -23,6 +23,7 @@ from kernels.structured.angles import TURN, cosine_of_turns, sine_of_turns
 from kernels.structured.decoded import Decoded, unwritten_decoded
 from kernels.structured.frames import NoiseModel, cut_in, require_frames, saturation_masks
 from kernels.structured.phase import decode_phase
+from kernels.structured.response import light_between, light_slope, light_table
 from kernels.structured.unwrap import EMPTY_CHI2, judge, keep_better
 
 LEVEL_ERROR = 0.02
@@ -39,7 +40,7 @@ _SATURATED, _MULTIPATH, _OUT_OF_RANGE = int(Status.SATURATED), int(Status.MULTIP
 
 
 def decode_micro(frames: Band, numbers: Sequence[int], periods_px: Sequence[float], shifts: Sequence[float], *,
-                 black: int | None = None, extent: float, noise: NoiseModel) -> Decoded:
+                 black: int | None = None, extent: float, response: Sequence[float] | None = None, noise: NoiseModel) -> Decoded:
     """Decode the coordinate from frames of several close periods that share offset and amplitude.
 
     Args:
@@ -49,6 +50,7 @@ def decode_micro(frames: Band, numbers: Sequence[int], periods_px: Sequence[floa
         shifts: of each of them in turns (step / steps).
         black: frame of the ambient light, or None.
         extent: projector pixels along the axis.
+        response: the projector's light at even levels from 0 to 1, rising; None: linear.
         noise: of a reading.
 
     Returns:
@@ -70,7 +72,7 @@ def decode_micro(frames: Band, numbers: Sequence[int], periods_px: Sequence[floa
     if member.all():
         raise ArrayError(f"all frames have the period {reference:g} px: give frames of other periods near it")
     start = decode_phase(frames, [n for n, m in zip(numbers, member, strict=True) if m], periods[member],
-                         np.array(shifts)[member].tolist(), black=black, noise=noise)
+                         np.array(shifts)[member].tolist(), black=black, response=response, noise=noise)
     require_frames(frames, *numbers, black)
     others, device, pack = np.flatnonzero(~member), frames.device, devices.pack_width(frames.device)
     ratio = reference / periods[others]
@@ -82,9 +84,10 @@ def decode_micro(frames: Band, numbers: Sequence[int], periods_px: Sequence[floa
     result = unwritten_decoded(frames.pixel_count, frames.device)
     scratch = wp.empty((2 * len(others), frames.packs * pack), dtype=wp.float32, device=device)
     inputs = [as_packs(array, device) for array in (start.phase, start.amplitude, start.offset, start.status)]
-    devices.launch(_micro_kernel(pack), frames.packs,
+    devices.launch(_micro_kernel(pack, response is not None), frames.packs,
                    [frames.values, frames.saturated, saturation_masks(frames, list(numbers)), *inputs,
                     wp.array(np.array(numbers)[order], dtype=wp.int32, device=device), wp.array(table, dtype=wp.vec2, device=device),
+                    wp.array(light_table(response), dtype=wp.float32, device=device),
                     wp.array(np.stack([np.cos(turns), np.sin(turns)], axis=-1), dtype=wp.vec2, device=device),
                     float(reference), float(member.sum()), float(extent), noise.read**2, noise.gain],
                    [as_packs(array, device) for array in (scratch, *result)], device=device)
@@ -104,10 +107,35 @@ def _require_unlike(periods: np.ndarray, reference: float, others: np.ndarray, e
                          "add a period, or choose other ones")
 
 
+@wp.func
+def cosine_at(light: wp.array(dtype=float), x: float) -> float:
+    """Return what a linear projector makes of the cosine x."""
+    return x
+
+
+@wp.func
+def cosine_slope(light: wp.array(dtype=float), x: float) -> float:
+    """Return its slope."""
+    return 1.0
+
+
+@wp.func
+def bent_at(light: wp.array(dtype=float), x: float) -> float:
+    """Return what a response makes of the cosine x, -1…1."""
+    return 2.0 * light_between(light, 0.5 + 0.5 * x) - 1.0
+
+
+@wp.func
+def bent_slope(light: wp.array(dtype=float), x: float) -> float:
+    """Return its slope."""
+    return light_slope(light, 0.5 + 0.5 * x)
+
+
 @cache
-def _micro_kernel(pack: int) -> Any:
+def _micro_kernel(pack: int, bent: bool = False) -> Any:
     float_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.uint8)
     cut_of = cut_in(pack)
+    wave_at, wave_slope = (bent_at, bent_slope) if bent else (cosine_at, cosine_slope)
 
     @wp.kernel(enable_backward=False, module="unique")
     def micro_kernel(first: int,
@@ -120,6 +148,7 @@ def _micro_kernel(pack: int) -> Any:
                      state: wp.array2d(dtype=byte_pack),  # [1, P]
                      order: wp.array(dtype=int),  # [N] frames, those of the reference last
                      table: wp.array(dtype=wp.vec2),  # [N] 1 / period, shift in turns
+                     light: wp.array(dtype=float),  # [LIGHT_STEPS + 1] at even levels
                      step: wp.array2d(dtype=wp.vec2),  # [wraps, others] cos, sin of what a wrap adds to the angle
                      period: float,
                      shifts: float,  # frames of the reference
@@ -127,7 +156,7 @@ def _micro_kernel(pack: int) -> Any:
                      read_variance: float,
                      gain: float,
                      # outputs
-                     turned: wp.array2d(dtype=float_pack),  # [2 · others, P] scratch: B cos, B sin at wrap 0
+                     turned: wp.array2d(dtype=float_pack),  # [2 · others, P] scratch: cos, sin at wrap 0
                      coordinate: wp.array(dtype=float_pack),
                      sigma: wp.array(dtype=float_pack),
                      signal: wp.array(dtype=float_pack),
@@ -143,8 +172,8 @@ def _micro_kernel(pack: int) -> Any:
             cosine, sine = float_pack(), float_pack()
             for k in range(pack):
                 t = angle[k] * wp.static(1.0 / TURN) * period * table[f][0] - table[f][1]
-                cosine[k] = swing[k] * cosine_of_turns(t)
-                sine[k] = swing[k] * sine_of_turns(t)
+                cosine[k] = cosine_of_turns(t)
+                sine[k] = sine_of_turns(t)
             turned[2 * f, p] = cosine
             turned[2 * f + 1, p] = sine
 
@@ -163,8 +192,9 @@ def _micro_kernel(pack: int) -> Any:
                 c, s = step[wrap, f][0], step[wrap, f][1]
                 w = TURN * table[f][0]
                 for k in range(pack):
-                    miss = reading[k] - mean[k] - cosine[k] * c + sine[k] * s
-                    slope = -w * (sine[k] * c + cosine[k] * s)
+                    x = cosine[k] * c - sine[k] * s
+                    miss = reading[k] - mean[k] - swing[k] * wave_at(light, x)
+                    slope = -w * swing[k] * (sine[k] * c + cosine[k] * s) * wave_slope(light, x)
                     squares[k] = squares[k] + miss * miss
                     slopes[k] = slopes[k] + miss * slope
                     stiffness[k] = stiffness[k] + slope * slope
@@ -185,8 +215,9 @@ def _micro_kernel(pack: int) -> Any:
                 frequency, delta = table[f][0], table[f][1]
                 for k in range(pack):
                     t = place[k] * frequency - delta
-                    c = cosine_of_turns(t)
-                    slope = -swing[k] * TURN * frequency * sine_of_turns(t)
+                    x = cosine_of_turns(t)
+                    c = wave_at(light, x)
+                    slope = -swing[k] * TURN * frequency * sine_of_turns(t) * wave_slope(light, x)
                     w = 1.0 / (read_variance + gain * wp.max(reading[k], 0.0))
                     miss = reading[k] - mean[k] - swing[k] * c
                     add_reading(miss, w, 1.0, c, slope, aa[k], ab[k], au[k], bb[k], bu[k], uu[k], ra[k], rb[k], ru[k], squares_left[k])

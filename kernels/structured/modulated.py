@@ -18,15 +18,18 @@ from kernels.errors import ArrayError
 from kernels.packs import Band, as_packs, pack_type, unwritten
 from kernels.structured.frames import NoiseModel, check_noise, cut_in, require_frames, saturation_masks
 from kernels.structured.phase import WrappedPhase, add_frame, weights, write_phases_in
+from kernels.structured.response import modulated_wave, phase_table, straighten
 
 
-def decode_modulated(frames: Band, numbers: Sequence[Sequence[int]], *, period_px: float, noise: NoiseModel) -> WrappedPhase:
+def decode_modulated(frames: Band, numbers: Sequence[Sequence[int]], *, period_px: float, response: Sequence[float] | None = None,
+                     noise: NoiseModel) -> WrappedPhase:
     """Decode the wrapped phase of one period from direct light alone.
 
     Args:
         frames: linear images of one channel.
         numbers: [steps][carrier steps] frames; both even over a turn.
         period_px: of the phase.
+        response: the projector's light at even levels from 0 to 1, rising; None: linear.
         noise: of a reading.
 
     Returns:
@@ -52,6 +55,10 @@ def decode_modulated(frames: Band, numbers: Sequence[Sequence[int]], *, period_p
                    [frames.values, frames.saturated, saturation_masks(frames, order), wp.array(numbers, dtype=wp.int32, device=device),
                     wp.array(outer, dtype=wp.vec3, device=device), wp.array(inner, dtype=wp.vec3, device=device),
                     noise.read**2, noise.gain], [as_packs(row, device) for row in rows], device=device)
+    if response is not None:
+        wave = modulated_wave(response, inner)
+        bend = phase_table((wave - wave.min()) / np.ptp(wave), outer, np.arange(steps) / steps, period_px)
+        straighten(rows, [bend], [0.0], device=device)
     return WrappedPhase(*rows, (float(period_px),), frames.pixel_count, device)
 
 

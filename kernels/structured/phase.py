@@ -22,6 +22,7 @@ from kernels.packs import Band, as_packs, pack_type, unwritten
 from kernels.status import OK, Status
 from kernels.structured.angles import angle_of
 from kernels.structured.frames import NoiseModel, check_noise, cut_in, require_frames, saturation_masks
+from kernels.structured.response import bent_wave, phase_table, straighten
 
 SIGNAL_SIGMAS = 5.0
 """Least light of the projector in its standard deviations, below which a pixel is SHADOWED, and least amplitude in its standard deviations,
@@ -49,7 +50,8 @@ class WrappedPhase(NamedTuple):
 
 
 def decode_phase(frames: Band, numbers: Sequence[int], periods_px: Sequence[float], shifts: Sequence[float], *,
-                 black: int | None = None, noise: NoiseModel) -> WrappedPhase:
+                 black: int | None = None, response: Sequence[float] | None = None, wave_errors: Sequence[float] | None = None,
+                 noise: NoiseModel) -> WrappedPhase:
     """Decode the wrapped phase of every period.
 
     Args:
@@ -58,6 +60,8 @@ def decode_phase(frames: Band, numbers: Sequence[int], periods_px: Sequence[floa
         periods_px: of each of them.
         shifts: δ of each of them in turns (step / steps), any three or more different ones a period.
         black: frame of the ambient light, or None: then it counts as light of the projector in telling SHADOWED pixels.
+        response: the projector's light at even levels from 0 to 1, rising, which bends the waves; None: linear.
+        wave_errors: of each period's phase beyond noise, radians, in order of first appearance; None: none.
         noise: of a reading.
 
     Returns:
@@ -66,7 +70,7 @@ def decode_phase(frames: Band, numbers: Sequence[int], periods_px: Sequence[floa
 
     Raises:
         ArrayError: lists of different lengths, a frame that does not exist or is given twice, a period with fewer than three
-            different shifts.
+            different shifts, a response under which the phase cannot be told.
     """
     check_noise(noise)
     require_frames(frames, *numbers, black)
@@ -74,12 +78,15 @@ def decode_phase(frames: Band, numbers: Sequence[int], periods_px: Sequence[floa
         raise ArrayError(f"there are {len(numbers)} frames, {len(periods_px)} periods, {len(shifts)} shifts: give one of each for "
                          "every frame, and at least three")
     periods = tuple(dict.fromkeys(float(period) for period in periods_px))
-    table, order, starts = [], [], [0]
+    table, bends, order, starts = [], [], [], [0]
+    wave = None if response is None else bent_wave(response)
     for period in periods:
         if not period > 0:
             raise ArrayError(f"a period is {period:g} px: give more than 0")
         members = [index for index, other in enumerate(periods_px) if float(other) == period]
-        table.append(weights(np.array([shifts[index] for index in members]), period))
+        own = np.array([shifts[index] for index in members])
+        table.append(weights(own, period))
+        bends.append(None if wave is None else phase_table(wave, table[-1], own, period))
         order += [numbers[index] for index in members]
         starts.append(len(order))
     device, pack = frames.device, devices.pack_width(frames.device)
@@ -90,6 +97,8 @@ def decode_phase(frames: Band, numbers: Sequence[int], periods_px: Sequence[floa
                     wp.array(order, dtype=wp.int32, device=device), wp.array(starts, dtype=wp.int32, device=device),
                     wp.array(np.concatenate(table), dtype=wp.vec3, device=device), black or 0, noise.read**2, noise.gain],
                    [as_packs(row, device) for row in rows], device=device)
+    if wave is not None or wave_errors is not None:
+        straighten(rows, bends, wave_errors or [0.0] * len(periods), device=device)
     return WrappedPhase(*rows, periods, frames.pixel_count, device)
 
 

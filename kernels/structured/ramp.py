@@ -18,6 +18,7 @@ from kernels.packs import Band, as_packs, pack_type
 from kernels.status import OK, Status
 from kernels.structured.decoded import Decoded, unwritten_decoded
 from kernels.structured.frames import NoiseModel, check_noise, cut_in, require_frames, saturation_masks
+from kernels.structured.response import light_of
 
 SHADOW_SIGMAS = 5.0
 """Least light of the projector in its standard deviations; a pixel with less is SHADOWED."""
@@ -79,13 +80,7 @@ def ratio_table(response: np.ndarray | None, *, pair: bool) -> np.ndarray:
     Raises:
         ArrayError: a response that does not rise.
     """
-    x = np.linspace(0, 1, TABLE + 1)
-    if response is None:
-        return x
-    given = np.asarray(response, dtype=np.float64)
-    if given.ndim != 1 or len(given) < 2 or not np.isfinite(given).all() or not (np.diff(given) > 0).all():
-        raise ArrayError(f"the response is {given.shape}: give two or more values, each above the one before")
-    light = np.interp(x, np.linspace(0, 1, len(given)), (given - given[0]) / (given[-1] - given[0]))
+    light = light_of(response, np.linspace(0, 1, TABLE + 1))
     return light / (light + light[::-1]) if pair else light
 
 

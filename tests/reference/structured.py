@@ -15,8 +15,9 @@ def gray_number(bits):
     return number
 
 
-def stripes(direct, inverse, white, black, read, gain, code="gray", base_bit=0, shadow=5.0, doubt=3.0, part=0.05, spread=1):
-    """Least and greatest stripe of each pixel, and a status name; readings [bits, pixels], bit 0 first."""
+def stripes(direct, inverse, white, black, read, gain, code="gray", base_bit=0, shadow=5.0, doubt=3.0, part=0.05, spread=1, free=2):
+    """Least and greatest stripe of each pixel, the width that its deviation stands for, and a status name; readings [bits, pixels], bit 0
+    first."""
     pixels, n = direct.shape[1], len(direct)
     if white is None:
         contrast = np.abs(direct - inverse).max(axis=0)
@@ -27,19 +28,38 @@ def stripes(direct, inverse, white, black, read, gain, code="gray", base_bit=0, 
     if inverse is None:
         difference = direct - (white + black) / 2
         own = read**2 + gain * np.maximum(direct, 0) + variance / 4
-        small = part * contrast / 2
+        small, factor = part * contrast / 2, 2
     else:
         difference = direct - inverse
         own = 2 * read**2 + gain * np.maximum(direct + inverse, 0)
-        small = part * contrast
+        small, factor = part * contrast, 1
     shown = difference > 0
-    doubtful = ~(difference**2 >= np.maximum(doubt**2 * own, small**2))
+    limit = np.maximum(doubt**2 * own, small**2)
+    doubtful = ~(difference**2 >= limit)
+    size = factor * np.abs(difference)
+    alone = size.max(axis=0) if code == "xor" else size[:2].mean(axis=0)
+    stray = np.maximum(contrast - 2 * alone, 0)
+    if code == "xor":
+        unproven = np.broadcast_to(~(stray < 0.5 * contrast), size.shape)
+    else:
+        unproven = ~(size >= stray)
+        if code == "binary":
+            unproven = unproven & ~((size - size[0])**2 < 4 * np.maximum(factor**2 * limit, 0.01 * contrast**2))
+    doubtful = doubtful | unproven
+    free = min(free, {"binary": 0, "gray": n - 1, "xor": base_bit}[code])
+    loose = np.minimum(np.maximum(doubt * np.sqrt(variance), stray) / np.maximum(contrast, 1e-20), 1)
     least, most, status = np.zeros(pixels, int), np.zeros(pixels, int), np.full(pixels, "OK", dtype=object)
     for p in range(pixels):
         if not (contrast[p] > 0 and contrast[p] ** 2 >= shadow**2 * variance[p]):
             status[p] = "SHADOWED"
             continue
-        where = np.flatnonzero(doubtful[:, p])
+        left = 0
+        while left < free and doubtful[left, p]:
+            left += 1
+        if unproven[left:, p].sum() > 2:
+            status[p] = "MULTIPATH"
+            continue
+        where = left + np.flatnonzero(doubtful[left:, p])
         if len(where) > 2:
             status[p] = "UNDECIDED"
             continue
@@ -49,12 +69,13 @@ def stripes(direct, inverse, white, black, read, gain, code="gray", base_bit=0, 
             bits[where[np.array(choice, dtype=bool)]] ^= True
             if code == "xor":
                 bits[base_bit + 1:] ^= bits[base_bit]
-            numbers.append(sum(int(b) << i for i, b in enumerate(bits)) if code == "binary" else int(gray_number(bits[:, None])[0]))
-        least[p], most[p] = min(numbers), max(numbers)
-        if most[p] - least[p] > spread:
+            number = sum(int(b) << i for i, b in enumerate(bits)) if code == "binary" else int(gray_number(bits[:, None])[0])
+            numbers.append(number >> left)
+        least[p], most[p] = min(numbers) << left, ((max(numbers) + 1) << left) - 1
+        if max(numbers) - min(numbers) > spread:
             status[p] = "UNDECIDED"
-    assert n == len(shown)
-    return least, most, status
+    width = np.where(most - least == 1, 1 + loose, most - least + 1)
+    return least, most, width, status
 
 
 def phase(readings, shifts):

@@ -71,14 +71,34 @@ def test_reflected_ternary_stays_within_one_column(device):
     assert (np.abs(coordinate - u)[ok] <= 1).mean() >= 0.997
 
 
-def test_reflected_is_right_at_edges_where_plain_is_refused_or_wrong(device):
-    u = np.arange(1, 700, dtype=float)  # half on either side
-    good = {}
-    for reflected in (True, False):
-        patterns = kary_patterns(WIDTH, "column", base=3, reflected=reflected)
-        coordinate, _, _, status = decode(view(patterns, u, WIDTH, blur=1.0, noise=NOISE), patterns, device)
-        good[reflected] = ((status == Status.OK) & (np.abs(coordinate - u) <= 1)).mean()
-    assert good[True] > 0.98 and good[False] < 0.75
+@pytest.mark.parametrize("options", [{}, {"reflected": False}, {"reflected": False, "colors": palette(3)}])
+def test_edges_are_right(options, device):
+    """A pixel half on either side mixes two levels in one digit of a reflected code, and in every digit that a carry turns in a plain one."""
+    u = np.arange(1, 700, dtype=float)
+    patterns = kary_patterns(WIDTH, "column", base=3, **options)
+    coordinate, _, _, status = decode(view(patterns, u, WIDTH, blur=1.0, noise=NOISE), patterns, device)
+    assert ((status == Status.OK) & (np.abs(coordinate - u) <= 1)).mean() > 0.98
+
+
+@pytest.mark.parametrize("base", [3, 4, 5])
+def test_mixtures_at_carries_are_not_silently_wrong(base, device):
+    """Uneven mixtures of two stripes spell numbers far away; with five levels, noise lets two in a thousand through."""
+    patterns = kary_patterns(WIDTH, "column", base=base, reflected=False)
+    u = np.repeat(np.arange(1, 700, dtype=float), 9) + np.tile(np.linspace(-0.45, 0.45, 9), 699)
+    coordinate, sigma, _, status = decode(view(patterns, u, WIDTH, blur=0.9, noise=NOISE), patterns, device)
+    ok = status == Status.OK
+    assert ok.mean() > 0.95
+    assert (np.abs(coordinate - u)[ok] > 5 * sigma[ok]).mean() < 3e-3
+
+
+def test_levels_between_digits_are_doubted(device):
+    """Readings that all lie a third of the way between levels are not of this code: they are not taken for the nearest digits."""
+    patterns = kary_patterns(WIDTH, "column", base=3)
+    rng = np.random.default_rng(5)
+    stack = 0.05 + 0.7 * rng.choice([0.17, 0.33, 0.67, 0.83], size=(len(patterns), 2000))
+    stack[-2], stack[-1] = 0.75, 0.05
+    *_, status = decode(stack, patterns, device)
+    assert (status == Status.OK).mean() < 0.05
 
 
 def test_crosstalk_that_is_not_said_is_refused_or_wrong(device):
