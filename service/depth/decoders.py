@@ -21,6 +21,7 @@ from kernels.structured.micro import decode_micro
 from kernels.structured.modulated import decode_modulated
 from kernels.structured.phase import WrappedPhase, decode_phase
 from kernels.structured.ramp import decode_ramp
+from kernels.structured.response import light_of
 from kernels.structured.unwrap import unwrap_by_code, unwrap_jointly
 from stage.model import Resolution, Rgb
 from stage.patterns.base import Axis
@@ -105,7 +106,8 @@ def modulated_decoder(axis: AxisCodes) -> AxisDecoder | None:
     waves = [code for code in axis.codes if isinstance(code, ModulatedCode)]
 
     def wrapped(readings: Readings, noise: NoiseModel) -> WrappedPhase:
-        parts = [decode_modulated(readings.grey, wave.frames, period_px=wave.period_px, noise=noise) for wave in waves]
+        parts = [decode_modulated(readings.grey, wave.frames, period_px=wave.period_px, response=axis.projector.response, noise=noise)
+                 for wave in waves]
         return parts[0] if len(parts) == 1 else join_periods(parts)
 
     return _unwrapped("modulated phase", axis, waves, [wave.period_px for wave in waves], wrapped) if waves else None
@@ -118,7 +120,8 @@ def micro_decoder(axis: AxisCodes) -> AxisDecoder | None:
         return None
 
     def decode(readings: Readings, noise: NoiseModel) -> Decoded:
-        return decode_micro(readings.grey, phase.frames, phase.periods_px, phase.shifts, black=axis.black, extent=axis.extent, noise=noise)
+        return decode_micro(readings.grey, phase.frames, phase.periods_px, phase.shifts, black=axis.black, extent=axis.extent,
+                            response=axis.projector.response, noise=noise)
 
     return AxisDecoder(axis.axis, "micro phase", False, decode, (phase,))
 
@@ -130,7 +133,8 @@ def phase_decoder(axis: AxisCodes) -> AxisDecoder | None:
         return None
 
     def wrapped(readings: Readings, noise: NoiseModel) -> WrappedPhase:
-        return decode_phase(readings.grey, phase.frames, phase.periods_px, phase.shifts, black=axis.black, noise=noise)
+        return decode_phase(readings.grey, phase.frames, phase.periods_px, phase.shifts, black=axis.black,
+                            response=axis.projector.response, noise=noise)
 
     return _unwrapped("phase", axis, [phase], phase.periods_px, wrapped)
 
@@ -189,7 +193,8 @@ def _decode_stripes(code: BinaryCode | KaryCode, axis: AxisCodes, readings: Read
         crosstalk = None if axis.projector.crosstalk is None or code.colors is None else np.array(axis.projector.crosstalk)
         frames = readings.colour if code.colors is not None and readings.colour is not None else readings.grey
         return decode_kary(frames, code.frames, white=axis.white, black=axis.black,
-                           levels=np.array(code.levels if code.levels is not None else code.colors), reflected=code.reflected,
+                           levels=light_of(axis.projector.response, np.array(code.levels if code.levels is not None else code.colors)),
+                           reflected=code.reflected,
                            extent=axis.extent, stripe_px=code.stripe_px, crosstalk=crosstalk, noise=noise)
     if code.name == "xor":
         return decode_xor(readings.grey, code.frames, code.inverses, base_bit=code.base_bit, white=axis.white, black=axis.black,

@@ -1,0 +1,293 @@
+"""Captures under projected patterns, made by a ray caster of its own: spheres and planes, mirrors, fog, textures, blur, gamma and noise.
+
+Each camera pixel is sampled at several places, so that pixels at edges mix what they see. A sample is light of one projector place: its
+weight and its (u, v). An image is the sum over these of what the projector shows there, and every pattern costs only that sum.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from stage.images import write_png
+from stage.manifest import Frame
+from stage.patterns.codes import Pattern, draw
+
+FULL_SCALE = 65535
+FINE = 4
+"""Parts of a projector pixel, along each side, between which its light changes."""
+FAR_M = 1.0e3
+"""Distance of what a line of sight that meets nothing is taken to see."""
+OFFSET_M = 1.0e-4
+"""Distance from a surface at which a ray of reflection or shadow starts."""
+
+
+class Ball(NamedTuple):
+    """A sphere."""
+
+    center_m: tuple[float, float, float]
+    radius_m: float
+    albedo: float = 0.7
+    mirror: bool = False
+    texture: float = 0.0
+    """Depth of its texture, 0 to 1."""
+
+
+class Wall(NamedTuple):
+    """A rectangle, or a plane without end."""
+
+    point_m: tuple[float, float, float]
+    normal: tuple[float, float, float]
+    albedo: float = 0.7
+    mirror: bool = False
+    texture: float = 0.0
+    half_m: tuple[float, float] = (FAR_M, FAR_M)
+    """Half of its width and of its height."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rig:
+    """Pinhole camera and projector; the camera frame has x right, y up, z backward."""
+
+    camera: tuple[int, int] = (200, 150)
+    camera_focal: float = 260.0
+    projector: tuple[int, int] = (320, 240)
+    projector_focal: float = 420.0
+    position_m: tuple[float, float, float] = (-0.22, 0.03, 0.0)
+    target_m: tuple[float, float, float] = (0.0, 0.0, -1.2)
+
+    @property
+    def pose(self) -> np.ndarray:
+        """Return camera_from_projector, [4, 4]."""
+        back = np.array(self.position_m) - self.target_m
+        back /= np.linalg.norm(back)
+        right = np.cross([0.0, 1.0, 0.0], back)
+        right /= np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
+        pose[:3, 3] = self.position_m
+        return pose
+
+
+@dataclass(frozen=True, kw_only=True)
+class World:
+    """What stands before the rig, and how its light is recorded."""
+
+    shapes: Sequence[Ball | Wall]
+    rig: Rig = field(default_factory=Rig)
+    fog: float = 0.0
+    """Scattering coefficient of a fog without absorption, 1/m: single scattering, evenly in all directions."""
+    ambient: float = 0.03
+    light: float = 0.8
+    """Reading of white on a white surface that faces the projector at 1 m."""
+    blur_px: float = 0.4
+    """Standard deviation of the projector's focus, projector pixels."""
+    samples: int = 4
+    """Samples along each side of a camera pixel."""
+    gamma: float = 1.0
+    read_noise: float = 0.003
+    electrons: float = 10000.0
+    """At full scale."""
+    bits: int = 12
+    seed: int = 0
+
+
+class Light(NamedTuple):
+    """Light that comes from places of the projector to camera pixels, and the truth."""
+
+    pixel: np.ndarray  # [n] int
+    u: np.ndarray  # [n]
+    v: np.ndarray  # [n]
+    weight: np.ndarray  # [n]
+    ambient: np.ndarray  # [pixels] reflectance under even ambient light
+    depth: np.ndarray  # [rows, cols] metres through the pixel's centre; NaN where nothing or a mirror's image is seen
+    lit: np.ndarray  # [rows, cols] bool: the projector reaches what the pixel's centre shows
+
+
+def trace(world: World) -> Light:
+    """Return where the light of each camera pixel comes from."""
+    rig = world.rig
+    width, height = rig.camera
+    step = (np.arange(world.samples) + 0.5) / world.samples
+    parts: list[tuple[np.ndarray, ...]] = []
+    ambient = np.zeros(width * height)
+    share = 1 / world.samples**2
+    for down in step:
+        for across in step:
+            direction = _rays(rig, across, down)
+            distance, normal, albedo, shape = _hit(world.shapes, np.zeros(3), direction)
+            point = direction * distance[:, None]
+            pixel = np.arange(len(direction))
+            seen, weight = point.copy(), np.full(len(direction), share)
+            for _bounce in range(2):
+                mirror = np.array([s.mirror for s in world.shapes] + [False])[shape]
+                if not mirror.any():
+                    break
+                turned = direction - 2 * (direction * normal).sum(axis=1, keepdims=True) * normal
+                again, other, colour, which = _hit(world.shapes, seen[mirror] + OFFSET_M * normal[mirror], turned[mirror])
+                seen[mirror] = seen[mirror] + turned[mirror] * again[:, None]
+                direction = np.where(mirror[:, None], turned, direction)
+                normal[mirror], albedo[mirror], shape[mirror] = other, colour, which
+                weight[mirror] *= 0.9
+            _add(world, parts, pixel, seen, normal, albedo, shape, weight, np.zeros(len(pixel)) if world.fog == 0 else distance)
+            met = shape < len(world.shapes)
+            ambient += np.where(met, albedo, 0) * share
+            if world.fog > 0:
+                _add_fog(world, parts, pixel, _rays(rig, across, down), distance, share)
+    middle = _rays(rig, 0.5, 0.5)
+    distance, normal, _, shape = _hit(world.shapes, np.zeros(3), middle)
+    depth = np.where(distance < FAR_M, -middle[:, 2] * distance, np.nan)
+    cosine, _, _, _ = _lit(world, middle * distance[:, None], normal)
+    return Light(*(np.concatenate(column) for column in zip(*parts, strict=True)), ambient,
+                 depth.reshape(height, width), ((cosine > 0) & np.isfinite(depth)).reshape(height, width))
+
+
+def _rays(rig: Rig, across: float, down: float) -> np.ndarray:
+    width, height = rig.camera
+    x, y = np.meshgrid(np.arange(width) + across, np.arange(height) + down)
+    ray = np.stack([(x - width / 2) / rig.camera_focal, -(y - height / 2) / rig.camera_focal, -np.ones_like(x)], axis=-1).reshape(-1, 3)
+    return np.asarray(ray / np.linalg.norm(ray, axis=1, keepdims=True))
+
+
+def _hit(shapes: Sequence[Ball | Wall], origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return distance, normal towards the origin, albedo and index of the first shape that rays meet."""
+    best = np.full(len(direction), FAR_M)
+    normal, albedo = np.zeros_like(direction), np.zeros(len(direction))
+    index = np.full(len(direction), len(shapes))
+    for number, shape in enumerate(shapes):
+        if isinstance(shape, Ball):
+            to = origin - np.array(shape.center_m)
+            b = (direction * to).sum(axis=1)
+            root = b**2 - (to**2).sum(axis=-1) + shape.radius_m**2
+            t = -b - np.sqrt(np.maximum(root, 0))
+            t = np.where((root > 0) & (t > 0), t, FAR_M)
+            place = origin + direction * t[:, None]
+            facing = (place - shape.center_m) / shape.radius_m
+            flat = np.stack([np.arctan2(facing[:, 0], facing[:, 2]), np.arcsin(np.clip(facing[:, 1], -1, 1))], axis=1) * shape.radius_m
+        else:
+            n = np.array(shape.normal) / np.linalg.norm(shape.normal)
+            slope = direction @ n
+            t = ((np.array(shape.point_m) - origin) @ n) / np.where(np.abs(slope) > 1e-12, slope, 1e-12)
+            place = origin + direction * t[:, None]
+            right = np.cross([0.0, 1.0, 0.0], n) if abs(n[1]) < 0.9 else np.array([1.0, 0.0, 0.0])
+            right = right / np.linalg.norm(right)
+            flat = np.stack([(place - shape.point_m) @ right, (place - shape.point_m) @ np.cross(n, right)], axis=1)
+            t = np.where((t > 0) & (np.abs(flat) <= np.array(shape.half_m)).all(axis=1), t, FAR_M)
+            facing = -n * np.sign(slope)[:, None]
+        nearer = t < best
+        best = np.where(nearer, t, best)
+        normal = np.where(nearer[:, None], facing, normal)
+        check = np.sign(np.sin(flat[:, 0] * 140) * np.sin(flat[:, 1] * 140)) * 0.6 + 0.4 * np.sin(flat[:, 0] * 900 + flat[:, 1] * 300)
+        albedo = np.where(nearer, shape.albedo * (1 - shape.texture * (0.5 + 0.5 * check)), albedo)
+        index = np.where(nearer, number, index)
+    return best, normal, albedo, index
+
+
+def _lit(world: World, point: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return irradiance over that of a facing surface at 1 m (0 in shadow), and u, v and distance in the projector."""
+    rig, pose = world.rig, world.rig.pose
+    to = pose[:3, 3] - point
+    far = np.linalg.norm(to, axis=1)
+    to = to / far[:, None]
+    cosine = np.clip((normal * to).sum(axis=1), 0, None)
+    blocked = _hit(world.shapes, point + OFFSET_M * normal, to)[0] < far - 2 * OFFSET_M
+    local = (point - pose[:3, 3]) @ pose[:3, :3]
+    ahead = local[:, 2] < -1e-6
+    z = np.where(ahead, -local[:, 2], 1.0)
+    u = rig.projector[0] / 2 + rig.projector_focal * local[:, 0] / z
+    v = rig.projector[1] / 2 - rig.projector_focal * local[:, 1] / z
+    inside = ahead & (u >= 0) & (u < rig.projector[0]) & (v >= 0) & (v < rig.projector[1])
+    return np.where(inside & ~blocked, cosine / far**2, 0.0), u, v, far
+
+
+def _add(world: World, parts: list[tuple[np.ndarray, ...]], pixel: np.ndarray, point: np.ndarray, normal: np.ndarray, albedo: np.ndarray,
+         shape: np.ndarray, weight: np.ndarray, way: np.ndarray) -> None:
+    strength, u, v, far = _lit(world, point, normal)
+    value = strength * albedo * weight * np.exp(-world.fog * (way + far) * (world.fog > 0))
+    kept = (value > 0) & (shape < len(world.shapes))
+    parts.append((pixel[kept], u[kept], v[kept], value[kept]))
+
+
+def _add_fog(world: World, parts: list[tuple[np.ndarray, ...]], pixel: np.ndarray, direction: np.ndarray, distance: np.ndarray,
+             share: float, steps: int = 48) -> None:
+    """Add the light that fog along the lines of sight scatters towards the camera."""
+    length = np.minimum(distance, 4.0)
+    rng = np.random.default_rng(1)
+    for step in range(steps):
+        t = length * (step + rng.random(len(length))) / steps
+        point = direction * t[:, None]
+        to = world.rig.pose[:3, 3] - point
+        normal = to / np.linalg.norm(to, axis=1, keepdims=True)
+        strength, u, v, far = _lit(world, point, normal)
+        value = strength * share * world.fog / 4 * (length / steps) * np.exp(-world.fog * (t + far))  # albedo/π against 1/4π
+        kept = value > 0
+        parts.append((pixel[kept], u[kept], v[kept], value[kept]))
+
+
+def images(world: World, light: Light, patterns: Sequence[Pattern]) -> np.ndarray:
+    """Return the recorded images, [frames, rows, cols] 0…1."""
+    width, height = world.rig.camera
+    rng = np.random.default_rng(world.seed)
+    frames = np.empty((len(patterns), height, width))
+    column, row = (np.floor(place * FINE).astype(int) for place in (light.u, light.v))
+    for number, pattern in enumerate(patterns):
+        shown = _focus(draw(pattern, world.rig.projector).astype(np.float64) ** world.gamma, world.blur_px)
+        recorded = np.bincount(light.pixel, light.weight * shown[row, column], width * height) * world.light
+        recorded += light.ambient * world.ambient
+        recorded = rng.poisson(recorded * world.electrons) / world.electrons + rng.normal(0, world.read_noise, recorded.shape)
+        frames[number] = np.clip(recorded, 0, 1).reshape(height, width)
+    top = 2**world.bits - 1
+    return np.rint(frames * top) / top
+
+
+def _focus(shown: np.ndarray, blur_px: float) -> np.ndarray:
+    """Return an image in pixels FINE times as fine, under a Gaussian point spread."""
+    shown = np.repeat(np.repeat(shown, FINE, axis=0), FINE, axis=1)
+    if blur_px <= 0:
+        return shown
+    blur_px = blur_px * FINE
+    reach = int(np.ceil(4 * blur_px))
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / blur_px) ** 2)
+    kernel /= kernel.sum()
+    for axis in (0, 1):
+        padded = np.pad(shown, [(reach, reach) if a == axis else (0, 0) for a in (0, 1)], mode="edge")
+        shown = sum(k * np.take(padded, np.arange(shown.shape[axis]) + i, axis=axis) for i, k in enumerate(kernel))
+    return shown
+
+
+def write_capture(folder: Path, world: World, patterns: Sequence[Pattern], *, light: Light | None = None,
+                  declared: Sequence[Pattern] | None = None, **projector: Any) -> Light:
+    """Write a capture of these patterns.
+
+    Args:
+        folder: where.
+        world: what is seen.
+        patterns: what is projected, frame by frame.
+        light: of `trace`, where the same world is captured again.
+        declared: what the manifest says instead; None: the truth.
+        projector: further fields of the manifest's projector.
+
+    Returns:
+        The light, with the truth.
+    """
+    light = trace(world) if light is None else light
+    folder.mkdir(parents=True, exist_ok=True)
+    rig, entries = world.rig, []
+    for number, (frame, pattern) in enumerate(zip(images(world, light, patterns), declared or patterns, strict=True)):
+        name = f"{number:03d}.png"
+        write_png(folder / name, np.rint(frame * FULL_SCALE).astype(np.uint16), srgb=False)
+        entries.append(Frame(image=name, pattern=pattern).model_dump(mode="json", exclude_defaults=True))
+    (folder / "capture.json").write_text(json.dumps({
+        "schema": "relit.capture/1", "name": folder.name, "color_space": "lin_rec709_scene",
+        "camera": {"projection": "perspective", "resolution": rig.camera, "focal_px": [rig.camera_focal] * 2,
+                   "principal_px": [rig.camera[0] / 2, rig.camera[1] / 2]},
+        "projector": {"resolution": rig.projector, "focal_px": [rig.projector_focal] * 2,
+                      "principal_px": [rig.projector[0] / 2, rig.projector[1] / 2], "camera_from_projector": rig.pose.tolist(),
+                      **projector},
+        "frames": entries}))
+    return light
