@@ -6,13 +6,13 @@ doubtful bits are tried both ways; where all readings lie within MAX_SPREAD + 1 
 always: there one bit changes) their middle is the result, with the deviation of the whole range; otherwise the pixel is UNDECIDED.
 Up to MAX_OPEN of the finest bits of a Gray code may be in doubt besides: the stripes that they tell apart are then one wide stripe.
 
-Light that reaches the pixel by other ways (fog, bounces, light below the surface) follows wide stripes as direct light does, and narrow ones
-hardly. So the two finest bits measure the direct part D of the contrast C, and a bit is proven where |d| > C - 2 D: other light, C - D at
-most, could not have turned it. Where more than two bits are not proven, the pixel is MULTIPATH.
+Light that reaches the pixel by other ways (fog, bounces, light below the surface) follows wide stripes as direct light does, and narrow
+ones hardly. So the two finest bits measure the direct part D of the contrast C, and a bit is proven where |d| > C - 2 D: other light,
+C - D at most, could not have turned it. Where more than two bits are not proven, the pixel is MULTIPATH.
 
 Sources: Posdamer and Altschuler, CGIP 1982 (binary); Inokuchi, Sato and Matsuda, ICPR 1984 (Gray); Gupta, Agrawal,
-Veeraraghavan and Narasimhan, CVPR 2011, section 4 (XOR); Xu and Aliaga, "Robust pixel classification for 3D modeling with structured light",
-Graphics Interface 2007 (bits that direct light proves).
+Veeraraghavan and Narasimhan, CVPR 2011, section 4 (XOR); Xu and Aliaga, "Robust pixel classification for 3D modeling with structured
+light", Graphics Interface 2007 (bits that direct light proves).
 """
 
 from collections.abc import Sequence
@@ -25,7 +25,6 @@ import warp as wp
 from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.packs import Band, as_packs, pack_type
-from kernels.status import OK
 from kernels.structured.decoded import MAX_SPREAD, Decoded, place_stripe, unwritten_decoded
 from kernels.structured.frames import NoiseModel, check_noise, check_stripes, cut_in, require_frames, saturation_masks
 
@@ -40,8 +39,9 @@ than noise decides."""
 MAX_OPEN = 2
 """Number of the finest bits that may be in doubt without the pixel being refused: a camera that resolves stripes a quarter as fine as those
 that are shown sees no more."""
-XOR_STRAY = 0.5
-"""Largest part of the contrast, minus twice the direct light, with which bits of an XOR code count: a quarter of the light is direct then."""
+MUCH_STRAY = 0.5
+"""Largest part of the contrast, minus twice the direct light, with which all bits of XOR and of plain binary codes count: a quarter is direct
+then."""
 LARGEST = 1.0e15
 """Contrast above which a reading counts as infinite, because contrast is squared in float32."""
 MAX_BITS = 24
@@ -113,7 +113,8 @@ def _decode(make: Any, code: str, frames: Band, bits: Sequence[int], inverses: S
     devices.launch(kernel, frames.packs,
                    [frames.values, frames.saturated, saturation_masks(frames, used), wp.array(rows, dtype=wp.int32, device=frames.device),
                     white if references else 0, black if references else 0, noise.read**2, noise.gain, float(stripe_px), float(extent),
-                    int(base_bit), (1 << len(bits)) - (2 << base_bit), min(MAX_OPEN, {"binary": 0, "gray": len(bits) - 1, "xor": base_bit}[code])],
+                    int(base_bit), (1 << len(bits)) - (2 << base_bit),
+                    min(MAX_OPEN, {"binary": 0, "gray": len(bits) - 1, "xor": base_bit}[code])],
                    [as_packs(array, frames.device) for array in result], device=frames.device)
     return result
 
@@ -154,15 +155,15 @@ def proven_gray(d: float, stray: float, finest: float, contrast: float, limit: f
 
 @wp.func
 def proven_binary(d: float, stray: float, finest: float, contrast: float, limit: float) -> bool:
-    """Return the same for plain binary code, where at a carry all bits that change are as faint as the finest, whose difference is given."""
+    """Return the same for plain binary code: at a carry all bits that change are as faint as the finest, whose difference is given."""
     off = d - finest
-    return d >= stray or off * off < 4.0 * wp.max(limit, 0.01 * contrast * contrast)
+    return d >= stray or stray < MUCH_STRAY * contrast or off * off < 4.0 * wp.max(limit, 0.01 * contrast * contrast)
 
 
 @wp.func
 def proven_xor(d: float, stray: float, finest: float, contrast: float, limit: float) -> bool:
-    """Return the same for XOR code: its stripes are all narrow and other light hardly follows them, unless nearly all light is other light."""
-    return stray < XOR_STRAY * contrast
+    """Return the same for XOR code: other light hardly follows its stripes, which are all narrow, unless nearly all is other light."""
+    return stray < MUCH_STRAY * contrast
 
 
 _NUMBERS = {"binary": (number_binary, proven_binary), "gray": (number_gray, proven_gray), "xor": (number_xor, proven_xor)}

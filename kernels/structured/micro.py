@@ -24,7 +24,7 @@ from kernels.structured.decoded import Decoded, unwritten_decoded
 from kernels.structured.frames import NoiseModel, cut_in, require_frames, saturation_masks
 from kernels.structured.phase import decode_phase
 from kernels.structured.response import light_between, light_slope, light_table
-from kernels.structured.unwrap import EMPTY_CHI2, judge, keep_better
+from kernels.structured.unwrap import EMPTY_CHI2, judge, keep_better, keeps_place
 
 LEVEL_ERROR = 0.02
 """Error of a reading beyond noise, as a part of the amplitude: the camera's and projector's responses and unequal amplitudes cause it."""
@@ -40,7 +40,8 @@ _SATURATED, _MULTIPATH, _OUT_OF_RANGE = int(Status.SATURATED), int(Status.MULTIP
 
 
 def decode_micro(frames: Band, numbers: Sequence[int], periods_px: Sequence[float], shifts: Sequence[float], *,
-                 black: int | None = None, extent: float, response: Sequence[float] | None = None, noise: NoiseModel) -> Decoded:
+                 black: int | None = None, extent: float, response: Sequence[float] | None = None,
+                 wave_error_px: float = 0.0, noise: NoiseModel) -> Decoded:
     """Decode the coordinate from frames of several close periods that share offset and amplitude.
 
     Args:
@@ -51,10 +52,12 @@ def decode_micro(frames: Band, numbers: Sequence[int], periods_px: Sequence[floa
         black: frame of the ambient light, or None.
         extent: projector pixels along the axis.
         response: the projector's light at even levels from 0 to 1, rising; None: linear.
+        wave_error_px: error of the place beyond noise, added to its deviation.
         noise: of a reading.
 
     Returns:
-        The coordinate on the device; not synchronised on CUDA. UNDECIDED: another wrap fits about as well. MULTIPATH: none fits.
+        The coordinate on the device; not synchronised on CUDA. UNDECIDED: another wrap fits about as well. MULTIPATH: none fits;
+        both keep what fits best.
         Else as decode_phase.
 
     Raises:
@@ -89,7 +92,7 @@ def decode_micro(frames: Band, numbers: Sequence[int], periods_px: Sequence[floa
                     wp.array(np.array(numbers)[order], dtype=wp.int32, device=device), wp.array(table, dtype=wp.vec2, device=device),
                     wp.array(light_table(response), dtype=wp.float32, device=device),
                     wp.array(np.stack([np.cos(turns), np.sin(turns)], axis=-1), dtype=wp.vec2, device=device),
-                    float(reference), float(member.sum()), float(extent), noise.read**2, noise.gain],
+                    float(reference), float(member.sum()), float(extent), wave_error_px**2, noise.read**2, noise.gain],
                    [as_packs(array, device) for array in (scratch, *result)], device=device)
     return result
 
@@ -153,6 +156,7 @@ def _micro_kernel(pack: int, bent: bool = False) -> Any:
                      period: float,
                      shifts: float,  # frames of the reference
                      extent: float,
+                     wave_variance: float,
                      read_variance: float,
                      gain: float,
                      # outputs
@@ -244,9 +248,9 @@ def _micro_kernel(pack: int, bent: bool = False) -> Any:
                 code = judge(best[k], second[k])
                 if code != _OUT_OF_RANGE and not information[k] > 0.0:  # NaN too
                     code = _MULTIPATH
-            if code == OK:
+            if keeps_place(code) and information[k] > 0.0 and place[k] >= -BORDER_PX and place[k] <= extent + BORDER_PX:
                 u_out[k] = place[k]
-                error[k] = 1.0 / wp.sqrt(information[k])
+                error[k] = wp.sqrt(1.0 / information[k] + wave_variance)
                 height[k] = swing[k]
             result[k] = wp.uint8(code)
         coordinate[p] = u_out

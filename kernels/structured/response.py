@@ -1,8 +1,8 @@
 """Waves that a projector bends: what its response makes of a cosine, and the phase that a fit of sinusoids then reads, put right.
 
 A projector shows g((1 + cos θ)/2) in place of (1 + cos θ)/2. The fitted sums C + iS of the readings are then a fixed curve F(φ) of the true
-phase φ, whatever the surface reflects and whatever other light there is, because the weights of the fit add up to zero. So the angle of F is
-a function of φ alone; it is tabulated and inverted, and the deviation of the phase grows by the slope of the inverse.
+phase φ, whatever the surface reflects and whatever other light there is, because the weights of the fit add up to zero. So the angle of F
+is a function of φ alone; it is tabulated and inverted, and the deviation of the phase grows by the slope of the inverse.
 
 Source: Zhang and Huang, "Phase error compensation for a 3-D shape measurement system based on the phase-shifting method", Optical
 Engineering 2007 (table of the error over the phase); here it follows from the measured response.
@@ -118,8 +118,8 @@ def phase_table(wave: np.ndarray, weights: np.ndarray, shifts: np.ndarray, perio
     true = 2 * np.pi * np.arange(GRID) / GRID
     slope = np.gradient(np.concatenate([fitted[-1:] - 2 * np.pi, fitted, fitted[:1] + 2 * np.pi]), 2 * np.pi / GRID)[1:-1]
     if slope.min() < MIN_SLOPE:
-        raise ArrayError(f"the projector's response bends the wave of {period_px:g} px so far that {len(shifts)} shifts show two places of a "
-                         "period alike: project four shifts or more, or patterns that are linear in light (relit patterns --gamma)")
+        raise ArrayError(f"the projector's response bends the wave of {period_px:g} px so far that {len(shifts)} shifts show two places of "
+                         "a period alike: project four shifts or more, or patterns that are linear in light (relit patterns --gamma)")
     wanted = fitted[0] + 2 * np.pi * np.arange(BINS + 1) / BINS
     at = np.interp(wanted, np.append(fitted, fitted[0] + 2 * np.pi), np.append(true, 2 * np.pi))
     place = at / (2 * np.pi) * GRID

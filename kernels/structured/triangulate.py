@@ -33,6 +33,7 @@ MIN_SIGMA_PX = 1.0e-3
 """Least standard deviation of a coordinate, projector pixels, so that a given one of zero does not take all the weight."""
 
 _OUT_OF_RANGE, _ILL_POSED, _AMBIGUOUS = int(Status.OUT_OF_RANGE), int(Status.ILL_POSED), int(Status.AMBIGUOUS)
+_UNDECIDED, _MULTIPATH = int(Status.UNDECIDED), int(Status.MULTIPATH)
 
 
 class ProjectorModel(NamedTuple):
@@ -47,7 +48,10 @@ class ProjectorModel(NamedTuple):
 
 
 class Triangulation(NamedTuple):
-    """Depth of a band; the last axis is pixels, padded to whole packs. Only pixels with a status of SOLVED have values."""
+    """Depth of a band; the last axis is pixels, padded to whole packs.
+
+    Pixels with a status of SOLVED have values, and those UNDECIDED or MULTIPATH whose most likely coordinate gives a point.
+    """
 
     depth: wp.array  # [pixels] float32, metres along -z of the camera
     sigma: wp.array  # [pixels] float32, metres: standard deviation that follows from that of the coordinates
@@ -162,6 +166,14 @@ def weight_of(code: int, sigma: float) -> float:
     return wp.where(code == OK, 1.0, wp.where(code == _AMBIGUOUS, 1.0, 0.0)) / (floor * floor)
 
 
+@wp.func
+def unsure_weight(code: int, sigma: float) -> float:
+    """Return 1 / variance of a coordinate that its decoder keeps without being sure of it, else 0."""
+    floor = wp.max(sigma, MIN_SIGMA_PX)
+    kept = wp.where(code == _UNDECIDED, 1.0, wp.where(code == _MULTIPATH, 1.0, 0.0))
+    return wp.where(sigma > 0.0, kept, 0.0) / (floor * floor)
+
+
 def triangulate(x: np.ndarray, y: np.ndarray, columns: Decoded | None, rows: Decoded | None, projector: ProjectorModel, *,
                 near_m: float, far_m: float, max_residual_px: float, device: str) -> Triangulation:
     """Return the depth of a band from one or both projector coordinates.
@@ -265,6 +277,9 @@ def _kernel(pack: int, with_u: bool, with_v: bool) -> Any:
         for k in range(pack):
             code_u, code_v = int(cu[k]), int(cv[k])
             weight_u, weight_v = weight_of(code_u, su[k]), weight_of(code_v, sv[k])
+            doubtful = weight_u == 0.0 and weight_v == 0.0
+            if doubtful:
+                weight_u, weight_v = unsure_weight(code_u, su[k]), unsure_weight(code_v, sv[k])
             if weight_u > 0.0 or weight_v > 0.0:
                 a = projection.turn * wp.vec3(px[k], py[k], -1.0)
                 found = locate(projection, a, pu[k], pv[k], weight_u, weight_v, near, far, limit)
@@ -274,6 +289,8 @@ def _kernel(pack: int, with_u: bool, with_v: bool) -> Any:
                 code = found.status
                 if code == OK and ((weight_u > 0.0 and code_u != OK) or (weight_v > 0.0 and code_v != OK)):
                     code = _AMBIGUOUS
+                if doubtful:
+                    code = wp.where(code_u > 0, code_u, code_v)
                 codes[k] = wp.uint8(code)
             else:
                 codes[k] = wp.uint8(wp.where(code_u > 0, code_u, code_v))

@@ -77,8 +77,8 @@ def unwrap_jointly(wrapped: WrappedPhase, *, extent: float) -> Decoded:
 
     Returns:
         The coordinate on the device; amplitude is the mean over the periods; not synchronised on CUDA. UNDECIDED: another wrap
-        within the projector fits about as well. MULTIPATH: none fits. OUT_OF_RANGE: what fits lies outside. Else the first period
-        that has no phase says why.
+        within the projector fits about as well. MULTIPATH: none fits. Both keep the coordinate that fits best, and its deviation
+        in that wrap. OUT_OF_RANGE: what fits lies outside. Else the first period that has no phase says why.
 
     Raises:
         ArrayError: the periods repeat within less than MIN_COVER of the projector.
@@ -109,8 +109,8 @@ def unwrap_by_code(wrapped: WrappedPhase, coarse: Decoded, *, stripe_px: float, 
         extent: projector pixels along the axis.
 
     Returns:
-        The coordinate on the device; not synchronised on CUDA. UNDECIDED: two wraps are about as near. OUT_OF_RANGE: outside.
-        Else the status of the code, or of the first period that has no phase.
+        The coordinate on the device; not synchronised on CUDA. UNDECIDED: two wraps are about as near; the nearest is kept.
+        OUT_OF_RANGE: outside. Else the status of the code, or of the first period that has no phase.
 
     Raises:
         ArrayError: stripes too wide to number the periods, or other pixels.
@@ -160,6 +160,12 @@ def judge(best: float, second: float) -> int:
     elif second < UNDECIDED_CHI2 + UNDECIDED_RATIO * best:
         code = _UNDECIDED
     return code
+
+
+@wp.func
+def keeps_place(code: int) -> bool:
+    """Return whether a pixel that has been judged keeps its coordinate."""
+    return code == OK or (code - _UNDECIDED) * (code - _MULTIPATH) == 0
 
 
 @cache
@@ -239,7 +245,7 @@ def _joint_kernel(pack: int) -> Any:
         for k in range(pack):
             if code[k] == OK:
                 code[k] = judge(best[k], second[k])
-            if code[k] == OK:
+            if keeps_place(code[k]):
                 u_out[k] = place[k] - slope_sum[k] / information[k]
                 error[k] = 1.0 / wp.sqrt(information[k])
             else:
@@ -277,9 +283,10 @@ def _numbered_kernel(pack: int) -> Any:
         periods = frequency.shape[0]
         near = coarse[p]
         given = coarse_state[p]
-        code, mean, away, total, information = int_pack(), float_pack(), float_pack(), float_pack(), float_pack()
+        code, whole, mean, away, total, information = int_pack(), int_pack(), float_pack(), float_pack(), float_pack(), float_pack()
         for k in range(pack):
             code[k] = int(given[k])
+            whole[k] = wp.where(near[k] > 0.0, 1, 0)
         for q in range(periods):
             angle = phase[q, p]
             spread = deviation[q, p]
@@ -288,6 +295,7 @@ def _numbered_kernel(pack: int) -> Any:
             f = frequency[q]
             for k in range(pack):
                 add_period(int(flags[k]), height[k], periods, code[k], mean[k])
+                whole[k] = whole[k] * wp.where(int(flags[k]) == OK, 1, 0)
                 t = angle[k] * turn - near[k] * f
                 rest = t - wp.floor(t + 0.5)
                 trust = f * f / (turn * turn * spread[k] * spread[k] + 1.0e-20)
@@ -303,8 +311,8 @@ def _numbered_kernel(pack: int) -> Any:
                     code[k] = _UNDECIDED
                 elif wp.abs(u - 0.5 * extent) > 0.5 * extent + BORDER_SIGMAS * deviation_u:
                     code[k] = _OUT_OF_RANGE
-            if code[k] == OK:
-                u_out[k] = u
+            if whole[k] == 1 and keeps_place(code[k]):
+                u_out[k] = wp.clamp(u, 0.0, extent)
                 error[k] = deviation_u
             else:
                 mean[k] = 0.0

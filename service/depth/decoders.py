@@ -19,9 +19,9 @@ from kernels.structured.join import join_periods
 from kernels.structured.kary import decode_kary
 from kernels.structured.micro import decode_micro
 from kernels.structured.modulated import decode_modulated
-from kernels.structured.phase import WrappedPhase, decode_phase
+from kernels.structured.phase import WrappedPhase, decode_phase, weights
 from kernels.structured.ramp import decode_ramp
-from kernels.structured.response import light_of
+from kernels.structured.response import light_of, wave_error
 from kernels.structured.unwrap import unwrap_by_code, unwrap_jointly
 from stage.model import Resolution, Rgb
 from stage.patterns.base import Axis
@@ -29,7 +29,7 @@ from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Code, Collected
 from stage.patterns.kary import KaryCode
 from stage.patterns.modulated import ModulatedCode
-from stage.patterns.phase import PhaseCode
+from stage.patterns.phase import FULL_STEPS, PhaseCode
 from stage.patterns.ramp import RampCode
 
 
@@ -39,6 +39,15 @@ class PatternProjector(NamedTuple):
     resolution: Resolution
     response: tuple[float, ...] | None = None
     crosstalk: tuple[Rgb, Rgb, Rgb] | None = None
+    exponent: float = 1.0
+    """The exponent γ of light = level^γ that the waves show though no response is given: their error is added to the deviation."""
+
+    def wave_error(self, shifts: Sequence[float], period_px: float) -> float:
+        """Return the RMS error in radians of a phase that is fitted to waves of the exponent as if they were linear."""
+        if self.response is not None or self.exponent == 1.0:
+            return 0.0
+        own = np.array(shifts)
+        return wave_error(np.linspace(0, 1, 256)**self.exponent, weights(own, period_px), own)
 
 
 class Readings(NamedTuple):
@@ -119,9 +128,12 @@ def micro_decoder(axis: AxisCodes) -> AxisDecoder | None:
     if phase is None or not phase.micro:
         return None
 
+    period = next(period for period in phase.periods_px if phase.periods_px.count(period) >= FULL_STEPS)
+    error = axis.projector.wave_error([s for s, p in zip(phase.shifts, phase.periods_px, strict=True) if p == period], period)
+
     def decode(readings: Readings, noise: NoiseModel) -> Decoded:
         return decode_micro(readings.grey, phase.frames, phase.periods_px, phase.shifts, black=axis.black, extent=axis.extent,
-                            response=axis.projector.response, noise=noise)
+                            response=axis.projector.response, wave_error_px=error * period / (2 * np.pi), noise=noise)
 
     return AxisDecoder(axis.axis, "micro phase", False, decode, (phase,))
 
@@ -131,10 +143,12 @@ def phase_decoder(axis: AxisCodes) -> AxisDecoder | None:
     phase = axis.phase
     if phase is None:
         return None
+    errors = [axis.projector.wave_error([s for s, p in zip(phase.shifts, phase.periods_px, strict=True) if p == period], period)
+              for period in dict.fromkeys(phase.periods_px)]
 
     def wrapped(readings: Readings, noise: NoiseModel) -> WrappedPhase:
         return decode_phase(readings.grey, phase.frames, phase.periods_px, phase.shifts, black=axis.black,
-                            response=axis.projector.response, noise=noise)
+                            response=axis.projector.response, wave_errors=errors, noise=noise)
 
     return _unwrapped("phase", axis, [phase], phase.periods_px, wrapped)
 

@@ -158,7 +158,8 @@ def _check_plausible(solution: DepthSolution, capture: Capture, using: Ranging) 
         reasons = {name: count for name, count in solution.counts(np.ones_like(estimated)).items() if count and name != "unsolved"}
         text = ", ".join(f"{count} {name}" for name, count in reasons.items()) or "nothing is inside the mask"
         if not estimated.any():
-            raise ManifestError(f"{capture.folder}: no pixel has a depth ({text}): {_advice(reasons, using)}")
+            raise ManifestError(f"{capture.folder}: no pixel has a depth ({text}): "
+                                f"{'; '.join(solution.warnings) or _advice(reasons, using)}")
         solution.warnings.append(f"no depth is sure enough to count as solved ({text}): depth.exr keeps the values outside the mask; "
                                  "--least-confidence 0 counts unsure ones as solved")
     middle, field = float(np.median(solution.depth[estimated])), KINDS[using].lengths

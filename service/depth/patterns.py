@@ -2,17 +2,19 @@
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from kernels.status import SOLVED, Status
+from kernels.status import ESTIMATED, SOLVED, Status
 from kernels.structured.decoded import Decoded
 from kernels.structured.frames import NoiseModel, saturated_bits, upload
 from kernels.structured.join import cropped
 from kernels.structured.triangulate import ProjectorModel, triangulate
+from service.depth.agreement import conclude, doubt_pixels
 from service.depth.codes import choose_decoder
 from service.depth.decoders import AxisDecoder, PatternProjector, Readings
+from service.depth.pattern_checks import check_declaration, find_exponent, response_sentence, sample_of
 from service.depth.solution import DepthSolution
 from service.reporting.progress import Timings
 from service.requests.depth import DepthRequest
@@ -66,18 +68,37 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
     """
     projector = check_projector(capture)
     frames = [frame for frame in capture.manifest.frames if frame.pattern is not None]
-    codes = read_codes(capture, frames, PatternProjector(projector.resolution, projector.response, projector.crosstalk),
-                       refine=request.refine)
+    shown = PatternProjector(projector.resolution, projector.response, projector.crosstalk)
+    codes = read_codes(capture, frames, shown, refine=request.refine)
     timings.stage("frames", len(frames))
     with frame_planes(capture, frames, colour=codes.colour, cache=request.cache, progress=timings.advance) as planes:
         full = full_scale(planes, capture, frames)
         noise = NoiseModel(request.read_noise * full, request.photon_gain * full)
-        solution = _bands(planes, mask, codes, projector, capture, noise, device, request, timings)
+        warnings, codes = _checked(planes, mask, codes, shown, projector, capture, frames, noise, device, request)
+        solution, right = _bands(planes, mask, codes, projector, capture, noise, device, request, timings)
+    conclude(solution, right, mask, request, warnings)
     solution.colour = scene_colour(capture, frames, codes.collected)
     solution.facts |= {"full_scale": float(f"{full:.6g}"), "frames": len(frames),
                        "codes": {decoder.axis: decoder.name for decoder in (codes.columns, codes.rows) if decoder is not None},
                        "unused": list(codes.unused)}
     return solution
+
+
+def _checked(planes: Planes, mask: np.ndarray, codes: PatternCodes, shown: PatternProjector, projector: Projector, capture: Capture,
+             frames: list[Frame], noise: NoiseModel, device: str, request: DepthRequest) -> tuple[list[str], PatternCodes]:
+    """Return what a sample of the frames says about all of them, and the decoders that heed it."""
+    sample = sample_of(planes, capture.camera, mask)
+    patterns = [frame.pattern for frame in frames if frame.pattern is not None]
+    wrong = check_declaration(sample, patterns, shown, projector_model(projector), noise, device)
+    if wrong is not None:
+        return [wrong], codes
+    if projector.response is None:
+        exponent = find_exponent(sample, codes.collected, shown, noise, device)
+        if exponent != 1.0:
+            names = [f"{decoder.axis}s" for decoder in (codes.columns, codes.rows) if decoder is not None]
+            return ([response_sentence(exponent, names)],
+                    read_codes(capture, frames, shown._replace(exponent=exponent), refine=request.refine))
+    return [], codes
 
 
 def read_codes(capture: Capture, frames: list[Frame], projector: PatternProjector, *, refine: bool = False) -> PatternCodes:
@@ -97,7 +118,8 @@ def read_codes(capture: Capture, frames: list[Frame], projector: PatternProjecto
 
 
 def _bands(planes: Planes, mask: np.ndarray, codes: PatternCodes, projector: Projector, capture: Capture, noise: NoiseModel, device: str,
-           request: DepthRequest, timings: Timings) -> DepthSolution:
+           request: DepthRequest, timings: Timings) -> tuple[DepthSolution, np.ndarray]:
+    """Return the depth of each pixel and its probability to be right."""
     shape = mask.shape
     columns, rows = codes.columns, codes.rows
     model = projector_model(projector)
@@ -119,12 +141,13 @@ def _bands(planes: Planes, mask: np.ndarray, codes: PatternCodes, projector: Pro
         code = found.status.numpy()[:part.size].reshape(part.shape)
         status[band] = np.where(part, code, int(Status.UNSOLVED))
         solved = np.isin(status[band], SOLVED)
+        kept = solved | (np.isin(status[band], ESTIMATED) & (found.depth.numpy()[:part.size].reshape(part.shape) > 0))
         for name in ("depth", "sigma", "residual"):
-            place(name, getattr(found, name).numpy(), solved)
+            place(name, getattr(found, name).numpy(), kept)
         place("amplitude", _amplitude(decoded), part)
         for name, axis in zip("uv", decoded, strict=True):
             if axis is not None:
-                place(name, axis.coordinate.numpy(), solved)
+                place(name, axis.coordinate.numpy(), kept)
                 sure = np.isin(axis.status.numpy()[:part.size].reshape(part.shape), SOLVED)
                 guessed[name][band] = solved & ~sure
         timings.advance(band.stop)
@@ -133,14 +156,17 @@ def _bands(planes: Planes, mask: np.ndarray, codes: PatternCodes, projector: Pro
             points = capture.camera.points(-maps["depth"])[missing]
             maps[name][missing] = projector.project(points)[0][:, index]
     solved = np.isin(status, SOLVED)
-    facts = {}
-    if columns is not None and rows is not None and solved.any():
+    facts: dict[str, Any] = {}
+    both = columns is not None and rows is not None
+    if both and solved.any():
         low, high = np.percentile(maps["residual"][solved], [50, 95])
         facts["residual_px"] = {"median": float(f"{low:.4g}"), "p95": float(f"{high:.4g}")}
     names = sorted({decoder.name for decoder in (columns, rows) if decoder is not None})
-    return DepthSolution(method=", ".join(names), depth=maps["depth"], status=status, sigma=maps["sigma"],
-                         projector_u=maps["u"] if columns is not None else None, projector_v=maps["v"] if rows is not None else None,
-                         amplitude=maps["amplitude"], facts=facts)
+    solution = DepthSolution(method=", ".join(names), depth=maps["depth"], status=status, sigma=maps["sigma"],
+                             projector_u=maps["u"] if columns is not None else None, projector_v=maps["v"] if rows is not None else None,
+                             amplitude=maps["amplitude"], facts=facts)
+    right = doubt_pixels(solution, maps["residual"] if both else None, capture.camera, projector, device)
+    return solution, right
 
 
 def decoded_bands(planes: Planes, decoders: Sequence[AxisDecoder | None], noise: NoiseModel,

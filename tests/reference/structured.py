@@ -44,7 +44,7 @@ def stripes(direct, inverse, white, black, read, gain, code="gray", base_bit=0, 
     else:
         unproven = ~(size >= stray)
         if code == "binary":
-            unproven = unproven & ~((size - size[0])**2 < 4 * np.maximum(factor**2 * limit, 0.01 * contrast**2))
+            unproven = unproven & ~(stray < 0.5 * contrast) & ~((size - size[0])**2 < 4 * np.maximum(factor**2 * limit, 0.01 * contrast**2))
     doubtful = doubtful | unproven
     free = min(free, {"binary": 0, "gray": n - 1, "xor": base_bit}[code])
     loose = np.minimum(np.maximum(doubt * np.sqrt(variance), stray) / np.maximum(contrast, 1e-20), 1)

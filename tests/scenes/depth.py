@@ -24,10 +24,11 @@ class Scene(NamedTuple):
     points: np.ndarray  # [rows, cols, 3] float64
     uv: np.ndarray  # [rows, cols, 2] float64 projector coordinates
     albedo: np.ndarray  # [rows, cols, 3]
+    shaded: np.ndarray  # [rows, cols] bool: the sphere keeps the projector's light off it
 
 
 def make_scene(*, sphere: bool = True, camera: reference.Device = CAMERA, pose: np.ndarray = POSE) -> Scene:
-    """The scene; without the sphere the plane alone. Nothing shades anything: what lies in the projector's shadow is lit too."""
+    """The scene; without the sphere the plane alone."""
     rays = reference.pixel_rays(camera)
     depth = reference.plane_depth(rays, PLANE, NORMAL)
     if sphere:
@@ -35,7 +36,11 @@ def make_scene(*, sphere: bool = True, camera: reference.Device = CAMERA, pose: 
     points = rays * depth[..., None]
     u = np.arange(camera.width) / camera.width
     albedo = np.stack([0.5 + 0.3 * u, np.full_like(u, 0.5), 0.8 - 0.3 * u], axis=-1) * np.ones((camera.height, 1, 1))
-    return Scene(depth, points, reference.seen_by(PROJECTOR, pose, points), albedo)
+    to = pose[:3, 3] - points
+    clear = np.isnan(reference.sphere_depth(-to, np.array(CENTRE) - pose[:3, 3], RADIUS * 0.999)) if sphere else np.ones(depth.shape, bool)
+    on_sphere = np.linalg.norm(points - CENTRE, axis=-1) < RADIUS * 1.001
+    facing = (to * (points - CENTRE)).sum(axis=-1) > 0
+    return Scene(depth, points, reference.seen_by(PROJECTOR, pose, points), albedo, np.where(on_sphere & sphere, ~facing, ~clear))
 
 
 def entry_of(device: reference.Device) -> dict[str, Any]:
@@ -108,6 +113,7 @@ def write_patterns(folder: Path, scene: Scene, patterns: list[dict[str, Any]], *
     frames = []
     for number, pattern in enumerate(patterns):
         light = shown(pattern, scene.uv) ** gamma
+        light = light * ~(scene.shaded if light.ndim == 2 else scene.shaded[..., None])
         image = scene.albedo * (level * (light if light.ndim == 3 else light[..., None]) + AMBIENT)
         image = np.clip(image + rng.normal(0, noise, image.shape[:2])[..., None], 0, 1) if noise else image
         name = f"{number:02d}.{suffix}"

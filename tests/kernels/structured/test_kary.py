@@ -73,7 +73,7 @@ def test_reflected_ternary_stays_within_one_column(device):
 
 @pytest.mark.parametrize("options", [{}, {"reflected": False}, {"reflected": False, "colors": palette(3)}])
 def test_edges_are_right(options, device):
-    """A pixel half on either side mixes two levels in one digit of a reflected code, and in every digit that a carry turns in a plain one."""
+    """A pixel half on either side mixes two levels in one digit of a reflected code, and in all that a carry turns in a plain one."""
     u = np.arange(1, 700, dtype=float)
     patterns = kary_patterns(WIDTH, "column", base=3, **options)
     coordinate, _, _, status = decode(view(patterns, u, WIDTH, blur=1.0, noise=NOISE), patterns, device)

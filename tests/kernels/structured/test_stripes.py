@@ -64,7 +64,8 @@ def test_values_are_those_of_the_twin_on_noisy_mixtures(code, options, device):
     stripe = found.codes[0]
     pick = [None if n is None else stack[n].astype(float) for n in (found.white, found.black)]
     inverse = None if stripe.inverses is None else stack[list(stripe.inverses)].astype(float)
-    least, most, width, expected = reference.stripes(stack[list(stripe.frames)].astype(float), inverse, *pick, noise.read, noise.gain, code=code)
+    least, most, width, expected = reference.stripes(
+        stack[list(stripe.frames)].astype(float), inverse, *pick, noise.read, noise.gain, code=code)
     expected[(expected == "OK") & (least >= WIDTH)] = "OUT_OF_RANGE"
     names = np.array([Status(s).name for s in status])
     assert (names != expected).mean() < 0.005  # float32 at a threshold

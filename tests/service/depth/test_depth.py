@@ -23,7 +23,7 @@ from tests.scenes.depth import (
 )
 
 SCENE = make_scene()
-LIT = (SCENE.uv > 0).all(axis=-1) & (SCENE.uv < (PROJECTOR.width, PROJECTOR.height)).all(axis=-1)
+LIT = (SCENE.uv > 0).all(axis=-1) & (SCENE.uv < (PROJECTOR.width, PROJECTOR.height)).all(axis=-1) & ~SCENE.shaded
 COLUMN_PX = 0.065
 """Metres of depth that a projector column is worth here, at most."""
 

@@ -1,0 +1,102 @@
+"""Depth under projected patterns: every code on a textured scene, and what its model leaves out: gamma, fog, mirrors, wrong manifests."""
+
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.projected_scenes import Ball, Light, Wall, World, trace, write_capture
+from benchmarks.trials.trial import Trial
+from service.depth.depth import depth
+from service.requests.depth import DepthRequest
+from stage.errors import StageError
+from stage.patterns.binary import binary_patterns, xor_patterns
+from stage.patterns.codes import Pattern
+from stage.patterns.kary import kary_patterns
+from stage.patterns.modulated import modulated_patterns
+from stage.patterns.phase import micro_patterns, phase_patterns
+from stage.patterns.ramp import ramp_patterns
+
+WIDTH, HEIGHT = 320, 240
+SHELF = (Wall((0, 0, -1.5), (-0.25, 0.1, 1), 0.75, texture=0.5), Ball((-0.15, 0.05, -1.15), 0.12, 0.8, texture=0.3),
+         Ball((0.2, -0.12, -1.3), 0.15, 0.5), Wall((0.12, 0.14, -1.2), (0.2, -0.3, 1), 0.6, half_m=(0.09, 0.07)))
+MIRRORS = (Wall((0, 0, -1.5), (-0.1, 0.1, 1), 0.7, texture=0.3), Wall((0, -0.3, 0), (0, 1, 0), 0.5, texture=0.2),
+           Ball((-0.06, -0.1, -1.2), 0.15, mirror=True))
+GRAY = binary_patterns(WIDTH, "column")
+PHASE_GRAY = (*phase_patterns("column", (16,), 4), *binary_patterns(WIDTH, "column", stripe_px=8))
+CODES: dict[str, Sequence[Pattern]] = {
+    "Gray, inverses": GRAY,
+    "Gray, white and black": binary_patterns(WIDTH, "column", inverses=False),
+    "Gray, both axes": (*binary_patterns(WIDTH, "column"), *binary_patterns(HEIGHT, "row", references=False)),
+    "binary": binary_patterns(WIDTH, "column", code="binary"),
+    "XOR": xor_patterns(WIDTH, "column"),
+    "k-ary, reflected": kary_patterns(WIDTH, "column", base=3),
+    "k-ary, plain": kary_patterns(WIDTH, "column", base=3, reflected=False),
+    "ramps": ramp_patterns("column"),
+    "phase 16/18/21, 3 steps": phase_patterns("column", (16, 18, 21), 3),
+    "phase 16/18/21, 4 steps": phase_patterns("column", (16, 18, 21), 4),
+    "phase 16, 4 steps, Gray": PHASE_GRAY,
+    "micro": micro_patterns(WIDTH, "column"),
+    "modulated": modulated_patterns("column", 1.1 * WIDTH),
+}
+BENT = {"phase 16/18/21, 3 steps": CODES["phase 16/18/21, 3 steps"],
+        "phase 16, 3 steps, Gray": (*phase_patterns("column", (16,), 3), *binary_patterns(WIDTH, "column", stripe_px=8)),
+        "k-ary, reflected": CODES["k-ary, reflected"]}
+GAMMA = 2.2
+NOISES = {"": (0.003, 10000.0), ", weak light": (0.006, 2500.0)}
+"""Read noise as a part of full scale, and electrons at full scale."""
+
+
+def trials(data: Path | None) -> Iterator[Trial]:
+    """Yield a trial for every code, and for every scene that is out of their model."""
+    light = trace(World(shapes=SHELF))
+    for words, (read, electrons) in NOISES.items():
+        world = World(shapes=SHELF, read_noise=read, electrons=electrons)
+        for name in CODES if not words else ("Gray, inverses", "k-ary, plain", "phase 16/18/21, 4 steps", "phase 16, 4 steps, Gray"):
+            yield _run(f"{name}{words}", True, world, CODES[name], light)
+    response = (np.linspace(0, 1, 256)**GAMMA).tolist()
+    for name, patterns in BENT.items():
+        bent = World(shapes=SHELF, gamma=GAMMA)
+        yield _run(f"{name}, gamma {GAMMA} declared", True, bent, patterns, light, response=response)
+        if not name.startswith("k-ary"):
+            yield _run(f"{name}, gamma {GAMMA} not declared", False, bent, patterns, light)
+    for fog in (0.5, 1.5, 3.0):
+        yield _run(f"Gray in fog of {fog:g} / m", False, World(shapes=SHELF, fog=fog, light=0.5 + fog, samples=2), GRAY)
+    yield _run("phase 16, 4 steps, Gray, in fog of 3 / m", False, World(shapes=SHELF, fog=3.0, light=3.5, samples=2), PHASE_GRAY)
+    seen = trace(World(shapes=MIRRORS))
+    for name in ("Gray, inverses", "Gray, both axes", "phase 16, 4 steps, Gray"):
+        yield _run(f"{name}, before a mirror ball", False, World(shapes=MIRRORS), CODES[name], seen)
+    for words, change in _WRONG.items():
+        yield _run(f"Gray, {words}", False, World(shapes=SHELF), GRAY, light, declared=[change(pattern) for pattern in GRAY])
+
+
+def _changed(**fields: Callable[[Pattern], object]) -> Callable[[Pattern], Pattern]:
+    return lambda pattern: pattern.model_copy(update={name: value(pattern) for name, value in fields.items() if hasattr(pattern, name)})
+
+
+_WRONG: dict[str, Callable[[Pattern], Pattern]] = {
+    "inverses declared for patterns": _changed(inverse=lambda p: not getattr(p, "inverse", False)),
+    "columns declared as rows": _changed(axis=lambda p: "row"),
+    "bits declared backwards": _changed(bit=lambda p: getattr(p, "bits", 1) - 1 - getattr(p, "bit", 0)),
+}
+
+
+def _run(name: str, in_model: bool, world: World, patterns: Sequence[Pattern], light: Light | None = None,
+         declared: Sequence[Pattern] | None = None, **projector: object) -> Trial:
+    """Return what `relit depth` says of one capture; every pixel that the projector lights has a truth."""
+    with tempfile.TemporaryDirectory() as folder:
+        capture = Path(folder) / "capture"
+        light = write_capture(capture, world, patterns, light=light,
+                              declared=declared, **projector)
+        known = light.lit & np.isfinite(light.depth)
+        try:
+            found = depth(DepthRequest(capture=capture, out=Path(folder) / "out", read_noise=world.read_noise,
+                                       photon_gain=1 / world.electrons))
+        except StageError as error:
+            nothing = np.zeros(int(known.sum()))
+            return Trial(name, in_model, nothing, nothing, nothing, nothing > 0, "mm", str(error).split(": ", 1)[-1])
+    maps = found.maps
+    assert maps.sigma is not None and maps.confidence is not None
+    return Trial(name, in_model, 1e3 * np.abs(maps.depth - light.depth)[known], 1e3 * maps.sigma[known], maps.confidence[known],
+                 maps.mask[known], "mm", "; ".join(found.warnings))

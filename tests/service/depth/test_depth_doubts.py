@@ -1,0 +1,137 @@
+"""relit depth on patterns that are bent, scattered, mirrored or declared wrongly: a right depth, a low confidence, or a sentence."""
+
+import json
+
+import numpy as np
+import pytest
+
+from benchmarks.projected_scenes import Ball, Rig, Wall, World, trace, write_capture
+from kernels.status import Status
+from stage.depth_maps import DepthMaps
+from stage.patterns.base import uniform_patterns
+from stage.patterns.binary import binary_patterns
+from stage.patterns.kary import kary_patterns
+from stage.patterns.phase import micro_patterns, phase_patterns
+
+RIG = Rig(camera=(120, 90), camera_focal=156.0, projector=(192, 144), projector_focal=252.0)
+ROOM = World(shapes=(Wall((0, 0, -1.6), (0.2, 0.1, 1), texture=0.4), Ball((0.12, -0.05, -1.2), 0.16, 0.8)), rig=RIG)
+WIDTH = RIG.projector[0]
+GRAY = binary_patterns(WIDTH, "column")
+GAMMA = (np.linspace(0, 1, 256) ** 2.2).tolist()
+
+
+@pytest.fixture(scope="module")
+def light():
+    """The light of the room, which every capture of it shares."""
+    return trace(ROOM)
+
+
+def solve(relit, folder, *arguments):
+    outcome = relit("depth", folder, "--out", folder / "out", "--device", "cpu", *arguments)
+    assert outcome.code in (0, 1), outcome.err  # 1: nothing is sure
+    return DepthMaps.read(folder / "out" / "depth.exr", unsure=True), json.loads((folder / "out" / "report.json").read_text()), outcome.out
+
+
+def bent(light, **changes):
+    """The room under a projector of gamma 2.2."""
+    return World(shapes=ROOM.shapes, rig=RIG, gamma=2.2, **changes)
+
+
+PHASES = {"three periods": phase_patterns("column", (16, 18, 21), 3),
+          "one and Gray": (*phase_patterns("column", (16,), 3), *binary_patterns(WIDTH, "column", stripe_px=8)),
+          "micro": micro_patterns(WIDTH, "column")}
+
+
+@pytest.mark.parametrize("name", PHASES)
+def test_the_response_is_taken_off_waves(relit, tmp_path, light, name):
+    write_capture(tmp_path, bent(light), PHASES[name], light=light, response=GAMMA)
+    maps, report, _ = solve(relit, tmp_path)
+    error = np.abs(maps.depth - light.depth)[maps.mask]
+    assert report["warnings"] == []
+    assert maps.mask[light.lit].mean() > 0.6
+    assert 0.5 < np.median(error / maps.sigma[maps.mask]) < 1.4 and (error > 5 * maps.sigma[maps.mask]).mean() < 0.01
+
+
+@pytest.mark.parametrize("name", PHASES)
+def test_bent_waves_are_found(relit, tmp_path, light, name):
+    """Without the response σ holds the error, and a sentence says what to measure; a linear projector gives no sentence."""
+    write_capture(tmp_path / "bent", bent(light), PHASES[name], light=light)
+    maps, report, out = solve(relit, tmp_path / "bent", "--least-confidence", "0")
+    error = np.abs(maps.depth - light.depth)[maps.mask]
+    assert "relit calibrate response" in report["warnings"][0] and "level^2.2" in report["warnings"][0] and "projector.response" in out
+    assert (error > 5 * maps.sigma[maps.mask]).mean() < 0.03
+    write_capture(tmp_path / "linear", ROOM, PHASES[name], light=light)
+    assert solve(relit, tmp_path / "linear")[1]["warnings"] == []
+
+
+def test_the_response_is_taken_off_digits(relit, tmp_path, light):
+    write_capture(tmp_path, bent(light), kary_patterns(WIDTH, "column", base=3, stripe_px=2), light=light, response=GAMMA)
+    maps, *_ = solve(relit, tmp_path)
+    assert maps.mask[light.lit].mean() > 0.7
+    assert (np.abs(maps.depth - light.depth)[maps.mask] > 5 * maps.sigma[maps.mask]).mean() < 0.01
+
+
+def test_fog_is_no_surface(relit, tmp_path):
+    """What shines through may be solved, and is right; the rest is kept beside it, and a sentence says why."""
+    light = write_capture(tmp_path, World(shapes=ROOM.shapes, rig=RIG, fog=0.8, light=1.5, samples=2), GRAY)
+    maps, report, _ = solve(relit, tmp_path)
+    assert (maps.mask & (np.abs(maps.depth - light.depth) > 5 * maps.sigma)).mean() < 0.002
+    scattered = maps.status == Status.MULTIPATH
+    assert scattered.mean() > 0.3 and (maps.depth[scattered] != 0).mean() > 0.5
+    assert "light comes by several ways" in report["warnings"][0]
+    assert maps.confidence[scattered].max() < 0.2
+
+
+def test_a_mirror_is_doubted(relit, tmp_path):
+    mirrors = World(samples=2, shapes=(Wall((0, 0, -1.6), (0.2, 0.1, 1), texture=0.3), Wall((0, -0.32, 0), (0, 1, 0), 0.5),
+                                       Ball((0.0, -0.1, -1.2), 0.16, mirror=True)))
+    patterns = (*phase_patterns("column", (16,), 4), *binary_patterns(320, "column", stripe_px=8))
+    light = write_capture(tmp_path, mirrors, patterns)
+    maps, *_ = solve(relit, tmp_path)
+    known = np.isfinite(light.depth)
+    wrong = known & (np.abs(maps.depth - light.depth) > 0.02 * light.depth) & np.isin(maps.status, [Status.OK, Status.UNSURE])
+    doubted = maps.status == Status.UNSURE
+    assert wrong.sum() > 300 and doubted[wrong].mean() > 0.4
+    assert maps.confidence[wrong & doubted].max() < 0.2
+    assert (doubted & ~wrong).mean() < 0.005
+
+
+def changed(**fields):
+    """Patterns whose fields are changed by functions of themselves."""
+    return [p.model_copy(update={name: change(p) for name, change in fields.items() if hasattr(p, name)}) for p in GRAY]
+
+
+@pytest.mark.parametrize(("declared", "words"), [
+    (changed(inverse=lambda p: not p.inverse), "patterns and inverses are exchanged"),
+    (changed(axis=lambda p: "row"), "columns and rows are exchanged"),
+    (changed(bit=lambda p: p.bits - 1 - p.bit), "the order of bits is reversed"),
+    (list(GRAY[::-1]), "the images are in reverse order"),
+])
+def test_a_wrong_declaration_is_named(relit, tmp_path, light, declared, words):
+    write_capture(tmp_path, ROOM, GRAY, light=light, declared=declared)
+    maps, *_ = solve(relit, tmp_path)
+    assert not maps.mask.any()
+    maps, report, _ = solve(relit, tmp_path, "--least-confidence", "0")
+    assert words in report["warnings"][0]
+    assert np.percentile(maps.confidence[maps.mask], 99) < 0.2
+
+
+def test_most_pixels_refused_is_said(relit, tmp_path, light):
+    """A projector of another focal length than declared: columns and rows contradict each other."""
+    patterns = (*binary_patterns(WIDTH, "column", references=False), *binary_patterns(RIG.projector[1], "row"))
+    write_capture(tmp_path, ROOM, patterns, light=light, focal_px=[2 * RIG.projector_focal] * 2)
+    maps, report, _ = solve(relit, tmp_path)
+    assert "lit pixels have a depth that can be trusted; most of the others are out of range" in report["warnings"][0]
+    assert maps.confidence[maps.mask].max() < 0.2
+
+
+@pytest.mark.parametrize("patterns", [GRAY, kary_patterns(WIDTH, "column", base=3, reflected=False),
+                                      (*binary_patterns(WIDTH, "column"), *binary_patterns(RIG.projector[1], "row", references=False)),
+                                      (*phase_patterns("column", (16, 18, 21), 4), *uniform_patterns())])
+def test_right_captures_raise_no_alarm(relit, tmp_path, light, patterns):
+    write_capture(tmp_path, ROOM, patterns, light=light)
+    maps, report, out = solve(relit, tmp_path)
+    assert report["warnings"] == [] and "warning" not in out
+    error = np.abs(maps.depth - light.depth)[maps.mask]
+    assert maps.mask[light.lit].mean() > 0.85 and (maps.status == Status.UNSURE).mean() < 0.02
+    assert 0.4 < np.median(error / maps.sigma[maps.mask]) < 1.4 and (error > 5 * maps.sigma[maps.mask]).mean() < 0.012
