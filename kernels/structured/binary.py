@@ -40,8 +40,7 @@ MAX_OPEN = 2
 """Number of the finest bits that may be in doubt without the pixel being refused: a camera that resolves stripes a quarter as fine as those
 that are shown sees no more."""
 MUCH_STRAY = 0.5
-"""Largest part of the contrast, minus twice the direct light, with which all bits of XOR and of plain binary codes count: a quarter is direct
-then."""
+"""Largest part of the contrast, minus twice the direct light, with which all bits of XOR and binary codes count: a quarter is direct."""
 LARGEST = 1.0e15
 """Contrast above which a reading counts as infinite, because contrast is squared in float32."""
 MAX_BITS = 24
