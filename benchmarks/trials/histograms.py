@@ -130,10 +130,7 @@ def solved(case: Case, seed: int = 30) -> Trial:
         light |= {"pulses": case.pulses, "first_photon_only": True}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        np.save(folder / "h.npy", counts.reshape(rows, cols, BINS).astype(np.float32))
-        camera = {"projection": "perspective", "resolution": [cols, rows], "focal_px": [95.0, 95.0]}
-        (folder / "capture.json").write_text(json.dumps({"schema": "relit.capture/1", "name": "room", "camera": camera,
-                                                         "frames": [{"image": "h.npy", "tof": light}]}))
+        _write(folder, counts.reshape(rows, cols, BINS), light)
         options: dict[str, Any] = {}
         if case.declared:
             times, power = pulse_of(case)
@@ -151,7 +148,37 @@ def solved(case: Case, seed: int = 30) -> Trial:
                  maps.confidence.ravel().astype(np.float64), maps.mask.ravel(), "mm", " ".join(result.warnings))
 
 
+def _write(folder: Path, counts: np.ndarray, light: dict[str, Any]) -> None:
+    """Write histograms [rows, cols, bins] as a capture."""
+    rows, cols = counts.shape[:2]
+    np.save(folder / "h.npy", counts.astype(np.float32))
+    camera = {"projection": "perspective", "resolution": [cols, rows], "focal_px": [95.0, 95.0]}
+    (folder / "capture.json").write_text(json.dumps({"schema": "relit.capture/1", "name": "room", "camera": camera,
+                                                     "frames": [{"image": "h.npy", "tof": light}]}))
+
+
+def real(path: Path) -> Trial:
+    """Solve the sums of nine zones at 159 distances of a plane, and compare distances after scale and offset, as a calibration has them."""
+    poses = json.loads(path.read_text())
+    truth = np.array([pose["dist_to_plane"] for pose in poses])
+    counts = np.array([pose["hists"] for pose in poses]).sum(axis=1)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        _write(folder, counts[None], {"type": "pulsed", "bin_s": REAL_BIN_S, "start_s": 0.0})
+        result = depth(DepthRequest(capture=folder, out=folder / "out", tof=TofOptions(vote=False), device="cpu"))
+    maps = result.maps
+    assert maps.range is not None and maps.sigma is not None and maps.confidence is not None
+    measured = maps.range.ravel().astype(np.float64)
+    scale, offset = np.polyfit(measured, truth, 1)
+    along = (maps.depth / np.maximum(maps.range, 1e-9)).ravel()
+    return Trial("pulsed, real plane, pulse not declared", False, 1000 * np.abs(scale * measured + offset - truth),
+                 1000 * maps.sigma.ravel() / along, maps.confidence.ravel().astype(np.float64), maps.mask.ravel(), "mm",
+                 " ".join(result.warnings))
+
+
 def trials(data: Path | None) -> Iterator[Trial]:
-    """Yield every case."""
+    """Yield every case, and the real plane where it is at hand."""
     for case in CASES:
         yield solved(case)
+    if data is not None and (data / REAL_FILE).is_file():
+        yield real(data / REAL_FILE)
