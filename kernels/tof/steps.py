@@ -2,6 +2,8 @@
 
 A step that is small against the wavelengths bends all phases alike, so that the frequencies agree on a range between the two sides and
 nothing but the neighbours tells of it. Larger ones make the frequencies disagree, which `decide` and `disagreement` find.
+
+On a slope the range of a pixel is that of its brighter part: where the amplitude changes from pixel to pixel, the mean lies aside.
 """
 
 import warp as wp
@@ -15,6 +17,9 @@ from kernels.tof.unwrap import TURN
 PART = 0.2
 """Standard deviation over the step: shares of both sides that are evenly distributed give 1/√12 = 0.29 of it, and about half of the pixels
 next to a step are mixed, which divides the variance by two."""
+ASIDE_PX = 1 / 12
+"""How far the mean of a pixel lies aside for a contrast of one, (a - b) / (a + b), between the pixels beside it: by so much if the
+amplitude grows evenly, and as a root mean square about as much if it has an edge anywhere between the two."""
 LARGEST_RAD = 1.0
 """Phase at the highest frequency from which on a step makes the frequencies disagree, radians."""
 SIGMAS = 4.0
@@ -25,13 +30,14 @@ _OK = int(Status.OK)
 wp.set_module_options({"enable_backward": False})
 
 
-def cover_steps(ranges: Ranges, rows: int, cols: int, *, spacing_m: float) -> wp.array:
+def cover_steps(ranges: Ranges, amplitude: wp.array, rows: int, cols: int, *, spacing_m: float) -> wp.array:
     """Return the standard deviation of each range, with that of mixed pixels where the range steps along a row or a column.
 
     A step is what the nearest OK pixels on both sides differ by, beyond the slopes further out on either side.
 
     Args:
         ranges: of `decide`; rows · cols pixels and padding.
+        amplitude: [frequency, pixel] float32; the last frequency's is used.
         rows, cols: of the image.
         spacing_m: between wraps of the highest frequency, metres.
 
@@ -45,7 +51,7 @@ def cover_steps(ranges: Ranges, rows: int, cols: int, *, spacing_m: float) -> wp
     if not 0 < rows * cols <= pixels:
         raise ArrayError(f"there are {pixels} pixels, the image is {rows} x {cols}: give the image's own size")
     sigma = wp.clone(ranges.sigma)
-    devices.launch(_steps_kernel, rows * cols, [ranges.range, ranges.sigma, ranges.status, rows, cols,
+    devices.launch(_steps_kernel, rows * cols, [ranges.range, ranges.sigma, ranges.status, amplitude, rows, cols,
                                                 LARGEST_RAD * spacing_m / TURN], [sigma], device=device)
     return sigma
 
@@ -85,11 +91,28 @@ def step_along(ranges: wp.array(dtype=wp.float32), sigma: wp.array(dtype=wp.floa
     return found
 
 
+@wp.func
+def aside(ranges: wp.array(dtype=wp.float32), status: wp.array(dtype=wp.int32), amplitude: wp.array2d(dtype=wp.float32), p: int,
+          stride: int, place: int, length: int):
+    """Return how far the range of a pixel lies aside because its light comes from one part of it, metres, along a row or column."""
+    found = float(0.0)
+    if place >= 1 and place + 1 < length:
+        a = p - stride
+        b = p + stride
+        if status[a] == _OK and status[b] == _OK:
+            f = amplitude.shape[0] - 1
+            contrast = wp.abs(amplitude[f, b] - amplitude[f, a]) / wp.max(amplitude[f, b] + amplitude[f, a], 1.0e-30)
+            slope = wp.min(wp.abs(ranges[b] - ranges[p]), wp.abs(ranges[p] - ranges[a]))
+            found = ASIDE_PX * contrast * slope
+    return found
+
+
 @wp.kernel(module="unique")
 def _steps_kernel(first: int,
                   ranges: wp.array(dtype=wp.float32),  # [pixel] metres
                   before: wp.array(dtype=wp.float32),  # [pixel] metres
                   status: wp.array(dtype=wp.int32),  # [pixel]
+                  amplitude: wp.array2d(dtype=wp.float32),  # [F, pixel]
                   rows: int,
                   cols: int,
                   largest: float,  # metres
@@ -101,4 +124,6 @@ def _steps_kernel(first: int,
         c = p - r * cols
         step = wp.max(step_along(ranges, before, status, p, 1, c, cols), step_along(ranges, before, status, p, cols, r, rows))
         more = PART * wp.min(step, largest)
-        sigma[p] = wp.sqrt(before[p] * before[p] + more * more)
+        across = aside(ranges, status, amplitude, p, 1, c, cols)
+        down = aside(ranges, status, amplitude, p, cols, r, rows)
+        sigma[p] = wp.sqrt(before[p] * before[p] + more * more + across * across + down * down)

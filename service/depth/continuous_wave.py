@@ -76,7 +76,8 @@ def solve_correlations(frames: CorrelationImages, options: TofOptions, calibrati
         ranges = ranges_of(widened.found)
         again = ranges.status.numpy()[:pixels]
         status = np.where((status == Status.MULTIPATH) & (again == Status.OK), status, again)
-    sigma = cover_steps(ranges, rows, cols, spacing_m=common_range_m(frames.modulation_hz.max(), SPEED_OF_LIGHT)).numpy()[:pixels]
+    spacing_m = common_range_m(frames.modulation_hz.max(), SPEED_OF_LIGHT)
+    sigma = cover_steps(ranges, found.amplitude, rows, cols, spacing_m=spacing_m).numpy()[:pixels]
     confidence = ranges.confidence.numpy()[:pixels] * np.where(reach > 0, POOLED, 1).astype(np.float32)
     facts = {
         "modulation_hz": found.modulation_hz.tolist(),
