@@ -5,7 +5,7 @@ For a candidate the readings are expected to be Σ x_k f_k(l), x ≥ 0, with f_0
 mixture is fitted by re-weighted non-negative least squares with Cauchy weights relative to the noise σ = s0 + s1 · reading, and the
 candidate's cost is Σ log(1 + r²/σ²) over the lights. A light that reads far below its prediction is in cast shadow, which has a fixed cost:
 any candidate may be shadowed, but no reading may be brighter than the lobes of the candidate. Candidates are rings about the best normal so
-far, coarse to fine.
+far, coarse to fine. Where the readings decide little, a prior may draw candidates to the normal of a simpler method.
 
 Source: hypothesised normals after Hui and Sankaranarayanan, "Shape and spatially-varying reflectance estimation from virtual
 exemplars", TPAMI 2017; here with analytic lobes in place of measured materials, and robust.
@@ -66,6 +66,19 @@ def criteria(options: SearchOptions, shape: Diffuse) -> list[Any]:
             wp.vec2(shape.rough, shape.slope)]
 
 
+PRIOR_DEGREES = 10.0
+"""Angle from the normal of a prior at which its cost begins to grow as a logarithm: far candidates that explain the readings stay
+possible."""
+
+
+class Prior(NamedTuple):
+    """What is expected of the normals before the readings are judged."""
+
+    normal: np.ndarray  # [n, 3] float32, unit
+    strength: float
+    """A candidate at angle a from the normal costs strength · log(1 + (a / PRIOR_DEGREES)²) more, on the sum over the lights."""
+
+
 WIDE = ((5.0, 10.0, 16.0, 24.0, 34.0, 46.0), 30)
 """Radii of the first rings about the start, degrees, and the number of candidates on the last of them."""
 FINE = (((2.5, 5.0), 10), ((0.9, 1.8), 8), ((0.4,), 6), ((0.2,), 6), ((0.06,), 6))
@@ -78,7 +91,9 @@ class Search(NamedTuple):
     normal: np.ndarray  # [n, 3] float32, unit
     cost: np.ndarray  # [n] float32, per light
     curvature: np.ndarray  # [n] float32, mean rise of the cost over the last ring, per light
+    swing: np.ndarray  # [n] float32, how much more than its mean the cost rises where it rises most, per light
     weights: np.ndarray  # [n, lobes] float32, of the mixture, for readings relative to the pixel's level
+    survey: wp.array  # [candidates, packs] float packs, on the device: cost of each candidate of the first rings, summed over the lights
 
     def variance(self, light_count: int, ring_degrees: float) -> np.ndarray:
         """Return the variance of the normals, degrees², by least squares: 2 · cost · ring² / (lights · rise), cost and rise per light.
@@ -107,7 +122,8 @@ def rings(degrees: tuple[float, ...], last_count: int) -> np.ndarray:
 
 def search_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse,
                    options: SearchOptions | None = None, wide: tuple[tuple[float, ...], int] = WIDE,
-                   fine: tuple[tuple[tuple[float, ...], int], ...] = FINE, table: wp.array | None = None) -> Search:
+                   fine: tuple[tuple[tuple[float, ...], int], ...] = FINE, table: wp.array | None = None,
+                   prior: Prior | None = None) -> Search:
     """Find the candidate normal of least cost for each sampled pixel.
 
     Args:
@@ -118,6 +134,7 @@ def search_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse,
         wide, fine: the rings.
         table: [cells, lights, lobes] of response_table.search_table or a reference_table, in place of the samples' directions;
             its diffuse lobe is what it is, whatever the shape.
+        prior: normals that candidates are drawn to, of which the costs include the cost; None: none.
 
     Returns:
         The best candidates. Waits for the device.
@@ -134,21 +151,26 @@ def search_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse,
     lane_type = pack_type(lanes, wp.float32)
     normal = per_pixel(samples, start)
     cost = wp.empty(packs, dtype=lane_type, device=device)
-    curvature = wp.empty(packs, dtype=lane_type, device=device)
+    bend = wp.empty((2, packs), dtype=lane_type, device=device)
+    drawn = per_pixel(samples, start if prior is None else prior.normal)
+    pull = wp.vec2(0.0 if prior is None else prior.strength, 1.0 / math.radians(PRIOR_DEGREES) ** 2)
     lobes = direction_lobes(lanes) if table is None else tabulated_lobes(lanes, table.shape[2])
     held = lobes.held
     weights = wp.empty((lobes.count, packs), dtype=lane_type, device=device)
     table = wp.empty((0, 0, 0), dtype=wp.float32, device=device) if table is None else table
     scratch = wp.empty(packs * lights * held, dtype=lane_type, device=device)
     strides = (lights * held, 1) if device == "cpu" else (1, packs)
+    survey = None
     for degrees, count in (wide, *fine):
         offsets = wp.array(rings(degrees, count), dtype=wp.vec4, device=device)
+        costs = wp.empty((offsets.shape[0], packs), dtype=lane_type, device=device)
+        survey = costs if survey is None else survey
         radius = math.sin(math.radians(degrees[0])) if len(degrees) == 1 else 0.0
         devices.launch(_search_kernel(lanes, lobes, options.reweightings, options.sweeps), packs,
-                       [samples.grey, samples.toward, table, samples.view, offsets, radius, *criteria(options, shape), lights,
-                        samples.pack_stride, samples.light_stride, *strides],
-                       [scratch, normal, cost, curvature, weights], device=device, uneven=True)
-    return Search(to_host(samples, normal), to_host(samples, cost), to_host(samples, curvature), to_host(samples, weights))
+                       [samples.grey, samples.toward, table, samples.view, offsets, radius, drawn, pull, *criteria(options, shape),
+                        lights, samples.pack_stride, samples.light_stride, *strides],
+                       [scratch, normal, cost, bend, weights, costs], device=device, uneven=True)
+    return Search(to_host(samples, normal), to_host(samples, cost), *to_host(samples, bend).T, to_host(samples, weights), survey)
 
 
 @wp.func
@@ -183,6 +205,8 @@ def _search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> 
                       view: wp.array2d(dtype=lane_type),  # [3, P]
                       offsets: wp.array(dtype=wp.vec4),  # [candidates]
                       radius: float,  # sine of the only ring's angle, 0 where there are several
+                      drawn: wp.array2d(dtype=lane_type),  # [3, P] normal of the prior
+                      pull: wp.vec2,  # its strength, and 1 / rad² of its angle
                       noise: wp.vec2,  # s0, s1
                       shadow: wp.vec2,  # r²/σ² of equal cost, depth
                       form: wp.vec2,  # diffuse roughness, slope
@@ -195,8 +219,9 @@ def _search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> 
                       scratch: wp.array(dtype=lane_type),  # [P · L · held]
                       normal: wp.array2d(dtype=lane_type),  # [3, P] in: start, out: best
                       cost: wp.array(dtype=lane_type),  # [P]
-                      curvature: wp.array(dtype=lane_type),  # [P]
-                      weights: wp.array2d(dtype=lane_type)):  # [lobes, P]
+                      bends: wp.array2d(dtype=lane_type),  # [2, P] rise over the last ring: its mean, and how far it swings about that
+                      weights: wp.array2d(dtype=lane_type),  # [lobes, P]
+                      costs: wp.array2d(dtype=lane_type)):  # [candidates, P]
         p = first + wp.tid()
         vx, vy, vz = view[0, p], view[1, p], view[2, p]
         start = p * pack_stride
@@ -205,6 +230,8 @@ def _search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> 
         cx, cy, cz = normal[0, p], normal[1, p], normal[2, p]
         best, bx, by, bz = lane_type(1.0e30), lane_type(), lane_type(), lane_type()
         centre, ring, slope_x, slope_y = lane_type(), lane_type(), lane_type(), lane_type()
+        twice_x, twice_y = lane_type(), lane_type()
+        ux, uy, uz = drawn[0, p], drawn[1, p], drawn[2, p]
         found = coefficients()
         for candidate in range(offsets.shape[0]):
             o = offsets[candidate]
@@ -265,10 +292,16 @@ def _search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> 
                                 move = relaxation * rest / (g[a * (a + 1) / 2 + a, k] + 1.0e-8)
                                 x_best[a, k] = wp.max(x_best[a, k] + move, 0.0)
             for k in range(lanes):
+                away = 2.0 - 2.0 * (nx[k] * ux[k] + ny[k] * uy[k] + nz[k] * uz[k])
+                total[k] += pull[0] * wp.log(1.0 + pull[1] * wp.max(away, 0.0))
+            costs[candidate, p] = total
+            for k in range(lanes):
                 around = wp.where(candidate > 0, total[k], 0.0)
                 ring[k] += around
                 slope_x[k] += around * o[2]
                 slope_y[k] += around * o[3]
+                twice_x[k] += around * (o[2] * o[2] - o[3] * o[3])
+                twice_y[k] += around * 2.0 * o[2] * o[3]
                 centre[k] = wp.where(candidate == 0, total[k], centre[k])
                 better = total[k] < best[k]
                 for a in range(mixture):
@@ -277,7 +310,7 @@ def _search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> 
                 bx[k] = wp.where(better, nx[k], bx[k])
                 by[k] = wp.where(better, ny[k], by[k])
                 bz[k] = wp.where(better, nz[k], bz[k])
-        share, bend = lane_type(), lane_type()
+        share, bend, swing = lane_type(), lane_type(), lane_type()
         for k in range(lanes):
             members = wp.max(float(offsets.shape[0] - 1), 1.0)
             rise = ring[k] / members - centre[k]
@@ -295,11 +328,13 @@ def _search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> 
                 bz[k] = moved[2]
             share[k] = best[k] / float(light_count)
             bend[k] = (ring[k] / members - best[k]) / float(light_count)
+            swing[k] = 2.0 * wp.sqrt(twice_x[k] * twice_x[k] + twice_y[k] * twice_y[k]) / (members * float(light_count))
         normal[0, p] = bx
         normal[1, p] = by
         normal[2, p] = bz
         cost[p] = share
-        curvature[p] = bend
+        bends[0, p] = bend
+        bends[1, p] = swing
         for a in range(mixture):
             for k in range(lanes):
                 share[k] = found[a, k]

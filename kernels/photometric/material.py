@@ -37,6 +37,8 @@ BRIGHTEST_DIELECTRIC = 0.2
 METAL_DIFFUSE = 0.25
 """Largest diffuse albedo of a metal, as a fraction of its F0. A metal has no diffuse reflection, but dirt and interreflection may look like
 this much; with more, a bright lobe replaces what the diffuse one misses, above all at the rim."""
+MATT = np.array([0.0, 0.0, 0.0, 1.0], dtype=np.float32)
+"""F0 and roughness of a surface whose readings do not say that it is anything but matt."""
 SHARED_RISE = 1.4
 """Factor by which the cost of a shared material may exceed that of the pixel's own material."""
 COST_FLOOR = 0.005

@@ -13,8 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kernels.photometric.hypotheses import FINE, Diffuse, SearchOptions, search_normals
-from kernels.photometric.material import fit_material, fit_tinted
+from kernels.photometric.certainty import assess
+from kernels.photometric.hypotheses import Diffuse, Prior, SearchOptions, search_normals
+from kernels.photometric.material import MATT, fit_given, fit_material, fit_tinted
 from kernels.photometric.refine import refine
 from kernels.photometric.samples import Samples
 
@@ -28,8 +29,6 @@ its weight. Costs a third apart may differ by misfit alone."""
 SINGLE_LOBE_CHARGE = 1.5
 """Factor on the cost of the single lobe: to replace the mixture, the single lobe must explain a pixel clearly better, as it does on
 metals."""
-RING_DEGREES = FINE[-1][0][-1]
-"""Radius of the last ring of the search, degrees; the rise of the cost towards it gives the standard error."""
 
 
 class SvbrdfFit(NamedTuple):
@@ -39,12 +38,14 @@ class SvbrdfFit(NamedTuple):
     diffuse_albedo: np.ndarray  # [n, 3] float32
     specular: np.ndarray  # [n, 3] float32, F0
     roughness: np.ndarray  # [n] float32
-    confidence: np.ndarray  # [n] float32: 1 / (1 + standard error of the normal / 1°)
+    sigma: np.ndarray  # [n] float32, standard deviation of the normal, degrees
+    confidence: np.ndarray  # [n] float32: probability of the mode / (1 + sigma / 1°)
     residual: np.ndarray  # [n] float32: root of the mean cost per light, in units of the noise
 
 
 def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, options: SearchOptions | None = None,
-                 shared: np.ndarray | None = None, roughness: np.ndarray | None = None, single_lobe: bool = True) -> SvbrdfFit:
+                 shared: np.ndarray | None = None, roughness: np.ndarray | None = None, single_lobe: bool = True,
+                 prior: Prior | None = None) -> SvbrdfFit:
     """Estimate the normal and the material of sampled pixels.
 
     Args:
@@ -55,6 +56,8 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, options
         shared: [materials, 4] of shared_materials.choose_materials; None: every pixel has a material of its own.
         roughness: [n] of an earlier fit, from which the single lobe begins; None: it is fitted first.
         single_lobe: False leaves the joint fit of one lobe out, to see what it buys.
+        prior: normals to which the search is drawn, because the readings do not support the lobes; then the joint fit, which knows no
+            prior, is left out, and the surface is taken as Lambertian.
 
     Returns:
         The fit. Waits for the device.
@@ -62,27 +65,33 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, options
     Raises:
         ArrayError: shapes that do not fit.
     """
-    found = search_normals(samples, start, shape=shape, options=options)
+    found = search_normals(samples, start, shape=shape, options=options, prior=prior)
     wide, fine = NEAR
     normals, costs = [found.normal], [found.cost]
     for rough, slope in NEIGHBOURS:
         if rough and shape.rough < 0:
             continue
         nearby = Diffuse(rough=max(shape.rough + rough, 0.0) if shape.rough >= 0 else shape.rough, slope=shape.slope + slope)
-        other = search_normals(samples, found.normal, shape=nearby, options=options, wide=wide, fine=fine)
+        other = search_normals(samples, found.normal, shape=nearby, options=options, wide=wide, fine=fine, prior=prior)
         normals.append(other.normal)
         costs.append(other.cost)
-    if single_lobe:
+    if single_lobe and prior is None:
         if roughness is None:
             roughness = fit_tinted(samples, found.normal, shape=shape, options=options).roughness
         single = refine(samples, found.normal, roughness, shape=shape, options=options)
         normals.append(single.normal)
         costs.append(SINGLE_LOBE_CHARGE * single.cost)
     normal, spread = average_normals(np.stack(normals), np.stack(costs))
-    material = fit_material(samples, normal, shape=shape, options=options, shared=shared)
-    variance = found.variance(samples.light_count, RING_DEGREES) + spread**2
-    return SvbrdfFit(normal, material.diffuse_albedo, material.specular, material.roughness,
-                     (1 / (1 + np.sqrt(variance))).astype(np.float32), np.sqrt(found.cost))
+    if prior is None:
+        material = fit_material(samples, normal, shape=shape, options=options, shared=shared)
+    else:
+        material = fit_given(samples, normal, MATT, shape=shape, options=options)
+        start = normal
+        found = search_normals(samples, start, shape=shape, options=options)  # the readings alone say how sure the normal is
+        spread = np.hypot(spread, _angles(found.normal, normal))
+    certainty = assess(samples, start, found, normal, spread)
+    return SvbrdfFit(normal, material.diffuse_albedo, material.specular, material.roughness, certainty.sigma,
+                     certainty.probability / (1 + certainty.sigma), np.sqrt(found.cost))
 
 
 def average_normals(normals: np.ndarray, costs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -100,6 +109,10 @@ def average_normals(normals: np.ndarray, costs: np.ndarray) -> tuple[np.ndarray,
     weights /= weights.sum(axis=0)
     mean = np.einsum("sn,snc->nc", weights, normals)
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
-    cosine = np.clip(np.einsum("snc,nc->sn", normals, mean), -1, 1)
-    spread = np.sqrt(np.einsum("sn,sn->n", weights, np.degrees(np.arccos(cosine)) ** 2))
+    spread = np.sqrt(np.einsum("sn,sn->n", weights, _angles(normals, mean) ** 2))
     return mean.astype(np.float32), spread.astype(np.float32)
+
+
+def _angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the angles in degrees between unit vectors along the last axis."""
+    return np.degrees(np.arccos(np.clip((a * b).sum(axis=-1), -1, 1)))

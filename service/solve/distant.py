@@ -14,13 +14,14 @@ import warp as wp
 from kernels.photometric.albedo import fit_albedo
 from kernels.photometric.bounce import subtract_bounce
 from kernels.photometric.diffuse_shape import choose_diffuse
-from kernels.photometric.hypotheses import Diffuse, search_normals
-from kernels.photometric.lambert import NormalFit
+from kernels.photometric.hypotheses import Diffuse, Prior, search_normals
+from kernels.photometric.lambert import NormalFit, solve_lambert
+from kernels.photometric.left_out import LeftOut, leave_out
 from kernels.photometric.lobes import GEOMETRY, MIXTURE
-from kernels.photometric.material import fit_tinted
+from kernels.photometric.material import MATT, fit_given, fit_tinted
 from kernels.photometric.misfit import uncertainty_of
 from kernels.photometric.near import NearField
-from kernels.photometric.readings import Lights, channel_weights, pad_lights
+from kernels.photometric.readings import Lights, channel_weights, grey_factors, grey_readings, pad_lights
 from kernels.photometric.robust import solve_robust
 from kernels.photometric.samples import Samples, evenly
 from kernels.photometric.shadowing import exclude_shadows
@@ -30,13 +31,23 @@ from kernels.status import Status
 from service.solve.batches import Batch, bands, pick_pixels, pixel_batches, view_directions
 from service.solve.interreflection import arriving_light
 from service.solve.misfit import object_misfit
-from service.solve.solution import Solution, SolveInput, suspect_lights
+from service.solve.solution import LARGEST_ERROR, Solution, SolveInput, suspect_lights
 from service.solve.surface import integrate, projection_of
 from stage.colour import GREY_WEIGHTS
 from stage.point_lights import DistantLights
 
 SPREAD_PIXELS = 384
 """Pixels, spread over the object, from which the shape of the diffuse lobe and the shared materials are chosen."""
+FEW_LIGHTS = 32
+"""Fewer lights than this, four for each of the eight unknowns of a pixel, must show that they support the general solver."""
+TESTED_LIGHTS = 6
+"""With fewer lights than this none can be left out: those that remain would not determine what is tested."""
+SUPPORTED_RATIO = 0.7
+"""Largest misfit of left-out readings, over that of Lambert's law, at which the general solver is supported: 0.28 to 0.5 on objects where
+its normals are better, real and path-traced, 0.9 and above where they follow errors of the lights."""
+PRIOR_STRENGTH = 10.0
+"""Strength of the prior towards the normals of `lambert` where the general solver is not supported: a standard deviation of some degrees
+for a reading that misfits by the noise floor of the search."""
 LARGEST_ALBEDO = 0.98
 """The part of light that a surface can send on; a fitted albedo may be larger where the scale of the lights is not absolute."""
 
@@ -123,17 +134,31 @@ def solve_material(given: SolveInput, lights: Lights, field: NearField | None = 
     result = Solution.empty(stack.pixel_count)
     result.specular = np.zeros((3, stack.pixel_count), np.float16)
     result.roughness = np.zeros(stack.pixel_count, np.float16)
+    few = stack.light_count < FEW_LIGHTS
+    lambertian = np.zeros_like(result.normal)
     timings.stage("start", stack.shape[2])
     for span, inside, band, readings, near in bands(given, lights, field):
         result.place(span, inside, solve_robust(band, readings, lights.direction, near))
+        if few:
+            fit = solve_lambert(band, grey_readings(band, grey_factors(lights, GREY_WEIGHTS)), lights.direction, near)
+            lambertian[:, span] = np.where(fit.status.numpy()[: len(inside)] == Status.OK, fit.normal.numpy()[:, : len(inside)],
+                                           result.normal[:, span])
     solvable = np.flatnonzero(result.status == Status.OK)
     spread = solvable[evenly(len(solvable), SPREAD_PIXELS)] if len(solvable) else solvable
     timings.stage("shape", 1)
-    shape = Diffuse()
+    shape, supported = Diffuse(), True
     if len(spread):
-        shape, tried = choose_diffuse(pick_pixels(given, lights, view, spread, field), result.normal[:, spread].T)
-        result.facts = {"diffuse_roughness": None if shape.rough < 0 else shape.rough, "diffuse_slope": shape.slope,
-                        "shapes_tried": len(tried)}
+        chosen = pick_pixels(given, lights, view, spread, field)
+        if few:
+            supported = _supported(result, chosen, result.normal[:, spread].T)
+        if supported:
+            shape, tried = choose_diffuse(chosen, result.normal[:, spread].T)
+            result.facts |= {"diffuse_roughness": None if shape.rough < 0 else shape.rough, "diffuse_slope": shape.slope,
+                             "shapes_tried": len(tried)}
+
+    def prior(pixels: np.ndarray) -> Prior | None:
+        """Return what is expected of the normals of some pixels."""
+        return None if supported else Prior(lambertian[:, pixels].T, PRIOR_STRENGTH)
 
     def batches(stage: str) -> Iterator[Batch]:
         timings.stage(stage, len(solvable))
@@ -145,10 +170,11 @@ def solve_material(given: SolveInput, lights: Lights, field: NearField | None = 
 
     interreflection = options.interreflection and field is None
     for pixels, samples in batches("search"):
-        normal = search_normals(samples, result.normal[:, pixels].T, shape=shape).normal
+        start = result.normal[:, pixels] if supported else lambertian[:, pixels]
+        normal = search_normals(samples, start.T, shape=shape, prior=prior(pixels)).normal
         result.normal[:, pixels] = normal.T
         if interreflection:
-            first = fit_tinted(samples, normal, shape=shape)
+            first = fit_tinted(samples, normal, shape=shape) if supported else fit_given(samples, normal, MATT, shape=shape)
             result.albedo[:, pixels], result.roughness[pixels] = first.diffuse_albedo.T, first.roughness
     solved = (result.status == Status.OK).reshape(given.mask.shape)
     surface = integrate(given, result.normal, solved, stage="surface")
@@ -167,8 +193,8 @@ def solve_material(given: SolveInput, lights: Lights, field: NearField | None = 
             albedo = np.minimum(result.albedo[:, pixels].T.astype(np.float32), LARGEST_ALBEDO)
             subtract_bounce(samples, arriving.light, corners, shares, albedo, channel_weights(lights, GREY_WEIGHTS))
 
-    materials = None
-    if options.sharing and len(spread):
+    materials, sigma = None, np.full(stack.pixel_count, LARGEST_ERROR, np.float16)
+    if options.sharing and supported and len(spread):
         samples = pick_pixels(given, lights, view, spread, field)
         clean(spread, samples)
         materials = choose_materials(samples, result.normal[:, spread].T, shape=shape)
@@ -177,11 +203,34 @@ def solve_material(given: SolveInput, lights: Lights, field: NearField | None = 
     for pixels, samples in batches("normals"):
         clean(pixels, samples)
         found = solve_svbrdf(samples, result.normal[:, pixels].T, shape=shape, shared=materials,
-                             roughness=result.roughness[pixels].astype(np.float32) if interreflection else None)
+                             roughness=result.roughness[pixels].astype(np.float32) if interreflection else None, prior=prior(pixels))
         result.normal[:, pixels] = found.normal.T
         result.albedo[:, pixels] = found.diffuse_albedo.T
         result.specular[:, pixels] = found.specular.T
         result.roughness[pixels] = found.roughness
-        result.confidence[pixels] = found.confidence
+        sigma[pixels], result.confidence[pixels] = found.sigma, found.confidence
         result.residual[pixels] = found.residual
+    result.sigma, result.judged_by_surface = sigma, True
     return result
+
+
+def _supported(result: Solution, samples: Samples, start: np.ndarray) -> bool:
+    """Return whether few lights support the general solver, and say in the solution what speaks against it.
+
+    Args:
+        result: whose facts and warnings are added to.
+        samples: some hundreds of pixels, spread over the object.
+        start: [n, 3] unit normals to begin from.
+    """
+    count = samples.light_count
+    fallback = ("normals are drawn to those of lambert and no specular lobe is estimated; capture 32 lights or more, "
+                "spread over the hemisphere, or take --method robust")
+    if count < TESTED_LIGHTS:
+        result.warnings.append(f"method svbrdf: {count} lights are fewer than the unknowns of a pixel: {fallback}.")
+        return False
+    left: LeftOut = leave_out(samples, start)
+    result.facts |= {"left_out_misfit": round(left.general, 4), "left_out_misfit_lambert": round(left.lambert, 4)}
+    if left.ratio > SUPPORTED_RATIO:
+        result.warnings.append(f"method svbrdf: the images of left-out lights are predicted hardly better with specular lobes than without "
+                               f"(misfit {left.general:.2g} against {left.lambert:.2g}): {fallback}.")
+    return left.ratio <= SUPPORTED_RATIO

@@ -76,6 +76,8 @@ class Solution:
     """The last integration of the normals, from which the height came."""
     suspects: list[SuspectLight] = field(default_factory=list)
     sigma: np.ndarray | None = None  # [pixels] float16, standard error of the normal in degrees; None: that of the confidence
+    judged_by_surface: bool = False
+    """Whether confidence falls where the normals are not those of a surface."""
     warnings: list[str] = field(default_factory=list)
     """A sentence for each thing that does not fit on the whole object: what it is, and what to try."""
     facts: dict[str, Any] = field(default_factory=dict)

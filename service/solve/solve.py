@@ -16,6 +16,7 @@ from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, metadata, report
 from service.requests.solve import MAX_SIGMA, SVBRDF_LIGHTS, Method, SolveRequest
+from service.solve import integrability
 from service.solve.diagnosis import diagnose
 from service.solve.distant import solve_diffuse, solve_distant, solve_material
 from service.solve.extended import solve_extended
@@ -127,17 +128,22 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
     mark_not_facing(capture.camera, solution)
     timings.stage("diagnosis", 1)
     diagnose(given, capture, lights, solution)
-    refine_status(solution, stack, max_sigma=MAX_SIGMA if request.max_sigma is None else request.max_sigma,
-                  least_confidence=request.least_confidence or 0.0)
-    status = solution.status.reshape(mask.shape)
-    solved, estimated = np.isin(status, SOLVED), np.isin(status, ESTIMATED)
-    counts = {s.name.lower(): int(np.count_nonzero(status[mask] == s)) for s in Status}
-    if not solved.any():
-        solution.warnings.append(_nothing_solved(counts))
+    estimated = np.isin(solution.status, ESTIMATED).reshape(mask.shape)
     sigma = solution.standard_error()
     if solution.integration is None:  # near lights have found the height with the normals
         solution.integration = integrate(given, solution.normal, estimated, sigma=sigma)
         solution.height = None if solution.integration is None else solution.integration.height.numpy()
+    if solution.judged_by_surface and solution.height is not None:
+        normal = np.moveaxis(solution.normal.reshape(3, *mask.shape), 0, -1)
+        factor = integrability.doubt(sigma.reshape(mask.shape), normal, solution.height, estimated, capture.camera)
+        solution.confidence = (solution.confidence * factor.reshape(-1)).astype(np.float16)
+    refine_status(solution, stack, max_sigma=MAX_SIGMA if request.max_sigma is None else request.max_sigma,
+                  least_confidence=request.least_confidence or 0.0)
+    status = solution.status.reshape(mask.shape)
+    solved = np.isin(status, SOLVED)
+    counts = {s.name.lower(): int(np.count_nonzero(status[mask] == s)) for s in Status}
+    if not solved.any():
+        solution.warnings.append(_nothing_solved(counts))
     guessed = guessed_part(sigma, estimated)
     solution.warnings += height_warnings(guessed, method)
     sources = metadata(request, method=method, capture=capture.name, inputs=stack.key, contents=solution.contents)
