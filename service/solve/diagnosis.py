@@ -11,7 +11,7 @@ import numpy as np
 from kernels.photometric.samples import evenly
 from kernels.status import ESTIMATED
 from service.solve.orientation import LightAxes, find_axes, find_inversion
-from service.solve.solution import Solution, SolveInput
+from service.solve.solution import PIXELS_AT_ONCE, Solution, SolveInput
 from stage.capture import Capture
 from stage.consistency.explanations import Cause, Explanation, Sample, better_explanation, fit_manifest
 from stage.extended_lights import ExtendedLights
@@ -77,11 +77,13 @@ def _raise_error(solution: Solution, degrees: np.ndarray | float) -> None:
 
 def _turned_by(normal: np.ndarray, axes: LightAxes) -> np.ndarray:
     """Return the angle between each normal and its correction, degrees; of two possible corrections the root mean square."""
-    squares = []
-    for matrix in axes.matrices:
-        corrected = matrix.astype(np.float32) @ normal
-        squares.append(np.degrees(np.arccos(np.clip((corrected * normal).sum(axis=0), -1, 1))) ** 2)
-    return np.sqrt(np.mean(squares, axis=0))
+    squares = np.zeros(normal.shape[1], dtype=np.float32)
+    for first in range(0, len(squares), PIXELS_AT_ONCE):
+        part = normal[:, first : first + PIXELS_AT_ONCE]
+        for matrix in axes.matrices:
+            cosine = np.clip((part * (matrix.astype(np.float32) @ part)).sum(axis=0), -1, 1)
+            squares[first : first + PIXELS_AT_ONCE] += np.degrees(np.arccos(cosine)) ** 2 / len(axes.matrices)
+    return np.sqrt(squares)
 
 
 def _sentence(found: Explanation, sample: Sample) -> str:

@@ -79,7 +79,7 @@ def find_axes(given: SolveInput, solution: Solution, lights: DistantLights | Non
     found = wrong_axes(np.moveaxis(_toward_viewer(given.camera, flat, positions.reshape(-1)).reshape(3, *positions.shape), 1, 0))
     if found is None:
         return None
-    return _sentence(_choices(found, _map_of(given, solution.normal, estimated, MAP_SIZE), np.eye(3)), found)
+    return _sentence(_choices(found, _map_of(given, solution.normal, estimated), np.eye(3)), found)
 
 
 def find_inversion(given: SolveInput, solution: Solution, lights: DistantLights | None) -> LightAxes | None:
@@ -93,7 +93,7 @@ def find_inversion(given: SolveInput, solution: Solution, lights: DistantLights 
     estimated = np.isin(solution.status, ESTIMATED).reshape(given.mask.shape)
     if not estimated.any():
         return None
-    small = _map_of(given, solution.normal, estimated, MAP_SIZE)
+    small = _map_of(given, solution.normal, estimated)
     edge = outline(small.normal, small.mask)
     if edge.outward >= CLEAR:
         return None
@@ -121,13 +121,12 @@ def _exchanged(given: SolveInput, lights: DistantLights, fit: Fit) -> LightAxes 
     exchange = np.eye(3)
     exchange[[2, axis]] = exchange[[axis, 2]]
     exchange[2] *= sign
-    normal = np.zeros((3, given.mask.size), dtype=np.float32)
-    coarse = _map_of(given, normal, given.mask, FIT_SIZE)
-    inside = coarse.pixels[coarse.mask]
-    radiance, usable = given.stack.pick_radiance(inside)
+    pixels, inside = _grid(given.mask, FIT_SIZE)
+    radiance, usable = given.stack.pick_radiance(pixels[inside])
     fitted = fit_lambertian(grey_readings(radiance, lights.irradiance), usable, lights.direction)
-    normal[:, inside] = exchange @ fitted.normal
-    small = _map_of(given, normal, given.mask, FIT_SIZE)
+    normal = np.zeros((3, *pixels.shape), dtype=np.float32)
+    normal[:, inside] = _toward_viewer(given.camera, exchange @ fitted.normal, pixels[inside])
+    small = _Map(normal, inside, pixels)
     positions = sites(small.mask)
     found = wrong_axes(np.moveaxis(small.normal.reshape(3, -1)[:, positions], 1, 0)) or Axes(np.eye(2), 1 - fit.facing, 1 - share)
     matrices = _choices(found, small, exchange)
@@ -179,15 +178,19 @@ def _shadows(given: SolveInput, solution: Solution, small: _Map, lights: Distant
     return part_lit(height, direction), part_lit(-height, direction @ INVERSE)
 
 
-def _map_of(given: SolveInput, normal: np.ndarray, mask: np.ndarray, size: int) -> _Map:
-    """Return every n-th pixel of the box around a mask, so that it is `size` pixels across at most."""
+def _grid(mask: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return row-major positions [rows, cols] of every n-th pixel of the box around a mask, `size` across at most, and which are inside."""
     rows, cols = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
     step = max(1, -(-max(int(np.ptp(rows)), int(np.ptp(cols))) // size))
     margin = step * (3 * size // EDGE + 2)  # of background, so that only the border of the image hides the outline
-    first, last = (max(rows[0] - margin, 0), max(cols[0] - margin, 0)), (rows[-1] + margin + 1, cols[-1] + margin + 1)
-    part = (slice(first[0], last[0], step), slice(first[1], last[1], step))
-    pixels = np.arange(mask.size).reshape(mask.shape)[part]
-    inside = mask[part]
+    row, col = (np.arange(max(lines[0] - margin, 0), min(lines[-1] + margin + 1, count), step)
+                for lines, count in zip((rows, cols), mask.shape, strict=True))
+    return row[:, None] * mask.shape[1] + col, mask[np.ix_(row, col)]
+
+
+def _map_of(given: SolveInput, normal: np.ndarray, mask: np.ndarray) -> _Map:
+    """Return a small map of solved normals."""
+    pixels, inside = _grid(mask, MAP_SIZE)
     flat = _toward_viewer(given.camera, normal[:, pixels.reshape(-1)], pixels.reshape(-1)).reshape(3, *pixels.shape)
     return _Map(np.where(inside, flat, 0).astype(np.float32), inside, pixels)
 
