@@ -29,13 +29,13 @@ LEAST_LIGHTS = 4
 """Fewer lights may lie almost in a plane, and then most normals of noise face away."""
 CLEAR, CLEAR_PART = 0.4, 0.8
 """An outline is clear where the mean outward component is above the first number, in the same direction on the second part of it."""
-SHADOW_PIXELS, SHADOW_LIGHTS = 1000, 64
+SHADOW_PIXELS, SHADOW_LIGHTS = 2000, 64
 """Pixels and lights of which cast shadows are compared."""
 LEAST_COSINE, LEVEL_COSINE = 0.1, 0.25
 """Least n·l of a reading that is compared, and of those whose median gives the level of the pixel."""
 LIT = 0.7
 """A reading above this part of level · n·l is lit: light from other surfaces in a cast shadow of a white bowl stays below it."""
-LEAST_SHADOWS, LEAST_SHADOWS_ALONE = 60, 200
+LEAST_SHADOWS, LEAST_SHADOWS_ALONE = 30, 400
 """Least count of readings that the height puts in shadow, for them to speak against an outline, and alone."""
 LIT_WRONG, LIT_WRONG_ALONE, LIT_RIGHT = 0.6, 0.7, 0.3
 """Part of these readings that is lit: from the first, or alone from the second, the height is wrong; up to the third it is right. On right

@@ -48,6 +48,24 @@ def ellipsoid(size: int = 72, count: int = 16, *, hollow: bool = False, largest_
     return Scene(normal, albedo, mask, directions, irradiance, np.maximum(images, 0))
 
 
+def seen_from_near(size: int = 72, count: int = 16, distance: float = 4.0) -> tuple[Scene, dict]:
+    """The object before a perspective camera, and the camera of its manifest."""
+    across = ((np.arange(size) + 0.5) / size * 2 - 1) * 1.3 / distance
+    ray = np.stack([*np.meshgrid(across, -across), np.full((size, size), -1.0)], axis=-1)
+    start = np.array([0.0, 0.0, distance])
+    a, h = np.einsum("rci,ij,rcj->rc", ray, TILT, ray), ray @ TILT @ start
+    root = h * h - a * (start @ TILT @ start - 1)
+    mask = root > 0.05
+    way = (-h - np.sqrt(np.maximum(root, 0))) / a
+    normal = (start + way[..., None] * ray) @ TILT
+    normal = np.where(mask[..., None], normal / np.linalg.norm(normal, axis=-1, keepdims=True), [0.0, 0.0, 1.0])
+    albedo, directions = np.full((size, size, 3), 0.5) * mask[..., None], lights(count)
+    irradiance = np.ones((count, 3))
+    focal = size / 2 / (1.3 / distance)
+    camera = {"projection": "perspective", "resolution": [size, size], "focal_px": [focal, focal], "surface_z_m": -distance}
+    return Scene(normal, albedo, mask, directions, irradiance, render(normal, albedo, directions, irradiance)), camera
+
+
 def _shadow(point: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """[lights, rows, cols] whether the way from a point of the hollow to the light meets the hollow again.
 

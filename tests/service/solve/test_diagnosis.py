@@ -7,8 +7,8 @@ import pytest
 
 from service.requests.solve import Method, SolveRequest
 from service.solve.solve import solve
-from tests.scenes.captures import angles_degrees, make_scene, ring, write_capture, write_exr
-from tests.scenes.ellipsoid import ellipsoid
+from tests.scenes.captures import angles_degrees, make_scene, manifest_of, ring, write_capture, write_exr, write_image, write_manifest
+from tests.scenes.ellipsoid import ellipsoid, seen_from_near
 
 SCENE = ellipsoid()
 SURE = 0.3
@@ -120,6 +120,34 @@ def test_mirrored_axes_of_a_relief_that_fills_the_image_leave_two_choices(tmp_pa
     wrong = solved(tmp_path / "wrong", scene._replace(directions=flat * [1, -1, 1]))
     assert "with y negated, or x negated" in wrong.warnings[0] or "with x negated, or y negated" in wrong.warnings[0]
     assert confidence(wrong) < UNSURE
+
+
+def test_a_perspective_camera_sees_wrong_axes_too(tmp_path):
+    scene, camera = seen_from_near(size=112)
+    assert solved(tmp_path / "right", scene, camera=camera).warnings == ()
+    for name, matrix, words in (("y", [1, -1, 1], "with y negated"), ("both", [-1, -1, 1], "with x and y negated"),
+                                ("behind", [1, 1, -1], "with z negated")):
+        result = solved(tmp_path / name, scene._replace(directions=scene.directions * matrix), camera=camera)
+        assert words in result.warnings[0]
+
+
+def test_the_axes_of_gradients_are_examined(tmp_path):
+    """A convex Lambertian surface under (1 ± axis)/2 has radiance albedo/2 · (1 ± ⅔ n)."""
+    for name, wrong in (("right", ""), ("wrong", "y")):
+        frames = []
+        for axis in "xyz":
+            for sign in (1, -1):
+                image = f"{axis}{sign}.exr"
+                shade = (1 + sign * 2 / 3 * SCENE.normal[..., "xyz".index(axis)]) / 2
+                write_exr(tmp_path / name / image, SCENE.albedo * shade[..., None])
+                frames.append({"image": image, "light": {"type": "gradient", "axis": axis, "sign": -sign if axis == wrong else sign,
+                                                         "polarization": "cross"}})
+        write_image(tmp_path / name / "mask.png", (SCENE.mask * 255).astype(np.uint8))
+        write_manifest(tmp_path / name, manifest_of(SCENE, frames=frames))
+        result = solve(SolveRequest(capture=tmp_path / name, out=tmp_path / name / "out", device="cpu"))
+        assert bool(result.warnings) == bool(wrong)
+    assert "frames[].light.axis and sign: " in result.warnings[0] and "with y negated" in result.warnings[0]
+    assert confidence(result) < UNSURE
 
 
 def test_a_solve_without_a_solved_pixel_says_so_and_exits_1(relit, tmp_path):
