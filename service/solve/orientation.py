@@ -34,12 +34,17 @@ SHADOW_PIXELS, SHADOW_LIGHTS = 2000, 64
 LEAST_COSINE, LEVEL_COSINE = 0.1, 0.25
 """Least n·l of a reading that is compared, and of those whose median gives the level of the pixel."""
 LIT = 0.7
-"""A reading above this part of level · n·l is lit: light from other surfaces in a cast shadow of a white bowl stays below it."""
+"""A reading above this part of level · n·l is lit: light from other surfaces in a cast shadow of a white bowl mostly stays below it."""
+MANY_LIGHTS = 6
+"""Fewer lights seldom contradict a height: their normals leave no misfit, and shadows turn them."""
 LEAST_SHADOWS, LEAST_SHADOWS_ALONE = 30, 400
 """Least count of readings that the height puts in shadow, for them to speak against an outline, and alone."""
-LIT_WRONG, LIT_WRONG_ALONE, LIT_RIGHT = 0.6, 0.7, 0.3
-"""Part of these readings that is lit: from the first, or alone from the second, the height is wrong; up to the third it is right. On right
-captures it was 0.4 at most, 0.7 to 1 on inverted ones."""
+LIT_INVERTED, LIT_WRONG, LIT_SHADOW = 0.9, 0.6, 0.5
+"""An inverted surface is lit in all the shadows that it should cast (0.92 to 1), but where the right one casts some: then from the second
+part on, and up to the third part of the readings that the inverse puts in shadow is lit. In right hollows less than 0.9 is lit, in white
+ones under few lights as much as 0.83, and their inverses cast no shadow, or one that is lit."""
+LEAST_SHADOWS_RIGHT, LEAST_SHADOWS_HOLLOW = 20, 8
+"""Least count of readings that the inverse puts in shadow, and of those in shadow that show a hollow if less than LIT_WRONG is lit."""
 INVERSE = np.diag([-1.0, -1.0, 1.0])
 """The turn by 180 degrees about the view axis."""
 
@@ -76,7 +81,8 @@ def find_axes(given: SolveInput, solution: Solution, lights: DistantLights | Non
     estimated = np.isin(solution.status, ESTIMATED).reshape(given.mask.shape)
     positions = sites(estimated)
     flat = solution.normal[:, positions.reshape(-1)]
-    found = wrong_axes(np.moveaxis(_toward_viewer(given.camera, flat, positions.reshape(-1)).reshape(3, *positions.shape), 1, 0))
+    normals = np.moveaxis(_toward_viewer(given.camera, flat, positions.reshape(-1)).reshape(3, *positions.shape), 1, 0)
+    found = wrong_axes(normals, strict=given.stack.light_count < MANY_LIGHTS)
     if found is None:
         return None
     return _sentence(_choices(found, _map_of(given, solution.normal, estimated), np.eye(3)), found)
@@ -97,19 +103,36 @@ def find_inversion(given: SolveInput, solution: Solution, lights: DistantLights 
     edge = outline(small.normal, small.mask)
     if edge.outward >= CLEAR:
         return None
-    inward = _is_clear(edge)
-    wrong = LightAxes("the surface looks inverted: with x and y negated (turned by 180° about the view axis) it casts the shadows that the "
-                      "images show; check the axes (x right, y up, z towards the camera)", (INVERSE,))
+    inward, decided = _is_clear(edge), None
     if lights is not None:
-        (count, lit), (count_inverse, lit_inverse) = _shadows(given, solution, small, lights)
-        if inward and count >= LEAST_SHADOWS:
-            return wrong if lit >= LIT_WRONG else None
-        if count >= LEAST_SHADOWS_ALONE and lit >= LIT_WRONG_ALONE and count_inverse >= LEAST_SHADOWS and lit_inverse <= LIT_RIGHT:
-            return wrong
-    if not inward:
+        decided = _is_inverted(*_shadows(given, solution, small, lights), len(lights.direction) >= MANY_LIGHTS, alone=not inward)
+    if decided:
+        return LightAxes("the surface looks inverted: with x and y negated (turned by 180° about the view axis) it casts the shadows that "
+                         "the images show; check the axes (x right, y up, z towards the camera)", (INVERSE,))
+    if decided is not None or not inward:
         return None
     return LightAxes("along the outline the normals point inwards: the object is hollow there, or x and y of the lights are both negated "
                      "(turned by 180° about the view axis); nothing else in the images decides")
+
+
+def _is_inverted(height: tuple[int, float], inverse: tuple[int, float], many: bool, *, alone: bool) -> bool | None:
+    """Return whether cast shadows say that a surface is inverted; None where they do not decide.
+
+    Args:
+        height: readings in shadow of the surface, and which part of them is lit.
+        inverse: the same of its inverse.
+        many: whether there are enough lights for the first to contradict the surface.
+        alone: whether there is no outline that speaks for the inversion.
+    """
+    (count, lit), (count_inverse, lit_inverse) = height, inverse
+    if count < (LEAST_SHADOWS_ALONE if alone else LEAST_SHADOWS):
+        return False if count >= LEAST_SHADOWS_HOLLOW and lit < LIT_WRONG else None
+    explained = count_inverse >= LEAST_SHADOWS_RIGHT and lit_inverse <= LIT_SHADOW
+    if alone:
+        return many and explained and lit >= LIT_WRONG
+    if many or explained:
+        return lit >= (LIT_WRONG if explained else LIT_INVERTED)
+    return False if lit < LIT_INVERTED else None
 
 
 def _exchanged(given: SolveInput, lights: DistantLights, fit: Fit) -> LightAxes | None:

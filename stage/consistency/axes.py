@@ -28,6 +28,9 @@ STANDARD_ERRORS_MIRROR, STANDARD_ERRORS_TURN = 6.0, 8.0
 is ahead by 2.4 at most (a white bowl under four lights) and behind by 10 to 40 on most; a turn is ahead by 10.7, but below 21 degrees."""
 LARGEST_PART = 0.85
 """The terms of the right axes are at most this part of those of the wrong ones."""
+LARGEST_PART_STRICT, LARGEST_LEFT_STRICT = 0.5, 0.1
+"""The part, and the most that the correction may leave, where three to five lights gave the normals: shadows and highlights then turn
+whole regions, and the normals of bowls and bare metal fit another mirroring better by chance (0.42 of it, but 0.12 left)."""
 LEAST_TURN_DEGREES = 30.0
 """Smaller turns are the bias of a few unevenly placed lights."""
 SNAP_DEGREES = 25.0
@@ -65,7 +68,7 @@ def sites(mask: np.ndarray) -> np.ndarray:  # -> [4, sites] int64
     return np.stack([centre + step, centre - step, centre - step * cols, centre + step * cols])
 
 
-def wrong_axes(normals: np.ndarray) -> Axes | None:
+def wrong_axes(normals: np.ndarray, *, strict: bool = False) -> Axes | None:
     """Return the mirroring or turn after which the normals fit together clearly better, or None.
 
     At every place the four sums and differences of the derivatives of the slopes are scaled to the length 1, so that edges and rims
@@ -74,6 +77,7 @@ def wrong_axes(normals: np.ndarray) -> Axes | None:
 
     Args:
         normals: [4, 3, sites] at the pixels of `sites`, z towards the viewer of that pixel.
+        strict: ask for more, where few lights gave the normals.
     """
     good = (normals[:, 2] > LEAST_TOWARD).all(axis=0)
     if good.sum() < LEAST_SITES:
@@ -85,12 +89,13 @@ def wrong_axes(normals: np.ndarray) -> Axes | None:
     turned, turn = _least(terms[:2])
     mirrored, mirror = _least(terms[2:])
     given = terms[0] ** 2
-    if _ahead(mirrored, turned) > STANDARD_ERRORS_MIRROR and mirrored.mean() < LARGEST_PART * turned.mean():
+    part, most = (LARGEST_PART_STRICT, LARGEST_LEFT_STRICT) if strict else (LARGEST_PART, 1.0)
+    if _ahead(mirrored, turned) > STANDARD_ERRORS_MIRROR and mirrored.mean() < min(part * turned.mean(), most):
         cosine, sine = _snapped(mirror)
         return Axes(np.array([[cosine, -sine], [-sine, -cosine]]), float(given.mean()), float(mirrored.mean()))
     turned_degrees = abs(np.degrees(np.arctan2(turn[1], turn[0])))
     if (turned_degrees > LEAST_TURN_DEGREES and _ahead(turned, given) > STANDARD_ERRORS_TURN
-            and turned.mean() < LARGEST_PART * given.mean()):
+            and turned.mean() < min(part * given.mean(), most)):
         cosine, sine = _snapped(turn)
         return Axes(np.array([[cosine, sine], [-sine, cosine]]), float(given.mean()), float(turned.mean()))
     return None
