@@ -39,10 +39,10 @@ MANY_LIGHTS = 6
 """Fewer lights seldom contradict a height: their normals leave no misfit, and shadows turn them."""
 LEAST_SHADOWS, LEAST_SHADOWS_ALONE = 30, 400
 """Least count of readings that the height puts in shadow, for them to speak against an outline, and alone."""
-LIT_INVERTED, LIT_WRONG, LIT_SHADOW = 0.9, 0.6, 0.5
-"""An inverted surface is lit in all the shadows that it should cast (0.92 to 1), but where the right one casts some: then from the second
-part on, and up to the third part of the readings that the inverse puts in shadow is lit. In right hollows less than 0.9 is lit, in white
-ones under few lights as much as 0.83, and their inverses cast no shadow, or one that is lit."""
+LIT_INVERTED, LIT_WRONG, LIT_SHADOW = 0.85, 0.6, 0.5
+"""An inverted surface is lit in all the shadows that it should cast (0.89 to 1), but where the right one casts some: then from the second
+part on, and up to the third part of the readings that the inverse puts in shadow is lit. In right hollows at most 0.77 is lit, in white
+ones under three to five lights 0.84, and their inverses cast no shadow, or one that is lit."""
 LEAST_SHADOWS_RIGHT, LEAST_SHADOWS_HOLLOW = 20, 8
 """Least count of readings that the inverse puts in shadow, and of those in shadow that show a hollow if less than LIT_WRONG is lit."""
 INVERSE = np.diag([-1.0, -1.0, 1.0])
