@@ -66,6 +66,7 @@ def _scan(request: ScanRequest) -> None:
         print(f"las      {result.las_path}")
     print(f"report   {result.report_path}")
     print(f"shots    {counted(result.counts)}")
+    print_warnings(result.warnings)
 
 
 def _cw(request: SimulateCwRequest) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from kernels.status import SOLVED, Status
-from kernels.tof.count_scale import estimate_count_scale
+from kernels.tof.count_scale import CountScale, estimate_count_scale
 from kernels.tof.fixed_pattern import pattern_bins, without_bins
 from kernels.tof.interlaced import interlaced
 from kernels.tof.misfit import misfit
@@ -132,14 +132,26 @@ def _photons(frames: Histograms, usable: np.ndarray, pattern: np.ndarray) -> tup
         return (frames.counts / np.float32(frames.count_scale)).astype(np.float32), {"units": frames.count_scale, "from": "manifest"}, []
     scale = estimate_count_scale(frames.counts[usable][:, ~pattern])
     facts = {"units": float(f"{scale.units:.4g}"), "from": "background" if scale.measured else "values"}
+    return (frames.counts / np.float32(scale.units)).astype(np.float32), facts, scale_warnings(scale)
+
+
+def scale_warnings(scale: CountScale) -> list[str]:
+    """Return what is said of counts that are not counts of photons."""
     warnings = []
     if scale.units != 1:
-        warnings.append(f"frames[].tof: counts vary as if {scale.units:.3g} units were one photon, and were divided by that: give counts "
+        warnings.append(f"tof: counts vary as if {scale.units:.3g} units were one photon, and were divided by that: give counts "
                         "of photons, or tof.count_scale, the recorded units of one photon")
     if scale.shared:
-        warnings.append("frames[].tof: neighbouring bins vary together, as in histograms that were smoothed: give them as recorded; the "
-                        "standard deviations are those of a pulse as wide as the smoothed one")
-    return (frames.counts / np.float32(scale.units)).astype(np.float32), facts, warnings
+        warnings.append("tof: neighbouring bins vary together, as in histograms that were smoothed: give them as recorded; the standard "
+                        "deviations are those of a pulse as wide as the smoothed one")
+    return warnings
+
+
+def pile_up_warning(found: PulseCount) -> str:
+    """Return what is said of pile-up that was found."""
+    return ("tof.pulses, tof.first_photon_only: the histograms show pile-up that is not declared, as if the first photon alone of each of "
+            f"{found.pulses} pulses had been counted ({100 * found.used:.0f} % of the pulses in the fullest histogram), and were corrected "
+            "for it: declare both")
 
 
 def _live(frames: Histograms, photons: np.ndarray, calibration: TofCalibration, pattern: np.ndarray, usable: np.ndarray, device: str,
@@ -172,9 +184,7 @@ def _live(frames: Histograms, photons: np.ndarray, calibration: TofCalibration, 
     found = estimate_pulses(photons[usable], shape.pulse, device, lambda some, seen: shape_of(some, seen).pulse, declared=known)
     if found is None:
         return histograms, shape, None
-    warnings.append("tof.pulses, tof.first_photon_only: the histograms show pile-up that is not declared, as if the first photon alone "
-                    f"of each of {found.pulses} pulses had been counted ({100 * found.used:.0f} % of the pulses in the fullest histogram), "
-                    "and were corrected for it: declare both")
+    warnings.append(pile_up_warning(found))
     histograms = correct_pileup(counts, pulses=found.pulses)
     return histograms, shape_of(histograms, shown), found
 

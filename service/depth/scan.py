@@ -7,9 +7,12 @@ import numpy as np
 
 from kernels import device as devices
 from kernels.status import SOLVED
+from kernels.tof.count_scale import estimate_count_scale
 from kernels.tof.pileup import correct_pileup, place, without_pileup
 from kernels.tof.pulse_width import estimate_pulse
 from kernels.tof.returns import find_returns
+from kernels.tof.undeclared_pileup import estimate_pulses
+from service.depth.histograms import pile_up_warning, scale_warnings
 from service.depth.points import srgb_bytes, white_of
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
@@ -39,6 +42,8 @@ class ScanResult(NamedTuple):
     report_path: Path
     counts: dict[str, int]
     """Number of shots and points, and of those left out, by reason."""
+    warnings: tuple[str, ...]
+    """A sentence for each thing that does not fit on the whole scan."""
 
 
 def scan(request: ScanRequest, progress: Progress | None = None) -> ScanResult:
@@ -60,7 +65,7 @@ def scan(request: ScanRequest, progress: Progress | None = None) -> ScanResult:
     timings.stage("read", 1)
     shots = read_scan(request.scan)
     timings.stage("returns", 1)
-    index, range_m, intensity, facts = _returns(shots, device)
+    index, range_m, intensity, facts, warnings = _returns(shots, device)
     near, far = request.near_m or 0.0, request.far_m or np.inf
     inside = (range_m >= near) & (range_m <= far) & (range_m > 0)
     timings.stage("place", 1)
@@ -89,27 +94,37 @@ def scan(request: ScanRequest, progress: Progress | None = None) -> ScanResult:
     write_text(report_path, report(
         request,
         inputs={"scan": str(request.scan), "name": shots.scan.name, "content": hashes, "poses": len(shots.scan.track)},
-        method="scan", found=facts,
+        method="scan", found=facts, warnings=warnings,
         device=devices.describe(device), timings_s=timings.close(), shots=counts,
         extent_m={"low": points.min(axis=0).tolist(), "high": points.max(axis=0).tolist()}))
-    return ScanResult(cloud, points_path, usd_path, las_path, report_path, counts)
+    return ScanResult(cloud, points_path, usd_path, las_path, report_path, counts, tuple(warnings))
 
 
-def _returns(shots: Shots, device: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-    """Return shot, range and intensity of each return, and facts about them for the report."""
+def _returns(shots: Shots, device: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, Any], list[str]]:
+    """Return shot, range and intensity of each return, facts about them for the report, and a sentence for each thing that does not fit."""
     if shots.waveforms is None:
         assert shots.range_m is not None and shots.intensity is not None  # the reader gives either these or waveforms
         index = np.nonzero(np.isfinite(shots.range_m) & np.isfinite(shots.intensity))[0]
-        return index, shots.range_m[index], shots.intensity[index], {"ranges": "as recorded"}
+        return index, shots.range_m[index], shots.intensity[index], {"ranges": "as recorded"}, []
     waveforms = shots.scan.waveforms
     assert waveforms is not None
-    counts = place(shots.waveforms, device)
+    place(shots.waveforms, device)  # faults of the counts come before those of what is estimated from them
+    scale = estimate_count_scale(shots.waveforms)
+    warnings = scale_warnings(scale)
+    photons = (shots.waveforms / np.float32(scale.units)).astype(np.float32)
+    counts = place(photons, device)
     histograms = correct_pileup(counts, pulses=waveforms.pulses or 1) if waveforms.first_photon_only else without_pileup(counts)
-    shape = estimate_pulse(histograms, shots.waveforms)
+    shape = estimate_pulse(histograms, photons)
+    if not waveforms.first_photon_only:
+        pile_up = estimate_pulses(photons, shape.pulse, device, lambda some, seen: estimate_pulse(some, seen).pulse)
+        if pile_up is not None:
+            warnings.append(pile_up_warning(pile_up))
+            histograms = correct_pileup(counts, pulses=pile_up.pulses)
+            shape = estimate_pulse(histograms, photons)
     found = find_returns(histograms, shape.pulse, most=MOST_RETURNS)
     there = (found.photons.numpy() > 0) & np.isin(found.status.numpy(), SOLVED)
     number, index = np.nonzero(there)
     time_s = waveforms.start_s + found.position.numpy()[number, index].astype(np.float64) * waveforms.bin_s
     facts = {"ranges": "from waveforms", "pulse_sigma_s": float(f"{shape.sigma * waveforms.bin_s:.4g}"),
              "shots_with_several_returns": int(there[1].sum())}
-    return index, range_of_delay_m(time_s), found.photons.numpy()[number, index], facts
+    return index, range_of_delay_m(time_s), found.photons.numpy()[number, index], facts, warnings

@@ -58,6 +58,18 @@ def test_waveforms_give_several_returns(tmp_path):
     assert np.median(np.abs(np.sort(distance) - np.sort(wanted))) < 0.02
 
 
+def test_scaled_waveforms_have_the_same_points_and_a_sentence(tmp_path):
+    """Ten units a photon: taken for photons, noise of the background gives as many points again."""
+    n = 400
+    view = View(np.linspace(2, 6, n)[None], np.full((1, n), 0.9), np.ones((1, n)))
+    np.save(tmp_path / "w.npy", 10 * histogram(view, 4e3, background=3.0, seed=0)[0])
+    result = scan(ScanRequest(scan=write(tmp_path, ring(n)[:, :3], waveforms={"file": "w.npy", "bin_s": 1.5e-9}), out=tmp_path / "out",
+                              device="cpu"))
+    assert any("units were one photon" in sentence for sentence in result.warnings)
+    assert json.loads(result.report_path.read_text())["warnings"] == list(result.warnings)
+    assert result.counts["points"] == pytest.approx(n, rel=0.02)
+
+
 def test_shots_outside_the_track_or_the_span_are_left_out_and_counted(tmp_path):
     still = np.eye(4).tolist()
     track = [{"time_s": 0, "world_from_platform": still}, {"time_s": 0.5, "world_from_platform": still}]
