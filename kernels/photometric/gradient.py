@@ -34,6 +34,7 @@ class GradientFit(NamedTuple):
     normal: wp.array  # [3, pixels] float32, unit
     albedo: wp.array  # [3, pixels] float32, scene-linear
     confidence: wp.array  # [pixels] float32, 0…1
+    bent: wp.array  # [pixels] float32, the part of the standard error that a length other than one stands for, degrees
     length: wp.array  # [pixels] float32, (3/2)|M|/M₀: one on a convex Lambertian surface
     status: wp.array  # [pixels] int32, kernels.status.Status
 
@@ -58,8 +59,7 @@ def diffuse_normals(diffuse: Moments, grey_weights: tuple[float, float, float], 
         that is missing or added across the normal tilts M by δ and changes its length by δ²/2.
     """
     fit = GradientFit(zeros(pixel_count, wp.float32, device, rows=3), zeros(pixel_count, wp.float32, device, rows=3),
-                      zeros(pixel_count, wp.float32, device), zeros(pixel_count, wp.float32, device),
-                      zeros(pixel_count, wp.int32, device))
+                      *(zeros(pixel_count, wp.float32, device) for _ in range(3)), zeros(pixel_count, wp.int32, device))
     devices.launch(_diffuse_kernel, pixel_count, [*diffuse, wp.vec3(*grey_weights), gain], fit, device=device)
     return fit
 
@@ -78,6 +78,7 @@ def _diffuse_kernel(first: int,
                     normal: wp.array2d(dtype=float),  # [3, N]
                     albedo: wp.array2d(dtype=float),  # [3, N]
                     confidence: wp.array(dtype=float),  # [N]
+                    bend: wp.array(dtype=float),  # [N]
                     length: wp.array(dtype=float),  # [N]
                     status: wp.array(dtype=int)):  # [N]
     p = first + wp.tid()
@@ -105,4 +106,5 @@ def _diffuse_kernel(first: int,
     noise = 2.0 * variance[p] * squares / ((spare[p] + 1.0) * size * size)
     explained = wp.static(2.0 * 1.5) * wp.sqrt(variance[p]) * (ROUNDING + residual[p])
     bent = 2.0 * wp.max(wp.abs(1.0 - 1.5 * size) - explained, 0.0)
+    bend[p] = wp.sqrt(bent) / CONFIDENCE_HALF
     confidence[p] = 1.0 / (1.0 + wp.sqrt(noise + bent + tilt[p] * tilt[p]) / CONFIDENCE_HALF)

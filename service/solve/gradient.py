@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from kernels import packs
+from kernels.photometric.cancellation import neighbours_doubt
 from kernels.photometric.gradient import diffuse_normals
 from kernels.photometric.highlight import fit_highlights, specular_normals
 from kernels.photometric.moments import Moments, fit_moments
@@ -43,6 +44,7 @@ def solve_gradients(given: SolveInput, frames: GradientFrames) -> Solution:
         result.specular_normal = np.zeros((3, pixels), np.float32)
     if frames.parallel is not None:
         result.specular, result.roughness = np.zeros((3, pixels), np.float16), np.zeros(pixels, np.float16)
+    bent = np.zeros(pixels, np.float32)
     length, separated, metal = np.zeros(pixels, np.float32), np.zeros(pixels, bool), np.zeros(pixels, bool)
     gain = CROSSED_GAIN if frames.polarised else 1.0
     for start, stop in stack.bands(BYTES_PER_PIXEL):
@@ -71,11 +73,16 @@ def solve_gradients(given: SolveInput, frames: GradientFrames) -> Solution:
             _store(result.residual, here, kept, diffuse.residual)
             _store(result.status, here, kept, fit.status)
             _store(length, here, kept, fit.length)
+            _store(bent, here, kept, fit.bent)
             if frames.parallel is not None:
                 metal[here] = _take_highlight(result, here, parts.specular.numpy()[:3, : len(kept)])
                 result.residual[here] = np.where(metal[here], parallel.residual.numpy()[: len(kept)], result.residual[here])
             separated[here] = kept & (diffuse.tilt.numpy()[: len(kept)] == 0)
         given.timings.advance(stop)
+    neighbours = neighbours_doubt(bent.reshape(given.mask.shape), given.mask).reshape(-1)
+    estimated = (result.status == Status.OK) & ~metal
+    doubted = np.sqrt(np.maximum(result.standard_error() ** 2 - bent**2 + neighbours**2, 0))
+    result.confidence[estimated] = 1 / (1 + doubted[estimated])
     result.facts = _facts(frames, result, length, separated, metal)
     if result.specular_normal is not None and not result.specular_normal.any():
         result.specular_normal = None  # a layer that holds nothing is absent
