@@ -1,8 +1,9 @@
-"""Real captures relit from seven eighths of their lights, against the images of the others: what lies between lights, on real objects."""
+"""Real captures relit from a part of their lights, against the images of the others: what lies between lights, and beyond them."""
 
 import json
 import shutil
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,21 +19,34 @@ from stage.importers import diligent
 
 EVERY = 8
 """Every light with an index that this number divides is left out."""
+RIM_DEGREES = 30.0
+"""Lights farther than this from the view axis are left out to test what lies beyond the others; the outermost are at 43 degrees."""
 DISC_DEGREES = 0.5
 
 
-def left_out_errors(source: Path) -> tuple[int, dict[str, float]]:
-    """Predict the images of every eighth light of a DiLiGenT object from the others, and return their relative RMSE.
+def every_eighth(directions: np.ndarray) -> list[int]:
+    """Return the lights that are left out between others."""
+    return list(range(EVERY // 2, len(directions), EVERY))
+
+
+def rim(directions: np.ndarray) -> list[int]:
+    """Return the lights that are left out beyond others."""
+    return np.flatnonzero(directions[:, 2] < np.cos(np.radians(RIM_DEGREES))).tolist()
+
+
+def left_out_errors(source: Path, choose: Callable[[np.ndarray], list[int]]) -> tuple[int, dict[str, float]]:
+    """Predict the images of some lights of a DiLiGenT object from the others, and return their relative RMSE.
 
     Args:
         source: folder of the object.
+        choose: returns the lights that are left out, from directions [lights, 3].
     """
     with tempfile.TemporaryDirectory() as folder:
         work, whole = Path(folder), Path(folder) / "whole"
         diligent.import_folder(source, whole)
         manifest = json.loads((whole / "capture.json").read_text())
         frames = manifest["frames"]
-        out = range(EVERY // 2, len(frames), EVERY)
+        out = choose(np.array([frame["light"]["direction"] for frame in frames]))
         capture = Capture.open(whole)
         mask, correction = capture.mask(), Correction.of(capture)
         truth = np.stack([correction.apply(capture.sources()[index]).pixels[mask] for index in out]).astype(np.float64)
@@ -63,9 +77,12 @@ def left_out_table(data: Path) -> list[str]:
     Args:
         data: folder with diligent_ball and diligent_cat.
     """
-    rows = []
-    for name in ("ball", "cat"):
-        count, errors = left_out_errors(data / f"diligent_{name}")
-        rows.append(f"| {name} | {count} | " + " | ".join(f"{errors[key]:.3f}" for key in ("cells", "smooth", "guided")) + " |")
-    return ["DiLiGenT objects: maps are solved and images are summed without some lights; relative RMSE of the images of these lights.", "",
-            "| | left out | `--weights cells` | `--weights smooth` | `--maps` |", "|---|---|---|---|---|", *rows]
+    lines = ["DiLiGenT objects: maps are solved and images are summed without some lights; relative RMSE of these lights' images. "
+             f"Between: every eighth light. Beyond: all lights more than {RIM_DEGREES:g}° from the view axis, 6 to 16° beyond.", "",
+             "| | left out | `--weights cells` | `--weights smooth` | `--maps` |", "|---|---|---|---|---|"]
+    for where, choose in (("between", every_eighth), ("beyond", rim)):
+        for name in ("ball", "cat"):
+            count, errors = left_out_errors(data / f"diligent_{name}", choose)
+            cells = " | ".join(f"{errors[key]:.3f}" for key in ("cells", "smooth", "guided"))
+            lines.append(f"| {name}, {where} | {count} | {cells} |")
+    return lines
