@@ -7,8 +7,9 @@ always: there one bit changes) their middle is the result, with the deviation of
 Up to MAX_OPEN of the finest bits of a Gray code may be in doubt besides: the stripes that they tell apart are then one wide stripe.
 
 Light that reaches the pixel by other ways (fog, bounces, light below the surface) follows wide stripes as direct light does, and narrow
-ones hardly. So the two finest bits measure the direct part D of the contrast C, and a bit is proven where |d| > C - 2 D: other light,
-C - D at most, could not have turned it. Where more than two bits are not proven, the pixel is MULTIPATH.
+ones hardly. So two neighbouring ones of the FINE_BITS finest bits measure the direct part D of the contrast C (the clearer pair: blur
+dims the finest), and a coarser bit is proven where |d| > C - 2 D: other light, C - D at most, could not have turned it. Where more
+than two bits are not proven, the pixel is MULTIPATH.
 
 Sources: Posdamer and Altschuler, CGIP 1982 (binary); Inokuchi, Sato and Matsuda, ICPR 1984 (Gray); Gupta, Agrawal,
 Veeraraghavan and Narasimhan, CVPR 2011, section 4 (XOR); Xu and Aliaga, "Robust pixel classification for 3D modeling with structured
@@ -39,6 +40,8 @@ than noise decides."""
 MAX_OPEN = 2
 """Number of the finest bits that may be in doubt without the pixel being refused: a camera that resolves stripes a quarter as fine as those
 that are shown sees no more."""
+FINE_BITS = 3
+"""Number of the finest bits that tell direct light."""
 MUCH_STRAY = 0.5
 """Largest part of the contrast, minus twice the direct light, with which all bits of XOR and binary codes count: a quarter is direct."""
 LARGEST = 1.0e15
@@ -173,6 +176,7 @@ def _stripe_kernel(pack: int, code: Literal["binary", "gray", "xor"] = "gray", i
     float_pack, int_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32), pack_type(pack, wp.uint8)
     number_of, proven = _NUMBERS[code]
     narrow = code == "xor"
+    first_open = 0 if narrow else FINE_BITS - 1  # finer bits show direct light
     cut_of = cut_in(pack)
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -213,9 +217,8 @@ def _stripe_kernel(pack: int, code: Literal["binary", "gray", "xor"] = "gray", i
                     contrast[k] = wp.max(contrast[k], wp.abs(one[k] - other[k]))
                     spread[k] = 2.0 * read_variance + gain * wp.max(one[k] + other[k], 0.0)
         # the light that may have come by other ways: all but twice the direct light, which the finest bits show
-        stray, finest = float_pack(), float_pack()
-        fine = wp.where(wp.static(narrow), rows.shape[0], wp.min(rows.shape[0], 2))
-        for bit in range(fine):
+        stray, finest, before = float_pack(), float_pack(), float_pack()
+        for bit in range(wp.where(wp.static(narrow), rows.shape[0], wp.min(rows.shape[0], FINE_BITS))):
             one = values[rows[bit, 0], p]
             other = values[rows[bit, 1], p]
             for k in range(pack):
@@ -223,7 +226,9 @@ def _stripe_kernel(pack: int, code: Literal["binary", "gray", "xor"] = "gray", i
                 if wp.static(not inverses):
                     d = 2.0 * wp.abs(one[k] - middle[k])
                 finest[k] = wp.where(bit == 0, d, finest[k])
-                stray[k] = wp.where(wp.static(narrow), wp.max(stray[k], d), stray[k] + d / float(fine))
+                pair = wp.where(bit == 0, wp.where(rows.shape[0] == 1, d, 0.0), 0.5 * (before[k] + d))
+                stray[k] = wp.max(stray[k], wp.where(wp.static(narrow), d, pair))
+                before[k] = d
         for k in range(pack):
             stray[k] = wp.max(contrast[k] - 2.0 * stray[k], 0.0)
         noise_part = wp.static(2.0 * DOUBT_SIGMAS**2) * read_variance
@@ -240,7 +245,8 @@ def _stripe_kernel(pack: int, code: Literal["binary", "gray", "xor"] = "gray", i
                     limit = wp.max(noise_part + gain_part * wp.max(one[k] + other[k], 0.0), part * part)
                     shown[k] = shown[k] + wp.where(d > 0.0, flag, 0)
                     doubt[k] = doubt[k] + wp.where(d * d >= limit, 0, flag)
-                    open[k] = open[k] + wp.where(proven(wp.abs(d), stray[k], finest[k], contrast[k], limit), 0, flag)
+                    sure = bit < wp.static(first_open) or proven(wp.abs(d), stray[k], finest[k], contrast[k], limit)
+                    open[k] = open[k] + wp.where(sure, 0, flag)
             else:
                 for k in range(pack):
                     d = one[k] - middle[k]
@@ -249,7 +255,8 @@ def _stripe_kernel(pack: int, code: Literal["binary", "gray", "xor"] = "gray", i
                     limit = wp.max(wp.static(DOUBT_SIGMAS**2) * variance, part * part)
                     shown[k] = shown[k] + wp.where(d > 0.0, flag, 0)
                     doubt[k] = doubt[k] + wp.where(d * d >= limit, 0, flag)
-                    open[k] = open[k] + wp.where(proven(2.0 * wp.abs(d), stray[k], finest[k], contrast[k], 4.0 * limit), 0, flag)
+                    sure = bit < wp.static(first_open) or proven(2.0 * wp.abs(d), stray[k], finest[k], contrast[k], 4.0 * limit)
+                    open[k] = open[k] + wp.where(sure, 0, flag)
         u, error, signal, result = float_pack(), float_pack(), float_pack(), byte_pack()
         for k in range(pack):
             doubtful = doubt[k] | open[k]

@@ -37,12 +37,12 @@ def stripes(direct, inverse, white, black, read, gain, code="gray", base_bit=0, 
     limit = np.maximum(doubt**2 * own, small**2)
     doubtful = ~(difference**2 >= limit)
     size = factor * np.abs(difference)
-    alone = size.max(axis=0) if code == "xor" else size[:2].mean(axis=0)
+    alone = size.max(axis=0) if code == "xor" or n == 1 else np.max([(a + b) / 2 for a, b in itertools.pairwise(size[:3])], axis=0)
     stray = np.maximum(contrast - 2 * alone, 0)
     if code == "xor":
         unproven = np.broadcast_to(~(stray < 0.5 * contrast), size.shape)
     else:
-        unproven = ~(size >= stray)
+        unproven = ~(size >= stray) & (np.arange(n) >= 2)[:, None]
         if code == "binary":
             unproven = unproven & ~(stray < 0.5 * contrast) & ~((size - size[0])**2 < 4 * np.maximum(factor**2 * limit, 0.01 * contrast**2))
     doubtful = doubtful | unproven
