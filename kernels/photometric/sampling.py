@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from kernels.photometric.hypotheses import Diffuse, Search, SearchOptions, search_normals
+from kernels.photometric.hypotheses import Diffuse, SearchOptions, search_normals
 from kernels.photometric.material import Material, fit_material
 from kernels.photometric.modes import Modes, find_modes, weigh
 from kernels.photometric.posterior import Group, bounded, measure_noise, normal_posterior
@@ -110,9 +110,10 @@ def solve_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, *
     materials = [fit_material(samples, search.normal, shape=lambert, options=options, table=tables.responses)
                  for search in searches]
     metallic = materials[1].cost < materials[0].cost
-    found, material = Search(*_choose(metallic, *searches)), Material(*_choose(metallic, *materials))
+    material = Material(*_choose(metallic, *materials))
+    found, cost, weights = _choose(metallic, *((search.normal, search.cost, search.weights) for search in searches))
     kinds = [kind for kind in (False, True) if (metallic == kind).any()]
-    groups = [Group(choose(samples, metallic == kind), bounded(tables.posterior[kind], samples), found.normal[metallic == kind])
+    groups = [Group(choose(samples, metallic == kind), bounded(tables.posterior[kind], samples), found[metallic == kind])
               for kind in kinds]
     noise = measure_noise(groups)
     modes = Modes.empty(samples.pixel_count)
@@ -120,16 +121,16 @@ def solve_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, *
         other = search_normals(group.samples, starts[1][metallic == kind], shape=lambert, options=AROUND_OPTIONS, wide=AROUND[0],
                                fine=AROUND[1:], table=tables.search[kind]).normal
         modes.place(metallic == kind, weigh(normal_posterior(group, noise), normal_posterior(group._replace(normal=other), noise)))
-    kept = modes.close_to(found.normal)
-    normal = np.where(kept[:, None], found.normal, modes.normal)
+    kept = modes.close_to(found)
+    normal = np.where(kept[:, None], found, modes.normal)
     if not kept.all():
         again = fit_material(choose(samples, ~kept), normal[~kept], shape=lambert, options=options, table=tables.responses)
         for values, better in zip(material, again, strict=True):
             values[~kept] = better
     facing = (normal * view).sum(axis=1)
     return SamplingFit(normal, material.diffuse_albedo, material.specular, material.roughness,
-                       regimes(found.weights, np.where(metallic, METAL, DIELECTRIC), facing, material),
-                       (modes.probability / (1 + modes.sigma)).astype(np.float32), modes.spread, np.sqrt(found.cost))
+                       regimes(weights, np.where(metallic, METAL, DIELECTRIC), facing, material),
+                       (modes.probability / (1 + modes.sigma)).astype(np.float32), modes.spread, np.sqrt(cost))
 
 
 def _choose(second: np.ndarray, a: tuple[np.ndarray, ...], b: tuple[np.ndarray, ...]) -> list[np.ndarray]:
