@@ -17,10 +17,10 @@ SAMPLES = Path(__file__).parents[1] / "samples"
 
 
 class SolveError(NamedTuple):
-    """The errors of the maps of a capture over its mask."""
+    """The errors of the maps of a capture over the pixels of its mask that have an estimate."""
 
     coverage: float
-    """Fraction of the mask that was solved."""
+    """Fraction of the mask that counts as solved."""
     mean_deg: float
     median_deg: float
     albedo_median: float
@@ -46,9 +46,10 @@ def read_truth(path: Path) -> dict[str, np.ndarray]:
 
 
 def compare(maps: SurfaceMaps, truth: dict[str, np.ndarray], mask: np.ndarray) -> SolveError:
-    """Return the errors of solved maps."""
+    """Return the errors of solved maps, over every pixel that has an estimate, also where it is unsure."""
     assert maps.normal is not None and maps.diffuse_albedo is not None
-    solved = mask & maps.mask
+    covered = float((mask & maps.mask).sum() / mask.sum())
+    solved = mask & (maps.mask if maps.estimated is None else maps.mask | maps.estimated)
     angle = angles_deg(maps.normal, truth["normal"])[solved]
     albedo = height = np.nan
     if "diffuse_albedo" in truth:
@@ -58,7 +59,7 @@ def compare(maps: SurfaceMaps, truth: dict[str, np.ndarray], mask: np.ndarray) -
         difference = (maps.height - truth["height"])[solved]
         relief = np.ptp(truth["height"][solved])
         height = float(np.sqrt(np.mean((difference - difference.mean()) ** 2)) / relief)
-    return SolveError(float(solved.sum() / mask.sum()), float(angle.mean()), float(np.median(angle)), albedo, height)
+    return SolveError(covered, float(angle.mean()), float(np.median(angle)), albedo, height)
 
 
 def sample_errors(name: str, method: Method) -> SolveError:

@@ -1,4 +1,4 @@
-"""Where a histogram leaves several times open, the neighbours' returns decide which is the most probable.
+"""Choose between the times that a histogram leaves open by the returns of the neighbours.
 
 The best RIVALS peaks of the likelihood are hypotheses, beside "another time" and "no return at all". The neighbours' hypotheses, weighed
 by their probabilities, are the prior distribution of a pixel's time and strength; each pixel's own likelihood enters once. The vote

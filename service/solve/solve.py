@@ -33,7 +33,7 @@ from stage.extended_lights import ExtendedLights
 from stage.files import write_text
 from stage.gradients import GradientFrames, gradient_frames, has_gradients
 from stage.ingest import open_stack
-from stage.light import ExtendedLight
+from stage.light import DistantLight, ExtendedLight, PointLight
 from stage.lighting import check_solvable
 from stage.manifest import FILE_NAME
 from stage.maps import MAPS_FILE, SurfaceMaps
@@ -57,7 +57,9 @@ class MethodEntry(NamedTuple):
 
 
 def _suits_svbrdf(capture: Capture) -> bool:
-    return bool(capture.lit_by(ExtendedLight)) or len(capture.sources()) >= SVBRDF_LIGHTS
+    places = {light.position_m if isinstance(light, PointLight) else light.direction
+              for frame in capture.sources() if isinstance(light := frame.light, DistantLight | PointLight)}
+    return bool(capture.lit_by(ExtendedLight)) or len(places) >= SVBRDF_LIGHTS  # exposures of one light are one
 
 
 def _single_lights(*series: Rounds) -> dict[type, Solver]:

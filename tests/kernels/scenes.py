@@ -28,7 +28,7 @@ class Solved(NamedTuple):
     weights: np.ndarray  # [light, pixel]
 
     def uncertainty(self, misfit: Misfit = Misfit()) -> Uncertainty:  # noqa: B008  (immutable)
-        """Of the normals, [pixel]."""
+        """Return how sure the normals are, [pixel]."""
         return uncertainty_of(self.across, self.squares, self.freedom, self.agreeing, misfit)
 
 

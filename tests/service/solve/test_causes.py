@@ -8,6 +8,7 @@ import pytest
 from kernels.status import Status
 from service.requests.solve import Method, SolveRequest
 from service.solve.solve import solve
+from stage import images
 from stage.maps import SurfaceMaps
 from tests.scenes import captures
 
@@ -51,8 +52,6 @@ def test_saturation_and_shadow_are_told_apart(tmp_path, scene):
     """A corner where all but two lights are cut off by the sensor, and one where they are dark."""
     folder = captures.write_capture(tmp_path / "capture", scene, saturation=0.9)
     manifest = json.loads((folder / "capture.json").read_text())
-    from stage import images
-
     rows = slice(11, 13)
     for index, frame in enumerate(manifest["frames"]):
         pixels = images.read_pixels(folder / frame["image"]).astype(np.float32)
@@ -72,8 +71,6 @@ def test_loose_normals_are_counted_and_kept(tmp_path, scene):
     """Noise as strong as the light: the normals are given, as ambiguous, and as unsure where σ is above what was asked for."""
     folder = captures.write_capture(tmp_path / "capture", scene)
     rng = np.random.default_rng(1)
-    from stage import images
-
     for frame in json.loads((folder / "capture.json").read_text())["frames"]:
         pixels = images.read_pixels(folder / frame["image"]).astype(np.float32)
         captures.write_exr(folder / frame["image"], pixels * rng.uniform(0.05, 3, pixels.shape[:2] + (1,)).astype(np.float32))
@@ -90,3 +87,20 @@ def test_loose_normals_are_counted_and_kept(tmp_path, scene):
     assert (written.sigma[unsure] > limit / half).all() and (written.sigma[written.mask] < limit * half).all()
     assert not written.mask[unsure].any() and np.array_equal(written.normal[unsure], every.maps.normal[unsure])
     assert np.array_equal(some.maps.mask, written.mask)
+
+
+@pytest.mark.parametrize(("lights", "exposures", "method"), [(5, 3, "robust"), (14, 1, "svbrdf")])
+def test_exposures_of_one_light_do_not_make_a_capture_one_of_many_lights(tmp_path, lights, exposures, method):
+    """Fifteen images of five lights say no more about a material than five do."""
+    folder = captures.write_capture(tmp_path / "capture", captures.make_scene(size=16, lights=lights))
+    manifest = json.loads((folder / "capture.json").read_text())
+    frames = manifest["frames"]
+    manifest["frames"] = [frame | {"exposure_s": 1.0} for frame in frames]
+    for number in range(1, exposures):
+        for frame in frames:
+            name = f"exposure{number}_{frame['image']}"
+            pixels = images.read_pixels(folder / frame["image"]).astype(np.float32)
+            captures.write_exr(folder / name, pixels * np.float32(2**number))
+            manifest["frames"].append(frame | {"image": name, "exposure_s": float(2**number)})
+    (folder / "capture.json").write_text(json.dumps(manifest))
+    assert solved(folder, tmp_path / "out", None)[1]["method"] == method
