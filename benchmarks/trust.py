@@ -9,6 +9,8 @@ the table is printed and nothing is written.
 import argparse
 import importlib
 import pkgutil
+import re
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -93,7 +95,8 @@ def row(trial: Trial) -> str:
     else:
         line = (f"{lead} {found.ratio:.2f} | {100 * found.far_out:.2f} % | {found.mean:.3g} {trial.unit} | "
                 f"{found.best_half:.3g} {trial.unit} | {found.confidence:.2f} |")
-    return f"{line}\n| *{trial.note}* | | | | | | | | |" if trial.note else line
+    note = re.sub(rf"{re.escape(tempfile.gettempdir())}/[^/\s]+/", "", trial.note)  # where the scene lay for a moment
+    return f"{line}\n| *{note}* | | | | | | | | |" if note else line
 
 
 def picture(trials: list[Trial]) -> np.ndarray:
