@@ -66,8 +66,8 @@ def estimate_pulses(counts: np.ndarray, pulse: Pulse, device: str, shape_of: Cal
         declared: number of pulses where it is known; it is tried alone.
 
     Convention:
-        The gain is divided by the dispersion of what the fit leaves: a pulse that fits badly makes likelihoods too certain. A background
-        fitted to the same photons prefers pile-up by half of them over the number of pulses, which is taken off (`spent`). A pulse of
+        The gain is divided by the dispersion of what the fit leaves: a pulse that fits badly makes likelihoods too certain. A flux
+        fitted to the same photons prefers pile-up where there is none, by what `spent` takes off. A pulse of
         another shape bends dim histograms as much as bright ones; pile-up does not, so that the dimmer half must agree.
 
     Source:
@@ -162,8 +162,15 @@ class _Counted:
         return value, found
 
     def spent(self, pulses: int) -> float:
-        """Return what first photons gain in the log likelihood on counts without pile-up: half a part of the pulses a histogram."""
-        return float(self.total.sum()) / (2 * pulses)
+        """Return what first photons gain in the log likelihood on counts without pile-up.
+
+        A fitted flux makes each sum t as likely as can be: C(N, t) (t/N)^t (1 - t/N)^(N-t) for N pulses, t^t exp(-t) / t! for all photons.
+        The logarithm of their ratio is about t / (2 N) where t is far below N, and rises to log(2π N) / 2.
+        """
+        every = np.minimum(self.total, pulses)
+        left = pulses - every
+        emptied = np.where(left > 0, left * np.log(np.maximum(left, 0.5) / pulses), 0.0)
+        return float(sum(lgamma(pulses + 1) - lgamma(n + 1) for n in left) + (emptied + every - every * np.log(pulses)).sum())
 
 
 def _expected(found: Returns, pulse: Pulse, bins: int) -> np.ndarray:

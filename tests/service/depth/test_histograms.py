@@ -61,6 +61,15 @@ def test_right_captures_raise_no_alarm(background, second, tmp_path):
     is_calibrated(ratios(result))
 
 
+@pytest.mark.parametrize("distance", [11.0, 6.0])
+def test_an_even_wall_shows_no_pile_up(distance, tmp_path):
+    """Thirty or a hundred photons in every pixel: sums that scatter little about one number are no full counters."""
+    view = tof.View(np.linspace(distance, distance + 0.3, 48) * np.ones((32, 1)), np.ones((32, 48)), np.ones((32, 48)))
+    result = solve(tmp_path / "c", tof.histogram(view, 4000, background=0.02, seed=5))
+    assert result.warnings == ()
+    is_calibrated(ratios(result, view))
+
+
 @pytest.mark.parametrize("factor", [10.0, 0.02, 3.7])
 def test_counts_in_other_units_have_the_same_sigma(factor, tmp_path):
     counts = tof.histogram(VIEW, 1500, background=2.0, seed=3)
