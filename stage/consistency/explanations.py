@@ -218,6 +218,10 @@ def _free_directions(sample: Sample, given: Fit) -> Explanation | None:
     top = np.maximum(bright_readings(readings, sample.usable), TINY)
     readings = readings / top
     lit = sample.usable & (readings > SHADOW)
+    enough = lit.sum(axis=0) >= MIN_READINGS_FREE
+    if enough.mean() < MIN_PART:
+        return None
+    lit &= enough
     best = np.argsort(-lit.sum(axis=0), kind="stable")[: max(PLENTY, lit.shape[1] // 4)]
     left, values, _ = np.linalg.svd(readings[:, best], full_matrices=False)
     lights, weight = left[:, :3] * values[:3], lit.astype(np.float64)
@@ -228,13 +232,9 @@ def _free_directions(sample: Sample, given: Fit) -> Explanation | None:
         residual = np.where(lit, readings - lights @ surface, 0)
         spread = TO_SIGMA * float(np.median(np.abs(residual[lit]))) + 1e-4
         weight = lit / (1 + (residual / (3 * spread)) ** 2)
-    enough = lit.sum(axis=0) >= MIN_READINGS_FREE
-    if enough.mean() < MIN_PART:
-        return None
-    chosen = lit & enough
-    free = TO_SIGMA * float(np.median(np.abs(residual[chosen])))
+    free = TO_SIGMA * float(np.median(np.abs(residual[lit])))
     scaled = np.abs(given.residual) * np.linalg.norm(given.vector, axis=0) / top
-    misfit = TO_SIGMA * float(np.median(scaled[chosen]))
+    misfit = TO_SIGMA * float(np.median(scaled[lit]))
     if misfit < LEAST_LEFT or not _explains(free, misfit, TIMES_FREE):
         return None
     halves = [fit_lambertian(readings[part::2], sample.usable[part::2], sample.directions[part::2]) for part in (0, 1)]
