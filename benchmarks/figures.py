@@ -63,8 +63,8 @@ def real(given: argparse.Namespace) -> list[str] | None:
     """Measure the DiLiGenT objects."""
     if given.data is None:
         return None
-    lines = ["DiLiGenT objects, 96 real lights; the cat at every second pixel. `lambert` leaves out readings of zero and of "
-             "full scale; with them NumPy's `lstsq` has mean errors of 4.17° and 8.46°. Errors count every normal, solved or unsure.", "", HEAD]
+    lines = ["DiLiGenT objects, 96 real lights; the cat at every second pixel. `lambert` leaves out readings of zero and of full scale; "
+             "with them NumPy's `lstsq` has mean errors of 4.17° and 8.46°. Errors count every normal, solved or unsure.", "", HEAD]
     for name in ("ball", "cat"):
         lines += [row(f"{name}, `{method}`", diligent_errors(given.data / f"diligent_{name}", method)) for method in DISTANT]
     return lines
