@@ -146,7 +146,7 @@ def main() -> None:
         print(rows[-1], flush=True)
     if not options.only:
         write_text(TABLE, HEAD + "\n".join(rows) + "\n\n" + CAPTION)
-        cv2.imwrite(str(PICTURE), picture(trials))
+        cv2.imwrite(str(PICTURE), picture(trials), [cv2.IMWRITE_PNG_COMPRESSION, 9])
 
 
 if __name__ == "__main__":
