@@ -25,6 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels.errors import ArrayError
+from kernels.photometric.least_squares import CONFIDENCE_HALF
 from kernels.photometric.samples import evenly
 
 SMOOTHNESS = np.radians(32.0)
@@ -45,14 +46,12 @@ SPREAD_PAIRS = 128
 """Number of pairs from which the excess is computed: it depends on the lights more than on the pixel."""
 WRONG_FIT = np.radians(45.0)
 """Standard error of a normal that most readings contradict."""
-LARGEST = 90.0
+LARGEST_ERROR = 90.0
 """Degrees: a visible normal that is not known at all is hardly further off."""
 MAJORITY, CLEAR_MAJORITY = 0.5, 0.6
 """Parts of the lit readings that agree with a fit that rejects some: up to the first no majority supports it, and from the second on the
 rejected ones are as few as those that the fit withstands: with highlights on three tenths of the lights 0.64 and more agree, on four
 tenths it breaks down with 0.52 and less."""
-CONFIDENCE_HALF = np.radians(1.0)
-"""Standard error of the normal, radians, at which confidence is one half."""
 
 
 class Misfit(NamedTuple):
@@ -129,7 +128,7 @@ def uncertainty_of(across: np.ndarray, squares: np.ndarray, freedom: np.ndarray,
     share = np.interp(np.log(np.maximum(variance, 1e-30)), np.log(np.maximum(misfit.residuals, 1e-30)), misfit.share)
     own = across * variance * np.maximum(1 + share * misfit.excess * freedom, 0.0)
     right = np.clip((agreeing - MAJORITY) / (CLEAR_MAJORITY - MAJORITY), 0, 1)
-    sigma = np.minimum(np.degrees(np.sqrt(right * own + (1 - right) * np.maximum(own, WRONG_FIT**2))), LARGEST)
+    sigma = np.minimum(np.degrees(np.sqrt(right * own + (1 - right) * np.maximum(own, WRONG_FIT**2))), LARGEST_ERROR)
     confidence = right / (1 + np.sqrt(own) / CONFIDENCE_HALF)
     return Uncertainty(sigma.astype(np.float32), confidence.astype(np.float32))
 

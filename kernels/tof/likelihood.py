@@ -41,6 +41,16 @@ class Shape:
     width: float  # bins: nearer than this two returns are one
 
 
+@wp.func
+def returns_found(photons: wp.array2d(dtype=wp.float32), p: int) -> int:
+    """Return how many returns a pixel has; they come first."""
+    found = wp.int32(0)
+    for m in range(photons.shape[0]):
+        if photons[m, p] > 0.0:
+            found = m + 1
+    return found
+
+
 def recorded(histograms: LiveCounts) -> Recorded:
     """Return the histograms as the kernels take them."""
     given = Recorded()

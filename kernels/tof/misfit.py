@@ -4,7 +4,18 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
-from kernels.tof.likelihood import Recorded, Shape, counted, counted_part, end_bin_of, first_bin_of, mean_of_bin, recorded, shape
+from kernels.tof.likelihood import (
+    Recorded,
+    Shape,
+    counted,
+    counted_part,
+    end_bin_of,
+    first_bin_of,
+    mean_of_bin,
+    recorded,
+    returns_found,
+    shape,
+)
 from kernels.tof.pileup import LiveCounts
 from kernels.tof.pulse import Pulse
 from kernels.tof.returns import Returns
@@ -47,10 +58,7 @@ def _misfit_kernel(first: int,
                    dispersion: wp.array2d(dtype=wp.float32)):
     p = first + wp.tid()
     b = background[p]
-    found = wp.int32(0)
-    for m in range(position.shape[0]):
-        if photons[m, p] > 0.0:
-            found = m + 1
+    found = returns_found(photons, p)
     for k in range(position.shape[0]):
         value = float(1.0)
         if k < found:

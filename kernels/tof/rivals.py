@@ -120,6 +120,16 @@ def _vote(times: np.ndarray, spread: np.ndarray, strength: np.ndarray, likely: n
     return before.numpy()[:, open_ones], before_none.numpy()[open_ones]
 
 
+@wp.func
+def is_free(times: wp.array2d(dtype=wp.float32), found: int, t: float, reach: float, p: int) -> bool:
+    """Tell whether a time is beyond the reach of every rival found."""
+    free = bool(True)
+    for m in range(found):
+        if wp.abs(times[m, p] - t) <= reach:
+            free = False
+    return free
+
+
 @wp.kernel(module="unique", module_options={"max_unroll": 0})  # unrolled, it is no faster and takes seconds to compile
 def _rivals_kernel(first: int,
                    given: Recorded,
@@ -159,11 +169,7 @@ def _rivals_kernel(first: int,
         strength = float(0.0)
         for j in range(low, high):
             t = float(j) / float(per_bin)
-            free = wp.int32(1)
-            for m in range(found):
-                if wp.abs(times[m, p] - t) <= reach:
-                    free = 0
-            if free == 1:
+            if is_free(times, found, t, reach, p):
                 added = added_at(given, pulse, t, b, p, 0, times, photons)
                 if added[0] > gain:
                     if found == 0:
@@ -184,11 +190,7 @@ def _rivals_kernel(first: int,
             for j in range(wp.max(int(wp.ceil((place - reach) * float(per_bin))), low),
                            wp.min(int((place + reach) * float(per_bin)) + 1, high)):
                 t = float(j) / float(per_bin)
-                free = wp.int32(1)
-                for m in range(found):
-                    if wp.abs(times[m, p] - t) <= reach:
-                        free = 0
-                if free == 1:
+                if is_free(times, found, t, reach, p):
                     added = added_at(given, pulse, t, b, p, 0, times, photons)
                     w = wp.exp(added[0] - top) / wp.sqrt(wp.max(added[1], 1.0))
                     mass += w

@@ -26,6 +26,7 @@ from kernels.tof.likelihood import (
     likelihood_slope,
     mean_of_bin,
     recorded,
+    returns_found,
     shape,
     share_before,
 )
@@ -185,10 +186,7 @@ def _times_kernel(first: int,
                   sigma: wp.array2d(dtype=wp.float32)):
     p = first + wp.tid()
     b = background[p]
-    found = wp.int32(0)
-    for m in range(position.shape[0]):
-        if photons[m, p] > 0.0:
-            found = m + 1
+    found = returns_found(photons, p)
     for k in range(found):
         top = position[k, p]
         known = _bounds(given, pulse, k, p, found, b, position, photons)

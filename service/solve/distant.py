@@ -19,7 +19,7 @@ from kernels.photometric.lambert import NormalFit, solve_lambert
 from kernels.photometric.left_out import LeftOut, leave_out
 from kernels.photometric.lobes import GEOMETRY, MIXTURE
 from kernels.photometric.material import MATT, fit_given, fit_tinted
-from kernels.photometric.misfit import uncertainty_of
+from kernels.photometric.misfit import LARGEST_ERROR, uncertainty_of
 from kernels.photometric.near import NearField
 from kernels.photometric.readings import Lights, channel_weights, grey_factors, grey_readings, pad_lights
 from kernels.photometric.robust import solve_robust
@@ -31,7 +31,7 @@ from kernels.status import Status
 from service.solve.batches import Batch, bands, pick_pixels, pixel_batches, view_directions
 from service.solve.interreflection import arriving_light
 from service.solve.misfit import object_misfit
-from service.solve.solution import LARGEST_ERROR, Solution, SolveInput, suspect_lights
+from service.solve.solution import Solution, SolveInput, suspect_lights
 from service.solve.surface import integrate, projection_of
 from stage.colour import GREY_WEIGHTS
 from stage.point_lights import DistantLights

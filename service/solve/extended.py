@@ -5,6 +5,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from kernels.photometric.misfit import LARGEST_ERROR
 from kernels.photometric.modes import GRID_FLOATS
 from kernels.photometric.readings import pad_lights
 from kernels.photometric.response_table import SEARCH_LOBES, response_table
@@ -12,7 +13,7 @@ from kernels.photometric.sampling import Regime, sampling_tables, solve_sampling
 from kernels.status import Status
 from service.requests.solve import MAX_SIGMA
 from service.solve.batches import pixel_batches, readable, view_directions
-from service.solve.solution import LARGEST_ERROR, Solution, SolveInput
+from service.solve.solution import Solution, SolveInput
 from stage.camera import Camera
 from stage.extended_lights import ExtendedLights
 

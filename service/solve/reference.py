@@ -2,13 +2,14 @@
 
 import numpy as np
 
+from kernels.photometric.misfit import LARGEST_ERROR
 from kernels.photometric.modes import GRID_FLOATS
 from kernels.photometric.readings import pad_lights
 from kernels.photometric.reference_table import reference_table, solve_reference
 from kernels.photometric.response_table import SEARCH_LOBES, nodes
 from kernels.status import Status
 from service.solve.batches import pixel_batches, readable, view_directions
-from service.solve.solution import LARGEST_ERROR, Solution, SolveInput
+from service.solve.solution import Solution, SolveInput
 from stage.colour import GREY_WEIGHTS
 from stage.ingest import open_stack
 from stage.reference_ball import ReferenceBall

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kernels.photometric.lambert import NormalFit
+from kernels.photometric.misfit import LARGEST_ERROR
 from kernels.photometric.readings import Lights, channel_weights
 from kernels.photometric.samples import evenly
 from kernels.status import Status, refuse_unsure
@@ -18,8 +19,6 @@ from stage.stack import Stack
 
 LOOSE_CONFIDENCE = 1.0 / (1.0 + 5.0)
 """Confidence of a normal whose standard error is five degrees."""
-LARGEST_ERROR = 90.0
-"""Degrees: a normal that is not known at all is this far off at most, on average."""
 PIXELS_AT_ONCE = 1 << 16
 """Number of pixels whose saturation bits are counted in one piece: it bounds the memory."""
 

@@ -15,7 +15,10 @@ TURNING = Subject(turn_degrees=0.4)
 
 
 def errors(relit, folder, subject, *arguments) -> np.ndarray:
-    """Of the normals, in degrees, but for a rim of four pixels, half a patch of the flow's search. Unaligned ones may be unsure."""
+    """Return the errors of the normals in degrees, but for a rim of four pixels, half a patch of the flow's search.
+
+    Aligned normals must be solved; unaligned ones may be unsure.
+    """
     outcome = relit("solve", folder, "--method", "lambert", "--out", folder / "out", *arguments)
     assert (outcome.code, outcome.err) == (0, "")
     maps = SurfaceMaps.read(folder / "out" / "maps.exr", unsure=True)
