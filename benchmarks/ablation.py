@@ -18,7 +18,7 @@ from kernels.photometric.samples import Samples, evenly, gather
 from kernels.photometric.svbrdf import average_normals, solve_svbrdf
 from kernels.status import Status
 from service.reporting.progress import Timings
-from service.solve.distant import SPREAD_PIXELS, MaterialOptions, solve_material
+from service.solve.material import SPREAD_PIXELS, MaterialOptions, solve_material
 from service.solve.solution import SolveInput
 from stage.capture import Capture
 from stage.colour import GREY_WEIGHTS

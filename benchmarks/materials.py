@@ -7,7 +7,7 @@ import numpy as np
 
 from kernels.photometric.readings import pad_lights
 from service.reporting.progress import Timings
-from service.solve.distant import MaterialOptions, solve_material
+from service.solve.material import MaterialOptions, solve_material
 from service.solve.solution import SolveInput
 from stage import exr
 from stage.capture import Capture

@@ -41,7 +41,7 @@ def mean_error(name, folder, method) -> float:
 
 
 def least_squares_error(name, *, every_reading: bool) -> float:
-    """Return the mean angular error in degrees of NumPy's least squares on BT.601 grey; without readings of zero or full scale, if asked."""
+    """Return the mean angular error in degrees of NumPy's least squares on BT.601 grey; else without readings of zero and full scale."""
     source = DATA / f"diligent_{name}"
     mask = images.read_pixels(source / "mask.png").max(axis=-1) > 0.5
     recorded = np.stack([images.read_pixels(path)[mask] for path in sorted(source.glob("[0-9]*.png"))])

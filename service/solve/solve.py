@@ -18,9 +18,11 @@ from service.reporting.provenance import REPORT_FILE, metadata, report
 from service.requests.solve import MAX_SIGMA, SVBRDF_LIGHTS, Method, SolveRequest
 from service.solve import integrability
 from service.solve.diagnosis import diagnose
-from service.solve.distant import solve_diffuse, solve_distant, solve_material
+from service.solve.diffuse import solve_diffuse
+from service.solve.distant import solve_distant
 from service.solve.extended import solve_extended
 from service.solve.gradient import solve_gradients
+from service.solve.material import solve_material
 from service.solve.near import MATERIAL_ROUNDS, Rounds, solve_near
 from service.solve.reference import solve_by_reference
 from service.solve.solution import Solution, SolveInput, SuspectLight, mark_not_facing, refine_status

@@ -1,0 +1,40 @@
+"""Normals and diffuse albedo by the methods that look at one pixel at a time: `lambert` and `robust`, band by band."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from kernels.photometric.albedo import fit_albedo
+from kernels.photometric.lambert import NormalFit
+from kernels.photometric.misfit import uncertainty_of
+from kernels.photometric.near import NearField
+from kernels.photometric.readings import Lights
+from kernels.status import Status
+from service.solve.batches import bands
+from service.solve.misfit import object_misfit
+from service.solve.solution import Solution, SolveInput
+
+
+def solve_diffuse(given: SolveInput, lights: Lights, field: NearField | None = None, *, fit_normals: Callable[..., NormalFit]) -> Solution:
+    """Solve every pixel of the mask for normal and diffuse albedo.
+
+    Args:
+        given: the images.
+        lights: lights of the stack, padded.
+        field: where the lights are, and the surface point of each pixel, where some light is near.
+        fit_normals: `solve_lambert` or `solve_robust`, which fits the normals of a band.
+    """
+    given.timings.stage("normals", given.stack.shape[2])
+    result = Solution.empty(given.stack.pixel_count)
+    result.sigma = np.zeros(given.stack.pixel_count, np.float16)
+    misfit = object_misfit(given, lights, field, fit_normals=fit_normals)
+    for span, inside, band, readings, near in bands(given, lights, field):
+        fit = fit_normals(band, readings, lights.direction, near)
+        result.place(span, inside, fit)
+        solved = inside & (result.status[span] == Status.OK)
+        evidence = (array.numpy()[: len(inside)] for array in (fit.across, fit.squares, fit.freedom, fit.agreeing))
+        sure = uncertainty_of(*evidence, misfit)
+        result.sigma[span], result.confidence[span] = np.where(solved, sure.sigma, 0), np.where(solved, sure.confidence, 0)
+        albedo = fit_albedo(band, readings, fit, lights, near).numpy()[:, : len(inside)]
+        result.albedo[:, span] = np.where(inside, albedo, 0)
+    return result

@@ -1,0 +1,74 @@
+"""The direct light of every reading: what the object itself does to the light of a lamp is taken out.
+
+From the first normals follows a height, from the height which readings lie in cast shadow, and from the height and the images the light
+that the object throws on itself.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from kernels.photometric.bounce import subtract_bounce
+from kernels.photometric.near import NearField
+from kernels.photometric.readings import Lights, channel_weights
+from kernels.photometric.samples import Samples
+from kernels.photometric.shadowing import exclude_shadows
+from service.solve.interreflection import ArrivingLight, arriving_light
+from service.solve.solution import SolveInput
+from service.solve.surface import integrate, projection_of
+from stage.colour import GREY_WEIGHTS
+
+LARGEST_ALBEDO = 0.98
+"""The part of light that a surface can send on; a fitted albedo may be larger where the scale of the lights is not absolute."""
+
+
+class DirectLight(NamedTuple):
+    """What hides the lights from the pixels of an object, and what it throws on itself."""
+
+    given: SolveInput
+    lights: Lights
+    field: NearField | None
+    """Where the lights are, where some light is near."""
+    solved: wp.array  # [rows, cols] uint8, on the device
+    occluder: wp.array | None  # [rows, cols] float32 height on the device; None: no cast shadow is taken out
+    arriving: ArrivingLight | None
+    """None: no interreflection is taken out."""
+    albedo: np.ndarray  # [3, pixels] diffuse, of the first search
+
+    def keep(self, pixels: np.ndarray, samples: Samples) -> None:
+        """Mark readings in cast shadow as none, and subtract the light that the object threw on itself from the others.
+
+        Args:
+            pixels: [n] row-major positions in the image.
+            samples: their readings; changed in place.
+        """
+        if self.occluder is not None:
+            exclude_shadows(samples, pixels, self.occluder, self.solved, projection_of(self.given.camera),
+                            None if self.field is None else self.field.places)
+        if self.arriving is not None:
+            corners, shares = self.arriving.at(*np.divmod(pixels, self.given.camera.width))
+            albedo = np.minimum(self.albedo[:, pixels].T.astype(np.float32), LARGEST_ALBEDO)
+            subtract_bounce(samples, self.arriving.light, corners, shares, albedo, channel_weights(self.lights, GREY_WEIGHTS))
+
+
+def direct_light(given: SolveInput, lights: Lights, field: NearField | None, normal: np.ndarray, albedo: np.ndarray,
+                 solved: np.ndarray, *, shadows: bool, interreflection: bool) -> DirectLight | None:
+    """Find what the object does to its own light, or return None when no pixel is solved.
+
+    Args:
+        given: the images.
+        lights: lights of the stack, padded.
+        field: where the lights are, where some light is near.
+        normal: [3, pixels] float32, of the first search.
+        albedo: [3, pixels] diffuse, of the same.
+        solved: [rows, cols] bool.
+        shadows: whether cast shadows are taken out.
+        interreflection: whether interreflection is taken out.
+    """
+    surface = integrate(given, normal, solved, stage="surface")
+    if surface is None:
+        return None
+    arriving = arriving_light(given, lights, normal, surface.height, solved) if interreflection else None
+    on_device = wp.array(solved.astype(np.uint8), dtype=wp.uint8, device=given.device)
+    return DirectLight(given, lights, field, on_device, surface.height if shadows else None, arriving, albedo)

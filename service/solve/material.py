@@ -1,0 +1,179 @@
+"""Normals and reflectance by the general solver, `svbrdf`, which fits a material.
+
+It walks over the image several times: a start, the diffuse lobe that the object shares, a first search, the direct light that follows
+from the height of its normals, the materials that pixels share, and the final solve.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from kernels.photometric.diffuse_shape import choose_diffuse
+from kernels.photometric.hypotheses import Diffuse, Prior, search_normals
+from kernels.photometric.lambert import solve_lambert
+from kernels.photometric.lobes import GEOMETRY, MIXTURE
+from kernels.photometric.material import MATT, fit_given, fit_tinted
+from kernels.photometric.misfit import LARGEST_ERROR
+from kernels.photometric.near import NearField
+from kernels.photometric.readings import Lights, grey_factors, grey_readings
+from kernels.photometric.robust import solve_robust
+from kernels.photometric.samples import Samples, evenly
+from kernels.photometric.shared_materials import choose_materials
+from kernels.photometric.svbrdf import solve_svbrdf
+from kernels.status import Status
+from service.solve.batches import Batch, bands, pick_pixels, pixel_batches, view_directions
+from service.solve.direct_light import DirectLight, direct_light
+from service.solve.solution import Solution, SolveInput
+from service.solve.support import FEW_LIGHTS, supports_lobes
+from stage.colour import GREY_WEIGHTS
+
+SPREAD_PIXELS = 384
+"""Pixels, spread over the object, from which the shape of the diffuse lobe and the shared materials are chosen."""
+PRIOR_STRENGTH = 10.0
+"""Strength of the prior towards the normals of `lambert` where the general solver is not supported: a standard deviation of some degrees
+for a reading that misfits by the noise floor of the search."""
+
+
+@dataclass(frozen=True)
+class MaterialOptions:
+    """Steps of the svbrdf solver that can be left out, to measure what each contributes."""
+
+    shadows: bool = True
+    """Leave out readings in cast shadow."""
+    interreflection: bool = True
+    """Subtract the light that the object throws on itself."""
+    sharing: bool = True
+    """Let pixels share materials."""
+
+
+WHOLE_SOLVER = MaterialOptions()
+
+
+def solve_material(given: SolveInput, lights: Lights, field: NearField | None = None,
+                   options: MaterialOptions = WHOLE_SOLVER) -> Solution:
+    """Solve every pixel of the mask for normal, diffuse albedo, F0 and roughness.
+
+    Args:
+        given: the images.
+        lights: lights of the stack, padded.
+        field: where the lights are, and the surface point of each pixel, where some light is near; then interreflection is not
+            subtracted.
+        options: the steps that are left out.
+    """
+    walk = _Walk(given, lights, field, options)
+    walk.start()
+    walk.choose_shape()
+    walk.search()
+    light = walk.direct_light()
+    walk.fit(light, walk.choose_materials(light))
+    return walk.result
+
+
+class _Walk:
+    """The state of a solve between its passes over the image."""
+
+    def __init__(self, given: SolveInput, lights: Lights, field: NearField | None, options: MaterialOptions) -> None:
+        self._given, self._lights, self._field, self._options = given, lights, field, options
+        self._view = view_directions(given.camera)
+        self._interreflection = options.interreflection and field is None
+        count = given.stack.pixel_count
+        self.result = Solution.empty(count)
+        self._specular = self.result.specular = np.zeros((3, count), np.float16)
+        self._roughness = self.result.roughness = np.zeros(count, np.float16)
+        self._lambertian = np.zeros_like(self.result.normal)
+        self._shape, self._supported = Diffuse(), True
+
+    def start(self) -> None:
+        """Find the normals of `robust`, from which the search begins, and under few lights those of `lambert`."""
+        self._given.timings.stage("start", self._given.stack.shape[2])
+        for span, inside, band, readings, near in bands(self._given, self._lights, self._field):
+            self.result.place(span, inside, solve_robust(band, readings, self._lights.direction, near))
+            if self._few:
+                grey = grey_readings(band, grey_factors(self._lights, GREY_WEIGHTS))
+                fit = solve_lambert(band, grey, self._lights.direction, near)
+                self._lambertian[:, span] = np.where(fit.status.numpy()[: len(inside)] == Status.OK, fit.normal.numpy()[:, : len(inside)],
+                                                     self.result.normal[:, span])
+        self._solvable = np.flatnonzero(self.result.status == Status.OK)
+        self._spread = self._solvable[evenly(len(self._solvable), SPREAD_PIXELS)] if len(self._solvable) else self._solvable
+
+    def choose_shape(self) -> None:
+        """Choose the shape of the diffuse lobe, and find out whether few lights support the lobes at all."""
+        self._given.timings.stage("shape", 1)
+        if not len(self._spread):
+            return
+        samples, normal = self._pick(self._spread), self.result.normal[:, self._spread].T
+        if self._few:
+            self._supported = supports_lobes(self.result, samples, normal)
+        if self._supported:
+            self._shape, tried = choose_diffuse(samples, normal)
+            self.result.facts |= {"diffuse_roughness": None if self._shape.rough < 0 else self._shape.rough,
+                                  "diffuse_slope": self._shape.slope, "shapes_tried": len(tried)}
+
+    def search(self) -> None:
+        """Search the normals a first time, and fit the albedo that interreflection needs."""
+        result = self.result
+        for pixels, samples in self._batches("search"):
+            start = result.normal[:, pixels] if self._supported else self._lambertian[:, pixels]
+            normal = search_normals(samples, start.T, shape=self._shape, prior=self._prior(pixels)).normal
+            result.normal[:, pixels] = normal.T
+            if self._interreflection:
+                first = (fit_tinted(samples, normal, shape=self._shape) if self._supported else
+                         fit_given(samples, normal, MATT, shape=self._shape))
+                result.albedo[:, pixels], self._roughness[pixels] = first.diffuse_albedo.T, first.roughness
+
+    def direct_light(self) -> DirectLight | None:
+        """Find what the object does to its own light, from the first search; None when no pixel is solved."""
+        solved = (self.result.status == Status.OK).reshape(self._given.mask.shape)
+        return direct_light(self._given, self._lights, self._field, self.result.normal, self.result.albedo.copy(), solved,
+                            shadows=self._options.shadows, interreflection=self._interreflection)
+
+    def choose_materials(self, light: DirectLight | None) -> np.ndarray | None:
+        """Return [materials, 4] F0 and roughness that pixels share, or None where they share none."""
+        if light is None or not (self._options.sharing and self._supported):
+            return None
+        samples = self._pick(self._spread)
+        light.keep(self._spread, samples)
+        materials = choose_materials(samples, self.result.normal[:, self._spread].T, shape=self._shape)
+        self.result.facts["shared_materials"] = [{"specular": material[:3].tolist(), "roughness": float(material[3])}
+                                                 for material in materials.round(4).astype(float)]
+        return materials
+
+    def fit(self, light: DirectLight | None, materials: np.ndarray | None) -> None:
+        """Fit normal and material of every pixel to its direct light."""
+        result = self.result
+        sigma = np.full(self._given.stack.pixel_count, LARGEST_ERROR, np.float16)
+        for pixels, samples in self._batches("normals"):
+            assert light is not None  # there are pixels
+            light.keep(pixels, samples)
+            roughness = self._roughness[pixels].astype(np.float32) if self._interreflection else None
+            found = solve_svbrdf(samples, result.normal[:, pixels].T, shape=self._shape, shared=materials, roughness=roughness,
+                                 prior=self._prior(pixels))
+            result.normal[:, pixels] = found.normal.T
+            result.albedo[:, pixels] = found.diffuse_albedo.T
+            self._specular[:, pixels] = found.specular.T
+            self._roughness[pixels] = found.roughness
+            sigma[pixels], result.confidence[pixels] = found.sigma, found.confidence
+            result.residual[pixels] = found.residual
+        result.sigma, result.judged_by_surface = sigma, True
+
+    @property
+    def _few(self) -> bool:
+        return self._given.stack.light_count < FEW_LIGHTS
+
+    def _prior(self, pixels: np.ndarray) -> Prior | None:
+        """Return what is expected of the normals of some pixels."""
+        return None if self._supported else Prior(self._lambertian[:, pixels].T, PRIOR_STRENGTH)
+
+    def _pick(self, pixels: np.ndarray) -> Samples:
+        """Return the readings of a few pixels, wherever they lie in the image."""
+        return pick_pixels(self._given, self._lights, self._view, pixels, self._field)
+
+    def _batches(self, stage: str) -> Iterator[Batch]:
+        """Yield the solvable pixels with their readings, and say how far the stage is."""
+        self._given.timings.stage(stage, len(self._solvable))
+        done = 0
+        for batch in pixel_batches(self._given, self._lights, self._view, self._solvable, lobes=MIXTURE + GEOMETRY, field=self._field):
+            yield batch
+            done += len(batch.pixels)
+            self._given.timings.advance(done)
