@@ -16,20 +16,24 @@ import warp as wp
 from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.packs import pack_type
+from kernels.photometric.near import NearField, falloff
 from kernels.photometric.samples import Samples, per_pixel
 
 
 def subtract_bounce(samples: Samples, arriving: np.ndarray, corners: np.ndarray, shares: np.ndarray, albedo: np.ndarray,
-                    grey_weights: np.ndarray) -> None:
+                    grey_weights: np.ndarray, field: NearField | None = None) -> None:
     """Subtract albedo · arriving light from the readings; a reading does not fall below zero.
 
     Args:
         samples: changed in place.
-        arriving: [patches, 3, lights] float32: what a surface of albedo 1 at each patch sends on, per irradiance of the light.
+        arriving: [patches, 3, lights] float32: what a surface of albedo 1 at each patch sends on, per irradiance of a distant or extended
+            light, or intensity of a near one.
         corners: [n, 4] int, the patches about each pixel.
         shares: [n, 4] float32, their interpolation weights.
         albedo: [n, 3] diffuse albedo of each pixel.
         grey_weights: [3], of the grey readings.
+        field: places of the lights and the points of these pixels, where some light is near: the readings of the samples are divided
+            by the falloff of each light there.
 
     Raises:
         ArrayError: shapes that do not fit, or corners outside the patches.
@@ -41,16 +45,23 @@ def subtract_bounce(samples: Samples, arriving: np.ndarray, corners: np.ndarray,
                          f"{arriving.shape}: expected {count} pixels and {samples.light_count} lights")
     if corners.min() < 0 or corners.max() >= patches:
         raise ArrayError(f"corners must be from 0 to {patches - 1}")
+    if field is not None and (field.points.shape != (3, count) or len(field.places.place) < lights):
+        raise ArrayError(f"points are {field.points.shape} under {len(field.places.place)} lights, expected {(3, count)} under {lights}")
     device = samples.device
-    devices.launch(_bounce_kernel(samples.lanes), samples.packs,
+    if field is None:
+        nowhere = wp.empty(0, dtype=wp.vec4, device=device)
+        near = (nowhere, nowhere, wp.empty((3, 0), dtype=pack_type(samples.lanes, wp.float32), device=device))
+    else:
+        near = (*(wp.array(values, dtype=wp.vec4, device=device) for values in field.places), per_pixel(samples, field.points.T))
+    devices.launch(_bounce_kernel(samples.lanes, field is not None), samples.packs,
                    [wp.array(arriving, dtype=wp.float32, device=device), per_pixel(samples, corners), per_pixel(samples, shares),
-                    per_pixel(samples, albedo), samples.level,
+                    per_pixel(samples, albedo), samples.level, *near,
                     wp.vec3(*(float(w) for w in grey_weights)), samples.light_count, samples.pack_stride, samples.light_stride],
                    [samples.grey, samples.colour], device=device)
 
 
 @cache
-def _bounce_kernel(lanes: int) -> Any:
+def _bounce_kernel(lanes: int, near: bool) -> Any:
     lane_type = pack_type(lanes, wp.float32)
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
@@ -60,6 +71,9 @@ def _bounce_kernel(lanes: int) -> Any:
                       shares: wp.array2d(dtype=lane_type),  # [4, P]
                       albedo: wp.array2d(dtype=lane_type),  # [3, P]
                       level: wp.array(dtype=lane_type),  # [P]
+                      places: wp.array(dtype=wp.vec4),  # [L or padded], if near
+                      lobes: wp.array(dtype=wp.vec4),  # [L or padded], if near
+                      points: wp.array2d(dtype=lane_type),  # [3, P], if near
                       weights: wp.vec3,
                       light_count: int,
                       pack_stride: int,
@@ -71,7 +85,12 @@ def _bounce_kernel(lanes: int) -> Any:
         bright = level[p]
         for light in range(light_count):
             at = p * pack_stride + light * light_stride
-            taken = lane_type()
+            taken, inverse = lane_type(), lane_type(1.0)  # inverse: 1 / falloff
+            if wp.static(near):
+                px, py, pz = points[0, p], points[1, p], points[2, p]
+                for k in range(lanes):
+                    fall = falloff(places[light], lobes[light], px[k], py[k], pz[k])
+                    inverse[k] = wp.where(fall > 0.0, 1.0 / wp.max(fall, 1.0e-30), 0.0)
             for c in range(3):
                 y, rho = colour[c, at], albedo[c, p]
                 for k in range(lanes):
@@ -79,7 +98,7 @@ def _bounce_kernel(lanes: int) -> Any:
                     for corner in range(4):
                         patch = int(corners[corner, p][k])
                         light_in += shares[corner, p][k] * arriving[patch, c, light]
-                    bounced = rho[k] * light_in
+                    bounced = inverse[k] * rho[k] * light_in
                     taken[k] += weights[c] * bounced
                     y[k] = wp.where(y[k] > 0.0, wp.max(y[k] - bounced, 0.0), y[k])
                 colour[c, at] = y

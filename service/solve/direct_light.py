@@ -34,7 +34,7 @@ class DirectLight(NamedTuple):
     occluder: wp.array | None  # [rows, cols] float32 height on the device; None: no cast shadow is taken out
     arriving: ArrivingLight | None
     """None: no interreflection is taken out."""
-    albedo: np.ndarray  # [3, pixels] diffuse, of the first search
+    albedo: np.ndarray  # [3, pixels] diffuse, of the normals from which all this follows
 
     def keep(self, pixels: np.ndarray, samples: Samples) -> None:
         """Mark readings in cast shadow as none, and subtract the light that the object threw on itself from the others.
@@ -49,7 +49,8 @@ class DirectLight(NamedTuple):
         if self.arriving is not None:
             corners, shares = self.arriving.at(*np.divmod(pixels, self.given.camera.width))
             albedo = np.minimum(self.albedo[:, pixels].T.astype(np.float32), LARGEST_ALBEDO)
-            subtract_bounce(samples, self.arriving.light, corners, shares, albedo, channel_weights(self.lights, GREY_WEIGHTS))
+            subtract_bounce(samples, self.arriving.light, corners, shares, albedo, channel_weights(self.lights, GREY_WEIGHTS),
+                            None if self.field is None else self.field.at(pixels))
 
 
 def direct_light(given: SolveInput, lights: Lights, field: NearField | None, normal: np.ndarray, albedo: np.ndarray,
@@ -60,7 +61,7 @@ def direct_light(given: SolveInput, lights: Lights, field: NearField | None, nor
         given: the images.
         lights: lights of the stack, padded.
         field: where the lights are, where some light is near.
-        normal: [3, pixels] float32, of the first search.
+        normal: [3, pixels] float32, found so far.
         albedo: [3, pixels] diffuse, of the same.
         solved: [rows, cols] bool.
         shadows: whether cast shadows are taken out.

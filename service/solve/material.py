@@ -21,7 +21,7 @@ from kernels.photometric.robust import solve_robust
 from kernels.photometric.samples import Samples, evenly
 from kernels.photometric.shared_materials import choose_materials
 from kernels.photometric.svbrdf import solve_svbrdf
-from kernels.status import Status
+from kernels.status import ESTIMATED, Status
 from service.solve.batches import Batch, bands, pick_pixels, pixel_batches, view_directions
 from service.solve.direct_light import DirectLight, direct_light
 from service.solve.solution import Solution, SolveInput
@@ -57,8 +57,7 @@ def solve_material(given: SolveInput, lights: Lights, field: NearField | None = 
     Args:
         given: the images.
         lights: lights of the stack, padded.
-        field: where the lights are, and the surface point of each pixel, where some light is near; then interreflection is not
-            subtracted.
+        field: where the lights are, and the surface point of each pixel, where some light is near.
         options: the steps that are left out.
     """
     walk = _Walk(given, lights, field, options)
@@ -70,13 +69,31 @@ def solve_material(given: SolveInput, lights: Lights, field: NearField | None = 
     return walk.result
 
 
+def refine_material(given: SolveInput, lights: Lights, field: NearField, before: Solution) -> Solution:
+    """Solve again from a solution: shadows and interreflection follow from its surface, and no first search is needed.
+
+    Args:
+        given: the images.
+        lights: lights of the stack, padded.
+        field: where the lights are, and the surface point of each pixel.
+        before: of `solve_material`, or of this function.
+    """
+    walk = _Walk(given, lights, field, WHOLE_SOLVER)
+    walk.start()
+    walk.resume(before)
+    light = walk.direct_light()
+    walk.choose_shape(light)
+    walk.fit(light, walk.choose_materials(light))
+    return walk.result
+
+
 class _Walk:
     """The state of a solve between its passes over the image."""
 
     def __init__(self, given: SolveInput, lights: Lights, field: NearField | None, options: MaterialOptions) -> None:
         self._given, self._lights, self._field, self._options = given, lights, field, options
         self._view = view_directions(given.camera)
-        self._interreflection = options.interreflection and field is None
+        self._interreflection = options.interreflection
         count = given.stack.pixel_count
         self.result = Solution.empty(count)
         self._specular = self.result.specular = np.zeros((3, count), np.float16)
@@ -97,12 +114,25 @@ class _Walk:
         self._solvable = np.flatnonzero(self.result.status == Status.OK)
         self._spread = self._solvable[evenly(len(self._solvable), SPREAD_PIXELS)] if len(self._solvable) else self._solvable
 
-    def choose_shape(self) -> None:
-        """Choose the shape of the diffuse lobe, and find out whether few lights support the lobes at all."""
+    def resume(self, before: Solution) -> None:
+        """Take normals, albedo and roughness of the pixels that are solved from an earlier solution."""
+        solved = np.isin(before.status, ESTIMATED) & (self.result.status == Status.OK)
+        assert before.roughness is not None
+        self.result.normal[:, solved], self.result.albedo[:, solved] = before.normal[:, solved], before.albedo[:, solved]
+        self._roughness[solved] = before.roughness[solved]
+
+    def choose_shape(self, light: DirectLight | None = None) -> None:
+        """Choose the shape of the diffuse lobe, and find out whether few lights support the lobes at all.
+
+        Args:
+            light: what the object does to its own light, as far as it is known.
+        """
         self._given.timings.stage("shape", 1)
         if not len(self._spread):
             return
         samples, normal = self._pick(self._spread), self.result.normal[:, self._spread].T
+        if light is not None:
+            light.keep(self._spread, samples)
         if self._few:
             self._supported = supports_lobes(self.result, samples, normal)
         if self._supported:

@@ -22,7 +22,7 @@ from service.solve.diffuse import solve_diffuse
 from service.solve.distant import solve_distant
 from service.solve.extended import solve_extended
 from service.solve.gradient import solve_gradients
-from service.solve.material import solve_material
+from service.solve.material import refine_material, solve_material
 from service.solve.near import MATERIAL_ROUNDS, Rounds, solve_near
 from service.solve.reference import solve_by_reference
 from service.solve.solution import Solution, SolveInput, SuspectLight, mark_not_facing, refine_status
@@ -71,7 +71,7 @@ def _single_lights(*series: Rounds) -> dict[type, Solver]:
 
 LAMBERT = Rounds(Method.LAMBERT, partial(solve_diffuse, fit_normals=solve_lambert))
 ROBUST = Rounds(Method.ROBUST, partial(solve_diffuse, fit_normals=solve_robust))
-MATERIAL = Rounds(Method.SVBRDF, solve_material, MATERIAL_ROUNDS)
+MATERIAL = Rounds(Method.SVBRDF, solve_material, MATERIAL_ROUNDS, refine_material)
 
 METHODS: Mapping[Method, MethodEntry] = {
     Method.GRADIENT: MethodEntry(gradient_frames, {GradientFrames: solve_gradients}, has_gradients),

@@ -35,13 +35,13 @@ def render(normal: np.ndarray, *, albedo=COLOUR, alpha=0.16, f0=0.04, rough=None
     return np.stack([channel * matt + shine for channel in albedo])
 
 
-def sample(radiance: np.ndarray, device: str, *, lights=LIGHTS, view=None, saturated=None):
+def sample(radiance: np.ndarray, device: str, *, lights=LIGHTS, view=None, saturated=None, field=None):
     """Everything as samples."""
     count, pixels = radiance.shape[1:]
     padded = pad_lights(lights, np.ones((count, 3)))
     band = packs.upload(store(radiance), None if saturated is None else bits(saturated), device=device)
     toward = np.tile(VIEW, (pixels, 1)) if view is None else view
-    return gather(band, np.arange(pixels), toward, padded, grey_factors(padded, GREY), count), band
+    return gather(band, np.arange(pixels), toward, padded, grey_factors(padded, GREY), count, field), band
 
 
 def degrees(a: np.ndarray, b: np.ndarray) -> np.ndarray:

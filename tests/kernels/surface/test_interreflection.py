@@ -6,7 +6,8 @@ import warp as wp
 
 from kernels.errors import ArrayError
 from kernels.photometric.bounce import subtract_bounce
-from kernels.photometric.samples import to_host
+from kernels.photometric.near import NearField, pad_places
+from kernels.photometric.samples import readings_of, to_host
 from kernels.surface.interreflection import form_factors
 from kernels.surface.shadows import Projection
 from tests.kernels.photometric.test_svbrdf import sample
@@ -84,3 +85,25 @@ def test_taking_off_the_bounce_leaves_the_direct_light(device):
     np.testing.assert_allclose(red, direct, atol=2**-11 * whole.max())
     with pytest.raises(ArrayError, match="corners must be"):
         subtract_bounce(samples, arriving, corners + 1, shares, np.full((count, 3), albedo), np.array([0.3, 0.6, 0.1]))
+
+
+def test_near_light_is_taken_off_in_the_unit_of_each_reading(device):
+    """A reading under a near light is radiance over intensity and falloff, and what arrives is radiance over intensity."""
+    rng = np.random.default_rng(5)
+    count, lights, albedo = 40, 8, 0.5
+    points = rng.uniform(-1, 1, (3, count)).astype(np.float32)
+    lamps = np.concatenate([rng.uniform(2, 3, (lights, 3)), np.ones((lights, 1))], axis=1)
+    lamps[-1] = 0, 0, 1, 0  # a distant one among them
+    field = NearField(pad_places(lamps, np.zeros((lights, 4))), points)
+    way = lamps[:, None, :3] - points.T
+    falloff = np.where(lamps[:, 3:] > 0, 1 / (way**2).sum(axis=-1), 1)
+    direct, arriving = rng.uniform(0.2, 0.4, (lights, count)), rng.uniform(0.1, 0.3, (count, lights))
+    stored = (direct * falloff + albedo * arriving.T).astype(np.float16).astype(float)
+    samples, _ = sample(np.repeat(stored[None], 3, axis=0), device, lights=np.tile([0.0, 0.0, 1.0], (lights, 1)), field=field)
+    corners = np.stack([np.arange(count)] * 4, axis=1)
+    subtract_bounce(samples, np.repeat(arriving[:, None], 3, axis=1), corners, np.full((count, 4), 0.25, np.float32),
+                    np.full((count, 3), albedo), np.full(3, 1 / 3), field)
+    np.testing.assert_allclose(readings_of(samples).T, direct, atol=2**-11 * (stored / falloff).max())  # half rounding of the images
+    with pytest.raises(ArrayError, match="points are"):
+        subtract_bounce(samples, np.repeat(arriving[:, None], 3, axis=1), corners, np.full((count, 4), 0.25, np.float32),
+                        np.full((count, 3), albedo), np.full(3, 1 / 3), field.at(np.arange(3)))

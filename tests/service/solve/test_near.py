@@ -8,7 +8,7 @@ import pytest
 from kernels import device as devices
 from stage import exr
 from stage.maps import SurfaceMaps
-from tests.scenes import near_lights
+from tests.scenes import bowl, near_lights
 from tests.scenes.captures import angles_degrees, edit_manifest, write_exr
 from tests.scenes.near_lights import Lamp, far, lamps
 
@@ -69,6 +69,17 @@ def test_cast_shadows_end_at_the_lamp(relit, tmp_path):
     assert height_error(maps, SMALL).max() < 0.005
     angle = angles_degrees(maps.normal, SMALL.normal)[maps.mask]
     assert angle.mean() < 0.05 and angle.max() < 2  # the rim of a shadow, within its margin of 0.3 pixels
+
+
+def test_a_white_bowl_is_neither_flatter_nor_brighter_than_it_is(relit, tmp_path):
+    """Bounced light adds a third to the readings: left in, the albedo is 1.07 for 0.8; taken off once, with that albedo, 0.68."""
+    scene = bowl.bowl(20)
+    maps, report = solve(relit, bowl.write_near(tmp_path, scene, 32, RADII), "svbrdf")
+    error = np.abs(maps.height - scene.points[..., 2])[scene.mask] / np.ptp(scene.points[..., 2][scene.mask])
+    assert angles_degrees(maps.normal, scene.normal)[scene.mask].mean() < 0.1  # 0.2 with one search
+    assert error.max() < 0.005  # some hundred patches, in the rounds that are left after the surface has changed by a thousandth
+    assert np.allclose(np.median(maps.diffuse_albedo[scene.mask], axis=0), bowl.ALBEDO, rtol=0.02)
+    assert report["found"]["near"]["rounds"]["svbrdf"] > 1
 
 
 @pytest.mark.parametrize("exponent", [1.0, 4.0])

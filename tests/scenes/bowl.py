@@ -1,0 +1,93 @@
+"""A white bowl with all bounces of light in closed form: the inside of a sphere, seen along its axis.
+
+Between any two places inside a sphere the form factor is the same, so that a cap sends every place the same bounced light: with albedo ρ,
+the part a of the sphere that the cap covers and the mean direct irradiance Ē on it, ρ a Ē / (1 - ρ a). Nothing here leans on the code that
+it judges.
+"""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tests.scenes.captures import write_exr, write_image, write_manifest
+
+ALBEDO = np.array([0.8, 0.64, 0.48])
+HALF_DEGREES = 70.0
+"""Half of the angle under which the sphere's centre sees the bowl; its rim is steep."""
+RIM = np.sin(np.radians(HALF_DEGREES))
+"""Radius of the rim in sphere radii."""
+PART = (1 - np.cos(np.radians(HALF_DEGREES))) / 2
+"""Of the sphere, the part that the bowl covers."""
+
+
+class Bowl(NamedTuple):
+    """What an orthographic camera sees of a bowl of radius 1 m about the origin."""
+
+    points: np.ndarray  # [rows, cols, 3] float64, metres; they are the outward side of the sphere: the normals are their opposites
+    mask: np.ndarray  # [rows, cols] bool
+    camera: dict[str, Any]
+
+    @property
+    def normal(self) -> np.ndarray:
+        return -self.points
+
+
+def bowl(size: int) -> Bowl:
+    u = (np.arange(size) + 0.5 - size / 2) / (size / 2) * RIM * 1.03
+    x, y = np.meshgrid(u, -u)
+    mask = x**2 + y**2 < RIM**2
+    points = np.stack([x, y, -np.sqrt(np.maximum(1 - x**2 - y**2, 0))], axis=-1)
+    return Bowl(points, mask, {"projection": "orthographic", "resolution": [size, size], "pixel_size_m": float(u[1] - u[0]),
+                               "surface_z_m": float(points[..., 2][mask].mean())})
+
+
+def spread(count: int, widest_degrees: float) -> np.ndarray:
+    """[count, 3] directions spread evenly over a cap about +z."""
+    index = np.arange(count) + 0.5
+    z = 1 - (1 - np.cos(np.radians(widest_degrees))) * index / count
+    turn = np.pi * (1 + 5**0.5) * index
+    return np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], axis=-1)
+
+
+WALL = spread(4000, HALF_DEGREES) * [1, 1, -1]
+"""[places, 3] spread evenly over the bowl, for means."""
+
+
+def cosine(points: np.ndarray, way: np.ndarray, length: np.ndarray | float) -> np.ndarray:
+    """n·l of each point, 0 where the bowl's other side stands before the light; points [..., 3], way unit."""
+    facing = -(points * way).sum(axis=-1)
+    opposite = points + 2 * facing[..., None] * way  # where the line meets the sphere again
+    hidden = (2 * facing < length) & (-opposite[..., 2] > np.cos(np.radians(HALF_DEGREES)))
+    return np.where(hidden, 0, np.maximum(facing, 0))
+
+
+def with_bounces(direct: np.ndarray, mean: float) -> np.ndarray:
+    """[..., 3] radiance from the direct irradiance [...] and its mean over the bowl."""
+    return ALBEDO / np.pi * (direct[..., None] + PART * ALBEDO * mean / (1 - PART * ALBEDO))
+
+
+def under_lamp(points: np.ndarray, lamp: np.ndarray, intensity: float) -> np.ndarray:
+    """[...] direct irradiance of a point light."""
+    way = lamp - points
+    length = np.linalg.norm(way, axis=-1)
+    return intensity * cosine(points, way / length[..., None], length) / length**2
+
+
+def write_near(folder: Path, scene: Bowl, count: int, radii: float) -> Path:
+    """A capture under point lights on a cap around the bowl's centre."""
+    images, lights = [], []
+    for lamp in radii * spread(count, 75.0):
+        images.append(with_bounces(under_lamp(scene.points, lamp, radii**2), under_lamp(WALL, lamp, radii**2).mean()))
+        lights.append({"type": "point", "position_m": lamp.tolist(), "intensity": [radii**2] * 3})
+    return write(folder, scene, images, lights)
+
+
+def write(folder: Path, scene: Bowl, images: list[np.ndarray], lights: list[dict[str, Any]]) -> Path:
+    frames = []
+    for index, (image, light) in enumerate(zip(images, lights, strict=True)):
+        write_exr(folder / f"{index:03d}.exr", image * scene.mask[..., None])
+        frames.append({"image": f"{index:03d}.exr", "light": light})
+    write_image(folder / "mask.png", (scene.mask * 255).astype(np.uint8))
+    write_manifest(folder, {"schema": "relit.capture/1", "name": "bowl", "mask": "mask.png", "camera": scene.camera, "frames": frames})
+    return folder
