@@ -1,6 +1,7 @@
 """The solved surface maps of one capture, and their file, maps.exr."""
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,11 @@ LAYERS: dict[str, tuple[tuple[str, ...], type[np.floating[Any]]]] = {
     "diffuse_albedo": (_RGB, np.float16),
     "specular": (_RGB, np.float16),
     "roughness": (("Y",), np.float16),
+    "abundance": (("Y",), np.float16),
+    "first_specular": (_RGB, np.float16),
+    "first_roughness": (("Y",), np.float16),
+    "second_specular": (_RGB, np.float16),
+    "second_roughness": (("Y",), np.float16),
     "regime": (("Y",), np.float16),
     "specular_normal": (_XYZ, np.float32),
     "height": (("Z",), np.float32),
@@ -27,6 +33,8 @@ LAYERS: dict[str, tuple[tuple[str, ...], type[np.floating[Any]]]] = {
     "mask": (("Y",), np.float16),
 }
 """The channels and the stored type of each layer: geometry is stored as float, the rest as half."""
+LOBES = (("specular", "roughness"), ("first_specular", "first_roughness"), ("second_specular", "second_roughness"))
+"""The layers of each specular lobe: that of the whole pixel, and those of the two materials of a pixel that mixes them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,6 +47,11 @@ class SurfaceMaps:
     diffuse_albedo: np.ndarray | None = None  # [rows, cols, 3] scene-linear, 0…1
     specular: np.ndarray | None = None  # [rows, cols, 3] F0, scene-linear, 0…1
     roughness: np.ndarray | None = None  # [rows, cols] 0…1, alpha = roughness²
+    abundance: np.ndarray | None = None  # [rows, cols] share of the first of two materials; 0 where the pixel has one
+    first_specular: np.ndarray | None = None  # [rows, cols, 3] F0 of the first material; 0 where the pixel has one
+    first_roughness: np.ndarray | None = None  # [rows, cols]
+    second_specular: np.ndarray | None = None  # [rows, cols, 3] F0 of the second
+    second_roughness: np.ndarray | None = None  # [rows, cols]
     regime: np.ndarray | None = None  # [rows, cols] 1 Lambertian, 2 glossy, 3 mirror, 4 mixture of diffuse and specular
     specular_normal: np.ndarray | None = None  # [rows, cols, 3] float32, unit, of the highlight; 0 where none was found
     height: np.ndarray | None = None  # [rows, cols] float32, camera-frame z; metres, or pixels without a scale
@@ -52,6 +65,15 @@ class SurfaceMaps:
     def layers(self) -> dict[str, np.ndarray]:
         """Return the layers that were estimated by their names, in the order of the file."""
         return {name: getattr(self, name) for name in LAYERS if getattr(self, name) is not None}
+
+    def with_lobes(self, change: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]) -> "SurfaceMaps":
+        """Return maps in which `change` replaced F0 [rows, cols, 3] and roughness [rows, cols] of every specular lobe."""
+        changed: dict[str, Any] = {}
+        for specular, roughness in LOBES:
+            lobe = getattr(self, specular), getattr(self, roughness)
+            if all(values is not None for values in lobe):
+                changed[specular], changed[roughness] = change(*lobe)
+        return replace(self, **changed)
 
     def write(self, path: str | Path) -> None:
         """Write maps.exr whole or not at all, with pixels that are not estimated 0 in every layer but `status`.

@@ -16,6 +16,7 @@ import numpy as np
 from kernels.photometric.certainty import assess
 from kernels.photometric.hypotheses import Diffuse, Prior, SearchOptions, search_normals
 from kernels.photometric.material import MATT, fit_given, fit_material, fit_tinted
+from kernels.photometric.mixtures import NO_PAIRS, Mixture, mix_materials
 from kernels.photometric.refine import refine
 from kernels.photometric.samples import Samples
 
@@ -41,11 +42,12 @@ class SvbrdfFit(NamedTuple):
     sigma: np.ndarray  # [n] float32, standard deviation of the normal, degrees
     confidence: np.ndarray  # [n] float32: probability of the mode / (1 + sigma / 1°)
     residual: np.ndarray  # [n] float32: root of the mean cost per light, in units of the noise
+    mixture: Mixture  # of pixels with two materials; F0 and roughness above are then those of one lobe close to both
 
 
 def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, options: SearchOptions | None = None,
-                 shared: np.ndarray | None = None, roughness: np.ndarray | None = None, single_lobe: bool = True,
-                 prior: Prior | None = None) -> SvbrdfFit:
+                 shared: np.ndarray | None = None, pairs: np.ndarray = NO_PAIRS, roughness: np.ndarray | None = None,
+                 single_lobe: bool = True, prior: Prior | None = None) -> SvbrdfFit:
     """Estimate the normal and the material of sampled pixels.
 
     Args:
@@ -54,6 +56,7 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, options
         shape: of the diffuse lobe, from diffuse_shape.choose_diffuse.
         options: how candidates are judged.
         shared: [materials, 4] of shared_materials.choose_materials; None: every pixel has a material of its own.
+        pairs: [pairs, 2, 4] of mixtures.choose_pairs.
         roughness: [n] of an earlier fit, from which the single lobe begins; None: it is fitted first.
         single_lobe: False leaves the joint fit of one lobe out, to see what it buys.
         prior: normals to which the search is drawn, because the readings do not support the lobes; then the joint fit, which knows no
@@ -89,9 +92,10 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, options
         start = normal
         found = search_normals(samples, start, shape=shape, options=options)  # the readings alone say how sure the normal is
         spread = np.hypot(spread, _angles(found.normal, normal))
+    material, mixture = mix_materials(samples, normal, material, pairs, shape=shape, options=options)
     certainty = assess(samples, start, found, normal, spread)
     return SvbrdfFit(normal, material.diffuse_albedo, material.specular, material.roughness, certainty.sigma,
-                     certainty.probability / (1 + certainty.sigma), np.sqrt(found.cost))
+                     certainty.probability / (1 + certainty.sigma), np.sqrt(found.cost), mixture)
 
 
 def average_normals(normals: np.ndarray, costs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -143,7 +143,7 @@ def _compare_kernel(pack: int) -> Any:
                        captured: wp.array2d(dtype=half_pack),  # [3 · lights padded, P]
                        clipped: wp.array2d(dtype=byte_pack),  # [lights padded / 8, P] bits
                        padded: int,  # lights
-                       values: wp.array2d(dtype=lane_type),  # [16, P]
+                       values: wp.array2d(dtype=lane_type),  # [21, P]
                        visible: wp.array2d(dtype=byte_pack),  # [lights, P]
                        places: wp.array(dtype=wp.vec4),  # [lights]
                        factors: wp.array(dtype=wp.vec3),  # [lights] stored → radiance / irradiance
@@ -154,17 +154,17 @@ def _compare_kernel(pack: int) -> Any:
         top, bottom = lane_type(), lane_type()
         for n in range(pairs.shape[0]):
             j, i = pairs[n][0], pairs[n][1]
-            facing_j, shine_j, rise_j, _ = evaluate(values, p, places[j], wp.vec4())
-            facing_i, shine_i, rise_i, _ = evaluate(values, p, places[i], wp.vec4())
+            facing_j, gloss_j, _ = evaluate(values, p, places[j], wp.vec4())
+            facing_i, gloss_i, _ = evaluate(values, p, places[i], wp.vec4())
             lit_j, lit_i = visible[j, p], visible[i, p]
             bits_j, bits_i = clipped[j / 8, p], clipped[i / 8, p]
             for c in range(3):
-                albedo, f0 = values[3 + c, p], values[6 + c, p]
+                albedo = values[3 + c, p]
                 image_j, image_i = captured[c * padded + j, p], captured[c * padded + i, p]
                 factor_j, factor_i = factors[j][c], factors[i][c]
                 for k in range(pack):
-                    after = modelled(float(lit_j[k]) * wp.static(1.0 / 255.0), albedo[k], f0[k], facing_j[k], shine_j[k], rise_j[k])
-                    before = modelled(float(lit_i[k]) * wp.static(1.0 / 255.0), albedo[k], f0[k], facing_i[k], shine_i[k], rise_i[k])
+                    after = modelled(float(lit_j[k]) * wp.static(1.0 / 255.0), albedo[k], facing_j[k], gloss_j[c, k])
+                    before = modelled(float(lit_i[k]) * wp.static(1.0 / 255.0), albedo[k], facing_i[k], gloss_i[c, k])
                     reading = factor_i * float(image_i[k])
                     missing = factor_j * float(image_j[k]) - reading
                     told = _told(before, after, reading)

@@ -116,7 +116,7 @@ def _compare_kernel(pack: int) -> Any:
                      captured: wp.array2d(dtype=half_pack),  # [3 · lights padded, P]
                      clipped: wp.array2d(dtype=byte_pack),  # [lights padded / 8, P] bits
                      padded: int,  # lights
-                     values: wp.array2d(dtype=lane_type),  # [16, P]
+                     values: wp.array2d(dtype=lane_type),  # [21, P]
                      visible: wp.array2d(dtype=byte_pack),  # [lights, P]
                      places: wp.array(dtype=wp.vec4),  # [lights]
                      factors: wp.array(dtype=wp.vec3),  # [lights] stored → radiance / irradiance
@@ -126,7 +126,6 @@ def _compare_kernel(pack: int) -> Any:
                      sums: wp.array2d(dtype=lane_type)):  # [2, P]
         p = first + wp.tid()
         albedo_r, albedo_g, albedo_b = values[3, p], values[4, p], values[5, p]
-        f0_r, f0_g, f0_b = values[6, p], values[7, p], values[8, p]
         top, bottom = lane_type(), lane_type()
         for light in range(places.shape[0]):
             parts = shares[light]
@@ -138,7 +137,7 @@ def _compare_kernel(pack: int) -> Any:
                 for corner in range(4):
                     at = wp.where(corner == 0, light, wp.where(corner == 1, near[0], wp.where(corner == 2, near[1], near[2])))
                     weight = wp.where(corner == 0, 1.0, -wp.where(corner == 1, parts[0], wp.where(corner == 2, parts[1], parts[2])))
-                    facing, shine, rise, _ = evaluate(values, p, places[at], wp.vec4())
+                    facing, gloss, _ = evaluate(values, p, places[at], wp.vec4())
                     lit = visible[at, p]
                     factor = factors[at] * weight
                     red, green, blue = captured[at, p], captured[padded + at, p], captured[2 * padded + at, p]
@@ -149,9 +148,9 @@ def _compare_kernel(pack: int) -> Any:
                         missing_r[k] += factor[0] * float(red[k])
                         missing_g[k] += factor[1] * float(green[k])
                         missing_b[k] += factor[2] * float(blue[k])
-                        told_r[k] += modelled(seen, albedo_r[k], f0_r[k], facing[k], shine[k], rise[k])
-                        told_g[k] += modelled(seen, albedo_g[k], f0_g[k], facing[k], shine[k], rise[k])
-                        told_b[k] += modelled(seen, albedo_b[k], f0_b[k], facing[k], shine[k], rise[k])
+                        told_r[k] += modelled(seen, albedo_r[k], facing[k], gloss[0, k])
+                        told_g[k] += modelled(seen, albedo_g[k], facing[k], gloss[1, k])
+                        told_b[k] += modelled(seen, albedo_b[k], facing[k], gloss[2, k])
                 for k in range(pack):
                     top[k] += counts[k] * (missing_r[k] * told_r[k] + missing_g[k] * told_g[k] + missing_b[k] * told_b[k])
                     bottom[k] += counts[k] * (told_r[k] * told_r[k] + told_g[k] * told_g[k] + told_b[k] * told_b[k])

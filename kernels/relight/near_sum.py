@@ -126,7 +126,7 @@ def _sum_kernel(pack: int) -> Any:
     def sum_kernel(first: int,
                    captured: wp.array2d(dtype=half_pack),  # [3 · lights padded, P]
                    padded: int,  # lights
-                   values: wp.array2d(dtype=lane_type),  # [16, P]
+                   values: wp.array2d(dtype=lane_type),  # [21, P]
                    visible: wp.array2d(dtype=byte_pack),  # [lights, P]
                    lights: wp.array(dtype=wp.vec4),  # [lights]
                    factors: wp.array(dtype=wp.vec3),  # [lights] stored → radiance / irradiance
@@ -136,11 +136,10 @@ def _sum_kernel(pack: int) -> Any:
         p = first + wp.tid()
         count = lights.shape[0]
         albedo_r, albedo_g, albedo_b = values[3, p], values[4, p], values[5, p]
-        f0_r, f0_g, f0_b = values[6, p], values[7, p], values[8, p]
         image_r, image_g, image_b = lane_type(), lane_type(), lane_type()
         model_r, model_g, model_b = lane_type(), lane_type(), lane_type()
         for light in range(count):
-            facing, shine, rise, _ = evaluate(values, p, lights[light], wp.vec4())
+            facing, gloss, _ = evaluate(values, p, lights[light], wp.vec4())
             lit = visible[light, p]
             factor = factors[light]
             red, green, blue = captured[light, p], captured[padded + light, p], captured[2 * padded + light, p]
@@ -150,9 +149,9 @@ def _sum_kernel(pack: int) -> Any:
                 image_r[k] += wr[k] * factor[0] * float(red[k])
                 image_g[k] += wg[k] * factor[1] * float(green[k])
                 image_b[k] += wb[k] * factor[2] * float(blue[k])
-                model_r[k] += wr[k] * modelled(seen, albedo_r[k], f0_r[k], facing[k], shine[k], rise[k])
-                model_g[k] += wg[k] * modelled(seen, albedo_g[k], f0_g[k], facing[k], shine[k], rise[k])
-                model_b[k] += wb[k] * modelled(seen, albedo_b[k], f0_b[k], facing[k], shine[k], rise[k])
+                model_r[k] += wr[k] * modelled(seen, albedo_r[k], facing[k], gloss[0, k])
+                model_g[k] += wg[k] * modelled(seen, albedo_g[k], facing[k], gloss[1, k])
+                model_b[k] += wb[k] * modelled(seen, albedo_b[k], facing[k], gloss[2, k])
         out[0, p] = image_r
         out[1, p] = image_g
         out[2, p] = image_b

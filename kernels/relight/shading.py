@@ -1,7 +1,7 @@
 """Solved surfaces under samples of light, shaded by Relit's BRDF with its diffuse and specular parts apart.
 
-Radiance = Σ over the samples of V · E · (ρ/π + D V F) · n·l, with E the energy of a far sample or intensity · cos^μ / distance² of a
-near one, and V the visibility that the caller gives by rows.
+Radiance = Σ over the samples of V · E · (ρ/π + Σ_k a_k D_k V_k F_k) · n·l, with E the energy of a far sample or
+intensity · cos^μ / distance² of a near one, V the visibility that the caller gives by rows, and a_k the shares of one material or two.
 """
 
 from functools import cache
@@ -20,14 +20,16 @@ LEAST_ROUGHNESS = 0.05
 """Least roughness that is shaded: a smoother lobe is narrower than any sample of a light."""
 LEAST_FACING = 0.02
 """Least n·v that is used: normals of pixels at the rim may point a little away from the viewer."""
-PLANES = 16
-"""Number of values of a pixel: normal, albedo, F0, view and position (3 each), and roughness."""
+WIDTHS = [3, 3, 3, 3, 3, 1, 3, 1, 1]
+"""Number of values of each kind of a pixel: normal, albedo, F0, view, position, roughness; F0, roughness and share of a second material."""
+PLANES = sum(WIDTHS)
+"""Number of values of a pixel."""
 
 
 class Surface(NamedTuple):
     """Pixels of solved maps on a device."""
 
-    values: wp.array  # [16, P] float packs
+    values: wp.array  # [21, P] float packs
     pixel_count: int
     device: str
 
@@ -35,6 +37,14 @@ class Surface(NamedTuple):
     def packs(self) -> int:
         """Number of packs that cover the pixels; the last is filled up with copies of the last pixel."""
         return int(self.values.shape[1])
+
+
+class SecondLobe(NamedTuple):
+    """Specular lobe of the second material of pixels that mix two; the first material has what is left of each pixel."""
+
+    specular: np.ndarray  # [n, 3] F0
+    roughness: np.ndarray  # [n] 0…1
+    share: np.ndarray  # [n] 0…1 of the pixel; 0: the pixel has one material
 
 
 class SourcesOnDevice(NamedTuple):
@@ -48,24 +58,26 @@ class SourcesOnDevice(NamedTuple):
 
 
 def upload_surface(normal: np.ndarray, diffuse_albedo: np.ndarray, specular: np.ndarray, roughness: np.ndarray, view: np.ndarray,
-                   position: np.ndarray, *, device: str) -> Surface:
+                   position: np.ndarray, *, second: SecondLobe | None = None, device: str) -> Surface:
     """Put pixels on the device.
 
     Args:
         normal, diffuse_albedo, specular, view, position: [n, 3]; unit normals and directions to the viewer, F0, places in the
             camera frame.
         roughness: [n] 0…1; 0: no specular lobe, whatever F0.
+        second: of pixels that mix two materials; None: there are none. The albedo is that of the whole pixel.
         device: where.
 
     Raises:
         ArrayError: no pixels, or shapes that do not fit.
     """
     count = len(normal)
-    given = (normal, diffuse_albedo, specular, view, position, roughness)
+    nothing = SecondLobe(np.zeros((count, 3)), np.zeros(count), np.zeros(count))
+    given = (normal, diffuse_albedo, specular, view, position, roughness, *(second or nothing))
     planes = [np.asarray(plane, dtype=np.float32).reshape(max(count, 1), -1) for plane in given]
     widths = [plane.shape[1] for plane in planes]
-    if count == 0 or widths != [3, 3, 3, 3, 3, 1]:
-        raise ArrayError(f"surface has {count} pixels with {widths} values: give [3, 3, 3, 3, 3, 1] of one pixel or more")
+    if count == 0 or widths != WIDTHS:
+        raise ArrayError(f"surface has {count} pixels with {widths} values: give {WIDTHS} of one pixel or more")
     pack = devices.pack_width(device)
     padded = -(-count // pack) * pack
     values = np.concatenate(planes, axis=1).T[:, np.minimum(np.arange(padded), count - 1)]
@@ -122,15 +134,14 @@ def require_same(band: Band, surface: Surface, visible: wp.array, count: int) ->
 @cache
 def lobes(pack: int) -> Any:
     """Return the Warp function that evaluates the lobes of every pixel of a pack under a sample at one place."""
-    lane_type = pack_type(pack, wp.float32)
+    lane_type, channels = pack_type(pack, wp.float32), channels_type(pack)
 
     @wp.func
     def evaluate(values: wp.array2d(dtype=lane_type), p: int, place: wp.vec4, axis: wp.vec4):
-        """Return n·l, D V n·l, Schlick's rise, and the part of the energy that arrives."""
-        facing, shine, rise, arriving = lane_type(), lane_type(), lane_type(), lane_type()
+        """Return n·l, [3, pack] D V F n·l summed over the materials of a pixel, and the part of the energy that arrives."""
+        facing, gloss, arriving = lane_type(), channels(), lane_type()
         nx, ny, nz = values[0, p], values[1, p], values[2, p]
         vx, vy, vz = values[9, p], values[10, p], values[11, p]
-        rough = values[15, p]
         tx, ty, tz = lane_type(), lane_type(), lane_type()
         if place[3] > 0.0:
             px, py, pz = values[12, p], values[13, p], values[14, p]
@@ -155,31 +166,59 @@ def lobes(pack: int) -> Any:
                 ty[k] = place[1]
                 tz[k] = place[2]
                 arriving[k] = 1.0
-        # microfacet.ggx and schlick without their guards, which cannot act here and cost the sums of images 6 %
+        nv, nh, rise = lane_type(), lane_type(), lane_type()
         for k in range(pack):  # no branches, so that the compiler uses SIMD instructions
-            nl = wp.max(nx[k] * tx[k] + ny[k] * ty[k] + nz[k] * tz[k], 0.0)
+            facing[k] = wp.max(nx[k] * tx[k] + ny[k] * ty[k] + nz[k] * tz[k], 0.0)
             hx, hy, hz = tx[k] + vx[k], ty[k] + vy[k], tz[k] + vz[k]
             half = 1.0 / wp.sqrt(hx * hx + hy * hy + hz * hz + 1.0e-12)
-            nh = wp.min((nx[k] * hx + ny[k] * hy + nz[k] * hz) * half, 1.0)  # normals rounded to half may be longer: a pole
+            nh[k] = wp.min((nx[k] * hx + ny[k] * hy + nz[k] * hz) * half, 1.0)  # normals rounded to half may be longer: a pole
             hv = (hx * vx[k] + hy * vy[k] + hz * vz[k]) * half
-            nv = wp.max(nx[k] * vx[k] + ny[k] * vy[k] + nz[k] * vz[k], LEAST_FACING)
-            a = wp.max(rough[k], LEAST_ROUGHNESS)
-            a2 = a * a * a * a
-            spread = nh * nh * (a2 - 1.0) + 1.0
-            masking = nl * wp.sqrt(nv * nv * (1.0 - a2) + a2) + nv * wp.sqrt(nl * nl * (1.0 - a2) + a2)
-            facing[k] = nl
-            shine[k] = wp.min(rough[k] * 1.0e6, 1.0) * 0.5 * INVERSE_PI * a2 * nl / (spread * spread * masking)
+            nv[k] = wp.max(nx[k] * vx[k] + ny[k] * vy[k] + nz[k] * vz[k], LEAST_FACING)
             u = wp.max(1.0 - hv, 0.0)
             rise[k] = u * u * u * u * u
-        return facing, shine, rise, arriving
+        rough = values[15, p]
+        steady, raised = lane_type(), lane_type()
+        for k in range(pack):
+            shine = _lobe(rough[k], facing[k], nv[k], nh[k])
+            raised[k] = shine * rise[k]
+            steady[k] = shine - raised[k]
+        for c in range(3):
+            f0 = values[6 + c, p]
+            for k in range(pack):
+                gloss[c, k] = f0[k] * steady[k] + raised[k]
+        share = values[20, p]
+        most = float(0.0)
+        for k in range(pack):
+            most = wp.max(most, share[k])
+        if most > 0.0:
+            other = values[19, p]
+            for k in range(pack):
+                shine = share[k] * _lobe(other[k], facing[k], nv[k], nh[k])
+                raised[k] = shine * rise[k]
+                steady[k] = shine - raised[k]
+            for c in range(3):
+                f0 = values[16 + c, p]
+                for k in range(pack):
+                    gloss[c, k] = (1.0 - share[k]) * gloss[c, k] + f0[k] * steady[k] + raised[k]
+        return facing, gloss, arriving
 
     return evaluate
 
 
 @wp.func
-def modelled(lit: float, albedo: float, f0: float, facing: float, shine: float, rise: float) -> float:
+def _lobe(rough: float, nl: float, nv: float, nh: float) -> float:
+    """Return D V n·l: microfacet.ggx without its guards, which cannot act here and cost the sums of images 6 %."""
+    a = wp.max(rough, LEAST_ROUGHNESS)
+    a2 = a * a * a * a
+    spread = nh * nh * (a2 - 1.0) + 1.0
+    masking = nl * wp.sqrt(nv * nv * (1.0 - a2) + a2) + nv * wp.sqrt(nl * nl * (1.0 - a2) + a2)
+    return wp.min(rough * 1.0e6, 1.0) * 0.5 * INVERSE_PI * a2 * nl / (spread * spread * masking)
+
+
+@wp.func
+def modelled(lit: float, albedo: float, facing: float, gloss: float) -> float:
     """Return the radiance of one channel under a light of irradiance one, from what `lobes` evaluates; `lit` is the visibility."""
-    return lit * (albedo * INVERSE_PI * facing + f0 * shine * (1.0 - rise) + shine * rise)
+    return lit * (albedo * INVERSE_PI * facing + gloss)
 
 
 @cache
@@ -189,7 +228,7 @@ def _shade_kernel(pack: int) -> Any:
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
     def shade_kernel(first: int,
-                     values: wp.array2d(dtype=lane_type),  # [16, P]
+                     values: wp.array2d(dtype=lane_type),  # [21, P]
                      place: wp.array(dtype=wp.vec4),  # [N]
                      energy: wp.array(dtype=wp.vec3),  # [N]
                      axis: wp.array(dtype=wp.vec4),  # [N]
@@ -199,9 +238,9 @@ def _shade_kernel(pack: int) -> Any:
                      # outputs
                      out: wp.array2d(dtype=lane_type)):  # [6, P]
         p = first + wp.tid()
-        matt, glossy, raised = channels(), channels(), channels()  # n·l, D V n·l, and that times Schlick's rise
+        matt, glossy = channels(), channels()
         for n in range(place.shape[0]):
-            facing, shine, rise, lit = evaluate(values, p, place[n], axis[n])
+            facing, gloss, lit = evaluate(values, p, place[n], axis[n])
             rows = occluder[n]
             if rows[0] >= 0 or rows[1] >= 0 or rows[2] >= 0:
                 parts = share[n]
@@ -220,15 +259,12 @@ def _shade_kernel(pack: int) -> Any:
             for c in range(3):
                 e = energy[n][c]
                 for k in range(pack):
-                    lobe = lit[k] * shine[k]
                     matt[c, k] += e * (lit[k] * facing[k])
-                    glossy[c, k] += e * lobe
-                    raised[c, k] += e * (lobe * rise[k])
+                    glossy[c, k] += e * (lit[k] * gloss[c, k])
         for c in range(3):
-            albedo, f0 = values[3 + c, p], values[6 + c, p]
+            albedo = values[3 + c, p]
             for k in range(pack):
                 matt[c, k] = albedo[k] * INVERSE_PI * matt[c, k]
-                glossy[c, k] = f0[k] * glossy[c, k] + (1.0 - f0[k]) * raised[c, k]
             out[c, p] = matt[c]
             out[3 + c, p] = glossy[c]
 

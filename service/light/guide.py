@@ -9,8 +9,7 @@ Source: a control variate with a regression coefficient, Glasserman, "Monte Carl
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -65,9 +64,7 @@ class Guide:
             raise ResultError(f"{where}: was solved from other images than the capture has: solve it again")
         if maps.color_space != space:
             raise ResultError(f"{where}: is in {maps.color_space}, the capture in {space}: solve it again")
-        if maps.specular is not None and maps.roughness is not None:
-            specular, roughness = seen_lobes(maps.specular, maps.roughness, lights.direction)
-            maps = replace(maps, specular=specular, roughness=roughness)
+        maps = maps.with_lobes(partial(seen_lobes, direction=lights.direction))
         try:
             neighbours, shares = left_out(lights.direction)
         except ArrayError as error:

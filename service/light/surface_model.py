@@ -1,6 +1,6 @@
 """Solved maps as a surface that can be lit: its pixels in batches on a device, and which lights they see over its height.
 
-The surface reflects by Relit's BRDF, Lambert and GGX (kernels.relight.shading cites its equations).
+The surface reflects by Relit's BRDF, Lambert and the GGX lobes of one material or two (kernels.relight.shading cites its equations).
 """
 
 from collections.abc import Iterator
@@ -11,11 +11,11 @@ import numpy as np
 import warp as wp
 
 from kernels.relight.occlusion import see_lights
-from kernels.relight.shading import Surface, upload_surface
+from kernels.relight.shading import SecondLobe, Surface, upload_surface
 from service.solve.batches import view_directions
 from service.solve.surface import projection_of
 from stage.errors import ResultError
-from stage.maps import SurfaceMaps
+from stage.maps import LOBES, SurfaceMaps
 
 BATCH_PIXELS = 1 << 17
 """Number of pixels that are lit at one time: 8 MB of maps, and a byte for each pixel and light whose visibility is kept."""
@@ -35,7 +35,8 @@ class SurfaceModel:
         """Keep solved maps for lighting.
 
         Args:
-            maps: with normal, diffuse albedo and height; without specular and roughness there is no specular lobe.
+            maps: with normal, diffuse albedo and height; without specular and roughness there is no specular lobe, and where abundance
+                is above 0 there are those of two materials.
             where: their file, for messages.
             device: where.
 
@@ -45,6 +46,8 @@ class SurfaceModel:
         for name in ("normal", "diffuse_albedo", "height"):
             if getattr(maps, name) is None:
                 raise ResultError(f"{where}: has no layer {name}, which lighting the maps needs: solve with lambert, robust or svbrdf")
+        if maps.abundance is not None and (lacking := [name for lobe in LOBES for name in lobe if getattr(maps, name) is None]):
+            raise ResultError(f"{where}: has a layer abundance and no layer {lacking[0]}, which pixels of two materials need: solve again")
         assert maps.normal is not None and maps.diffuse_albedo is not None and maps.height is not None
         self.maps, self.device = maps, device
         normal = maps.normal.reshape(-1, 3)
@@ -72,12 +75,19 @@ class SurfaceModel:
             def rows(values: np.ndarray, pixels: np.ndarray = pixels) -> np.ndarray:
                 return values.reshape(maps.mask.size, -1)[pixels]
 
-            nothing = np.zeros((len(pixels), 3), np.float32)
-            shiny = maps.specular is not None and maps.roughness is not None
-            yield ModelBatch(pixels, upload_surface(
-                rows(maps.normal), rows(maps.diffuse_albedo), rows(maps.specular) if maps.specular is not None else nothing,
-                rows(maps.roughness) if shiny and maps.roughness is not None else nothing[:, :1], self._view(pixels),
-                self._points[pixels], device=self.device))
+            specular, roughness = np.zeros((len(pixels), 3), np.float32), np.zeros((len(pixels), 1), np.float32)
+            if maps.specular is not None and maps.roughness is not None:
+                specular, roughness = rows(maps.specular), rows(maps.roughness)
+            second = None
+            if maps.abundance is not None:
+                layers = (maps.first_specular, maps.first_roughness, maps.second_specular, maps.second_roughness)
+                first_specular, first_roughness, *other = (rows(layer) for layer in layers if layer is not None)
+                abundance = rows(maps.abundance)
+                specular = np.where(abundance > 0, first_specular, specular)
+                roughness = np.where(abundance > 0, first_roughness, roughness)
+                second = SecondLobe(*other, np.where(abundance > 0, 1 - abundance, 0))
+            yield ModelBatch(pixels, upload_surface(rows(maps.normal), rows(maps.diffuse_albedo), specular, roughness, self._view(pixels),
+                                                    self._points[pixels], second=second, device=self.device))
 
     def see(self, place: np.ndarray, pixels: np.ndarray) -> wp.array:
         """Return which pixels see which lights, as [n, P] uint8 packs of 255 or 0.

@@ -13,8 +13,9 @@ from kernels.photometric.diffuse_shape import choose_diffuse
 from kernels.photometric.hypotheses import Diffuse, Prior, search_normals
 from kernels.photometric.lambert import solve_lambert
 from kernels.photometric.lobes import GEOMETRY, MIXTURE
-from kernels.photometric.material import MATT, fit_given, fit_tinted
+from kernels.photometric.material import MATT, fit_given, fit_material, fit_tinted
 from kernels.photometric.misfit import LARGEST_ERROR
+from kernels.photometric.mixtures import NO_PAIRS, choose_pairs
 from kernels.photometric.near import NearField
 from kernels.photometric.readings import Lights, grey_factors, grey_readings
 from kernels.photometric.robust import solve_robust
@@ -45,6 +46,8 @@ class MaterialOptions:
     """Subtract the light that the object throws on itself."""
     sharing: bool = True
     """Let pixels share materials."""
+    mixtures: bool = True
+    """Let a pixel have two of the shared materials."""
 
 
 WHOLE_SOLVER = MaterialOptions()
@@ -99,7 +102,7 @@ class _Walk:
         self._specular = self.result.specular = np.zeros((3, count), np.float16)
         self._roughness = self.result.roughness = np.zeros(count, np.float16)
         self._lambertian = np.zeros_like(self.result.normal)
-        self._shape, self._supported = Diffuse(), True
+        self._shape, self._supported, self._pairs = Diffuse(), True, NO_PAIRS
 
     def start(self) -> None:
         """Find the normals of `robust`, from which the search begins, and under few lights those of `lambert`."""
@@ -164,28 +167,38 @@ class _Walk:
             return None
         samples = self._pick(self._spread)
         light.keep(self._spread, samples)
-        materials = choose_materials(samples, self.result.normal[:, self._spread].T, shape=self._shape)
+        normal = self.result.normal[:, self._spread].T
+        materials = choose_materials(samples, normal, shape=self._shape)
         self.result.facts["shared_materials"] = [{"specular": material[:3].tolist(), "roughness": float(material[3])}
                                                  for material in materials.round(4).astype(float)]
+        if self._options.mixtures:
+            single = fit_material(samples, normal, shape=self._shape, shared=materials)
+            self._pairs = choose_pairs(samples, normal, materials, single, shape=self._shape)
         return materials
 
     def fit(self, light: DirectLight | None, materials: np.ndarray | None) -> None:
         """Fit normal and material of every pixel to its direct light."""
         result = self.result
-        sigma = np.full(self._given.stack.pixel_count, LARGEST_ERROR, np.float16)
+        count = self._given.stack.pixel_count
+        sigma = np.full(count, LARGEST_ERROR, np.float16)
+        abundance, pair = np.zeros(count, np.float16), np.zeros(count, np.uint8)
         for pixels, samples in self._batches("normals"):
             assert light is not None  # there are pixels
             light.keep(pixels, samples)
             roughness = self._roughness[pixels].astype(np.float32) if self._interreflection else None
-            found = solve_svbrdf(samples, result.normal[:, pixels].T, shape=self._shape, shared=materials, roughness=roughness,
-                                 prior=self._prior(pixels))
+            found = solve_svbrdf(samples, result.normal[:, pixels].T, shape=self._shape, shared=materials, pairs=self._pairs,
+                                 roughness=roughness, prior=self._prior(pixels))
             result.normal[:, pixels] = found.normal.T
             result.albedo[:, pixels] = found.diffuse_albedo.T
             self._specular[:, pixels] = found.specular.T
             self._roughness[pixels] = found.roughness
+            abundance[pixels], pair[pixels] = found.mixture
             sigma[pixels], result.confidence[pixels] = found.sigma, found.confidence
             result.residual[pixels] = found.residual
         result.sigma, result.judged_by_surface = sigma, True
+        if (mixed := abundance > 0).any():
+            result.abundance, result.pair, result.pairs = abundance, pair, self._pairs
+            result.facts["mixed_pixels"] = int(mixed.sum())
 
     @property
     def _few(self) -> bool:

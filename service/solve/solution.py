@@ -68,6 +68,9 @@ class Solution:
     status: np.ndarray  # [pixels] uint8
     specular: np.ndarray | None = None  # [3, pixels] float16, F0
     roughness: np.ndarray | None = None  # [pixels] float16
+    abundance: np.ndarray | None = None  # [pixels] float16, share of the first of two materials; 0 where the pixel has one
+    pair: np.ndarray | None = None  # [pixels] uint8, which pair these are
+    pairs: np.ndarray | None = None  # [pairs, 2, 4] float32, F0 and roughness of both materials; None: no pixel has two
     specular_normal: np.ndarray | None = None  # [3, pixels] float32
     regime: np.ndarray | None = None  # [pixels] uint8, codes of kernels.photometric.sampling.Regime
     height: np.ndarray | None = None  # [rows, cols] float32, camera-frame z, 0 where not solved; None: not integrated yet

@@ -190,6 +190,7 @@ def _maps(solution: Solution, solved: np.ndarray, estimated: np.ndarray, method:
         diffuse_albedo=None if method is Method.REFERENCE else image(solution.albedo),
         specular=image(solution.specular),
         roughness=image(solution.roughness),
+        **_lobes_of_mixtures(solution, image),
         regime=image(solution.regime),
         specular_normal=image(solution.specular_normal),
         height=solution.height,
@@ -199,6 +200,18 @@ def _maps(solution: Solution, solved: np.ndarray, estimated: np.ndarray, method:
         color_space=linear_space(capture.manifest.color_space),
         provenance=provenance,
     )
+
+
+def _lobes_of_mixtures(solution: Solution, image: Callable[[np.ndarray], np.ndarray | None]) -> dict[str, np.ndarray | None]:
+    """Return the layers of pixels that mix two materials; none if there is no such pixel."""
+    if solution.abundance is None or solution.pair is None or solution.pairs is None:
+        return {}
+    mixed = solution.abundance > 0
+    layers = {"abundance": image(solution.abundance)}
+    for place, name in enumerate(("first", "second")):
+        lobe = np.where(mixed, solution.pairs[solution.pair, place].T, 0).astype(np.float16)
+        layers |= {f"{name}_specular": image(lobe[:3]), f"{name}_roughness": image(lobe[3])}
+    return layers
 
 
 def _nothing_solved(counts: Mapping[str, int]) -> str:

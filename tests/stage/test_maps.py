@@ -21,6 +21,8 @@ def make_maps(**changes) -> SurfaceMaps:
     three, one = (lambda: RNG.random((ROWS, COLS, 3)).astype(np.float32)), (lambda: RNG.random((ROWS, COLS)).astype(np.float32))
     layers = {"normal": three(), "diffuse_albedo": three(), "specular": three(), "roughness": one(), "height": one() - 1,
               "confidence": one(), "specular_normal": three(), "regime": one(), "sigma": one(),
+              "abundance": one(), "first_specular": three(), "first_roughness": one(), "second_specular": three(),
+              "second_roughness": one(),
               "status": MASK.astype(np.uint8)}
     return SurfaceMaps(**{"camera": CAMERA, "mask": MASK, "provenance": {"relit:capture": "owl"}, **layers, **changes})
 
@@ -43,8 +45,9 @@ def test_the_channels_are_those_of_the_contract(tmp_path):
     with OpenEXR.File(str(tmp_path / "maps.exr"), separate_channels=True) as file:
         types = {name: channel.pixels.dtype.name for name, channel in file.channels().items()}
         header = dict(file.header())
-    half = [f"{layer}.{c}" for layer in ("diffuse_albedo", "specular") for c in "RGB"]
-    half += [f"{layer}.Y" for layer in ("roughness", "regime", "sigma", "confidence", "status", "mask")]
+    half = [f"{layer}.{c}" for layer in ("diffuse_albedo", "specular", "first_specular", "second_specular") for c in "RGB"]
+    half += [f"{layer}.Y" for layer in ("roughness", "abundance", "first_roughness", "second_roughness", "regime", "sigma", "confidence",
+                                        "status", "mask")]
     floats = [f"{layer}.{c}" for layer in ("normal", "specular_normal") for c in "XYZ"] + ["height.Z"]
     assert types == {**dict.fromkeys(half, "float16"), **dict.fromkeys(floats, "float32")}
     assert header["colorInteropID"] == "lin_rec709_scene" and "chromaticities" in header and "relit:camera" in header
@@ -66,6 +69,14 @@ def test_a_layer_that_was_not_estimated_is_absent_not_zero(tmp_path, absent):
     channels, _ = exr.read(tmp_path / "maps.exr")
     assert {name.split(".")[0] for name in channels} == set(LAYERS) - {absent}
     assert getattr(SurfaceMaps.read(tmp_path / "maps.exr"), absent) is None
+
+
+def test_every_lobe_is_changed_and_nothing_else():
+    maps = make_maps(second_specular=None)
+    changed = maps.with_lobes(lambda specular, roughness: (2 * specular, roughness + 1))
+    for name, layer in maps.layers().items():
+        expected = 2 * layer if name in ("specular", "first_specular") else layer + 1 if name in ("roughness", "first_roughness") else layer
+        assert np.array_equal(getattr(changed, name), expected), name
 
 
 def test_what_is_unsure_is_kept_outside_the_mask(tmp_path):

@@ -7,6 +7,7 @@ from kernels import packs
 from kernels.errors import ArrayError
 from kernels.relight.around import left_out
 from kernels.relight.guide import LEAST_ALPHA, POOL, compare_model, fit_trust, seen_lobes
+from kernels.relight.shading import SecondLobe, upload_surface
 from tests.kernels.relight.lights import AXES, icosahedron
 from tests.kernels.relight.surfaces import LOBE, facing, pack_bytes, scattered_pixels, stored, upload
 from tests.kernels.scenes import HALF_ROUNDING, HALF_STEP, cap, colours, store
@@ -77,6 +78,29 @@ def test_packs_of_four_are_packs_of_more(monkeypatch):
     model = reference.readings(pixels, LIGHTS)
     got, held = trusted(pixels, 0.1 + 0.6 * model, "cpu")
     assert close(got, held, model)
+
+
+def test_a_model_of_two_materials_explains_its_images(device):
+    """β is one of images that the twin mixes, and less where the model lacks the second material. Tolerance: as against the twin."""
+    pixels, other = scattered_pixels(45, seed=1), scattered_pixels(45, seed=2)
+    share = np.full(45, 0.5, np.float32)
+    one, two = (reference.readings(surface, LIGHTS) for surface in (pixels, pixels._replace(f0=other.f0, roughness=other.roughness)))
+    model = (one + two) / 2
+    stack, scale, held = stored(model, IRRADIANCE)
+    visible = pack_bytes(np.full((len(LIGHTS), 45), 255, np.uint8), device)
+
+    def sums(second):
+        surface = upload_surface(*pixels, second=second, device=device)
+        band = packs.upload(stack, device=device)
+        return compare_model(band, surface, visible, LIGHTS, IRRADIANCE, scale, NEIGHBOURS, SHARES).numpy()[:, :45]
+
+    top, bottom = sums(SecondLobe(other.f0, other.roughness, share))
+    _, missing, told = reference.trust(held, model, NEIGHBOURS, SHARES)
+    allowed = 3 * wobble(model, LOBE, told) * (told**2).sum(axis=(0, 1))
+    assert (np.abs(bottom - (told**2).sum(axis=(0, 1))) <= allowed).all()
+    assert (np.abs(top - (missing * told).sum(axis=(0, 1))) <= allowed).all()
+    lone_top, lone_bottom = sums(None)
+    assert np.abs(lone_top / lone_bottom - 1).mean() > 10 * np.abs(top / bottom - 1).mean()
 
 
 def test_sums_are_the_twins(device):

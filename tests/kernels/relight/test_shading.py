@@ -87,6 +87,22 @@ def test_a_lobe_is_never_narrower_than_the_least(device):
     np.testing.assert_array_equal(radiance(narrow, lights("sphere"), device), radiance(least, lights("sphere"), device))
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_two_materials_are_the_mean_of_their_surfaces(kind, device):
+    """Shares of two surfaces that differ in their lobe alone; packs without a mixed pixel beside packs that have some."""
+    count = 100
+    pixels, other, given = scattered_pixels(count, seed=5), scattered_pixels(count, seed=6), lights(kind)
+    share = np.where(np.arange(count) < 40, np.random.default_rng(1).uniform(0, 1, count), 0).astype(np.float32)
+    share[:40:4] = 0
+    second = shading.SecondLobe(other.f0, other.roughness, share)
+    got = shading.shade(shading.upload_surface(*pixels, second=second, device=device), given).numpy()[:, :count]
+    one, two = (reference.shade(surface, given) for surface in (pixels, pixels._replace(f0=other.f0, roughness=other.roughness)))
+    size = np.abs(one) + np.abs(two)
+    assert (np.abs(got - (1 - share) * one - share * two) <= 2 * LOBE * size + 64 * FLOAT * np.abs(size).max()).all()
+    assert np.abs(one - two)[3:, share > 0.2].max() > 0.01
+    np.testing.assert_array_equal(got[:, 64:], radiance(pixels, given, device)[:, 64:])
+
+
 def test_a_mirror_direction_peaks_as_the_distribution_says(device):
     """Light, normal and viewer in one line: D = 1 / (π α²), masking 1, Fresnel F0, over 4: E F0 / (4 π α²), n·l being n·v."""
     pixels = facing(1)._replace(roughness=np.float32([0.5]), f0=np.float32([[0.04, 0.5, 1]]))
@@ -220,8 +236,8 @@ def test_no_light_is_black(device):
 
 @pytest.mark.parametrize("change, message", [
     ({"normal": np.zeros((0, 3))}, "surface has 0 pixels"),
-    ({"albedo": np.zeros((4, 1))}, r"surface has 4 pixels with \[3, 1, 3, 3, 3, 1\] values: give \[3, 3, 3, 3, 3, 1\]"),
-    ({"roughness": np.zeros((4, 3))}, r"\[3, 3, 3, 3, 3, 3\]"),
+    ({"albedo": np.zeros((4, 1))}, r"surface has 4 pixels with \[3, 1, 3, 3, 3, 1, 3, 1, 1\] values: give \[3, 3, 3, 3, 3, 1, 3, 1, 1\]"),
+    ({"roughness": np.zeros((4, 3))}, r"\[3, 3, 3, 3, 3, 3, 3, 1, 1\]"),
 ])
 def test_bad_surfaces_are_refused(change, message, device):
     pixels = scattered_pixels(4)._replace(**change)

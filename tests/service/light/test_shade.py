@@ -6,6 +6,7 @@ import pytest
 from stage import exr
 from stage.camera import Camera
 from stage.maps import MAPS_FILE, SurfaceMaps
+from tests.reference import microfacet
 from tests.scenes.captures import files_in, write_exr
 from tests.scenes.glossy import ALBEDO, PIXEL_M, dome, reflect, write_dome, write_maps
 
@@ -36,6 +37,30 @@ def test_a_point_light_is_the_model_pixel_by_pixel(relit, maps, tmp_path):
     wanted = 2 * reflect(SURFACE.normal, toward / away) * intensity / away**2
     np.testing.assert_allclose(rgb(tmp_path / "p.exr")[SURFACE.mask], wanted[SURFACE.mask], rtol=4e-3)
     assert (rgb(tmp_path / "p.exr")[~SURFACE.mask] == 0).all()
+
+
+def test_two_materials_of_a_pixel_are_their_mean(relit, tmp_path):
+    """Left of the middle a share of another lobe, right of it one material. Tolerance: half rounding of two lobes and the share."""
+    place, share = np.array([0.01, 0.015, 0.03]), 0.7
+    mixed = np.arange(len(SURFACE.mask)) < 12
+    full = np.ones((*SURFACE.mask.shape, 3), np.float32)
+    lobes = {"first_specular": 0.9 * full, "first_roughness": 0.4 * full[..., 0], "second_specular": 0.05 * full,
+             "second_roughness": 0.55 * full[..., 0], "abundance": share * mixed * full[..., 0]}
+    maps = write_maps(tmp_path / "maps", SURFACE, **lobes)
+    relit("shade", maps, "--light", text(place, [1e-3] * 3), "--out", tmp_path / "p.exr")
+    toward = place - SURFACE.places
+    away = np.linalg.norm(toward, axis=-1, keepdims=True)
+    one = reflect(SURFACE.normal, toward / away)
+    shine = microfacet.specular(SURFACE.normal, toward / away, np.array([0, 0, 1.0]), 0.4**2, 0.9)[..., None]
+    matt = ALBEDO * microfacet.diffuse(SURFACE.normal, toward / away, np.array([0, 0, 1.0]))[..., None]
+    wanted = np.where(mixed[:, None], share * (matt + shine) + (1 - share) * one, one) * 1e-3 / away**2
+    np.testing.assert_allclose(rgb(tmp_path / "p.exr")[SURFACE.mask], wanted[SURFACE.mask], rtol=5e-3)
+
+
+def test_maps_with_the_share_of_a_material_and_not_its_lobe_are_refused(relit, tmp_path):
+    maps = write_maps(tmp_path / "maps", SURFACE, abundance=np.full(SURFACE.mask.shape, 0.5, np.float32))
+    outcome = relit("shade", maps, "--light", "0,0,1,1,1,1", "--out", tmp_path / "p.exr")
+    assert outcome.code == 2 and "no layer first_specular" in outcome.err
 
 
 def test_lights_add_up(relit, maps, tmp_path):

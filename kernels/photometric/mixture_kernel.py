@@ -1,0 +1,117 @@
+"""The kernel of the mixture fit: for each pixel of a pack and each pair of given materials the abundance of the first and the albedo, by
+re-weighted least squares under their bounds, and the best pair."""
+
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from kernels.packs import channels_type, pack_type
+from kernels.photometric.lobes import Reflectance
+from kernels.photometric.material_kernel import COMMON_ROUNDS, REWEIGHTINGS, squared_misfit, weigh
+
+
+@cache
+def mixture_kernel(lanes: int, reflectance: Reflectance) -> Any:
+    """Return the kernel for one width of packs and one kind of light.
+
+    Args:
+        lanes: pixels of a pack.
+        reflectance: expected readings.
+    """
+    respond, lambertian = reflectance
+    lane_type = pack_type(lanes, wp.float32)
+    channels = channels_type(lanes)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
+    def mix_kernel(first: int,
+                   colour: wp.array2d(dtype=lane_type),  # [3, P · L] radiance / irradiance
+                   toward: wp.array2d(dtype=lane_type),  # [3, P · L]
+                   table: wp.array3d(dtype=float),  # [cells, L, columns]
+                   level: wp.array(dtype=lane_type),  # [P]
+                   view: wp.array2d(dtype=lane_type),  # [3, P]
+                   normal: wp.array2d(dtype=lane_type),  # [3, P]
+                   noise: wp.vec2,  # s0, s1
+                   shadow: wp.vec2,  # r²/σ² of equal cost, depth
+                   form: wp.vec2,  # diffuse roughness, slope
+                   pairs: wp.array2d(dtype=wp.vec4),  # [pairs, 2] F0 and roughness
+                   light_count: int,
+                   pack_stride: int,
+                   light_stride: int,
+                   # outputs
+                   fitted: wp.array2d(dtype=lane_type)):  # [6, P] albedo, abundance of the first material, pair, cost
+        p = first + wp.tid()
+        vx, vy, vz = view[0, p], view[1, p], view[2, p]
+        nx, ny, nz = normal[0, p], normal[1, p], normal[2, p]
+        bright = level[p]
+        best_cost, best_share, best_pair = lane_type(1.0e30), lane_type(), lane_type()
+        best_rho = channels()
+        for pair in range(pairs.shape[0]):
+            one, two = pairs[pair, 0], pairs[pair, 1]
+            rough_one, rough_two = lane_type(one[3]), lane_type(two[3])
+            rho, share, cost = channels(), lane_type(), lane_type()
+            for turn in range(wp.static(REWEIGHTINGS + 1)):
+                dd, ds, ss, rd, rs = channels(), channels(), channels(), channels(), channels()
+                cost = lane_type()
+                for light in range(light_count):
+                    at = p * pack_stride + light * light_stride
+                    fd, fs, fixed = respond(toward, table, form, nx, ny, nz, vx, vy, vz, rough_one, at, light)
+                    _, fs_two, fixed_two = respond(toward, table, form, nx, ny, nz, vx, vy, vz, rough_two, at, light)
+                    off2, shining, expected, w = lane_type(), lane_type(), lane_type(), lane_type()
+                    for c in range(3):
+                        y = colour[c, at]
+                        for k in range(lanes):
+                            below = two[c] * fs_two[k] + fixed_two[k]
+                            above = one[c] * fs[k] + fixed[k]
+                            predicted = rho[c, k] * fd[k] + below + share[k] * (above - below)
+                            off2[k] += wp.where(turn == 0, 0.0, squared_misfit(y[k], predicted, bright[k], noise))
+                            shining[k] += y[k]
+                            expected[k] += predicted
+                    for k in range(lanes):
+                        weight, added = weigh(shining[k], expected[k], off2[k], bright[k], noise, shadow)
+                        w[k] = weight
+                        cost[k] += added
+                    for c in range(3):
+                        y = colour[c, at]
+                        for k in range(lanes):
+                            below = two[c] * fs_two[k] + fixed_two[k]
+                            apart = one[c] * fs[k] + fixed[k] - below
+                            left = y[k] - below
+                            dd[c, k] += w[k] * fd[k] * fd[k]
+                            ds[c, k] += w[k] * fd[k] * apart
+                            ss[c, k] += w[k] * apart * apart
+                            rd[c, k] += w[k] * fd[k] * left
+                            rs[c, k] += w[k] * apart * left
+                if turn < wp.static(REWEIGHTINGS):
+                    for k in range(lanes):
+                        common = float(0.0)
+                        for _round in range(COMMON_ROUNDS):
+                            # it explains what the diffuse lobe cannot in channels with albedo above 0, and everything in the others
+                            top, bottom, whole = float(0.0), float(0.0), float(0.0)
+                            for c in range(3):
+                                shared = wp.where(rd[c, k] > common * ds[c, k], ds[c, k] / wp.max(dd[c, k], 1.0e-20), 0.0)
+                                top += rs[c, k] - shared * rd[c, k]
+                                bottom += ss[c, k] - shared * ds[c, k]
+                                whole += ss[c, k]
+                            common = wp.where(bottom > 1.0e-6 * whole, wp.clamp(top / wp.max(bottom, 1.0e-20), 0.0, 1.0), 0.0)
+                        share[k] = common
+                        for c in range(3):
+                            rho[c, k] = wp.max(rd[c, k] - common * ds[c, k], 0.0) / wp.max(dd[c, k], 1.0e-20)
+            for k in range(lanes):
+                better = cost[k] < best_cost[k]
+                best_cost[k] = wp.where(better, cost[k], best_cost[k])
+                best_share[k] = wp.where(better, share[k], best_share[k])
+                best_pair[k] = wp.where(better, float(pair), best_pair[k])
+                for c in range(3):
+                    best_rho[c, k] = wp.where(better, rho[c, k], best_rho[c, k])
+        closest = lambertian(toward, form, nx, ny, nz, vx, vy, vz, p * pack_stride, light_count, light_stride)
+        for c in range(3):
+            out = lane_type()
+            for k in range(lanes):
+                out[k] = best_rho[c, k] * closest[k]
+            fitted[c, p] = out
+        fitted[3, p] = best_share
+        fitted[4, p] = best_pair
+        fitted[5, p] = best_cost
+
+    return mix_kernel

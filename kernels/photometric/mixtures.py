@@ -1,0 +1,144 @@
+"""Pixels in which two of the object's materials lie side by side: the share of each, by how much better both explain the readings than one.
+
+On the border of two materials a reading is y = a y_1 + (1 - a) y_2, whether the pixel covers both or a texture blends them. One lobe
+cannot stand for two that differ in F0 or roughness: between metal and paint it would need the F0 of a metal beside a diffuse albedo,
+which a fit of one material rightly refuses. With the two materials given, a pixel has one unknown more than its albedo, the abundance a.
+
+Source: materials as few and mixed per pixel after Goldman et al., "Shape and spatially-varying BRDFs from photometric stereo", TPAMI 2010,
+section 4; the width of the single lobe that stands for a mixture, the mean of the slope variances, after Olano and Baker, "LEAN mapping",
+I3D 2010.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from kernels.packs import pack_type
+from kernels.photometric.hypotheses import Diffuse, SearchOptions, criteria
+from kernels.photometric.lobes import direction_reflectance
+from kernels.photometric.material import COST_FLOOR, Material
+from kernels.photometric.mixture_kernel import mixture_kernel
+from kernels.photometric.samples import Samples, choose, per_pixel, to_host
+from kernels.photometric.shared_materials import LEAST_GAIN
+
+MIXED_RISE = 1.25
+"""Factor by which the cost of one material must exceed that of two: on real objects without mixed pixels hardly a pixel reaches it, on soft
+borders of metal and paint it is mostly several times as much."""
+LEAST_SHARE = 0.02
+"""Least share of a material in a pixel that mixes two; with less the pixel has one material."""
+MOST_PAIRS = 4
+"""Largest number of pairs of materials that pixels mix."""
+
+NO_PAIRS = np.zeros((0, 2, 4), dtype=np.float32)
+"""No pair of materials: every pixel has one material."""
+
+
+class Mixture(NamedTuple):
+    """Two materials in each of the sampled pixels."""
+
+    abundance: np.ndarray  # [n] float32, share of the first material; 0 where the pixel has one
+    pair: np.ndarray  # [n] uint8, which pair of materials
+
+
+class _Mixed(NamedTuple):
+    """The best pair of each pixel, whether or not it explains the pixel better than one material."""
+
+    diffuse_albedo: np.ndarray  # [n, 3]
+    abundance: np.ndarray  # [n]
+    pair: np.ndarray  # [n]
+    cost: np.ndarray  # [n] per light
+
+
+def choose_pairs(samples: Samples, normal: np.ndarray, materials: np.ndarray, single: Material, *, shape: Diffuse,
+                 options: SearchOptions | None = None) -> np.ndarray:
+    """Choose the pairs of shared materials that pixels mix.
+
+    Args:
+        samples: some hundreds of pixels, spread over the object.
+        normal: [n, 3] unit normals.
+        materials: [materials, 4] F0 and roughness, of shared_materials.choose_materials.
+        single: what one material a pixel makes of the same samples.
+        shape: of the diffuse lobe.
+        options: noise and shadows, as in the search.
+
+    Returns:
+        [pairs, 2, 4] float32, the pair that explains most first; none where two materials explain no pixel clearly better than
+        one. Waits for the device.
+    """
+    pairs = np.array([(materials[i], materials[j]) for i in range(len(materials)) for j in range(i)], dtype=np.float32).reshape(-1, 2, 4)
+    fits = [_fit(samples, normal, pair[None], shape, options) for pair in pairs]
+    best, chosen = single.cost, []
+    while fits and len(chosen) < MOST_PAIRS:
+        saved = [np.where(_better(fit, single.cost), np.maximum(best - fit.cost, 0), 0) for fit in fits]
+        index = int(np.argmax([gain.sum() for gain in saved]))
+        if saved[index].sum() < LEAST_GAIN * single.cost.sum() or index in chosen:
+            break
+        chosen.append(index)
+        best = best - saved[index]
+    return pairs[chosen]
+
+
+def mix_materials(samples: Samples, normal: np.ndarray, single: Material, pairs: np.ndarray, *, shape: Diffuse,
+                  options: SearchOptions | None = None) -> tuple[Material, Mixture]:
+    """Replace the material of pixels that two materials explain clearly better than one.
+
+    Args:
+        samples: their readings.
+        normal: [n, 3] unit normals.
+        single: one material a pixel.
+        pairs: [pairs, 2, 4] of choose_pairs.
+        shape: of the diffuse lobe.
+        options: noise and shadows, as in the search.
+
+    Returns:
+        The materials, in mixed pixels with the albedo of both together and with F0 and roughness of single_lobe; and the mixture. Waits for
+        the device.
+    """
+    mixture = Mixture(np.zeros(len(normal), np.float32), np.zeros(len(normal), np.uint8))
+    tried = np.flatnonzero(single.cost > COST_FLOOR)  # what costs less needs no second material
+    if not len(tried) or not len(pairs):
+        return single, mixture
+    fit = _fit(choose(samples, tried), normal[tried], pairs, shape, options)
+    kept = _better(fit, single.cost[tried])
+    mixed = tried[kept]
+    material = Material(*(plane.copy() for plane in single))
+    material.diffuse_albedo[mixed], material.cost[mixed] = fit.diffuse_albedo[kept], fit.cost[kept]
+    mixture.abundance[mixed], mixture.pair[mixed] = fit.abundance[kept], fit.pair[kept]
+    material.specular[mixed], material.roughness[mixed] = single_lobe(fit.abundance[kept], pairs[fit.pair[kept]])
+    return material, mixture
+
+
+def single_lobe(abundance: np.ndarray, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return F0 [n, 3] and roughness [n] of the single lobe that comes closest to the lobes of two materials.
+
+    F0 is the mean of both, so that as much light is reflected at normal incidence; α² is the mean of both weighted by what each reflects.
+
+    Args:
+        abundance: [n] share of the first material.
+        pairs: [n, 2, 4] F0 and roughness of both materials.
+    """
+    shares = np.stack([abundance, 1 - abundance], axis=1)
+    specular = np.einsum("np,npc->nc", shares, pairs[..., :3])
+    reflected = shares * pairs[..., :3].mean(axis=-1)
+    variance = np.einsum("np,np->n", reflected, pairs[..., 3] ** 4) / np.maximum(reflected.sum(axis=1), 1e-20)
+    return specular.astype(np.float32), (variance**0.25).astype(np.float32)
+
+
+def _better(fit: _Mixed, single_cost: np.ndarray) -> np.ndarray:
+    """Return where two materials explain a pixel clearly better than one."""
+    inside = (fit.abundance >= LEAST_SHARE) & (fit.abundance <= 1 - LEAST_SHARE)
+    return inside & (MIXED_RISE * fit.cost + COST_FLOOR < single_cost)
+
+
+def _fit(samples: Samples, normal: np.ndarray, pairs: np.ndarray, shape: Diffuse, options: SearchOptions | None) -> _Mixed:
+    device, lanes, packs = samples.device, samples.lanes, samples.packs
+    fitted = wp.empty((6, packs), dtype=pack_type(lanes, wp.float32), device=device)
+    devices.launch(mixture_kernel(lanes, direction_reflectance(lanes)), packs,
+                   [samples.colour, samples.toward, wp.empty((0, 0, 0), dtype=wp.float32, device=device), samples.level, samples.view,
+                    per_pixel(samples, normal), *criteria(options or SearchOptions(), shape), wp.array(pairs, dtype=wp.vec4, device=device),
+                    samples.light_count, samples.pack_stride, samples.light_stride],
+                   [fitted], device=device)
+    values = to_host(samples, fitted)
+    return _Mixed(values[:, :3], values[:, 3], values[:, 4].astype(np.uint8), values[:, 5] / samples.light_count)
