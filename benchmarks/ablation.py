@@ -78,7 +78,8 @@ def load_case(name: str, capture: Capture, truth: np.ndarray, cache: Path) -> Ca
     shape, _ = choose_diffuse(_gather(band, few, lights, factors, stack.light_count), robust[0][few])
 
     def whole(options: MaterialOptions) -> np.ndarray:
-        solution = solve_material(SolveInput(stack, capture.camera, capture.mask(), "cpu", Timings()), lights, options=options)
+        solution = solve_material(SolveInput(stack, capture.camera, capture.mask(), "cpu", Timings(),
+                                             relative=capture.manifest.irradiance_scale == "relative"), lights, options=options)
         return solution.normal[:, chosen[solved]].T
 
     return Case(name, truth.reshape(-1, 3)[chosen[solved]], lambert[0][solved], robust[0][solved], samples, channels, shape, whole)
@@ -105,7 +106,9 @@ VARIANTS: dict[str, Callable[[Case], np.ndarray]] = {
     "+ averaged over nearby shapes": lambda case: solve_svbrdf(case.samples, case.robust, shape=case.shape, single_lobe=False).normal,
     "+ a single lobe fitted jointly with the normal": lambda case: solve_svbrdf(case.samples, case.robust, shape=case.shape).normal,
     "+ readings in cast shadows of the height left out": lambda case: case.whole(MaterialOptions(interreflection=False)),
-    "+ interreflection subtracted, materials shared (`svbrdf`)": lambda case: case.whole(MaterialOptions()),
+    "+ interreflection subtracted, materials shared": lambda case: case.whole(MaterialOptions(settling=False)),
+    "+ shape and interreflection in turn": lambda case: case.whole(MaterialOptions(scale=False)),
+    "+ scale of albedo where that of the lights is unknown (`svbrdf`)": lambda case: case.whole(MaterialOptions()),
 }
 
 

@@ -55,6 +55,8 @@ class Manifest(Strict):
     dark: FileName | None = None
     flat: FileName | None = None
     saturation: Positive | None = None
+    irradiance_scale: Literal["absolute", "relative"] = "absolute"
+    """`relative` where the irradiance (and intensity and radiance) of all lights lacks one common factor, and albedo with it."""
     frames: Annotated[tuple[Frame, ...], Field(min_length=1), FirstFault]
 
     @model_validator(mode="after")

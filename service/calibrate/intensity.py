@@ -72,4 +72,4 @@ def intensity(request: IntensityRequest, progress: Progress | None = None) -> Li
     timings.close()
     measured = leave_out_failures(captures, results, drop_failed=request.drop_failed)
     return write_lights("intensity", request, captures, measured, headings=("irradiance", "sure to", "residual"),
-                        summary={"pixels": found.pixels})
+                        summary={"pixels": found.pixels}, relative=True)

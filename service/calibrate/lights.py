@@ -146,7 +146,7 @@ def grey_ball(request: GreyBallRequest, progress: Progress | None = None) -> Lig
     results = leave_out_failures(captures, _measure_each(captures, [view], measure, timings), drop_failed=request.drop_failed)
     timings.close()
     return write_lights("grey-ball", request, captures, _scaled(results, request.albedo),
-                        headings=("irradiance", "residual"), summary={"balls": [ball_entry(ball)]})
+                        headings=("irradiance", "residual"), summary={"balls": [ball_entry(ball)]}, relative=request.albedo is None)
 
 
 def _measure_each(captures: LightCaptures, views: Sequence[BallView],

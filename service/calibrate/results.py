@@ -90,9 +90,21 @@ def leave_out_failures(captures: LightCaptures, results: Sequence[MeasuredLight 
 
 
 def write_lights(kind: str, request: Options, captures: LightCaptures, results: Sequence[MeasuredLight], *,
-                 headings: tuple[str, ...], summary: dict[str, Any]) -> LightCalibration:
-    """Write the report, then the manifest, each whole or not at all, and return what was written."""
+                 headings: tuple[str, ...], summary: dict[str, Any], relative: bool | None = None) -> LightCalibration:
+    """Write the report, then the manifest, each whole or not at all, and return what was written.
+
+    Args:
+        kind: of the calibration, the section of the report.
+        request: what was asked.
+        captures: that were read and that get the lights.
+        results: of each light.
+        headings: of the table, between frame and flags.
+        summary: what the report says beside the lights.
+        relative: whether the common scale of the measured lights is unknown; None: their strength was not measured.
+    """
     manifest = with_lights(captures.target, [result.light for result in results])
+    if relative is not None:
+        manifest = manifest.model_copy(update={"irradiance_scale": "relative" if relative else "absolute"})
     lights = [{"frame": lit.number, "image": lit.frame.image, **result.entry,
                "was": lit.light.model_dump(mode="json", exclude_none=True)}
               for lit, result in zip(captures.lit, results, strict=True)]

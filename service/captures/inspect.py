@@ -103,6 +103,7 @@ def _facts(capture: Capture) -> Iterator[tuple[str, str]]:
         behind = int((directions[:, 2] < 0).sum())
         widest = np.degrees(np.arccos(np.clip(directions[:, 2].min(), -1, 1)))
         yield "lights", f"{len(directions)} distant, up to {widest:.0f} degrees from the view axis, {behind} behind the object"
+        yield "irradiance", manifest.irradiance_scale
 
 
 def _near_lights(lights: PlacedLights) -> str:

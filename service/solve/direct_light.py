@@ -31,10 +31,14 @@ class DirectLight(NamedTuple):
     field: NearField | None
     """Where the lights are, where some light is near."""
     solved: wp.array  # [rows, cols] uint8, on the device
-    occluder: wp.array | None  # [rows, cols] float32 height on the device; None: no cast shadow is taken out
+    height: wp.array  # [rows, cols] float32, on the device
+    shadows: bool
+    """Whether cast shadows of the height are taken out."""
     arriving: ArrivingLight | None
     """None: no interreflection is taken out."""
     albedo: np.ndarray  # [3, pixels] diffuse, of the normals from which all this follows
+    albedo_scale: float = 1.0
+    """Albedo of the surface over this albedo, which is relative where the scale of the lights is."""
 
     def keep(self, pixels: np.ndarray, samples: Samples) -> None:
         """Mark readings in cast shadow as none, and subtract the light that the object threw on itself from the others.
@@ -43,12 +47,12 @@ class DirectLight(NamedTuple):
             pixels: [n] row-major positions in the image.
             samples: their readings; changed in place.
         """
-        if self.occluder is not None:
-            exclude_shadows(samples, pixels, self.occluder, self.solved, projection_of(self.given.camera),
+        if self.shadows:
+            exclude_shadows(samples, pixels, self.height, self.solved, projection_of(self.given.camera),
                             None if self.field is None else self.field.places)
         if self.arriving is not None:
             corners, shares = self.arriving.at(*np.divmod(pixels, self.given.camera.width))
-            albedo = np.minimum(self.albedo[:, pixels].T.astype(np.float32), LARGEST_ALBEDO)
+            albedo = np.minimum(self.albedo_scale * self.albedo[:, pixels].T.astype(np.float32), LARGEST_ALBEDO)
             subtract_bounce(samples, self.arriving.light, corners, shares, albedo, channel_weights(self.lights, GREY_WEIGHTS),
                             None if self.field is None else self.field.at(pixels))
 
@@ -72,4 +76,4 @@ def direct_light(given: SolveInput, lights: Lights, field: NearField | None, nor
         return None
     arriving = arriving_light(given, lights, normal, surface.height, solved) if interreflection else None
     on_device = wp.array(solved.astype(np.uint8), dtype=wp.uint8, device=given.device)
-    return DirectLight(given, lights, field, on_device, surface.height if shadows else None, arriving, albedo)
+    return DirectLight(given, lights, field, on_device, surface.height, shadows, arriving, albedo)

@@ -59,6 +59,24 @@ class ArrivingLight(NamedTuple):
         total = np.sum(shares, axis=0)
         return np.stack(corners, axis=1), (np.stack(shares, axis=1) / np.maximum(total, 1e-6)[:, None]).astype(np.float32)
 
+    def patch_of(self, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
+        """Return [n] the number of the patch that each pixel lies in; -1 where there is none."""
+        return self.numbers[rows // self.side, cols // self.side]
+
+    def middles(self, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
+        """Return, for each patch in order, which of these pixels lies nearest its middle.
+
+        Args:
+            rows, cols: [n] positions of pixels, one or more in every patch.
+
+        Returns:
+            [patches] indices into the pixels.
+        """
+        patch, middle = self.patch_of(rows, cols), (self.side - 1) / 2
+        order = np.lexsort(((rows % self.side - middle) ** 2 + (cols % self.side - middle) ** 2, patch))
+        numbers, first = np.unique(patch[order], return_index=True)
+        return order[first[numbers >= 0]]
+
 
 def arriving_light(given: SolveInput, lights: Lights, normal: np.ndarray, height: wp.array, solved: np.ndarray) -> ArrivingLight | None:
     """Return the light that the object throws on itself, or None when the solved pixels cover fewer than two patches.

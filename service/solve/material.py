@@ -25,6 +25,7 @@ from kernels.photometric.svbrdf import solve_svbrdf
 from kernels.status import ESTIMATED, Status
 from service.solve.batches import Batch, bands, pick_pixels, pixel_batches, view_directions
 from service.solve.direct_light import DirectLight, direct_light
+from service.solve.settling import settle
 from service.solve.solution import Solution, SolveInput
 from service.solve.support import FEW_LIGHTS, supports_lobes
 from stage.colour import GREY_WEIGHTS
@@ -44,6 +45,10 @@ class MaterialOptions:
     """Leave out readings in cast shadow."""
     interreflection: bool = True
     """Subtract the light that the object throws on itself."""
+    settling: bool = True
+    """Find that light again from the surface without it."""
+    scale: bool = True
+    """Choose the scale of albedo from the images where that of the lights is unknown."""
     sharing: bool = True
     """Let pixels share materials."""
     mixtures: bool = True
@@ -158,8 +163,15 @@ class _Walk:
     def direct_light(self) -> DirectLight | None:
         """Find what the object does to its own light, from the first search; None when no pixel is solved."""
         solved = (self.result.status == Status.OK).reshape(self._given.mask.shape)
-        return direct_light(self._given, self._lights, self._field, self.result.normal, self.result.albedo.copy(), solved,
-                            shadows=self._options.shadows, interreflection=self._interreflection)
+        light = direct_light(self._given, self._lights, self._field, self.result.normal, self.result.albedo.copy(), solved,
+                             shadows=self._options.shadows, interreflection=self._interreflection)
+        if light is None or light.arriving is None or self._field is not None or not (self._supported and self._options.settling):
+            return light  # near lights settle the light in rounds, with the surface
+        relative = self._given.relative and self._options.scale
+        settled = settle(light, self.result.normal, self._shape, self._pick, relative=relative)
+        if relative:
+            self.result.facts["albedo_scale"] = settled.report()
+        return settled.light
 
     def choose_materials(self, light: DirectLight | None) -> np.ndarray | None:
         """Return [materials, 4] F0 and roughness that pixels share, or None where they share none."""

@@ -47,6 +47,8 @@ class SolveInput:
     timings: Timings
     cache: Path | None = None
     """Folder for stack caches; None: `.relit` in the folder of each capture."""
+    relative: bool = False
+    """Whether the irradiance of all lights lacks one common factor, so that the scale of albedo is unknown."""
 
 
 class SuspectLight(NamedTuple):

@@ -127,7 +127,8 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
     stack = open_stack(capture, cache=request.cache, tracking=tracking, progress=lambda done, _: timings.advance(done))
     if isinstance(lights, DistantLights | PlacedLights):
         stack, lights = one_frame_a_light(merge_brackets(stack, capture.sources(), lights), lights)
-    given = SolveInput(stack, capture.camera, mask, device, timings, request.cache)
+    given = SolveInput(stack, capture.camera, mask, device, timings, request.cache,
+                       relative=capture.manifest.irradiance_scale == "relative")
     solution = solver(given, lights)
     mark_not_facing(capture.camera, solution)
     timings.stage("diagnosis", 1)
@@ -158,7 +159,8 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
     write_text(report_path, report(
         request,
         inputs={"capture": str(request.capture), "name": capture.name, "content": stack.key, "frames": len(capture.sources()),
-                "resolution": list(capture.camera.resolution), "color_space": capture.manifest.color_space},
+                "resolution": list(capture.camera.resolution), "color_space": capture.manifest.color_space,
+                "irradiance_scale": capture.manifest.irradiance_scale},
         method=str(method),
         found=solution.facts,
         warnings=solution.warnings,

@@ -1,7 +1,8 @@
 """Import of the DiLiGenT benchmark: filenames.txt, light_directions.txt, light_intensities.txt, mask.png, 16-bit PNG.
 
 Source: Shi et al., "A Benchmark Dataset and Evaluation for Non-Lambertian and Uncalibrated Photometric Stereo", TPAMI 2019.
-Its camera frame is that of relit (x right, y up, z to the camera). Images are linear; light intensities become irradiances.
+Its camera frame is that of relit (x right, y up, z to the camera). Images are linear; light intensities become irradiances, whose common
+scale is unknown.
 """
 
 from pathlib import Path
@@ -44,6 +45,7 @@ def import_folder(source: Path, destination: Path) -> Path:
         "color_space": "lin_rec709_scene",
         "camera": {"projection": "orthographic", "resolution": image_resolution(source / names[0])},
         "mask": mask,
+        "irradiance_scale": "relative",
         "frames": [
             {"image": name, "light": {"type": "distant", "direction": list(direction), "irradiance": list(intensity)}}
             for name, direction, intensity in zip(names, directions.tolist(), intensities.tolist(), strict=True)

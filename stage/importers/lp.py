@@ -1,7 +1,8 @@
 """Import of RTI `.lp` files: a count, then one line for each image with its name and the direction x y z of its light.
 
 The convention is that of RTIBuilder and its viewers: x right, y up, z towards the camera; the vector points to the light. The file
-does not give the colour space: 8-bit images are taken as sRGB and others as scene-linear, and the manifest declares it.
+does not give the colour space: 8-bit images are taken as sRGB and others as scene-linear, and the manifest declares it. Nor does it give
+the strength of the lights, which are declared equal, with an unknown common scale.
 """
 
 from pathlib import Path
@@ -49,6 +50,7 @@ def import_folder(source: Path, destination: Path) -> Path:
         "color_space": "srgb_texture" if _display_encoded(first) else "lin_rec709_scene",
         "camera": {"projection": "orthographic", "resolution": resolution},
         "mask": mask,
+        "irradiance_scale": "relative",
         "frames": frames,
     }, path, destination)
 

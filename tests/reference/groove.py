@@ -26,9 +26,17 @@ class Groove:
         there = np.maximum(-(way * self.normals[None]).sum(-1), 0)
         return here * there / squared * self.areas[None] / (np.pi * squared + self.areas[None])
 
+    def shadowed(self, lights: np.ndarray) -> np.ndarray:
+        """[light, pixel] whether the other face stands before the light, as no light within 45 degrees of +z finds it."""
+        x, y = self.points[:, 0], self.points[:, 1]
+        lx, ly, lz = (part[:, None] for part in np.asarray(lights).T)
+        away = np.where(x * lx < 0, np.abs(lx) - lz, 0)  # how fast the way to the light comes nearer to the other face
+        length = 2 * np.abs(x) / np.where(away > 0, away, 1)
+        edge = self.side / 2
+        return (away > 0) & (np.abs(x + length * lx) < edge) & (np.abs(y + length * ly) < edge)
+
     def radiance(self, lights: np.ndarray, albedo: float) -> tuple[np.ndarray, np.ndarray]:
-        """[light, pixel] radiance with all bounces, and the direct part, for unit irradiance. The faces throw no shadows on each
-        other for lights within 45 degrees of +z."""
-        direct = albedo / np.pi * np.maximum(lights @ self.normals.T, 0)
+        """[light, pixel] radiance with all bounces, and the direct part, for unit irradiance."""
+        direct = albedo / np.pi * np.where(self.shadowed(lights), 0, np.maximum(lights @ self.normals.T, 0))
         whole = np.linalg.solve(np.eye(self.side**2) - albedo * self.factors(), direct.T).T
         return whole, direct

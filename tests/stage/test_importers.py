@@ -40,6 +40,7 @@ def test_a_diligent_object_in_place(object_folder):
     capture = Capture.open(object_folder)
     assert (capture.name, capture.manifest.color_space, capture.camera.resolution) == ("catPNG", "lin_rec709_scene", (5, 4))
     assert '"color_space": "lin_rec709_scene"' in path.read_text()
+    assert capture.manifest.irradiance_scale == "relative"  # the intensities have no absolute scale
     for frame, name, direction, intensity in zip(capture.manifest.frames, NAMES, DIRECTIONS, INTENSITIES, strict=True):
         assert frame.image == name
         assert np.allclose(frame.light.direction, np.array(direction) / np.linalg.norm(direction))
@@ -130,6 +131,7 @@ def test_an_rti_capture_with_a_space_in_a_name(tmp_path):
     assert [frame.image for frame in capture.manifest.frames] == ["a 1.jpg", "b.jpg", "c.jpg"]
     assert np.allclose([frame.light.direction for frame in capture.manifest.frames], [(0, 0, 1), (0.6, 0, 0.8), (0, 0.6, 0.8)])
     assert all(frame.light.irradiance == (1, 1, 1) for frame in capture.manifest.frames)
+    assert capture.manifest.irradiance_scale == "relative"
     assert (capture.name, capture.camera.resolution) == ("dome", (5, 4))
 
 

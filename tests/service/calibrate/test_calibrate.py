@@ -167,9 +167,11 @@ def test_grey_ball_writes_irradiance(relit, tmp_path):
     assert relit("calibrate", "grey-ball", folder, "--ball", CIRCLE, "--albedo", "0.5").code == 0
     found = np.array([light.irradiance for light in lights_of(folder)])
     np.testing.assert_allclose(found, np.arange(1, 6)[:, None] * np.ones(3), rtol=2e-3)  # a 30 px ball: curvature inside pixels
+    assert Capture.open(folder).manifest.irradiance_scale == "absolute"
     assert relit("calibrate", "grey-ball", folder, "--ball", CIRCLE).code == 0
     found = np.array([light.irradiance for light in lights_of(folder)])
     np.testing.assert_allclose(found, np.arange(1, 6)[:, None] / 3 * np.ones(3), rtol=2e-3)
+    assert Capture.open(folder).manifest.irradiance_scale == "relative"
 
 
 def test_grey_ball_gives_directions_too(relit, tmp_path):
@@ -203,6 +205,7 @@ def test_intensity_from_the_object_itself(relit, tmp_path):
     found = np.array([light.irradiance for light in lights_of(folder)])
     np.testing.assert_allclose(found, scene.irradiance / scene.irradiance.mean(axis=0), rtol=1e-5)  # float32 images
     assert report_of(folder, "intensity")["measured"] == 6
+    assert Capture.open(folder).manifest.irradiance_scale == "relative"
     other = write_capture(tmp_path / "three", make_scene(8, 3))
     refused(relit("calibrate", "intensity", other), "three/capture.json: frames: 3 distant lights: brightness needs 4 or more")
 
