@@ -111,7 +111,7 @@ def predict(left: LeftOut, weights: LightWeights | None, *, guided: bool) -> np.
     maps = work / "maps" if guided else None
     if maps is not None and not (maps / MAPS_FILE).exists():
         solve(SolveRequest(capture=left.folder, out=maps, method=Method.SVBRDF, cache=work))
-    name = "guided" if guided else str(weights or "default")
+    name = "guided" if guided else str(weights)
     result = relight(RelightRequest(capture=left.folder, keys=work / "keys.json", frames=f"1-{len(left.wanted)}", weights=weights,
                                     maps=maps, out=str(work / f"{name}.##.exr"), cache=work, overwrite=True))
     return np.stack([rgb(path)[left.mask] for path in result.frames])
@@ -131,8 +131,8 @@ def left_out_scores(left: LeftOut, *, rti: bool) -> dict[str, Scores]:
     def psnr(display: np.ndarray) -> float:
         return float(10 * np.log10(255**2 / np.mean((np.round(255 * display) - truth) ** 2)))
 
-    for name, weights, guided in (("cells", LightWeights.CELLS, False), ("smooth", LightWeights.SMOOTH, False), ("guided", None, True)):
-        ours = predict(left, weights, guided=guided)
+    for name, guided in [*((str(weights), False) for weights in LightWeights), ("guided", True)]:
+        ours = predict(left, None if guided else LightWeights(name), guided=guided)
         error = float(np.sqrt(((ours - left.truth) ** 2).mean() / (left.truth**2).mean()))
         scores[name] = Scores(error, psnr(srgb(exposure * ours / left.irradiance[:, None])))
     if rti:

@@ -101,7 +101,7 @@ def relighting_table(checks: Path | None) -> list[str]:
     """
     lines = ["Relative RMSE over the object, and total energy divided by that of the truth. `--maps`: guided by maps that `svbrdf` "
              "solved from the same capture.", "",
-             "| | `--weights cells` | `--weights smooth` | `--maps` |", "|---|---|---|---|"]
+             "| | `--weights cells` | `--weights smooth` | `--weights kernel` | `--maps` |", "|---|---|---|---|---|"]
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         scenes = [(open_check("owl", SAMPLES / "owl", Path(folder) / "sample"), "`samples/owl`, 96 lights, sun of 3° and sky",
@@ -114,10 +114,11 @@ def relighting_table(checks: Path | None) -> list[str]:
         for check, title, environment, reference in scenes:
             truth, mask = rgb(check.folder / reference), check.mask
             pictures = [relit(check, check.folder / environment, weights, maps) for weights, maps in
-                        ((LightWeights.CELLS, None), (LightWeights.SMOOTH, None), (None, check.maps))]
+                        ((LightWeights.CELLS, None), (LightWeights.SMOOTH, None), (LightWeights.KERNEL, None),
+                         (None, check.maps))]
             cells = [f"{rmse:.3f}, {energy:.3f}" for rmse, energy in (error(picture, truth, mask) for picture in pictures)]
             lines.append(f"| {title} | " + " | ".join(cells) + " |")
-            rows.append(_row(f"{check.name}, {environment.removesuffix('.exr')}: path traced", truth, pictures[0], pictures[2], mask))
+            rows.append(_row(f"{check.name}, {environment.removesuffix('.exr')}: path traced", truth, pictures[2], pictures[3], mask))
         if checks:
             lines += ["", *_near_lines({check.name: check for check, *_ in scenes[1:]})]
             write_sheet(PICTURE, rows, height=220)

@@ -27,7 +27,8 @@ def spin_table() -> list[str]:
         solve(SolveRequest(capture=sample, out=work / "maps", method=Method.SVBRDF, cache=work / "solve"))
         relight(RelightRequest(capture=sample, environment=sample / "environment.exr", out=str(work / "warm.#.exr"), cache=work / "solve",
                                maps=work / "maps"))
-        for title, weights, compression, maps in (("cells, zip", LightWeights.CELLS, FrameCompression.ZIP, None),
+        for title, weights, compression, maps in (("kernel, zip", LightWeights.KERNEL, FrameCompression.ZIP, None),
+                                                  ("cells, zip", LightWeights.CELLS, FrameCompression.ZIP, None),
                                                   ("smooth, zip", LightWeights.SMOOTH, FrameCompression.ZIP, None),
                                                   ("smooth, dwaa", LightWeights.SMOOTH, FrameCompression.DWAA, None),
                                                   ("guided, zip", None, FrameCompression.ZIP, work / "maps")):

@@ -152,7 +152,7 @@ def main() -> None:
         sums = []
         for picture in (environment, environment[:, ::-1]):
             cells = integrate_cells(picture, directions, np.eye(3)[None], device="cpu")
-            weights = light_weights(cells, irradiance, np.ones(len(directions)))[0]
+            weights = light_weights(cells.energy, irradiance, np.ones(len(directions)))[0]
             sums.append(np.einsum("cl,lpc->pc", weights.astype(np.float64), images))
         report(f"{name} against weighted images, RMSE", rmse(sums[0], lit), limit, "128 lights, 18 degrees apart")
         report("  energy", abs(sums[0].sum() / lit.sum() - 1), energy_limit, "the light that stands for a sun is up to 9 degrees from it")

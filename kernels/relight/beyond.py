@@ -56,7 +56,7 @@ def share_beyond(direction: np.ndarray, samples: np.ndarray) -> np.ndarray:
     Returns:
         [n] float64: 0 up to the reach of the nearest light, 1 from twice the reach on, linear in the angle between.
     """
-    nearest = np.arccos(np.clip((samples @ direction.T).max(axis=1, initial=-1.0), -1, 1))
+    nearest = np.arccos(np.clip((direction @ samples.T).max(axis=0, initial=-1.0), -1, 1))
     return np.asarray(np.clip(nearest / reach(direction) - 1, 0, 1))
 
 

@@ -1,7 +1,7 @@
 """A lat-long environment → per-light RGB weights.
 
-The environment is shared out over the lights, by one of two weightings; the weight of a light of irradiance E is the energy that it
-was given, ∫ w L dω, divided by E.
+The environment is shared out over the lights, by one of three weightings; the weight of a light of irradiance E is the energy that it
+was given divided by E.
 
 Source: Debevec et al., SIGGRAPH 2000, section 3.3.
 """
@@ -12,13 +12,15 @@ import numpy as np
 
 from kernels.errors import ArrayError
 from kernels.relight.cells import integrate_cells
-from kernels.relight.latlong import LightEnergy
+from kernels.relight.kernel_quadrature import integrate_kernel
 from kernels.relight.smooth import integrate_smooth
 
 
 class Weighting(Enum):
-    """Ways to share a direction of the environment out over the lights."""
+    """Ways to share the environment out over the lights."""
 
+    KERNEL = auto()
+    """As `integrate_kernel` does: the least expected error of the frame; a moving sun fades from light to light."""
     CELLS = auto()
     """As `integrate_cells` does: shadows and highlights are as sharp as a light's own, and a moving sun steps from light to light."""
     SMOOTH = auto()
@@ -26,7 +28,7 @@ class Weighting(Enum):
 
 
 def integrate(environment: np.ndarray, directions: np.ndarray, rotations: np.ndarray, *, weighting: Weighting,
-              device: str) -> LightEnergy:
+              device: str) -> np.ndarray:
     """Share a lat-long map out over the lights, for several rotations of the map.
 
     Args:
@@ -34,24 +36,26 @@ def integrate(environment: np.ndarray, directions: np.ndarray, rotations: np.nda
         directions: [lights, 3] unit vectors from the object to the lights (without padding).
         rotations: [frames, 3, 3]: the environment is turned by these, turned = rotation @ direction.
         weighting: how.
-        device: where lights or triangles are found; sums are taken on the host in float64.
+        device: where nearest lights or triangles are found; sums are taken on the host in float64.
 
     Returns:
-        Energy and solid angle of each light; both sum to those of the whole map.
+        [frames, lights, 3] float64 energy of each light; it sums to that of the whole map.
 
     Raises:
         ArrayError: shapes that do not fit, directions that are not unit vectors, radiance that is negative or not finite (counted);
             for smooth weighting also fewer than four lights in different places, or all of them in one plane.
     """
+    if weighting is Weighting.KERNEL:
+        return integrate_kernel(environment, directions, rotations)
     chosen = {Weighting.CELLS: integrate_cells, Weighting.SMOOTH: integrate_smooth}[weighting]
-    return chosen(environment, directions, rotations, device=device)
+    return chosen(environment, directions, rotations, device=device).energy
 
 
-def light_weights(given: LightEnergy, irradiance: np.ndarray, scale: np.ndarray) -> np.ndarray:
+def light_weights(energy: np.ndarray, irradiance: np.ndarray, scale: np.ndarray) -> np.ndarray:
     """Return the weight of each stored image with which their sum is lit by the environment.
 
     Args:
-        given: to each light, of integrate.
+        energy: [frames, lights, 3] of each light, of integrate.
         irradiance: [lights, 3] of each captured light, without padding.
         scale: [lights padded] radiance of a stored 1.0.
 
@@ -66,7 +70,7 @@ def light_weights(given: LightEnergy, irradiance: np.ndarray, scale: np.ndarray)
         light, channel = dark[0]
         raise ArrayError(f"irradiance of light {light} is 0 in channel {'RGB'[channel]}: "
                          "its part of the environment would stay dark in it")
-    frames, lights, _ = given.energy.shape
+    frames, lights, _ = energy.shape
     weights = np.zeros((frames, 3, len(scale)), dtype=np.float32)
-    weights[:, :, :lights] = np.swapaxes(given.energy / irradiance, 1, 2) * scale[:lights]
+    weights[:, :, :lights] = np.swapaxes(energy / irradiance, 1, 2) * scale[:lights]
     return weights

@@ -6,8 +6,9 @@ The samples lie in NumPy: a few hundred directions are too few for a launch.
 import numpy as np
 
 from kernels.relight.environment import Weighting
+from kernels.relight.kernel_quadrature import share_kernel
 from kernels.relight.latlong import first_of_equals
-from kernels.relight.triangulation import find_faces, triangulate_sphere
+from kernels.relight.smooth import share_smooth
 
 
 def share_samples(samples: np.ndarray, energy: np.ndarray, directions: np.ndarray, *, weighting: Weighting) -> np.ndarray:
@@ -25,17 +26,14 @@ def share_samples(samples: np.ndarray, energy: np.ndarray, directions: np.ndarra
     Raises:
         ArrayError: for smooth weighting, fewer than four lights in different places, or all of them in one plane.
     """
+    if weighting is Weighting.KERNEL:
+        return share_kernel(samples, energy, directions)
     kept = first_of_equals(directions)
     given = np.zeros((len(directions), energy.shape[1]))
-    if weighting is Weighting.CELLS:
-        nearest = (samples @ directions[kept].T).argmax(axis=1)
-        for channel, amount in enumerate(energy.T):
-            given[kept, channel] = np.bincount(nearest, weights=amount, minlength=len(kept))
+    if weighting is Weighting.SMOOTH:
+        given[kept] = share_smooth(samples, energy, directions[kept])
         return given
-    triangles = triangulate_sphere(directions[kept])
-    face, part = find_faces(triangles, samples)
-    corner = triangles.corner[face].reshape(-1)
+    nearest = (samples @ directions[kept].T).argmax(axis=1)
     for channel, amount in enumerate(energy.T):
-        at_vertices = np.bincount(corner, weights=(part * amount[:, None]).reshape(-1), minlength=len(triangles.vertex))
-        given[kept, channel] = at_vertices @ triangles.share
+        given[kept, channel] = np.bincount(nearest, weights=amount, minlength=len(kept))
     return given

@@ -16,7 +16,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.relight.borders import Shares
 from kernels.relight.latlong import LightEnergy, SampleGrid, check, first_of_equals, gather
-from kernels.relight.triangulation import SphereTriangles, edge_planes, triangulate_sphere
+from kernels.relight.triangulation import SphereTriangles, edge_planes, find_faces, triangulate_sphere
 
 RUN = 64
 """Number of neighbouring samples that one thread locates: it seeks the triangle of the first over the whole sphere, and that of each other
@@ -64,6 +64,27 @@ def integrate_smooth(environment: np.ndarray, directions: np.ndarray, rotations:
     energy[:, kept] = np.einsum("fvc,vl->flc", sums.energy, triangles.share)
     solid_angle[:, kept] = sums.solid_angle @ triangles.share
     return LightEnergy(energy, solid_angle)
+
+
+def share_smooth(samples: np.ndarray, energy: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Share the energy of a few samples out over the lights, each to the three around it; in NumPy, because they are too few for a launch.
+
+    Args:
+        samples: [n, 3] unit vectors to the samples.
+        energy: [n, channels] of each.
+        directions: [lights, 3] unit vectors to the lights, all in different places.
+
+    Returns:
+        [lights, channels] float64; its sum is that of the samples.
+
+    Raises:
+        ArrayError: fewer than four lights, or all of them in one plane.
+    """
+    triangles = triangulate_sphere(directions)
+    face, part = find_faces(triangles, samples)
+    corner = triangles.corner[face].reshape(-1)
+    return np.stack([np.bincount(corner, weights=(part * amount[:, None]).reshape(-1), minlength=len(triangles.vertex)) @ triangles.share
+                     for amount in energy.T], axis=1)
 
 
 def locate(grid: SampleGrid, triangles: SphereTriangles, rotation: np.ndarray, *, device: str) -> Located:

@@ -10,7 +10,7 @@ from service.light.relight import relight
 from service.reporting.progress import Progress, Timings
 from service.requests.demo import DemoRequest
 from service.requests.export import ExportRequest
-from service.requests.relight import LightWeights, RelightRequest
+from service.requests.relight import RelightRequest
 from service.requests.solve import SolveRequest
 from service.solve.solve import SolveResult, solve
 from service.usd.export import export
@@ -59,8 +59,7 @@ def demo(request: DemoRequest, progress: Progress | None = None) -> DemoResult:
     solved = solve(SolveRequest(capture=sample, out=out, device=device, cache=cache), progress)
     asset = export(ExportRequest(maps=out, out=out / "asset.usdz"), progress)
     relit = relight(RelightRequest(capture=sample, environment=sample / "environment.exr", out=str(out / "frame.####.exr"),
-                                   frames=FRAMES, spin_degrees=360.0, weights=LightWeights.SMOOTH, device=device,
-                                   cache=cache), progress)
+                                   frames=FRAMES, spin_degrees=360.0, device=device, cache=cache), progress)
     timings = Timings(progress)
     timings.stage("preview", 1)
     preview = out / "preview.png"

@@ -16,7 +16,6 @@ from kernels.relight.around import lights_around
 from kernels.relight.beyond import reach, share_beyond
 from kernels.relight.discs import disc_samples, integrate_discs
 from kernels.relight.environment import Weighting, integrate, light_weights
-from kernels.relight.latlong import LightEnergy
 from kernels.relight.marching import grouped
 from kernels.relight.sample_energy import share_samples
 from kernels.relight.sources import NEVER, Sources, far, join
@@ -170,14 +169,14 @@ class CaptureLighting:
         if environment is not None:
             given = integrate(environment.radiance, self._lights.direction, np.stack([light.rotation for light in run]),
                               weighting=self._weighting, device=self._device)
-            energy += given.energy * np.array([light.gain for light in run])[:, None, None]
+            energy += given * np.array([light.gain for light in run])[:, None, None]
         if discs:
             shares = integrate_discs(np.stack([disc.direction for _, disc in discs]),
                                      np.array([disc.angle_degrees for _, disc in discs]), self._lights.direction,
                                      weighting=self._weighting)
             for (index, disc), share in zip(discs, shares, strict=True):
                 energy[index] += share[:, None] * disc.irradiance
-        return light_weights(LightEnergy(energy, np.zeros(energy.shape[:2])), self._lights.irradiance, self._stack.scale)
+        return light_weights(energy, self._lights.irradiance, self._stack.scale)
 
     def _model_light(self, samples: FarSamples, beyond: np.ndarray, weights: np.ndarray, captured: Mapping[int, float]) -> ModelLight:
         """Return the light of one frame for a model.
@@ -201,7 +200,9 @@ class CaptureLighting:
         outside = None
         if (beyond > 0).any():
             part = samples.scaled(beyond)
-            stands_in = share_samples(part.direction, part.energy, directions, weighting=self._weighting)
+            # share_kernel leaves light from beyond to share_smooth
+            sharing = Weighting.SMOOTH if self._weighting is Weighting.KERNEL else self._weighting
+            stands_in = share_samples(part.direction, part.energy, directions, weighting=sharing)
             outside = LightBeyond(_hidden(part, directions), captured_lights(directions, stands_in))
             samples, given = samples.scaled(1 - beyond), given - stands_in
         wanted, marched = light_samples(samples, directions)

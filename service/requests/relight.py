@@ -15,6 +15,7 @@ later. A task of a render farm makes as many by default: with fewer, images are 
 class LightWeights(Choice):
     """How light from a direction between the captured lights is shared out over them."""
 
+    KERNEL = "kernel", "so that the expected error of the frame is least"
     CELLS = "cells", "all of it to the nearest light"
     SMOOTH = "smooth", "in parts to the three lights around it"
 
@@ -26,7 +27,7 @@ class RelightOptions(PictureOptions, StackOptions):
     """A number, or first-last; None: 1, or for a sequence 1 to the number of its time steps."""
     weights: LightWeights | None = None
     """How light from a direction between the captured lights is shared out over them; None: smooth where solved maps guide the frames,
-    else cells."""
+    else kernel."""
     spin_degrees: Finite = 0.0
     """Degrees by which the environment turns over the range, about +y from +z towards +x; the first frame is not turned, and with 360 the
     frame after the last would be the first again."""
@@ -59,4 +60,4 @@ class RelightRequest(RelightOptions, Request):
     @property
     def weighting(self) -> LightWeights:
         """Return the weights that are used."""
-        return self.weights or (LightWeights.CELLS if self.maps is None else LightWeights.SMOOTH)
+        return self.weights or (LightWeights.KERNEL if self.maps is None else LightWeights.SMOOTH)

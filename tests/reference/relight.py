@@ -86,3 +86,30 @@ def smooth_energy(environment, directions, rotation, *, down, across):
         np.add.at(solid_angle, triangles[face], share)
         np.add.at(energy, triangles[face], share[..., None] * radiance[:, None])
     return energy, solid_angle
+
+
+def matern(directions, others, of=None):
+    """Covariance of smoothness 3/2, whose range is twice the median over the lights of the mean distance to the nearest six."""
+    lights = directions if of is None else of
+    apart = np.array([[np.linalg.norm(a - b) for b in lights] for a in lights])
+    length = 2 * np.median([np.mean(np.sort(row)[1:7]) for row in apart])
+    r = np.sqrt(3) * np.array([[np.linalg.norm(a - b) for b in others] for a in directions]) / length
+    return (1 + r) * np.exp(-r)
+
+
+def best_weights(towards, energy, directions):
+    """Weights of least expected error among those that are not negative and keep the energy: the best of the solutions on each set of
+    lights."""
+    count, whole = len(directions), energy.sum()
+    between, moment = matern(directions, directions), matern(directions, towards, of=directions) @ energy
+    best, least = None, np.inf
+    for size in range(1, count + 1):
+        for chosen in map(list, itertools.combinations(range(count), size)):
+            border = np.ones((size, 1))
+            system = np.block([[between[np.ix_(chosen, chosen)], border], [border.T, np.zeros((1, 1))]])
+            part = np.linalg.solve(system, np.append(moment[chosen], whole))[:size]
+            error = part @ between[np.ix_(chosen, chosen)] @ part - 2 * part @ moment[chosen]
+            if part.min() >= 0 and error < least:
+                least, best = error, np.zeros(count)
+                best[chosen] = part
+    return best

@@ -160,7 +160,7 @@ BAD_RELIGHT = {
     "no maps there": ({}, {"maps": "cap", "aov": "normal"}, "cap/maps.exr is not there: run `relit solve` first"),
     "another colour space": ({}, {"color-space": "srgb_texture"}, "'srgb_texture' is not one of 'lin_rec709_scene', 'lin_ap1_scene'"),
     "another compression": ({}, {"compression": "jpeg"}, "'jpeg' is not one of 'zip', 'piz', 'dwaa'"),
-    "other weights": ({}, {"weights": "even"}, "'even' is not one of 'cells', 'smooth'"),
+    "other weights": ({}, {"weights": "even"}, "'even' is not one of 'kernel', 'cells', 'smooth'"),
     "smooth weights in one plane": ({"plane": True}, {"weights": "smooth"}, "smooth weighting needs lights that are not all in one plane"),
     "a sheet of another kind": ({}, {"sheet": "s.jpg"}, "--sheet s.jpg: a contact sheet is a PNG"),
     "a sheet over the mask": ({}, {"sheet": "cap/mask.png"}, "--sheet cap/mask.png: cap/mask.png is an input"),

@@ -58,7 +58,7 @@ def test_guided_frames_are_nearer_to_the_truth_than_plain_ones(relit, scene, tmp
     changes = {"nothing": {}, "albedo": {"diffuse_albedo": patchy()},
                "normals": {"normal": (SURFACE.normal[:, :, [1, 0, 2]] * (-1, 1, 1)).astype(np.float32)}}[wrong]
     maps = write_maps(tmp_path / "maps", SURFACE, **changes)
-    plain = min(rmse(relight(relit, folder, tmp_path / w, "--weights", w)[0], truth) for w in ("cells", "smooth"))
+    plain = min(rmse(relight(relit, folder, tmp_path / w, "--weights", w)[0], truth) for w in ("kernel", "cells", "smooth"))
     frame, _ = relight(relit, folder, tmp_path / "guided", "--maps", maps)
     assert rmse(frame, truth) < {"nothing": 0.02, "albedo": 0.1, "normals": 1.0}[wrong] * plain
     if wrong == "albedo":

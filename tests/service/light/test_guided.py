@@ -49,9 +49,9 @@ def test_true_maps_make_up_for_what_lies_between_lights(relit, scene, tmp_path):
     lobe to what such lights can tell, and 1024 samples of the map."""
     folder, truth = scene
     plain = rmse(relight(relit, folder, tmp_path / "a", "--weights", "smooth"), truth)
-    cells = rmse(relight(relit, folder, tmp_path / "b"), truth)
+    kernel = rmse(relight(relit, folder, tmp_path / "b"), truth)
     guided = rmse(relight(relit, folder, tmp_path / "c", "--maps", folder / "maps"), truth)
-    assert guided < 0.5 * min(plain, cells)
+    assert guided < 0.5 * min(plain, kernel)
 
 
 @pytest.mark.parametrize("wrong", ["normals", "gloss"])
@@ -98,10 +98,10 @@ def test_bad_maps_are_a_sentence(relit, scene, tmp_path):
 
 
 def test_a_finished_range_is_the_undisturbed_one_to_the_last_bit(relit, scene, tmp_path, monkeypatch):
-    """Frames of a range that are made later, among others, are the same: plain in both weightings, and guided."""
+    """Frames of a range that are made later, among others, are the same: plain in all weightings, and guided."""
     monkeypatch.setattr("kernels.relight.latlong.SAMPLE_PITCH_DEGREES", 4.0)  # bits are compared: few samples show it as well
     folder, _ = scene
-    for options in ((), ("--weights", "smooth"), ("--maps", folder / "maps")):
+    for options in ((), ("--weights", "cells"), ("--weights", "smooth"), ("--maps", folder / "maps")):
         out = tmp_path / str(len(list(tmp_path.iterdir())))
         words = ("relight", folder / "cap", "--environment", folder / "sky.exr", "--frames", "1-40", "--spin-degrees", "360", *options)
         relit(*words, "--out", out / "f.##.exr")

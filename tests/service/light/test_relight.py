@@ -53,7 +53,7 @@ def test_relight_turns_the_environment_from_the_camera_to_the_right(relit, tmp_p
     sky[3:5, 7:9] = 1  # around +z
     write_exr(tmp_path / "sky.exr", sky)
     relit("relight", tmp_path / "cap", "--environment", tmp_path / "sky.exr", "--out", tmp_path / "a.#.exr", "--frames", "1-4",
-          "--spin-degrees", "360")
+          "--spin-degrees", "360", "--weights", "cells")
     levels = [float(exr.read(tmp_path / f"a.{i}.exr")[0]["G"].mean()) for i in (1, 2, 3, 4)]
     assert np.allclose(np.array(levels) / levels[0], [1, 2, 3, 4], rtol=5e-3)  # half, and texels cut by no cell border
 
@@ -118,19 +118,20 @@ def test_compressions(lit):
     assert np.allclose(read_rgb(frames["zip"]), read_rgb(frames["dwaa"]), rtol=0.01)  # lossy by its nature
 
 
-def test_smooth_weights_keep_the_energy_and_share_it_otherwise(lit, tmp_path):
+def test_weights_keep_the_energy_and_share_it_differently(lit, tmp_path):
     sun = np.zeros((32, 64, 3))
     sun[15, 32] = 100  # 4 degrees beside the light in front, whose cell ends at 15
     write_exr(tmp_path / "even.exr", sun)
     for index in range(7):
         write_exr(tmp_path / "cap" / f"{index:03d}.exr", np.full((16, 16, 3), 1.0 + index))
-    (_, cells), (outcome, smooth) = lit("cells"), lit("smooth", "--weights", "smooth")
+    (_, cells), (_, smooth), (outcome, kernel) = (lit(name, "--weights", name) for name in ("cells", "smooth", "kernel"))
     assert outcome.code == 0
+    assert np.array_equal(read_rgb(lit("default")[1] / "a.01.exr"), read_rgb(kernel / "a.01.exr"))
     energy = 100 * np.sin(np.pi * 15.5 / 32) * (np.pi / 32) * (2 * np.pi / 64) / 2
     whole = read_rgb(cells / "a.01.exr")[0, 0, 0] / energy
-    shared = read_rgb(smooth / "a.01.exr")[0, 0, 0] / energy
+    shared, fitted = (read_rgb(each / "a.01.exr")[0, 0, 0] / energy for each in (smooth, kernel))
     assert whole == pytest.approx(1, rel=1e-3)  # half; all of it on the light in front
-    assert 1.05 < shared < 7
+    assert 1.05 < shared < 7 and 1.001 < fitted < shared  # the lights beside take over more slowly than linearly
 
 
 def test_layers_of_a_frame(relit, lit, tmp_path):

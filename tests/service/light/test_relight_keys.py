@@ -45,7 +45,7 @@ def light(*keys, **changes):
     return {"lights": [{"name": "key", "keys": list(keys), **changes}]}
 
 
-@pytest.mark.parametrize("weights", ["cells", "smooth"])
+@pytest.mark.parametrize("weights", ["kernel", "cells", "smooth"])
 def test_a_light_where_a_captured_one_stood_is_that_image(animate, weights):
     keys = light({"frame": 1, "direction": [0, 3, 0], "irradiance": [1, 1, 3], "angle_degrees": 0})
     frames = animate(2, keys, "--weights", weights)
@@ -64,7 +64,7 @@ def test_a_light_moves_on_the_great_circle_and_its_irradiance_changes_evenly(ani
 def test_steps_hold_until_the_next_key(animate):
     keys = light({"frame": 2, "direction": [0, 0, 1], "irradiance": [1, 1, 1], "interpolation": "step"},
                  {"frame": 4, "direction": [0, 0, -1], "irradiance": [5, 5, 5]})  # opposite, which a step may be
-    assert np.allclose(animate(4, keys)[:, 0], [1, 1, 1, 20], rtol=1e-3)
+    assert np.allclose(animate(4, keys, "--weights", "cells")[:, 0], [1, 1, 1, 20], rtol=1e-3)
 
 
 def test_lights_are_converted_to_the_captures_colour_space(animate):
@@ -94,7 +94,7 @@ def test_an_environment_turned_about_another_axis(animate, tmp_path):
     sky = np.zeros((32, 64, 3))
     sky[15:17, 31:33] = 1  # around +z
     keys = {"environment": [{"frame": 1, "turn_degrees": -90, "axis": [2, 0, 0]}]}  # by the right hand from +z to +y
-    frame = animate(1, keys, "--environment", write_exr(tmp_path / "sky.exr", sky))
+    frame = animate(1, keys, "--environment", write_exr(tmp_path / "sky.exr", sky), "--weights", "cells")
     energy = 4 * np.sin(np.pi * 15.5 / 32) * (np.pi / 32) * (2 * np.pi / 64)
     assert np.allclose(frame, energy * 3 / np.array([1, 2, 4]), rtol=2e-3)
     metadata = exr.read_header(tmp_path / "f" / "a.1.exr").metadata

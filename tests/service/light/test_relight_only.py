@@ -51,7 +51,7 @@ def sky(path):
 
 @pytest.mark.parametrize("options", [
     ("--spin-degrees", "360"), ("--spin-degrees", "77", "--weights", "smooth", "--color-space", "lin_ap1_scene", "--aov", "mask"),
-], ids=["cells", "smooth"])
+], ids=["kernel", "smooth"])
 def test_parts_of_a_spin(compare, tmp_path, options):
     write_capture(tmp_path / "cap", SCENE)
     whole, parts = compare(tmp_path / "cap", "1-40", PARTS, "--environment", sky(tmp_path / "sky.exr"), *options)
