@@ -156,10 +156,10 @@ def left_out_table(data: Path) -> list[str]:
         data: folder with diligent_ball and diligent_cat.
     """
     lines = ["DiLiGenT objects: maps are solved and images are summed without some lights, and compared with these lights' images. "
-             f"Between: every eighth light. Beyond: all lights more than {RIM_DEGREES:g}° from the view axis, 6 to 16° beyond. The "
-             f"first number is the relative RMSE of radiance. The second is the PSNR in dB of 8-bit sRGB over the object; percentile "
-             f"{WHITE_PERCENTILE:g} of the captured images is white. PTM, HSH and RBF (`benchmarks/rti_baselines.py`) are fitted to "
-             "such sRGB images, as software for RTI does.", ""]
+             f"Between: every eighth light. Beyond: all lights more than {RIM_DEGREES:g}° from the view axis, 6 to 16° beyond; in "
+             "brackets their number. The first number is the relative RMSE of radiance. The second is the PSNR in dB of 8-bit sRGB over "
+             f"the object; percentile {WHITE_PERCENTILE:g} of the captured images is white. PTM, HSH and RBF "
+             "(`benchmarks/rti_baselines.py`) are fitted to such sRGB images, as software for RTI does.", ""]
     found: dict[str, dict[str, Scores]] = {}
     for where, choose in ((RTI_BETWEEN, every_eighth), ("beyond", rim)):
         for name in ("ball", "cat"):

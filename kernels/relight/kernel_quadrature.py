@@ -102,9 +102,10 @@ def share_kernel(samples: np.ndarray, energy: np.ndarray, directions: np.ndarray
         moments[:-1] += _covariance(towards, samples[part], solved.range) @ energy[part]
     moments[-1] = energy.sum(axis=0)
     best = solved.inverse[:-1] @ moments
+    held = np.zeros(len(kept), dtype=bool)  # for the first channel; the next one is likely to hold the same lights
     for channel, whole in enumerate(moments[-1]):
         if whole > 0:
-            weights = _non_negative(solved.inverse[:-1, :-1], best[:, channel] / whole)
+            weights, held = _non_negative(solved.inverse[:-1, :-1], best[:, channel] / whole, held)
             given[kept, channel] += weights * (whole / weights.sum())
     return given
 
@@ -146,14 +147,15 @@ def _covariance(a: np.ndarray, b: np.ndarray, length: float) -> np.ndarray:
     return np.multiply(scaled, falling, out=scaled)
 
 
-def _non_negative(inverse: np.ndarray, best: np.ndarray) -> np.ndarray:
-    """Return the weights of least expected error among those that are not negative.
+def _non_negative(inverse: np.ndarray, best: np.ndarray, held: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the weights of least expected error among those that are not negative, and which of them are held at zero.
 
     Args:
         inverse: [lights, lights] block of the bordered inverse.
         best: [lights] weights of least expected error whatever their signs; they sum to one.
+        held: [lights] bool, a guess of those that are held at zero.
     """
-    held = np.zeros(len(best), dtype=bool)  # at zero
+    held = held.copy()
     fewest, patience = len(best) + 1, PATIENCE
     for _ in range(MOST_EXCHANGES):
         force = np.linalg.solve(inverse[np.ix_(held, held)], -best[held])  # that holds them
@@ -170,4 +172,4 @@ def _non_negative(inverse: np.ndarray, best: np.ndarray) -> np.ndarray:
         else:
             wrong = wrong[-1:]
         held[wrong] ^= True
-    return np.maximum(weights, 0)
+    return np.maximum(weights, 0), held
