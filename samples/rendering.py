@@ -18,8 +18,10 @@ CAMERA_DISTANCE_M = 1.0  # only in front of everything: an orthographic image do
 COVERAGE_SUBSAMPLES = 17  # rays per pixel side, edges included, that must all hit for a pixel to be in the mask
 
 
-def import_mitsuba() -> Any:
-    """Return the mitsuba module with the llvm variant set and relit's BRDF registered.
+def import_mitsuba(variant: str = "llvm_ad_rgb") -> Any:
+    """Return the mitsuba module with a variant set and, unless it is `scalar_rgb`, relit's BRDF registered.
+
+    The scalar variant needs no LLVM, but calls a BSDF in Python for every ray.
 
     Raises:
         SystemExit: in one sentence, when mitsuba or a usable LLVM is missing.
@@ -33,8 +35,11 @@ def import_mitsuba() -> Any:
         import mitsuba as mi
     except ImportError:
         raise SystemExit("mitsuba is not installed: it renders the samples, get it with 'pip install mitsuba'.") from None
+    if variant == "scalar_rgb":
+        mi.set_variant(variant)
+        return mi
     try:
-        mi.set_variant("llvm_ad_rgb")
+        mi.set_variant(variant)
         mi.Float(1) + 1
     except Exception as error:
         raise SystemExit(

@@ -1,0 +1,133 @@
+"""Objects of several parts with breaks of depth between them, for make_parts.py: signed distances, and materials at points.
+
+Everything here is in metres, in the camera frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from feathers import mix, noise, smoothstep
+from meshing import Distance, gradient, project, subdivide, surface_nets
+
+FIELD_M = 0.2
+"""Side of the square that the camera sees."""
+CM = 0.01
+
+
+class Paint(NamedTuple):
+    """Materials at points: a dielectric and a metal, and how much of each."""
+
+    dielectric: np.ndarray  # [V, 3] base colour
+    metal: np.ndarray  # [V, 3] base colour, the F0 of the metal
+    roughness: np.ndarray  # [V] of both
+    share: np.ndarray  # [V] of the metal, 0…1
+
+
+class Part(NamedTuple):
+    """A part that touches no other one."""
+
+    distance: Distance  # of points in centimetres
+    lower: tuple[float, float, float]  # cm, of a box around it
+    upper: tuple[float, float, float]
+    paint: Callable[[np.ndarray], Paint]  # of points in centimetres
+
+
+class PartMesh(NamedTuple):
+    """A part as triangles."""
+
+    points: np.ndarray  # [V, 3] m
+    faces: np.ndarray  # [F, 3]
+    normals: np.ndarray  # [V, 3]
+    paint: Paint
+
+
+def build(part: Part, *, detail: float) -> PartMesh:
+    """Mesh a part with edges of about `detail` centimetres."""
+    points, faces = surface_nets(part.distance, part.lower, part.upper, 4 * detail)
+    for _ in range(2):
+        points, faces = subdivide(project(part.distance, points, step=0.01), faces)
+    points = project(part.distance, points, step=0.01, rounds=2)
+    return PartMesh(points * CM, faces, gradient(part.distance, points, step=0.005), part.paint(points))
+
+
+def _capsule(p: np.ndarray, start, end, thick: float, thin: float) -> np.ndarray:
+    start, end = np.array(start, float), np.array(end, float)
+    t = np.clip((p - start) @ (end - start) / ((end - start) @ (end - start)), 0, 1)
+    return np.linalg.norm(p - start - t[..., None] * (end - start), axis=-1) - (thick + (thin - thick) * t)
+
+
+def _join(a: np.ndarray, b: np.ndarray, k: float) -> np.ndarray:
+    h = np.maximum(k - np.abs(a - b), 0) / k
+    return np.minimum(a, b) - 0.25 * k * h * h
+
+
+def _lumpy(p: np.ndarray) -> np.ndarray:
+    """Return the distance to a lumpy body of about 7.5 cm radius."""
+    q = p - [-0.6, -0.7, 0]
+    radius = np.linalg.norm(q * [1.0, 0.93, 1.1], axis=-1)
+    unit = q / np.maximum(np.linalg.norm(q, axis=-1), 1e-9)[..., None]
+    lumps = np.sin(4 * unit[..., 0] + 0.5) * np.cos(5 * unit[..., 1] - 0.4) + np.sin(3 * unit[..., 2] + 5 * unit[..., 1] * unit[..., 0])
+    return 0.8 * (radius - 7.4 - 0.28 * lumps)
+
+
+def _lumpy_paint(p: np.ndarray) -> Paint:
+    colour = mix(np.array([0.55, 0.16, 0.10]), np.array([0.70, 0.55, 0.30]), smoothstep(-1.5, 1.5, noise(p, 5.0, seed=31)))
+    across = p @ np.array([0.55, 0.80, 0.24])
+    share = smoothstep(-3.4, -2.9, across) * smoothstep(-0.6, -1.5, across)  # a narrow and a wide border, 3 and 6 pixels
+    return Paint(colour, np.tile([0.92, 0.74, 0.40], (len(p), 1)), 0.32 + 0.22 * smoothstep(-2, 2, noise(p, 6.0, seed=32)), share)
+
+
+def _steel(p: np.ndarray) -> Paint:
+    count = len(p)
+    return Paint(np.full((count, 3), 0.5), np.tile([0.63, 0.60, 0.57], (count, 1)), np.full(count, 0.36), np.ones(count))
+
+
+def _folded(p: np.ndarray) -> np.ndarray:
+    """Return the distance to a torso with folds across it, and a head-like knob."""
+    q = p - [0.0, -1.6, -1.0]
+    trunk = np.linalg.norm(q * [1.0, 0.82, 1.25], axis=-1) - 6.1
+    slope = q[..., 1] + 0.35 * q[..., 0] + 0.5 * np.sin(0.9 * q[..., 0])
+    folds = np.maximum(np.sin(1.9 * slope), -0.35) * smoothstep(5.5, 2.5, np.abs(q[..., 1] + 1.0))
+    knob = np.linalg.norm(p - [0.5, 6.4, -0.6], axis=-1) - 2.5
+    return 0.6 * _join(trunk - 0.42 * folds, knob, 1.2)
+
+
+def _cloth(p: np.ndarray) -> Paint:
+    colour = mix(np.array([0.12, 0.26, 0.42]), np.array([0.62, 0.60, 0.52]), smoothstep(-1.0, 1.0, noise(p, 3.5, seed=41)))
+    roughness = 0.2 + 0.4 * smoothstep(-1.5, 1.5, noise(p, 4.5, seed=42))
+    return Paint(colour, np.full((len(p), 3), 0.6), roughness, np.zeros(len(p)))
+
+
+def _ring(p: np.ndarray) -> np.ndarray:
+    """Return the distance to a tilted ring before the chest."""
+    axis = np.array([0.35, 0.30, 0.89]) / np.linalg.norm([0.35, 0.30, 0.89])
+    q = p - [1.9, 1.2, 6.4]
+    along = q @ axis
+    return np.hypot(np.linalg.norm(q - along[..., None] * axis, axis=-1) - 2.7, along) - 0.62
+
+
+def _gold(p: np.ndarray) -> Paint:
+    count = len(p)
+    return Paint(np.full((count, 3), 0.5), np.tile([0.95, 0.70, 0.30], (count, 1)), np.full(count, 0.28), np.ones(count))
+
+
+def _glaze(p: np.ndarray) -> Paint:
+    count = len(p)
+    return Paint(np.tile([0.66, 0.42, 0.30], (count, 1)), np.full((count, 3), 0.6), np.full(count, 0.45), np.zeros(count))
+
+
+SCENES: dict[str, dict[str, Part]] = {
+    "two_parts": {
+        "body": Part(_lumpy, (-9.9, -9.9, -9.0), (8.7, 8.9, 9.0), _lumpy_paint),
+        "ball": Part(lambda p: np.linalg.norm(p - [2.3, 2.6, 9.0], axis=-1) - 2.6, (-0.6, -0.3, 6.1), (5.2, 5.5, 11.9), _steel),
+    },
+    "figure": {
+        "torso": Part(_folded, (-7.6, -10.4, -7.6), (7.6, 9.6, 5.6), _cloth),
+        "ring": Part(_ring, (-2.0, -2.7, 3.5), (5.8, 5.1, 9.3), _gold),
+        "arm": Part(lambda p: _capsule(p, (-5.6, 1.0, 3.6), (1.6, -5.2, 6.8), 1.25, 0.8), (-7.3, -6.8, 1.9), (3.3, 2.7, 8.4), _glaze),
+    },
+}
+"""The parts of each object by name; part.Y of truth.exr counts them from 1."""
