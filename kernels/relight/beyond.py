@@ -143,7 +143,7 @@ def _compare_kernel(pack: int) -> Any:
                        captured: wp.array2d(dtype=half_pack),  # [3 · lights padded, P]
                        clipped: wp.array2d(dtype=byte_pack),  # [lights padded / 8, P] bits
                        padded: int,  # lights
-                       values: wp.array2d(dtype=lane_type),  # [21, P]
+                       values: wp.array2d(dtype=lane_type),  # [24, P]
                        visible: wp.array2d(dtype=byte_pack),  # [lights, P]
                        places: wp.array(dtype=wp.vec4),  # [lights]
                        factors: wp.array(dtype=wp.vec3),  # [lights] stored → radiance / irradiance
@@ -154,8 +154,8 @@ def _compare_kernel(pack: int) -> Any:
         top, bottom = lane_type(), lane_type()
         for n in range(pairs.shape[0]):
             j, i = pairs[n][0], pairs[n][1]
-            facing_j, gloss_j, _ = evaluate(values, p, places[j], wp.vec4())
-            facing_i, gloss_i, _ = evaluate(values, p, places[i], wp.vec4())
+            facing_j, gloss_j, _, _ = evaluate(values, p, places[j], wp.vec4())
+            facing_i, gloss_i, _, _ = evaluate(values, p, places[i], wp.vec4())
             lit_j, lit_i = visible[j, p], visible[i, p]
             bits_j, bits_i = clipped[j / 8, p], clipped[i / 8, p]
             for c in range(3):

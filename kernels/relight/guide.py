@@ -1,8 +1,9 @@
 """How far a model of the surface may correct the captured images, pixel by pixel.
 
-Between the lights a picture is predicted from those around: Σ s_k I_k. The model says by how much that is wrong, M - Σ s_k M_k; how much
-of it to believe is what the captured lights tell when each is left out and predicted from its neighbours: β is the least-squares factor
-between what was missing and what the model says was missing, 0 to 1. A model that explains nothing gets 0, and the plain sum stays.
+Between the lights a picture is predicted from those around: Σ s_k I_k. The model says by how much that is wrong, M - Σ s_k M_k, its gloss
+scaled to what the images around show (kernels.relight.gloss_ratio); how much of it to believe is what the captured lights tell when each is
+left out and predicted from its neighbours: β is the least-squares factor between what was missing and what the model says was missing, 0 to
+1. A model that explains nothing gets 0, and the plain sum stays.
 
 Source: the model as a control variate with regression coefficient, Glasserman, "Monte Carlo Methods in Financial Engineering",
 section 4.1; here over lights in place of samples.
@@ -16,9 +17,11 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
-from kernels.packs import Band, as_packs, bit_of, pack_type
+from kernels.microfacet import INVERSE_PI
+from kernels.packs import Band, as_packs, bit_of, channels_type, pack_type
 from kernels.relight.beyond import spacing
-from kernels.relight.shading import Surface, lobes, modelled, require_same
+from kernels.relight.gloss_ratio import gloss_ratio, mean_ratio
+from kernels.relight.shading import Surface, lobes, require_same
 
 POOL = 2
 """Half-width, in pixels, of the window over which the sums of β are pooled."""
@@ -82,6 +85,21 @@ def compare_model(band: Band, surface: Surface, visible: wp.array, direction: np
     return sums
 
 
+def pooled(plane: np.ndarray, pixels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Return the sum of a value [n] over the window of POOL pixels around each of the pixels, over those that are given.
+
+    Args:
+        plane: [n] of the pixels.
+        pixels: [n] row-major positions in the image.
+        shape: (rows, cols) of the image.
+    """
+    rows, cols = np.divmod(pixels, shape[1])
+    table = np.zeros((shape[0] + 2 * POOL, shape[1] + 2 * POOL))
+    table[rows + POOL, cols + POOL] = plane
+    across = sum(table[:, k : k + shape[1]] for k in range(2 * POOL + 1))  # no running sums: they would spread a NaN to later pixels
+    return np.asarray(sum(across[k : k + shape[0]] for k in range(2 * POOL + 1))[rows, cols])
+
+
 def fit_trust(sums: np.ndarray, pixels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """Return β from the sums of each pixel and of its neighbours.
 
@@ -95,28 +113,21 @@ def fit_trust(sums: np.ndarray, pixels: np.ndarray, shape: tuple[int, int]) -> n
     Returns:
         [n] float32, 0…1; 0 where the model says nothing.
     """
-    rows, cols = np.divmod(pixels, shape[1])
-    pooled = []
-    for plane in sums:
-        table = np.zeros((shape[0] + 2 * POOL, shape[1] + 2 * POOL))
-        table[rows + POOL, cols + POOL] = plane
-        across = sum(table[:, k : k + shape[1]] for k in range(2 * POOL + 1))  # no running sums: they would spread a NaN to later pixels
-        pooled.append(sum(across[k : k + shape[0]] for k in range(2 * POOL + 1))[rows, cols])
-    top, bottom = pooled
+    top, bottom = (pooled(plane, pixels, shape) for plane in sums)
     return np.clip(np.divide(top, bottom, out=np.zeros(len(pixels)), where=bottom > 1e-12), 0, 1).astype(np.float32)
 
 
 @cache
 def _compare_kernel(pack: int) -> Any:
     lane_type, half_pack, byte_pack = (pack_type(pack, dtype) for dtype in (wp.float32, wp.float16, wp.uint8))
-    evaluate = lobes(pack)
+    channels, evaluate = channels_type(pack), lobes(pack)
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
     def compare_kernel(first: int,
                      captured: wp.array2d(dtype=half_pack),  # [3 · lights padded, P]
                      clipped: wp.array2d(dtype=byte_pack),  # [lights padded / 8, P] bits
                      padded: int,  # lights
-                     values: wp.array2d(dtype=lane_type),  # [21, P]
+                     values: wp.array2d(dtype=lane_type),  # [24, P]
                      visible: wp.array2d(dtype=byte_pack),  # [lights, P]
                      places: wp.array(dtype=wp.vec4),  # [lights]
                      factors: wp.array(dtype=wp.vec3),  # [lights] stored → radiance / irradiance
@@ -125,35 +136,36 @@ def _compare_kernel(pack: int) -> Any:
                      # outputs
                      sums: wp.array2d(dtype=lane_type)):  # [2, P]
         p = first + wp.tid()
-        albedo_r, albedo_g, albedo_b = values[3, p], values[4, p], values[5, p]
         top, bottom = lane_type(), lane_type()
         for light in range(places.shape[0]):
             parts = shares[light]
             if parts[0] + parts[1] + parts[2] > 0.0:
                 near = neighbours[light]
-                missing_r, missing_g, missing_b = lane_type(), lane_type(), lane_type()
-                told_r, told_g, told_b = lane_type(), lane_type(), lane_type()
+                missing, told, shown, shone = channels(), channels(), channels(), channels()
                 counts = lane_type(1.0)
-                for corner in range(4):
-                    at = wp.where(corner == 0, light, wp.where(corner == 1, near[0], wp.where(corner == 2, near[1], near[2])))
-                    weight = wp.where(corner == 0, 1.0, -wp.where(corner == 1, parts[0], wp.where(corner == 2, parts[1], parts[2])))
-                    facing, gloss, _ = evaluate(values, p, places[at], wp.vec4())
-                    lit = visible[at, p]
-                    factor = factors[at] * weight
-                    red, green, blue = captured[at, p], captured[padded + at, p], captured[2 * padded + at, p]
-                    bits = clipped[at / 8, p]
+                for corner in range(4):  # the light itself last, because its gloss is scaled as that of the others is
+                    at = wp.where(corner == 0, near[0], wp.where(corner == 1, near[1], wp.where(corner == 2, near[2], light)))
+                    part = wp.where(corner == 0, parts[0], wp.where(corner == 1, parts[1], wp.where(corner == 2, parts[2], -1.0)))
+                    facing, gloss, _, _ = evaluate(values, p, places[at], wp.vec4())
+                    lit, bits = visible[at, p], clipped[at / 8, p]
                     for k in range(pack):
                         counts[k] = wp.where(bit_of(bits[k], at) == 1, 0.0, counts[k])
-                        seen = weight * float(lit[k]) * wp.static(1.0 / 255.0)
-                        missing_r[k] += factor[0] * float(red[k])
-                        missing_g[k] += factor[1] * float(green[k])
-                        missing_b[k] += factor[2] * float(blue[k])
-                        told_r[k] += modelled(seen, albedo_r[k], facing[k], gloss[0, k])
-                        told_g[k] += modelled(seen, albedo_g[k], facing[k], gloss[1, k])
-                        told_b[k] += modelled(seen, albedo_b[k], facing[k], gloss[2, k])
-                for k in range(pack):
-                    top[k] += counts[k] * (missing_r[k] * told_r[k] + missing_g[k] * told_g[k] + missing_b[k] * told_b[k])
-                    bottom[k] += counts[k] * (told_r[k] * told_r[k] + told_g[k] * told_g[k] + told_b[k] * told_b[k])
+                    for c in range(3):
+                        albedo, stored, factor = values[3 + c, p], captured[c * padded + at, p], factors[at][c]
+                        for k in range(pack):
+                            seen = float(lit[k]) * wp.static(1.0 / 255.0)
+                            reading = factor * float(stored[k])
+                            matt = seen * albedo[k] * INVERSE_PI * facing[k]
+                            shine = seen * gloss[c, k]
+                            ratio = wp.where(corner < 3, gloss_ratio(reading, matt, shine), mean_ratio(shown[c, k], shone[c, k]))
+                            missing[c, k] -= part * reading
+                            told[c, k] -= part * (matt + ratio * shine)
+                            shown[c, k] += part * ratio * shine
+                            shone[c, k] += part * shine
+                for c in range(3):
+                    for k in range(pack):
+                        top[k] += counts[k] * missing[c, k] * told[c, k]
+                        bottom[k] += counts[k] * told[c, k] * told[c, k]
         sums[0, p] = top
         sums[1, p] = bottom
 

@@ -126,7 +126,7 @@ def _sum_kernel(pack: int) -> Any:
     def sum_kernel(first: int,
                    captured: wp.array2d(dtype=half_pack),  # [3 · lights padded, P]
                    padded: int,  # lights
-                   values: wp.array2d(dtype=lane_type),  # [21, P]
+                   values: wp.array2d(dtype=lane_type),  # [24, P]
                    visible: wp.array2d(dtype=byte_pack),  # [lights, P]
                    lights: wp.array(dtype=wp.vec4),  # [lights]
                    factors: wp.array(dtype=wp.vec3),  # [lights] stored → radiance / irradiance
@@ -139,7 +139,7 @@ def _sum_kernel(pack: int) -> Any:
         image_r, image_g, image_b = lane_type(), lane_type(), lane_type()
         model_r, model_g, model_b = lane_type(), lane_type(), lane_type()
         for light in range(count):
-            facing, gloss, _ = evaluate(values, p, lights[light], wp.vec4())
+            facing, gloss, _, _ = evaluate(values, p, lights[light], wp.vec4())
             lit = visible[light, p]
             factor = factors[light]
             red, green, blue = captured[light, p], captured[padded + light, p], captured[2 * padded + light, p]

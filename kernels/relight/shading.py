@@ -2,6 +2,7 @@
 
 Radiance = Σ over the samples of V · E · (ρ/π + Σ_k a_k D_k V_k F_k) · n·l, with E the energy of a far sample or
 intensity · cos^μ / distance² of a near one, V the visibility that the caller gives by rows, and a_k the shares of one material or two.
+The specular part can have a profile of each pixel (kernels.relight.lobe_profile): a factor that depends on the angle of the half vector.
 """
 
 from functools import cache
@@ -20,8 +21,9 @@ LEAST_ROUGHNESS = 0.05
 """Least roughness that is shaded: a smoother lobe is narrower than any sample of a light."""
 LEAST_FACING = 0.02
 """Least n·v that is used: normals of pixels at the rim may point a little away from the viewer."""
-WIDTHS = [3, 3, 3, 3, 3, 1, 3, 1, 1]
-"""Number of values of each kind of a pixel: normal, albedo, F0, view, position, roughness; F0, roughness and share of a second material."""
+WIDTHS = [3, 3, 3, 3, 3, 1, 3, 1, 1, 3]
+"""Number of values of each kind of a pixel: normal, albedo, F0, view, position, roughness; F0, roughness and share of a second material;
+profile of the specular part."""
 PLANES = sum(WIDTHS)
 """Number of values of a pixel."""
 
@@ -29,7 +31,7 @@ PLANES = sum(WIDTHS)
 class Surface(NamedTuple):
     """Pixels of solved maps on a device."""
 
-    values: wp.array  # [21, P] float packs
+    values: wp.array  # [24, P] float packs
     pixel_count: int
     device: str
 
@@ -58,7 +60,7 @@ class SourcesOnDevice(NamedTuple):
 
 
 def upload_surface(normal: np.ndarray, diffuse_albedo: np.ndarray, specular: np.ndarray, roughness: np.ndarray, view: np.ndarray,
-                   position: np.ndarray, *, second: SecondLobe | None = None, device: str) -> Surface:
+                   position: np.ndarray, *, second: SecondLobe | None = None, profile: np.ndarray | None = None, device: str) -> Surface:
     """Put pixels on the device.
 
     Args:
@@ -66,6 +68,7 @@ def upload_surface(normal: np.ndarray, diffuse_albedo: np.ndarray, specular: np.
             camera frame.
         roughness: [n] 0…1; 0: no specular lobe, whatever F0.
         second: of pixels that mix two materials; None: there are none. The albedo is that of the whole pixel.
+        profile: [n, 3] of lobe_profile.fit_profile; None: the specular part is that of the BRDF.
         device: where.
 
     Raises:
@@ -73,7 +76,8 @@ def upload_surface(normal: np.ndarray, diffuse_albedo: np.ndarray, specular: np.
     """
     count = len(normal)
     nothing = SecondLobe(np.zeros((count, 3)), np.zeros(count), np.zeros(count))
-    given = (normal, diffuse_albedo, specular, view, position, roughness, *(second or nothing))
+    plain = np.tile(np.float32([1, 0, 0]), (count, 1))
+    given = (normal, diffuse_albedo, specular, view, position, roughness, *(second or nothing), plain if profile is None else profile)
     planes = [np.asarray(plane, dtype=np.float32).reshape(max(count, 1), -1) for plane in given]
     widths = [plane.shape[1] for plane in planes]
     if count == 0 or widths != WIDTHS:
@@ -138,8 +142,11 @@ def lobes(pack: int) -> Any:
 
     @wp.func
     def evaluate(values: wp.array2d(dtype=lane_type), p: int, place: wp.vec4, axis: wp.vec4):
-        """Return n·l, [3, pack] D V F n·l summed over the materials of a pixel, and the part of the energy that arrives."""
-        facing, gloss, arriving = lane_type(), channels(), lane_type()
+        """Return n·l, [3, pack] D V F n·l summed over the materials of a pixel, the part of the energy that arrives, and t.
+
+        t = 1 / (1 + (tan θ_h / α)²), with α of the first material, is 1 at the peak of its lobe and falls to 0.
+        """
+        facing, gloss, arriving, peak = lane_type(), channels(), lane_type(), lane_type()
         nx, ny, nz = values[0, p], values[1, p], values[2, p]
         vx, vy, vz = values[9, p], values[10, p], values[11, p]
         tx, ty, tz = lane_type(), lane_type(), lane_type()
@@ -200,7 +207,19 @@ def lobes(pack: int) -> Any:
                 f0 = values[16 + c, p]
                 for k in range(pack):
                     gloss[c, k] = (1.0 - share[k]) * gloss[c, k] + f0[k] * steady[k] + raised[k]
-        return facing, gloss, arriving
+        whole, middle, narrow = values[21, p], values[22, p], values[23, p]
+        for k in range(pack):
+            a = wp.max(rough[k], LEAST_ROUGHNESS)
+            a2 = a * a * a * a
+            near = nh[k] * nh[k]
+            peak[k] = near * a2 / (near * (a2 - 1.0) + 1.0)
+            square = peak[k] * peak[k]
+            fourth = square * square
+            factor = wp.max(whole[k] + middle[k] * square + narrow[k] * fourth * fourth, 0.0)
+            gloss[0, k] = factor * gloss[0, k]
+            gloss[1, k] = factor * gloss[1, k]
+            gloss[2, k] = factor * gloss[2, k]
+        return facing, gloss, arriving, peak
 
     return evaluate
 
@@ -228,7 +247,7 @@ def _shade_kernel(pack: int) -> Any:
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
     def shade_kernel(first: int,
-                     values: wp.array2d(dtype=lane_type),  # [21, P]
+                     values: wp.array2d(dtype=lane_type),  # [24, P]
                      place: wp.array(dtype=wp.vec4),  # [N]
                      energy: wp.array(dtype=wp.vec3),  # [N]
                      axis: wp.array(dtype=wp.vec4),  # [N]
@@ -240,7 +259,7 @@ def _shade_kernel(pack: int) -> Any:
         p = first + wp.tid()
         matt, glossy = channels(), channels()
         for n in range(place.shape[0]):
-            facing, gloss, lit = evaluate(values, p, place[n], axis[n])
+            facing, gloss, lit, _ = evaluate(values, p, place[n], axis[n])
             rows = occluder[n]
             if rows[0] >= 0 or rows[1] >= 0 or rows[2] >= 0:
                 parts = share[n]

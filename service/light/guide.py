@@ -1,9 +1,10 @@
 """Model-guided relighting: what a model of the surface says the plain sum of captured images misses is added, as far as it can be trusted.
 
 frame = Σ w_i I_i + β · (model under the wanted light − Σ w_i · model under captured light i). The captured images bring shadows,
-interreflection and scattering, the model brings what lies between the lights: sharp lobes, and the shadows of small bright lights. β of
-each pixel is fitted to the captured images (kernels.relight.guide). Light from beyond the captured lights has a β of its own, and what the
-model takes away there is a share of the sum (kernels.relight.beyond).
+interreflection and scattering, the model brings what lies between the lights: sharp lobes, and the shadows of small bright lights. The
+lobes are first refined to what the captured images show of them (kernels.relight.lobe_profile), and what is still missing of a highlight is
+a ratio, not a difference (kernels.relight.gloss_ratio). β of each pixel is fitted to the captured images (kernels.relight.guide). Light
+from beyond the captured lights has a β of its own, and what the model takes away there is a share of the sum (kernels.relight.beyond).
 
 Source: a control variate with a regression coefficient, Glasserman, "Monte Carlo Methods in Financial Engineering", section 4.1.
 """
@@ -19,7 +20,9 @@ from kernels import packs
 from kernels.errors import ArrayError
 from kernels.relight.around import left_out
 from kernels.relight.beyond import compare_beyond, followed, inward_pairs, share_beyond
+from kernels.relight.gloss_ratio import sum_shown
 from kernels.relight.guide import compare_model, fit_trust, seen_lobes
+from kernels.relight.lobe_profile import MOMENTS, fit_profile, profile_moments
 from kernels.relight.near_sum import sum_near
 from kernels.relight.shading import shade
 from kernels.relight.sources import Sources
@@ -76,8 +79,11 @@ class Guide:
         self._seen: dict[int, wp.array] = {}
         if progress is not None:
             progress.stage("guide", len(self._model.pixels))
-        self.trust = self._fit(lambda band, batch: compare_model(
-            band, batch.surface, self._visible(batch), lights.direction, lights.irradiance, stack.scale, neighbours, shares), progress)
+        given = lights.direction, lights.irradiance, stack.scale
+        moments = self._sums(MOMENTS, lambda band, batch: profile_moments(band, batch.surface, self._visible(batch), *given), None)
+        self._model.profile = fit_profile(moments, self._model.pixels, maps.mask.shape)
+        self.trust = self._fit(lambda band, batch: compare_model(band, batch.surface, self._visible(batch), *given, neighbours, shares),
+                               progress)
         """[n] β of the model's pixels between the captured lights, 0…1."""
         self.stack = self._unclipped(clipping.level)
         """The captured images, with clipped readings as bright as the model has them."""
@@ -92,14 +98,18 @@ class Guide:
 
     def _fit(self, compare: Callable[[packs.Band, ModelBatch], wp.array], progress: Timings | None) -> np.ndarray:
         """Return [n] β from sums [2, pixels] that a comparison takes of every batch."""
-        sums, done = np.zeros((2, len(self._model.pixels)), dtype=np.float32), 0
+        return fit_trust(self._sums(2, compare, progress), self._model.pixels, self._model.maps.mask.shape)
+
+    def _sums(self, rows: int, take: Callable[[packs.Band, ModelBatch], wp.array], progress: Timings | None) -> np.ndarray:
+        """Return [rows, n] float32 sums [rows, pixels padded] that are taken of every batch."""
+        sums, done = np.zeros((rows, len(self._model.pixels)), dtype=np.float32), 0
         for batch in self._model.batches():
-            compared = compare(packs.upload(*self._stack.pick(batch.pixels), device=self._model.device), batch)
-            sums[:, done : done + len(batch.pixels)] = compared.numpy()[:, : len(batch.pixels)]
+            taken = take(packs.upload(*self._stack.pick(batch.pixels), device=self._model.device), batch)
+            sums[:, done : done + len(batch.pixels)] = taken.numpy()[:, : len(batch.pixels)]
             done += len(batch.pixels)
             if progress is not None:
                 progress.advance(done)
-        return fit_trust(sums, self._model.pixels, self._model.maps.mask.shape)
+        return sums
 
     def _unclipped(self, level: np.ndarray) -> Stack:
         """Return the captured images, where a reading is clipped at `level` [lights padded] and the model is brighter, by β brighter."""
@@ -141,10 +151,11 @@ class Guide:
         done = 0
         for batch in self._model.batches():
             part = slice(done, done + len(batch.pixels))
+            band = packs.upload(*self.stack.pick(batch.pixels), device=self._model.device)
             for index, light in enumerate(lights):
                 visible = self._visible(batch, light.marched)
                 plain = frames[index][:, batch.pixels]
-                correction, mirror = self._correction(batch, part, light, visible, plain)
+                correction, mirror = self._correction(batch, band, part, light, visible, plain)
                 guided = np.maximum(plain + correction, np.minimum(plain, 0))
                 frames[index][:, batch.pixels] = guided
                 if mirrored is not None:
@@ -152,19 +163,22 @@ class Guide:
             done = part.stop
         return mirrored
 
-    def _correction(self, batch: ModelBatch, part: slice, light: ModelLight, visible: wp.array,
+    def _correction(self, batch: ModelBatch, band: packs.Band, part: slice, light: ModelLight, visible: wp.array,
                     plain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return what is added to a plain frame [3, n], and the model's specular part of the frame's light [3, n]."""
         def lit(sources: Sources) -> np.ndarray:
             return shade(batch.surface, sources, visible).numpy()[:, : len(batch.pixels)].reshape(2, 3, -1)
 
-        wanted, given = lit(light.wanted), lit(light.captured)
-        correction, mirror = self.trust[part] * (wanted - given).sum(axis=0), wanted[1]
+        wanted = lit(light.wanted)
+        given = sum_shown(band, batch.surface, visible, self._lights.direction, self._lights.irradiance, self.stack.scale,
+                          light.captured.energy)
+        matt, mirror = wanted[0], wanted[1] * given.ratio
+        correction = self.trust[part] * (matt + mirror - given.whole)
         added = np.zeros_like(wanted) if light.added is None else lit(light.added)
         if light.beyond is not None:
             outside, stands_in = lit(light.beyond.wanted), lit(light.beyond.captured)
-            whole = stands_in + np.maximum(given, 0) + added
-            correction += self.trust_beyond[part] * followed((outside - stands_in).sum(axis=0), plain, whole.sum(axis=0))
+            whole = (stands_in + added).sum(axis=0) + np.maximum(given.whole, 0)
+            correction += self.trust_beyond[part] * followed((outside - stands_in).sum(axis=0), plain, whole)
             mirror = mirror + outside[1]
         return correction, mirror + added[1]
 

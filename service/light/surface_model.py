@@ -64,6 +64,8 @@ class SurfaceModel:
         self._height = wp.array(np.where(inside, maps.height, 0).astype(np.float32), dtype=wp.float32, device=device)
         self._mask = wp.array(inside.astype(np.uint8), dtype=wp.uint8, device=device)
         self._projection = projection_of(maps.camera)
+        self.profile: np.ndarray | None = None
+        """[n, 3] Profile of the specular part at the solved pixels (kernels.relight.lobe_profile); None: that of the BRDF."""
 
     def batches(self) -> Iterator[ModelBatch]:
         """Yield the solved pixels in batches."""
@@ -87,7 +89,9 @@ class SurfaceModel:
                 roughness = np.where(abundance > 0, first_roughness, roughness)
                 second = SecondLobe(*other, np.where(abundance > 0, 1 - abundance, 0))
             yield ModelBatch(pixels, upload_surface(rows(maps.normal), rows(maps.diffuse_albedo), specular, roughness, self._view(pixels),
-                                                    self._points[pixels], second=second, device=self.device))
+                                                    self._points[pixels], second=second,
+                                                    profile=None if self.profile is None else self.profile[start : start + BATCH_PIXELS],
+                                                    device=self.device))
 
     def see(self, place: np.ndarray, pixels: np.ndarray) -> wp.array:
         """Return which pixels see which lights, as [n, P] uint8 packs of 255 or 0.

@@ -66,24 +66,44 @@ def shade(pixels, sources, visible=None):
     return total
 
 
+def parts(pixels, directions, visible=None):
+    """[2, lights, 3, P] radiance / irradiance of the model under far lights, diffuse and specular."""
+    pixels = pixels.double()
+    far = np.asarray(directions, dtype=np.float64)
+    both = np.stack([np.stack(response(pixels, direction)).swapaxes(1, 2) for direction in far], axis=1)
+    return both if visible is None else both * (visible[:, None].astype(np.float64) / 255)
+
+
 def readings(pixels, directions, visible=None):
     """[lights, 3, P] radiance / irradiance of the model under far lights."""
-    pixels = pixels.double()
-    both = np.stack([np.add(*response(pixels, direction)).T for direction in np.asarray(directions, dtype=np.float64)])
-    return both if visible is None else both * (visible[:, None].astype(np.float64) / 255)
+    return parts(pixels, directions, visible).sum(axis=0)
+
+
+def shown(images, model, most=4.0):
+    """What the specular parts of a model [2, lights, 3, P] are multiplied by to be as bright as images [lights, 3, P]: image / model."""
+    whole = model.sum(axis=0)
+    return np.where(whole > 1e-9, np.clip(images / np.where(whole > 1e-9, whole, 1), 0, most), 1)
+
+
+def mean_shown(images, model, weight):
+    """Its mean [3, P] over lights of weights [lights], each weighted by its specular part too; 1 where there is none."""
+    weighted = np.maximum(weight, 0)[:, None, None] * model[1]
+    gloss = weighted.sum(axis=0)
+    return np.where(gloss > 1e-9, (weighted * shown(images, model)).sum(axis=0) / np.where(gloss > 1e-9, gloss, 1), 1)
 
 
 def trust(images, model, neighbours, shares):
     """β [P]: the least-squares factor, held between 0 and 1, of what images [lights, 3, P] of readings miss when each is predicted by its
-    neighbours, on what the model's images say is missing; lights without shares are left out. With it both, [lights, 3, P]."""
-    def lacking(stack):
-        misses = np.zeros(stack.shape)
-        for light, (near, share) in enumerate(zip(neighbours, shares, strict=True)):
-            if sum(share) > 0:
-                misses[light] = stack[light] - sum(float(part) * stack[other] for part, other in zip(share, near, strict=True))
-        return misses
-
-    missing, told = lacking(images), lacking(model)
+    neighbours, on what the model [2, lights, 3, P] says is missing when its specular parts are as bright as the images; lights without
+    shares are left out. With it both, [lights, 3, P]."""
+    missing, told = np.zeros(images.shape), np.zeros(images.shape)
+    scaled = model[0] + shown(images, model) * model[1]
+    for light, (near, share) in enumerate(zip(neighbours, shares, strict=True)):
+        if sum(share) > 0:
+            weight = np.zeros(len(images))
+            np.add.at(weight, near, share)
+            missing[light] = images[light] - np.tensordot(weight, images, 1)
+            told[light] = model[0, light] + mean_shown(images, model, weight) * model[1, light] - np.tensordot(weight, scaled, 1)
     return np.clip((missing * told).sum(axis=(0, 1)) / (told**2).sum(axis=(0, 1)), 0, 1), missing, told
 
 

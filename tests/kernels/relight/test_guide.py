@@ -19,6 +19,11 @@ NEIGHBOURS, SHARES = left_out(LIGHTS)
 IRRADIANCE = 3 * colours(24, seed=4)
 
 
+def matte(count, seed=0):
+    """Scattered pixels without a specular part: what the model says is missing does not depend on the images."""
+    return scattered_pixels(count, seed)._replace(roughness=np.zeros(count, np.float32))
+
+
 def compared(pixels, readings, device, *, visible=None, shares=SHARES):
     """[2, P] of compare_model, and the readings that its band holds."""
     stack, scale, held = stored(readings, IRRADIANCE)
@@ -47,9 +52,10 @@ def rounded(readings, told, shares=SHARES):
     return wobble(np.abs(readings) + 10 * HALF_STEP / HALF_ROUNDING, 1.01 * HALF_ROUNDING, told, shares)
 
 
-def close(got, held, model, shares=SHARES):
+def close(got, held, parts, shares=SHARES):
     """Float32: the model's readings are off by LOBE, which moves what is missing times it, and its square twice."""
-    expected, missing, told = reference.trust(held, model, NEIGHBOURS, shares)
+    expected, missing, told = reference.trust(held, parts, NEIGHBOURS, shares)
+    model = np.maximum(parts.sum(axis=0), held)  # a specular part is scaled to the images
     size = np.maximum(np.sqrt((missing**2).sum(axis=(0, 1)) / (told**2).sum(axis=(0, 1))), 1)
     return (np.abs(got - expected) <= 3 * size * wobble(model, LOBE, np.abs(told), shares) + 1e-6).all()
 
@@ -64,10 +70,11 @@ def test_it_is_the_twin(count, device):
     rng = np.random.default_rng(count)
     pixels = scattered_pixels(count, seed=count)
     visible = rng.choice(np.array([0, 255, 90], np.uint8), (len(LIGHTS), count))
-    model = reference.readings(pixels, LIGHTS, visible)
+    parts = reference.parts(pixels, LIGHTS, visible)
+    model = parts.sum(axis=0)
     readings = np.abs(rng.uniform(0.2, 0.8, count) * model + rng.normal(0.2, 0.03, model.shape))
     got, held = trusted(pixels, readings, device, visible=visible)
-    assert close(got, held, model)
+    assert close(got, held, parts)
     assert count == 1 or np.ptp(got) > 0.1
 
 
@@ -75,17 +82,18 @@ def test_packs_of_four_are_packs_of_more(monkeypatch):
     """As CUDA takes them, on the CPU."""
     monkeypatch.setattr("kernels.device.pack_width", lambda device: 4)
     pixels = scattered_pixels(30)
-    model = reference.readings(pixels, LIGHTS)
-    got, held = trusted(pixels, 0.1 + 0.6 * model, "cpu")
-    assert close(got, held, model)
+    parts = reference.parts(pixels, LIGHTS)
+    got, held = trusted(pixels, 0.1 + 0.6 * parts.sum(axis=0), "cpu")
+    assert close(got, held, parts)
 
 
 def test_a_model_of_two_materials_explains_its_images(device):
     """β is one of images that the twin mixes, and less where the model lacks the second material. Tolerance: as against the twin."""
     pixels, other = scattered_pixels(45, seed=1), scattered_pixels(45, seed=2)
     share = np.full(45, 0.5, np.float32)
-    one, two = (reference.readings(surface, LIGHTS) for surface in (pixels, pixels._replace(f0=other.f0, roughness=other.roughness)))
-    model = (one + two) / 2
+    one, two = (reference.parts(surface, LIGHTS) for surface in (pixels, pixels._replace(f0=other.f0, roughness=other.roughness)))
+    parts = (one + two) / 2
+    model = parts.sum(axis=0)
     stack, scale, held = stored(model, IRRADIANCE)
     visible = pack_bytes(np.full((len(LIGHTS), 45), 255, np.uint8), device)
 
@@ -95,7 +103,7 @@ def test_a_model_of_two_materials_explains_its_images(device):
         return compare_model(band, surface, visible, LIGHTS, IRRADIANCE, scale, NEIGHBOURS, SHARES).numpy()[:, :45]
 
     top, bottom = sums(SecondLobe(other.f0, other.roughness, share))
-    _, missing, told = reference.trust(held, model, NEIGHBOURS, SHARES)
+    _, missing, told = reference.trust(held, parts, NEIGHBOURS, SHARES)
     allowed = 3 * wobble(model, LOBE, told) * (told**2).sum(axis=(0, 1))
     assert (np.abs(bottom - (told**2).sum(axis=(0, 1))) <= allowed).all()
     assert (np.abs(top - (missing * told).sum(axis=(0, 1))) <= allowed).all()
@@ -106,9 +114,10 @@ def test_a_model_of_two_materials_explains_its_images(device):
 def test_sums_are_the_twins(device):
     """What neighbours are weighed by. Tolerance: float32 sums, and twice the lobes of the sum of squares."""
     pixels = scattered_pixels(45)
-    model = reference.readings(pixels, LIGHTS)
+    parts = reference.parts(pixels, LIGHTS)
+    model = parts.sum(axis=0)
     (top, bottom), held = compared(pixels, 0.2 + 0.5 * model, device)
-    _, missing, told = reference.trust(held, model, NEIGHBOURS, SHARES)
+    _, missing, told = reference.trust(held, parts, NEIGHBOURS, SHARES)
     allowed = 3 * wobble(model, LOBE, told) * (told**2).sum(axis=(0, 1))
     assert (np.abs(bottom - (told**2).sum(axis=(0, 1))) <= allowed).all()
     assert (np.abs(top - (missing * told).sum(axis=(0, 1))) <= allowed).all()
@@ -163,9 +172,10 @@ def test_where_nothing_is_told_nothing_is_trusted():
 def test_images_that_are_the_model_are_trusted_whole(device):
     pixels = scattered_pixels(45)
     visible = np.random.default_rng(0).choice(np.array([0, 255], np.uint8), (len(LIGHTS), 45))
-    model = reference.readings(pixels, LIGHTS, visible)
+    parts = reference.parts(pixels, LIGHTS, visible)
+    model = parts.sum(axis=0)
     got, held = trusted(pixels, model, device, visible=visible)
-    _, _, told = reference.trust(held, model, NEIGHBOURS, SHARES)
+    _, _, told = reference.trust(held, parts, NEIGHBOURS, SHARES)
     assert (got <= 1).all()
     assert (1 - got <= rounded(model, told) + wobble(model, 2 * LOBE, told)).all()
     assert got.mean() > 1 - HALF_ROUNDING
@@ -175,20 +185,22 @@ def test_images_that_are_the_model_are_trusted_whole(device):
 def test_images_of_a_smooth_part_and_a_part_of_the_model(part, device):
     """What is the same under every light is predicted by its neighbours, and so misses nothing; what the model says is missing, is so in
     part."""
-    pixels = scattered_pixels(45)
-    model = reference.readings(pixels, LIGHTS)
+    pixels = matte(45)
+    parts = reference.parts(pixels, LIGHTS)
+    model = parts.sum(axis=0)
     readings = 0.2 + part * model
     got, held = trusted(pixels, readings, device)
-    _, _, told = reference.trust(held, model, NEIGHBOURS, SHARES)
+    _, _, told = reference.trust(held, parts, NEIGHBOURS, SHARES)
     assert (np.abs(got - part) <= rounded(readings, told) + wobble(model, 2 * LOBE, told)).all()
 
 
 def test_every_pixel_has_its_own(device):
-    pixels, part = scattered_pixels(70), np.linspace(0, 1, 70)
-    model = reference.readings(pixels, LIGHTS)
+    pixels, part = matte(70), np.linspace(0, 1, 70)
+    parts = reference.parts(pixels, LIGHTS)
+    model = parts.sum(axis=0)
     readings = 0.2 + part * model
     got, held = trusted(pixels, readings, device)
-    _, _, told = reference.trust(held, model, NEIGHBOURS, SHARES)
+    _, _, told = reference.trust(held, parts, NEIGHBOURS, SHARES)
     assert (np.abs(got - part) <= rounded(readings, told) + wobble(model, 2 * LOBE, told)).all()
 
 
@@ -197,7 +209,7 @@ def test_images_that_the_model_does_not_explain_are_not_guided(device):
     pixels = scattered_pixels(45)
     readings = np.full((len(LIGHTS), 3, 45), 0.3)
     got, held = trusted(pixels, readings, device)
-    _, _, told = reference.trust(held, reference.readings(pixels, LIGHTS), NEIGHBOURS, SHARES)
+    _, _, told = reference.trust(held, reference.parts(pixels, LIGHTS), NEIGHBOURS, SHARES)
     assert (got <= rounded(readings, told) + wobble(readings, LOBE, told)).all()
 
 
@@ -205,9 +217,9 @@ def test_noise_is_trusted_as_little_as_chance_has_it(device):
     """β before it is held at none is normal around none, with a spread σ that follows from the shares: then half of the pixels have none,
     and the mean is σ / √2π."""
     count = 4000
-    pixels = type(scattered_pixels(1))(*(np.repeat(plane, count, axis=0) for plane in scattered_pixels(1, seed=3)))
-    one = reference.readings(type(pixels)(*(plane[:1] for plane in pixels)), LIGHTS)
-    _, _, told = reference.trust(one, one, NEIGHBOURS, SHARES)
+    pixels = type(matte(1))(*(np.repeat(plane, count, axis=0) for plane in matte(1, seed=3)))
+    one = reference.parts(type(pixels)(*(plane[:1] for plane in pixels)), LIGHTS)
+    _, _, told = reference.trust(one.sum(axis=0), one, NEIGHBOURS, SHARES)
     slope = np.where(SHARES.sum(axis=1) > 0, 1, 0)[:, None, None] * told
     for light, (near, share) in enumerate(zip(NEIGHBOURS, SHARES, strict=True)):
         for k in range(3):
@@ -234,14 +246,15 @@ def test_images_that_miss_more_than_is_told_are_trusted_whole(device):
 
 def test_lights_without_shares_say_nothing(device):
     """Of all but one: images that have no part in its prediction may hold anything."""
-    pixels = scattered_pixels(45)
-    model = reference.readings(pixels, LIGHTS)
+    pixels = matte(45)
+    parts = reference.parts(pixels, LIGHTS)
+    model = parts.sum(axis=0)
     light = int(np.argmax(SHARES.sum(axis=1) * LIGHTS[:, 2]))
     shares = np.where(np.arange(len(LIGHTS))[:, None] == light, SHARES, 0).astype(np.float32)
     readings = 0.2 + 0.5 * model
     readings[np.setdiff1d(np.arange(len(LIGHTS)), [light, *NEIGHBOURS[light]])] = 7
     got, held = trusted(pixels, readings, device, shares=shares)
-    _, _, told = reference.trust(held, model, NEIGHBOURS, shares)
+    _, _, told = reference.trust(held, parts, NEIGHBOURS, shares)
     clear = (told**2).sum(axis=(0, 1)) > 1e-4
     assert clear.sum() > 30
     error = rounded(0.2 + 0.5 * model, told, shares) + wobble(model, 2 * LOBE, told, shares)

@@ -1,0 +1,123 @@
+"""The model under the captured lights, with its gloss as bright as the images show it.
+
+What a captured image has beyond the model is added to frames between the lights, because scattering and interreflection change slowly. A
+highlight does not: what the model misses of it would stay where the captured light had it, as a ghost beside the frame's own highlight.
+So the specular part is taken as a ratio: under each captured light, it is scaled by the ratio of image to model, and the frame's
+specular part by the mean of these ratios, each weighted by the light's part in the frame times its specular part. A frame under a captured
+light remains the captured image.
+
+Source: brightness as a ratio to that of an image under other light, Shashua and Riklin-Raviv, "The quotient image", TPAMI 2001.
+"""
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from kernels.errors import ArrayError
+from kernels.microfacet import INVERSE_PI
+from kernels.packs import Band, as_packs, channels_type, pack_type
+from kernels.relight.shading import Surface, lobes, require_same
+
+MOST_RATIO = 4.0
+"""Largest ratio of image to model that the gloss is scaled by: what is brighter is no error of a lobe, and stays a difference."""
+
+
+class ShownModel(NamedTuple):
+    """The model under the captured lights, summed for one frame, with its gloss as bright as the images show it."""
+
+    whole: np.ndarray  # [3, n] diffuse and scaled specular part
+    ratio: np.ndarray  # [3, n] mean ratio of image to model, 0…MOST_RATIO; 1 where no light of the frame gives gloss
+
+
+@wp.func
+def gloss_ratio(reading: float, matt: float, gloss: float) -> float:
+    """Return what the specular part of one channel is scaled by under a light, from readings of the image and the model's two parts."""
+    whole = matt + gloss
+    return wp.where(whole > 1.0e-9, wp.clamp(reading / wp.max(whole, 1.0e-9), 0.0, MOST_RATIO), 1.0)
+
+
+@wp.func
+def mean_ratio(shown: float, gloss: float) -> float:
+    """Return the mean of ratios from sums of the scaled specular part and of the specular part."""
+    return wp.where(gloss > 1.0e-9, shown / wp.max(gloss, 1.0e-9), 1.0)
+
+
+def sum_shown(band: Band, surface: Surface, visible: wp.array, direction: np.ndarray, irradiance: np.ndarray, scale: np.ndarray,
+              energy: np.ndarray) -> ShownModel:
+    """Sum the model under the captured lights for one frame; waits for the device.
+
+    Args:
+        band: captured images of the same pixels as the surface.
+        surface: solved maps.
+        visible: [lights or more, P] uint8 packs of occlusion.see_lights.
+        direction: [lights, 3] unit vectors to the captured lights.
+        irradiance: [lights, 3] of each.
+        scale: [lights padded] radiance of a stored 1.0.
+        energy: [lights, 3] that the frame gives each light; may be negative.
+
+    Raises:
+        ArrayError: shapes that do not fit.
+    """
+    count, device = len(direction), surface.device
+    require_same(band, surface, visible, count)
+    if np.shape(energy) != (count, 3):
+        raise ArrayError(f"energy is {np.shape(energy)}: give {(count, 3)}")
+    pack = devices.pack_width(device)
+    factor = np.divide(scale[:count, None], irradiance, out=np.zeros((count, 3)), where=irradiance > 0)
+    place = np.concatenate([direction, np.zeros((count, 1))], axis=1)
+    used = np.flatnonzero(np.abs(energy).max(axis=1, initial=0) > 0).astype(np.int32)
+    sums = wp.empty((6, surface.packs * pack), dtype=wp.float32, device=device)
+    devices.launch(_sum_kernel(pack), surface.packs,
+                   [band.values, band.frame_count, surface.values, visible, wp.array(place, dtype=wp.vec4, device=device),
+                    wp.array(factor, dtype=wp.vec3, device=device), wp.array(energy, dtype=wp.vec3, device=device),
+                    wp.array(used, dtype=wp.int32, device=device)], [as_packs(sums, device)], device=device)
+    whole, ratio = sums.numpy()[:, : surface.pixel_count].reshape(2, 3, -1)
+    return ShownModel(whole, ratio)
+
+
+@cache
+def _sum_kernel(pack: int) -> Any:
+    lane_type, half_pack, byte_pack = (pack_type(pack, dtype) for dtype in (wp.float32, wp.float16, wp.uint8))
+    channels, evaluate = channels_type(pack), lobes(pack)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
+    def sum_kernel(first: int,
+                   captured: wp.array2d(dtype=half_pack),  # [3 · lights padded, P]
+                   padded: int,  # lights
+                   values: wp.array2d(dtype=lane_type),  # [24, P]
+                   visible: wp.array2d(dtype=byte_pack),  # [rows, P]
+                   places: wp.array(dtype=wp.vec4),  # [lights]
+                   factors: wp.array(dtype=wp.vec3),  # [lights] stored → radiance / irradiance
+                   energy: wp.array(dtype=wp.vec3),  # [lights]
+                   used: wp.array(dtype=wp.int32),  # lights with energy
+                   # outputs
+                   sums: wp.array2d(dtype=lane_type)):  # [6, P]
+        p = first + wp.tid()
+        whole, shown, shone = channels(), channels(), channels()
+        for n in range(used.shape[0]):
+            light = used[n]
+            facing, gloss, _, _ = evaluate(values, p, places[light], wp.vec4())
+            lit = visible[light, p]
+            for c in range(3):
+                albedo, reading = values[3 + c, p], captured[c * padded + light, p]
+                given, factor = energy[light][c], factors[light][c]
+                for k in range(pack):
+                    seen = float(lit[k]) * wp.static(1.0 / 255.0)
+                    matt = seen * albedo[k] * INVERSE_PI * facing[k]
+                    shine = seen * gloss[c, k]
+                    scaled = shine * gloss_ratio(factor * float(reading[k]), matt, shine)
+                    whole[c, k] += given * (matt + scaled)
+                    shown[c, k] += wp.max(given, 0.0) * scaled
+                    shone[c, k] += wp.max(given, 0.0) * shine
+        for c in range(3):
+            one, other = lane_type(), lane_type()
+            for k in range(pack):
+                one[k] = whole[c, k]
+                other[k] = mean_ratio(shown[c, k], shone[c, k])
+            sums[c, p] = one
+            sums[3 + c, p] = other
+
+    return sum_kernel
