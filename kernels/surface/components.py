@@ -46,7 +46,7 @@ def label_runs(
     touching = np.maximum(below_last - below_first, 0)
     a = np.repeat(np.arange(start.size), touching)
     b = np.arange(a.size) - np.repeat(np.cumsum(touching) - touching, touching) + np.repeat(below_first, touching)
-    root = _join(start.size, a, b)
+    root = join(start.size, a, b)
     kept, label = np.unique(root, return_inverse=True)
     row = start // width
     first_col = start - row * width
@@ -59,7 +59,7 @@ def label_runs(
     )
 
 
-def _join(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def join(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return the smallest member of each node's component, given the pairs (a, b) of connected nodes."""
     root = np.arange(count)
     while a.size:

@@ -5,18 +5,24 @@ pixels; an edge that *crosses* a break has such loops on both sides of it, an ed
 edge keeps its weight by the better of its two loops. This needs no heights and no iteration, and finds a tear up to its tip: on a torn
 sheet of 96² pixels it leaves 0.03 % of the relief as the worst error.
 
-A break whose two sides have equal slopes leaves no trace in the loops and is not found. A part that is broken off all around keeps its
-shape, and normals do not tell its depth.
+Where a break follows a direction in which both sides have one slope, it leaves no trace in the loops, and on the staircase of a crease loops
+contradict themselves though nothing is broken. Where normals turn abruptly, whole outlines are therefore judged (parts.py), after a first
+integration of what lies between them. A part that is broken off all around keeps its shape, and normals do not tell its depth.
 
 Source: slopes that add up to nothing are the integrability of Frankot and Chellappa, "A method for enforcing integrability in shape from
 shading algorithms", TPAMI 1988; weighing edges by it is ours.
 """
 
+from collections.abc import Callable
+from typing import NamedTuple
+
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.surface.conjugate import Convergence
 from kernels.surface.grid import EdgeWeights, Grid, Walk, end_cell, first_cell, run
+from kernels.surface.parts import assemble, connect, cut
 from kernels.surface.slopes import Slopes
 
 wp.set_module_options({"enable_backward": False})
@@ -33,6 +39,14 @@ MAD_TO_SIGMA = 1.4826
 """Ratio of the standard deviation of Gaussian values to the median of their magnitudes."""
 
 _TRUST = wp.constant(wp.float32(LEAST_TRUST))
+
+
+class Broken(NamedTuple):
+    """A surface that is broken where its normals say so."""
+
+    height: wp.array  # [size] float32, in units of the spacing; parts that share an edge meet along it in the mean
+    part: np.ndarray  # [size] int, the part of each cell, -1 outside
+    convergence: Convergence  # of the last solve
 
 
 @wp.func
@@ -84,11 +98,11 @@ def _distrust_loops(first: int,
         lowered.down[i] = weights.down[i] * _loop_trust(here, _loop_sum(right, down, weights, i - 1), scale)
 
 
-def distrust_loops(slopes: Slopes, *, grid: Grid) -> Slopes:
-    """Return the same slopes with lower weights for edges across contradictions.
+def loop_noise(slopes: Slopes, *, grid: Grid) -> float:
+    """Return the standard deviation of the sum of slopes around four pixels, as their median shows it.
 
     Convention:
-        Reads a sample of the loops back to the host once, for the median.
+        Reads a sample of the loops back to the host once.
     """
     start, count = grid.pitch, grid.rows * grid.pitch
     stride = max(1, count // SAMPLES)
@@ -97,7 +111,64 @@ def distrust_loops(slopes: Slopes, *, grid: Grid) -> Slopes:
     devices.launch(_sample_loops, samples.shape[0], [*slopes, start, stride], [samples], device=grid.device)
     loops = samples.numpy()
     loops = loops[loops >= 0.0]
-    noise = MAD_TO_SIGMA * float(np.sqrt(np.median(loops))) if loops.size else 0.0
+    return MAD_TO_SIGMA * float(np.sqrt(np.median(loops))) if loops.size else 0.0
+
+
+def distrust_loops(slopes: Slopes, *, noise: float, grid: Grid) -> Slopes:
+    """Return the same slopes with lower weights for edges across contradictions.
+
+    Args:
+        slopes: of all pairs of neighbours.
+        noise: of loop_noise.
+        grid: the layout of the slopes.
+    """
     lowered = slopes._replace(weights=grid.no_edges())
     run(_distrust_loops, grid.cells, [*slopes, max(LEAST_LOOP, NOISE_LOOPS * noise)], [lowered.weights])
     return lowered
+
+
+def integrate_broken(slopes: Slopes, normal: wp.array, x: wp.array, y: wp.array, *, grid: Grid, perspective: bool, spacing: float,
+                     solve: Callable[[Slopes, wp.array], Convergence]) -> Broken:
+    """Integrate slopes, with breaks where the normals say so.
+
+    Args:
+        slopes: of all pairs of neighbours.
+        normal: [3, rows, cols] float32, camera frame.
+        x: [rows, cols] float32, right, in the plane of the projection.
+        y: [rows, cols] float32, up.
+        grid: the layout of the slopes.
+        perspective: whether the slopes are those of -log depth.
+        spacing: distance of neighbouring pixels in the plane of x and y.
+        solve: integrates slopes, improving the heights that it is given.
+
+    Convention:
+        Reads slopes, weights and normals back to the host, and heights where the normals turn abruptly anywhere.
+    """
+    noise = loop_noise(slopes, grid=grid)
+    lowered, height = distrust_loops(slopes, noise=noise, grid=grid), grid.zeros()
+    whole, left = (np.stack([w.right.numpy(), w.down.numpy()]) for w in (slopes.weights, lowered.weights))
+    slope = np.stack([slopes.right.numpy(), slopes.down.numpy()])
+    found = cut(normal.numpy(), np.stack([x.numpy(), y.numpy()]), slope, whole, left, grid=grid, perspective=perspective, spacing=spacing)
+    if not len(found.first):
+        return Broken(height, found.label, solve(lowered, height))
+    edges = (found.way, found.first)
+    whole, left = whole[edges], left[edges]
+    _set(lowered.weights, edges, np.where(found.turned, 0.0, left))
+    solve(lowered, height)
+    parts = connect(found, height.numpy(), noise=noise)
+    kept = np.where(parts.holds, whole, LEAST_TRUST * whole)
+    _set(lowered.weights, edges, np.where(parts.between, 0.0, np.where(found.turned, kept, left)))
+    height.zero_()  # the tolerance is relative to the first residual
+    convergence = solve(lowered, height)
+    heights = height.numpy()
+    height.assign(heights + np.where(parts.label >= 0, assemble(found, parts, heights)[parts.label], 0).astype(np.float32))
+    return Broken(height, parts.label, convergence)
+
+
+def _set(weights: EdgeWeights, edges: tuple[np.ndarray, np.ndarray], values: np.ndarray) -> None:
+    """Set the weights of edges, given as (0 right or 1 down, cell)."""
+    for way, plane in enumerate((weights.right, weights.down)):
+        changed = plane.numpy()
+        mine = edges[0] == way
+        changed[edges[1][mine]] = values[mine]
+        plane.assign(changed)

@@ -9,10 +9,10 @@ import warp as wp
 
 from kernels.errors import ArrayError
 from kernels.surface.components import label_runs, place
-from kernels.surface.conjugate import Solver
-from kernels.surface.discontinuities import distrust_loops
+from kernels.surface.conjugate import Convergence, Solver
+from kernels.surface.discontinuities import integrate_broken
 from kernels.surface.grid import make_grid
-from kernels.surface.slopes import pair_slopes, usable_pixels
+from kernels.surface.slopes import Slopes, pair_slopes, usable_pixels
 from kernels.surface.support import supported_normals
 
 
@@ -37,6 +37,8 @@ class Integration(NamedTuple):
     iterations: int  # of conjugate gradients
     residual: float  # relative
     converged: bool
+    part: np.ndarray | None = None
+    """[rows, cols] int: pixels of one number are connected across no break, -1 outside. None: breaks were not looked for."""
 
 
 def integrate_normals(
@@ -77,7 +79,8 @@ def integrate_normals(
 
     Convention:
         Waits for the device: the mask of usable pixels and one number per mask run are read back, and the residual
-        every few iterations. Needs eleven float32 per pixel beyond the inputs (15 with discontinuities).
+        every few iterations. Needs eleven float32 per pixel beyond the inputs (15 with discontinuities,
+        and thirty on the host).
     """
     options = options or IntegrationOptions()
     _check(normal, mask, x, y, sigma, perspective=perspective, mean_z=mean_z)
@@ -93,16 +96,20 @@ def integrate_normals(
                                              device=device)
     slopes = pair_slopes(inputs[0], usable, *inputs[1:], trust, grid=grid, perspective=perspective, spacing=spacing)
     runs = label_runs(usable.numpy())
-    del inputs, usable, trust
 
-    h = grid.zeros()
+    def improve(slopes: Slopes, h: wp.array) -> Convergence:
+        return Solver(grid, slopes, max_iterations=options.max_iterations).solve(h, tolerance=options.tolerance, progress=progress)
+
     if options.discontinuities:
-        slopes = distrust_loops(slopes, grid=grid)
-    done = Solver(grid, slopes, max_iterations=options.max_iterations).solve(h, tolerance=options.tolerance, progress=progress)
+        h, part, done = integrate_broken(slopes, *inputs, grid=grid, perspective=perspective, spacing=spacing, solve=improve)
+    else:
+        h, part = grid.zeros(), None
+        done = improve(slopes, h)
     height = place(h, runs, grid=grid, perspective=perspective, spacing=spacing, mean_z=mean_z)
     if progress is not None:
         progress(1.0)
-    return Integration(height, runs.count, done.iterations, done.residual, done.converged)
+    return Integration(height, runs.count, done.iterations, done.residual, done.converged,
+                       None if part is None else part.reshape(-1, grid.pitch)[1 : rows + 1, 1 : cols + 1])
 
 
 def _check(normal: Any, mask: Any, x: Any, y: Any, sigma: Any, *, perspective: bool, mean_z: float) -> None:

@@ -44,3 +44,48 @@ def test_smooth_surface_stays(noise, device):
     broken = solve(shape, device, discontinuities=True).height.numpy()
     ours, theirs = ((h - shape.z)[shape.mask].std() for h in (broken, plain))
     assert ours < 1.1 * theirs
+
+
+def parts_of(integration):
+    """Sizes of the parts, largest first."""
+    return np.sort(np.bincount(integration.part[integration.part >= 0]))[::-1]
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.03])
+def test_a_tilted_disc_before_a_plane_keeps_both_slopes(noise, device):
+    """Where the outline of the disc follows its axis of tilt no loop of slopes contradicts itself; the outline as a whole does.
+
+    Noise of 0.03 leaves 0.03 / √pixels of a slope on each pixel's, and cuts few of the pixels that line the outline wrongly.
+    """
+    x, y = shapes.plane_coordinates(96, 96, size=2.4)
+    disc = np.hypot(x, 1.16 * y) < 0.45
+    shape = shapes.from_gradient(x, y, np.where(disc, 0.5 - 0.58 * y, 0), np.zeros_like(x), np.where(disc, -0.58, 0.0))
+    shape = shape._replace(normal=(shape.normal + noise * np.random.default_rng(0).normal(size=shape.normal.shape)).astype(np.float32))
+    found = solve(shape, device, discontinuities=True)
+    assert found.converged and len(parts_of(found)) == 2
+    for part, slope in ((disc, -0.58), (~disc, 0.0)):
+        assert len(np.unique(found.part[part])) == 1
+        up = np.polyfit(y[part], found.height.numpy()[part], 1)[0]
+        assert up == pytest.approx(slope, abs=0.002 if noise else 1e-4)
+
+
+@pytest.mark.parametrize(("degrees", "slope"), [(0, 0.5), (20, 1.0), (7, 2.0), (45, 0.5)])
+def test_a_crease_is_no_break(degrees, slope, device):
+    """A ridge at any angle to the pixels: the loops on its staircase contradict themselves, and its two sides meet all along it.
+
+    The height errs by the ridge's place between two pixel centres, at most half a pixel times half of the turn.
+    """
+    x, y = shapes.plane_coordinates(96, 96, size=96)
+    turn = np.radians(degrees)
+    across = x * np.cos(turn) + y * np.sin(turn)
+    shape = shapes.from_gradient(x, y, -slope * np.abs(across), *(-slope * np.sign(across) * side for side in (np.cos(turn), np.sin(turn))))
+    found = solve(shape, device, discontinuities=True)
+    assert len(parts_of(found)) == 1
+    assert worst(found, shape) * np.ptp(shape.z) < 0.5 * slope
+
+
+def test_a_ball_before_a_wall_is_a_part_and_one_that_stands_on_it_keeps_its_outline(device):
+    shape, ball = shapes.ball_before_wall(192)
+    found = solve(shape, device, discontinuities=True)
+    assert parts_of(found).tolist() == [int((~ball).sum()), int(ball.sum())]
+    assert len(np.unique(found.part[ball])) == 1
