@@ -106,7 +106,8 @@ VARIANTS: dict[str, Callable[[Case], np.ndarray]] = {
     "+ averaged over nearby shapes": lambda case: solve_svbrdf(case.samples, case.robust, shape=case.shape, single_lobe=False).normal,
     "+ a single lobe fitted jointly with the normal": lambda case: solve_svbrdf(case.samples, case.robust, shape=case.shape).normal,
     "+ readings in cast shadows of the height left out": lambda case: case.whole(MaterialOptions(interreflection=False)),
-    "+ interreflection subtracted, materials shared": lambda case: case.whole(MaterialOptions(settling=False)),
+    "+ interreflection subtracted, materials shared": lambda case: case.whole(MaterialOptions(settling=False, parts=False)),
+    "+ parts placed in depth by their shadows": lambda case: case.whole(MaterialOptions(settling=False)),
     "+ shape and interreflection in turn": lambda case: case.whole(MaterialOptions(scale=False)),
     "+ scale of albedo where that of the lights is unknown (`svbrdf`)": lambda case: case.whole(MaterialOptions()),
 }

@@ -28,13 +28,15 @@ LEAST_TRUST = 0.1
 LEAST_PART = 48
 """Number of pixels below which a fragment is no part: outlines are lined with pixels that show both sides."""
 EDGE_ON = 0.3
-"""Cosine between a normal and the line of sight below which a pixel is seen edge on, and does not tell whether it touches its neighbours:
-an outline where a smooth surface turns away from the viewer is one of a part."""
-MEETING = 0.5
+"""Cosine between normal and line of sight below which a surface is seen edge on, and does not tell whether it touches its neighbour: an
+outline where a smooth surface turns away from the viewer is one of a part. It is taken half a pixel beyond the last pixel centre."""
+MEETING = 0.6
 """Part of the edge between two fragments along which they must meet to belong together."""
 PLAY_PIXELS, PLAY_JUMP, PLAY_NOISE = 0.1, 0.6, 3.0
 """Distance within which two sides meet: in pixels; per difference between their slopes, because a crease may pass anywhere between two
 pixel centres; and in standard deviations of the noise of the loops."""
+DRIFT = 0.015
+"""Distance within which two fragments meet, besides, per pixel of the edge that they share: integrated heights drift by about a degree."""
 LEAST_PULL = 1e-9
 """Weight, of that of all edges, by which the constant of each part is drawn to 0, so that parts that share no edge have one."""
 LIKE_TURN = np.radians(5.0)
@@ -56,16 +58,15 @@ class Fragments(NamedTuple):
     turn: np.ndarray  # [E] angle between the two normals, radians
     turned: np.ndarray  # [E] bool, whether the normals turn abruptly; else only loops contradict themselves
     jump: np.ndarray  # [E] difference between the slopes of the two normals
-    edge_on: np.ndarray  # [E] bool, whether one of the two pixels is seen edge on
+    edge_on: np.ndarray  # [E] bool, whether one of the two sides is seen edge on where it ends
 
 
 class Parts(NamedTuple):
-    """The parts, and which of the cut edges hold."""
+    """The parts, and the edges between them."""
 
     label: np.ndarray  # [size] int, the part of each cell; -1 outside
     count: int
-    holds: np.ndarray  # [E] bool, whether the surface passes through this cut edge of the fragments
-    between: np.ndarray  # [E] bool, whether this edge leads from part to part
+    between: np.ndarray  # [E] bool, whether this cut edge of the fragments leads from part to part
 
 
 def cut(normal: np.ndarray, ray: np.ndarray, slope: np.ndarray, weight: np.ndarray, left: np.ndarray, *, grid: Grid,
@@ -100,10 +101,18 @@ def cut(normal: np.ndarray, ray: np.ndarray, slope: np.ndarray, weight: np.ndarr
     xy = _cells(ray, grid)
     step = (xy[:, second] - xy[:, first]) / spacing
     sides = n[:, first], n[:, second]
-    facing = [side[2] - (side[:2] * xy[:, first]).sum(axis=0) * perspective for side in sides]
-    alone = [-(side[:2] * step).sum(axis=0) / np.maximum(cosine, STEEPEST) for side, cosine in zip(sides, facing, strict=True)]
+    facing = n[2] - (n[0] * xy[0] + n[1] * xy[1]) * perspective
+    alone = [-(side[:2] * step).sum(axis=0) / np.maximum(facing[cell], STEEPEST) for side, cell in zip(sides, (first, second), strict=True)]
+    inward = np.where(way == 1, grid.pitch, 1)
+    ends = np.minimum(*(_squared_end(facing, label, cell, cell + inner) for cell, inner in ((first, -inward), (second, inward))))
     return Fragments(label, count, first, second, way, slope[way, first], weight[way, first], turn[way, first],
-                     turned[way, first], np.abs(alone[0] - alone[1]), np.minimum(*facing) < EDGE_ON)
+                     turned[way, first], np.abs(alone[0] - alone[1]), ends < EDGE_ON**2)
+
+
+def _squared_end(facing: np.ndarray, label: np.ndarray, cell: np.ndarray, inner: np.ndarray) -> np.ndarray:
+    """Return the squared cosine to the viewer where a fragment ends, half a pixel beyond a cell; on a sphere it falls steadily to 0."""
+    here = np.maximum(facing[cell], 0) ** 2
+    return here - np.where(label[inner] == label[cell], 0.5 * np.maximum(np.maximum(facing[inner], 0) ** 2 - here, 0), 0)
 
 
 def label_cells(usable: np.ndarray, open_edges: np.ndarray, pitch: int) -> tuple[np.ndarray, int]:
@@ -125,7 +134,7 @@ def label_cells(usable: np.ndarray, open_edges: np.ndarray, pitch: int) -> tuple
 
 
 def connect(found: Fragments, height: np.ndarray, *, noise: float) -> Parts:
-    """Connect fragments that belong together, and find the edges through which a surface passes.
+    """Connect fragments that belong together.
 
     Args:
         found: the fragments.
@@ -142,9 +151,8 @@ def connect(found: Fragments, height: np.ndarray, *, noise: float) -> Parts:
         if low != high:
             _join_meeting(seam, low, high, play)
     first, second = seam.sides()
-    holds = (first == second) & (np.abs(seam.rest()) <= play)
     kept, number = np.unique(seam.group, return_inverse=True)
-    return Parts(np.where(found.label >= 0, number[np.maximum(found.label, 0)], -1), len(kept), holds, first != second)
+    return Parts(np.where(found.label >= 0, number[np.maximum(found.label, 0)], -1), len(kept), first != second)
 
 
 def assemble(found: Fragments, parts: Parts, height: np.ndarray) -> np.ndarray:
@@ -240,7 +248,7 @@ def _join_meeting(seam: _Seam, low: int, high: int, play: np.ndarray) -> None:
     if len(telling) <= MEETING * len(edges):
         return
     needed = np.where(first[telling] == low, 1, -1) * seam.rest()[telling]
-    reach = play[telling]
+    reach = play[telling] + DRIFT * len(edges)
     bounds = np.concatenate([needed - reach, needed + reach])
     order = np.argsort(bounds, kind="stable")
     met = np.cumsum(np.repeat([1, -1], len(needed))[order])

@@ -2,7 +2,9 @@
 and the height of the surface is compared with it.
 
 A point is in shadow when the surface stands above the line by more than a margin: a part of a pixel, and a slope by which a
-height integrated from normals may err. Only surface that the camera sees can cast a shadow here.
+height integrated from normals may err. Only surface that the camera sees can cast a shadow here. Of another part of the object than the
+point's own, which may be thin, only the visible front does: the line must pass through it, and one that lies behind it from where it comes
+into the picture of that part to where it leaves passes behind the part.
 """
 
 from typing import NamedTuple
@@ -45,7 +47,10 @@ def unproject(u: float, v: float, z: float, perspective: bool, scale: wp.vec2, c
 @wp.func
 def in_shadow_within(height: wp.array2d(dtype=float), mask: wp.array2d(dtype=wp.uint8), row: int, col: int, toward: wp.vec3,
                      reach: float, perspective: bool, scale: wp.vec2, centre: wp.vec2) -> bool:
-    """Return whether the surface hides a light in this direction from this pixel before `reach`: what lies behind a light hides nothing."""
+    """Return whether the surface hides a light in this direction from this pixel before `reach`: what lies behind a light hides nothing.
+
+    The mask is 0 outside the surface and elsewhere the number of the part that a pixel lies on; a surface without breaks is one part.
+    """
     z = height[row, col]
     start = unproject(float(col) + 0.5, float(row) + 0.5, z, perspective, scale, centre)
     pixel = wp.where(perspective, -z, 1.0) / (0.5 * (scale[0] + scale[1]))  # what a pixel spans here
@@ -54,7 +59,9 @@ def in_shadow_within(height: wp.array2d(dtype=float), mask: wp.array2d(dtype=wp.
         return False  # along the line of sight
     stride = pixel / across
     travelled = FIRST_STEP * stride
-    hidden = bool(False)  # a literal could not change inside the loop
+    hidden, behind = bool(False), bool(False)  # literals could not change inside the loop
+    own = int(mask[row, col])
+    last = own  # the part that the line met last; `behind`, whether it ran behind that part's front
     rows, cols = mask.shape[0], mask.shape[1]
     for _ in range(rows + cols):
         if travelled >= reach:
@@ -65,13 +72,18 @@ def in_shadow_within(height: wp.array2d(dtype=float), mask: wp.array2d(dtype=wp.
         c, r = int(wp.floor(u)), int(wp.floor(v))
         if c < 0 or r < 0 or c >= cols - 1 or r >= rows - 1:
             break
-        if int(mask[r, c]) + int(mask[r, c + 1]) + int(mask[r + 1, c]) + int(mask[r + 1, c + 1]) == 4:
+        part = int(mask[r, c])
+        if part != 0 and int(mask[r, c + 1]) == part and int(mask[r + 1, c]) == part and int(mask[r + 1, c + 1]) == part:
             fu, fv = u - float(c), v - float(r)
             upper = height[r, c] * (1.0 - fu) + height[r, c + 1] * fu
             lower = height[r + 1, c] * (1.0 - fu) + height[r + 1, c + 1] * fu
             above = upper * (1.0 - fv) + lower * fv - point[2]
-            if above > MARGIN_PIXELS * pixel + MARGIN_SLOPE * travelled * across:
-                hidden = True
+            under = above > MARGIN_PIXELS * pixel + MARGIN_SLOPE * travelled * across
+            hidden = under
+            if part != own:
+                hidden = part == last and under != behind
+            last, behind = part, under
+            if hidden:
                 break
         travelled += stride
     return hidden

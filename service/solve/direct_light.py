@@ -15,6 +15,7 @@ from kernels.photometric.readings import Lights, channel_weights
 from kernels.photometric.samples import Samples
 from kernels.photometric.shadowing import exclude_shadows
 from service.solve.interreflection import ArrivingLight, arriving_light
+from service.solve.parts import Material, numbered, place_parts
 from service.solve.solution import SolveInput
 from service.solve.surface import integrate, projection_of
 from stage.colour import GREY_WEIGHTS
@@ -30,7 +31,7 @@ class DirectLight(NamedTuple):
     lights: Lights
     field: NearField | None
     """Where the lights are, where some light is near."""
-    solved: wp.array  # [rows, cols] uint8, on the device
+    solved: wp.array  # [rows, cols] uint8 on the device: the number of the part of each solved pixel, 0 elsewhere
     height: wp.array  # [rows, cols] float32, on the device
     shadows: bool
     """Whether cast shadows of the height are taken out."""
@@ -57,8 +58,8 @@ class DirectLight(NamedTuple):
                             None if self.field is None else self.field.at(pixels))
 
 
-def direct_light(given: SolveInput, lights: Lights, field: NearField | None, normal: np.ndarray, albedo: np.ndarray,
-                 solved: np.ndarray, *, shadows: bool, interreflection: bool) -> DirectLight | None:
+def direct_light(given: SolveInput, lights: Lights, field: NearField | None, normal: np.ndarray, material: Material,
+                 solved: np.ndarray, *, shadows: bool, interreflection: bool, parts: bool) -> DirectLight | None:
     """Find what the object does to its own light, or return None when no pixel is solved.
 
     Args:
@@ -66,14 +67,20 @@ def direct_light(given: SolveInput, lights: Lights, field: NearField | None, nor
         lights: lights of the stack, padded.
         field: where the lights are, where some light is near.
         normal: [3, pixels] float32, found so far.
-        albedo: [3, pixels] diffuse, of the same.
+        material: of the same.
         solved: [rows, cols] bool.
         shadows: whether cast shadows are taken out.
         interreflection: whether interreflection is taken out.
+        parts: whether parts are moved in depth to where their shadows agree with the images; not under near lights.
     """
     surface = integrate(given, normal, solved, stage="surface")
     if surface is None:
         return None
-    arriving = arriving_light(given, lights, normal, surface.height, solved) if interreflection else None
-    on_device = wp.array(solved.astype(np.uint8), dtype=wp.uint8, device=given.device)
-    return DirectLight(given, lights, field, on_device, surface.height, shadows, arriving, albedo)
+    height = surface.height
+    if parts and field is None and surface.part is not None:
+        placed = place_parts(given, lights, normal, material, height.numpy(), surface.part)
+        height = wp.array(placed.height, dtype=float, device=given.device)
+    arriving = arriving_light(given, lights, normal, height, solved) if interreflection else None
+    mask = solved.astype(np.uint8) if surface.part is None else numbered(surface.part)
+    on_device = wp.array(mask, dtype=wp.uint8, device=given.device)
+    return DirectLight(given, lights, field, on_device, height, shadows, arriving, material.albedo)

@@ -25,6 +25,7 @@ from kernels.photometric.svbrdf import solve_svbrdf
 from kernels.status import ESTIMATED, Status
 from service.solve.batches import Batch, bands, pick_pixels, pixel_batches, view_directions
 from service.solve.direct_light import DirectLight, direct_light
+from service.solve.parts import Material
 from service.solve.settling import settle
 from service.solve.solution import Solution, SolveInput
 from service.solve.support import FEW_LIGHTS, supports_lobes
@@ -53,6 +54,8 @@ class MaterialOptions:
     """Let pixels share materials."""
     mixtures: bool = True
     """Let a pixel have two of the shared materials."""
+    parts: bool = True
+    """Move parts of the object in depth to where their shadows agree with the images."""
 
 
 WHOLE_SOLVER = MaterialOptions()
@@ -149,7 +152,7 @@ class _Walk:
                                   "diffuse_slope": self._shape.slope, "shapes_tried": len(tried)}
 
     def search(self) -> None:
-        """Search the normals a first time, and fit the albedo that interreflection needs."""
+        """Search the normals a first time, and fit the material from which shadows and interreflection are told."""
         result = self.result
         for pixels, samples in self._batches("search"):
             start = result.normal[:, pixels] if self._supported else self._lambertian[:, pixels]
@@ -159,12 +162,14 @@ class _Walk:
                 first = (fit_tinted(samples, normal, shape=self._shape) if self._supported else
                          fit_given(samples, normal, MATT, shape=self._shape))
                 result.albedo[:, pixels], self._roughness[pixels] = first.diffuse_albedo.T, first.roughness
+                self._specular[:, pixels] = first.specular.T
 
     def direct_light(self) -> DirectLight | None:
         """Find what the object does to its own light, from the first search; None when no pixel is solved."""
         solved = (self.result.status == Status.OK).reshape(self._given.mask.shape)
-        light = direct_light(self._given, self._lights, self._field, self.result.normal, self.result.albedo.copy(), solved,
-                             shadows=self._options.shadows, interreflection=self._interreflection)
+        material = Material(self.result.albedo.copy(), self._specular.copy(), self._roughness.copy())
+        light = direct_light(self._given, self._lights, self._field, self.result.normal, material, solved, shadows=self._options.shadows,
+                             interreflection=self._interreflection, parts=self._options.parts and self._interreflection)
         if light is None or light.arriving is None or self._field is not None or not (self._supported and self._options.settling):
             return light  # near lights settle the light in rounds, with the surface
         relative = self._given.relative and self._options.scale

@@ -24,6 +24,7 @@ from service.solve.extended import solve_extended
 from service.solve.gradient import solve_gradients
 from service.solve.material import refine_material, solve_material
 from service.solve.near import MATERIAL_ROUNDS, Rounds, solve_near
+from service.solve.parts import place_solution
 from service.solve.reference import solve_by_reference
 from service.solve.solution import Solution, SolveInput, SuspectLight, mark_not_facing, refine_status
 from service.solve.surface import guessed_part, height_warnings, integrate
@@ -138,6 +139,10 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
     if solution.integration is None:  # near lights have found the height with the normals
         solution.integration = integrate(given, solution.normal, estimated, sigma=sigma)
         solution.height = None if solution.integration is None else solution.integration.height.numpy()
+    placed = place_solution(given, lights, solution) if isinstance(lights, DistantLights) else None
+    if placed is not None:
+        solution.height = placed.height
+        solution.warnings += placed.warnings()
     if solution.judged_by_surface and solution.height is not None:
         normal = np.moveaxis(solution.normal.reshape(3, *mask.shape), 0, -1)
         factor = integrability.doubt(sigma.reshape(mask.shape), normal, solution.height, estimated, capture.camera)
@@ -171,6 +176,7 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
         residual=_residual_statistics(solution.residual.reshape(mask.shape)[solved]),
         albedo_above_one=int((maps.diffuse_albedo[solved] > 1).any(axis=-1).sum()) if maps.diffuse_albedo is not None else 0,
         height=_height_report(solution.integration, guessed, capture),
+        **({} if placed is None else {"parts": [part.facts() for part in placed.parts]}),
         **({} if stack.motion is None else {"motion": stack.motion}),
     ))
     return SolveResult(maps, maps_path, report_path, counts, tuple(solution.suspects), tuple(solution.warnings))

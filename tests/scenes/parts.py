@@ -117,7 +117,7 @@ def shoot(parts: list[Part], directions: np.ndarray, *, side: int, across: float
     if noise:
         rng = np.random.default_rng(seed)
         floor = 0.1 * noise * np.percentile(images[:, seen], 99)
-        images += rng.normal(size=images.shape) * (noise * images + floor)
+        images = np.maximum(images + rng.normal(size=images.shape) * (noise * images + floor), 0)
     shape = (side, side)
     mask = (number >= 0).reshape(shape)
     full = np.zeros((x.size, 3))

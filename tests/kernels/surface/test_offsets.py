@@ -1,0 +1,130 @@
+"""Offsets of parts from cast shadows: the march against brute force, and the likelihood against what made the readings."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from kernels.errors import ArrayError
+from kernels.photometric.shadow_evidence import LARGEST_ODDS, shadow_odds
+from kernels.surface.offsets import GROUPS, choose_offset, weigh_offsets
+from kernels.surface.part_shadows import march_part
+from kernels.surface.shadows import Projection
+
+SIDE = 40
+RISE = 9.0
+"""Height of the block before the floor."""
+THICK = 3.0
+"""Guessed thickness."""
+
+
+def block(rise=RISE):
+    """A floor and a block before it, [rows, cols] heights and parts."""
+    part = np.zeros((SIDE, SIDE), np.int32)
+    part[14:24, 16:28] = 1
+    return np.where(part == 1, rise, 0).astype(np.float32), part
+
+
+def lights(count=24):
+    turn = np.arange(count) * 2 * np.pi / count
+    slope = np.where(np.arange(count) % 2, 1.0, 0.6)
+    toward = np.stack([np.cos(turn), np.sin(turn), slope], axis=1)
+    return toward / np.linalg.norm(toward, axis=1, keepdims=True)
+
+
+def march(height, part, device, perspective=False, far=0.0):
+    pixels = np.argwhere(part >= 0)
+    scale = far if perspective else 1.0
+    projection = Projection(perspective, wp.vec2(scale, scale), wp.vec2(SIDE / 2, SIDE / 2))
+    found = march_part(wp.array(pixels.astype(np.int32), dtype=wp.vec2i, device=device),
+                       wp.array(lights().astype(np.float32), dtype=wp.vec3, device=device),
+                       wp.array(height, dtype=float, device=device), wp.array(part, dtype=wp.int32, device=device),
+                       wp.array(np.full_like(height, THICK), dtype=float, device=device), 1, projection)
+    return pixels, found
+
+
+@pytest.mark.parametrize("perspective", [False, True])
+def test_one_march_tells_the_shadows_at_every_offset(perspective, device):
+    """Of a block that stands anywhere before the floor, marched once where it lies, against a march where it was moved to.
+
+    In perspective it moves by growing about the eye. Tolerance: where a gap is within a hundredth of a pixel of the ray, rounding decides.
+    """
+    far = 400.0
+    height, part = block()
+    if perspective:
+        height = height - far
+    found = march(height, part, device, perspective, far)[1]
+    assert not found.hidden.numpy().any()  # neither the floor nor the block hides a light from itself
+    on = (part.reshape(-1) == 1)[:, None]
+    for offset in (-4.0, 3.0, 20.0):
+        told = -np.log((far - offset) / far) if perspective else offset
+        moved = np.where(part == 1, height * np.exp(-told) if perspective else height + offset, height).astype(np.float32)
+        for here, there in zip(found[:3], march(moved, part, device, perspective, far)[1][:3], strict=True):
+            here, there = here.numpy(), there.numpy()
+            met = np.abs(there) < 1e29
+            assert np.array_equal(met, np.abs(here) < 1e29)
+            expected = here + np.where(on, -told, told)
+            assert np.abs(expected - there)[met].max() < (2e-5 if perspective else 1e-3)
+
+
+def test_the_march_refuses_parts_of_another_shape(device):
+    height, part = block()
+    with pytest.raises(ArrayError, match="one of each for every pixel"):
+        march(height[:-1], part, device)
+
+
+def evidence(true_rise, device, *, errors=0.0, reach=30.0):
+    """Readings of a block at another height than it is taken to be, as one of the guessed thickness hides them; a part of them is wrong."""
+    height, part = block()
+    pixels, found = march(height, part, device)
+    truth = march(*block(true_rise), device)[1]
+    odds = np.where((truth.highest.numpy() > 0) & (truth.back.numpy() < 0), LARGEST_ODDS, -LARGEST_ODDS)
+    rng = np.random.default_rng(0)
+    odds = np.where(rng.random(odds.shape) < errors, -odds, odds)
+    group = np.arange(24) * GROUPS // 24
+    return weigh_offsets(found, odds, part[tuple(pixels.T)] == 1, group, reach=reach, blur=0.7)
+
+
+@pytest.mark.parametrize("rise", [4.0, 9.0, 18.0])
+@pytest.mark.parametrize("errors", [0.0, 0.1])
+def test_the_offset_of_a_block_is_found(rise, errors, device):
+    """To a pixel, the sampling of a ray; the true offset lies within three of its standard deviations."""
+    offset = choose_offset(evidence(rise, device, errors=errors), least_sigma=0.5)
+    assert abs(offset.offset - (rise - RISE)) < 1.0
+    assert abs(offset.offset - (rise - RISE)) < 3 * offset.sigma and offset.sigma < 2.0
+    assert offset.low - 0.5 <= offset.offset <= offset.high + 0.5
+
+
+def test_readings_without_evidence_leave_the_offset_open(device):
+    height, part = block()
+    pixels, found = march(height, part, device)
+    flat = weigh_offsets(found, np.zeros(found.highest.shape), part[tuple(pixels.T)] == 1, np.arange(24) % GROUPS, reach=30.0,
+                         blur=0.7)
+    offset = choose_offset(flat, least_sigma=0.5)
+    assert (offset.low, offset.high) == (-30.0, 30.0)
+
+
+def test_contradicting_lights_leave_the_offset_open(device):
+    """Half of the lights show the block 5 pixels nearer, the other half 5 pixels farther: no offset between is ruled out."""
+    near, far = evidence(RISE + 5, device), evidence(RISE - 5, device)
+    mixed = near._replace(gain=np.where(np.arange(GROUPS)[:, None] % 2 == 0, near.gain, far.gain))
+    offset = choose_offset(mixed, least_sigma=0.5)
+    assert offset.low < -4 and offset.high > 4 and offset.sigma > 2
+
+
+def test_odds_speak_only_where_a_lit_reading_would_be_bright(device):
+    """Dark where light is expected: shadow. Dark on a metal whose highlight is elsewhere, or away from the light: nothing.
+
+    Brighter than the material explains is no shadow; whether it is lit, such a reading does not say.
+    """
+    toward = np.array([[0.0, 0.0, 1.0], [0.8, 0.0, 0.6], [1.0, 0.0, 0.0]])
+    one = np.ones((4, 1))
+    normal, view = one * [[0.0, 0.0, 1.0]], one * [[0.0, 0.0, 1.0]]
+    paint, metal = [0.6, 0.04, 0.5], [0.0, 0.8, 0.3]
+    material = np.array([paint, paint, paint, metal])
+    lit = 0.6 / np.pi * np.array([1.0, 0.6, 0.0])
+    readings = np.array([[0.005, 0.005, 0.0], lit, 3 * lit, [0.9, 0.0, 0.0]])
+    odds = shadow_odds(readings, toward, normal, view, material, device=device)
+    assert (odds[0, :2] > 1).all() and (odds[1, :2] < -1).all() and (odds[2, :2] <= 0).all()
+    assert (odds[:, 2] == 0).all() and odds[3, 1] == 0
+    with pytest.raises(ArrayError, match="one direction per light"):
+        shadow_odds(readings[:, :2], toward, normal, view, material, device=device)
