@@ -85,7 +85,50 @@ def sampling_tables(responses: wp.array) -> SamplingTables:
                                        for widths in (SEARCH_WIDTHS, POSTERIOR_WIDTHS)))
 
 
-def solve_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, *,
+class Found(NamedTuple):
+    """Normal and material of least cost of each sampled pixel, on the host."""
+
+    normal: np.ndarray  # [n, 3] float32, unit
+    other: np.ndarray  # [n, 3] float32, unit: the second-best minimum of the grid
+    metallic: np.ndarray  # [n] bool: lobes with the Fresnel rise of a metal explain the pixel better
+    weights: np.ndarray  # [n, lobes] float32, of the mixture
+    cost: np.ndarray  # [n] float32, per light
+    diffuse_albedo: np.ndarray  # [n, 3] float32
+    specular: np.ndarray  # [n, 3] float32, F0
+    roughness: np.ndarray  # [n] float32
+
+
+def search_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, *, start: np.ndarray | None = None,
+                    options: SearchOptions = OPTIONS) -> Found:
+    """Find the normal and the material of sampled pixels that explain their readings best.
+
+    Args:
+        samples: their readings, radiance over the irradiance of each light.
+        tables: of the same lights.
+        view: [n, 3] unit directions to the viewer.
+        start: [n, 3] unit normals near which the best ones lie; None: they may be anywhere on the visible hemisphere.
+        options: how candidates are judged.
+
+    Returns:
+        The best candidates. Waits for the device.
+
+    Raises:
+        ArrayError: shapes that do not fit.
+    """
+    lambert = Diffuse()
+    first, other = find_modes(samples, bounded(tables.search[0], samples), view) if start is None else (start, start)
+    near = search_normals(samples, first, shape=lambert, options=AROUND_OPTIONS, wide=AROUND[0], fine=AROUND[1:],
+                          table=tables.search[0]).normal
+    searches = [search_normals(samples, near, shape=lambert, options=options, wide=FINE[0], fine=FINE[1:], table=table)
+                for table in tables.search]
+    materials = [fit_material(samples, search.normal, shape=lambert, options=options, table=tables.responses) for search in searches]
+    metallic = materials[1].cost < materials[0].cost
+    material = Material(*_choose(metallic, *materials))
+    normal, cost, weights = _choose(metallic, *((search.normal, search.cost, search.weights) for search in searches))
+    return Found(normal, other, metallic, weights, cost, *material[:3])
+
+
+def solve_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, *, found: Found | None = None,
                    options: SearchOptions = OPTIONS) -> SamplingFit:
     """Estimate normal, material and regime of sampled pixels.
 
@@ -93,6 +136,7 @@ def solve_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, *
         samples: their readings, radiance over the irradiance of each light.
         tables: of the same lights.
         view: [n, 3] unit directions to the viewer.
+        found: of `search_sampling` for these samples; None: it is looked for here.
         options: how candidates are judged by the search.
 
     Returns:
@@ -102,35 +146,29 @@ def solve_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, *
         ArrayError: shapes that do not fit.
     """
     lambert = Diffuse()
-    starts = find_modes(samples, bounded(tables.search[0], samples), view)
-    start = search_normals(samples, starts[0], shape=lambert, options=AROUND_OPTIONS, wide=AROUND[0], fine=AROUND[1:],
-                           table=tables.search[0]).normal
-    searches = [search_normals(samples, start, shape=lambert, options=options, wide=FINE[0], fine=FINE[1:], table=table)
-                for table in tables.search]
-    materials = [fit_material(samples, search.normal, shape=lambert, options=options, table=tables.responses)
-                 for search in searches]
-    metallic = materials[1].cost < materials[0].cost
-    material = Material(*_choose(metallic, *materials))
-    found, cost, weights = _choose(metallic, *((search.normal, search.cost, search.weights) for search in searches))
+    if found is None:
+        found = search_sampling(samples, tables, view, options=options)
+    metallic = found.metallic
+    material = Material(*(values.copy() for values in (found.diffuse_albedo, found.specular, found.roughness, found.cost)))
     kinds = [kind for kind in (False, True) if (metallic == kind).any()]
-    groups = [Group(choose(samples, metallic == kind), bounded(tables.posterior[kind], samples), found[metallic == kind])
+    groups = [Group(choose(samples, metallic == kind), bounded(tables.posterior[kind], samples), found.normal[metallic == kind])
               for kind in kinds]
     noise = measure_noise(groups)
     modes = Modes.empty(samples.pixel_count)
     for kind, group in zip(kinds, groups, strict=True):
-        other = search_normals(group.samples, starts[1][metallic == kind], shape=lambert, options=AROUND_OPTIONS, wide=AROUND[0],
+        other = search_normals(group.samples, found.other[metallic == kind], shape=lambert, options=AROUND_OPTIONS, wide=AROUND[0],
                                fine=AROUND[1:], table=tables.search[kind]).normal
         modes.place(metallic == kind, weigh(normal_posterior(group, noise), normal_posterior(group._replace(normal=other), noise)))
-    kept = modes.close_to(found)
-    normal = np.where(kept[:, None], found, modes.normal)
+    kept = modes.close_to(found.normal)
+    normal = np.where(kept[:, None], found.normal, modes.normal)
     if not kept.all():
         again = fit_material(choose(samples, ~kept), normal[~kept], shape=lambert, options=options, table=tables.responses)
         for values, better in zip(material, again, strict=True):
             values[~kept] = better
     facing = (normal * view).sum(axis=1)
     return SamplingFit(normal, material.diffuse_albedo, material.specular, material.roughness,
-                       regimes(weights, np.where(metallic, METAL, DIELECTRIC), facing, material),
-                       (modes.probability / (1 + modes.sigma)).astype(np.float32), modes.spread, np.sqrt(cost))
+                       regimes(found.weights, np.where(metallic, METAL, DIELECTRIC), facing, material),
+                       (modes.probability / (1 + modes.sigma)).astype(np.float32), modes.spread, np.sqrt(found.cost))
 
 
 def _choose(second: np.ndarray, a: tuple[np.ndarray, ...], b: tuple[np.ndarray, ...]) -> list[np.ndarray]:

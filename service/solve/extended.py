@@ -1,18 +1,26 @@
 """Normals and materials under extended lights (photometric sampling): tables of the lights' responses for each part of the view,
-then a search in them, batch by batch."""
+then searches in them, batch by batch.
+
+The first search takes every source as seen by every pixel. From its height follows which sources are hidden and what light the object
+throws on itself; the next searches are made in what is left.
+"""
 
 from collections.abc import Iterator
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
 from kernels.photometric.misfit import LARGEST_ERROR
-from kernels.photometric.modes import GRID_FLOATS
+from kernels.photometric.modes import GRID_FLOATS, angle_degrees
 from kernels.photometric.readings import pad_lights
-from kernels.photometric.response_table import SEARCH_LOBES, response_table
-from kernels.photometric.sampling import Regime, sampling_tables, solve_sampling
+from kernels.photometric.response_table import SEARCH_LOBES, SEARCH_WIDTHS, response_table
+from kernels.photometric.samples import Samples
+from kernels.photometric.sampling import Found, Regime, SamplingTables, sampling_tables, search_sampling, solve_sampling
 from kernels.status import Status
 from service.requests.solve import MAX_SIGMA
-from service.solve.batches import pixel_batches, readable, view_directions
+from service.solve.batches import View, pixel_batches, readable, view_directions
+from service.solve.open_sources import OpenSources, open_sources
 from service.solve.solution import Solution, SolveInput
 from stage.camera import Camera
 from stage.extended_lights import ExtendedLights
@@ -22,6 +30,16 @@ PART_DEGREES = 8.0
 0.5 or 0.7 is off by another 0.3°, that of anything else by less than 0.1°."""
 MOSTLY_OPEN = 0.25
 """Fraction of pixels with an open normal above which the sources do not suit the object."""
+REFINEMENTS = 5
+"""Searches after the first, each with the shadows and the interreflection of the surface before it; a search near a known normal is an
+eighth of the work of a pixel."""
+UNEXPLAINED = 0.1
+"""Cost per light, mean over the pixels whose light the object changes, above which the change is not understood: it is that of readings
+off by a third of the noise that the search assumes, where shadows that are found leave a hundredth to a sixtieth of it."""
+LARGE_PART = 0.1
+"""Part of the light of these pixels that the object changes above which that matters."""
+TABLES_KEPT = 4
+"""Parts of the view whose tables are kept from pass to pass, some 50 megabytes each under 24 sources."""
 
 
 def solve_extended(given: SolveInput, lights: ExtendedLights) -> Solution:
@@ -31,48 +49,151 @@ def solve_extended(given: SolveInput, lights: ExtendedLights) -> Solution:
         given: the images.
         lights: lights of the stack.
     """
-    stack, mask, count = given.stack, given.mask, given.stack.light_count
-    padded = pad_lights(np.tile([0.0, 0.0, 1.0], (count, 1)), lights.irradiance, stack.scale)
-    view = view_directions(given.camera)
-    result = Solution.empty(stack.pixel_count)
-    result.specular, result.roughness = np.zeros((3, stack.pixel_count), np.float16), np.zeros(stack.pixel_count, np.float16)
-    result.regime, result.sigma = np.zeros(stack.pixel_count, np.uint8), np.zeros(stack.pixel_count, np.float16)
-    given.timings.stage("normals", int(mask.sum()))
-    parts = done = 0
-    for inside in view_parts(given.camera, mask):
-        parts += 1
-        rotation = rotation_to_z(view(inside).mean(axis=0, dtype=np.float64))
-        tables = sampling_tables(response_table(lights.direction @ rotation.T, lights.solid_angle, lights.light, lights.share,
-                                                light_count=count, device=given.device))
-
-        def turned_view(pixels: np.ndarray, rotation: np.ndarray = rotation) -> np.ndarray:
-            return (view(pixels) @ rotation.T).astype(np.float32)
-
-        for pixels, samples in pixel_batches(given, padded, turned_view, inside, lobes=SEARCH_LOBES + GRID_FLOATS // count):
-            found = solve_sampling(samples, tables, turned_view(pixels))
-            status = readable(samples)
-            ok = status == Status.OK
-            kept = pixels[ok]
-            result.status[pixels] = status
-            result.normal[:, kept] = (found.normal @ rotation).T[:, ok]
-            result.albedo[:, kept] = found.diffuse_albedo.T[:, ok]
-            result.specular[:, kept] = found.specular.T[:, ok]
-            result.roughness[kept] = found.roughness[ok]
-            result.regime[kept] = found.regime[ok]
-            result.confidence[kept] = found.confidence[ok]
-            result.sigma[kept] = np.minimum(found.sigma[ok], LARGEST_ERROR)
-            result.residual[kept] = found.residual[ok]
-            done += len(pixels)
-            given.timings.advance(done)
-    codes = np.bincount(result.regime[mask.reshape(-1)], minlength=len(Regime))
-    result.facts = {"light_samples": len(lights.share), "views": parts,
-                    "regimes": {regime.name.lower(): int(codes[regime]) for regime in Regime if regime is not Regime.UNSOLVED}}
+    walk = _Walk(given, lights)
+    walk.search()
+    walk.refine()
+    walk.judge()
+    result = walk.result
+    assert result.regime is not None and result.sigma is not None
+    codes = np.bincount(result.regime[given.mask.reshape(-1)], minlength=len(Regime))
+    result.facts |= {"light_samples": len(lights.share), "views": walk.views,
+                     "regimes": {regime.name.lower(): int(codes[regime]) for regime in Regime if regime is not Regime.UNSOLVED}}
     found = result.status == Status.OK
     open_share = float((result.sigma[found] > MAX_SIGMA).mean()) if found.any() else 0.0
     if open_share > MOSTLY_OPEN:
         result.warnings.append(f"frames[].light: at {100 * open_share:.0f} % of the pixels the readings leave the normal open by more than "
                                f"{MAX_SIGMA:g}°, as a mirror does that sees hardly any of the sources: give wider sources, or more of them")
     return result
+
+
+class _Part(NamedTuple):
+    """Pixels that see the object from about one side."""
+
+    number: int
+    pixels: np.ndarray  # [n] row-major positions
+    rotation: np.ndarray  # [3, 3] that brings their mean direction to the viewer to z
+
+
+class _Walk:
+    """The state of a solve between its passes over the image: a search, searches again in what the object leaves of the light, and the
+    posterior."""
+
+    def __init__(self, given: SolveInput, lights: ExtendedLights) -> None:
+        stack = given.stack
+        self._given, self._lights, count = given, lights, stack.pixel_count
+        self._padded = pad_lights(np.tile([0.0, 0.0, 1.0], (stack.light_count, 1)), lights.irradiance, stack.scale)
+        self._view = view_directions(given.camera)
+        self._parts = [_Part(number, pixels, rotation_to_z(self._view(pixels).mean(axis=0, dtype=np.float64)))
+                       for number, pixels in enumerate(view_parts(given.camera, given.mask))]
+        self._tables = lru_cache(TABLES_KEPT)(self._tabulate)
+        self._light: OpenSources | None = None
+        self._doubt = np.zeros(count, np.float16)
+        result = self.result = Solution.empty(count)
+        result.regime, result.sigma = np.zeros(count, np.uint8), np.zeros(count, np.float16)
+        result.specular, result.roughness = np.zeros((3, count), np.float16), np.zeros(count, np.float16)
+        self._found = Found(result.normal.T, np.zeros((count, 3), np.float16), np.zeros(count, bool),
+                            np.zeros((count, 2 + len(SEARCH_WIDTHS)), np.float16), np.zeros(count, np.float32), result.albedo.T,
+                            result.specular.T, result.roughness)
+
+    @property
+    def views(self) -> int:
+        """Return the number of view directions that have tables of their own."""
+        return len(self._parts)
+
+    def search(self) -> None:
+        """Search the normals over the whole visible hemisphere, as if every pixel saw every source."""
+        inside = np.flatnonzero(self._given.mask.reshape(-1))
+        for part, pixels, samples in self._batches("search", inside):
+            status = self.result.status[pixels] = readable(samples)
+            found = search_sampling(samples, self._tables(part.number), self._turned_view(part)(pixels))
+            self._place(part, pixels, found, status == Status.OK)
+
+    def refine(self) -> None:
+        """Search again, near the normals so far, in the light that the object leaves, where it hides sources or throws light on itself.
+
+        The searches are forgotten if they explain the readings no better. What the last one moved a normal by is added to its standard
+        error, and so is the part of its light that the object changes, as far as a misfit shows that the change is not the right one: a
+        misfit of the noise that the search assumes counts whole, as an error of the light from one side by this part.
+        """
+        before = Found(*(values.copy() for values in self._found))
+        costs, cost = [0.0, 0.0], np.zeros(0)
+        for _ in range(REFINEMENTS):
+            light = open_sources(self._given, self._lights, self._padded, self.result.status, self._found, self._view)
+            if light is None:
+                break
+            for part, pixels, samples in self._batches("normals", light.touched):
+                light.keep(pixels, samples)
+                start = self._found.normal[pixels]
+                found = search_sampling(samples, self._tables(part.number), self._turned_view(part)(pixels),
+                                        start=(start @ part.rotation.T).astype(np.float32))
+                self._place(part, pixels, found, np.ones(len(pixels), bool))
+                self._doubt[pixels] = angle_degrees(start, self._found.normal[pixels])
+            self._light, cost = light, self._found.cost[light.touched] / light.given_share
+            costs = [float(before.cost[light.touched].mean()), float(cost.mean())]
+        if self._light is None:
+            return
+        used = costs[1] < costs[0]
+        self.result.facts["own_light"] = {"pixels": len(self._light.touched), "cost_without": round(costs[0], 5),
+                                          "cost": round(costs[1], 5), "used": used}
+        if not used:
+            self._light, self._doubt[:] = None, 0
+            for values, first in zip(self._found, before, strict=True):
+                values[:] = first
+            return
+        touched, change = self._light.touched, float(self._light.change.mean())
+        if costs[1] > UNEXPLAINED and change > LARGE_PART:
+            self.result.warnings.append(f"height: the object hides or throws on itself {100 * change:.0f} % of the light of {len(touched)} "
+                                        "pixels, and that does not explain their readings: hollows may be deeper than they are solved; "
+                                        "capture single lights (type distant or point), whose shadows and bounces are told apart better")
+        self._doubt[touched] = np.hypot(self._doubt[touched], np.degrees(self._light.change * np.sqrt(np.minimum(cost, 1))))
+
+    def judge(self) -> None:
+        """Find how far the readings leave the normals open, and the regime of every pixel."""
+        result, all_found = self.result, self._found
+        assert result.specular is not None and result.roughness is not None and result.regime is not None and result.sigma is not None
+        for part, pixels, samples in self._batches("posterior", np.flatnonzero(result.status == Status.OK)):
+            if self._light is not None:
+                self._light.keep(pixels, samples)
+            turned = Found(*(values[pixels].astype(np.float32) if values.dtype == np.float16 else values[pixels] for values in all_found))
+            turned = turned._replace(normal=(turned.normal @ part.rotation.T).astype(np.float32),
+                                     other=(turned.other @ part.rotation.T).astype(np.float32))
+            fit = solve_sampling(samples, self._tables(part.number), self._turned_view(part)(pixels), found=turned)
+            sigma = np.hypot(fit.sigma, self._doubt[pixels].astype(np.float32))
+            result.normal[:, pixels] = (fit.normal @ part.rotation).T
+            result.albedo[:, pixels] = fit.diffuse_albedo.T
+            result.specular[:, pixels] = fit.specular.T
+            result.roughness[pixels] = fit.roughness
+            result.regime[pixels] = fit.regime
+            result.confidence[pixels] = fit.confidence * (1 + fit.sigma) / (1 + sigma)
+            result.sigma[pixels] = np.minimum(sigma, LARGEST_ERROR)
+            result.residual[pixels] = fit.residual
+
+    def _place(self, part: _Part, pixels: np.ndarray, found: Found, kept: np.ndarray) -> None:
+        """Store what a search found at the pixels that are kept, [n] bool."""
+        turned = found._replace(normal=found.normal @ part.rotation, other=found.other @ part.rotation)
+        for values, new in zip(self._found, turned, strict=True):
+            values[pixels[kept]] = new[kept]
+
+    def _batches(self, stage: str, chosen: np.ndarray) -> Iterator[tuple[_Part, np.ndarray, Samples]]:
+        """Yield chosen pixels, ascending positions, with their readings, part by part, and say how far the stage is."""
+        self._given.timings.stage(stage, len(chosen))
+        done, lobes = 0, SEARCH_LOBES + GRID_FLOATS // self._given.stack.light_count
+        for part in self._parts:
+            pixels = np.intersect1d(part.pixels, chosen, assume_unique=True)
+            for some, samples in pixel_batches(self._given, self._padded, self._turned_view(part), pixels, lobes=lobes):
+                yield part, some, samples
+                done += len(some)
+                self._given.timings.advance(done)
+
+    def _turned_view(self, part: _Part) -> View:
+        """Return the function that gives the direction to the viewer in the frame of a part's tables."""
+        return lambda pixels: (self._view(pixels) @ part.rotation.T).astype(np.float32)
+
+    def _tabulate(self, number: int) -> SamplingTables:
+        """Return the tables of a part of the view."""
+        lights, rotation = self._lights, self._parts[number].rotation
+        return sampling_tables(response_table(lights.direction @ rotation.T, lights.solid_angle, lights.light, lights.share,
+                                              light_count=self._given.stack.light_count, device=self._given.device))
 
 
 def view_parts(camera: Camera, mask: np.ndarray) -> Iterator[np.ndarray]:
