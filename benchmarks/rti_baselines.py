@@ -31,7 +31,8 @@ def rti_fits(captured: Matrix, wanted: Matrix, images: Matrix) -> dict[str, Matr
         images: [lights, values] display values of the captured lights, on which the width of Gaussians is chosen.
 
     Returns:
-        Matrices [n, lights]; the fits of PTM and HSH with 9 and 16 terms, and radial basis functions that interpolate.
+        Matrices [n, lights]; the fits of PTM and HSH with 9 and 16 terms, and radial basis functions: Gaussians, which the ridge lets
+        smooth over noise where lights are close together, and biharmonic ones, which interpolate.
     """
     # the pseudo-inverse, as such software has it: relit itself refuses HSH with 16 terms where lights are on a part of the hemisphere
     fits = {"PTM": biquadratic(wanted) @ np.linalg.pinv(biquadratic(captured))}
