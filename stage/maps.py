@@ -27,6 +27,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], type[np.floating[Any]]]] = {
     "regime": (("Y",), np.float16),
     "specular_normal": (_XYZ, np.float32),
     "height": (("Z",), np.float32),
+    "part": (("Y",), np.float16),
     "sigma": (("Y",), np.float16),
     "confidence": (("Y",), np.float16),
     "status": (("Y",), np.float16),
@@ -55,6 +56,7 @@ class SurfaceMaps:
     regime: np.ndarray | None = None  # [rows, cols] 1 Lambertian, 2 glossy, 3 mirror, 4 mixture of diffuse and specular
     specular_normal: np.ndarray | None = None  # [rows, cols, 3] float32, unit, of the highlight; 0 where none was found
     height: np.ndarray | None = None  # [rows, cols] float32, camera-frame z; metres, or pixels without a scale
+    part: np.ndarray | None = None  # [rows, cols] uint8, parts with a break of the height between them, 1 the largest; None: there is one
     sigma: np.ndarray | None = None  # [rows, cols] standard error of the normal, degrees
     confidence: np.ndarray | None = None  # [rows, cols] 0…1
     status: np.ndarray | None = None  # [rows, cols] uint8, codes of the report
@@ -129,8 +131,9 @@ class SurfaceMaps:
             for name, values in found.items():
                 if name != "status":
                     values[~mask] = 0
-        if "status" in found:
-            found["status"] = found["status"].astype(np.uint8)
+        for name in ("status", "part"):
+            if name in found:
+                found[name] = found[name].astype(np.uint8)
         return cls(camera=camera, mask=mask, estimated=estimated, color_space=exr.color_space_of(metadata), provenance=provenance, **found)
 
 

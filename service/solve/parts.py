@@ -49,12 +49,15 @@ LARGE_SHARE = 0.05
 
 
 def numbered(part: np.ndarray) -> np.ndarray:
-    """Return the mask of a surface that numbers its parts, as shadows are marched: [rows, cols] uint8, 0 outside.
+    """Return the mask of a surface that numbers its parts from 1, the largest first: [rows, cols] uint8, 0 outside.
 
     Args:
-        part: [rows, cols] int, -1 outside; all parts beyond the 254th share a number.
+        part: [rows, cols] int, -1 outside; all parts beyond the 254th largest share a number.
     """
-    return np.minimum(part + 1, 255).astype(np.uint8)
+    inside = part >= 0
+    number = np.zeros(part.max() + 2, dtype=int)
+    number[1 + np.argsort(-np.bincount(part[inside]), kind="stable")] = np.arange(1, len(number))
+    return np.where(inside, np.minimum(number[part + 1], 255), 0).astype(np.uint8)
 
 
 class PlacedPart(NamedTuple):

@@ -24,7 +24,7 @@ from service.solve.extended import solve_extended
 from service.solve.gradient import solve_gradients
 from service.solve.material import refine_material, solve_material
 from service.solve.near import MATERIAL_ROUNDS, Rounds, solve_near
-from service.solve.parts import place_solution
+from service.solve.parts import numbered, place_solution
 from service.solve.reference import solve_by_reference
 from service.solve.solution import Solution, SolveInput, SuspectLight, mark_not_facing, refine_status
 from service.solve.surface import guessed_part, height_warnings, integrate
@@ -202,12 +202,19 @@ def _maps(solution: Solution, solved: np.ndarray, estimated: np.ndarray, method:
         regime=image(solution.regime),
         specular_normal=image(solution.specular_normal),
         height=solution.height,
+        part=_part_numbers(solution),
         sigma=image(solution.standard_error()),
         confidence=image(solution.confidence),
         status=image(solution.status),
         color_space=linear_space(capture.manifest.color_space),
         provenance=provenance,
     )
+
+
+def _part_numbers(solution: Solution) -> np.ndarray | None:
+    """Return the number of the part of each pixel, [rows, cols] uint8, or None where the height has no break."""
+    part = None if solution.integration is None else solution.integration.part
+    return numbered(part) if part is not None and part.max() > 0 else None
 
 
 def _lobes_of_mixtures(solution: Solution, image: Callable[[np.ndarray], np.ndarray | None]) -> dict[str, np.ndarray | None]:

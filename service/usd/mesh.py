@@ -1,7 +1,8 @@
 """A solved height map as a polygon mesh: arrays only, no USD.
 
 One vertex per masked pixel (or every `step`-th one), four-sided faces between neighbours that are all valid, triangles
-where three of the four are. Nothing is bridged at full resolution; with a step, gaps narrower than it are.
+where three of the four are. Nothing is bridged at full resolution; with a step, gaps narrower than it are. No face leads from one part of
+the object to another (layer `part`): nothing was seen of what lies between.
 """
 
 import math
@@ -69,6 +70,9 @@ def height_mesh(maps: SurfaceMaps, *, vertex_budget: int = VERTEX_BUDGET) -> Sur
     step = _step(valid_pixels, vertex_budget)
     valid = valid_pixels[::step, ::step]
     quads, triangles = _faces(valid)
+    if maps.part is not None:
+        part = maps.part[::step, ::step].reshape(-1)
+        quads, triangles = (faces[(part[faces] == part[faces[:, :1]]).all(axis=1)] for faces in (quads, triangles))
     if len(quads) + len(triangles) == 0:
         raise AssetError(f"the mask holds {np.count_nonzero(valid_pixels)} pixels with a height and no three of them "
                          "are neighbours, so there is no face to export")

@@ -41,6 +41,8 @@ def test_a_ball_stands_as_far_before_a_body_as_its_shadows_say(gap, distance, tm
     error = step_error(maps, shot)
     assert abs(error) < 0.03 and abs(error) * 2.0 < 3 * ball["sigma"] < 0.4
     assert report["warnings"] == []
+    inner = np.hypot(*(np.argwhere(shot.part == 0) - np.argwhere(shot.part == 0).mean(axis=0)).T) < 6
+    assert (maps.part[shot.part == 0][inner] == 2).all() and (maps.part == 1).sum() == body["pixels"]
 
 
 def test_a_tilted_disc_over_a_plane_has_both_slopes(tmp_path):
@@ -66,8 +68,8 @@ def test_a_part_whose_shadow_meets_no_other_has_an_unknown_step(tmp_path):
 
 def test_an_object_without_a_break_has_no_parts(tmp_path):
     shot = shoot([Part((0.0, 0.0, 0.0), (0.9, 0.8, 0.7))], sphere_lights(24, least_z=0.2), side=SIDE, across=2.2)
-    _, report = solved(shot, tmp_path)
-    assert report["parts"] == [] and report["warnings"] == []
+    maps, report = solved(shot, tmp_path)
+    assert maps.part is None and report["parts"] == [] and report["warnings"] == []
 
 
 def test_metal_before_metal_is_placed_by_svbrdf(tmp_path):

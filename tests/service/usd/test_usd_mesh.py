@@ -52,6 +52,17 @@ def test_normals_are_area_weighted():
     np.testing.assert_allclose(mesh.normals[1], expected / np.linalg.norm(expected), atol=1e-6)
 
 
+def test_no_face_leads_from_part_to_part():
+    """A sheet of 4 × 6 pixels whose right third stands before the rest: the column of faces between is left out, and no vertex is."""
+    part = np.ones((4, 6), dtype=np.uint8)
+    part[:, 4:] = 2
+    maps = make_sheet(part > 0)
+    whole, cut = (height_mesh(dataclasses.replace(maps, height=part.astype(np.float32), part=parts)) for parts in (None, part))
+    assert (len(whole.quads), len(cut.quads), len(cut.points)) == (15, 12, 24)
+    assert (np.ptp(cut.points[cut.quads][..., 2], axis=1) == 0).all()
+    assert (cut.normals == [0, 0, 1]).all()  # no wall between the parts bends the normals beside it
+
+
 def test_texture_coordinates_are_texel_centres(ball):
     mesh = height_mesh(ball)
     rows, cols = ball.mask.shape
