@@ -150,7 +150,7 @@ def main() -> None:
             image = spread_bounces(tracer.light(**given, seed=i + 1), direct.light(**given, seed=i + 2001), layers)
             if args.noise > 0:
                 deviation = np.sqrt(args.noise**2 * np.maximum(image, 0) + READ_NOISE**2)
-                image = image + deviation * np.random.default_rng(i).standard_normal(image.shape)
+                image = np.maximum(image + deviation * np.random.default_rng(i).standard_normal(image.shape), 0)
             write(f"{i:03d}.exr", image, f"light {i}")
         if (i + 1) % 16 == 0:
             say(f"light {i + 1} of {count}")

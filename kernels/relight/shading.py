@@ -68,7 +68,7 @@ def upload_surface(normal: np.ndarray, diffuse_albedo: np.ndarray, specular: np.
             camera frame.
         roughness: [n] 0…1; 0: no specular lobe, whatever F0.
         second: of pixels that mix two materials; None: there are none. The albedo is that of the whole pixel.
-        profile: [n, 3] of lobe_profile.fit_profile; None: the specular part is that of the BRDF.
+        profile: [n, 3] of lobe_profile.fit_profile; None: the specular part is that of the BRDF. A pixel without a lobe has no second one.
         device: where.
 
     Raises:
@@ -82,6 +82,7 @@ def upload_surface(normal: np.ndarray, diffuse_albedo: np.ndarray, specular: np.
     widths = [plane.shape[1] for plane in planes]
     if count == 0 or widths != WIDTHS:
         raise ArrayError(f"surface has {count} pixels with {widths} values: give {WIDTHS} of one pixel or more")
+    planes[-1] = planes[-1] * np.where(planes[5] > 0, np.float32(0.5 / np.pi), 0)  # 1 / 2π of D V; none where there is no lobe
     pack = devices.pack_width(device)
     padded = -(-count // pack) * pack
     values = np.concatenate(planes, axis=1).T[:, np.minimum(np.arange(padded), count - 1)]
@@ -184,9 +185,20 @@ def lobes(pack: int) -> Any:
             u = wp.max(1.0 - hv, 0.0)
             rise[k] = u * u * u * u * u
         rough = values[15, p]
-        steady, raised = lane_type(), lane_type()
+        whole, middle, narrow = values[21, p], values[22, p], values[23, p]
+        steady, raised, factor = lane_type(), lane_type(), lane_type()
         for k in range(pack):
-            shine = _lobe(rough[k], facing[k], nv[k], nh[k])
+            a2 = _alpha_squared(rough[k])
+            near = nh[k] * nh[k] * a2
+            spread = near - nh[k] * nh[k] + 1.0
+            below = spread * _masking(a2, facing[k], nv[k])
+            inverse = 1.0 / (spread * below)
+            t = near * below * inverse
+            square = t * t
+            fourth = square * square
+            factor[k] = wp.max(whole[k] + square * (middle[k] + narrow[k] * fourth * square), 0.0)
+            peak[k] = t
+            shine = factor[k] * a2 * facing[k] * inverse
             raised[k] = shine * rise[k]
             steady[k] = shine - raised[k]
         for c in range(3):
@@ -200,38 +212,32 @@ def lobes(pack: int) -> Any:
         if most > 0.0:
             other = values[19, p]
             for k in range(pack):
-                shine = share[k] * _lobe(other[k], facing[k], nv[k], nh[k])
+                a2 = _alpha_squared(other[k])
+                spread = nh[k] * nh[k] * (a2 - 1.0) + 1.0
+                below = spread * spread * _masking(a2, facing[k], nv[k])
+                shine = share[k] * factor[k] * wp.min(other[k] * 1.0e6, 1.0) * a2 * facing[k] / below
                 raised[k] = shine * rise[k]
                 steady[k] = shine - raised[k]
             for c in range(3):
                 f0 = values[16 + c, p]
                 for k in range(pack):
                     gloss[c, k] = (1.0 - share[k]) * gloss[c, k] + f0[k] * steady[k] + raised[k]
-        whole, middle, narrow = values[21, p], values[22, p], values[23, p]
-        for k in range(pack):
-            a = wp.max(rough[k], LEAST_ROUGHNESS)
-            a2 = a * a * a * a
-            near = nh[k] * nh[k]
-            peak[k] = near * a2 / (near * (a2 - 1.0) + 1.0)
-            square = peak[k] * peak[k]
-            fourth = square * square
-            factor = wp.max(whole[k] + middle[k] * square + narrow[k] * fourth * fourth, 0.0)
-            gloss[0, k] = factor * gloss[0, k]
-            gloss[1, k] = factor * gloss[1, k]
-            gloss[2, k] = factor * gloss[2, k]
         return facing, gloss, arriving, peak
 
     return evaluate
 
 
 @wp.func
-def _lobe(rough: float, nl: float, nv: float, nh: float) -> float:
-    """Return D V n·l: microfacet.ggx without its guards, which cannot act here and cost the sums of images 6 %."""
+def _alpha_squared(rough: float) -> float:
+    """Return GGX's α² of a roughness."""
     a = wp.max(rough, LEAST_ROUGHNESS)
-    a2 = a * a * a * a
-    spread = nh * nh * (a2 - 1.0) + 1.0
-    masking = nl * wp.sqrt(nv * nv * (1.0 - a2) + a2) + nv * wp.sqrt(nl * nl * (1.0 - a2) + a2)
-    return wp.min(rough * 1.0e6, 1.0) * 0.5 * INVERSE_PI * a2 * nl / (spread * spread * masking)
+    return a * a * a * a
+
+
+@wp.func
+def _masking(a2: float, nl: float, nv: float) -> float:
+    """Return (n·l + n·v) / 2 V: microfacet.ggx without its guards, which cannot act here and cost the sums of images 6 %."""
+    return nl * wp.sqrt(nv * nv * (1.0 - a2) + a2) + nv * wp.sqrt(nl * nl * (1.0 - a2) + a2)
 
 
 @wp.func
