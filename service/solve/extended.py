@@ -33,6 +33,9 @@ MOSTLY_OPEN = 0.25
 REFINEMENTS = 5
 """Searches after the first, each with the shadows and the interreflection of the surface before it; a search near a known normal is an
 eighth of the work of a pixel."""
+LEAST_GAIN = 0.1
+"""Part by which the cost must fall for the searches in the object's own light to be kept: hollows that are there make it fall by 14 % and
+more, those of a mirror whose normals are open, which are none, by 0.5 to 4 %."""
 UNEXPLAINED = 0.1
 """Cost per light, mean over the pixels whose light the object changes, above which the change is not understood: it is that of readings
 off by a third of the noise that the search assumes, where shadows that are found leave a hundredth to a sixtieth of it."""
@@ -111,7 +114,7 @@ class _Walk:
     def refine(self) -> None:
         """Search again, near the normals so far, in the light that the object leaves, where it hides sources or throws light on itself.
 
-        The searches are forgotten if they explain the readings no better. What the last one moved a normal by is added to its standard
+        The searches are forgotten if they explain the readings hardly better. What the last one moved a normal by is added to its standard
         error, and so is the part of its light that the object changes, as far as a misfit shows that the change is not the right one: a
         misfit of the noise that the search assumes counts whole, as an error of the light from one side by this part.
         """
@@ -132,7 +135,7 @@ class _Walk:
             costs = [float(before.cost[light.touched].mean()), float(cost.mean())]
         if self._light is None:
             return
-        used = costs[1] < costs[0]
+        used = costs[1] < (1 - LEAST_GAIN) * costs[0]
         self.result.facts["own_light"] = {"pixels": len(self._light.touched), "cost_without": round(costs[0], 5),
                                           "cost": round(costs[1], 5), "used": used}
         if not used:
