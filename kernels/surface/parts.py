@@ -27,9 +27,9 @@ LEAST_TRUST = 0.1
 """Part of its weight below which loops have found that an edge crosses a break."""
 LEAST_PART = 48
 """Number of pixels below which a fragment is no part: outlines are lined with pixels that show both sides."""
-EDGE_ON = 0.3
+EDGE_ON = 0.4
 """Cosine between normal and line of sight below which a surface is seen edge on, and does not tell whether it touches its neighbour: an
-outline where a smooth surface turns away from the viewer is one of a part. It is taken half a pixel beyond the last pixel centre."""
+outline where a smooth surface turns away from the viewer is one of a part. It is taken a pixel beyond the last pixel centre."""
 MEETING = 0.6
 """Part of the edge between two fragments along which they must meet to belong together."""
 PLAY_PIXELS, PLAY_JUMP, PLAY_NOISE = 0.1, 0.6, 3.0
@@ -110,9 +110,9 @@ def cut(normal: np.ndarray, ray: np.ndarray, slope: np.ndarray, weight: np.ndarr
 
 
 def _squared_end(facing: np.ndarray, label: np.ndarray, cell: np.ndarray, inner: np.ndarray) -> np.ndarray:
-    """Return the squared cosine to the viewer where a fragment ends, half a pixel beyond a cell; on a sphere it falls steadily to 0."""
+    """Return the squared cosine to the viewer a pixel beyond the last cell of a fragment; on a sphere it falls steadily to 0."""
     here = np.maximum(facing[cell], 0) ** 2
-    return here - np.where(label[inner] == label[cell], 0.5 * np.maximum(np.maximum(facing[inner], 0) ** 2 - here, 0), 0)
+    return here - np.where(label[inner] == label[cell], np.maximum(np.maximum(facing[inner], 0) ** 2 - here, 0), 0)
 
 
 def label_cells(usable: np.ndarray, open_edges: np.ndarray, pitch: int) -> tuple[np.ndarray, int]:

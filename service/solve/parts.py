@@ -44,6 +44,8 @@ BLUR_PIXELS = 0.7
 """Standard deviation, in pixels of the thinned picture, of the place of a shadow's edge."""
 TURNED_AWAY = 0.6
 """Cosine to the viewer below which the outermost pixels of a part are taken to turn away from the viewer."""
+LEAST_SIGMA_PIXELS = 0.5
+"""Least σ of an offset, in pixels of the thinned picture: rays are followed pixel by pixel."""
 LARGE_SHARE = 0.05
 """Part of the surface from which a part of unknown step is warned of."""
 
@@ -215,7 +217,7 @@ class _Scene:
         shadows = march_part(self._pixels, self._toward, height, self._parts, thickness, number, self._projection)
         evidence = weigh_offsets(shadows, self._odds, self._on == number, self._group, reach=self._size,
                                  blur=self._blur)
-        step = choose_offset(evidence, least_sigma=self._blur)
+        step = choose_offset(evidence, least_sigma=LEAST_SIGMA_PIXELS * self._blur / BLUR_PIXELS)
         return step if step.high - step.low < 2 * OPEN * self._size else None
 
     def _guess_thickness(self, normal: np.ndarray, view: View) -> np.ndarray:
