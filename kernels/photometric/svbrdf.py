@@ -16,9 +16,10 @@ import numpy as np
 from kernels.photometric.certainty import assess
 from kernels.photometric.hypotheses import Diffuse, Prior, SearchOptions, search_normals
 from kernels.photometric.material import MATT, fit_given, fit_material, fit_tinted
+from kernels.photometric.metal_search import Metals, search_metals
 from kernels.photometric.mixtures import NO_PAIRS, Mixture, mix_materials
 from kernels.photometric.refine import refine
-from kernels.photometric.samples import Samples
+from kernels.photometric.samples import Samples, choose
 
 NEIGHBOURS = ((-0.15, 0.0), (0.15, 0.0), (0.0, -0.1), (0.0, 0.1))
 """Differences in roughness and slope of the shapes that are tried besides the shared one: a material varies by as much over an object."""
@@ -46,8 +47,8 @@ class SvbrdfFit(NamedTuple):
 
 
 def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, options: SearchOptions | None = None,
-                 shared: np.ndarray | None = None, pairs: np.ndarray = NO_PAIRS, roughness: np.ndarray | None = None,
-                 single_lobe: bool = True, prior: Prior | None = None) -> SvbrdfFit:
+                 shared: np.ndarray | None = None, pairs: np.ndarray = NO_PAIRS, metals: Metals | None = None,
+                 roughness: np.ndarray | None = None, single_lobe: bool = True, prior: Prior | None = None) -> SvbrdfFit:
     """Estimate the normal and the material of sampled pixels.
 
     Args:
@@ -57,6 +58,7 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, options
         options: how candidates are judged.
         shared: [materials, 4] of shared_materials.choose_materials; None: every pixel has a material of its own.
         pairs: [pairs, 2, 4] of mixtures.choose_pairs.
+        metals: of metal_search.metals_of; None: normals are not searched under shared metals.
         roughness: [n] of an earlier fit, from which the single lobe begins; None: it is fitted first.
         single_lobe: False leaves the joint fit of one lobe out, to see what it buys.
         prior: normals to which the search is drawn, because the readings do not support the lobes; then the joint fit, which knows no
@@ -87,6 +89,15 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, options
     normal, spread = average_normals(np.stack(normals), np.stack(costs))
     if prior is None:
         material = fit_material(samples, normal, shape=shape, options=options, shared=shared)
+        if metals is not None:
+            better = search_metals(samples, normal, material, metals, shape=shape, options=options)
+            moved = np.flatnonzero((better != normal).any(axis=1))
+            if len(moved):
+                again = fit_material(choose(samples, moved), better[moved], shape=shape, options=options, shared=shared)
+                for plane, replaced in zip(material, again, strict=True):
+                    plane[moved] = replaced
+                spread = np.hypot(spread, _angles(normal, better))
+                normal = better
     else:
         material = fit_given(samples, normal, MATT, shape=shape, options=options)
         start = normal

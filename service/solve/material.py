@@ -14,6 +14,7 @@ from kernels.photometric.hypotheses import Diffuse, Prior, search_normals
 from kernels.photometric.lambert import solve_lambert
 from kernels.photometric.lobes import GEOMETRY, MIXTURE
 from kernels.photometric.material import MATT, fit_given, fit_material, fit_tinted
+from kernels.photometric.metal_search import Metals, metals_of
 from kernels.photometric.misfit import LARGEST_ERROR
 from kernels.photometric.mixtures import NO_PAIRS, choose_pairs
 from kernels.photometric.near import NearField
@@ -56,6 +57,8 @@ class MaterialOptions:
     """Let a pixel have two of the shared materials."""
     parts: bool = True
     """Move parts of the object in depth to where their shadows agree with the images."""
+    metals: bool = True
+    """Search the normals of metals again under the lobes that they share."""
 
 
 WHOLE_SOLVER = MaterialOptions()
@@ -111,6 +114,7 @@ class _Walk:
         self._roughness = self.result.roughness = np.zeros(count, np.float16)
         self._lambertian = np.zeros_like(self.result.normal)
         self._shape, self._supported, self._pairs = Diffuse(), True, NO_PAIRS
+        self._metals: Metals | None = None
 
     def start(self) -> None:
         """Find the normals of `robust`, from which the search begins, and under few lights those of `lambert`."""
@@ -188,8 +192,10 @@ class _Walk:
         materials = choose_materials(samples, normal, shape=self._shape)
         self.result.facts["shared_materials"] = [{"specular": material[:3].tolist(), "roughness": float(material[3])}
                                                  for material in materials.round(4).astype(float)]
+        single = fit_material(samples, normal, shape=self._shape, shared=materials)
+        if self._options.metals:
+            self._metals = metals_of(materials, single)
         if self._options.mixtures:
-            single = fit_material(samples, normal, shape=self._shape, shared=materials)
             self._pairs = choose_pairs(samples, normal, materials, single, shape=self._shape)
         return materials
 
@@ -204,7 +210,7 @@ class _Walk:
             light.keep(pixels, samples)
             roughness = self._roughness[pixels].astype(np.float32) if self._interreflection else None
             found = solve_svbrdf(samples, result.normal[:, pixels].T, shape=self._shape, shared=materials, pairs=self._pairs,
-                                 roughness=roughness, prior=self._prior(pixels))
+                                 metals=self._metals, roughness=roughness, prior=self._prior(pixels))
             result.normal[:, pixels] = found.normal.T
             result.albedo[:, pixels] = found.diffuse_albedo.T
             self._specular[:, pixels] = found.specular.T
