@@ -45,6 +45,16 @@ def unproject(u: float, v: float, z: float, perspective: bool, scale: wp.vec2, c
 
 
 @wp.func
+def between_pixels(height: wp.array2d(dtype=float), u: float, v: float) -> float:
+    """Return the height between the four pixels around (u, v), bilinear; pixel (row r, column c) is at (c, r)."""
+    c, r = int(wp.floor(u)), int(wp.floor(v))
+    fu, fv = u - float(c), v - float(r)
+    upper = height[r, c] * (1.0 - fu) + height[r, c + 1] * fu
+    lower = height[r + 1, c] * (1.0 - fu) + height[r + 1, c + 1] * fu
+    return upper * (1.0 - fv) + lower * fv
+
+
+@wp.func
 def in_shadow_within(height: wp.array2d(dtype=float), mask: wp.array2d(dtype=wp.uint8), row: int, col: int, toward: wp.vec3,
                      reach: float, perspective: bool, scale: wp.vec2, centre: wp.vec2) -> bool:
     """Return whether the surface hides a light in this direction from this pixel before `reach`: what lies behind a light hides nothing.

@@ -37,7 +37,7 @@ class DirectLight(NamedTuple):
     """Whether cast shadows of the height are taken out."""
     arriving: ArrivingLight | None
     """None: no interreflection is taken out."""
-    albedo: np.ndarray  # [3, pixels] diffuse, of the normals from which all this follows
+    albedo: np.ndarray  # [3, pixels] of the light that other surfaces send, at the normals from which all this follows
     albedo_scale: float = 1.0
     """Albedo of the surface over this albedo, which is relative where the scale of the lights is."""
 
@@ -59,7 +59,7 @@ class DirectLight(NamedTuple):
 
 
 def direct_light(given: SolveInput, lights: Lights, field: NearField | None, normal: np.ndarray, material: Material,
-                 solved: np.ndarray, *, shadows: bool, interreflection: bool, parts: bool) -> DirectLight | None:
+                 bouncing: np.ndarray, solved: np.ndarray, *, shadows: bool, interreflection: bool, parts: bool) -> DirectLight | None:
     """Find what the object does to its own light, or return None when no pixel is solved.
 
     Args:
@@ -68,6 +68,7 @@ def direct_light(given: SolveInput, lights: Lights, field: NearField | None, nor
         field: where the lights are, where some light is near.
         normal: [3, pixels] float32, found so far.
         material: of the same.
+        bouncing: [3, pixels] albedo of the light that other surfaces send.
         solved: [rows, cols] bool.
         shadows: whether cast shadows are taken out.
         interreflection: whether interreflection is taken out.
@@ -83,4 +84,4 @@ def direct_light(given: SolveInput, lights: Lights, field: NearField | None, nor
     arriving = arriving_light(given, lights, normal, height, solved) if interreflection else None
     mask = solved.astype(np.uint8) if surface.part is None else numbered(surface.part)
     on_device = wp.array(mask, dtype=wp.uint8, device=given.device)
-    return DirectLight(given, lights, field, on_device, height, shadows, arriving, material.albedo)
+    return DirectLight(given, lights, field, on_device, height, shadows, arriving, bouncing)

@@ -1,8 +1,8 @@
 """The light that an object throws on itself, from its height and normals and from its own images.
 
-The image is cut into square patches. Their radiance under each light is measured, so that all bounces are in it, and form factors
-carry it from patch to patch (kernels/surface/interreflection.py). The light that arrives is interpolated between patches and
-subtracted from the readings of each pixel (kernels/photometric/bounce.py).
+The image is cut into square patches, which are small, because larger ones would average over the sides of a fold. Their radiance under
+each light is measured, so that all bounces are in it, and form factors carry it from patch to patch (kernels/surface/interreflection.py).
+The light that arrives is interpolated between patches and subtracted from the readings of each pixel (kernels/photometric/bounce.py).
 
 Source: Nayar, Ikeuchi and Kanade, "Shape from interreflections", IJCV 1991, section 3: on a Lambertian surface radiance is direct
 radiance + ρ K radiance, with the form factors in K.
@@ -15,13 +15,13 @@ import numpy as np
 import warp as wp
 
 from kernels.photometric.readings import Lights
-from kernels.surface.interreflection import form_factors
+from kernels.surface.interreflection import gather_light
 from service.solve.solution import SolveInput
 from service.solve.surface import projection_of
 from stage.stack import Stack
 
-PATCHES = 2500
-"""Most patches: pairs grow with their square, and twice as many change normals by a few hundredths of a degree."""
+PATCHES = 20_000
+"""Most patches: each pixel of an object of some 140 pixels across, and the memory that their light takes (12 bytes a patch and light)."""
 PIXELS_PER_PATCH = 9
 """Pixels whose mean stands for the radiance of a patch."""
 LEAST_COVER = 0.5
@@ -58,24 +58,6 @@ class ArrivingLight(NamedTuple):
             shares.append(np.where(patch >= 0, share, 0))
         total = np.sum(shares, axis=0)
         return np.stack(corners, axis=1), (np.stack(shares, axis=1) / np.maximum(total, 1e-6)[:, None]).astype(np.float32)
-
-    def patch_of(self, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
-        """Return [n] the number of the patch that each pixel lies in; -1 where there is none."""
-        return self.numbers[rows // self.side, cols // self.side]
-
-    def middles(self, rows: np.ndarray, cols: np.ndarray) -> np.ndarray:
-        """Return, for each patch in order, which of these pixels lies nearest its middle.
-
-        Args:
-            rows, cols: [n] positions of pixels, one or more in every patch.
-
-        Returns:
-            [patches] indices into the pixels.
-        """
-        patch, middle = self.patch_of(rows, cols), (self.side - 1) / 2
-        order = np.lexsort(((rows % self.side - middle) ** 2 + (cols % self.side - middle) ** 2, patch))
-        numbers, first = np.unique(patch[order], return_index=True)
-        return order[first[numbers >= 0]]
 
 
 def arriving_light(given: SolveInput, lights: Lights, normal: np.ndarray, height: wp.array, solved: np.ndarray) -> ArrivingLight | None:
@@ -115,11 +97,11 @@ def arriving_light(given: SolveInput, lights: Lights, normal: np.ndarray, height
     pixel = (-centres[:, 2] if perspective else np.ones(len(kept))) / float(np.mean(projection.scale))
     areas = count[kept] * pixel**2 / np.maximum((facing * to_viewer).sum(axis=1), LEAST_FACING)
     on_device = wp.array(solved.astype(np.uint8), dtype=wp.uint8, device=given.device)
-    factors = form_factors(centres, facing, areas, height, on_device, projection, device=given.device)
     radiance = _patch_radiance(given.stack, lights, pixels, patch, len(kept))
-    matrix = factors.numpy()
-    light = np.stack([matrix @ radiance[:, channel] for channel in range(3)], axis=1)
-    return ArrivingLight(light.astype(np.float32), number.reshape(shape), side)
+    cells = np.stack(np.divmod(kept, shape[1]), axis=1)
+    light = gather_light(centres, facing, areas, cells, radiance.reshape(len(kept), -1), height, on_device, projection,
+                         device=given.device).reshape(radiance.shape)
+    return ArrivingLight(light, number.reshape(shape), side)
 
 
 def _patch_radiance(stack: Stack, lights: Lights, pixels: np.ndarray, patch: np.ndarray, patches: int) -> np.ndarray:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from kernels.photometric.bounce import bounce_albedo
 from kernels.photometric.diffuse_shape import choose_diffuse
 from kernels.photometric.hypotheses import Diffuse, Prior, search_normals
 from kernels.photometric.lambert import solve_lambert
@@ -113,6 +114,7 @@ class _Walk:
         self._specular = self.result.specular = np.zeros((3, count), np.float16)
         self._roughness = self.result.roughness = np.zeros(count, np.float16)
         self._lambertian = np.zeros_like(self.result.normal)
+        self._bouncing = np.zeros((3, count), np.float32)  # albedo of the light that other surfaces send
         self._shape, self._supported, self._pairs = Diffuse(), True, NO_PAIRS
         self._metals: Metals | None = None
 
@@ -135,6 +137,7 @@ class _Walk:
         assert before.roughness is not None
         self.result.normal[:, solved], self.result.albedo[:, solved] = before.normal[:, solved], before.albedo[:, solved]
         self._roughness[solved] = before.roughness[solved]
+        self._bouncing[:, solved] = before.albedo[:, solved]
 
     def choose_shape(self, light: DirectLight | None = None) -> None:
         """Choose the shape of the diffuse lobe, and find out whether few lights support the lobes at all.
@@ -167,13 +170,15 @@ class _Walk:
                          fit_given(samples, normal, MATT, shape=self._shape))
                 result.albedo[:, pixels], self._roughness[pixels] = first.diffuse_albedo.T, first.roughness
                 self._specular[:, pixels] = first.specular.T
+                self._bouncing[:, pixels] = bounce_albedo(samples, normal, first, shape=self._shape).T
 
     def direct_light(self) -> DirectLight | None:
         """Find what the object does to its own light, from the first search; None when no pixel is solved."""
         solved = (self.result.status == Status.OK).reshape(self._given.mask.shape)
         material = Material(self.result.albedo.copy(), self._specular.copy(), self._roughness.copy())
-        light = direct_light(self._given, self._lights, self._field, self.result.normal, material, solved, shadows=self._options.shadows,
-                             interreflection=self._interreflection, parts=self._options.parts and self._interreflection)
+        light = direct_light(self._given, self._lights, self._field, self.result.normal, material, self._bouncing, solved,
+                             shadows=self._options.shadows, interreflection=self._interreflection,
+                             parts=self._options.parts and self._interreflection)
         if light is None or light.arriving is None or self._field is not None or not (self._supported and self._options.settling):
             return light  # near lights settle the light in rounds, with the surface
         relative = self._given.relative and self._options.scale

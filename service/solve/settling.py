@@ -1,12 +1,13 @@
 """Interreflection settled: the surface, its albedo and the light that it throws on itself are found again from each other.
 
 Bounced light makes hollows look shallower, so that the first search underestimates form factors, and its albedo contains the bounce. One
-pixel of each patch is searched again in its direct light; what this changes is carried over to the patch, and the arriving light follows
+pixel of each block is searched again in its direct light; what this changes is carried over to the block, and the arriving light follows
 anew. Where the scale of the lights is unknown, the scale of albedo is chosen from the images in each round.
 
 Source: Nayar, Ikeuchi and Kanade, "Shape from interreflections", IJCV 1991, section 4: shape and interreflection are corrected in turn.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -20,6 +21,8 @@ from service.solve.direct_light import LARGEST_ALBEDO, DirectLight
 from service.solve.interreflection import ArrivingLight, arriving_light
 from stage.colour import GREY_WEIGHTS
 
+BLOCKS = 2500
+"""Most pixels that are searched again, each for a square block around it."""
 ROUNDS = 2
 """Rounds: the third changes the scale of albedo by 1 %."""
 RINGS = (((2.0, 4.0, 7.0), 14), (((0.9, 1.8), 8), ((0.4,), 6)))
@@ -62,11 +65,9 @@ def settle(light: DirectLight, normal: np.ndarray, shape: Diffuse, pick: Callabl
         relative: whether the scale of the lights, and so of albedo, is unknown.
     """
     assert light.arriving is not None
-    pixels = np.flatnonzero(light.solved.numpy())
-    places = np.divmod(pixels, light.given.camera.width)
-    patch = light.arriving.patch_of(*places)
-    middles = pixels[light.arriving.middles(*places)]
-    inside, patch = pixels[patch >= 0], patch[patch >= 0]
+    solved = light.solved.numpy() > 0
+    pixels = np.flatnonzero(solved)
+    block, middles = _blocks(pixels, light.given.camera.width)
     first, albedo, start = normal, light.albedo, normal[:, middles].T
     turned = start
     for _ in range(ROUNDS):
@@ -75,12 +76,30 @@ def settle(light: DirectLight, normal: np.ndarray, shape: Diffuse, pick: Callabl
         light.keep(middles, samples)
         turned = search_normals(samples, start, shape=shape, wide=RINGS[0], fine=RINGS[1]).normal
         again, dimmed = first.copy(), albedo.copy()
-        again[:, inside] = _turn(first[:, inside].T, start[patch], turned[patch]).T
-        dimmed[:, inside] = albedo[:, inside] * _direct_part(readings_of(samples), whole)[patch]
-        arriving = arriving_light(light.given, light.lights, again, light.height, light.solved.numpy() > 0)
+        again[:, pixels] = _turn(first[:, pixels].T, start[block], turned[block]).T
+        dimmed[:, pixels] = albedo[:, pixels] * _direct_part(readings_of(samples), whole)[block]
+        arriving = arriving_light(light.given, light.lights, again, light.height, solved)
         light = light._replace(arriving=arriving, albedo=dimmed)
     found = _fit(light, middles, turned, pick) if relative else None
     return Settled(light._replace(albedo_scale=_value(found)), found)
+
+
+def _blocks(pixels: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return [n] the number of the square block that each pixel lies in, and [blocks] the pixel of each that is nearest its middle.
+
+    Args:
+        pixels: [n] row-major positions in the image, one or more.
+        width: of the image.
+    """
+    side = max(1, math.ceil(math.sqrt(len(pixels) / BLOCKS)))
+    rows, cols = np.divmod(pixels, width)
+    number = rows // side * width + cols // side
+    middle = (side - 1) / 2
+    order = np.lexsort(((rows % side - middle) ** 2 + (cols % side - middle) ** 2, number))
+    _, first, block = np.unique(number[order], return_index=True, return_inverse=True)
+    back = np.empty_like(block)
+    back[order] = block
+    return back, pixels[order[first]]
 
 
 def _value(fit: ScaleFit | None) -> float:

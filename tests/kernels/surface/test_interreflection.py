@@ -1,32 +1,65 @@
-"""Form factors against a closed form and float64, and the bounced light taken off readings."""
+"""Light between patches against a closed form and float64, and the bounced light taken off readings."""
 
 import numpy as np
 import pytest
 import warp as wp
 
 from kernels.errors import ArrayError
-from kernels.photometric.bounce import subtract_bounce
+from kernels.photometric.bounce import bounce_albedo, subtract_bounce
+from kernels.photometric.hypotheses import Diffuse
+from kernels.photometric.material import fit_tinted
 from kernels.photometric.near import NearField, pad_places
 from kernels.photometric.samples import readings_of, to_host
-from kernels.surface.interreflection import form_factors
+from kernels.surface.interreflection import gather_light
 from kernels.surface.shadows import Projection
-from tests.kernels.photometric.test_svbrdf import sample
+from tests.kernels.photometric.test_svbrdf import LIGHTS, render, sample, tilted
 from tests.kernels.scenes import cap
 from tests.reference.groove import Groove
 
 
-def factors_of(groove: Groove, device: str, *, mask=None, height=None) -> np.ndarray:
+def arriving_on(groove: Groove, radiance: np.ndarray, device: str, *, height=None, normals=None, opening=0.0) -> np.ndarray:
+    """What arrives at each patch of a groove; with the unit matrix as radiance these are the form factors."""
     side = groove.side
     z = (groove.points[:, 2].reshape(side, side) if height is None else height).astype(np.float32)
-    inside = np.ones((side, side), np.uint8) if mask is None else mask
-    return form_factors(groove.points, groove.normals, groove.areas, wp.array(z, dtype=wp.float32, device=device),
-                        wp.array(inside, dtype=wp.uint8, device=device),
-                        Projection(False, wp.vec2(1.0, 1.0), wp.vec2(side / 2, side / 2)), device=device).numpy()
+    cells = np.stack(np.divmod(np.arange(side**2), side), axis=1)
+    return gather_light(groove.points, groove.normals if normals is None else normals, groove.areas, cells, radiance,
+                        wp.array(z, dtype=wp.float32, device=device), wp.ones((side, side), dtype=wp.uint8, device=device),
+                        Projection(False, wp.vec2(1.0, 1.0), wp.vec2(side / 2, side / 2)), device=device, opening=opening)
+
+
+def factors_of(groove: Groove, device: str, *, height=None) -> np.ndarray:
+    return arriving_on(groove, np.eye(groove.side**2, dtype=np.float32), device, height=height)
 
 
 def test_factors_agree_with_float64(device):
     groove = Groove(16)
     np.testing.assert_allclose(factors_of(groove, device), groove.factors(), rtol=1e-4, atol=1e-7)  # float32
+
+
+@pytest.mark.parametrize("opening, within", [(0.25, 0.03), (0.5, 0.13)])
+def test_far_patches_send_as_groups(device, opening, within):
+    """A group stands for its members to second order in its size over its distance. The seam is the worst place, because the groups
+    that face it are large; the light of uneven patches is weighted by their area."""
+    groove = Groove(32)
+    radiance = np.random.default_rng(1).uniform(0.5, 1.5, (32**2, 5)).astype(np.float32)
+    exact = groove.factors() @ radiance
+    found = arriving_on(groove, radiance, device, opening=opening)
+    np.testing.assert_allclose(found, exact, atol=within * exact.mean())
+    assert np.abs(found - exact).max() > 1e-4 * exact.mean()  # groups did send
+
+
+def test_the_two_sides_of_a_ridge_do_not_cancel(device):
+    """Narrow pleats seen from afar: those of their faces that look at a patch send it light, and those that look away do not take it
+    back, as a group of mean normal would."""
+    side = 32
+    groove = Groove(side)
+    pleats = np.tile(np.where(np.arange(side) % 2 == 0, 1.0, -1.0), side)
+    left = groove.points[:, 0] < 0
+    slant = np.stack([pleats, np.zeros(side**2), np.ones(side**2)], axis=1) / np.sqrt(2)
+    normals = np.where(left[:, None], slant, groove.normals)
+    radiance = np.ones((side**2, 1), dtype=np.float32)
+    exact, found = (arriving_on(groove, radiance, device, normals=normals, opening=opening)[~left] for opening in (0.0, 0.25))
+    np.testing.assert_allclose(found, exact, atol=0.05 * exact.mean())
 
 
 def plates_at_right_angles(width: float, length: float) -> float:
@@ -62,6 +95,8 @@ def test_a_wall_between_hides(device):
 
 def test_shapes_are_checked(device):
     groove = Groove(4)
+    with pytest.raises(ArrayError, match="radiance"):
+        arriving_on(groove, np.ones((15, 1), np.float32), device)
     groove.areas = groove.areas[:-1]
     with pytest.raises(ArrayError, match="areas"):
         factors_of(groove, device)
@@ -85,6 +120,23 @@ def test_taking_off_the_bounce_leaves_the_direct_light(device):
     np.testing.assert_allclose(red, direct, atol=2**-11 * whole.max())
     with pytest.raises(ArrayError, match="corners must be"):
         subtract_bounce(samples, arriving, corners + 1, shares, np.full((count, 3), albedo), np.array([0.3, 0.6, 0.1]))
+
+
+def test_bounced_light_is_that_of_the_whole_reflection(device):
+    """Soft light added to a surface is taken by the fit for a wide tinted lobe, in place of the diffuse one; a matt fit keeps it. A
+    metal has no diffuse reflection, whatever a matt fit would call it."""
+    normal = tilted(60)
+    colour = np.array([0.6, 0.5, 0.4])
+    soft = 0.04 * colour[:, None, None] * (1 + LIGHTS[None, :, None, 0])  # as a wall beside it sends
+    samples, _ = sample(render(normal, albedo=colour, alpha=0.1) + soft, device)
+    tinted = fit_tinted(samples, normal.astype(np.float32), shape=Diffuse())
+    found = bounce_albedo(samples, normal.astype(np.float32), tinted, shape=Diffuse())
+    wrong, alone = (np.quantile(np.abs(np.log(np.maximum(albedo, 1e-3) / colour)), 0.9) for albedo in (found, tinted.diffuse_albedo))
+    assert wrong < 0.3  # the added light is 10 to 20 % of the diffuse
+    assert alone > 0.3
+    samples, _ = sample(render(normal, albedo=np.zeros(3), alpha=0.16, f0=0.8), device)
+    tinted = fit_tinted(samples, normal.astype(np.float32), shape=Diffuse())
+    assert bounce_albedo(samples, normal.astype(np.float32), tinted, shape=Diffuse()).max() < 0.05
 
 
 def test_near_light_is_taken_off_in_the_unit_of_each_reading(device):
