@@ -21,8 +21,9 @@ from kernels.microfacet import INVERSE_PI
 from kernels.packs import Band, as_packs, channels_type, pack_type
 from kernels.relight.shading import Surface, lobes, require_same
 
-MOST_RATIO = 4.0
-"""Largest ratio of image to model that the gloss is scaled by: what is brighter is no error of a lobe, and stays a difference."""
+MOST_RATIO = 1.25
+"""Largest ratio of image to model that the gloss is scaled by; what is brighter stays a difference. On the flank of a lobe that is
+too wide, the ratio says little of the peak: unbounded, it makes sharp highlights half as bright again as they are."""
 
 
 class ShownModel(NamedTuple):

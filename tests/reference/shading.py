@@ -79,7 +79,7 @@ def readings(pixels, directions, visible=None):
     return parts(pixels, directions, visible).sum(axis=0)
 
 
-def shown(images, model, most=4.0):
+def shown(images, model, most=1.25):
     """What the specular parts of a model [2, lights, 3, P] are multiplied by to be as bright as images [lights, 3, P]: image / model."""
     whole = model.sum(axis=0)
     return np.where(whole > 1e-9, np.clip(images / np.where(whole > 1e-9, whole, 1), 0, most), 1)
