@@ -106,11 +106,13 @@ VARIANTS: dict[str, Callable[[Case], np.ndarray]] = {
     "+ averaged over nearby shapes": lambda case: solve_svbrdf(case.samples, case.robust, shape=case.shape, single_lobe=False).normal,
     "+ a single lobe fitted jointly with the normal": lambda case: solve_svbrdf(case.samples, case.robust, shape=case.shape).normal,
     "+ readings in cast shadows of the height left out":
-        lambda case: case.whole(MaterialOptions(interreflection=False, metals=False)),
-    "+ interreflection subtracted, materials shared": lambda case: case.whole(MaterialOptions(settling=False, parts=False, metals=False)),
-    "+ parts placed in depth by their shadows": lambda case: case.whole(MaterialOptions(settling=False, metals=False)),
-    "+ shape and interreflection in turn": lambda case: case.whole(MaterialOptions(scale=False, metals=False)),
-    "+ scale of albedo where that of the lights is unknown": lambda case: case.whole(MaterialOptions(metals=False)),
+        lambda case: case.whole(MaterialOptions(interreflection=False, metals=False, intensities=False)),
+    "+ interreflection subtracted, materials shared":
+        lambda case: case.whole(MaterialOptions(settling=False, parts=False, metals=False, intensities=False)),
+    "+ parts placed in depth by their shadows": lambda case: case.whole(MaterialOptions(settling=False, metals=False, intensities=False)),
+    "+ shape and interreflection in turn": lambda case: case.whole(MaterialOptions(scale=False, metals=False, intensities=False)),
+    "+ scale of albedo where that of the lights is unknown": lambda case: case.whole(MaterialOptions(metals=False, intensities=False)),
+    "+ intensities of the lights refined": lambda case: case.whole(MaterialOptions(metals=False)),
     "+ metals searched again under the lobes that they share (`svbrdf`)": lambda case: case.whole(MaterialOptions()),
     "· the same without two materials in a pixel, which leave the normals as they are":
         lambda case: case.whole(MaterialOptions(mixtures=False)),

@@ -122,6 +122,24 @@ def to_host(samples: Samples, packs: wp.array) -> np.ndarray:
     return flat[0] if packs.ndim == 1 else flat.T
 
 
+def host_values(samples: Samples, packs: wp.array) -> np.ndarray:
+    """Return [packs · lights] packs on the device as [n, lights] host values; waits for the device."""
+    values = packs.numpy()
+    if samples.light_stride == 1:
+        flat = values.reshape(samples.packs, samples.light_count, samples.lanes).transpose(0, 2, 1)
+    else:
+        flat = values.reshape(samples.light_count, samples.packs, samples.lanes).transpose(1, 2, 0)
+    return flat.reshape(-1, samples.light_count)[: samples.pixel_count]
+
+
+def device_values(samples: Samples, values: np.ndarray) -> wp.array:
+    """Return [n, lights] host values as [packs · lights] packs on the device."""
+    order = np.minimum(np.arange(samples.packs * samples.lanes), samples.pixel_count - 1)
+    planes = values[order].astype(np.float32).reshape(samples.packs, samples.lanes, samples.light_count)
+    planes = planes.transpose(0, 2, 1) if samples.light_stride == 1 else planes.transpose(2, 0, 1)
+    return wp.array(np.ascontiguousarray(planes).reshape(-1, samples.lanes), dtype=samples.grey.dtype, device=samples.device)
+
+
 def readings_of(samples: Samples) -> np.ndarray:
     """Return [n, lights] grey readings radiance over irradiance; below 0 where there is none; waits for the device."""
     values, level = samples.grey.numpy().reshape(_planes(samples)), samples.level.numpy()

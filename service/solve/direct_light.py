@@ -57,6 +57,18 @@ class DirectLight(NamedTuple):
             subtract_bounce(samples, self.arriving.light, corners, shares, albedo, channel_weights(self.lights, GREY_WEIGHTS),
                             None if self.field is None else self.field.at(pixels))
 
+    def under(self, lights: Lights, factor: np.ndarray) -> "DirectLight":
+        """Return the same under lights of other strength.
+
+        Args:
+            lights: the same lights with another irradiance.
+            factor: [lights] their irradiance over that so far.
+        """
+        arriving = self.arriving
+        if arriving is not None:
+            arriving = arriving._replace(light=(arriving.light / factor).astype(np.float32))
+        return self._replace(lights=lights, arriving=arriving)
+
 
 def direct_light(given: SolveInput, lights: Lights, field: NearField | None, normal: np.ndarray, material: Material,
                  bouncing: np.ndarray, solved: np.ndarray, *, shadows: bool, interreflection: bool, parts: bool) -> DirectLight | None:

@@ -13,6 +13,7 @@ from kernels.photometric.bounce import bounce_albedo
 from kernels.photometric.diffuse_shape import choose_diffuse
 from kernels.photometric.hypotheses import Diffuse, Prior, search_normals
 from kernels.photometric.lambert import solve_lambert
+from kernels.photometric.light_factors import find_light_factors
 from kernels.photometric.lobes import GEOMETRY, MIXTURE
 from kernels.photometric.material import MATT, fit_given, fit_material, fit_tinted
 from kernels.photometric.metal_search import Metals, metals_of
@@ -35,6 +36,8 @@ from stage.colour import GREY_WEIGHTS
 
 SPREAD_PIXELS = 384
 """Pixels, spread over the object, from which the shape of the diffuse lobe and the shared materials are chosen."""
+INTENSITY_SQUARES = 8
+"""Number of squares along the longer side of the image; intensities found in one half of them must explain the other half."""
 PRIOR_STRENGTH = 10.0
 """Strength of the prior towards the normals of `lambert` where the general solver is not supported: a standard deviation of some degrees
 for a reading that misfits by the noise floor of the search."""
@@ -52,6 +55,8 @@ class MaterialOptions:
     """Find that light again from the surface without it."""
     scale: bool = True
     """Choose the scale of albedo from the images where that of the lights is unknown."""
+    intensities: bool = True
+    """Refine the intensities of the lights where the object shows that they are wrong."""
     sharing: bool = True
     """Let pixels share materials."""
     mixtures: bool = True
@@ -79,7 +84,7 @@ def solve_material(given: SolveInput, lights: Lights, field: NearField | None = 
     walk.start()
     walk.choose_shape()
     walk.search()
-    light = walk.direct_light()
+    light = walk.refine_intensities(walk.direct_light())
     walk.fit(light, walk.choose_materials(light))
     return walk.result
 
@@ -186,6 +191,27 @@ class _Walk:
         if relative:
             self.result.facts["albedo_scale"] = settled.report()
         return settled.light
+
+    def refine_intensities(self, light: DirectLight | None) -> DirectLight | None:
+        """Replace the intensities of the lights where the object shows that others explain it better; returns the direct light of them."""
+        told = self._supported and not self._few and self._field is None and self._options.intensities
+        if light is None or not told:
+            return light
+        samples, count = self._pick(self._spread), self._given.stack.light_count
+        light.keep(self._spread, samples)
+        square = max(self._given.mask.shape) / INTENSITY_SQUARES
+        row, col = (np.floor(part / square).astype(int) for part in np.divmod(self._spread, self._given.camera.width))
+        start, directions = self.result.normal[:, self._spread].T, self._lights.direction[:count]
+        found = find_light_factors(samples, start, directions, row, col, shape=self._shape)
+        self.result.facts["light_factors"] = {"believed": found.believed, "left_out_gain": round(found.gain, 4)}
+        if not found.believed:
+            return light
+        self.result.facts["light_factors"] |= {"spread": round(float(np.std(np.log(found.factor))), 4),
+                                               "factors": found.factor.round(4).tolist()}
+        irradiance = self._lights.irradiance.copy()
+        irradiance[:count] *= found.factor[:, None]
+        self._lights = self._lights._replace(irradiance=irradiance)
+        return light.under(self._lights, found.factor)
 
     def choose_materials(self, light: DirectLight | None) -> np.ndarray | None:
         """Return [materials, 4] F0 and roughness that pixels share, or None where they share none."""
