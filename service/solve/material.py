@@ -38,6 +38,9 @@ SPREAD_PIXELS = 384
 """Pixels, spread over the object, from which the shape of the diffuse lobe and the shared materials are chosen."""
 INTENSITY_SQUARES = 8
 """Number of squares along the longer side of the image; intensities found in one half of them must explain the other half."""
+FIRST = (((5.0, 10.0, 16.0, 24.0, 34.0, 46.0), 20), (((2.5, 5.0), 10), ((0.9, 1.8), 8), ((0.4,), 6)))
+"""Rings of the first search, which the surface and the next search begin with. It judges two thirds of the candidates of that one: bounced
+light, which is not known yet, moves normals by more than a tenth of a degree."""
 PRIOR_STRENGTH = 10.0
 """Strength of the prior towards the normals of `lambert` where the general solver is not supported: a standard deviation of some degrees
 for a reading that misfits by the noise floor of the search."""
@@ -168,7 +171,7 @@ class _Walk:
         result = self.result
         for pixels, samples in self._batches("search"):
             start = result.normal[:, pixels] if self._supported else self._lambertian[:, pixels]
-            normal = search_normals(samples, start.T, shape=self._shape, prior=self._prior(pixels)).normal
+            normal = search_normals(samples, start.T, shape=self._shape, prior=self._prior(pixels), wide=FIRST[0], fine=FIRST[1]).normal
             result.normal[:, pixels] = normal.T
             if self._interreflection:
                 first = (fit_tinted(samples, normal, shape=self._shape) if self._supported else
