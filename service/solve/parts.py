@@ -136,14 +136,14 @@ def place_parts(given: SolveInput, lights: Lights, normal: np.ndarray, material:
     for _ in range(SWEEPS):
         restless = False
         for number in (int(one) for one in moved):
-            step = scene.step_of(number)
+            step = scene.step_of(number, against=[int(order[0]), *(other for other in found if other != number)])
             before = found.pop(number, NOWHERE)
             if step is None:
                 scene.move(number, -before.offset)
                 continue
             scene.move(number, step.offset)
             found[number] = Offset(step.offset + before.offset, step.sigma, step.low + before.offset, step.high + before.offset)
-            restless |= abs(step.offset) > SETTLED * step.sigma
+            restless |= before is NOWHERE or abs(step.offset) > SETTLED * step.sigma
         if not restless or len(moved) == 1:
             break
     placed = []
@@ -204,21 +204,23 @@ class _Scene:
         self._group[around] = np.arange(len(lit)) * GROUPS // len(lit)
         self._pixels = wp.array(inside.astype(np.int32), dtype=wp.vec2i, device=given.device)
         self._toward = wp.array(toward.astype(np.float32), dtype=wp.vec3, device=given.device)
-        self._parts = wp.array(self._thin_part, dtype=wp.int32, device=given.device)
 
     def _positions(self, inside: np.ndarray) -> np.ndarray:
         """Return the positions in the image of [n, 2] rows and columns of the thinned picture."""
         return (inside * self._step + self._step // 2) @ np.array([self._part.shape[1], 1])
 
-    def step_of(self, number: int) -> Offset | None:
-        """Return how far a part should move against all others, or None where the shadows leave that open."""
+    def step_of(self, number: int, *, against: list[int]) -> Offset | None:
+        """Return how far a part should move against some others, or None where the shadows leave that open; the rest is not there."""
+        there = [number, *against]
+        parts = wp.array(np.where(np.isin(self._thin_part, there), self._thin_part, -1), dtype=wp.int32, device=self._device)
+        odds = np.where(np.isin(self._on, there)[:, None], self._odds, 0)
         height = wp.array(np.ascontiguousarray(self._height[self._thin], dtype=np.float32), dtype=float, device=self._device)
         thickness = wp.array(self._thickness.astype(np.float32), dtype=float, device=self._device)
-        shadows = march_part(self._pixels, self._toward, height, self._parts, thickness, number, self._projection)
-        evidence = weigh_offsets(shadows, self._odds, self._on == number, self._group, reach=self._size,
-                                 blur=self._blur)
+        shadows = march_part(self._pixels, self._toward, height, parts, thickness, number, self._projection)
+        evidence = weigh_offsets(shadows, odds, self._on == number, self._group, reach=self._size, blur=self._blur)
         step = choose_offset(evidence, least_sigma=LEAST_SIGMA_PIXELS * self._blur / BLUR_PIXELS)
-        return step if step.high - step.low < 2 * OPEN * self._size else None
+        bounded = -self._size < step.low and step.high < self._size
+        return step if bounded and step.high - step.low < 2 * OPEN * self._size else None
 
     def _guess_thickness(self, normal: np.ndarray, view: View) -> np.ndarray:
         """Return the distance from front to back of parts that are mirrored in their outlines, on the thinned picture.
