@@ -23,6 +23,11 @@ LEAST_TURN = np.radians(8.0)
 """Least angle between the normals of two neighbours that may be a break."""
 TURN_OF_MEDIAN = 4.0
 """The same in medians of this angle over all neighbours: noise and curvature turn normals everywhere."""
+STEADY, REACH = 0.5, 2
+"""Part of its turn by which the edges beside an edge must turn alike where a surface is merely round, and how many of them are looked
+at: three in line, since the outline of a part may turn twice, at a pixel that shows both sides."""
+NECK = 1
+"""Pixels beside cut edges that are left out where necks are looked for: an outline is open where both sides happen to share a normal."""
 LEAST_TRUST = 0.1
 """Part of its weight below which loops have found that an edge crosses a break."""
 LEAST_PART = 48
@@ -90,12 +95,14 @@ def cut(normal: np.ndarray, ray: np.ndarray, slope: np.ndarray, weight: np.ndarr
     for way, step in enumerate((1, grid.pitch)):
         turn[way, :-step] = np.arccos(np.clip((n[:, :-step] * n[:, step:]).sum(axis=0), -1.0, 1.0))
     usual = float(np.median(turn[there])) if there.any() else 0.0
-    turned = there & (turn > max(LEAST_TURN, TURN_OF_MEDIAN * usual))
+    turned = there & (turn > max(LEAST_TURN, TURN_OF_MEDIAN * usual)) & ~_rounded(n, there, grid.pitch)
     lost = turned | (there & (left < LEAST_TRUST * weight) & turned.any())
     usable = there[0] | there[1]
     usable[1:] |= there[0, :-1]
     usable[grid.pitch :] |= there[1, : -grid.pitch]
-    label, count = label_cells(usable, there & ~lost, grid.pitch)
+    label, count = _part_at_necks(*label_cells(usable, there & ~lost, grid.pitch), there & ~lost, lost, grid.pitch)
+    for way, step in enumerate((1, grid.pitch)):
+        lost[way, :-step] |= there[way, :-step] & (label[:-step] != label[step:])
     way, first = np.nonzero(lost)
     second = first + np.where(way == 1, grid.pitch, 1)
     xy = _cells(ray, grid)
@@ -109,10 +116,66 @@ def cut(normal: np.ndarray, ray: np.ndarray, slope: np.ndarray, weight: np.ndarr
                      turned[way, first], np.abs(alone[0] - alone[1]), ends < EDGE_ON**2)
 
 
+def _rounded(n: np.ndarray, there: np.ndarray, pitch: int) -> np.ndarray:
+    """Return which edges, [2, size], turn outwards as steadily as their neighbours in line: there a thin rod or ring is round."""
+    out = np.zeros(there.shape, dtype=bool)
+    for way, step in enumerate((1, pitch)):
+        change = np.where(there[way, :-step], n[:, step:] - n[:, :-step], 0)
+        least = STEADY * (change**2).sum(axis=0)
+        alike = [np.zeros(least.shape, dtype=bool) for _ in range(2 * REACH + 1)]  # of the edges that lie -REACH to REACH farther on
+        for k in range(1, REACH + 1):
+            near, far = slice(None, -k * step), slice(k * step, None)
+            along = (change[:, near] * change[:, far]).sum(axis=0)
+            alike[REACH + k][near], alike[REACH - k][far] = along > least[near], along > least[far]
+        two_before, before, _, after, two_after = alike
+        outwards = change[0] > 0 if way == 0 else change[1] < 0
+        out[way, :-step] = outwards & ((before & two_before) | (before & after) | (after & two_after))
+    return out
+
+
 def _squared_end(facing: np.ndarray, label: np.ndarray, cell: np.ndarray, inner: np.ndarray) -> np.ndarray:
     """Return the squared cosine to the viewer a pixel beyond the last cell of a fragment; on a sphere it falls steadily to 0."""
     here = np.maximum(facing[cell], 0) ** 2
     return here - np.where(label[inner] == label[cell], np.maximum(np.maximum(facing[inner], 0) ** 2 - here, 0), 0)
+
+
+def _part_at_necks(label: np.ndarray, count: int, open_edges: np.ndarray, lost: np.ndarray, pitch: int) -> tuple[np.ndarray, int]:
+    """Return the fragments, [size] int with -1 outside, parted where only a neck of few pixels connects them, and their number.
+
+    What is left without the pixels beside lost edges falls apart at necks. Pieces of at least LEAST_PART pixels grow back until they meet.
+    """
+    near = lost[0] | lost[1]
+    near[1:] |= lost[0, :-1]
+    near[pitch:] |= lost[1, :-pitch]
+    for _ in range(NECK):
+        for step in (1, pitch):
+            wide = near.copy()
+            wide[step:] |= near[:-step]
+            wide[:-step] |= near[step:]
+            near = wide
+    inner = (label >= 0) & ~near
+    within = open_edges & inner
+    within[0, :-1] &= inner[1:]
+    within[1, :-pitch] &= inner[pitch:]
+    core, cores = label_cells(inner, within, pitch)
+    large = np.bincount(core[core >= 0], minlength=cores) >= LEAST_PART
+    seed = np.where((core >= 0) & large[np.maximum(core, 0)], core + count, -1) if cores else core
+    seeded = np.zeros(count, dtype=bool)
+    seeded[label[seed >= 0]] = True
+    grown = np.where((label >= 0) & ~seeded[np.maximum(label, 0)], label, seed)
+    front = np.flatnonzero(seed >= 0)
+    while len(front):
+        reached = []
+        for step, ways, back in ((1, 0, 0), (pitch, 1, 0), (1, 0, 1), (pitch, 1, 1)):
+            into = front - step if back else front + step
+            passed = open_edges[ways, into if back else front] & (grown[into] < 0)
+            grown[into[passed]] = grown[front[passed]]
+            reached.append(into[passed])
+        front = np.unique(np.concatenate(reached))
+    kept, number = np.unique(grown[grown >= 0], return_inverse=True)
+    out = np.full(label.shape, -1)
+    out[grown >= 0] = number
+    return out, len(kept)
 
 
 def label_cells(usable: np.ndarray, open_edges: np.ndarray, pitch: int) -> tuple[np.ndarray, int]:

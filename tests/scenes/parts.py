@@ -22,6 +22,7 @@ class Part(NamedTuple):
     albedo: tuple[float, float, float] = (0.6, 0.5, 0.4)
     f0: tuple[float, float, float] = (0.0, 0.0, 0.0)
     roughness: float = 0.5
+    hole: float = 0.0  # radius of the hole of a disc
 
     def hit(self, origin: np.ndarray, way: np.ndarray) -> np.ndarray:
         """Distance along each ray [n, 3] + t [n, 3] or [3], FAR where it misses."""
@@ -31,7 +32,8 @@ class Part(NamedTuple):
             if self.normal is not None:
                 across = way @ np.asarray(self.normal)
                 t = (towards @ np.asarray(self.normal)) / across
-                good = (np.abs(across) > 1e-12) & (((origin + t[:, None] * way - self.centre) ** 2).sum(1) < self.radii[0] ** 2)
+                from_centre = ((origin + t[:, None] * way - self.centre) ** 2).sum(1)
+                good = (np.abs(across) > 1e-12) & (from_centre < self.radii[0] ** 2) & (from_centre > self.hole**2)
             else:
                 o, d = -towards / np.asarray(self.radii), way / np.asarray(self.radii)
                 a, b, c = (d * d).sum(1), (o * d).sum(1), (o * o).sum(1) - 1

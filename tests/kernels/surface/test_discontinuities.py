@@ -89,3 +89,15 @@ def test_a_ball_before_a_wall_is_a_part_and_one_that_stands_on_it_keeps_its_outl
     found = solve(shape, device, discontinuities=True)
     assert parts_of(found).tolist() == [int((~ball).sum()), int(ball.sum())]
     assert len(np.unique(found.part[ball])) == 1
+
+
+def test_an_outline_with_a_gap_parts_a_ball_from_a_wall(device):
+    """In a strip two pixels wide the wall bends up to the ball by less than 8° a pixel, as wrong normals do. Through it, both were one."""
+    shape, ball = shapes.ball_before_wall(192)
+    normal, middle = shape.normal.copy(), 96
+    end = np.flatnonzero(ball[middle])[-1]
+    turns = np.arccos(normal[2, middle, end]) * np.linspace(1, 0, 20)
+    normal[:, middle - 1 : middle + 1, end + 1 : end + 21] = np.stack([np.sin(turns), 0 * turns, np.cos(turns)])[:, None]
+    found = solve(shape._replace(normal=normal), device, discontinuities=True)
+    assert len(parts_of(found)) == 2
+    assert np.mean(found.part[ball] == np.median(found.part[ball])) > 0.99 and parts_of(found)[1] < 1.02 * ball.sum()
