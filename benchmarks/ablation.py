@@ -119,12 +119,13 @@ VARIANTS: dict[str, Callable[[Case], np.ndarray]] = {
 }
 
 
-def ablation_table(data: Path | None, glossy: Path | None) -> list[str] | None:
+def ablation_table(data: Path | None, glossy: Path | None, traced: Path | None) -> list[str] | None:
     """Return the mean and median angular error of each variant of the solver on each object in the data folders.
 
     Args:
         data: folder with diligent_ball and diligent_cat.
         glossy: folder with glossy and glossy_metal of samples/make_glossy.py.
+        traced: folder with two_parts and figure of samples/make_parts.py.
 
     Returns:
         Lines of Markdown, or None without any data.
@@ -136,9 +137,10 @@ def ablation_table(data: Path | None, glossy: Path | None) -> list[str] | None:
             diligent.import_folder(data / name, capture)
             truth = np.load(data / name / "normal_gt.npz")["normal"]
             cases.append(load_case(name, Capture.open(capture), truth, capture / ".relit"))
-        for name in ("glossy", "glossy_metal") if glossy else ():
-            truth = read_truth(glossy / name / "truth.exr")["normal"]
-            cases.append(load_case(name, Capture.open(glossy / name), truth, Path(folder) / f"{name}-stack"))
+        for home, names in ((glossy, ("glossy", "glossy_metal")), (traced, ("two_parts", "figure"))):
+            for name in names if home else ():
+                truth = read_truth(home / name / "truth.exr")["normal"]
+                cases.append(load_case(name, Capture.open(home / name), truth, Path(folder) / f"{name}-stack"))
         if not cases:
             return None
         lines = ["Angular error of normals, degrees, mean / median, over some 4000 pixels of each object:", "",

@@ -101,7 +101,7 @@ def materials(given: argparse.Namespace) -> list[str] | None:
 
 def ablation(given: argparse.Namespace) -> list[str] | None:
     """Measure the parts of the general solver, one at a time."""
-    return ablation_table(given.data, given.glossy)
+    return ablation_table(given.data, given.glossy, given.relighting)
 
 
 def relighting(given: argparse.Namespace) -> list[str]:
@@ -188,7 +188,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--data", type=Path, help="folder with diligent_ball and diligent_cat")
     parser.add_argument("--glossy", type=Path, help="folder with glossy and glossy_metal of samples/make_glossy.py")
-    parser.add_argument("--relighting", type=Path, help="folder with glossy and owl of samples/make_relight_checks.py")
+    parser.add_argument("--relighting", type=Path, help="folder with glossy and owl of samples/make_relight_checks.py, and "
+                                                           "two_parts and figure of samples/make_parts.py")
     parser.add_argument("--rig", type=Path, help="folder with the sets of samples/make_rig.py")
     parser.add_argument("--large", type=Path, help="folder where some 12 GiB may be written and are removed again")
     parser.add_argument("--only", nargs="+", choices=SECTIONS, help="sections to measure (default: all)")
