@@ -25,7 +25,7 @@ NO_GAP = -1.0e30
 
 
 class PartShadows(NamedTuple):
-    """Of each pixel and light: what the surface on the way to the light does."""
+    """What the surface on the way to the light does, for each pixel and light."""
 
     highest: wp.array  # [pixels, lights] float32: largest height of the surface above the ray, over all of it that moves against the pixel
     lowest: wp.array  # [pixels, lights] float32: the least

@@ -18,7 +18,7 @@ HALF_DEGREES = 70.0
 RIM = np.sin(np.radians(HALF_DEGREES))
 """Radius of the rim in sphere radii."""
 PART = (1 - np.cos(np.radians(HALF_DEGREES))) / 2
-"""Of the sphere, the part that the bowl covers."""
+"""The part of the sphere that the bowl covers."""
 
 
 class Bowl(NamedTuple):

@@ -24,8 +24,8 @@ def shown(pixels, readings, energy, device, visible=None):
 
 @pytest.mark.parametrize("count", [1, 45, 64])
 def test_it_is_the_twin(count, device):
-    """Of energies of both signs, some none, and images that differ from the model. Tolerance: twice the lobes, of the sum of what is
-    summed; at most MOST_RATIO of it is gloss."""
+    """The energies have both signs, some are none, and the images differ from the model. Tolerance: twice the lobes, of the sum of what
+    is summed; at most MOST_RATIO of it is gloss."""
     rng = np.random.default_rng(count)
     pixels = scattered_pixels(count, seed=count)
     visible = rng.choice(np.array([0, 255, 90], np.uint8), (len(LIGHTS), count))

@@ -15,7 +15,7 @@ from tests.kernels.scenes import cap
 from tests.reference.relight import best_weights, matern, rotation_about_y, samples, texel_directions, texel_solid_angles
 
 ROUNDING = 1e-9
-"""Of an inverse of a well-conditioned matrix, relative to the sum of the weights."""
+"""Error of the inverse of a well-conditioned matrix, relative to the sum of the weights."""
 SAMPLED = 2e-3
 """Part of the whole energy by which a light is off because a map is cut into 2048 samples; it is .0004 where an even sky is bright."""
 DOME = cap(300, 180)[cap(300, 180)[:, 2] > 0]

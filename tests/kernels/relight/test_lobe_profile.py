@@ -14,7 +14,7 @@ from tests.reference import shading as reference
 LIGHTS = cap(64, 85)
 IRRADIANCE = 3 * colours(64, seed=4)
 SIDE = 12
-"""Of a square of pixels that are neighbours."""
+"""Pixels along the side of a square of neighbours."""
 
 
 def square(seed=0):

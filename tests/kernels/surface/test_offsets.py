@@ -44,7 +44,7 @@ def march(height, part, device, perspective=False, far=0.0):
 
 @pytest.mark.parametrize("perspective", [False, True])
 def test_one_march_tells_the_shadows_at_every_offset(perspective, device):
-    """Of a block that stands anywhere before the floor, marched once where it lies, against a march where it was moved to.
+    """Shadows of a block that stands anywhere before the floor, marched once where it lies, against a march where it was moved to.
 
     In perspective it moves by growing about the eye. Tolerance: where a gap is within a hundredth of a pixel of the ray, rounding decides.
     """
