@@ -35,7 +35,9 @@ from service.solve.support import FEW_LIGHTS, supports_lobes
 from stage.colour import GREY_WEIGHTS
 
 SPREAD_PIXELS = 384
-"""Pixels, spread over the object, from which the shape of the diffuse lobe and the shared materials are chosen."""
+"""Pixels, spread over the object, from which the shape of the diffuse lobe is chosen."""
+MATERIAL_PIXELS = 640
+"""Pixels, spread over the object, from which the shared materials are chosen: an object has more materials than diffuse lobes."""
 INTENSITY_SQUARES = 8
 """Number of squares along the longer side of the image; intensities found in one half of them must explain the other half."""
 FIRST = (((5.0, 10.0, 16.0, 24.0, 34.0, 46.0), 20), (((2.5, 5.0), 10), ((0.9, 1.8), 8), ((0.4,), 6)))
@@ -220,9 +222,10 @@ class _Walk:
         """Return [materials, 4] F0 and roughness that pixels share, or None where they share none."""
         if light is None or not (self._options.sharing and self._supported):
             return None
-        samples = self._pick(self._spread)
-        light.keep(self._spread, samples)
-        normal = self.result.normal[:, self._spread].T
+        spread = self._solvable[evenly(len(self._solvable), MATERIAL_PIXELS)]
+        samples = self._pick(spread)
+        light.keep(spread, samples)
+        normal = self.result.normal[:, spread].T
         materials = choose_materials(samples, normal, shape=self._shape)
         self.result.facts["shared_materials"] = [{"specular": material[:3].tolist(), "roughness": float(material[3])}
                                                  for material in materials.round(4).astype(float)]
