@@ -69,10 +69,10 @@ def settle(light: DirectLight, normal: np.ndarray, shape: Diffuse, pick: Callabl
     pixels = np.flatnonzero(solved)
     block, middles = _blocks(pixels, light.given.camera.width)
     first, albedo, start = normal, light.albedo, normal[:, middles].T
-    turned = start
+    turned, whole = start, readings_of(pick(middles))
     for _ in range(ROUNDS):
-        light = light._replace(albedo_scale=_value(_fit(light, middles, turned, pick)) if relative else 1.0)
-        whole, samples = readings_of(pick(middles)), pick(middles)
+        light = light._replace(albedo_scale=_value(_fit(light, middles, turned, whole)) if relative else 1.0)
+        samples = pick(middles)
         light.keep(middles, samples)
         turned = search_normals(samples, start, shape=shape, wide=RINGS[0], fine=RINGS[1]).normal
         again, dimmed = first.copy(), albedo.copy()
@@ -80,7 +80,7 @@ def settle(light: DirectLight, normal: np.ndarray, shape: Diffuse, pick: Callabl
         dimmed[:, pixels] = albedo[:, pixels] * _direct_part(readings_of(samples), whole)[block]
         arriving = arriving_light(light.given, light.lights, again, light.height, solved)
         light = light._replace(arriving=arriving, albedo=dimmed)
-    found = _fit(light, middles, turned, pick) if relative else None
+    found = _fit(light, middles, turned, whole) if relative else None
     return Settled(light._replace(albedo_scale=_value(found)), found)
 
 
@@ -107,8 +107,8 @@ def _value(fit: ScaleFit | None) -> float:
     return 1.0 if fit is None else fit.scale
 
 
-def _fit(light: DirectLight, pixels: np.ndarray, normal: np.ndarray, pick: Callable[[np.ndarray], Samples]) -> ScaleFit | None:
-    """Fit the scale of albedo at some pixels of known normals [n, 3]."""
+def _fit(light: DirectLight, pixels: np.ndarray, normal: np.ndarray, readings: np.ndarray) -> ScaleFit | None:
+    """Fit the scale of albedo at some pixels of known normals [n, 3] and readings [n, lights]."""
     assert isinstance(light.arriving, ArrivingLight)
     weights = channel_weights(light.lights, GREY_WEIGHTS)
     albedo = light.albedo[:, pixels].T.astype(np.float64) * weights
@@ -116,8 +116,7 @@ def _fit(light: DirectLight, pixels: np.ndarray, normal: np.ndarray, pick: Calla
     rows, cols = np.divmod(pixels, light.given.camera.width)
     corners, shares = light.arriving.at(rows, cols)
     arriving = np.einsum("nc,nk,nkcl->nl", albedo, shares, light.arriving.light[corners], optimize=True)
-    readings = readings_of(pick(pixels)).astype(np.float64)
-    ratio = np.where((readings >= 0) & (grey > LEAST_ALBEDO), readings / np.maximum(grey, LEAST_ALBEDO), np.nan)
+    ratio = np.where((readings >= 0) & (grey > LEAST_ALBEDO), readings.astype(np.float64) / np.maximum(grey, LEAST_ALBEDO), np.nan)
     square = max(light.given.mask.shape) / GROUPS
     group = (rows // square * (GROUPS + 1) + cols // square).astype(int)
     cosine = normal @ light.lights.direction[: readings.shape[1]].T
