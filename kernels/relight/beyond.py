@@ -19,7 +19,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.packs import Band, as_packs, bit_of, pack_type
 from kernels.relight.latlong import first_of_equals
-from kernels.relight.shading import Surface, lobes, modelled, require_same
+from kernels.relight.shading import Surface, lobes, modelled, require_same, upload_captured
 
 LONGEST_REACH = math.pi / 4
 """Largest reach, radians. With it, light that is 90 degrees from every captured light is wholly beyond them: a surface that faces it may
@@ -114,12 +114,11 @@ def compare_beyond(band: Band, surface: Surface, visible: wp.array, direction: n
     count, device = len(direction), surface.device
     require_same(band, surface, visible, count)
     pack = devices.pack_width(device)
-    factor = np.divide(scale[:count, None], irradiance, out=np.zeros((count, 3)), where=irradiance > 0)
-    place = np.concatenate([direction, np.zeros((count, 1))], axis=1)
+    places, factors = upload_captured(direction, irradiance, scale, device)
     sums = wp.empty((2, surface.packs * pack), dtype=wp.float32, device=device)
     devices.launch(_compare_kernel(pack), surface.packs,
-                   [band.values, band.saturated, band.frame_count, surface.values, visible, wp.array(place, dtype=wp.vec4, device=device),
-                    wp.array(factor, dtype=wp.vec3, device=device), wp.array(pairs, dtype=wp.vec2i, device=device)],
+                   [band.values, band.saturated, band.frame_count, surface.values, visible, places, factors,
+                    wp.array(pairs, dtype=wp.vec2i, device=device)],
                    [as_packs(sums, device)], device=device)
     return sums
 

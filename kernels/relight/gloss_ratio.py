@@ -19,7 +19,7 @@ from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.microfacet import INVERSE_PI
 from kernels.packs import Band, as_packs, channels_type, pack_type
-from kernels.relight.shading import Surface, lobes, require_same
+from kernels.relight.shading import Surface, lobes, require_same, upload_captured
 
 MOST_RATIO = 1.25
 """Largest ratio of image to model that the gloss is scaled by; what is brighter stays a difference. On the flank of a lobe that is
@@ -67,14 +67,13 @@ def sum_shown(band: Band, surface: Surface, visible: wp.array, direction: np.nda
     if np.shape(energy) != (count, 3):
         raise ArrayError(f"energy is {np.shape(energy)}: give {(count, 3)}")
     pack = devices.pack_width(device)
-    factor = np.divide(scale[:count, None], irradiance, out=np.zeros((count, 3)), where=irradiance > 0)
-    place = np.concatenate([direction, np.zeros((count, 1))], axis=1)
+    places, factors = upload_captured(direction, irradiance, scale, device)
     used = np.flatnonzero(np.abs(energy).max(axis=1, initial=0) > 0).astype(np.int32)
     sums = wp.empty((6, surface.packs * pack), dtype=wp.float32, device=device)
     devices.launch(_sum_kernel(pack), surface.packs,
-                   [band.values, band.frame_count, surface.values, visible, wp.array(place, dtype=wp.vec4, device=device),
-                    wp.array(factor, dtype=wp.vec3, device=device), wp.array(energy, dtype=wp.vec3, device=device),
-                    wp.array(used, dtype=wp.int32, device=device)], [as_packs(sums, device)], device=device)
+                   [band.values, band.frame_count, surface.values, visible, places, factors,
+                    wp.array(energy, dtype=wp.vec3, device=device), wp.array(used, dtype=wp.int32, device=device)],
+                   [as_packs(sums, device)], device=device)
     whole, ratio = sums.numpy()[:, : surface.pixel_count].reshape(2, 3, -1)
     return ShownModel(whole, ratio)
 

@@ -21,7 +21,7 @@ from kernels.microfacet import INVERSE_PI
 from kernels.packs import Band, as_packs, bit_of, channels_type, pack_type
 from kernels.relight.beyond import spacing
 from kernels.relight.gloss_ratio import gloss_ratio, mean_ratio
-from kernels.relight.shading import Surface, lobes, require_same
+from kernels.relight.shading import Surface, lobes, require_same, upload_captured
 
 POOL = 2
 """Half-width, in pixels, of the window over which the sums of β are pooled."""
@@ -74,12 +74,10 @@ def compare_model(band: Band, surface: Surface, visible: wp.array, direction: np
     if np.shape(neighbours) != (count, 3) or np.shape(shares) != (count, 3):
         raise ArrayError(f"neighbours are {np.shape(neighbours)}, shares {np.shape(shares)}: give {(count, 3)} of both")
     pack = devices.pack_width(device)
-    factor = np.divide(scale[:count, None], irradiance, out=np.zeros((count, 3)), where=irradiance > 0)
-    place = np.concatenate([direction, np.zeros((count, 1))], axis=1)
+    places, factors = upload_captured(direction, irradiance, scale, device)
     sums = wp.empty((2, surface.packs * pack), dtype=wp.float32, device=device)
     devices.launch(_compare_kernel(pack), surface.packs,
-                   [band.values, band.saturated, band.frame_count, surface.values, visible,
-                    wp.array(place, dtype=wp.vec4, device=device), wp.array(factor, dtype=wp.vec3, device=device),
+                   [band.values, band.saturated, band.frame_count, surface.values, visible, places, factors,
                     wp.array(neighbours, dtype=wp.vec3i, device=device), wp.array(shares, dtype=wp.vec3, device=device)],
                    [as_packs(sums, device)], device=device)
     return sums

@@ -21,7 +21,7 @@ from kernels import device as devices
 from kernels.microfacet import INVERSE_PI
 from kernels.packs import Band, as_packs, bit_of, pack_type
 from kernels.relight.guide import pooled
-from kernels.relight.shading import Surface, lobes, require_same
+from kernels.relight.shading import Surface, lobes, require_same, upload_captured
 
 TERMS = 4
 """Number of terms whose moments are taken: three of the profile, and the diffuse part."""
@@ -64,12 +64,11 @@ def profile_moments(band: Band, surface: Surface, visible: wp.array, direction: 
     count, device = len(direction), surface.device
     require_same(band, surface, visible, count)
     pack = devices.pack_width(device)
-    factor = np.divide(scale[:count, None], irradiance, out=np.zeros((count, 3)), where=irradiance > 0)
-    place = np.concatenate([direction, np.zeros((count, 1))], axis=1)
+    places, factors = upload_captured(direction, irradiance, scale, device)
     moments = wp.empty((MOMENTS, surface.packs * pack), dtype=wp.float32, device=device)
     devices.launch(_moments_kernel(pack), surface.packs,
-                   [band.values, band.saturated, band.frame_count, surface.values, visible, wp.array(place, dtype=wp.vec4, device=device),
-                    wp.array(factor, dtype=wp.vec3, device=device)], [as_packs(moments, device)], device=device)
+                   [band.values, band.saturated, band.frame_count, surface.values, visible, places, factors],
+                   [as_packs(moments, device)], device=device)
     return moments
 
 

@@ -14,7 +14,7 @@ from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.packs import Band, as_packs, pack_type
 from kernels.relight.latlong import first_of_equals
-from kernels.relight.shading import Surface, lobes, modelled, require_same
+from kernels.relight.shading import Surface, lobes, modelled, require_same, upload_captured
 from kernels.relight.smooth import walk
 from kernels.relight.sources import Sources
 from kernels.relight.triangulation import edge_planes, triangulate_sphere
@@ -54,7 +54,7 @@ def sum_near(band: Band, surface: Surface, visible: wp.array, sources: Sources, 
     part = triangles.share[vertex, owner] / np.add.reduceat(triangles.share[vertex, owner], start[:-1])[vertex]
     inward, length = edge_planes(triangles)
     pack = devices.pack_width(device)
-    place = np.concatenate([direction, np.zeros((count, 1))], axis=1)
+    places, factors = upload_captured(direction, irradiance, scale, device)
     weights = wp.zeros((3 * count, surface.packs * pack), dtype=wp.float32, device=device)
     out = wp.empty((6, surface.packs * pack), dtype=wp.float32, device=device)
 
@@ -68,8 +68,8 @@ def sum_near(band: Band, surface: Surface, visible: wp.array, sources: Sources, 
                     upload(triangles.neighbour.reshape(-1), wp.int32), upload(triangles.corner.reshape(-1), wp.int32),
                     upload(start, wp.int32), upload(kept[owner], wp.int32), upload(part, wp.float32), count], [weights], device=device)
     devices.launch(_sum_kernel(pack), surface.packs,
-                   [band.values, band.frame_count, surface.values, visible, upload(place, wp.vec4),
-                    upload(scale[:count, None] / irradiance, wp.vec3), as_packs(weights, device)], [as_packs(out, device)], device=device)
+                   [band.values, band.frame_count, surface.values, visible, places, factors, as_packs(weights, device)],
+                   [as_packs(out, device)], device=device)
     return out
 
 

@@ -136,6 +136,25 @@ def require_same(band: Band, surface: Surface, visible: wp.array, count: int) ->
                          f"{visible.shape}, directions are {count}: give the same pixels and lights")
 
 
+def upload_captured(direction: np.ndarray, irradiance: np.ndarray, scale: np.ndarray, device: str) -> tuple[wp.array, wp.array]:
+    """Return what kernels need to compare captured images with a model under the same lights.
+
+    Args:
+        direction: [lights, 3] unit vectors to the captured lights.
+        irradiance: [lights, 3] of each.
+        scale: [lights or more] radiance of a stored 1.0.
+        device: where.
+
+    Returns:
+        On the device, [lights] vec4 places of far samples and [lights] vec3 factors from stored values to radiance / irradiance; 0 in
+        channels without irradiance.
+    """
+    count = len(direction)
+    place = np.concatenate([direction, np.zeros((count, 1))], axis=1)
+    factor = np.divide(scale[:count, None], irradiance, out=np.zeros((count, 3)), where=irradiance > 0)
+    return wp.array(place, dtype=wp.vec4, device=device), wp.array(factor, dtype=wp.vec3, device=device)
+
+
 @cache
 def lobes(pack: int) -> Any:
     """Return the Warp function that evaluates the lobes of every pixel of a pack under a sample at one place."""
