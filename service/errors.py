@@ -7,7 +7,7 @@ ValidationError    pydantic's: a field of a request has an invalid value; names 
 from pydantic import ValidationError
 
 from kernels.errors import KernelError
-from service.usd.errors import AssetError
+from service.asset.errors import AssetError
 from stage.errors import StageError
 from stage.records import describe
 

@@ -11,8 +11,10 @@ import pytest
 
 HOME = Path(__file__).resolve().parents[1]
 ROOTS = ("stage", "kernels", "service")
-PRODUCTS = tuple(f"service.{name}" for name in ("solve", "depth", "light", "calibrate", "basis", "captures", "demo"))
+PRODUCTS = tuple(f"service.{name}" for name in ("solve", "depth", "light", "calibrate", "basis", "captures", "demo", "export"))
 """Where stage and kernels meet: captures go in, results come out."""
+WRITERS = ("service.asset", "service.usd", "service.gltf")
+"""Meshes and textures of solved maps, and the formats that they are written in."""
 DOORS = ("service.cli", "service.client", "service.farm", "service.server")
 
 
@@ -92,14 +94,16 @@ def test_opencv_lives_where_motion_is_tracked_and_rigs_are_calibrated():
 
 @pytest.mark.parametrize(("package", "forbidden"), [
     *((product, DOORS) for product in (*PRODUCTS, "service.requests", "service.reporting")),
-    ("service.requests", (*PRODUCTS, "service.usd", "service.reporting", "kernels")),
-    ("service.usd", (*DOORS, *PRODUCTS, "kernels")),
+    ("service.requests", (*PRODUCTS, *WRITERS, "service.reporting", "kernels")),
+    ("service.asset", (*DOORS, *PRODUCTS, "service.usd", "service.gltf", "kernels")),
+    ("service.usd", (*DOORS, *PRODUCTS, "service.gltf", "kernels")),
+    ("service.gltf", (*DOORS, *PRODUCTS, "service.usd", "kernels")),
     ("service.server.jobs", ("service.cli", "service.client", "service.server.api")),
     ("service.server.database", ("service.server.jobs", "service.server.api", *PRODUCTS, "stage", "kernels")),
     ("service.server.storage", ("service.server.jobs", "service.server.api", *PRODUCTS, "kernels")),
-    ("service.server.api", ("service.cli", "service.client", *PRODUCTS, "service.usd", "kernels")),
-    ("service.client", ("service.cli", "service.farm", "service.server", *PRODUCTS, "service.usd", "stage", "kernels")),
-    ("service.views", (*DOORS, *PRODUCTS, "service.usd", "service.reporting", "stage", "kernels")),
+    ("service.server.api", ("service.cli", "service.client", *PRODUCTS, *WRITERS, "kernels")),
+    ("service.client", ("service.cli", "service.farm", "service.server", *PRODUCTS, *WRITERS, "stage", "kernels")),
+    ("service.views", (*DOORS, *PRODUCTS, *WRITERS, "service.reporting", "stage", "kernels")),
 ])
 def test_what_a_part_of_the_roof_must_not_know(package, forbidden):
     assert {i for i in IMPORTS if under(i.importer, package) and under(i.target, *forbidden)} == set()

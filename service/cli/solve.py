@@ -35,10 +35,12 @@ def _solve(request: SolveRequest) -> None:
 
 
 def _export(request: ExportRequest) -> None:
-    from service.usd.export import export
+    from service.export.export import export
 
     with ProgressBar() as bar:
-        print(f"asset    {export(request, bar)}")
+        exported = export(request, bar)
+    print(f"asset    {exported.path}")
+    print_warnings(exported.warnings)
 
 
 def _basis(request: BasisRequest) -> None:

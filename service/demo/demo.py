@@ -6,6 +6,7 @@ from typing import NamedTuple
 import service
 from service.demo.preview import write_preview
 from service.errors import RequestError
+from service.export.export import export
 from service.light.relight import relight
 from service.reporting.progress import Progress, Timings
 from service.requests.demo import DemoRequest
@@ -13,7 +14,6 @@ from service.requests.export import ExportRequest
 from service.requests.relight import RelightRequest
 from service.requests.solve import SolveRequest
 from service.solve.solve import SolveResult, solve
-from service.usd.export import export
 from stage.capture import Capture
 from stage.correction import Correction
 from stage.ingest import CACHE_FOLDER
@@ -57,7 +57,7 @@ def demo(request: DemoRequest, progress: Progress | None = None) -> DemoResult:
     sample, out, device = sample_folder(), request.out, request.device
     cache = out / CACHE_FOLDER
     solved = solve(SolveRequest(capture=sample, out=out, device=device, cache=cache), progress)
-    asset = export(ExportRequest(maps=out, out=out / "asset.usdz"), progress)
+    asset = export(ExportRequest(maps=out, out=out / "asset.usdz"), progress).path
     relit = relight(RelightRequest(capture=sample, environment=sample / "environment.exr", out=str(out / "frame.####.exr"),
                                    frames=FRAMES, spin_degrees=360.0, device=device, cache=cache), progress)
     timings = Timings(progress)

@@ -5,10 +5,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+from service.asset.mesh import height_mesh
+from service.asset.textures import FILE_NAMES, write_textures
 from service.usd.files import check_suffix, define_layer, temporary_folder_beside
-from service.usd.mesh import height_mesh
 from service.usd.scene import define_asset
-from service.usd.textures import FILE_NAMES, write_textures
 from stage.maps import SurfaceMaps
 
 Progress = Callable[[str, float], None]

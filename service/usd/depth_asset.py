@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
+from service.asset.errors import AssetError
+from service.asset.mesh import SurfaceMesh, height_mesh, without_faces
 from service.usd.camera import define_camera
-from service.usd.errors import AssetError
 from service.usd.files import check_suffix, write_layer
-from service.usd.mesh import SurfaceMesh, height_mesh, without_faces
 from service.usd.points import define_points, linear_colours, set_display_color
 from service.usd.scene import define_mesh, define_root, hint_extent
 from stage.depth_maps import DepthMaps

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from pxr import Tf, Usd
 
-from service.usd.errors import AssetError
+from service.asset.errors import AssetError
 from stage.errors import StorageError, storage
 
 SUFFIXES = (".usda", ".usdc", ".usdz")

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from pxr import Gf, Sdf, Usd, UsdShade
 
-from service.usd.textures import Texture
+from service.asset.textures import Texture
 
 _TYPES = Sdf.ValueTypeNames
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
 
-from service.usd.errors import AssetError
+from service.asset.errors import AssetError
 from service.usd.files import write_layer
 from stage.colour import convert
 from stage.ply import PointCloud

@@ -8,10 +8,10 @@ from collections.abc import Mapping
 import numpy as np
 from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdShade, Vt
 
+from service.asset.mesh import SurfaceMesh
+from service.asset.textures import Texture
 from service.usd.camera import define_camera
 from service.usd.materials import define_material
-from service.usd.mesh import SurfaceMesh
-from service.usd.textures import Texture
 from stage.camera import Camera
 from stage.maps import SurfaceMaps
 

@@ -8,6 +8,8 @@ import pytest
 
 from service.cli.main import main
 from service.cli.progress import ProgressBar
+from stage.maps import SurfaceMaps
+from tests.scenes.surfaces import make_ball
 from tests.service.postgres import binaries, postgres
 from tests.service.recording import Recording
 
@@ -50,3 +52,9 @@ def server_postgres():
         pytest.skip("no PostgreSQL server programs: neither on the PATH nor in /usr/lib/postgresql")
     with postgres(programs) as server:
         yield server
+
+
+@pytest.fixture
+def ball() -> SurfaceMaps:
+    """A hemisphere with every layer."""
+    return make_ball()

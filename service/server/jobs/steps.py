@@ -149,8 +149,8 @@ def _shade(job: Job, request: ShadeJob, context: WorkerContext, progress: Progre
 
 
 def _export(job: Job, request: ExportJob, context: WorkerContext, progress: Progress) -> None:
+    from service.export.export import export
     from service.requests.export import ExportRequest
-    from service.usd.export import export
 
     export(ExportRequest(maps=job_maps(job, request.maps, context, progress), out=_out(job, context) / f"{layout.ASSET}.{request.format}",
                          **dict(request.options)), progress)

@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 from pxr import Usd, UsdGeom, UsdShade, UsdValidation
 
-from service.usd import asset, textures
+from service.asset import textures
+from service.asset.errors import AssetError
+from service.usd import asset
 from service.usd.asset import write_asset
-from service.usd.errors import AssetError
 from stage.errors import StorageError
 from stage.maps import SurfaceMaps
-from tests.service.usd.surfaces import make_ball, make_sheet, make_wave
+from tests.scenes.surfaces import make_ball, make_sheet, make_wave
 
 SUFFIXES = (".usda", ".usdc", ".usdz")
 every_suffix = pytest.mark.parametrize("suffix", SUFFIXES)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from pxr import Usd, UsdGeom
 
+from service.asset.mesh import height_mesh
 from service.usd.asset import write_asset
-from service.usd.mesh import height_mesh
-from tests.service.usd.surfaces import make_ball, make_wave
+from tests.scenes.surfaces import make_ball, make_wave
 
 POSE = ((0.0, 0.0, 1.0, 0.3), (1.0, 0.0, 0.0, -0.1), (0.0, 1.0, 0.0, 2.0), (0.0, 0.0, 0.0, 1.0))
 

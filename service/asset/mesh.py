@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.usd.errors import AssetError
+from service.asset.errors import AssetError
 from stage.maps import SurfaceMaps
 
 VERTEX_BUDGET = 1_000_000

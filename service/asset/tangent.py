@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.usd.mesh import SurfaceMesh, face_to_vertex
+from service.asset.mesh import SurfaceMesh, face_to_vertex
 
 
 class TangentFrame(NamedTuple):

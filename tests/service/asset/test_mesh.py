@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from service.usd.errors import AssetError
-from service.usd.mesh import height_mesh
-from tests.service.usd.surfaces import RADIUS_M, make_ball, make_sheet, make_wave
+from service.asset.errors import AssetError
+from service.asset.mesh import height_mesh
+from tests.scenes.surfaces import RADIUS_M, make_ball, make_sheet, make_wave
 
 
 def face_areas(mesh):

@@ -7,10 +7,10 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from service.usd.errors import AssetError
-from service.usd.mesh import height_mesh
-from service.usd.textures import bleed, write_textures
-from tests.service.usd.surfaces import make_ball, make_sheet, make_wave
+from service.asset.errors import AssetError
+from service.asset.mesh import height_mesh
+from service.asset.textures import bleed, write_textures
+from tests.scenes.surfaces import make_ball, make_sheet, make_wave
 
 AP1_TO_REC709 = np.array([[1.70505, -0.62179, -0.08326], [-0.13026, 1.14080, -0.01055], [-0.02400, -0.12897, 1.15297]])
 """As published for ACEScg with the Bradford adaptation."""

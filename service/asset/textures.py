@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.usd.errors import AssetError
-from service.usd.mesh import SurfaceMesh
-from service.usd.tangent import tangent_frame
+from service.asset.errors import AssetError
+from service.asset.mesh import SurfaceMesh
+from service.asset.tangent import tangent_frame
 from stage.colour import convert
 from stage.images import write_png
 from stage.maps import SurfaceMaps

@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
@@ -14,11 +15,16 @@ from stage.maps import MAPS_FILE, SurfaceMaps
 from stage.ply import POINTS_FILE, PointCloud, read_ply
 
 
-def export(request: ExportRequest, progress: Progress | None = None) -> Path:
-    """Write a USD asset from solved maps, or from a depth where there are no maps.
+class Exported(NamedTuple):
+    """An asset and what its user should know of it."""
 
-    Returns:
-        The path of the asset.
+    path: Path
+    warnings: tuple[str, ...]
+    """Sentences."""
+
+
+def export(request: ExportRequest, progress: Progress | None = None) -> Exported:
+    """Write a USD asset from solved maps, or from a depth where there are no maps.
 
     Raises:
         ResultError: the maps are missing or incomplete.
@@ -28,6 +34,7 @@ def export(request: ExportRequest, progress: Progress | None = None) -> Path:
     """
     timings = Timings(progress)
     timings.stage("read", 1)
+    warnings: list[str] = []
     path = request.maps / MAPS_FILE if request.maps.is_dir() else request.maps
     depth = request.maps / DEPTH_FILE if request.maps.is_dir() else request.maps
     of_depth = depth.name == DEPTH_FILE and depth.exists() and (request.geometry is not None or not path.exists() or path == depth)
@@ -40,9 +47,11 @@ def export(request: ExportRequest, progress: Progress | None = None) -> Path:
             raise RequestError(f"--geometry {request.geometry}: is for a depth, {path} holds solved maps: they become a mesh")
         maps = SurfaceMaps.read(path)
         timings.stage("asset", 1)
-        write_asset(maps, request.out, name=_name(request, maps.provenance.get("relit:capture")))
+        report = write_asset(maps, request.out, name=_name(request, maps.provenance.get("relit:capture")))
+        warnings += [f"{layer}: {count} pixels have a value outside 0…1, which the texture cannot hold: they are clipped"
+                     for layer, count in report.clipped_pixels.items() if count]
     timings.close()
-    return request.out
+    return Exported(request.out, tuple(warnings))
 
 
 def _export_depth(path: Path, request: ExportRequest, timings: Timings) -> None:
