@@ -144,6 +144,8 @@ def _part_at_necks(label: np.ndarray, count: int, open_edges: np.ndarray, lost: 
 
     What is left without the pixels beside lost edges falls apart at necks. Pieces of at least LEAST_PART pixels grow back until they meet.
     """
+    if count == 0:
+        return label, 0
     near = lost[0] | lost[1]
     near[1:] |= lost[0, :-1]
     near[pitch:] |= lost[1, :-pitch]

@@ -114,11 +114,12 @@ def test_masked_step_has_two_heights(device):
     assert (height[:, 40] == 0.0).all()
 
 
-def test_lone_pixels_lie_at_the_mean(device):
+@pytest.mark.parametrize("discontinuities", [False, True])
+def test_lone_pixels_lie_at_the_mean(discontinuities, device):
     shape = shapes.plane(9, 11)
     mask = np.zeros((9, 11), dtype=bool)
     mask[::2, ::3] = True
-    result = solve(shape._replace(mask=mask), device, mean_z=1.5)
+    result = solve(shape._replace(mask=mask), device, mean_z=1.5, discontinuities=discontinuities)
     assert result.components == mask.sum()
     assert result.iterations == 0
     assert result.converged
@@ -144,9 +145,10 @@ def test_bad_pixels_leave_the_mask(device):
     assert (damaged[holes] == 0.0).all()
 
 
-def test_only_bad_pixels(device):
+@pytest.mark.parametrize("discontinuities", [False, True])
+def test_only_bad_pixels(discontinuities, device):
     shape = shapes.bumps(8)
-    result = solve(shape._replace(normal=np.full_like(shape.normal, np.nan)), device, mean_z=1.0)
+    result = solve(shape._replace(normal=np.full_like(shape.normal, np.nan)), device, mean_z=1.0, discontinuities=discontinuities)
     assert result.components == 0
     assert (result.height.numpy() == 0.0).all()
 
