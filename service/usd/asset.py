@@ -1,14 +1,14 @@
 """Writes solved maps as a USD asset: a mesh with textures, a material and the camera, as .usda, .usdc or .usdz."""
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 from service.asset.mesh import height_mesh
 from service.asset.textures import FILE_NAMES, write_textures
-from service.usd.files import check_suffix, define_layer, temporary_folder_beside
-from service.usd.scene import define_asset
+from service.usd.files import check_suffix, install, temporary_folder_beside
+from service.usd.layers import FIRST_VERSION, LAYER_FILES, AssetLayers, Description, texture_folder
+from service.usd.scene import UNIT_WITHOUT_SCALE_M, define_asset
 from stage.maps import SurfaceMaps
 
 Progress = Callable[[str, float], None]
@@ -29,14 +29,16 @@ class AssetReport(NamedTuple):
     clipped_pixels: dict[str, int]  # layer → pixels that did not fit into 0…1
 
 
-def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, progress: Progress | None = None) -> AssetReport:
+def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str = FIRST_VERSION,
+                progress: Progress | None = None) -> AssetReport:
     """Write solved maps as a USD asset.
 
     Args:
         maps: with `height`.
-        path: its suffix chooses the format. Textures of .usda and .usdc go to the folder `<stem>_textures` beside it;
-            a .usda and a .usdc of one name share that folder.
+        path: its suffix chooses the format. Beside a .usda and .usdc go the folders `<stem>_layers` and `<stem>_textures`; a .usda and a
+            .usdc of one name share them.
         name: free text; the root prim is named after it.
+        version: of the asset, for assetInfo.
         progress: called before each part of the work.
 
     Raises:
@@ -49,40 +51,20 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, progress: Pro
 
     tell("mesh", 0.0)
     mesh = height_mesh(maps)
+    description = Description(name, maps.camera, {**maps.provenance, "relit:color_space": maps.color_space},
+                              1.0 if maps.camera.metric else UNIT_WITHOUT_SCALE_M, version)
     with temporary_folder_beside(target) as temporary:
-        folder = temporary / f"{target.stem}_textures"
+        folder = temporary / texture_folder(target)
         folder.mkdir()
         textures = write_textures(maps, mesh, folder, progress=lambda layer, done: tell(
             f"texture {layer}", TEXTURES_START + (TEXTURES_END - TEXTURES_START) * done))
         tell("layer", TEXTURES_END)
-        files = [folder / texture.file_name for texture in textures.values()]
-        written = define_layer(temporary, target, lambda usd_stage: define_asset(
-            usd_stage, maps, mesh, textures, name=name, texture_folder=f"./{folder.name}"), files)
-        if packed:
-            os.replace(written, target)
-            files = []
-        else:
-            _install(written, folder, target)
-    installed = tuple(target.parent / file.relative_to(temporary) for file in files)
+        images = [folder / texture.file_name for texture in textures.values()]
+        layers = AssetLayers(temporary, target, description)
+        define_asset(layers, maps, mesh, textures)
+        layers.save()
+        first, *others = layers.files
+        install(target, first, [*others, *images], ours=(*LAYER_FILES, *FILE_NAMES))
+    installed = () if packed else tuple(target.parent / folder.name / image.name for image in images)
     return AssetReport(target, installed, len(mesh.points), len(mesh.face_counts), mesh.step,
                        {layer: texture.clipped_pixels for layer, texture in textures.items()})
-
-
-def _install(layer: Path, folder: Path, target: Path) -> None:
-    """Put the textures and then the layer in place of older ones; on an error put the older ones back."""
-    place, replaced = target.parent / folder.name, folder.with_name("replaced")
-    if place.exists():
-        os.rename(place, replaced)
-    try:
-        os.rename(folder, place)
-        os.replace(layer, target)
-    except OSError:
-        if place.exists():
-            os.rename(place, folder)
-        if replaced.exists():
-            os.rename(replaced, place)
-        raise
-    if replaced.exists():  # files that are not ours stay
-        for file in replaced.iterdir():
-            if file.name not in FILE_NAMES:
-                os.rename(file, place / file.name)

@@ -4,14 +4,15 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from pxr import Sdf, Usd, UsdGeom
+from pxr import Sdf, Usd
 
 from service.asset.errors import AssetError
 from service.asset.mesh import SurfaceMesh, height_mesh, without_faces
 from service.usd.camera import define_camera
-from service.usd.files import check_suffix, write_layer
+from service.usd.files import check_suffix, install, temporary_folder_beside
+from service.usd.layers import LAYER_FILES, AssetLayers, Description
 from service.usd.points import define_points, linear_colours, set_display_color
-from service.usd.scene import define_mesh, define_root, hint_extent
+from service.usd.scene import define_mesh
 from stage.depth_maps import DepthMaps
 from stage.depth_normals import same_surface
 from stage.maps import SurfaceMaps
@@ -48,7 +49,7 @@ def write_depth_points(maps: DepthMaps, cloud: PointCloud | None, path: str | Pa
         set_display_color(prim, colours)
         return np.array(prim.GetExtentAttr().Get())
 
-    _write(maps, Path(path), name, fill)
+    _write(maps, Path(path), name, "points", fill)
 
 
 def write_depth_mesh(maps: DepthMaps, cloud: PointCloud | None, path: str | Path, *, name: str) -> None:
@@ -76,7 +77,7 @@ def write_depth_mesh(maps: DepthMaps, cloud: PointCloud | None, path: str | Path
         set_display_color(define_mesh(usd_stage, parent.AppendChild("Mesh"), mesh), colours)
         return mesh.extent
 
-    _write(maps, Path(path), name, fill)
+    _write(maps, Path(path), name, "mesh", fill)
 
 
 def depth_mesh(maps: DepthMaps) -> SurfaceMesh:
@@ -98,13 +99,13 @@ def _torn(corners: np.ndarray, mesh: SurfaceMesh, maps: DepthMaps) -> np.ndarray
     return ~same_surface(corners.min(axis=1), corners.max(axis=1), mesh.step * float(np.sqrt(2)), maps.camera)
 
 
-def _write(maps: DepthMaps, target: Path, name: str, fill: Callable[[Usd.Stage, Sdf.Path], np.ndarray]) -> None:
+def _write(maps: DepthMaps, target: Path, name: str, variant: str, fill: Callable[[Usd.Stage, Sdf.Path], np.ndarray]) -> None:
     """Write the asset around what `fill` defines below /Name/Geom; `fill` returns the extent of that."""
-    def define(usd_stage: Usd.Stage) -> None:
-        root = define_root(usd_stage, maps.camera, maps.provenance, name=name, unit_m=1.0)
-        geometry = UsdGeom.Scope.Define(usd_stage, root.GetPath().AppendChild("Geom"))
-        extent = fill(usd_stage, geometry.GetPath())
-        define_camera(usd_stage, root.GetPath().AppendChild("Camera"), maps.camera, extent)
-        hint_extent(root)
-
-    write_layer(target, define)
+    with temporary_folder_beside(target) as temporary:
+        layers = AssetLayers(temporary, target, Description(name, maps.camera, maps.provenance))
+        with layers.geometry_variant(variant) as geom:
+            extent = fill(layers.geometry, geom)
+        define_camera(layers.geometry, layers.root.AppendChild("Camera"), maps.camera, extent)
+        layers.save()
+        first, *others = layers.files
+        install(target, first, others, ours=LAYER_FILES)

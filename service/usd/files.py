@@ -9,9 +9,10 @@ import shutil
 import struct
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 from pxr import Tf, Usd
 
@@ -51,37 +52,69 @@ def write_layer(target: Path, define: Callable[[Usd.Stage], None]) -> None:
         AssetError: another suffix, or what `define` raises.
         StorageError: the disk refuses; what was there before is left as it was.
     """
-    check_suffix(target)
+    suffix = check_suffix(target)
     with temporary_folder_beside(target) as temporary:
-        os.replace(define_layer(temporary, target, define), target)
+        layer = temporary / f"{target.stem}{'.usdc' if suffix == '.usdz' else suffix}"
+        usd_stage = Usd.Stage.CreateNew(str(layer))
+        define(usd_stage)
+        usd_stage.Save()
+        del usd_stage
+        install(target, layer, (), ours=())
 
 
-def define_layer(temporary: Path, target: Path, define: Callable[[Usd.Stage], None], files: Sequence[Path] = ()) -> Path:
-    """Write a layer into a temporary folder, packed with the files that it refers to where the target is a .usdz.
+def install(target: Path, layer: Path, files: Sequence[Path], *, ours: Container[str]) -> None:
+    """Flush an asset to the disk and put it in place of an older one, whole or not at all; as a package where the target is a .usdz.
 
     Args:
-        temporary: the folder of temporary_folder_beside; the files lie in it at any depth.
-        target: names the file and chooses its format.
-        define: fills the empty stage.
-        files: that the layer refers to.
+        layer: the asset's first layer, in the folder of temporary_folder_beside.
+        files: that it refers to, in folders of that folder. Unless they are packed, these folders take the place of older ones beside the
+            target.
+        ours: names of files that an older asset can have in such a folder; other files that lie there stay.
 
-    Returns:
-        The file to be put in place of the target; it and, unless packed, `files` are flushed to the disk.
+    Raises:
+        AssetError: larger than a package can be.
+        StorageError: there is something else in place of a folder.
+        OSError: the disk refuses; what was there before is put back.
     """
-    suffix = check_suffix(target)
-    layer = temporary / f"{target.stem}{'.usdc' if suffix == '.usdz' else suffix}"
-    usd_stage = Usd.Stage.CreateNew(str(layer))
-    define(usd_stage)
-    usd_stage.Save()
-    del usd_stage
-    if suffix == ".usdz":
-        package = temporary / f"{target.stem}.usdz"
+    if check_suffix(target) == ".usdz":
+        package = layer.with_suffix(".usdz")
         _pack(package, layer, files)
         layer, files = package, ()
     for file in (layer, *files):
         with open(file, "rb") as written:
             os.fsync(written.fileno())
-    return layer
+    moves = [_Move(folder, target.parent / folder.name, folder.with_name(f"{folder.name}.replaced"))
+             for folder in sorted(layer.parent.iterdir()) if folder.is_dir() and files]
+    for move in moves:
+        if move.place.is_symlink() or (move.place.exists() and not move.place.is_dir()):
+            raise StorageError(f"cannot write {target}: {move.place} is no folder, and the asset needs a folder of this name: move it away")
+    try:
+        for move in moves:
+            if move.place.exists():
+                os.rename(move.place, move.replaced)
+            os.rename(move.folder, move.place)
+        os.replace(layer, target)
+    except OSError:
+        for move in reversed(moves):
+            if not move.folder.exists():
+                os.rename(move.place, move.folder)
+            if move.replaced.exists():
+                os.rename(move.replaced, move.place)
+        raise
+    for move in moves:
+        for file in move.replaced.iterdir() if move.replaced.exists() else ():
+            if file.name not in ours:
+                os.rename(file, move.place / file.name)
+        if not any(move.place.iterdir()):
+            move.place.rmdir()
+
+
+class _Move(NamedTuple):
+    """A new folder, where it goes, and where an older one is kept meanwhile."""
+
+    folder: Path
+    place: Path
+    replaced: Path
 
 
 @contextmanager

@@ -1,0 +1,209 @@
+"""The layers of an asset while it is written, with its variant sets `geo` and `look`.
+
+A .usda or .usdc asset is a small interface layer (root prim, variant sets, extents) with a payload: `<stem>_layers/payload.usda`, which
+has `geometry.usdc` and `materials.usda` as sublayers. A .usdz is one layer: ARKit takes no package whose root layer refers to others, and
+three.js reads neither payloads nor sublayers of binary layers.
+
+The prims of the first variant of `geo` are ordinary prims, and each further variant deactivates them and has prims of its own. Readers that
+do not know variants therefore see the first one, and nothing twice. The variants of `look` bind one material each.
+
+Source: OpenUSD: UsdVariantSet, UsdModelAPI (kind, assetInfo), UsdGeomModelAPI (extentsHint), LIVERPS strength ordering (an opinion in a
+variant is weaker than one beside it, so that what variants change is stated in variants alone).
+"""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdShade
+
+from service.usd.files import check_suffix
+from service.usd.names import prim_name
+from stage.camera import Camera
+
+GEO, LOOK = "geo", "look"
+"""The variant sets."""
+
+PAYLOAD, GEOMETRY, MATERIALS = "payload.usda", "geometry.usdc", "materials.usda"
+"""Layers of a .usda or .usdc asset beside its interface: the same files whatever the suffix, so that a .usda and a .usdc can share them."""
+LAYER_FILES = (PAYLOAD, GEOMETRY, MATERIALS)
+
+FIRST_VERSION = "1"
+"""Version of an asset that nobody gave one."""
+
+_PURPOSES = [UsdGeom.Tokens.default_, UsdGeom.Tokens.render, UsdGeom.Tokens.proxy, UsdGeom.Tokens.guide]
+
+
+class Description(NamedTuple):
+    """What the layers of an asset say about it."""
+
+    name: str  # free text; the root prim is named after it
+    camera: Camera  # its world_from_camera becomes the root's transform
+    provenance: Mapping[str, str]  # kept in customLayerData of every layer, with the camera
+    unit_m: float = 1.0  # metres of a scene unit
+    version: str = FIRST_VERSION  # of the asset, for assetInfo
+
+
+class AssetLayers:
+    """The USD stages on which an asset is defined; one and the same for a .usdz.
+
+    Attributes:
+        geometry: the stage for everything below `geom`, for cameras and lights.
+        materials: the stage for everything below `looks`.
+        root: path of the root prim, /Name.
+        texture_folder: of the textures, relative to the layer of the materials.
+        surfaces: prims that take the material of the selected look; whoever defines a surface appends it.
+    """
+
+    def __init__(self, folder: Path, target: Path, description: Description) -> None:
+        """Create empty layers.
+
+        Args:
+            folder: temporary; the layers are created in it.
+            target: the asset that they become.
+        """
+        self._description = description
+        self._packed = check_suffix(target) == ".usdz"
+        self._interface_file = folder / f"{target.stem}{'.usdc' if self._packed else target.suffix.lower()}"
+        self._identifier = target.name
+        self.root = Sdf.Path.absoluteRootPath.AppendChild(prim_name(description.name))
+        self.surfaces: list[Sdf.Path] = []
+        self._interface = self._create(self._interface_file)
+        if self._packed:
+            self.files: tuple[Path, ...] = (self._interface_file,)
+            self.geometry = self.materials = self._interface
+        else:
+            layers = folder / layer_folder(target)
+            layers.mkdir()
+            self.files = (self._interface_file, *(layers / file for file in LAYER_FILES))
+            self.geometry, self.materials = self._create(layers / GEOMETRY), self._create(layers / MATERIALS)
+        self.texture_folder = f"{'.' if self._packed else '..'}/{texture_folder(target)}"
+        self._geometries: list[str] = []
+        self._first_prims: list[Sdf.Path] = []
+        self._looks: dict[str, Sdf.Path] = {}
+
+    @property
+    def geom(self) -> Sdf.Path:
+        """Path of the scope of the geometry."""
+        return self.root.AppendChild("Geom")
+
+    @property
+    def looks(self) -> Sdf.Path:
+        """Path of the scope of the materials."""
+        return self.root.AppendChild("Looks")
+
+    @contextmanager
+    def geometry_variant(self, name: str) -> Iterator[Sdf.Path]:
+        """Define a variant of `geo` inside the block, on the stage `geometry` and below the yielded path; the first is the default.
+
+        The names of its prims differ from those of other variants.
+        """
+        UsdGeom.Scope.Define(self.geometry, self.geom)
+        if not self._geometries:
+            yield self.geom
+            self._first_prims = [prim.GetPath() for prim in self.geometry.GetPrimAtPath(self.geom).GetAllChildren()]
+        else:
+            with _in_variant(self.geometry, self.root, GEO, name):
+                for path in self._first_prims:
+                    self.geometry.OverridePrim(path).SetActive(False)
+                yield self.geom
+        self._geometries.append(name)
+
+    def add_look(self, name: str, material: UsdShade.Material) -> None:
+        """Make a material, which lies below `looks` on the stage `materials`, a variant of `look`; the first is the default."""
+        self._looks[name] = material.GetPath()
+
+    def save(self) -> None:
+        """Bind the looks, write variant sets and extents, and save the layers; the object is of no use afterwards."""
+        for name, material in self._looks.items():
+            for surface in self.surfaces:
+                with _in_variant(self.materials, self.root, LOOK, name):
+                    prim = self.materials.OverridePrim(surface)
+                    UsdShade.MaterialBindingAPI.Apply(prim).Bind(UsdShade.Material(self.materials.GetPrimAtPath(material)))
+        if not self._packed:
+            self._write_payload()
+        root = self._interface.GetPrimAtPath(self.root)
+        for name in self._geometries:
+            with _in_variant(self._interface, self.root, GEO, name):
+                model = UsdGeom.ModelAPI.Apply(root)
+                model.SetExtentsHint(model.ComputeExtentsHint(UsdGeom.BBoxCache(Usd.TimeCode.Default(), _PURPOSES)))
+        for name in self._looks:
+            root.GetVariantSets().AddVariantSet(LOOK).AddVariant(name)
+        for variant_set, variants in ((GEO, self._geometries), (LOOK, [*self._looks])):
+            if variants:
+                root.GetVariantSets().GetVariantSet(variant_set).SetVariantSelection(variants[0])
+        self._interface.Save()
+        del self.geometry, self.materials, self._interface
+
+    def _write_payload(self) -> None:
+        """Save the layers of the payload, and refer to them."""
+        self.geometry.Save()
+        self.materials.Save()
+        payload = self._create(self.files[1 + LAYER_FILES.index(PAYLOAD)])
+        payload.GetRootLayer().subLayerPaths = [f"./{MATERIALS}", f"./{GEOMETRY}"]
+        payload.Save()
+        root = self._interface.GetPrimAtPath(self.root)
+        root.GetPayloads().AddPayload(f"./{self.files[1].parent.name}/{PAYLOAD}")
+
+    def _create(self, file: Path) -> Usd.Stage:
+        """Return a new stage with axes, unit, default prim and provenance; the root prim of the interface says what the asset is."""
+        description = self._description
+        usd_stage: Usd.Stage = Usd.Stage.CreateNew(str(file))
+        UsdGeom.SetStageUpAxis(usd_stage, UsdGeom.Tokens.y)
+        UsdGeom.SetStageMetersPerUnit(usd_stage, description.unit_m)
+        root = UsdGeom.Xform.Define(usd_stage, self.root)
+        usd_stage.SetDefaultPrim(root.GetPrim())
+        method = description.provenance.get("relit:method")
+        usd_stage.GetRootLayer().documentation = (
+            f"{description.name}: a measured surface, exported by Relit{f' (method {method})' if method else ''}. Camera frame: "
+            "+x right, +y up, +z towards the viewer. Where it comes from is in customLayerData.")
+        for key, value in sorted({**description.provenance, "relit:camera": description.camera.model_dump_json()}.items()):
+            usd_stage.SetMetadataByDictKey("customLayerData", key, value)
+        if file == self._interface_file:
+            self._describe_root(root)
+        return usd_stage
+
+    def _describe_root(self, root: UsdGeom.Xform) -> None:
+        """Write kind, assetInfo, the name for people and the pose."""
+        description = self._description
+        model = Usd.ModelAPI(root.GetPrim())
+        model.SetKind(Kind.Tokens.component)
+        model.SetAssetName(description.name)
+        model.SetAssetIdentifier(Sdf.AssetPath(self._identifier))
+        model.SetAssetVersion(description.version)
+        if description.name and description.name != root.GetPrim().GetName():
+            root.GetPrim().SetDisplayName(description.name)
+        if description.camera.world_from_camera is not None:
+            root.AddTransformOp().Set(_matrix(description.camera.world_from_camera, description.unit_m))
+
+
+def layer_folder(target: Path) -> str:
+    """Return the name of the folder beside an asset that holds the layers of its payload."""
+    return f"{target.stem}_layers"
+
+
+def texture_folder(target: Path) -> str:
+    """Return the name of the folder beside an asset, or in its package, that holds its textures."""
+    return f"{target.stem}_textures"
+
+
+@contextmanager
+def _in_variant(usd_stage: Usd.Stage, root: Sdf.Path, variant_set: str, name: str) -> Iterator[None]:
+    """Write what is authored inside the block into a variant, which is selected meanwhile; the layer's own selection stays."""
+    variants = usd_stage.GetPrimAtPath(root).GetVariantSets().AddVariantSet(variant_set)
+    variants.AddVariant(name)
+    session = usd_stage.GetSessionLayer()
+    with Usd.EditContext(usd_stage, session):
+        variants.SetVariantSelection(name)
+    with variants.GetVariantEditContext():
+        yield
+    session.Clear()
+
+
+def _matrix(world_from_camera: tuple[tuple[float, ...], ...], unit_m: float) -> Gf.Matrix4d:
+    """Return a column-vector transform in metres as USD's row-vector transform in scene units."""
+    matrix = np.array(world_from_camera, dtype=np.float64)
+    matrix[:3, 3] /= unit_m
+    return Gf.Matrix4d(*matrix.T.ravel().tolist())
