@@ -73,12 +73,12 @@ def write_textures(maps: SurfaceMaps, mesh: SurfaceMesh, folder: Path, *,
         values = values.astype(np.float32)
         known = maps.mask & np.isfinite(values if values.ndim == 2 else values.sum(axis=-1))
         if layer == "normal":
-            encoded, known = _tangent_space(values, known, mesh)
+            encoded, known = tangent_space(values, known, mesh)
             write(layer, encoded, known, np.uint16)
         elif layer == "roughness":
             write(layer, values, known, np.uint16)
         else:
-            write(layer, _to_display(np.where(known[..., None], values, 0), maps.color_space), known, np.uint8)
+            write(layer, to_display(np.where(known[..., None], values, 0), maps.color_space), known, np.uint8)
     return written
 
 
@@ -95,8 +95,12 @@ def quantise(values: np.ndarray, known: np.ndarray, dtype: type[np.unsignedinteg
     return np.clip(codes, 0, top).astype(dtype), int(np.count_nonzero(clipped & known))
 
 
-def _to_display(values: np.ndarray, color_space: str) -> np.ndarray:
-    """Return colours [rows, cols, 3] of the maps in the display space; not clipped."""
+def to_display(values: np.ndarray, color_space: str) -> np.ndarray:
+    """Return colours [rows, cols, 3] of the maps in the display space; not clipped.
+
+    Raises:
+        AssetError: the colour space has no known conversion.
+    """
     try:
         return convert(np.ascontiguousarray(values), color_space, DISPLAY_SPACE)
     except ValueError as error:
@@ -104,7 +108,7 @@ def _to_display(values: np.ndarray, color_space: str) -> np.ndarray:
                          "that OpenColorIO's default configuration knows") from error
 
 
-def _tangent_space(normal: np.ndarray, known: np.ndarray, mesh: SurfaceMesh) -> tuple[np.ndarray, np.ndarray]:
+def tangent_space(normal: np.ndarray, known: np.ndarray, mesh: SurfaceMesh) -> tuple[np.ndarray, np.ndarray]:
     """Return normals [rows, cols, 3] as 0…1 in the tangent space of the mesh, and where they are known."""
     frame = tangent_frame(mesh, known.shape)
     length = np.linalg.norm(np.where(known[..., None], normal, 0), axis=-1)
