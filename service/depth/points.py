@@ -34,7 +34,7 @@ def point_cloud(solution: DepthSolution, camera: Camera, *, color_space: str, no
         spread = depth if camera.projection == "perspective" else 1.0
         points = np.stack([x[rows, cols] * spread, y[rows, cols] * spread, -depth], axis=-1)
     colours = display_colours(solution, color_space)[rows, cols]
-    found = depth_normals(solution.depth, solved, camera)[rows, cols] if normals else None
+    found = depth_normals(solution.depth, solved, camera, sigma=solution.sigma)[rows, cols] if normals else None
     return PointCloud(points.astype(np.float32), colours, found)
 
 

@@ -52,7 +52,7 @@ def _scene(maps: DepthMaps, request: SimulateRequest) -> TofScene:
     """Return ranges, and cosines from the normals of the depth; pixels without a depth are black, unknown normals face the camera."""
     range_m = np.where(maps.mask, maps.depth / z_per_range(maps.camera), 1.0)
     origins, rays = _lines_of_sight(maps.camera)
-    normal = depth_normals(maps.depth, maps.mask, maps.camera).astype(np.float64)
+    normal = depth_normals(maps.depth, maps.mask, maps.camera, sigma=maps.sigma).astype(np.float64)
     known = np.linalg.norm(normal, axis=-1) > 0.5
     path = SourcePath.of(maps.camera, request.source_m)
     if path is None or request.source_m is None:

@@ -10,7 +10,7 @@ from kernels.status import Status
 from service.depth.stripe_curves import RIVAL, WHOLE
 from service.depth.stripe_map import StripeSamples
 from stage.camera import Camera
-from stage.depth_normals import same_surface
+from stage.depth_breaks import same_surface
 
 REACH_PX = 10.0
 """Distance on a line up to which stripes of two frames are compared."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from kernels.status import Status
 from stage.camera import Camera
-from stage.depth_normals import same_surface
+from stage.depth_breaks import same_surface
 
 SLOPE_PX = 32.0
 """Distance up to which a neighbour determines the slope."""

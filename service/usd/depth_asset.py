@@ -6,16 +6,14 @@ from pathlib import Path
 import numpy as np
 from pxr import Sdf, Usd
 
+from service.asset.depth_mesh import depth_mesh
 from service.asset.errors import AssetError
-from service.asset.mesh import SurfaceMesh, height_mesh, without_faces
 from service.usd.camera import define_camera
 from service.usd.files import check_suffix, install, temporary_folder_beside
 from service.usd.layers import LAYER_FILES, AssetLayers, Description
 from service.usd.points import define_points, linear_colours, set_display_color
 from service.usd.scene import define_mesh
 from stage.depth_maps import DepthMaps
-from stage.depth_normals import same_surface
-from stage.maps import SurfaceMaps
 from stage.ply import PointCloud
 
 POINT_WIDTH = 1.5
@@ -78,25 +76,6 @@ def write_depth_mesh(maps: DepthMaps, cloud: PointCloud | None, path: str | Path
         return mesh.extent
 
     _write(maps, Path(path), name, "mesh", fill)
-
-
-def depth_mesh(maps: DepthMaps) -> SurfaceMesh:
-    """Return faces between neighbouring pixels, without those over a step that is steeper than 80 degrees.
-
-    Raises:
-        AssetError: there is no face.
-    """
-    mesh = height_mesh(SurfaceMaps(camera=maps.camera, mask=maps.mask, height=-maps.depth))
-    depth = -mesh.points[:, 2].astype(np.float64)
-    torn = [_torn(depth[faces], mesh, maps) for faces in (mesh.quads, mesh.triangles)]
-    return without_faces(mesh, np.concatenate(torn))
-
-
-def _torn(corners: np.ndarray, mesh: SurfaceMesh, maps: DepthMaps) -> np.ndarray:
-    """Return [faces] bool: True where the nearest and the farthest corner, at most a diagonal apart, cannot lie on one surface."""
-    if len(corners) == 0:
-        return np.zeros(0, dtype=bool)
-    return ~same_surface(corners.min(axis=1), corners.max(axis=1), mesh.step * float(np.sqrt(2)), maps.camera)
 
 
 def _write(maps: DepthMaps, target: Path, name: str, variant: str, fill: Callable[[Usd.Stage, Sdf.Path], np.ndarray]) -> None:

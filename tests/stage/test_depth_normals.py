@@ -46,3 +46,21 @@ def test_pixels_without_neighbours_have_none():
     mask = np.zeros((44, 60), bool)
     mask[10, 10], mask[20] = True, True  # one alone; one row, which spans no plane
     assert not depth_normals(np.ones((44, 60)), mask, CAMERA).any()
+
+
+def test_a_floor_has_normals_up_to_the_horizon():
+    with np.errstate(divide="ignore"):
+        depth = reference.plane_depth(RAYS, (0.0, -0.3, 0.0), (0.0, 1.0, 0.0))
+    mask = (depth > 0) & (depth < 20)
+    grazing = mask & (depth > 0.3 * 8)  # steeper than 80°
+    assert grazing.sum() > 60
+    found = depth_normals(np.where(mask, depth, 0), mask, CAMERA)
+    assert angles_degrees(found[grazing], np.array([0.0, 1.0, 0.0])).max() < 0.05  # float32
+
+
+def test_noise_takes_no_normal_away():
+    depth = reference.plane_depth(RAYS, (0.0, 0.0, -3.0), (0.2, 0.1, 1.0))
+    sigma = np.full(depth.shape, 0.15)  # a step to a neighbour is often steeper than 80°
+    noisy = depth + sigma * np.random.default_rng(5).standard_normal(depth.shape)
+    missing, blind = (int((~depth_normals(noisy, ALL, CAMERA, sigma=given).any(axis=-1)).sum()) for given in (sigma, None))
+    assert missing == 0 and blind > 10

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from pxr import Usd, UsdGeom, UsdValidation
 
+from service.asset.depth_mesh import depth_mesh
 from service.asset.errors import AssetError
-from service.usd.depth_asset import depth_mesh, write_depth_mesh, write_depth_points
+from service.usd.depth_asset import write_depth_mesh, write_depth_points
 from stage.camera import Camera
 from stage.depth_maps import DepthMaps
 from stage.ply import PointCloud
