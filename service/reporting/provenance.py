@@ -53,6 +53,18 @@ def metadata(request: Options, *, capture: str, inputs: str, method: str | None 
     return found
 
 
+def export_metadata(request: Options, contents: Mapping[str, str]) -> dict[str, str]:
+    """Return the string attributes that an export adds to the provenance of what it exports.
+
+    Args:
+        request: what was asked; as in `metadata`.
+        contents: content hash of each file that the asset was made from, by the name of its stem, such as maps.
+    """
+    options = {name: value for name, value in choices(request).items() if value is not None and value is not False}
+    return {"relit:export_version": __version__, "relit:export_options": json.dumps(options, sort_keys=True),
+            **{f"relit:{name}": content for name, content in contents.items()}}
+
+
 def choices(request: Options) -> dict[str, Any]:
     """Return what a request chooses about the work, as plain data; neither paths nor how the work was carried out."""
     plain = request.model_dump(mode="json")

@@ -3,9 +3,14 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
+from pydantic import Field
+
 from service.requests.base import Choice, Options, Role, Spelling
 
 AssetFormat = Literal["usdz", "usda", "usdc"]
+
+FIRST_VERSION = "1"
+"""Version of an asset that nobody gave one."""
 
 
 class Geometry(Choice):
@@ -20,6 +25,8 @@ class ExportOptions(Options):
 
     name: str | None = None
     """Name of the asset; None: the name that the maps have, else the stem of the file's name."""
+    version: Annotated[str, Field(min_length=1)] = FIRST_VERSION
+    """Version of the asset, written into its assetInfo: what a pipeline counts, as in 3 or v003."""
     geometry: Geometry | None = None
     """What an asset of a depth (depth.exr in place of maps.exr) is made of; None: mesh."""
 

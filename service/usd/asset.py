@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 from service.asset.mesh import height_mesh
 from service.asset.textures import FILE_NAMES, write_textures
+from service.requests.export import FIRST_VERSION
 from service.usd.files import check_suffix, install, temporary_folder_beside
-from service.usd.layers import FIRST_VERSION, LAYER_FILES, AssetLayers, Description, texture_folder
+from service.usd.layers import LAYER_FILES, AssetLayers, Description, texture_folder
 from service.usd.scene import UNIT_WITHOUT_SCALE_M, define_asset
 from stage.maps import SurfaceMaps
 

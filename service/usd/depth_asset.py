@@ -8,6 +8,7 @@ from pxr import Sdf, Usd
 
 from service.asset.depth_mesh import depth_mesh
 from service.asset.errors import AssetError
+from service.requests.export import FIRST_VERSION
 from service.usd.camera import define_camera
 from service.usd.files import check_suffix, install, temporary_folder_beside
 from service.usd.layers import LAYER_FILES, AssetLayers, Description
@@ -22,7 +23,8 @@ GREY = 0.5
 """Linear colour where none is known."""
 
 
-def write_depth_points(maps: DepthMaps, cloud: PointCloud | None, path: str | Path, *, name: str) -> None:
+def write_depth_points(maps: DepthMaps, cloud: PointCloud | None, path: str | Path, *, name: str,
+                       version: str = FIRST_VERSION) -> None:
     """Write the measured points as a USD asset.
 
     Args:
@@ -30,6 +32,7 @@ def write_depth_points(maps: DepthMaps, cloud: PointCloud | None, path: str | Pa
         cloud: what points.ply holds, or None.
         path: .usda, .usdc or .usdz.
         name: free text; the root prim is named after it.
+        version: of the asset, for assetInfo.
 
     Raises:
         AssetError: another suffix, or no point.
@@ -47,10 +50,11 @@ def write_depth_points(maps: DepthMaps, cloud: PointCloud | None, path: str | Pa
         set_display_color(prim, colours)
         return np.array(prim.GetExtentAttr().Get())
 
-    _write(maps, Path(path), name, "points", fill)
+    _write(maps, Path(path), Description(name, maps.camera, maps.provenance, version=version), "points", fill)
 
 
-def write_depth_mesh(maps: DepthMaps, cloud: PointCloud | None, path: str | Path, *, name: str) -> None:
+def write_depth_mesh(maps: DepthMaps, cloud: PointCloud | None, path: str | Path, *, name: str,
+                       version: str = FIRST_VERSION) -> None:
     """Write a depth as a mesh without faces over steps of the depth.
 
     Args:
@@ -58,6 +62,7 @@ def write_depth_mesh(maps: DepthMaps, cloud: PointCloud | None, path: str | Path
         cloud: what points.ply holds, for the colours of its pixels, or None.
         path: .usda, .usdc or .usdz.
         name: free text; the root prim is named after it.
+        version: of the asset, for assetInfo.
 
     Raises:
         AssetError: another suffix, or no face.
@@ -75,13 +80,14 @@ def write_depth_mesh(maps: DepthMaps, cloud: PointCloud | None, path: str | Path
         set_display_color(define_mesh(usd_stage, parent.AppendChild("Mesh"), mesh), colours)
         return mesh.extent
 
-    _write(maps, Path(path), name, "mesh", fill)
+    _write(maps, Path(path), Description(name, maps.camera, maps.provenance, version=version), "mesh", fill)
 
 
-def _write(maps: DepthMaps, target: Path, name: str, variant: str, fill: Callable[[Usd.Stage, Sdf.Path], np.ndarray]) -> None:
+def _write(maps: DepthMaps, target: Path, description: Description, variant: str,
+           fill: Callable[[Usd.Stage, Sdf.Path], np.ndarray]) -> None:
     """Write the asset around what `fill` defines below /Name/Geom; `fill` returns the extent of that."""
     with temporary_folder_beside(target) as temporary:
-        layers = AssetLayers(temporary, target, Description(name, maps.camera, maps.provenance))
+        layers = AssetLayers(temporary, target, description)
         with layers.geometry_variant(variant) as geom:
             extent = fill(layers.geometry, geom)
         define_camera(layers.geometry, layers.root.AppendChild("Camera"), maps.camera, extent)

@@ -12,13 +12,14 @@ variant is weaker than one beside it, so that what variants change is stated in 
 """
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdShade
 
+from service.requests.export import FIRST_VERSION
 from service.usd.files import check_suffix
 from service.usd.names import prim_name
 from stage.camera import Camera
@@ -29,9 +30,6 @@ GEO, LOOK = "geo", "look"
 PAYLOAD, GEOMETRY, MATERIALS = "payload.usda", "geometry.usdc", "materials.usda"
 """Layers of a .usda or .usdc asset beside its interface: the same files whatever the suffix, so that a .usda and a .usdc can share them."""
 LAYER_FILES = (PAYLOAD, GEOMETRY, MATERIALS)
-
-FIRST_VERSION = "1"
-"""Version of an asset that nobody gave one."""
 
 _PURPOSES = [UsdGeom.Tokens.default_, UsdGeom.Tokens.render, UsdGeom.Tokens.proxy, UsdGeom.Tokens.guide]
 
@@ -54,7 +52,6 @@ class AssetLayers:
         materials: the stage for everything below `looks`.
         root: path of the root prim, /Name.
         texture_folder: of the textures, relative to the layer of the materials.
-        surfaces: prims that take the material of the selected look; whoever defines a surface appends it.
     """
 
     def __init__(self, folder: Path, target: Path, description: Description) -> None:
@@ -69,7 +66,6 @@ class AssetLayers:
         self._interface_file = folder / f"{target.stem}{'.usdc' if self._packed else target.suffix.lower()}"
         self._identifier = target.name
         self.root = Sdf.Path.absoluteRootPath.AppendChild(prim_name(description.name))
-        self.surfaces: list[Sdf.Path] = []
         self._interface = self._create(self._interface_file)
         if self._packed:
             self.files: tuple[Path, ...] = (self._interface_file,)
@@ -82,6 +78,7 @@ class AssetLayers:
         self.texture_folder = f"{'.' if self._packed else '..'}/{texture_folder(target)}"
         self._geometries: list[str] = []
         self._first_prims: list[Sdf.Path] = []
+        self._surfaces: list[tuple[str, Sdf.Path]] = []
         self._looks: dict[str, Sdf.Path] = {}
 
     @property
@@ -101,7 +98,8 @@ class AssetLayers:
         The names of its prims differ from those of other variants.
         """
         UsdGeom.Scope.Define(self.geometry, self.geom)
-        if not self._geometries:
+        self._geometries.append(name)
+        if len(self._geometries) == 1:
             yield self.geom
             self._first_prims = [prim.GetPath() for prim in self.geometry.GetPrimAtPath(self.geom).GetAllChildren()]
         else:
@@ -109,7 +107,10 @@ class AssetLayers:
                 for path in self._first_prims:
                     self.geometry.OverridePrim(path).SetActive(False)
                 yield self.geom
-        self._geometries.append(name)
+
+    def add_surface(self, prim: Sdf.Path) -> None:
+        """Bind the material of the selected look to a prim; called inside the block of the prim's variant."""
+        self._surfaces.append((self._geometries[-1], prim))
 
     def add_look(self, name: str, material: UsdShade.Material) -> None:
         """Make a material, which lies below `looks` on the stage `materials`, a variant of `look`; the first is the default."""
@@ -118,10 +119,8 @@ class AssetLayers:
     def save(self) -> None:
         """Bind the looks, write variant sets and extents, and save the layers; the object is of no use afterwards."""
         for name, material in self._looks.items():
-            for surface in self.surfaces:
-                with _in_variant(self.materials, self.root, LOOK, name):
-                    prim = self.materials.OverridePrim(surface)
-                    UsdShade.MaterialBindingAPI.Apply(prim).Bind(UsdShade.Material(self.materials.GetPrimAtPath(material)))
+            for geometry, surface in self._surfaces:
+                self._bind(geometry, surface, name, material)
         if not self._packed:
             self._write_payload()
         root = self._interface.GetPrimAtPath(self.root)
@@ -136,6 +135,15 @@ class AssetLayers:
                 root.GetVariantSets().GetVariantSet(variant_set).SetVariantSelection(variants[0])
         self._interface.Save()
         del self.geometry, self.materials, self._interface
+
+    def _bind(self, geometry: str, surface: Sdf.Path, look: str, material: Sdf.Path) -> None:
+        """Bind a material in a variant of `look`, which is nested in the variant of `geo` that the surface is in."""
+        with ExitStack() as variants:
+            if geometry != self._geometries[0]:
+                variants.enter_context(_in_variant(self.materials, self.root, GEO, geometry))
+            variants.enter_context(_in_variant(self.materials, self.root, LOOK, look))
+            prim = self.materials.OverridePrim(surface)
+            UsdShade.MaterialBindingAPI.Apply(prim).Bind(UsdShade.Material(self.materials.GetPrimAtPath(material)))
 
     def _write_payload(self) -> None:
         """Save the layers of the payload, and refer to them."""
@@ -199,7 +207,8 @@ def _in_variant(usd_stage: Usd.Stage, root: Sdf.Path, variant_set: str, name: st
         variants.SetVariantSelection(name)
     with variants.GetVariantEditContext():
         yield
-    session.Clear()
+    with Usd.EditContext(usd_stage, session):
+        variants.ClearVariantSelection()
 
 
 def _matrix(world_from_camera: tuple[tuple[float, ...], ...], unit_m: float) -> Gf.Matrix4d:

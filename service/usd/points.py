@@ -69,9 +69,9 @@ def define_points(usd_stage: Usd.Stage, path: Sdf.Path, points: np.ndarray, widt
     """
     prim = UsdGeom.Points.Define(usd_stage, path)
     prim.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(points, dtype=np.float32)))
-    prim.CreateWidthsAttr(Vt.FloatArray.FromNumpy(np.ascontiguousarray(widths, dtype=np.float32)))
-    prim.SetWidthsInterpolation(UsdGeom.Tokens.constant if len(widths) == 1 else UsdGeom.Tokens.vertex)
     each_width = Vt.FloatArray.FromNumpy(np.broadcast_to(widths, len(points)).astype(np.float32))
+    prim.CreateWidthsAttr(each_width)  # one a point: readers that compute an extent give up on one for all
+    prim.SetWidthsInterpolation(UsdGeom.Tokens.vertex)
     prim.CreateExtentAttr(UsdGeom.Points.ComputeExtent(prim.GetPointsAttr().Get(), each_width))
     if normals is not None:
         prim.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(normals, dtype=np.float32)))

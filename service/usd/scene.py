@@ -33,7 +33,7 @@ def define_asset(layers: AssetLayers, maps: SurfaceMaps, mesh: SurfaceMesh, text
         layers.geometry.GetPrimAtPath(layers.root).SetCustomDataByKey("relit:scale", SCALE_NOTE)
     with layers.geometry_variant("mesh") as geom:
         usd_mesh = define_mesh(layers.geometry, geom.AppendChild("Mesh"), mesh)
-        layers.surfaces.append(usd_mesh.GetPath())
+        layers.add_surface(usd_mesh.GetPath())
     UsdGeom.Scope.Define(layers.materials, layers.looks)
     material = define_material(layers.materials, layers.looks.AppendChild("Material"), textures, layers.texture_folder)
     layers.add_look("specular", material)
