@@ -1,21 +1,25 @@
-"""Exports maps.exr or depth.exr as a USD asset."""
+"""Exports maps.exr or depth.exr as a USD or glTF asset."""
 
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
+from service.asset.errors import AssetError
 from service.errors import RequestError
+from service.gltf.asset import write_asset as write_gltf_asset
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import export_metadata
-from service.requests.export import ExportRequest, Geometry
-from service.usd.asset import write_asset
+from service.requests.export import AssetFormat, ExportRequest, Geometry
+from service.usd.asset import write_asset as write_usd_asset
 from service.usd.depth_asset import write_depth_mesh, write_depth_points
 from stage.depth_maps import DEPTH_FILE, DepthMaps
 from stage.errors import ResultError
 from stage.fingerprint import digest
 from stage.maps import MAPS_FILE, SurfaceMaps
 from stage.ply import POINTS_FILE, PointCloud, read_ply
+
+GLB = ".glb"
 
 
 class Exported(NamedTuple):
@@ -27,14 +31,15 @@ class Exported(NamedTuple):
 
 
 def export(request: ExportRequest, progress: Progress | None = None) -> Exported:
-    """Write a USD asset from solved maps, or from a depth where there are no maps.
+    """Write an asset from solved maps, or from a depth where there are no maps.
 
     Raises:
         ResultError: the maps are missing or incomplete.
-        RequestError: a geometry is asked for solved maps.
+        RequestError: a geometry is asked for solved maps, or a .glb of a depth.
         AssetError: an unknown suffix, no height, or no face.
         StorageError: the asset cannot be written; nothing is left half-written.
     """
+    suffix = _check_suffix(request.out)
     timings = Timings(progress)
     timings.stage("read", 1)
     warnings: list[str] = []
@@ -44,6 +49,8 @@ def export(request: ExportRequest, progress: Progress | None = None) -> Exported
     if not of_depth and not path.exists():
         raise ResultError(f"{path}: is not there: run `relit solve` or `relit depth` first")
     if of_depth:
+        if suffix == GLB:
+            raise RequestError(f"--out {request.out}: a .glb is of solved maps, {depth} holds a depth: name a .usdz, .usda or .usdc")
         _export_depth(depth, request, timings)
     else:
         if request.geometry is not None:
@@ -51,11 +58,25 @@ def export(request: ExportRequest, progress: Progress | None = None) -> Exported
         maps = SurfaceMaps.read(path)
         maps = replace(maps, provenance={**maps.provenance, **export_metadata(request, {path.stem: digest(path)})})
         timings.stage("asset", 1)
-        report = write_asset(maps, request.out, name=_name(request, maps.provenance.get("relit:capture")), version=request.version)
+        name = _name(request, maps.provenance.get("relit:capture"))
+        if suffix == GLB:
+            in_gltf = write_gltf_asset(maps, request.out, name=name, version=request.version)
+            clipped_pixels = in_gltf.clipped_pixels
+            warnings += in_gltf.warnings
+        else:
+            clipped_pixels = write_usd_asset(maps, request.out, name=name, version=request.version).clipped_pixels
         warnings += [f"{layer}: {count} pixels have a value outside 0…1, which the texture cannot hold: they are clipped"
-                     for layer, count in report.clipped_pixels.items() if count]
+                     for layer, count in clipped_pixels.items() if count]
     timings.close()
     return Exported(request.out, tuple(warnings))
+
+
+def _check_suffix(target: Path) -> str:
+    """Return the suffix of an asset in lower case."""
+    suffix = target.suffix.lower()
+    if suffix.removeprefix(".") not in get_args(AssetFormat):
+        raise AssetError(f"{target} cannot be written as an asset: its suffix must be .usda, .usdc or .usdz for USD, or .glb for glTF")
+    return suffix
 
 
 def _export_depth(path: Path, request: ExportRequest, timings: Timings) -> None:

@@ -7,7 +7,7 @@ from pydantic import Field
 
 from service.requests.base import Choice, Options, Role, Spelling
 
-AssetFormat = Literal["usdz", "usda", "usdc"]
+AssetFormat = Literal["usdz", "usda", "usdc", "glb"]
 
 FIRST_VERSION = "1"
 """Version of an asset that nobody gave one."""
@@ -21,7 +21,7 @@ class Geometry(Choice):
 
 
 class ExportOptions(Options):
-    """What a USD asset is called and made of."""
+    """What an asset is called and made of."""
 
     name: str | None = None
     """Name of the asset; None: the name that the maps have, else the stem of the file's name."""
@@ -32,9 +32,9 @@ class ExportOptions(Options):
 
 
 class ExportRequest(ExportOptions):
-    """A USD asset of solved maps with their material, or of a depth with its colours."""
+    """A USD or glTF asset of solved maps with their material, or a USD asset of a depth with its colours."""
 
     maps: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="DIR")]
     """Folder with maps.exr or depth.exr, or the file."""
     out: Annotated[Path, Role.OUTPUT]
-    """The asset: .usdz, .usda or .usdc."""
+    """The asset: .usdz, .usda, .usdc or .glb (binary glTF)."""

@@ -88,7 +88,7 @@ class ShadeJob(JobRequest):
 
 
 class ExportJob(JobRequest):
-    """A USD asset of a solve or depth job: asset.usdz, .usda or .usdc."""
+    """An asset of a solve or depth job: asset.usdz, .usda, .usdc or, of a solve job, .glb."""
 
     kind: Literal["export"]
     maps: Annotated[JobId, Role.INPUT, MAPS]

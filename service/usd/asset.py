@@ -6,10 +6,11 @@ from typing import NamedTuple
 
 from service.asset.mesh import height_mesh
 from service.asset.textures import FILE_NAMES, write_textures
+from service.asset.units import unit_in_metres
 from service.requests.export import FIRST_VERSION
 from service.usd.files import check_suffix, install, temporary_folder_beside
 from service.usd.layers import LAYER_FILES, AssetLayers, Description, texture_folder
-from service.usd.scene import UNIT_WITHOUT_SCALE_M, define_asset
+from service.usd.scene import define_asset
 from stage.maps import SurfaceMaps
 
 Progress = Callable[[str, float], None]
@@ -53,7 +54,7 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str 
     tell("mesh", 0.0)
     mesh = height_mesh(maps)
     description = Description(name, maps.camera, {**maps.provenance, "relit:color_space": maps.color_space},
-                              1.0 if maps.camera.metric else UNIT_WITHOUT_SCALE_M, version)
+                              unit_in_metres(maps.camera), version)
     with temporary_folder_beside(target) as temporary:
         folder = temporary / texture_folder(target)
         folder.mkdir()

@@ -9,15 +9,11 @@ from pxr import Sdf, Usd, UsdGeom, Vt
 
 from service.asset.mesh import SurfaceMesh
 from service.asset.textures import Texture
+from service.asset.units import SCALE_NOTE
 from service.usd.camera import define_camera
 from service.usd.layers import AssetLayers
 from service.usd.materials import define_material
 from stage.maps import SurfaceMaps
-
-UNIT_WITHOUT_SCALE_M = 0.001
-"""Metres of a pixel where the capture has no scale, so that the asset has a visible size."""
-
-SCALE_NOTE = "unknown: the capture gives no scale, so one pixel is taken as one millimetre"
 
 
 def define_asset(layers: AssetLayers, maps: SurfaceMaps, mesh: SurfaceMesh, textures: Mapping[str, Texture]) -> None:

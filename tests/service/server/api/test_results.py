@@ -97,6 +97,7 @@ def test_a_file_is_downloaded_with_what_clients_need(client, frames, folder):
 
 @pytest.mark.parametrize("name, media_type", [
     ("maps.exr", "image/x-exr"), ("asset.usdz", "model/vnd.usdz+zip"), ("asset.usda", "model/vnd.usda"),
+    ("asset.glb", "model/gltf-binary"),
     ("asset.usdc", "application/octet-stream"), ("report.json", "application/json"), ("preview.png", "image/png"),
     ("points.ply", "application/octet-stream"), ("page.html", "application/octet-stream"), ("none", "application/octet-stream")])
 def test_media_types(client, frames, folder, name, media_type):

@@ -1,0 +1,129 @@
+"""The .glb file: a glTF document and its binary data, which is streamed into the file and never held as a whole.
+
+Source: glTF 2.0 Specification, 3.6 "Binary Data Storage" and 4 "GLB File Format Specification".
+"""
+
+import shutil
+import struct
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from pygltflib import GLTF2, Accessor, Buffer, BufferView, Image
+
+from service.asset.errors import AssetError
+
+MAX_FILE_BYTES = 2**32 - 1
+"""The header of the file gives its length in 32 bits (4.4.2)."""
+
+ALIGNMENT = 4
+"""Bytes: the start of every chunk and of every accessor (3.6.2.4 and 4.4.3)."""
+
+_HEADER, _CHUNK_HEADER = struct.Struct("<4sII"), struct.Struct("<I4s")
+_MAGIC, _VERSION = b"glTF", 2
+_JSON, _BIN = b"JSON", b"BIN\0"
+
+_COMPONENT_TYPES = {"<u1": 5121, "<u2": 5123, "<u4": 5125, "<f4": 5126}
+"""The code of each NumPy type (3.6.2.2, "Accessor Data Types")."""
+_ELEMENT_TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
+
+
+class Glb:
+    """A glTF document in the making: its JSON objects, and the arrays and files that its buffer will hold."""
+
+    def __init__(self) -> None:
+        self.document = GLTF2()
+        self._parts: list[np.ndarray | Path] = []
+        self._size = 0
+
+    def add_array(self, values: np.ndarray, *, target: int, bounds: bool = False, normalized: bool = False) -> int:
+        """Add an array and return the number of its accessor.
+
+        Args:
+            values: [n] or [n, 2, 3 or 4] uint8, uint16, uint32 or float32; kept until the file is written.
+            target: what the array is for: ARRAY_BUFFER or ELEMENT_ARRAY_BUFFER of pygltflib.
+            bounds: write the least and the greatest value of each component, as positions need.
+            normalized: integers stand for fractions of their largest value.
+        """
+        values = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
+        components = values.shape[1] if values.ndim == 2 else 1
+        least, greatest = (np.atleast_1d(edge).tolist() for edge in (values.min(axis=0), values.max(axis=0))) if bounds else ([], [])
+        self.document.accessors.append(Accessor(
+            bufferView=self._add_part(values, values.nbytes, target), componentType=_COMPONENT_TYPES[_type_code(values.dtype)],
+            normalized=normalized, count=len(values), type=_ELEMENT_TYPES[components], min=least, max=greatest))
+        return len(self.document.accessors) - 1
+
+    def add_image(self, file: Path, *, media_type: str) -> int:
+        """Add an image file and return the number of the image; the file is read when the .glb is written.
+
+        Args:
+            file: a PNG or JPEG file.
+            media_type: "image/png" or "image/jpeg".
+        """
+        self.document.images.append(Image(bufferView=self._add_part(file, file.stat().st_size, None), mimeType=media_type, name=file.stem))
+        return len(self.document.images) - 1
+
+    def write(self, path: Path) -> None:
+        """Write the file.
+
+        Raises:
+            AssetError: more than the 4 GiB that a .glb can hold.
+            OSError: it cannot be written.
+        """
+        self.document.buffers = [Buffer(byteLength=self._size)]
+        text = self.document.gltf_to_json(separators=(",", ":"), indent=None).encode()
+        text += b" " * (-len(text) % ALIGNMENT)
+        length = _HEADER.size + _CHUNK_HEADER.size + len(text) + _CHUNK_HEADER.size + self._size
+        if length > MAX_FILE_BYTES:
+            raise AssetError(f"the asset has {length / 2**30:.1f} GiB, more than the 4 GiB that a .glb can hold: export a .usdc")
+        with open(path, "wb") as stream:
+            stream.write(_HEADER.pack(_MAGIC, _VERSION, length) + _CHUNK_HEADER.pack(len(text), _JSON) + text)
+            stream.write(_CHUNK_HEADER.pack(self._size, _BIN))
+            for part in self._parts:
+                _append(stream, part)
+                stream.write(bytes(-stream.tell() % ALIGNMENT))
+
+    def _add_part(self, part: np.ndarray | Path, size: int, target: int | None) -> int:
+        """Add data to the buffer and return the number of its view."""
+        self.document.bufferViews.append(BufferView(buffer=0, byteOffset=self._size, byteLength=size, target=target))
+        self._parts.append(part)
+        self._size += size + -size % ALIGNMENT
+        return len(self.document.bufferViews) - 1
+
+
+def read_document(path: Path) -> GLTF2:
+    """Return the document of a .glb file, without its binary data.
+
+    Raises:
+        AssetError: it is not a .glb file of version 2, or it is cut off.
+        OSError: it cannot be read.
+    """
+    with open(path, "rb") as stream:
+        start = stream.read(_HEADER.size + _CHUNK_HEADER.size)
+        size = path.stat().st_size
+        if len(start) < _HEADER.size + _CHUNK_HEADER.size or start[:4] != _MAGIC:
+            raise AssetError(f"{path}: is not a .glb file")
+        _, version, length = _HEADER.unpack_from(start)
+        text_length, kind = _CHUNK_HEADER.unpack_from(start, _HEADER.size)
+        if version != _VERSION or kind != _JSON:
+            raise AssetError(f"{path}: is not glTF of version {_VERSION}: its header says {version}")
+        if length != size or text_length > size:
+            raise AssetError(f"{path}: is cut off: it has {size} of {length} bytes")
+        text = stream.read(text_length)
+    try:
+        return GLTF2.gltf_from_json(text.decode())
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise AssetError(f"{path}: holds no glTF document that can be read: {error}") from error
+
+
+def _type_code(dtype: np.dtype[Any]) -> str:
+    """Return the byte order, kind and size of a type; single bytes have no order of their own."""
+    return f"<{dtype.kind}{dtype.itemsize}"
+
+
+def _append(stream: BinaryIO, part: np.ndarray | Path) -> None:
+    if isinstance(part, Path):
+        with open(part, "rb") as source:
+            shutil.copyfileobj(source, stream)
+    else:
+        stream.write(part.data)
