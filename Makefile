@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PYTEST := $(BIN)/python -m pytest -q -n auto --maxprocesses 4 --dist loadfile
 
-.PHONY: demo serve test test-all lint bench figures samples lock clean
+.PHONY: demo serve test test-all clients lint bench figures samples lock clean
 demo: $(VENV)/installed
 	$(BIN)/relit demo
 
@@ -17,6 +17,9 @@ test: $(VENV)/installed-dev
 # with the long suites: workers and servers killed, databases restarted, load, random requests
 test-all: $(VENV)/installed-dev
 	$(PYTEST)
+
+# Blender, Mitsuba and three.js, which tests/clients opens assets with; needs Python 3.11 exactly, npm, and Chromium beside it
+clients: .clients/installed
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff check .
@@ -42,13 +45,24 @@ lock:
 	  --custom-compile-command "make lock" --extra build pyproject.toml -o requirements.lock
 	uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-annotate \
 	  --custom-compile-command "make lock" --extra build --extra dev pyproject.toml -o requirements-dev.lock
+	uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-annotate \
+	  --custom-compile-command "make lock" tests/clients/requirements.in -o tests/clients/requirements.lock
+	cd tests/clients && npm install --silent --package-lock-only --omit-lockfile-registry-resolved
 
 clean:
-	rm -rf $(VENV) relit-demo
+	rm -rf $(VENV) .clients relit-demo
 
 $(VENV)/bin/python:
 	$(PYTHON) -c 'import sys; sys.exit("relit needs Python 3.11 or newer: make PYTHON=python3.11 ...") if sys.version_info < (3, 11) else None'
 	$(PYTHON) -m venv $(VENV) || (rm -rf $(VENV); echo "the venv module is missing: on Debian, apt-get install python3-venv"; exit 1)
+
+.clients/installed: tests/clients/requirements.lock tests/clients/package-lock.json
+	$(PYTHON) -c 'import sys; sys.exit("bpy needs Python 3.11: make clients PYTHON=python3.11") if sys.version_info[:2] != (3, 11) else None'
+	$(PYTHON) -m venv .clients
+	.clients/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r tests/clients/requirements.lock
+	cp tests/clients/package.json tests/clients/package-lock.json .clients
+	cd .clients && npm ci --silent --no-audit --no-fund
+	touch $@
 
 $(VENV)/installed: requirements.lock pyproject.toml | $(VENV)/bin/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock

@@ -62,7 +62,7 @@ def mesh(name: str, arrays: dict) -> object:
     params = mi.traverse(shape)
     params["vertex_positions"] = arrays["points"].ravel()
     params["vertex_normals"] = arrays["normals"].ravel()
-    params["vertex_texcoords"] = arrays["st"].ravel()
+    params["vertex_texcoords"] = np.stack([arrays["st"][:, 0], 1 - arrays["st"][:, 1]], axis=-1).ravel()  # rows of bitmaps run down
     params["faces"] = arrays["triangles"].ravel()
     params.update()
     return shape

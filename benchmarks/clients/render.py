@@ -57,35 +57,52 @@ def render(client: Client, asset: Path, camera: Camera, light: Environment | Sun
         MissingClientError: the program is not installed.
         RuntimeError: the program fails; the text ends with what it said.
     """
-    asset = asset.resolve()
+    if client is Client.MITSUBA:
+        return trace(usd_arrays.read(asset), camera, light, samples=samples)
+    job: dict[str, Any] = {"asset": str(asset.resolve()), "camera": camera.model_dump(), "samples": samples}
+    if isinstance(light, Sun):
+        job["sun"] = light._asdict()
+    if client is Client.THREE:
+        return three.render(job, light.latlong if isinstance(light, Environment) else None)
     with tempfile.TemporaryDirectory() as folder:
-        work = Path(folder)
-        job: dict[str, Any] = {"asset": str(asset), "camera": camera.model_dump(), "samples": samples, "bounces": BOUNCES,
-                               "out": str(work / "picture.exr")}
+        if isinstance(light, Environment):
+            job["environment"] = str(Path(folder) / "environment.exr")
+            exr.write(job["environment"], dict(zip("RGB", np.moveaxis(light.latlong.astype(np.float32), -1, 0), strict=True)),
+                      color_space="lin_rec709_scene", metadata={})
+        return _run(installed.python_with("bpy", "RELIT_BLENDER_PYTHON"), "inside_blender.py", job, Path(folder))
+
+
+def trace(arrays: dict[str, np.ndarray], camera: Camera, light: Environment | Sun, *, samples: int) -> np.ndarray:
+    """Return the picture of meshes and materials that Mitsuba traces, as `render` does.
+
+    Args:
+        arrays: as usd_arrays.read returns them.
+        camera: of the capture.
+        light: the only light.
+        samples: paths of each pixel.
+
+    Raises:
+        MissingClientError: Mitsuba is not installed.
+        RuntimeError: Mitsuba fails.
+    """
+    job: dict[str, Any] = {"camera": camera.model_dump(), "samples": samples}
+    with tempfile.TemporaryDirectory() as folder:
+        job["arrays"] = str(Path(folder) / "arrays.npz")
+        np.savez(job["arrays"], **arrays)
         if isinstance(light, Sun):
-            job["sun"] = {"direction": light.direction, "irradiance": light.irradiance}
+            job["sun"] = light._asdict()
         else:
-            job["environment"] = str(work / "environment.exr")
-            latlong = np.moveaxis(light.latlong.astype(np.float32), -1, 0)
-            exr.write(work / "environment.exr", dict(zip("RGB", latlong, strict=True)), color_space="lin_rec709_scene", metadata={})
-        if client is Client.THREE:
-            return three.render(job, light.latlong if isinstance(light, Environment) else None)
-        if client is Client.BLENDER:
-            python = installed.python_with("bpy", "RELIT_BLENDER_PYTHON")
-        else:
-            python = installed.python_with("mitsuba", "RELIT_MITSUBA_PYTHON")
-            if isinstance(light, Environment):
-                np.save(work / "environment.npy", light.latlong.astype(np.float32))
-                job["environment"] = str(work / "environment.npy")
-            job["arrays"] = str(work / "arrays.npz")
-            np.savez(job["arrays"], **usd_arrays.read(asset))
-        (work / "job.json").write_text(json.dumps(job))
-        _run([str(python), "-P", str(HERE / f"inside_{client}.py"), str(work / "job.json")])
-        channels, _ = exr.read(job["out"])
-    return np.stack([channels[name] for name in "RGBA"], axis=-1).astype(np.float32)
+            job["environment"] = str(Path(folder) / "environment.npy")
+            np.save(job["environment"], light.latlong.astype(np.float32))
+        return _run(installed.python_with("mitsuba", "RELIT_MITSUBA_PYTHON"), "inside_mitsuba.py", job, Path(folder))
 
 
-def _run(command: list[str]) -> None:
-    done = subprocess.run(command, capture_output=True, text=True, timeout=TIME_LIMIT_S)
+def _run(python: Path, script: str, job: dict[str, Any], folder: Path) -> np.ndarray:
+    """Run a script of this package in another Python and return the picture that it writes."""
+    job = {**job, "bounces": BOUNCES, "out": str(folder / "picture.exr")}
+    (folder / "job.json").write_text(json.dumps(job))
+    done = subprocess.run([python, "-P", HERE / script, folder / "job.json"], capture_output=True, text=True, timeout=TIME_LIMIT_S)
     if done.returncode != 0:
-        raise RuntimeError(f"{Path(command[2]).name} failed: {(done.stdout + done.stderr)[-3000:]}")
+        raise RuntimeError(f"{script} failed: {(done.stdout + done.stderr)[-3000:]}")
+    channels, _ = exr.read(job["out"])
+    return np.stack([channels[name] for name in "RGBA"], axis=-1).astype(np.float32)

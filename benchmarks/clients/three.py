@@ -33,8 +33,8 @@ def render(job: dict[str, Any], latlong: np.ndarray | None) -> np.ndarray:
     """Return the picture [rows, cols, 4] float32, linear, premultiplied.
 
     Args:
-        job: `asset`, `camera`, and `sun` or `environment`.
-        latlong: [H, 2 H, 3] radiance of the environment, in relit's orientation.
+        job: `asset`, `camera`, and `sun` where there is no environment.
+        latlong: [H, 2 H, 3] radiance of the environment, in relit's orientation, or None.
 
     Raises:
         MissingClientError: Chromium or three.js is missing.

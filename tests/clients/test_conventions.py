@@ -9,11 +9,13 @@ from benchmarks.clients.comparison import compare
 from benchmarks.clients.render import Environment, Sun, render
 from stage.camera import Camera
 from stage.maps import SurfaceMaps
+from tests.clients.scenes import directions, uneven
 
 pytestmark = pytest.mark.long
 
 SIDE = 32
-ALBEDO = np.array([0.3, 0.4, 0.6])
+ALBEDO_MAP = np.array([0.4, 0.5, 0.7]) * (1 - np.linspace(0, 0.5, SIDE))[:, None, None] * (1 - np.linspace(0, 0.3, SIDE))[None, :, None]
+"""Brighter at the top and at the left."""
 TOLERANCE = 0.08
 """The least specular lobe that UsdPreviewSurface has (F0 .04, roughness 1) adds up to a tenth to the darkest channel; noise of 256 paths is
 some percent of a pixel, and Mitsuba's `principled` has Burley's diffuse lobe."""
@@ -38,29 +40,8 @@ def ball(camera: Camera, radius: float, centre_z: float) -> SurfaceMaps:
     normal = (point - [0, 0, centre_z]) / radius
     inside = (under > 0) & (normal[..., 2] > 0.2)
     return SurfaceMaps(camera=camera, mask=inside, normal=np.where(inside[..., None], normal, 0).astype(np.float32),
-                       diffuse_albedo=np.broadcast_to(ALBEDO, point.shape).astype(np.float32), roughness=np.ones(inside.shape, np.float32),
+                       diffuse_albedo=ALBEDO_MAP.astype(np.float32), roughness=np.ones(inside.shape, np.float32),
                        specular=np.full(point.shape, 0.04, np.float32), height=np.where(inside, point[..., 2], 0).astype(np.float32))
-
-
-def directions(height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return directions [H, 2 H, 3] and solid angles [H, 2 H] of a lat-long map, from the formula of docs/relight.md."""
-    v, u = np.meshgrid((np.arange(height) + 0.5) / height, (np.arange(2 * height) + 0.5) / (2 * height), indexing="ij")
-    d = np.stack([np.sin(2 * np.pi * u) * np.sin(np.pi * v), np.cos(np.pi * v), -np.cos(2 * np.pi * u) * np.sin(np.pi * v)], axis=-1)
-    return d, np.sin(np.pi * v) * (np.pi / height) ** 2
-
-
-PATCHES = (((0.7, 0.2, 0.7), (4, 1, 0)), ((-0.3, 0.8, 0.5), (0, 2, 4)), ((0.2, -0.8, 0.3), (1, 4, 1)), ((-1, 0, 0), (3, 0, 3)))
-"""Direction and peak radiance."""
-
-
-def uneven(height: int = 64) -> np.ndarray:
-    """Return an environment that is another one when it is turned or mirrored."""
-    d, _ = directions(height)
-    picture = np.full((*d.shape[:2], 3), 0.2)
-    for axis, colour in PATCHES:
-        apart = np.degrees(np.arccos(np.clip(d @ (np.array(axis) / np.linalg.norm(axis)), -1, 1)))
-        picture += np.exp(-0.5 * (apart / 20) ** 2)[..., None] * np.array(colour)
-    return picture
 
 
 CAMERAS = {
@@ -86,7 +67,7 @@ def test_a_rough_ball_has_its_closed_form(client, camera, kind, tmp_path):
     else:
         light = Sun((0.48, 0.6, 0.64), (3.0, 2.0, 1.0))
         irradiance = np.maximum(normal @ np.array(light.direction), 0)[..., None] * np.array(light.irradiance)
-    truth = ALBEDO / np.pi * irradiance
+    truth = ALBEDO_MAP / np.pi * irradiance
     picture = render(client, asset, view, light, samples=256)
     shown = binary_erosion(maps.mask, np.ones((3, 3)))  # a vertex lies on a pixel's centre, so the mesh fills the outermost ones in part
     np.testing.assert_allclose(picture[shown][:, 3], 1, atol=1e-3)
