@@ -12,7 +12,7 @@ Source: OpenUSD, "UsdPreviewSurface Specification", inputs metallic and ior; glT
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -45,6 +45,9 @@ GRID, GOLDEN_STEPS = 9, 10
 EXACT = 1e-6
 """Squared misfit of a pixel that single precision cannot tell from none: the nearer end, 0 or 1, is taken then."""
 
+LOSS_MATTERS = 0.03
+"""RMS loss of reflectance that is worth a warning: a tenth of what an average object reflects."""
+
 BAND_PIXELS = 1 << 15
 """Pixels of a band: its planes of 128 KiB stay in the cache of a core."""
 
@@ -52,8 +55,9 @@ BAND_PIXELS = 1 << 15
 class MetallicLook(NamedTuple):
     """The metallic workflow of solved maps."""
 
-    base_color: np.ndarray  # [rows, cols, 3] float32, 0…1, scene-linear in the colour space of the maps; 0 outside the mask
-    metallic: np.ndarray  # [rows, cols] float32, 0…1; 0 outside the mask
+    base_color: np.ndarray  # [rows, cols, 3] float32, scene-linear in the colour space of the maps; 0 where not known
+    metallic: np.ndarray  # [rows, cols] float32, 0…1; 0 where not known
+    known: np.ndarray  # [rows, cols] bool, pixels of the mask whose layers are finite
     ior: float  # of the dielectric share of all pixels, IOR_LIMITS; 1 without specular light
     lost_albedo: float  # RMS of the difference in diffuse albedo from the maps, over the mask and three channels
     lost_specular: float  # the same of F0
@@ -67,21 +71,23 @@ def metallic_look(maps: SurfaceMaps) -> MetallicLook:
     nothing if their colours are alike.
 
     Args:
-        maps: with `diffuse_albedo`. Without `specular` the surface is Lambertian: metallic is 0 and nothing is reflected at n = 1.
+        maps: with `diffuse_albedo`. Without `specular` the surface is Lambertian: the albedo is the base colour, metallic is 0, and nothing
+            is reflected at n = 1.
     """
     assert maps.diffuse_albedo is not None, "maps without reflectance have no look"
     base_color = np.zeros((*maps.mask.shape, 3), dtype=np.float32)
     metallic = np.zeros(maps.mask.shape, dtype=np.float32)
+    finite = maps.mask & np.isfinite(maps.diffuse_albedo.sum(axis=-1))
     if maps.specular is None:
-        np.copyto(base_color, np.clip(maps.diffuse_albedo, 0, 1), where=maps.mask[..., None])
-        lost = np.where(maps.mask[..., None], maps.diffuse_albedo - base_color, 0)
-        return MetallicLook(base_color, metallic, IOR_LIMITS[0], _rms(float((lost**2).sum()), int(maps.mask.sum())), 0.0)
-    ior = dielectric_ior(maps.specular[maps.mask])
+        np.copyto(base_color, maps.diffuse_albedo, where=finite[..., None])
+        return MetallicLook(base_color, metallic, finite, IOR_LIMITS[0], 0.0, 0.0)
+    finite &= np.isfinite(maps.specular.sum(axis=-1))
+    ior = dielectric_ior(maps.specular[finite])
     dielectric = specular_of_ior(ior)
     diffuse_albedo, specular = maps.diffuse_albedo, maps.specular
 
     def convert_band(rows: slice) -> tuple[float, float, int]:
-        known = maps.mask[rows]
+        known = finite[rows]
         albedo, f0 = (np.ascontiguousarray(layer[rows][known].T, dtype=np.float32) for layer in (diffuse_albedo, specular))
         share = _metal_share(albedo, f0, dielectric)
         if maps.regime is not None:
@@ -96,7 +102,14 @@ def metallic_look(maps: SurfaceMaps) -> MetallicLook:
     with ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="relit-metallic") as pool:
         sums = list(pool.map(convert_band, bands))
     lost_albedo, lost_f0, count = (sum(column) for column in zip(*sums, strict=True))
-    return MetallicLook(base_color, metallic, ior, _rms(lost_albedo, int(count)), _rms(lost_f0, int(count)))
+    return MetallicLook(base_color, metallic, finite, ior, _rms(lost_albedo, int(count)), _rms(lost_f0, int(count)))
+
+
+def loss_warnings(look: MetallicLook) -> Iterator[str]:
+    """Yield what the metallic workflow loses of the maps, where that is visible."""
+    if max(look.lost_albedo, look.lost_specular) > LOSS_MATTERS:
+        yield (f"material: base colour and metallic miss F0 by {look.lost_specular:.2f} and the diffuse albedo by {look.lost_albedo:.2f} "
+               "(RMS): they have one colour a pixel and one index of refraction; the look specular of a USD asset has what was fitted")
 
 
 def specular_of_ior(ior: float) -> float:

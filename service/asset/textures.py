@@ -1,34 +1,57 @@
-"""Texture images of an asset: 8-bit sRGB PNG for colours, 16-bit raw PNG for normals and roughness.
+"""Texture images of an asset: what its materials read, in PNG of 16 bits, PNG of 8 bits, or half EXR.
 
-PNG is what every reader of a USDZ package must know. Values outside 0…1 cannot be kept in it: they are clipped, and
-counted.
+Colours of a PNG are Rec.709 with the sRGB curve, because clients know that and raw data and nothing else; what lies outside 0…1 is clipped
+there, and counted. Colours of an EXR are scene-linear in the colour space of the maps. The other images are data.
+
+Source: OpenUSD, "UsdPreviewSurface Specification", texture reader (sourceColorSpace); USDZ File Format Specification (kinds of images).
 """
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from service.asset.errors import AssetError
 from service.asset.mesh import SurfaceMesh
+from service.asset.metallic import MetallicLook
 from service.asset.tangent import tangent_frame
+from service.requests.export import TextureFormat
+from stage import exr
 from stage.colour import convert
+from stage.colour_spaces import linear_space
 from stage.images import write_png
 from stage.maps import SurfaceMaps
 
 DISPLAY_SPACE = "srgb_rec709_scene"
 """The space that UsdUVTexture calls sRGB in sourceColorSpace: Rec.709 primaries and the sRGB curve."""
 
+DATA_SPACE = "data"
+"""The colour space of images that are no colours."""
+
 BLEED_TEXELS = 8
 """How far colour is bled over the edge of the mask: bilinear filtering stays clean down to the third mip level."""
 
-LAYERS = ("diffuse_albedo", "normal", "specular", "roughness")
-"""Layers that a material uses, in the order they are written."""
+BAND_ROWS = 256
+"""Rows that are converted at a time: bounds the memory of single-precision copies; OpenColorIO needs 0.02 s for each call."""
+
+IMAGES_AT_ONCE = 2
+"""Images that are compressed side by side: each holds some 300 MB at 4096 by 4096 texels."""
+
+VISIBLE = 0.5 / 255
+"""How far outside 0…1 a value is called clipped: half a code of a display."""
+
+COLOURS = ("base_color", "diffuse_albedo", "specular")
+"""Images that hold colours."""
+
+NAMES = ("base_color", "metallic", "roughness", "normal", "diffuse_albedo", "specular")
+"""Every image, in the order they are written: the look `metallic` reads the first four, `specular` the last four."""
 
 _NEIGHBOURS = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)]
+_PNG_TYPES: dict[TextureFormat, type[np.unsignedinteger[Any]]] = {TextureFormat.PNG16: np.uint16, TextureFormat.PNG8: np.uint8}
 
-FILE_NAMES = tuple(f"{layer}.png" for layer in LAYERS)
+FILE_NAMES = tuple(f"{name}.{suffix}" for name in NAMES for suffix in ("png", "exr"))
 """Every file that write_textures can write."""
 
 
@@ -36,63 +59,101 @@ class Texture(NamedTuple):
     """A written image, and how a material has to read it."""
 
     file_name: str
-    color_space: str  # the UsdUVTexture token: sRGB or raw
+    color_space: str  # DISPLAY_SPACE, DATA_SPACE, or the scene-linear space of the maps
     clipped_pixels: int  # masked pixels with a channel that had to be cut to 0…1
 
 
-def write_textures(maps: SurfaceMaps, mesh: SurfaceMesh, folder: Path, *,
-                   progress: Callable[[str, float], None] = lambda layer, done: None) -> dict[str, Texture]:
-    """Write a texture for each layer that exists and that a material uses.
+def write_textures(maps: SurfaceMaps, mesh: SurfaceMesh, folder: Path, *, look: MetallicLook | None = None,
+                   storage: TextureFormat = TextureFormat.PNG16,
+                   progress: Callable[[str, float], None] = lambda name, done: None) -> dict[str, Texture]:
+    """Write the images that the materials of solved maps use.
 
     Args:
         mesh: of these maps; the normal map is relative to its frame.
         folder: exists.
-        progress: is called before each image with the layer's name and the part that is done, 0…1.
+        look: of these maps, for `base_color` and `metallic`; an object without metal has no `metallic`.
+        storage: 8 bits are kept for colours alone: normals and roughness would show their steps in highlights, and have 16.
+        progress: is called before each image is waited for, with its name and the part that is done, 0…1.
 
     Returns:
-        By layer name, in the order of LAYERS.
+        By name, in the order of NAMES.
 
     Raises:
         AssetError: the colour space of the maps has no known conversion to Rec.709.
-        OSError: a file cannot be written.
+        OSError, StorageError: a file cannot be written.
     """
+    sources: dict[str, np.ndarray | None] = {"roughness": maps.roughness, "normal": maps.normal}
+    if look is not None:
+        sources |= {"base_color": look.base_color, "metallic": look.metallic if look.metallic.any() else None}
+    if maps.specular is not None or look is None:  # of a Lambertian surface the base colour is the albedo
+        sources |= {"diffuse_albedo": maps.diffuse_albedo, "specular": maps.specular}
     reach = max(BLEED_TEXELS, mesh.step)
-    written: dict[str, Texture] = {}
 
-    def write(layer: str, values: np.ndarray, known: np.ndarray, dtype: type[np.unsignedinteger]) -> None:
-        codes, clipped = quantise(bleed(values, known, reach=reach), known, dtype)
-        color_space = "sRGB" if dtype is np.uint8 else "raw"
-        write_png(folder / f"{layer}.png", codes, srgb=color_space == "sRGB")
-        written[layer] = Texture(f"{layer}.png", color_space, clipped)
-
-    for index, layer in enumerate(LAYERS):
-        values = getattr(maps, layer)
-        if values is None:
-            continue
-        progress(layer, index / len(LAYERS))
-        values = values.astype(np.float32)
+    def write(name: str, values: np.ndarray) -> Texture:
         known = maps.mask & np.isfinite(values if values.ndim == 2 else values.sum(axis=-1))
-        if layer == "normal":
-            encoded, known = tangent_space(values, known, mesh)
-            write(layer, encoded, known, np.uint16)
-        elif layer == "roughness":
-            write(layer, values, known, np.uint16)
-        else:
-            write(layer, to_display(np.where(known[..., None], values, 0), maps.color_space), known, np.uint8)
+        if look is not None and name in ("base_color", "metallic"):
+            known &= look.known
+        if name == "normal":
+            values, known = tangent_space(values, known, mesh)
+        space = DATA_SPACE if name not in COLOURS else linear_space(maps.color_space) if storage is TextureFormat.EXR else DISPLAY_SPACE
+        if storage is TextureFormat.EXR:
+            return _write_exr(folder / f"{name}.exr", values, known, space, reach)
+        dtype = _PNG_TYPES[storage] if name in COLOURS else np.uint16
+        codes, clipped = _encode(values, known, maps.color_space if name in COLOURS else None, dtype)
+        write_png(folder / f"{name}.png", bleed(codes, known, reach=reach), srgb=name in COLOURS)
+        return Texture(f"{name}.png", space, clipped)
+
+    present = [(name, source) for name in NAMES if (source := sources.get(name)) is not None]
+    written: dict[str, Texture] = {}
+    with ThreadPoolExecutor(IMAGES_AT_ONCE, thread_name_prefix="relit-textures") as pool:
+        futures = [(name, pool.submit(write, name, source)) for name, source in present]
+        try:
+            for index, (name, future) in enumerate(futures):
+                progress(name, index / len(futures))
+                written[name] = future.result()
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
     return written
+
+
+def _encode(values: np.ndarray, known: np.ndarray, color_space: str | None,
+            dtype: type[np.unsignedinteger[Any]]) -> tuple[np.ndarray, int]:
+    """Return the codes of an image, 0 where nothing is known, and the count of clipped pixels.
+
+    Args:
+        color_space: of `values`, which are converted to DISPLAY_SPACE; None: they are data.
+    """
+    codes, clipped = np.zeros(values.shape, dtype=dtype), 0
+    for start in range(0, len(values), BAND_ROWS):
+        rows = slice(start, start + BAND_ROWS)
+        inside = known[rows]
+        band = np.where(inside if values.ndim == 2 else inside[..., None], values[rows], 0).astype(np.float32, copy=False)
+        codes[rows], more = quantise(to_display(band, color_space) if color_space else band, inside, dtype)
+        clipped += more
+    return codes, clipped
+
+
+def _write_exr(path: Path, values: np.ndarray, known: np.ndarray, color_space: str, reach: int) -> Texture:
+    """Write an image as EXR with channels R, G and B, or Y; half, but normals float: half would turn them by 0.03°."""
+    dtype = np.float32 if path.stem == "normal" else np.float16
+    image = bleed(np.where(known if values.ndim == 2 else known[..., None], values, 0).astype(dtype), known, reach=reach)
+    channels = {"Y": image} if image.ndim == 2 else {channel: image[..., c] for c, channel in enumerate("RGB")}
+    exr.write(path, channels, color_space=color_space, metadata={})
+    return Texture(path.name, color_space, 0)
 
 
 def quantise(values: np.ndarray, known: np.ndarray, dtype: type[np.unsignedinteger]) -> tuple[np.ndarray, int]:
     """Round values of 0…1 to the codes of an integer type.
 
     Returns:
-        codes, as values; and the number of known pixels with a channel more than half a code outside 0…1.
+        codes, as values; and the number of known pixels with a channel more than VISIBLE outside 0…1.
     """
     top = float(np.iinfo(dtype).max)
-    codes = np.floor(values * top + 0.5)
-    outside = (codes < 0) | (codes > top)
+    outside = (values < -VISIBLE) | (values > 1 + VISIBLE)
     clipped = outside if outside.ndim == 2 else outside.any(axis=-1)
-    return np.clip(codes, 0, top).astype(dtype), int(np.count_nonzero(clipped & known))
+    codes = np.floor(np.clip(values, 0, 1) * top + 0.5)
+    return codes.astype(dtype), int(np.count_nonzero(clipped & known))
 
 
 def to_display(values: np.ndarray, color_space: str) -> np.ndarray:
@@ -121,38 +182,56 @@ def bleed(values: np.ndarray, known: np.ndarray, *, reach: int) -> np.ndarray:
     """Fill unknown texels from their known neighbours, ring by ring, so that filtering a texture does not darken its border.
 
     Args:
-        values: [rows, cols] or [rows, cols, channels] float32.
+        values: [rows, cols] or [rows, cols, channels], integers or floats.
         known: [rows, cols] bool; known texels are returned as they are.
         reach: number of rings; texels beyond get the mean of the known ones, for the coarse mip levels.
 
     Returns:
-        An array like `values`; zero throughout when nothing is known.
+        A new array like `values`, of the same type; zero throughout when nothing is known.
     """
-    planes = values[..., None] if values.ndim == 2 else values
-    filled = np.pad(np.where(known[..., None], planes, 0), ((1, 1), (1, 1), (0, 0)))
-    done = np.pad(known, 1)
-    inside = np.pad(np.ones_like(known), 1)
-    ring = _around(np.argwhere(done), done, inside)
+    filled = (values[..., None] if values.ndim == 2 else values).copy()
+    rows, cols, channels = filled.shape
+    done, inside = np.pad(known, 1), np.pad(np.ones_like(known), 1)
+    ring = np.argwhere(_dilated(done) & inside & ~done) - 1
     for _ in range(reach):
         if len(ring) == 0:
             break
-        total = np.zeros((len(ring), planes.shape[-1]), dtype=np.float32)
+        total = np.zeros((len(ring), channels), dtype=np.float32)
         count = np.zeros((len(ring), 1), dtype=np.float32)
         for r, c in _NEIGHBOURS:
-            neighbour = ring[:, 0] + r, ring[:, 1] + c
-            total += filled[neighbour]  # zero where not done
-            count += done[neighbour][:, None]
-        filled[ring[:, 0], ring[:, 1]] = total / count
-        done[ring[:, 0], ring[:, 1]] = True
+            row, col = ring[:, 0] + r, ring[:, 1] + c
+            given = done[row + 1, col + 1][:, None]
+            total += np.where(given, filled[np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)], 0)
+            count += given
+        filled[ring[:, 0], ring[:, 1]] = _as_type(total / count, filled.dtype)
+        done[ring[:, 0] + 1, ring[:, 1] + 1] = True
         ring = _around(ring, done, inside)
-    if known.any():
-        filled[~done] = planes[known].mean(axis=0, dtype=np.float64)
-    return filled[1:-1, 1:-1].reshape(values.shape)
+    beyond = ~done[1:-1, 1:-1]
+    if beyond.any():
+        mean = [filled[..., c].mean(where=known, dtype=np.float64) if known.any() else 0.0 for c in range(channels)]
+        filled[beyond] = _as_type(np.array(mean), filled.dtype)
+    return filled.reshape(values.shape)
+
+
+def _as_type(values: np.ndarray, dtype: np.dtype[Any]) -> np.ndarray:
+    """Return values as a type, rounded where it is one of integers."""
+    return (np.floor(values + 0.5) if np.issubdtype(dtype, np.integer) else values).astype(dtype)
+
+
+def _dilated(done: np.ndarray) -> np.ndarray:
+    """Return where a texel or one of its eight neighbours is set; the array has a frame of one unset texel."""
+    wide = done.copy()
+    wide[:, 1:] |= done[:, :-1]
+    wide[:, :-1] |= done[:, 1:]
+    tall = wide.copy()
+    tall[1:] |= wide[:-1]
+    tall[:-1] |= wide[1:]
+    return tall
 
 
 def _around(texels: np.ndarray, done: np.ndarray, inside: np.ndarray) -> np.ndarray:
-    """Return the texels [n, 2] of the image that touch these and are not done, each once."""
+    """Return the texels [n, 2] of the image that touch these and are not done, each once; the masks have a frame of one texel."""
     touched = np.zeros_like(done)
     for r, c in _NEIGHBOURS:
-        touched[texels[:, 0] + r, texels[:, 1] + c] = True
-    return np.argwhere(touched & inside & ~done)
+        touched[texels[:, 0] + r + 1, texels[:, 1] + c + 1] = True
+    return np.argwhere(touched & inside & ~done) - 1

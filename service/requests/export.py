@@ -20,6 +20,14 @@ class Geometry(Choice):
     POINTS = "points", "the measured points"
 
 
+class TextureFormat(Choice):
+    """How the textures of an asset are stored."""
+
+    PNG16 = "png16", "16 bits, which every client reads; colours as sRGB"
+    PNG8 = "png8", "8 bits for colours, a fifth of the size; normals, roughness and metallic keep 16"
+    EXR = "exr", "half floats in the capture's scene-linear colour space, for .usda and .usdc"
+
+
 class ExportOptions(Options):
     """What an asset is called and made of."""
 
@@ -29,6 +37,8 @@ class ExportOptions(Options):
     """Version of the asset, written into its assetInfo: what a pipeline counts, as in 3 or v003."""
     geometry: Geometry | None = None
     """What an asset of a depth (depth.exr in place of maps.exr) is made of; None: mesh."""
+    textures: TextureFormat = TextureFormat.PNG16
+    """How textures are stored."""
 
 
 class ExportRequest(ExportOptions):

@@ -4,10 +4,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+from service.asset.errors import AssetError
 from service.asset.mesh import height_mesh
+from service.asset.metallic import IOR_LIMITS, loss_warnings, metallic_look
 from service.asset.textures import FILE_NAMES, write_textures
 from service.asset.units import unit_in_metres
-from service.requests.export import FIRST_VERSION
+from service.requests.export import FIRST_VERSION, TextureFormat
 from service.usd.files import check_suffix, install, temporary_folder_beside
 from service.usd.layers import LAYER_FILES, AssetLayers, Description, texture_folder
 from service.usd.scene import define_asset
@@ -21,18 +23,19 @@ TEXTURES_START, TEXTURES_END = 0.1, 0.9
 
 
 class AssetReport(NamedTuple):
-    """The files and the sizes of an asset."""
+    """The files and the sizes of an asset, and what its user should know of it."""
 
     path: Path  # the asset
     textures: tuple[Path, ...]  # files beside it; empty for .usdz, which holds them
     vertex_count: int
     face_count: int
     step: int  # every step-th pixel in both directions carries a vertex
-    clipped_pixels: dict[str, int]  # layer → pixels that did not fit into 0…1
+    clipped_pixels: dict[str, int]  # texture → pixels that did not fit into 0…1
+    warnings: tuple[str, ...]  # sentences
 
 
 def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str = FIRST_VERSION,
-                progress: Progress | None = None) -> AssetReport:
+                textures: TextureFormat = TextureFormat.PNG16, progress: Progress | None = None) -> AssetReport:
     """Write solved maps as a USD asset.
 
     Args:
@@ -41,32 +44,38 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str 
             .usdc of one name share them.
         name: free text; the root prim is named after it.
         version: of the asset, for assetInfo.
+        textures: how they are stored.
         progress: called before each part of the work.
 
     Raises:
-        AssetError: another suffix; no height layer, or no face; a colour space that is not known.
+        AssetError: another suffix; EXR textures in a .usdz; no height layer, or no face; a colour space that is not known.
         StorageError: the disk refuses; what was there before is left as it was.
     """
     target = Path(path)
     packed = check_suffix(target) == ".usdz"
+    if packed and textures is TextureFormat.EXR:
+        raise AssetError(f"{target} cannot hold EXR textures, which ARKit and three.js do not read in a .usdz: export a .usda or .usdc, or "
+                         "store the textures as png16")
     tell = progress or (lambda what, done: None)
 
     tell("mesh", 0.0)
     mesh = height_mesh(maps)
     description = Description(name, maps.camera, {**maps.provenance, "relit:color_space": maps.color_space},
                               unit_in_metres(maps.camera), version)
+    look = metallic_look(maps) if maps.diffuse_albedo is not None else None
     with temporary_folder_beside(target) as temporary:
         folder = temporary / texture_folder(target)
         folder.mkdir()
-        textures = write_textures(maps, mesh, folder, progress=lambda layer, done: tell(
-            f"texture {layer}", TEXTURES_START + (TEXTURES_END - TEXTURES_START) * done))
+        written = write_textures(maps, mesh, folder, look=look, storage=textures, progress=lambda name, done: tell(
+            f"texture {name}", TEXTURES_START + (TEXTURES_END - TEXTURES_START) * done))
         tell("layer", TEXTURES_END)
-        images = [folder / texture.file_name for texture in textures.values()]
+        images = [folder / texture.file_name for texture in written.values()]
         layers = AssetLayers(temporary, target, description)
-        define_asset(layers, maps, mesh, textures)
+        define_asset(layers, maps, mesh, written, ior=look.ior if look is not None else IOR_LIMITS[0])
         layers.save()
         first, *others = layers.files
         install(target, first, [*others, *images], ours=(*LAYER_FILES, *FILE_NAMES))
     installed = () if packed else tuple(target.parent / folder.name / image.name for image in images)
     return AssetReport(target, installed, len(mesh.points), len(mesh.face_counts), mesh.step,
-                       {layer: texture.clipped_pixels for layer, texture in textures.items()})
+                       {name: texture.clipped_pixels for name, texture in written.items()},
+                       tuple(loss_warnings(look)) if look is not None else ())

@@ -1,64 +1,103 @@
-"""The material of an asset: UsdPreviewSurface in its specular workflow, which is the reflectance model that the solvers fit.
+"""The looks of an asset as UsdPreviewSurface: the metallic workflow, in which clients agree, and the specular one, which the solvers fit.
 
-Source: OpenUSD, "UsdPreviewSurface Specification": the surface, UsdUVTexture and UsdPrimvarReader.
+Blender and three.js multiply `specularColor` with the F0 of the index of refraction, so that metals of the specular workflow are black
+there.
+
+Source: OpenUSD, "UsdPreviewSurface Specification" (surface, UsdUVTexture, UsdPrimvarReader); "Color User Guide" (colorSpace of an
+attribute, UsdColorSpaceAPI).
 """
 
 from collections.abc import Mapping
 
 from pxr import Gf, Sdf, Usd, UsdShade
 
-from service.asset.textures import Texture
+from service.asset.textures import DISPLAY_SPACE, Texture
+from service.usd.layers import AssetLayers
+
+METALLIC, SPECULAR = "metallic", "specular"
+"""The variants of `look`."""
 
 _TYPES = Sdf.ValueTypeNames
 
-_INPUTS = {
-    "diffuse_albedo": ("diffuseColor", _TYPES.Color3f, "rgb", _TYPES.Float3),
-    "normal": ("normal", _TYPES.Normal3f, "rgb", _TYPES.Float3),
-    "specular": ("specularColor", _TYPES.Color3f, "rgb", _TYPES.Float3),
-    "roughness": ("roughness", _TYPES.Float, "r", _TYPES.Float),
+_TEXTURED: dict[str, dict[str, tuple[str, ...]]] = {
+    METALLIC: {"diffuseColor": ("base_color",), "metallic": ("metallic",)},
+    SPECULAR: {"diffuseColor": ("diffuse_albedo", "base_color"), "specularColor": ("specular",)},
 }
-"""Layer → input of the surface, its type; output of the texture, its type."""
+"""Look → input of the surface → names of the textures that it reads, of which it takes the first that there is."""
+
+_SHARED: dict[str, tuple[str, ...]] = {"roughness": ("roughness",), "normal": ("normal",)}
+
+_INPUT_TYPES = {
+    "diffuseColor": (_TYPES.Color3f, "rgb", _TYPES.Float3),
+    "specularColor": (_TYPES.Color3f, "rgb", _TYPES.Float3),
+    "normal": (_TYPES.Normal3f, "rgb", _TYPES.Float3),
+    "metallic": (_TYPES.Float, "r", _TYPES.Float),
+    "roughness": (_TYPES.Float, "r", _TYPES.Float),
+}
+"""Input of the surface → its type; output of the texture, its type."""
 
 
-def define_material(usd_stage: Usd.Stage, path: Sdf.Path, textures: Mapping[str, Texture],
-                    folder: str) -> UsdShade.Material:
-    """Define a material at `path` that uses these textures.
+def define_looks(layers: AssetLayers, textures: Mapping[str, Texture], *, ior: float) -> None:
+    """Define a material for each look, and make them the variants of `look`.
 
     Args:
-        textures: by layer name. Without `specular` the surface is the fitted Lambertian: F0 = 0, roughness = 1.
-        folder: of the textures, relative to the layer, "./…".
+        textures: by name, written into the folder that `layers` names. Without `roughness` the surface is the fitted Lambertian: `ior` is
+            1, so that nothing is reflected at normal incidence, and roughness is 1.
+        ior: index of refraction of the dielectric share, in the metallic workflow.
 
     Convention:
         The normal map holds (n + 1)/2, so its texture has scale (2, 2, 2, 1) and bias (-1, -1, -1, 0) and is read raw.
-        (UsdPreviewSurface Proposal, "Texture reader" and "Normal maps").
+        Each file says its colour space twice: `sourceColorSpace` for the readers of UsdUVTexture (sRGB, or raw for scene-linear colours and
+        data), and the metadata `colorSpace` of the attribute, which names the primaries too. Colours in the layer are lin_rec709_scene.
     """
-    material = UsdShade.Material.Define(usd_stage, path)
-    surface = _shader(usd_stage, path.AppendChild("Surface"), "UsdPreviewSurface")
-    surface.CreateInput("useSpecularWorkflow", _TYPES.Int).Set(1)
-    material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", _TYPES.Token))
-    if "specular" not in textures:
-        surface.CreateInput("specularColor", _TYPES.Color3f).Set(Gf.Vec3f(0))
-        if "roughness" not in textures:
-            surface.CreateInput("roughness", _TYPES.Float).Set(1.0)
-    if not textures:
-        return material
+    metallic = _define_material(layers, METALLIC, "Material", textures)
+    surface = UsdShade.Shader(layers.materials.GetPrimAtPath(metallic.GetPath().AppendChild("Surface")))
+    surface.CreateInput("ior", _TYPES.Float).Set(ior)
+    if "metallic" not in textures:
+        surface.CreateInput("metallic", _TYPES.Float).Set(0.0)
+    layers.add_look(METALLIC, metallic)
 
+    specular = _define_material(layers, SPECULAR, "Specular", textures)
+    if "specular" not in textures:
+        surface = UsdShade.Shader(layers.materials.GetPrimAtPath(specular.GetPath().AppendChild("Surface")))
+        surface.CreateInput("specularColor", _TYPES.Color3f).Set(Gf.Vec3f(0))
+    layers.add_look(SPECULAR, specular)
+
+
+def _define_material(layers: AssetLayers, look: str, name: str, textures: Mapping[str, Texture]) -> UsdShade.Material:
+    """Define a material whose inputs read the textures that there are."""
+    usd_stage, path = layers.materials, layers.looks.AppendChild(name)
+    material = UsdShade.Material.Define(usd_stage, path)
+    Usd.ColorSpaceAPI.Apply(material.GetPrim()).CreateColorSpaceNameAttr().Set(Gf.ColorSpaceNames.LinearRec709)
+    surface = _shader(usd_stage, path.AppendChild("Surface"), "UsdPreviewSurface")
+    surface.CreateInput("useSpecularWorkflow", _TYPES.Int).Set(int(look == SPECULAR))
+    material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", _TYPES.Token))
+    if "roughness" not in textures:
+        surface.CreateInput("roughness", _TYPES.Float).Set(1.0)
+
+    read = {name: next((textures[t] for t in candidates if t in textures), None)
+            for name, candidates in {**_TEXTURED[look], **_SHARED}.items()}
+    if not any(read.values()):
+        return material
     reader = _shader(usd_stage, path.AppendChild("TextureCoordinates"), "UsdPrimvarReader_float2")
     reader.CreateInput("varname", _TYPES.String).Set("st")
     coordinates = reader.CreateOutput("result", _TYPES.Float2)
-    for layer, texture in textures.items():
-        name, value_type, channel, channel_type = _INPUTS[layer]
+    for name, texture in read.items():
+        if texture is None:
+            continue
+        value_type, channel, channel_type = _INPUT_TYPES[name]
         image = _shader(usd_stage, path.AppendChild(name[0].upper() + name[1:]), "UsdUVTexture")
-        image.CreateInput("file", _TYPES.Asset).Set(Sdf.AssetPath(f"{folder}/{texture.file_name}"))
+        file = image.CreateInput("file", _TYPES.Asset)
+        file.Set(Sdf.AssetPath(f"{layers.texture_folder}/{texture.file_name}"))
+        file.GetAttr().SetColorSpace(texture.color_space)
         image.CreateInput("st", _TYPES.Float2).ConnectToSource(coordinates)
-        image.CreateInput("sourceColorSpace", _TYPES.Token).Set(texture.color_space)
+        image.CreateInput("sourceColorSpace", _TYPES.Token).Set("sRGB" if texture.color_space == DISPLAY_SPACE else "raw")
         image.CreateInput("wrapS", _TYPES.Token).Set("clamp")
         image.CreateInput("wrapT", _TYPES.Token).Set("clamp")
-        if layer == "normal":
+        if name == "normal":
             image.CreateInput("scale", _TYPES.Float4).Set(Gf.Vec4f(2, 2, 2, 1))
             image.CreateInput("bias", _TYPES.Float4).Set(Gf.Vec4f(-1, -1, -1, 0))
-        output = image.CreateOutput(channel, channel_type)
-        surface.CreateInput(name, value_type).ConnectToSource(output)
+        surface.CreateInput(name, value_type).ConnectToSource(image.CreateOutput(channel, channel_type))
     return material
 
 

@@ -12,15 +12,16 @@ from service.asset.textures import Texture
 from service.asset.units import SCALE_NOTE
 from service.usd.camera import define_camera
 from service.usd.layers import AssetLayers
-from service.usd.materials import define_material
+from service.usd.materials import define_looks
 from stage.maps import SurfaceMaps
 
 
-def define_asset(layers: AssetLayers, maps: SurfaceMaps, mesh: SurfaceMesh, textures: Mapping[str, Texture]) -> None:
+def define_asset(layers: AssetLayers, maps: SurfaceMaps, mesh: SurfaceMesh, textures: Mapping[str, Texture], *, ior: float) -> None:
     """Define the prims of an asset of solved maps.
 
     Args:
         textures: written into the folder that `layers` names.
+        ior: index of refraction of the dielectric share of the surface.
 
     Convention:
         The asset is in the camera frame.
@@ -31,8 +32,7 @@ def define_asset(layers: AssetLayers, maps: SurfaceMaps, mesh: SurfaceMesh, text
         usd_mesh = define_mesh(layers.geometry, geom.AppendChild("Mesh"), mesh)
         layers.add_surface(usd_mesh.GetPath())
     UsdGeom.Scope.Define(layers.materials, layers.looks)
-    material = define_material(layers.materials, layers.looks.AppendChild("Material"), textures, layers.texture_folder)
-    layers.add_look("specular", material)
+    define_looks(layers, textures, ior=ior)
     define_camera(layers.geometry, layers.root.AppendChild("Camera"), maps.camera, mesh.extent)
 
 

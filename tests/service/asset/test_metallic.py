@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kernels.photometric.sampling import Regime
-from service.asset.metallic import GLASS_IOR, IOR_LIMITS, MIRROR, dielectric_ior, metallic_look, specular_of_ior
+from service.asset.metallic import GLASS_IOR, IOR_LIMITS, MIRROR, dielectric_ior, loss_warnings, metallic_look, specular_of_ior
 from tests.scenes.surfaces import make_ball, make_sheet
 
 SEARCHED = 0.003
@@ -82,9 +82,11 @@ def test_no_other_colour_and_share_fits_better():
 
 
 def test_what_the_workflow_cannot_hold_is_reported():
-    tinted = np.tile([0.09, 0.04, 0.01], (64, 1))  # coloured F0 on white paint
+    tinted = np.tile([0.07, 0.04, 0.02], (64, 1))  # coloured F0 on white paint
     look = metallic_look(sheet(np.full((64, 3), 0.8), tinted))
-    assert 0.02 < look.lost_specular < 0.05 and look.lost_albedo < 0.02
+    assert 0.01 < look.lost_specular < 0.03 and look.lost_albedo < 0.02 and not list(loss_warnings(look))
+    strongly = metallic_look(sheet(np.full((64, 3), 0.8), np.tile([0.45, 0.2, 0.05], (64, 1))))
+    assert "F0 by 0.1" in next(loss_warnings(strongly))
     assert metallic_look(sheet(np.full((64, 3), 0.8), np.full((64, 3), 0.04))).lost_specular < 1e-6
 
 

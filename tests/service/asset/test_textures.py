@@ -9,11 +9,18 @@ import pytest
 
 from service.asset.errors import AssetError
 from service.asset.mesh import height_mesh
+from service.asset.metallic import metallic_look
 from service.asset.textures import bleed, write_textures
+from service.requests.export import TextureFormat
+from stage import exr
 from tests.scenes.surfaces import make_ball, make_sheet, make_wave
 
 AP1_TO_REC709 = np.array([[1.70505, -0.62179, -0.08326], [-0.13026, 1.14080, -0.01055], [-0.02400, -0.12897, 1.15297]])
 """As published for ACEScg with the Bradford adaptation."""
+
+
+CODE = 0.5 / 65535 * 2.28 + 1.5e-5
+"""Half a code of 16 bits, times the steepest slope of the sRGB curve, and the fast powers of OpenColorIO."""
 
 
 def read_png(path):
@@ -112,9 +119,8 @@ def test_albedo_round_trip(tmp_path):
     maps = make_sheet(np.ones((16, 9), dtype=bool), diffuse_albedo=albedo)
     textures = write_textures(maps, height_mesh(maps), tmp_path)
     encoded, bits, chunks = read_png(tmp_path / "diffuse_albedo.png")
-    assert bits == 8 and "sRGB" in chunks
-    # half a code of 8 bits, times the steepest slope of the sRGB curve, 2.28
-    np.testing.assert_allclose(srgb_to_linear(encoded), albedo, atol=0.5 / 255 * 2.28)
+    assert bits == 16 and "sRGB" in chunks
+    np.testing.assert_allclose(srgb_to_linear(encoded), albedo, atol=CODE)
     assert textures["diffuse_albedo"].clipped_pixels == 0
 
 
@@ -125,14 +131,14 @@ def test_albedo_is_converted_from_acescg(tmp_path):
     write_textures(maps, height_mesh(maps), tmp_path)
     encoded, _, _ = read_png(tmp_path / "diffuse_albedo.png")
     expected = AP1_TO_REC709 @ [0.5, 0.4, 0.3]
-    np.testing.assert_allclose(srgb_to_linear(encoded[0, 0]), expected, atol=0.5 / 255 * 2.28 + 1e-4)  # matrix digits
+    np.testing.assert_allclose(srgb_to_linear(encoded[0, 0]), expected, atol=CODE + 1e-4)  # matrix digits
 
 
 def test_clipped_pixels_are_counted_where_the_mask_is(tmp_path):
     albedo = np.full((8, 8, 3), 0.5, dtype=np.float32)
     albedo[0, :3, 0] = 1.5
     albedo[1, 0] = -0.2
-    albedo[2, 0] = 1.0005  # half rounding of a white: rounds to the top code, nothing is lost
+    albedo[2, 0] = 1.0005  # half rounding of a white: no display shows it
     albedo[7] = 9.0
     mask = np.ones((8, 8), dtype=bool)
     mask[7] = False
@@ -148,7 +154,7 @@ def test_roughness_is_sixteen_bit_raw(tmp_path):
     maps = make_sheet(np.ones((5, 8), dtype=bool), roughness=roughness)
     textures = write_textures(maps, height_mesh(maps), tmp_path)
     encoded, bits, chunks = read_png(tmp_path / "roughness.png")
-    assert bits == 16 and textures["roughness"].color_space == "raw" and "sRGB" not in chunks
+    assert bits == 16 and textures["roughness"].color_space == "data" and "sRGB" not in chunks
     np.testing.assert_allclose(encoded, roughness, atol=0.5 / 65535 + 1e-7)  # half a code
 
 
@@ -156,13 +162,50 @@ def test_specular_and_roughness_reach_over_the_edge_of_the_mask(ball, tmp_path):
     write_textures(ball, height_mesh(ball), tmp_path)
     assert np.ptp(read_png(tmp_path / "roughness.png")[0]) == 0  # 0.35 in the mask, and bled everywhere else
     f0 = srgb_to_linear(read_png(tmp_path / "specular.png")[0])
-    np.testing.assert_allclose(f0, 0.04, atol=0.5 / 255 * 0.36)  # half a code, slope of the curve at 0.04
+    np.testing.assert_allclose(f0, 0.04, atol=CODE)
 
 
 def test_only_layers_that_exist_are_written(ball, tmp_path):
     maps = dataclasses.replace(ball, specular=None, roughness=None)
-    assert list(write_textures(maps, height_mesh(maps), tmp_path)) == ["diffuse_albedo", "normal"]
+    assert list(write_textures(maps, height_mesh(maps), tmp_path)) == ["normal", "diffuse_albedo"]
     assert sorted(p.name for p in tmp_path.iterdir()) == ["diffuse_albedo.png", "normal.png"]
+
+
+def test_a_look_adds_its_images_once(ball, tmp_path):
+    def names(maps, folder):
+        (tmp_path / folder).mkdir()
+        return list(write_textures(maps, height_mesh(maps), tmp_path / folder, look=metallic_look(maps)))
+
+    lambertian = dataclasses.replace(ball, specular=None, roughness=None)
+    metal = dataclasses.replace(ball, specular=np.full_like(ball.specular, 0.7), diffuse_albedo=np.zeros_like(ball.specular))
+    assert names(lambertian, "lambertian") == ["base_color", "normal"]  # its base colour is the albedo
+    assert names(ball, "paint") == ["base_color", "roughness", "normal", "diffuse_albedo", "specular"]  # no metal anywhere
+    assert names(metal, "metal") == ["base_color", "metallic", "roughness", "normal", "diffuse_albedo", "specular"]
+    assert np.ptp(read_png(tmp_path / "metal" / "metallic.png")[0]) == 0
+
+
+def test_eight_bits_are_for_colours_alone(ball, tmp_path):
+    textures = write_textures(ball, height_mesh(ball), tmp_path, storage=TextureFormat.PNG8)
+    bits = {name: read_png(tmp_path / texture.file_name)[1] for name, texture in textures.items()}
+    assert bits == {"roughness": 16, "normal": 16, "diffuse_albedo": 8, "specular": 8}
+
+
+def test_exr_keeps_the_values_and_the_colour_space_of_the_maps(ball, tmp_path):
+    albedo = ball.diffuse_albedo * np.float32(2)  # more than a PNG can hold
+    maps = dataclasses.replace(tilted(ball), diffuse_albedo=albedo, color_space="lin_ap1_scene")
+    mesh = height_mesh(maps)
+    textures = write_textures(maps, mesh, tmp_path, storage=TextureFormat.EXR)
+    assert {name: texture.color_space for name, texture in textures.items()} == {
+        "roughness": "data", "normal": "data", "diffuse_albedo": "lin_ap1_scene", "specular": "lin_ap1_scene"}
+    channels, metadata = exr.read(tmp_path / "diffuse_albedo.exr")
+    stored = np.stack([channels[c] for c in "RGB"], axis=-1)
+    assert stored.dtype == np.float16 and exr.color_space_of(metadata) == "lin_ap1_scene"
+    np.testing.assert_array_equal(stored[maps.mask], albedo[maps.mask].astype(np.float16))
+    assert stored[0, 0].min() > 0 and textures["diffuse_albedo"].clipped_pixels == 0  # bled
+    normals, _ = exr.read(tmp_path / "normal.exr")
+    encoded = np.stack([normals[c] for c in "RGB"], axis=-1)
+    assert encoded.dtype == np.float32
+    np.testing.assert_allclose(recomposed(mesh, encoded), maps.normal[mesh.rows, mesh.cols], atol=2e-6)  # single precision, three sums
 
 
 def test_pixels_that_are_not_finite_are_filled_from_their_neighbours(ball, tmp_path):
@@ -195,6 +238,13 @@ def test_bleed_averages_the_nearest():
     known = np.array([[True, False, False, True]])
     filled = bleed(np.array([[1.0, 50, np.nan, 3.0]], dtype=np.float32), known, reach=1)
     np.testing.assert_array_equal(filled, [[1, 1, 3, 3]])
+
+
+def test_bleed_rounds_codes_and_reaches_round_corners():
+    codes = np.array([[10, 0, 13], [0, 0, 0], [0, 0, 0]], dtype=np.uint16)
+    filled = bleed(codes, codes > 0, reach=1)
+    assert filled.dtype == np.uint16
+    np.testing.assert_array_equal(filled, [[10, 12, 13], [10, 12, 13], [12, 12, 12]])  # 11.5 is rounded up; the mean beyond
 
 
 def test_bleed_of_nothing_is_zero():

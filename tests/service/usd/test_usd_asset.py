@@ -21,6 +21,8 @@ from stage.maps import SurfaceMaps
 from tests.scenes.surfaces import make_ball, make_sheet, make_wave
 
 SUFFIXES = (".usda", ".usdc", ".usdz")
+BALL_TEXTURES = ("base_color", "roughness", "normal", "diffuse_albedo", "specular")
+"""Textures of a ball without metal, in the order of the package."""
 every_suffix = pytest.mark.parametrize("suffix", SUFFIXES)
 POSE = ((0.0, 0.0, 1.0, 0.3), (1.0, 0.0, 0.0, -0.1), (0.0, 1.0, 0.0, 2.0), (0.0, 0.0, 0.0, 1.0))
 
@@ -97,34 +99,6 @@ def test_prims_and_metadata(ball, suffix, tmp_path):
     assert bound.GetPath() == "/Ball/Looks/Material"
 
 
-def test_material_reads_the_textures(ball, tmp_path):
-    write_asset(ball, tmp_path / "ball.usda", name="Ball")
-    usd_stage = Usd.Stage.Open(str(tmp_path / "ball.usda"))
-    surface = shader(usd_stage, "Surface")
-    assert surface.GetInput("useSpecularWorkflow").Get() == 1 and not surface.GetInput("opacity")
-    expected = {"diffuseColor": ("diffuse_albedo", "sRGB"), "normal": ("normal", "raw"),
-                "specularColor": ("specular", "sRGB"), "roughness": ("roughness", "raw")}
-    for name, (layer, color_space) in expected.items():
-        source = surface.GetInput(name).GetConnectedSources()[0][0].source
-        image = UsdShade.Shader(source.GetPrim())
-        file = image.GetInput("file").Get()
-        assert file.path == f"../ball_textures/{layer}.png"
-        assert Path(file.resolvedPath) == (tmp_path / "ball_textures" / f"{layer}.png").resolve()
-        assert image.GetInput("sourceColorSpace").Get() == color_space
-        assert image.GetInput("wrapS").Get() == image.GetInput("wrapT").Get() == "clamp"
-    assert tuple(shader(usd_stage, "Normal").GetInput("scale").Get()) == (2, 2, 2, 1)
-    assert tuple(shader(usd_stage, "Normal").GetInput("bias").Get()) == (-1, -1, -1, 0)
-    assert str(tmp_path) not in (tmp_path / "ball.usda").read_text()  # nothing in the layer names this folder
-
-
-def test_without_specular_it_renders_as_the_fitted_lambertian(tmp_path):
-    write_asset(SURFACES["diffuse only"], tmp_path / "ball.usdc", name="Ball")
-    usd_stage = Usd.Stage.Open(str(tmp_path / "ball.usdc"))  # prims live no longer than their stage
-    surface = shader(usd_stage, "Surface")
-    assert tuple(surface.GetInput("specularColor").Get()) == (0, 0, 0) and surface.GetInput("roughness").Get() == 1
-    assert not surface.GetInput("roughness").HasConnectedSource()
-
-
 def test_pose_is_the_transform_of_the_root(ball, tmp_path):
     for camera, unit_m in ((ball.camera, 1.0), (ball.camera.model_copy(update={"pixel_size_m": None}), 0.001)):
         posed = dataclasses.replace(ball, camera=camera.model_copy(update={"world_from_camera": POSE}))
@@ -156,7 +130,7 @@ def test_usdz_is_the_layer_first_then_textures_stored_and_aligned(ball, tmp_path
     assert [p.name for p in tmp_path.iterdir()] == ["ball.usdz"] and report.textures == ()
     data = report.path.read_bytes()
     entries = zipfile.ZipFile(report.path).infolist()
-    assert [e.filename for e in entries] == ["ball.usdc", *(f"ball_textures/{name}" for name in textures.FILE_NAMES)]
+    assert [e.filename for e in entries] == ["ball.usdc", *(f"ball_textures/{name}.png" for name in BALL_TEXTURES)]
     for entry in entries:
         name_length, extra_length = (int.from_bytes(data[entry.header_offset + at:][:2], "little") for at in (26, 28))
         assert entry.compress_type == zipfile.ZIP_STORED
@@ -173,8 +147,9 @@ def test_the_report_says_what_was_written(suffix, tmp_path):
     maps = make_ball(diffuse_albedo=albedo)
     report = write_asset(maps, tmp_path / f"a{suffix}", name="A", progress=lambda what, done: told.append((what, done)))
     assert report.path == tmp_path / f"a{suffix}" and report.step == 1
-    assert report.clipped_pixels == {"diffuse_albedo": maps.mask.sum(), "normal": 0, "specular": 0, "roughness": 0}
-    assert all(p.is_file() for p in report.textures) and len(report.textures) == (0 if suffix == ".usdz" else 4)
+    assert report.clipped_pixels == dict.fromkeys(BALL_TEXTURES, 0) | {"diffuse_albedo": maps.mask.sum()}
+    assert [warning.partition(":")[0] for warning in report.warnings] == ["material"]  # the base colour ends at 1
+    assert all(p.is_file() for p in report.textures) and len(report.textures) == (0 if suffix == ".usdz" else 5)
     fractions = [done for _, done in told]
     assert told[0] == ("mesh", 0.0) and fractions == sorted(fractions) and fractions[-1] < 1
 
@@ -194,10 +169,10 @@ def test_export_over_an_older_asset(ball, suffix, tmp_path):
     write_asset(SURFACES["diffuse only"], tmp_path / f"ball{suffix}", name="Ball")
     usd_stage = Usd.Stage.Open(str(tmp_path / f"ball{suffix}"))
     usd_stage.Reload()
-    assert shader(usd_stage, "Surface").GetInput("specularColor").Get() == (0, 0, 0)
+    assert shader(usd_stage, "Surface").GetInput("ior").Get() == 1
     if suffix != ".usdz":
         kept = sorted(p.name for p in (tmp_path / "ball_textures").iterdir())
-        assert kept == ["diffuse_albedo.png", "normal.png", "painted.png"]  # what is not ours stays
+        assert kept == ["base_color.png", "normal.png", "painted.png"]  # what is not ours stays
     assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")]
 
 
@@ -211,7 +186,7 @@ def test_full_disk_in_a_texture_leaves_no_trace(ball, suffix, older, tmp_path, m
     written = textures.write_png
 
     def fail(path, codes, *, srgb):
-        if path.name == "specular.png":  # the third of four
+        if path.name == "normal.png":  # neither the first nor the last
             raise OSError(errno.ENOSPC, "No space left on device")
         written(path, codes, srgb=srgb)
 
