@@ -1,8 +1,8 @@
-"""A solved height map as a polygon mesh: arrays only, no USD.
+"""A solved height map as a polygon mesh: arrays only, no file format.
 
-One vertex per masked pixel (or every `step`-th one), four-sided faces between neighbours that are all valid, triangles
-where three of the four are. Nothing is bridged at full resolution; with a step, gaps narrower than it are. No face leads from one part of
-the object to another (layer `part`): nothing was seen of what lies between.
+One vertex per masked pixel (or every `step`-th one), four-sided faces between neighbours that lie on one surface (service/asset/links.py).
+No face leads across a gap or a break: nothing was seen of what lies between. There the surface goes on for half a pixel, to the edge of its
+outermost pixels, so that seen by the camera the mesh covers its pixels and nothing else, and both sides of a break meet.
 """
 
 import math
@@ -10,27 +10,28 @@ from typing import NamedTuple
 
 import numpy as np
 
+from service.asset.cells import CORNERS, cell_faces
 from service.asset.errors import AssetError
+from service.asset.links import Links, height_of, relief, surface_links, touched, without_islands
+from stage.depth_breaks import STEEPEST
 from stage.maps import SurfaceMaps
 
 VERTEX_BUDGET = 1_000_000
 """Vertices above which pixels are skipped: what DCC viewports and the web viewer still turn smoothly (some 60 MB)."""
 
-CORNERS = 4
-"""A cell of the pixel grid, counter-clockwise seen by the viewer: top left, bottom left, bottom right, top right."""
-
 
 class SurfaceMesh(NamedTuple):
-    """A mesh in the camera frame, wound counter-clockwise as the camera sees it."""
+    """A mesh in the camera frame, wound counter-clockwise as the camera sees it; an edge has at most two faces, a vertex one fan of them."""
 
     points: np.ndarray  # [V, 3] float32, camera frame, unit of the height map
     normals: np.ndarray  # [V, 3] float32, unit, area-weighted mean of the adjacent faces
     st: np.ndarray  # [V, 2] float32, texture coordinates, (0, 0) at the lower left corner of the image
     quads: np.ndarray  # [Q, 4] int32, vertex numbers
     triangles: np.ndarray  # [T, 3] int32, vertex numbers
-    rows: np.ndarray  # [V] int64, pixel row of each vertex
-    cols: np.ndarray  # [V] int64, pixel column of each vertex
+    rows: np.ndarray  # [V] int64, row of the pixel in which each vertex lies or on whose edge it lies
+    cols: np.ndarray  # [V] int64, its column
     step: int  # every step-th pixel in both directions carries a vertex
+    centred: int  # so many of the first vertices lie on the centre of their pixel, the others along the border
 
     @property
     def face_counts(self) -> np.ndarray:
@@ -48,12 +49,14 @@ class SurfaceMesh(NamedTuple):
         return np.stack([self.points.min(axis=0), self.points.max(axis=0)])
 
 
-def height_mesh(maps: SurfaceMaps, *, vertex_budget: int = VERTEX_BUDGET) -> SurfaceMesh:
+def height_mesh(maps: SurfaceMaps, *, vertex_budget: int = VERTEX_BUDGET, links: Links | None = None) -> SurfaceMesh:
     """Return a height map as a mesh.
 
     Args:
-        maps: with `height`; pixels outside the mask, not finite, or not in front of a perspective camera get no vertex.
+        maps: with `height`; pixels outside the mask, not finite, or not in front of a perspective camera get no vertex, nor do single
+            pixels, lines that are one pixel wide, and islands of a few pixels.
         vertex_budget: above it only every k-th pixel in both directions is used, with the smallest k that fits.
+        links: which neighbours lie on one surface; None: those of surface_links.
 
     Raises:
         AssetError: there is no height layer, or no three neighbouring pixels to span a face.
@@ -62,55 +65,41 @@ def height_mesh(maps: SurfaceMaps, *, vertex_budget: int = VERTEX_BUDGET) -> Sur
         st = ((c + 0.5) / W, 1 - (r + 0.5) / H) for the pixel (row r, column c), so that a vertex lies on the centre
         of its own texel.
     """
-    if maps.height is None:
-        raise AssetError("the maps have no height layer, so there is no surface to export: solve with a height")
-    valid_pixels = maps.mask & np.isfinite(maps.height)
-    if maps.camera.projection == "perspective":
-        valid_pixels &= maps.height < 0
-    step = _step(valid_pixels, vertex_budget)
-    valid = valid_pixels[::step, ::step]
-    quads, triangles = _faces(valid)
-    if maps.part is not None:
-        part = maps.part[::step, ::step].reshape(-1)
-        quads, triangles = (faces[(part[faces] == part[faces[:, :1]]).all(axis=1)] for faces in (quads, triangles))
-    if len(quads) + len(triangles) == 0:
-        raise AssetError(f"the mask holds {np.count_nonzero(valid_pixels)} pixels with a height and no three of them "
-                         "are neighbours, so there is no face to export")
-
-    used = np.zeros(valid.size, dtype=bool)
-    used[quads] = True
-    used[triangles] = True
-    vertex_of_cell = np.cumsum(used, dtype=np.int32) - np.int32(1)
-    quads, triangles = vertex_of_cell[quads], vertex_of_cell[triangles]
-    rows, cols = (step * index for index in np.nonzero(used.reshape(valid.shape)))
-
-    all_points = maps.camera.points(np.where(valid_pixels, maps.height, 0))
-    points = all_points[rows, cols]
-    image_rows, image_cols = maps.mask.shape
-    st = np.stack([(cols + 0.5) / image_cols, 1 - (rows + 0.5) / image_rows], axis=-1).astype(np.float32)
-    return SurfaceMesh(points, _normals(points, quads, triangles), st, quads, triangles, rows, cols, step)
+    valid = valid_heights(maps)
+    assert maps.height is not None
+    if not _three_neighbours(valid):
+        raise AssetError(f"the mask holds {np.count_nonzero(valid)} pixels with a height and no three of them are neighbours, so there is "
+                         "no face to export")
+    links = without_islands(surface_links(maps, valid) if links is None else links)
+    step = _step(touched(links), vertex_budget)
+    faces = cell_faces(links, step)
+    if len(faces.quads) + len(faces.triangles) == 0:
+        raise AssetError("no neighbouring pixels lie on one surface, so there is no face to export: --geometry points exports them alone")
+    camera, (rows, cols) = maps.camera, faces.pixel.T
+    nearest, other = (relief(maps.height[tuple(pixel.T)].astype(np.float64), camera) for pixel in (faces.pixel, faces.other))
+    slope = np.where(faces.weight > 0, np.clip(nearest - other, -STEEPEST, STEEPEST), nearest - other)
+    height = np.where(faces.weight == 0, maps.height[rows, cols], height_of(nearest + faces.weight * slope, camera))
+    v, u = (faces.pixel + faces.shift + 0.5).T
+    x, y = camera.plane_at(u, v)
+    if camera.projection == "perspective":
+        x, y = -x * height, -y * height
+    points = np.stack([x, y, height], axis=-1).astype(np.float32)
+    st = np.stack([u / camera.width, 1 - v / camera.height], axis=-1).astype(np.float32)
+    return SurfaceMesh(points, _normals(points, faces.quads, faces.triangles), st, faces.quads, faces.triangles, rows, cols, step, faces.centred)
 
 
-def without_faces(mesh: SurfaceMesh, torn: np.ndarray) -> SurfaceMesh:
-    """Return the mesh without some of its faces and without the vertices that only these used.
-
-    Args:
-        torn: [Q + T] bool, quads first.
+def valid_heights(maps: SurfaceMaps) -> np.ndarray:
+    """Return where the maps have a height in front of the camera: [rows, cols] bool.
 
     Raises:
-        AssetError: no face is left.
+        AssetError: there is no height layer.
     """
-    quads, triangles = mesh.quads[~torn[:len(mesh.quads)]], mesh.triangles[~torn[len(mesh.quads):]]
-    if len(quads) + len(triangles) == 0:
-        raise AssetError("no neighbouring pixels lie on one surface, so there is no face to export: --geometry points exports them alone")
-    used = np.zeros(len(mesh.points), dtype=bool)
-    used[quads] = True
-    used[triangles] = True
-    renumbered = np.cumsum(used, dtype=np.int32) - np.int32(1)
-    quads, triangles = renumbered[quads], renumbered[triangles]
-    points = mesh.points[used]
-    return SurfaceMesh(points, _normals(points, quads, triangles), mesh.st[used], quads, triangles, mesh.rows[used], mesh.cols[used],
-                       mesh.step)
+    if maps.height is None:
+        raise AssetError("the maps have no height layer, so there is no surface to export: solve with a height")
+    valid = maps.mask & np.isfinite(maps.height)
+    if maps.camera.projection == "perspective":
+        valid &= maps.height < 0
+    return valid
 
 
 def face_to_vertex(quad_values: np.ndarray, triangle_values: np.ndarray, quads: np.ndarray, triangles: np.ndarray,
@@ -129,27 +118,18 @@ def face_to_vertex(quad_values: np.ndarray, triangle_values: np.ndarray, quads: 
     return total / np.linalg.norm(total, axis=-1, keepdims=True)
 
 
-def _step(valid: np.ndarray, vertex_budget: int) -> int:
+def _step(pixels: np.ndarray, vertex_budget: int) -> int:
     """Return the smallest step whose vertices fit the budget."""
-    step = max(1, math.isqrt(np.count_nonzero(valid) // vertex_budget))
-    while np.count_nonzero(valid[::step, ::step]) > vertex_budget:
+    step = max(1, math.isqrt(np.count_nonzero(pixels) // vertex_budget))
+    while np.count_nonzero(pixels[::step, ::step]) > vertex_budget:
         step += 1
     return step
 
 
-def _faces(valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return quads [Q, 4] and triangles [T, 3] between valid grid points, as flat grid numbers."""
-    numbers = np.arange(valid.size).reshape(valid.shape)
-
-    def corners(grid: np.ndarray) -> np.ndarray:
-        return np.stack([grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]])
-
-    number, present = corners(numbers), corners(valid)
-    count = present.sum(axis=0)
-    quads = number[:, count == CORNERS].T
-    triangles = [number[[c for c in range(CORNERS) if c != absent]][:, (count == CORNERS - 1) & ~present[absent]].T
-                 for absent in range(CORNERS)]
-    return quads, np.concatenate(triangles)
+def _three_neighbours(valid: np.ndarray) -> bool:
+    """Return whether three pixels of any 2×2 pixels are valid."""
+    count = valid[:-1, :-1].astype(np.uint8) + valid[1:, :-1] + valid[1:, 1:] + valid[:-1, 1:]
+    return bool((count >= CORNERS - 1).any())
 
 
 def _normals(points: np.ndarray, quads: np.ndarray, triangles: np.ndarray) -> np.ndarray:

@@ -57,15 +57,14 @@ def vertex_tangents(mesh: SurfaceMesh) -> np.ndarray:
         [V, 3] float32. Each face adds its ∂P/∂s, weighted by its area in the texture.
     """
     p, st = mesh.points.astype(np.float64), mesh.st.astype(np.float64)
-    top_left, bottom_left, bottom_right, top_right = mesh.quads.T
-    cell_t = st[top_left, 1:] - st[bottom_left, 1:]
-    quad_tangent = (p[top_right] - p[top_left] + p[bottom_right] - p[bottom_left]) / 2 * cell_t
 
-    a, b, c = mesh.triangles.T
-    edge_1, edge_2, st_1, st_2 = p[b] - p[a], p[c] - p[a], st[b] - st[a], st[c] - st[a]
-    triangle_tangent = (edge_1 * st_2[:, 1:] - edge_2 * st_1[:, 1:]) / 2  # ∂P/∂s times the signed area in (s, t)
+    def tangents(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+        """Return ∂P/∂s of triangles times their signed area in (s, t)."""
+        edge_1, edge_2, st_1, st_2 = p[b] - p[a], p[c] - p[a], st[b] - st[a], st[c] - st[a]
+        return (edge_1 * st_2[:, 1:] - edge_2 * st_1[:, 1:]) / 2
 
-    total = face_to_vertex(quad_tangent, triangle_tangent, mesh.quads, mesh.triangles, len(p))
+    a, b, c, d = mesh.quads.T
+    total = face_to_vertex(tangents(a, b, c) + tangents(a, c, d), tangents(*mesh.triangles.T), mesh.quads, mesh.triangles, len(p))
     normals = mesh.normals.astype(np.float64)
     total -= normals * np.einsum("vx,vx->v", total, normals)[:, None]
     return (total / np.linalg.norm(total, axis=-1, keepdims=True)).astype(np.float32)
@@ -75,7 +74,8 @@ def _spread(values: np.ndarray, mesh: SurfaceMesh, shape: tuple[int, int]) -> np
     """Return vertex values [V, 3] at every pixel, bilinear between the vertices; zero where no vertex is near."""
     step = mesh.step
     grid = np.zeros((-(-shape[0] // step), -(-shape[1] // step), 3), dtype=np.float32)
-    grid[mesh.rows // step, mesh.cols // step] = values
+    centred = slice(mesh.centred)
+    grid[mesh.rows[centred] // step, mesh.cols[centred] // step] = values[centred]
     for axis in (0, 1):
         if step > 1:
             position = np.arange(shape[axis]) / step

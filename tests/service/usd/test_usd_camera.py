@@ -35,8 +35,8 @@ def test_vertices_project_onto_their_pixels(maps, tmp_path):
     x, y, depth = (clip[:, :3] / clip[:, 3:]).T
     width, height = maps.camera.resolution
     mesh = height_mesh(maps)
-    np.testing.assert_allclose((x + 1) / 2 * width, mesh.cols + 0.5, atol=1e-3)  # apertures and points are float32
-    np.testing.assert_allclose((1 - y) / 2 * height, mesh.rows + 0.5, atol=1e-3)
+    np.testing.assert_allclose((x + 1) / 2 * width, mesh.st[:, 0] * width, atol=1e-3)  # apertures and points are float32
+    np.testing.assert_allclose((1 - y) / 2 * height, (1 - mesh.st[:, 1]) * height, atol=1e-3)
     assert depth.min() > -1 and depth.max() < 1  # nothing is clipped away
 
 
