@@ -114,7 +114,8 @@ def _with_vertices(quads: np.ndarray, triangles: np.ndarray, grid: _Grid, count:
     inner = (reach > 0) | (grid.reach[(direction + 2) % 4, row, col] > 0)
     other = np.where((on_border & inner)[:, None], pixel - ahead, pixel) + grid.step * in_cell[:, None]
     shift = np.where(in_cell[:, None], grid.step / 2, ahead * BORDER_PX)
-    return CellFaces(quads, triangles, pixel, other, np.where(in_cell, -0.5, BORDER_PX * on_border), shift, int(np.count_nonzero(used[:count])))
+    weight = np.where(in_cell, -0.5, BORDER_PX * on_border)
+    return CellFaces(quads, triangles, pixel, other, weight, shift, int(np.count_nonzero(used[:count])))
 
 
 def _grid(links: Links, step: int) -> _Grid:
@@ -138,8 +139,7 @@ def _grid(links: Links, step: int) -> _Grid:
 
     whole = np.ones((shape[0] - 1, shape[1] - 1), dtype=bool)
     if step > 1:
-        rows_linked = across.all(axis=2)
-        cols_linked = along.all(axis=1)
+        rows_linked, cols_linked = np.asarray(across.all(axis=2)), np.asarray(along.all(axis=1))
         below = np.zeros((grid_rows, grid_cols), dtype=bool)
         below[:-1] = rows_linked[step::step]
         beside = np.zeros((grid_rows, grid_cols), dtype=bool)

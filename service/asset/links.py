@@ -17,14 +17,15 @@ STEEPER = 1.5
 """A step of the height breaks the surface from this multiple of the steeper slope that the two normals say: between two pixels of a
 curved limb the mean slope is no greater than the steeper one, and normals near the limb are wrong by some degrees."""
 STEP_PX = 1.5
-"""Relief in pixels that a step may have beyond that: the height rests on all normals around, and differs by this much where they are noisy."""
+"""Relief in pixels that a step may have beyond that: the height rests on all normals around, and differs so much where they are noisy."""
 LEAST_FACING = 1e-2
 """Least cosine between a normal and the line of sight: steeper slopes than its hundred pixels a pixel support any step."""
 ISLAND_PIXELS = 8
 """Patches of fewer linked pixels are left out: two pixels more than what noise on the rim of a mask makes."""
 
 
-NEIGHBOURS = (((slice(None), slice(None, -1)), (slice(None), slice(1, None))), ((slice(None, -1), slice(None)), (slice(1, None), slice(None))))
+_ALL, _FIRST, _LAST = slice(None), slice(None, -1), slice(1, None)
+NEIGHBOURS = ((_ALL, _FIRST), (_ALL, _LAST)), ((_FIRST, _ALL), (_LAST, _ALL))
 """Pixels and those to their right; pixels and those below them."""
 
 
@@ -115,10 +116,10 @@ def touched(links: Links) -> np.ndarray:
 
 
 def _patches(links: Links) -> tuple[np.ndarray, np.ndarray]:
-    """Return the number of the patch of every pixel, [rows, cols] int32, and the pixels of each patch; pixels without a link have any number.
+    """Return the number of the patch of every pixel, [rows, cols] int32, and the pixels of each patch.
 
-    Runs of linked pixels of a row are numbered first; then numbers that are linked to the row below become the least of them, in rounds
-    that at least halve the numbers still to be joined.
+    Pixels without a link have the number of any patch. Runs of linked pixels of a row are numbered first; then numbers that are linked to
+    the row below become the least of them, in rounds that at least halve the numbers still to be joined.
     """
     pixels = touched(links)
     if not pixels.any():

@@ -21,7 +21,7 @@ VERTEX_BUDGET = 1_000_000
 
 
 class SurfaceMesh(NamedTuple):
-    """A mesh in the camera frame, wound counter-clockwise as the camera sees it; an edge has at most two faces, a vertex one fan of them."""
+    """A mesh in the camera frame, wound counter-clockwise as the camera sees it; edges have at most two faces, vertices one fan."""
 
     points: np.ndarray  # [V, 3] float32, camera frame, unit of the height map
     normals: np.ndarray  # [V, 3] float32, unit, area-weighted mean of the adjacent faces
@@ -85,7 +85,8 @@ def height_mesh(maps: SurfaceMaps, *, vertex_budget: int = VERTEX_BUDGET, links:
         x, y = -x * height, -y * height
     points = np.stack([x, y, height], axis=-1).astype(np.float32)
     st = np.stack([u / camera.width, 1 - v / camera.height], axis=-1).astype(np.float32)
-    return SurfaceMesh(points, _normals(points, faces.quads, faces.triangles), st, faces.quads, faces.triangles, rows, cols, step, faces.centred)
+    normals = _normals(points, faces.quads, faces.triangles)
+    return SurfaceMesh(points, normals, st, faces.quads, faces.triangles, rows, cols, step, faces.centred)
 
 
 def valid_heights(maps: SurfaceMaps) -> np.ndarray:

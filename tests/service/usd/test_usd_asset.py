@@ -71,10 +71,7 @@ def test_nvidia_validator_finds_no_failure(maps, suffix, tmp_path):
     write_asset(maps, tmp_path / f"ball{suffix}", name="Ball")
     issues = nvidia.ValidationEngine().validate(str(tmp_path / f"ball{suffix}")).issues()
     found = [(i.severity.name, i.rule.__name__ if i.rule else "", i.message) for i in issues]
-    if maps is SURFACES["bow tie"]:  # two patches that meet in one pixel share its vertex: a warning, and true
-        assert {issue[:2] for issue in found} == {("WARNING", "ManifoldChecker")}
-    else:
-        assert found == []
+    assert found == []
 
 
 @every_suffix

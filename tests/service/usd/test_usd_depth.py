@@ -60,10 +60,11 @@ def test_points_keep_place_colour_and_normal(tmp_path):
 
 def test_a_mesh_is_not_bridged_over_a_break(tmp_path):
     whole, broken = depth_mesh(make()), depth_mesh(make(broken=True))
-    assert len(whole.quads) == 15 * 23 - 1 and len(whole.triangles) == 1
-    assert len(broken.quads) == 15 * 22 - 1
-    columns = broken.cols[broken.quads]
-    assert not ((columns.min(axis=1) == 11) & (columns.max(axis=1) == 12)).any()
+    assert whole.centred == broken.centred == 16 * 24 - 1
+    assert np.ptp(whole.points[whole.quads][..., 2], axis=1).max() < 0.1 and np.isin(whole.cols[whole.quads], [11, 12]).all(axis=1).any()
+    faces = [*broken.quads, *broken.triangles]
+    assert all(np.ptp(broken.points[face, 2]) < 0.1 for face in faces)
+    assert not any({11, 12} <= set(broken.cols[face].tolist()) for face in faces)
     maps = make(broken=True)
     write_depth_mesh(maps, cloud_of(maps), tmp_path / "wall.usda", name="Wall")
     usd_stage = Usd.Stage.Open(str(tmp_path / "wall.usda"))
