@@ -96,8 +96,9 @@ def test_texture_coordinates_and_tangents(tmp_path):
     maps = make_ball(48)
     read, mesh = Read(write_asset(maps, tmp_path / "a.glb", name="A").path), height_mesh(maps)
     uv = read.attribute("TEXCOORD_0")
-    # the centre of each pixel, from the upper left corner; float32 rounding of values below 1, twice
-    np.testing.assert_allclose(uv, (np.stack([mesh.cols, mesh.rows], axis=-1) + 0.5) / 48, atol=1.2e-7)
+    # the centre of each pixel, from the upper left corner, then the border; float32 rounding of values below 1, twice
+    np.testing.assert_allclose(uv[:mesh.centred], (np.stack([mesh.cols, mesh.rows], axis=-1) + 0.5)[:mesh.centred] / 48, atol=1.2e-7)
+    np.testing.assert_allclose(uv, np.stack([mesh.st[:, 0], 1 - mesh.st[:, 1]], axis=-1), atol=1.2e-7)
     tangent, normal = read.attribute("TANGENT").astype(np.float64), read.attribute("NORMAL").astype(np.float64)
     assert (tangent[:, 3] == 1).all()
     np.testing.assert_allclose(np.linalg.norm(tangent[:, :3], axis=1), 1, atol=1e-6)
@@ -124,7 +125,8 @@ def test_normal_map_gives_the_solved_normals_back(tmp_path):
     t, n = read.attribute("TANGENT").astype(np.float64), read.attribute("NORMAL").astype(np.float64)
     shaded = x * t[:, :3] + y * np.cross(n, t[:, :3]) * t[:, 3:] + z * n
     # half a code of 16 bits is 1.5e-5 after the factor 2; the frame is float32; three components add up
-    np.testing.assert_allclose(shaded, maps.normal[mesh.rows, mesh.cols], atol=5e-5)
+    on_pixels = slice(mesh.centred)
+    np.testing.assert_allclose(shaded[on_pixels], maps.normal[mesh.rows[on_pixels], mesh.cols[on_pixels]], atol=5e-5)
 
 
 def srgb_to_linear(encoded):
@@ -190,8 +192,8 @@ def test_camera_sees_each_vertex_at_its_pixel(maps, tmp_path):
         lens = camera.perspective
         x, y = (seen[axis] / -seen[2] / np.tan(lens.yfov / 2) for axis in (0, 1))
         x = x / lens.aspectRatio
-    np.testing.assert_allclose((x + 1) / 2 * 30, mesh.cols + 0.5, atol=1e-4)  # float32 positions
-    np.testing.assert_allclose((1 - y) / 2 * 20, mesh.rows + 0.5, atol=1e-4)
+    np.testing.assert_allclose((x + 1) / 2 * 30, mesh.st[:, 0] * 30, atol=1e-4)  # float32 positions
+    np.testing.assert_allclose((1 - y) / 2 * 20, (1 - mesh.st[:, 1]) * 20, atol=1e-4)
     assert (-seen[2] > lens.znear).all() and (-seen[2] < lens.zfar).all()
     assert report.warnings == ()
 
