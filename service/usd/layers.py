@@ -31,7 +31,8 @@ PAYLOAD, GEOMETRY, MATERIALS = "payload.usda", "geometry.usdc", "materials.usda"
 """Layers of a .usda or .usdc asset beside its interface: the same files whatever the suffix, so that a .usda and a .usdc can share them."""
 LAYER_FILES = (PAYLOAD, GEOMETRY, MATERIALS)
 
-_PURPOSES = [UsdGeom.Tokens.default_, UsdGeom.Tokens.render, UsdGeom.Tokens.proxy, UsdGeom.Tokens.guide]
+PURPOSES = [UsdGeom.Tokens.default_, UsdGeom.Tokens.render, UsdGeom.Tokens.proxy, UsdGeom.Tokens.guide]
+"""All of them: extents hold the geometry of every purpose."""
 
 
 class Description(NamedTuple):
@@ -127,7 +128,7 @@ class AssetLayers:
         for name in self._geometries:
             with _in_variant(self._interface, self.root, GEO, name):
                 model = UsdGeom.ModelAPI.Apply(root)
-                model.SetExtentsHint(model.ComputeExtentsHint(UsdGeom.BBoxCache(Usd.TimeCode.Default(), _PURPOSES)))
+                model.SetExtentsHint(model.ComputeExtentsHint(UsdGeom.BBoxCache(Usd.TimeCode.Default(), PURPOSES)))
         for name in self._looks:
             root.GetVariantSets().AddVariantSet(LOOK).AddVariant(name)
         for variant_set, variants in ((GEO, self._geometries), (LOOK, [*self._looks])):

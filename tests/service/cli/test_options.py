@@ -16,6 +16,7 @@ from service.requests import (
     demo,
     depth,
     export,
+    inspect,
     jobs,
     keys,
     patterns,
@@ -30,7 +31,8 @@ from service.requests.base import Choice, Options, Role
 from service.requests.options import build, options_of, typed, values_of
 
 COMMANDS: dict[str, list[type[Options]]] = {
-    "solve": [solve.SolveRequest], "export": [export.ExportRequest], "depth": [depth.DepthRequest], "scan": [scan.ScanRequest],
+    "solve": [solve.SolveRequest], "export": [export.ExportRequest], "inspect": [inspect.InspectRequest],
+    "depth": [depth.DepthRequest], "scan": [scan.ScanRequest],
     "separate": [separate.SeparateRequest],
     "simulate cw": [simulate.SimulateCwRequest], "simulate pulsed": [simulate.SimulatePulsedRequest],
     "patterns": [patterns.PatternsRequest, patterns.PlanRequest], "relight": [relight.RelightRequest], "shade": [shade.ShadeRequest],

@@ -1,0 +1,115 @@
+"""relit inspect: look at an asset as a technical director does."""
+
+import dataclasses
+import json
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
+
+import typer
+
+from service.cli.request_commands import local_command
+from service.requests.inspect import InspectRequest
+
+if TYPE_CHECKING:
+    from service.usd.inspect import Inspection
+    from service.usd.inspect_geometry import PrimvarFacts
+    from service.usd.inspect_looks import MaterialFacts, TextureFacts
+
+LONGEST_TEXT = 100
+"""Characters of a text of the provenance that are printed; --json has all."""
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    local_command(app, "inspect", _inspect)
+
+
+def _inspect(request: InspectRequest) -> None:
+    from service.asset.errors import AssetError
+    from service.usd.inspect import inspect_asset
+
+    found = inspect_asset(request.asset)
+    if request.as_json:
+        print(json.dumps(dataclasses.asdict(found), ensure_ascii=False, indent=2))
+    else:
+        for name, value in _lines(found):
+            print(f"{name:<12} {value}")
+    if found.errors:
+        others = f" (and {len(found.errors) - 1} more)" if len(found.errors) > 1 else ""
+        raise AssetError(f"{request.asset}: {found.errors[0]}{others}")
+
+
+def _lines(found: "Inspection") -> Iterator[tuple[str, str]]:
+    """Yield what is printed, as names and values."""
+    yield "asset", f"{found.file}, {_bytes(found.size_bytes)}"
+    for layer in found.layers:
+        yield "layer", layer
+    yield "prim", f"{found.default_prim or 'no default prim'}, {f'kind {found.kind}' if found.kind else 'no kind'}"
+    yield "assetInfo", ", ".join(f"{key} {value}" for key, value in found.asset_info.items()) or "none"
+    yield "unit", f"{found.meters_per_unit:g} m, {found.up_axis} up"
+    if found.time_codes is not None:
+        yield "time", "{:g} to {:g}, {:g} a second".format(*found.time_codes)
+    if found.extent_m is None:
+        yield "extent", "nothing"
+    else:
+        low, high = found.extent_m
+        size = " × ".join(f"{top - bottom:.4g}" for bottom, top in zip(low, high, strict=True))
+        yield "extent", f"{size} m, from {_vector(low)} to {_vector(high)}"
+    for name, variants in found.variants.items():
+        yield "variants", f"{name}: {', '.join(f'[{each}]' if each == found.selections.get(name) else each for each in variants)}"
+    for variant in found.meshes:
+        where = f"geo={variant} " if variant else ""
+        for mesh in found.meshes[variant]:
+            yield "mesh", (f"{where}{mesh.path}, purpose {mesh.purpose}: {mesh.vertices} vertices, {mesh.faces} faces, "
+                           f"{mesh.pieces} pieces, {mesh.boundary_edges} boundary edges, {mesh.non_manifold_edges} non-manifold edges, "
+                           f"{mesh.holes} holes")
+            yield from _primvars(mesh.primvars)
+        for cloud in found.points[variant]:
+            width = "no width" if cloud.width_m is None else "widths {:.3g} to {:.3g} m".format(*cloud.width_m)
+            yield "points", f"{where}{cloud.path}, purpose {cloud.purpose}: {cloud.points} points, {width}"
+            yield from _primvars(cloud.primvars)
+    for look, materials in found.looks.items():
+        for material in materials:
+            yield from _material(f"look={look} " if look else "", material)
+    for light in found.lights:
+        yield "light", light
+    for camera in found.cameras:
+        yield "camera", f"{camera.path}, {camera.projection}, {camera.framing}"
+    for key, value in found.provenance.items():
+        yield "provenance", f"{key} {value if len(value) <= LONGEST_TEXT else value[:LONGEST_TEXT] + ' …'}"
+    for sentence in found.warnings:
+        yield "warning", sentence
+    for sentence in found.errors:
+        yield "wrong", sentence
+
+
+def _primvars(primvars: "Sequence[PrimvarFacts]") -> Iterator[tuple[str, str]]:
+    for primvar in primvars:
+        values = "" if primvar.low is None or primvar.high is None else f", {_vector(primvar.low)} to {_vector(primvar.high)}"
+        yield "  primvar", f"{primvar.name}, {primvar.interpolation}, {primvar.count} values{values}"
+
+
+def _material(where: str, material: "MaterialFacts") -> Iterator[tuple[str, str]]:
+    for surface in material.surfaces:
+        workflow = f", {surface.workflow} workflow" if surface.workflow else ""
+        yield "material", f"{where}{material.path}, {surface.context}: {surface.shader}{workflow}"
+        for entry in surface.inputs:
+            if entry.texture is not None:
+                yield "  texture", f"{entry.name}: {_texture(entry.texture)}"
+            elif entry.value is not None:
+                yield "  value", f"{entry.name}: {entry.value}"
+
+
+def _texture(texture: "TextureFacts") -> str:
+    if not texture.found or texture.size_bytes is None:
+        return f"{texture.file}, missing"
+    image = "no image" if texture.width is None else f"{texture.width}×{texture.height}, {texture.channels} × {texture.depth}"
+    return f"{texture.file}, {image}, {texture.color_space or 'no colour space'}, {_bytes(texture.size_bytes)}"
+
+
+def _vector(values: Sequence[float]) -> str:
+    return f"({', '.join(f'{value:.4g}' for value in values)})"
+
+
+def _bytes(count: int) -> str:
+    return f"{count / 1e6:.3g} MB" if count >= 1e6 else f"{count / 1e3:.3g} kB"

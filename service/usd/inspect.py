@@ -1,0 +1,211 @@
+"""Inspection of a USD asset for relit inspect: the facts that a technical director checks, and every finding of the validators.
+
+Source: OpenUSD: UsdModelAPI, UsdGeomModelAPI, UsdGeomCamera (units of apertures), UsdValidation.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdLux, UsdShade, UsdUtils, UsdValidation
+
+from service.asset.errors import AssetError
+from service.usd.camera import APERTURE_UNIT
+from service.usd.inspect_geometry import MeshFacts, PointsFacts, mesh_facts, points_facts
+from service.usd.inspect_looks import MaterialFacts, material_facts
+from service.usd.inspect_package import arkit_findings, package_findings
+from service.usd.layers import GEO, LOOK, PURPOSES
+
+SUFFIXES = (".usda", ".usdc", ".usd", ".usdz")
+
+HINT_TOLERANCE = 1e-4
+"""How far extentsHint may be from the geometry, as a part of its size: more than float32 rounds."""
+
+
+@dataclass(frozen=True)
+class CameraFacts:
+    """A camera."""
+
+    path: str
+    projection: str
+    framing: str
+    """The angle of view, or the width and height of the picture in metres."""
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What an asset holds, and what is wrong with it."""
+
+    file: str
+    size_bytes: int
+    """Of all files."""
+    layers: tuple[str, ...]
+    """Layers beyond the first, relative to its folder."""
+    default_prim: str | None
+    kind: str | None
+    asset_info: dict[str, str]
+    up_axis: str
+    meters_per_unit: float
+    time_codes: tuple[float, float, float] | None
+    """First and last, and how many a second; None where nothing is timed."""
+    extent_m: tuple[tuple[float, ...], tuple[float, ...]] | None
+    """Lowest and highest corner of the bounding box in the world, metres."""
+    variants: dict[str, tuple[str, ...]]
+    """The variants of each set."""
+    selections: dict[str, str]
+    meshes: dict[str, tuple[MeshFacts, ...]]
+    """By variant of `geo`; under an empty name where there is no such set."""
+    points: dict[str, tuple[PointsFacts, ...]]
+    looks: dict[str, tuple[MaterialFacts, ...]]
+    """Materials that something is bound to, by variant of `look`."""
+    lights: tuple[str, ...]
+    cameras: tuple[CameraFacts, ...]
+    provenance: dict[str, str]
+    """customLayerData."""
+    warnings: tuple[str, ...]
+    errors: tuple[str, ...]
+
+
+def inspect_asset(path: Path) -> Inspection:
+    """Open an asset, look at each of its variants, and run every validator on them.
+
+    Raises:
+        AssetError: it is no USD file, or one that cannot be opened.
+        StorageError: it cannot be read.
+    """
+    if path.is_dir():
+        raise AssetError(f"{path} is a folder: give the asset, a file that ends with {', '.join(SUFFIXES)}")
+    if not path.exists():
+        raise AssetError(f"{path} is not there")
+    if path.suffix.lower() not in SUFFIXES:
+        raise AssetError(f"{path}: relit inspect reads {', '.join(SUFFIXES)}")
+    packed = path.suffix.lower() == ".usdz"
+    errors = package_findings(path) if packed else []
+    quiet = UsdUtils.CoalescingDiagnosticDelegate()  # what USD would print about missing files is among the findings
+    try:
+        usd_stage = Usd.Stage.Open(str(path))
+    except Tf.ErrorException as error:
+        raise AssetError(f"{path} cannot be opened: it is no USD file, or a damaged one") from error
+    errors += arkit_findings(usd_stage.GetRootLayer()) if packed else []
+    usd_stage.SetEditTarget(usd_stage.GetSessionLayer())
+    inspection = _inspect(usd_stage, path, errors)
+    del quiet
+    return inspection
+
+
+def _inspect(usd_stage: Usd.Stage, path: Path, errors: list[str]) -> Inspection:
+    root = usd_stage.GetDefaultPrim()
+    if not root:
+        errors.append("the layer has no default prim, so that nothing can refer to it")
+    unit_m = UsdGeom.GetStageMetersPerUnit(usd_stage)
+    warnings: list[str] = []
+    meshes, points, looks = {}, {}, {}
+    for variant in _each_variant(root, GEO):
+        meshes[variant] = tuple(mesh_facts(UsdGeom.Mesh(prim)) for prim in usd_stage.Traverse() if prim.IsA(UsdGeom.Mesh))
+        points[variant] = tuple(points_facts(UsdGeom.Points(prim), unit_m) for prim in usd_stage.Traverse() if prim.IsA(UsdGeom.Points))
+        _find(usd_stage, root, warnings, errors)
+    for variant in _each_variant(root, LOOK):
+        looks[variant] = _materials(usd_stage)
+        _find(usd_stage, root, warnings, errors)
+    start, end = usd_stage.GetStartTimeCode(), usd_stage.GetEndTimeCode()
+    layers = [layer for layer in usd_stage.GetUsedLayers() if not layer.anonymous and layer != usd_stage.GetRootLayer()]
+    files = {texture.file: texture.size_bytes or 0 for look in looks.values() for material in look for texture in material.textures()}
+    size = path.stat().st_size if path.suffix.lower() == ".usdz" else (
+        path.stat().st_size + sum(Path(layer.realPath).stat().st_size for layer in layers) + sum(files.values()))
+    sets = root.GetVariantSets() if root else None
+    return Inspection(
+        file=str(path), size_bytes=size, layers=tuple(sorted(_relative(layer, path) for layer in layers)),
+        default_prim=str(root.GetPath()) if root else None, kind=(Usd.ModelAPI(root).GetKind() or None) if root else None,
+        asset_info={key: value.path if isinstance(value, Sdf.AssetPath) else str(value)
+                    for key, value in (Usd.ModelAPI(root).GetAssetInfo() if root else {}).items()},
+        up_axis=str(UsdGeom.GetStageUpAxis(usd_stage)), meters_per_unit=unit_m,
+        time_codes=(start, end, usd_stage.GetTimeCodesPerSecond()) if usd_stage.HasAuthoredTimeCodeRange() else None,
+        extent_m=_extent(root, unit_m) if root else None,
+        variants={name: tuple(sets.GetVariantSet(name).GetVariantNames()) for name in sets.GetNames()} if sets else {},
+        selections=dict(sets.GetAllVariantSelections()) if sets else {},
+        meshes=meshes, points=points, looks=looks,
+        lights=tuple(f"{prim.GetPath()} ({prim.GetTypeName()})" for prim in usd_stage.Traverse() if prim.HasAPI(UsdLux.LightAPI)),
+        cameras=tuple(_camera(UsdGeom.Camera(prim), unit_m) for prim in usd_stage.Traverse() if prim.IsA(UsdGeom.Camera)),
+        provenance=dict(_flat(usd_stage.GetRootLayer().customLayerData)), warnings=tuple(sorted(set(warnings))),
+        errors=tuple(sorted(set(errors))))  # sorted: validators run side by side
+
+
+def _each_variant(root: Usd.Prim, name: str) -> Iterator[str]:
+    """Select each variant of a set in turn, the selected one first; then restore the selection. Yield "" where there is no such set."""
+    names = root.GetVariantSets().GetNames() if root else []
+    if name not in names:
+        yield ""
+        return
+    variants = root.GetVariantSets().GetVariantSet(name)
+    selected = variants.GetVariantSelection()
+    for variant in sorted(variants.GetVariantNames(), key=lambda each: (each != selected, each)):
+        variants.SetVariantSelection(variant)
+        yield variant
+    variants.ClearVariantSelection()
+
+
+def _materials(usd_stage: Usd.Stage) -> tuple[MaterialFacts, ...]:
+    """Return the materials that are bound to geometry, each once."""
+    bound: dict[Sdf.Path, MaterialFacts] = {}
+    for prim in usd_stage.Traverse():
+        if prim.IsA(UsdGeom.Gprim) or prim.IsA(UsdGeom.Subset):
+            material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
+            if material and material.GetPath() not in bound:
+                bound[material.GetPath()] = material_facts(material)
+    return tuple(bound.values())
+
+
+def _find(usd_stage: Usd.Stage, root: Usd.Prim, warnings: list[str], errors: list[str]) -> None:
+    """Add what the validators find in the selected variants, and whether extentsHint is right."""
+    context = UsdValidation.ValidationContext(UsdValidation.ValidationRegistry().GetOrLoadAllValidators())
+    for found in context.Validate(usd_stage):
+        sentence = f"{found.GetName()}: {' '.join(found.GetMessage().split())}"
+        if found.GetType() == UsdValidation.ValidationErrorType.Error:
+            errors.append(sentence)
+        else:
+            warnings.append(sentence)
+    hint = UsdGeom.ModelAPI(root).GetExtentsHint() if root else None
+    box = _bounds(root, UsdGeom.BBoxCache.ComputeUntransformedBound) if root else Gf.Range3d()
+    if hint and not box.IsEmpty():
+        given = Gf.Range3d(Gf.Vec3d(hint[0]), Gf.Vec3d(hint[1]))
+        tolerance = HINT_TOLERANCE * max(box.GetSize().GetLength(), 1e-12)
+        if len(hint) == 2 and (_distance(box, given) > tolerance):
+            errors.append(f"extentsHint of {root.GetPath()} is {given}, and the geometry of the selected variants fills {box}")
+
+
+def _bounds(root: Usd.Prim, compute: Callable[[UsdGeom.BBoxCache, Usd.Prim], Gf.BBox3d]) -> Gf.Range3d:
+    """Return the bounding box of the geometry below a prim, of every purpose."""
+    return compute(UsdGeom.BBoxCache(Usd.TimeCode.EarliestTime(), PURPOSES), root).ComputeAlignedRange()
+
+
+def _distance(one: Gf.Range3d, other: Gf.Range3d) -> float:
+    return float(max(np.abs(np.array(one.GetMin()) - other.GetMin()).max(), np.abs(np.array(one.GetMax()) - other.GetMax()).max()))
+
+
+def _extent(root: Usd.Prim, unit_m: float) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
+    box = _bounds(root, UsdGeom.BBoxCache.ComputeWorldBound)
+    return None if box.IsEmpty() else (tuple(unit_m * each for each in box.GetMin()), tuple(unit_m * each for each in box.GetMax()))
+
+
+def _camera(camera: UsdGeom.Camera, unit_m: float) -> CameraFacts:
+    gf_camera = camera.GetCamera(Usd.TimeCode.EarliestTime())
+    if gf_camera.projection == Gf.Camera.Orthographic:
+        width, height = (APERTURE_UNIT * aperture * unit_m for aperture in (gf_camera.horizontalAperture, gf_camera.verticalAperture))
+        return CameraFacts(str(camera.GetPath()), "orthographic", f"{width:.6g} × {height:.6g} m")
+    angles = (gf_camera.GetFieldOfView(direction) for direction in (Gf.Camera.FOVHorizontal, Gf.Camera.FOVVertical))
+    return CameraFacts(str(camera.GetPath()), "perspective", " × ".join(f"{angle:.4g}°" for angle in angles))
+
+
+def _flat(data: dict[str, object], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Yield the entries of nested dictionaries as texts, the keys joined by colons, as USD takes them apart."""
+    for key, value in sorted(data.items()):
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{key}:")
+        else:
+            yield f"{prefix}{key}", str(value)
+
+
+def _relative(layer: Sdf.Layer, path: Path) -> str:
+    folder = f"{path.resolve().parent}/"
+    return str(layer.identifier).removeprefix(folder).removeprefix(f"{path.parent}/")

@@ -1,0 +1,196 @@
+"""What relit inspect says of assets that are right, and of broken ones."""
+
+import dataclasses
+import json
+import shutil
+import zipfile
+
+import numpy as np
+import pytest
+from pxr import Sdf, Usd, UsdGeom
+
+from service.asset.errors import AssetError
+from service.asset.mesh import height_mesh
+from service.usd.asset import write_asset
+from service.usd.inspect import inspect_asset
+from service.usd.layers import LAYER_FILES
+from tests.scenes.surfaces import make_ball, make_wave
+
+SUFFIXES = (".usda", ".usdc", ".usdz")
+every_suffix = pytest.mark.parametrize("suffix", SUFFIXES)
+
+
+@every_suffix
+def test_a_ball(ball, suffix, tmp_path):
+    path = tmp_path / f"ball{suffix}"
+    report = write_asset(ball, path, name="Kugel", version="v2")
+    found = inspect_asset(path)
+    assert (found.errors, found.warnings) == ((), ())
+    assert (found.default_prim, found.kind, found.up_axis, found.meters_per_unit) == ("/Kugel", "component", "Y", 1.0)
+    assert found.asset_info == {"name": "Kugel", "identifier": f"ball{suffix}", "version": "v2"}
+    assert found.layers == (() if suffix == ".usdz" else tuple(f"ball_layers/{name}" for name in (
+        "geometry.usdc", "materials.usda", "payload.usda")))
+    assert found.size_bytes == sum(p.stat().st_size for p in tmp_path.rglob("*") if p.is_file())
+    np.testing.assert_allclose(found.extent_m, height_mesh(ball).extent, atol=1e-6)
+    mesh, = found.meshes["mesh"]
+    assert (mesh.vertices, mesh.faces, mesh.purpose) == (report.vertex_count, report.face_count, "default")
+    assert (mesh.pieces, mesh.holes, mesh.non_manifold_edges) == (1, 0, 0)
+    normals, st = mesh.primvars
+    assert (normals.name, normals.interpolation, normals.count) == ("normals", "vertex", mesh.vertices) and normals.high[2] <= 1
+    assert st.name == "st" and min(st.low) > 0 and max(st.high) < 1
+    assert found.provenance["relit:method"] == "svbrdf" and json.loads(found.provenance["relit:camera"])["resolution"] == [24, 24]
+    camera, = found.cameras
+    assert camera.path == "/Kugel/Camera" and camera.projection == "orthographic"
+    side = f"{24 * ball.camera.pixel_size_m:.6g}"
+    assert camera.framing == f"{side} × {side} m"
+    for materials in found.looks.values():
+        material, = materials
+        assert all(texture.found and (texture.width, texture.height) == (24, 24) for texture in material.textures())
+
+
+def test_the_capturing_angle_of_view_in_degrees(tmp_path):
+    maps = make_wave("perspective")
+    write_asset(maps, tmp_path / "a.usdz", name="a")
+    width, height = maps.camera.resolution
+    angles = [2 * np.degrees(np.arctan(side / 2 / focal)) for side, focal in zip((width, height), maps.camera.focal_px, strict=True)]
+    camera, = inspect_asset(tmp_path / "a.usdz").cameras
+    assert camera.projection == "perspective" and camera.framing == " × ".join(f"{angle:.4g}°" for angle in angles)
+
+
+def write_mesh(path, points, counts, indices):
+    usd_stage = Usd.Stage.CreateNew(str(path))
+    mesh = UsdGeom.Mesh.Define(usd_stage, "/Mesh")
+    mesh.CreatePointsAttr(points)
+    mesh.CreateFaceVertexCountsAttr(counts)
+    mesh.CreateFaceVertexIndicesAttr(indices)
+    usd_stage.Save()
+
+
+@pytest.mark.parametrize(("picture", "pieces", "boundary", "holes"), [
+    (["###", "###", "###"], 1, 12, 0),
+    (["#####", "#####", "##.##", "#####", "#####"], 1, 20 + 4, 1),
+    (["#####", "#.#.#", "#####"], 1, 16 + 8, 2),
+    (["##.##", "##.##"], 2, 8 + 8, 0),
+    ([".."], 0, 0, 0),
+])
+def test_topology(picture, pieces, boundary, holes, tmp_path):
+    """A face for each #."""
+    rows, cols = len(picture), len(picture[0])
+    points = [(col, -row, 0) for row in range(rows + 1) for col in range(cols + 1)]
+    faces = [[row * (cols + 1) + col, (row + 1) * (cols + 1) + col, (row + 1) * (cols + 1) + col + 1, row * (cols + 1) + col + 1]
+             for row in range(rows) for col in range(cols) if picture[row][col] == "#"]
+    write_mesh(tmp_path / "a.usda", points, [4] * len(faces), [corner for face in faces for corner in face])
+    mesh, = inspect_asset(tmp_path / "a.usda").meshes[""]
+    assert (mesh.pieces, mesh.boundary_edges, mesh.holes, mesh.non_manifold_edges) == (pieces, boundary, holes, 0)
+
+
+def test_edges_of_three_faces_are_counted(tmp_path):
+    write_mesh(tmp_path / "fin.usda", [(0, 0, 0), (0, 1, 0), (1, 0, 0), (-1, 0, 0), (0, 0, 1)], [3, 3, 3], [0, 1, 2, 0, 1, 3, 0, 1, 4])
+    found = inspect_asset(tmp_path / "fin.usda")
+    mesh, = found.meshes[""]
+    assert (mesh.non_manifold_edges, mesh.boundary_edges, mesh.pieces) == (1, 6, 1)
+    assert found.default_prim is None and found.kind is None and found.extent_m is None
+    assert any("no default prim" in sentence for sentence in found.errors)
+
+
+def test_missing_files_are_named(tmp_path):
+    write_asset(make_ball(), tmp_path / "ball.usdc", name="Ball")
+    gone = next((tmp_path / "ball_textures").iterdir())
+    gone.unlink()
+    found = inspect_asset(tmp_path / "ball.usdc")
+    assert any(gone.name in sentence for sentence in found.errors)
+    textures = [texture for materials in found.looks.values() for material in materials for texture in material.textures()]
+    assert {texture.found for texture in textures if texture.file.endswith(gone.name)} == {False}
+    assert all(texture.width for texture in textures if not texture.file.endswith(gone.name))
+    shutil.rmtree(tmp_path / "ball_layers")
+    found = inspect_asset(tmp_path / "ball.usdc")
+    assert found.default_prim == "/Ball" and found.extent_m is None and any("payload.usda" in sentence for sentence in found.errors)
+
+
+def test_an_extents_hint_that_is_wrong_is_an_error(tmp_path):
+    write_asset(make_ball(), tmp_path / "ball.usdz", name="Ball")
+    with zipfile.ZipFile(tmp_path / "ball.usdz") as archive:
+        archive.extractall(tmp_path)
+    usd_stage = Usd.Stage.Open(str(tmp_path / "ball.usdc"))
+    UsdGeom.ModelAPI(usd_stage.GetDefaultPrim()).SetExtentsHint([(0, 0, 0), (9, 9, 9)])
+    usd_stage.Save()
+    assert any("extentsHint of /Ball" in sentence for sentence in inspect_asset(tmp_path / "ball.usdc").errors)
+
+
+def repack(source, target, change):
+    """A package with other entries: `change` takes and returns (name, data) and the method of compression."""
+    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w") as new:
+        for entry in old.infolist():
+            name, data, method = change(entry.filename, old.read(entry))
+            new.writestr(zipfile.ZipInfo(name), data, method)
+
+
+def test_packages_that_arkit_does_not_take(tmp_path):
+    write_asset(make_ball(), tmp_path / "ball.usdz", name="Ball")
+    repack(tmp_path / "ball.usdz", tmp_path / "zipped.usdz", lambda name, data: (name, data, zipfile.ZIP_DEFLATED))
+    with pytest.raises(AssetError, match=r"ball\.usdc is compressed"):
+        inspect_asset(tmp_path / "zipped.usdz")
+    repack(tmp_path / "ball.usdz", tmp_path / "loose.usdz", lambda name, data: (name, data, zipfile.ZIP_STORED))
+    assert any("ball.usdc is not aligned to 64 bytes" in sentence for sentence in inspect_asset(tmp_path / "loose.usdz").errors)
+    text = Sdf.Layer.FindOrOpen(str(tmp_path / "ball.usdz")).ExportToString().encode()
+    repack(tmp_path / "ball.usdz", tmp_path / "text.usdz",
+           lambda name, data: ("ball.usda", text, zipfile.ZIP_STORED) if name == "ball.usdc" else (name, data, zipfile.ZIP_STORED))
+    assert any("ARKit: the root layer ball.usda is text" in sentence for sentence in inspect_asset(tmp_path / "text.usdz").errors)
+    write_asset(make_ball(), tmp_path / "layered.usdc", name="Ball")
+    with zipfile.ZipFile(tmp_path / "layered.usdz", "w") as package:
+        for file in ("layered.usdc", *(f"layered_layers/{name}" for name in LAYER_FILES)):
+            package.write(tmp_path / file, file)
+    assert any("refers to ./layered_layers/payload.usda" in sentence for sentence in inspect_asset(tmp_path / "layered.usdz").errors)
+
+
+@pytest.mark.parametrize(("name", "content", "words"), [
+    ("a.usda", b"hello", "a.usda cannot be opened: it is no USD file, or a damaged one"),
+    ("a.usdc", b"PXR-USDC", "a.usdc cannot be opened"),
+    ("a.usdz", b"PK", "a.usdz is no USDZ package, or only a part of one"),
+    ("a.obj", b"v 0 0 0", "a.obj: relit inspect reads .usda, .usdc, .usd, .usdz"),
+    ("none.usda", None, "none.usda is not there"),
+    ("folder.usda", "folder", "folder.usda is a folder: give the asset"),
+])
+def test_what_is_no_asset_is_one_sentence(relit, tmp_path, name, content, words):
+    if content == "folder":
+        (tmp_path / name).mkdir()
+    elif content is not None:
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(AssetError, match=words):
+        inspect_asset(tmp_path / name)
+    outcome = relit("inspect", tmp_path / name)
+    assert (outcome.code, outcome.out) == (2, "") and words in outcome.err and outcome.err.count("\n") == 1
+
+
+@pytest.mark.parametrize("part", [0.3, 0.9])
+def test_half_a_package_is_one_sentence(part, tmp_path):
+    write_asset(make_ball(), tmp_path / "ball.usdz", name="Ball")
+    whole = (tmp_path / "ball.usdz").read_bytes()
+    (tmp_path / "half.usdz").write_bytes(whole[:int(part * len(whole))])
+    with pytest.raises(AssetError, match="only a part of one"):
+        inspect_asset(tmp_path / "half.usdz")
+    damaged = bytearray(whole)
+    damaged[len(whole) // 2] ^= 0xFF
+    (tmp_path / "damaged.usdz").write_bytes(damaged)
+    with pytest.raises(AssetError, match="damaged"):
+        inspect_asset(tmp_path / "damaged.usdz")
+
+
+def test_the_command_prints_facts_or_json(relit, tmp_path):
+    write_asset(make_ball(), tmp_path / "ball.usda", name="Ball")
+    outcome = relit("inspect", tmp_path / "ball.usda")
+    assert (outcome.code, outcome.err) == (0, "")
+    lines = outcome.out.splitlines()
+    assert lines[0].startswith(f"asset        {tmp_path}/ball.usda, ") and "prim         /Ball, kind component" in lines
+    assert "variants     geo: [mesh]" in lines and not any(line.startswith("wrong") for line in lines)
+    outcome = relit("inspect", tmp_path / "ball.usda", "--json")
+    found = inspect_asset(tmp_path / "ball.usda")
+    assert outcome.code == 0 and json.loads(outcome.out) == json.loads(json.dumps(dataclasses.asdict(found)))
+
+
+def test_the_command_ends_with_what_is_wrong(relit, tmp_path):
+    write_asset(make_ball(), tmp_path / "ball.usda", name="Ball")
+    (tmp_path / "ball_layers" / "geometry.usdc").unlink()
+    outcome = relit("inspect", tmp_path / "ball.usda")
+    assert outcome.code == 2 and "geometry.usdc" in outcome.err and outcome.err.count("\n") == 1
+    assert sum(line.startswith("wrong") for line in outcome.out.splitlines()) >= 2
