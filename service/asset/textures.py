@@ -6,8 +6,9 @@ there, and counted. Colours of an EXR are scene-linear in the colour space of th
 Source: OpenUSD, "UsdPreviewSurface Specification", texture reader (sourceColorSpace); USDZ File Format Specification (kinds of images).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -99,14 +100,23 @@ def write_textures(maps: SurfaceMaps, mesh: SurfaceMesh, folder: Path, *, look: 
         if storage is TextureFormat.EXR:
             return _write_exr(folder / f"{name}.exr", values, known, space, reach)
         dtype = _PNG_TYPES[storage] if name in COLOURS else np.uint16
-        codes, clipped = _encode(values, known, maps.color_space if name in COLOURS else None, dtype)
+        codes, clipped = encode(values, known, maps.color_space if name in COLOURS else None, dtype)
         write_png(folder / f"{name}.png", bleed(codes, known, reach=reach), srgb=name in COLOURS)
         return Texture(f"{name}.png", space, clipped)
 
-    present = [(name, source) for name in NAMES if (source := sources.get(name)) is not None]
+    return side_by_side({name: partial(write, name, source) for name in NAMES if (source := sources.get(name)) is not None}, progress)
+
+
+def side_by_side(writers: Mapping[str, Callable[[], Texture]], progress: Callable[[str, float], None]) -> dict[str, Texture]:
+    """Call the writers of images, IMAGES_AT_ONCE at a time, and return what they return.
+
+    Args:
+        writers: by name of the image.
+        progress: is called before each image is waited for, with its name and the part that is done, 0…1.
+    """
     written: dict[str, Texture] = {}
     with ThreadPoolExecutor(IMAGES_AT_ONCE, thread_name_prefix="relit-textures") as pool:
-        futures = [(name, pool.submit(write, name, source)) for name, source in present]
+        futures = [(name, pool.submit(writer)) for name, writer in writers.items()]
         try:
             for index, (name, future) in enumerate(futures):
                 progress(name, index / len(futures))
@@ -117,8 +127,8 @@ def write_textures(maps: SurfaceMaps, mesh: SurfaceMesh, folder: Path, *, look: 
     return written
 
 
-def _encode(values: np.ndarray, known: np.ndarray, color_space: str | None,
-            dtype: type[np.unsignedinteger[Any]]) -> tuple[np.ndarray, int]:
+def encode(values: np.ndarray, known: np.ndarray, color_space: str | None,
+           dtype: type[np.unsignedinteger[Any]]) -> tuple[np.ndarray, int]:
     """Return the codes of an image, 0 where nothing is known, and the count of clipped pixels.
 
     Args:

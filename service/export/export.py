@@ -10,7 +10,7 @@ from service.errors import RequestError
 from service.gltf.asset import write_asset as write_gltf_asset
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import export_metadata
-from service.requests.export import AssetFormat, ExportRequest, Geometry, TextureFormat
+from service.requests.export import AssetFormat, ExportRequest, Geometry
 from service.usd.asset import write_asset as write_usd_asset
 from service.usd.depth_asset import write_depth_mesh, write_depth_points
 from stage.depth_maps import DEPTH_FILE, DepthMaps
@@ -35,13 +35,11 @@ def export(request: ExportRequest, progress: Progress | None = None) -> Exported
 
     Raises:
         ResultError: the maps are missing or incomplete.
-        RequestError: a geometry is asked for solved maps, or a .glb of a depth or with EXR textures.
-        AssetError: an unknown suffix, no height, or no face.
+        RequestError: a geometry is asked for solved maps, or a .glb of a depth.
+        AssetError: an unknown suffix, EXR textures in a .usdz or .glb, no height, or no face.
         StorageError: the asset cannot be written; nothing is left half-written.
     """
     suffix = _check_suffix(request.out)
-    if suffix == GLB and request.textures is TextureFormat.EXR:
-        raise RequestError(f"--textures {request.textures}: a .glb holds PNG images alone: leave the option out, or name a .usda or .usdc")
     timings = Timings(progress)
     timings.stage("read", 1)
     warnings: list[str] = []
@@ -61,16 +59,11 @@ def export(request: ExportRequest, progress: Progress | None = None) -> Exported
         maps = replace(maps, provenance={**maps.provenance, **export_metadata(request, {path.stem: digest(path)})})
         timings.stage("asset", 1)
         name = _name(request, maps.provenance.get("relit:capture"))
-        if suffix == GLB:
-            in_gltf = write_gltf_asset(maps, request.out, name=name, version=request.version)
-            clipped_pixels = in_gltf.clipped_pixels
-            warnings += in_gltf.warnings
-        else:
-            in_usd = write_usd_asset(maps, request.out, name=name, version=request.version, textures=request.textures)
-            clipped_pixels = in_usd.clipped_pixels
-            warnings += in_usd.warnings
+        write = write_gltf_asset if suffix == GLB else write_usd_asset
+        report = write(maps, request.out, name=name, version=request.version, textures=request.textures)
+        warnings += report.warnings
         warnings += [f"{layer}: {count} pixels have a value outside 0…1, which the texture cannot hold: they are clipped"
-                     for layer, count in clipped_pixels.items() if count]
+                     for layer, count in report.clipped_pixels.items() if count]
     timings.close()
     return Exported(request.out, tuple(warnings))
 

@@ -9,14 +9,16 @@ import numpy as np
 from pygltflib import Asset, Mesh, Node, Primitive, Scene
 
 from service import __version__
+from service.asset.errors import AssetError
 from service.asset.mesh import height_mesh
+from service.asset.metallic import GLASS_IOR, loss_warnings, metallic_look
 from service.asset.units import SCALE_NOTE, unit_in_metres
 from service.gltf.camera import camera_and_place, camera_warnings
 from service.gltf.container import Glb
 from service.gltf.geometry import add_surface
 from service.gltf.materials import add_material
 from service.gltf.textures import NORMAL, write_textures
-from service.requests.export import FIRST_VERSION
+from service.requests.export import FIRST_VERSION, TextureFormat
 from stage.camera import Camera
 from stage.files import replacing
 from stage.maps import SurfaceMaps
@@ -43,7 +45,7 @@ class AssetReport(NamedTuple):
 
 
 def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str = FIRST_VERSION,
-                progress: Progress | None = None) -> AssetReport:
+                textures: TextureFormat = TextureFormat.PNG16, progress: Progress | None = None) -> AssetReport:
     """Write solved maps as a .glb file, whole or not at all.
 
     Args:
@@ -51,31 +53,36 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str 
         path: the file; missing folders are made.
         name: free text; the root node, the mesh and the material are named after it.
         version: of the asset, kept with the file's name in the extras of `asset`.
+        textures: the bits of normals, roughness and metallic; colours have 8.
         progress: called before each part of the work.
 
     Raises:
-        AssetError: no height layer, or no face; a colour space that is not known; more than the 4 GiB that a .glb can hold.
+        AssetError: EXR textures; no height layer, or no face; a colour space that is not known; more than the 4 GiB that a .glb can hold.
         StorageError: the disk refuses; what was there before is left as it was.
     """
     target = Path(path)
+    if textures is TextureFormat.EXR:
+        raise AssetError(f"{target} cannot hold EXR textures: a .glb takes PNG; store the textures as png16, or export a .usda or .usdc")
     tell = progress or (lambda what, done: None)
     tell("mesh", 0.0)
     mesh = height_mesh(maps)
+    look = metallic_look(maps) if maps.diffuse_albedo is not None else None
     unit_m = unit_in_metres(maps.camera)
     with replacing(target) as temporary, tempfile.TemporaryDirectory(prefix=f".{target.stem}.", dir=target.parent) as folder:
         glb = Glb()
-        textures = write_textures(maps, mesh, Path(folder), progress=lambda image, done: tell(
-            f"texture {image}", TEXTURES_START + (TEXTURES_END - TEXTURES_START) * done))
+        written = write_textures(maps, mesh, Path(folder), look=look, storage=textures, progress=lambda name, done: tell(
+            f"texture {name}", TEXTURES_START + (TEXTURES_END - TEXTURES_START) * done))
         tell("file", TEXTURES_END)
-        surface = add_surface(glb, mesh, unit_m=unit_m, material=add_material(glb, textures, name=name), textured=bool(textures.files),
-                              with_tangents=NORMAL in textures.files)
+        material = add_material(glb, written, Path(folder), ior=look.ior if look is not None else GLASS_IOR, name=name)
+        surface = add_surface(glb, mesh, unit_m=unit_m, material=material, textured=bool(written), with_tangents=NORMAL in written)
         provenance = {**maps.provenance, "relit:color_space": maps.color_space}
         glb.document.asset = Asset(version=GLTF_VERSION, generator=f"Relit {__version__}",
                                    extras={"identifier": target.name, "version": version})
         add_scene(glb, surface, maps.camera, mesh.extent, provenance, name=name, unit_m=unit_m)
         glb.write(temporary)
-    return AssetReport(target, len(mesh.points), 2 * len(mesh.quads) + len(mesh.triangles), mesh.step, textures.clipped_pixels,
-                       tuple(camera_warnings(maps.camera)))
+    return AssetReport(target, len(mesh.points), 2 * len(mesh.quads) + len(mesh.triangles), mesh.step,
+                       {name: texture.clipped_pixels for name, texture in written.items()},
+                       (*camera_warnings(maps.camera), *(loss_warnings(look) if look is not None else ())))
 
 
 def add_scene(glb: Glb, primitive: Primitive, camera: Camera, extent: np.ndarray, provenance: Mapping[str, str], *, name: str,

@@ -53,14 +53,10 @@ class Glb:
             normalized=normalized, count=len(values), type=_ELEMENT_TYPES[components], min=least, max=greatest))
         return len(self.document.accessors) - 1
 
-    def add_image(self, file: Path, *, media_type: str) -> int:
-        """Add an image file and return the number of the image; the file is read when the .glb is written.
-
-        Args:
-            file: a PNG or JPEG file.
-            media_type: "image/png" or "image/jpeg".
-        """
-        self.document.images.append(Image(bufferView=self._add_part(file, file.stat().st_size, None), mimeType=media_type, name=file.stem))
+    def add_png(self, file: Path) -> int:
+        """Add a PNG file and return the number of the image; the file is read when the .glb is written."""
+        view = self._add_part(file, file.stat().st_size, None)
+        self.document.images.append(Image(bufferView=view, mimeType="image/png", name=file.stem))
         return len(self.document.images) - 1
 
     def write(self, path: Path) -> None:

@@ -24,7 +24,7 @@ class TextureFormat(Choice):
     """How the textures of an asset are stored."""
 
     PNG16 = "png16", "16 bits, which every client reads; colours as sRGB"
-    PNG8 = "png8", "8 bits for colours, a fifth of the size; normals, roughness and metallic keep 16"
+    PNG8 = "png8", "8 bits for colours, a fifth of the size; normals, roughness and metallic keep 16, but not in a .glb"
     EXR = "exr", "half floats in the capture's scene-linear colour space, for .usda and .usdc"
 
 

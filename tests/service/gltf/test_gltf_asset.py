@@ -16,6 +16,7 @@ from service.asset.metallic import metallic_look
 from service.gltf import container, textures
 from service.gltf.asset import write_asset
 from service.gltf.container import read_document
+from service.requests.export import TextureFormat
 from stage.errors import StorageError
 from tests.scenes.surfaces import make_ball, make_sheet, make_wave
 from tests.service.gltf.khronos import findings, validate
@@ -152,6 +153,24 @@ def test_material_is_the_metallic_look(tmp_path):
     np.testing.assert_allclose(srgb_to_linear(base[brass]), np.broadcast_to([0.9, 0.7, 0.4], (brass.sum(), 3)), atol=0.5 / 255 * 2.28)
     sampler = read.document.samplers[0]
     assert (sampler.wrapS, sampler.wrapT, sampler.magFilter, sampler.minFilter) == (33071, 33071, 9729, 9987)
+
+
+def test_eight_bits_on_request(tmp_path):
+    maps = metal_and_paint()
+    large, small = (write_asset(maps, tmp_path / f"{kind}.glb", name="A", textures=kind).path
+                    for kind in (TextureFormat.PNG16, TextureFormat.PNG8))
+    assert small.stat().st_size < large.stat().st_size
+    read = Read(small)
+    for texture in range(3):
+        assert read.image(texture, tmp_path)[1] == 8
+    packed, _ = read.image(read.material.pbrMetallicRoughness.metallicRoughnessTexture.index, tmp_path)
+    np.testing.assert_allclose(packed[maps.mask][:, 1], 0.35, atol=0.5 / 255 + 1e-6)  # half a code
+
+
+def test_exr_textures_are_refused(tmp_path):
+    with pytest.raises(AssetError, match=r"a \.glb takes PNG"):
+        write_asset(SURFACES["everything"], tmp_path / "a.glb", name="A", textures=TextureFormat.EXR)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_index_of_refraction_is_written_where_it_is_not_the_default(tmp_path):
