@@ -13,7 +13,7 @@ from service.asset.mesh import SurfaceMesh, face_to_vertex
 
 
 class TangentFrame(NamedTuple):
-    """The tangent frame of the mesh at every texel; zero where no vertex is near."""
+    """The tangent frame of the mesh at the texels of some rows; zero where no vertex is near."""
 
     tangent: np.ndarray  # [rows, cols, 3] float32, unit, camera frame, towards growing s
     normal: np.ndarray  # [rows, cols, 3] float32, unit, camera frame, the interpolated vertex normal
@@ -33,21 +33,41 @@ class TangentFrame(NamedTuple):
         return np.stack([np.einsum("rcx,rcx->rc", axis, normal) for axis in axes], axis=-1).astype(np.float32)
 
 
-def tangent_frame(mesh: SurfaceMesh, shape: tuple[int, int]) -> TangentFrame:
-    """Return the frame that a renderer interpolates over the mesh, at each texel centre.
-
-    Args:
-        shape: rows, cols of the texture; that of the height map.
+class TangentFrames:
+    """The frames that a renderer interpolates over a mesh, at the centres of texels.
 
     Convention:
         Between the vertices of a mesh with step > 1 the frame is interpolated bilinearly; renderers split the quads
         into triangles, which differs in second order of the step.
     """
-    normal = _spread(mesh.normals, mesh, shape)
-    tangent = _spread(vertex_tangents(mesh), mesh, shape)
-    normal, covered = _unit(normal)
-    tangent, _ = _unit(tangent - normal * np.einsum("rcx,rcx->rc", tangent, normal)[..., None])
-    return TangentFrame(tangent, normal, covered)
+
+    def __init__(self, mesh: SurfaceMesh, shape: tuple[int, int]) -> None:
+        """Put the vertices in order.
+
+        Args:
+            shape: rows, cols of the texture; that of the height map.
+        """
+        self._step, self._shape = mesh.step, shape
+        self._normals, self._tangents = _grid(mesh.normals, mesh, shape), _grid(vertex_tangents(mesh), mesh, shape)
+
+    def of_rows(self, start: int, stop: int) -> TangentFrame:
+        """Return the frames of the texels of rows start … stop - 1."""
+        normal, covered = _unit(self._spread(self._normals, start, stop))
+        tangent = self._spread(self._tangents, start, stop)
+        tangent, _ = _unit(tangent - normal * np.einsum("rcx,rcx->rc", tangent, normal)[..., None])
+        return TangentFrame(tangent, normal, covered)
+
+    def _spread(self, grid: np.ndarray, start: int, stop: int) -> np.ndarray:
+        """Return values of the vertices' grid at every texel of the rows, bilinear between the vertices."""
+        if self._step == 1:
+            return grid[start:stop]
+        for axis, texels in ((0, np.arange(start, stop)), (1, np.arange(self._shape[1]))):
+            position = texels / self._step
+            low = position.astype(np.int64)
+            high = np.minimum(low + 1, grid.shape[axis] - 1)
+            weight = np.expand_dims((position - low).astype(np.float32), tuple({0, 1, 2} - {axis}))
+            grid = np.take(grid, low, axis=axis) * (1 - weight) + np.take(grid, high, axis=axis) * weight
+        return grid
 
 
 def vertex_tangents(mesh: SurfaceMesh) -> np.ndarray:
@@ -70,19 +90,11 @@ def vertex_tangents(mesh: SurfaceMesh) -> np.ndarray:
     return (total / np.linalg.norm(total, axis=-1, keepdims=True)).astype(np.float32)
 
 
-def _spread(values: np.ndarray, mesh: SurfaceMesh, shape: tuple[int, int]) -> np.ndarray:
-    """Return vertex values [V, 3] at every pixel, bilinear between the vertices; zero where no vertex is near."""
-    step = mesh.step
-    grid = np.zeros((-(-shape[0] // step), -(-shape[1] // step), 3), dtype=np.float32)
+def _grid(values: np.ndarray, mesh: SurfaceMesh, shape: tuple[int, int]) -> np.ndarray:
+    """Return vertex values [V, 3] in rows and columns of every step-th pixel; zero where there is no vertex."""
+    grid = np.zeros((-(-shape[0] // mesh.step), -(-shape[1] // mesh.step), 3), dtype=np.float32)
     centred = slice(mesh.centred)
-    grid[mesh.rows[centred] // step, mesh.cols[centred] // step] = values[centred]
-    for axis in (0, 1):
-        if step > 1:
-            position = np.arange(shape[axis]) / step
-            low = position.astype(np.int64)
-            high = np.minimum(low + 1, grid.shape[axis] - 1)
-            weight = np.expand_dims((position - low).astype(np.float32), tuple({0, 1, 2} - {axis}))
-            grid = np.take(grid, low, axis=axis) * (1 - weight) + np.take(grid, high, axis=axis) * weight
+    grid[mesh.rows[centred] // mesh.step, mesh.cols[centred] // mesh.step] = values[centred]
     return grid
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from service.asset.errors import AssetError
 from service.asset.mesh import SurfaceMesh
 from service.asset.metallic import MetallicLook
-from service.asset.tangent import tangent_frame
+from service.asset.tangent import TangentFrames
 from service.requests.export import TextureFormat
 from stage import exr
 from stage.colour import convert
@@ -35,7 +35,7 @@ BLEED_TEXELS = 8
 """How far colour is bled over the edge of the mask: bilinear filtering stays clean down to the third mip level."""
 
 BAND_ROWS = 256
-"""Rows that are converted at a time: bounds the memory of single-precision copies; OpenColorIO needs 0.02 s for each call."""
+"""Rows that are computed at a time: bounds the memory of single-precision copies; OpenColorIO needs 0.02 s for each call."""
 
 IMAGES_AT_ONCE = 2
 """Images that are compressed side by side: each holds some 300 MB at 4096 by 4096 texels."""
@@ -181,11 +181,17 @@ def to_display(values: np.ndarray, color_space: str) -> np.ndarray:
 
 def tangent_space(normal: np.ndarray, known: np.ndarray, mesh: SurfaceMesh) -> tuple[np.ndarray, np.ndarray]:
     """Return normals [rows, cols, 3] as 0…1 in the tangent space of the mesh, and where they are known."""
-    frame = tangent_frame(mesh, known.shape)
-    length = np.linalg.norm(np.where(known[..., None], normal, 0), axis=-1)
-    known = known & frame.covered & (length > 0)
-    unit = np.where(known[..., None], normal, 0) / np.where(known, length, 1)[..., None]
-    return frame.express(unit) / 2 + 0.5, known
+    frames = TangentFrames(mesh, (known.shape[0], known.shape[1]))
+    encoded, covered = np.empty(normal.shape, dtype=np.float32), np.empty_like(known)
+    for start in range(0, len(known), BAND_ROWS):
+        rows = slice(start, min(start + BAND_ROWS, len(known)))
+        frame = frames.of_rows(rows.start, rows.stop)
+        vectors = np.where(known[rows][..., None], normal[rows], 0)
+        length = np.linalg.norm(vectors, axis=-1)
+        covered[rows] = known[rows] & frame.covered & (length > 0)
+        unit = np.where(covered[rows][..., None], vectors, 0) / np.where(covered[rows], length, 1)[..., None]
+        encoded[rows] = frame.express(unit) / 2 + 0.5
+    return encoded, covered
 
 
 def bleed(values: np.ndarray, known: np.ndarray, *, reach: int) -> np.ndarray:
