@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import NamedTuple, get_args
 
 from service.asset.errors import AssetError
+from service.asset.repair import repair_heights
 from service.errors import RequestError
 from service.gltf.asset import write_asset as write_gltf_asset
 from service.reporting.progress import Progress, Timings
@@ -36,7 +37,8 @@ def export(request: ExportRequest, progress: Progress | None = None) -> Exported
     Raises:
         ResultError: the maps are missing or incomplete.
         RequestError: a geometry is asked for solved maps, or a .glb of a depth.
-        AssetError: an unknown suffix, EXR textures in a .usdz or .glb, no height, or no face.
+        AssetError: an unknown suffix, EXR textures in a .usdz or .glb, no height, a height that
+            contradicts its normals, or no face.
         StorageError: the asset cannot be written; nothing is left half-written.
     """
     suffix = _check_suffix(request.out)
@@ -58,6 +60,8 @@ def export(request: ExportRequest, progress: Progress | None = None) -> Exported
         maps = SurfaceMaps.read(path)
         maps = replace(maps, provenance={**maps.provenance, **export_metadata(request, {path.stem: digest(path)})})
         timings.stage("asset", 1)
+        maps, _, repairs = repair_heights(maps)
+        warnings += repairs
         name = _name(request, maps.provenance.get("relit:capture"))
         write = write_gltf_asset if suffix == GLB else write_usd_asset
         report = write(maps, request.out, name=name, version=request.version, textures=request.textures)
