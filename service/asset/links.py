@@ -84,18 +84,17 @@ def slopes(normal: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Return how relief grows from a pixel to the one on its right and to the one below, as its normal says.
 
     Args:
-        normal: [rows, cols, 3] unit, camera frame; slopes are 0 where it is 0.
+        normal: [rows, cols, 3] unit, camera frame; slopes are 0 where it is 0 or not finite.
 
     Returns:
         Two arrays [rows, cols], in pixels a pixel.
     """
-    if camera.focal_px is None:
-        facing = normal[..., 2]
-    else:
+    across, up, facing = (np.nan_to_num(normal[..., axis], posinf=0, neginf=0) for axis in range(3))
+    if camera.focal_px is not None:
         x, y = (plane.astype(np.float32) for plane in camera.plane_coordinates())
-        facing = normal[..., 2] - normal[..., 0] * x - normal[..., 1] * y
+        facing = facing - across * x - up * y
     facing = np.maximum(facing, LEAST_FACING)
-    return -normal[..., 0] / facing, normal[..., 1] / facing
+    return -across / facing, up / facing
 
 
 def without_islands(links: Links) -> Links:
