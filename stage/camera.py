@@ -107,6 +107,26 @@ class Camera(Strict):
             x, down = self.distortion.undo(x, down)
         return x, -down
 
+    def image_coordinates(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the image coordinates at which the camera sees points: the inverse of `plane_at`.
+
+        Args:
+            points: [..., 3] camera frame, in front of a perspective camera; metres, or pixels when the capture has no scale.
+
+        Returns:
+            u and v, each [...] float64.
+        """
+        x, y, z = np.moveaxis(points.astype(np.float64), -1, 0)
+        cu, cv = self.principal_px or (self.width / 2, self.height / 2)
+        if self.projection == "orthographic":
+            pixel = self.pixel_size_m or 1.0
+            return cu + x / pixel, cv - y / pixel
+        assert self.focal_px is not None  # the validator saw to it
+        x, down = -x / z, y / z
+        if self.distortion is not None:
+            x, down = self.distortion.apply(x, down)
+        return cu + self.focal_px[0] * x, cv + self.focal_px[1] * down
+
     def points(self, height: np.ndarray) -> np.ndarray:
         """Return the camera-frame points of a height map.
 

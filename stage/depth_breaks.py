@@ -48,8 +48,8 @@ def same_surface(first: np.ndarray, second: np.ndarray, distance_px: float | np.
     return np.asarray(np.abs(first - second) <= STEEPEST * footprint * distance_px)
 
 
-def connected(depth: np.ndarray, mask: np.ndarray, camera: Camera, offset: tuple[int, int], *, sigma: np.ndarray | None = None,
-              step: int = 1) -> np.ndarray:
+def connected(depth: np.ndarray, mask: np.ndarray, camera: Camera, offset: tuple[int, int], *,
+              sigma: np.ndarray | None = None) -> np.ndarray:
     """Return for each pixel whether its neighbour at an offset shows the same surface.
 
     Args:
@@ -58,7 +58,6 @@ def connected(depth: np.ndarray, mask: np.ndarray, camera: Camera, offset: tuple
         camera: of the whole image.
         offset: rows downwards, at least 0, and columns to the right, which may be negative.
         sigma: [rows, cols] metres, standard deviation of the depth; values that are not finite count as 0. None: 0 everywhere.
-        step: the arrays hold every step-th row and column of the image.
 
     Returns:
         [rows, cols] bool; False where either pixel lies outside the mask or the image.
@@ -71,7 +70,7 @@ def connected(depth: np.ndarray, mask: np.ndarray, camera: Camera, offset: tuple
     if first_col >= last_col:
         return joined
     both = mask[here] & mask[there]
-    gentle = same_surface(depth[here], depth[there], step * float(np.hypot(down, right)), camera)
+    gentle = same_surface(depth[here], depth[there], float(np.hypot(down, right)), camera)
     joined[here] = both & gentle
     pixels = np.argwhere(both & ~gentle) + np.array((0, first_col))
     joined[tuple(pixels.T)] = _continues(*_along(depth, sigma, mask, camera, pixels, offset))

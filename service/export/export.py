@@ -13,7 +13,7 @@ from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import export_metadata
 from service.requests.export import AssetFormat, ExportRequest, Geometry
 from service.usd.asset import write_asset as write_usd_asset
-from service.usd.depth_asset import write_depth_mesh, write_depth_points
+from service.usd.depth_asset import write_depth
 from stage.depth_maps import DEPTH_FILE, DepthMaps
 from stage.errors import ResultError
 from stage.fingerprint import digest
@@ -53,7 +53,7 @@ def export(request: ExportRequest, progress: Progress | None = None) -> Exported
     if of_depth:
         if suffix == GLB:
             raise RequestError(f"--out {request.out}: a .glb is of solved maps, {depth} holds a depth: name a .usdz, .usda or .usdc")
-        _export_depth(depth, request, timings)
+        warnings += _export_depth(depth, request, timings)
     else:
         if request.geometry is not None:
             raise RequestError(f"--geometry {request.geometry}: is for a depth, {path} holds solved maps: they become a mesh")
@@ -80,15 +80,16 @@ def _check_suffix(target: Path) -> str:
     return suffix
 
 
-def _export_depth(path: Path, request: ExportRequest, timings: Timings) -> None:
+def _export_depth(path: Path, request: ExportRequest, timings: Timings) -> tuple[str, ...]:
+    """Write an asset of a depth, and return what its user should know of it."""
     maps = DepthMaps.read(path)
     beside = path.parent / POINTS_FILE
     cloud: PointCloud | None = read_ply(beside) if beside.exists() else None
     contents = {file.stem: digest(file) for file in (path, beside) if file.exists()}
     maps = replace(maps, provenance={**maps.provenance, **export_metadata(request, contents)})
     timings.stage("asset", 1)
-    write = write_depth_points if request.geometry is Geometry.POINTS else write_depth_mesh
-    write(maps, cloud, request.out, name=_name(request, maps.provenance.get("relit:capture")), version=request.version)
+    return write_depth(maps, cloud, request.out, name=_name(request, maps.provenance.get("relit:capture")),
+                       geometry=request.geometry or Geometry.MESH, version=request.version, textures=request.textures)
 
 
 def _name(request: ExportRequest, capture: str | None) -> str:

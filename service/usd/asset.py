@@ -4,13 +4,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from service.asset.errors import AssetError
 from service.asset.mesh import height_mesh
 from service.asset.metallic import IOR_LIMITS, loss_warnings, metallic_look
 from service.asset.textures import FILE_NAMES, write_textures
 from service.asset.units import unit_in_metres
 from service.requests.export import FIRST_VERSION, TextureFormat
-from service.usd.files import check_suffix, install, temporary_folder_beside
+from service.usd.files import check_textures, install, temporary_folder_beside
 from service.usd.layers import LAYER_FILES, AssetLayers, Description, texture_folder
 from service.usd.scene import define_asset
 from stage.maps import SurfaceMaps
@@ -52,10 +51,7 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str 
         StorageError: the disk refuses; what was there before is left as it was.
     """
     target = Path(path)
-    packed = check_suffix(target) == ".usdz"
-    if packed and textures is TextureFormat.EXR:
-        raise AssetError(f"{target} cannot hold EXR textures, which ARKit and three.js do not read in a .usdz: export a .usda or .usdc, or "
-                         "store the textures as png16")
+    packed = check_textures(target, textures) == ".usdz"
     tell = progress or (lambda what, done: None)
 
     tell("mesh", 0.0)

@@ -1,96 +1,139 @@
-"""Writes a measured depth as a USD asset: a mesh between neighbouring pixels of one surface, or points; with the scene's colours."""
+"""Writes a measured depth as a USD asset: a mesh between neighbouring pixels of one surface, and points; with what the scene looks like."""
 
-from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from pxr import Sdf, Usd
+from pxr import Sdf, UsdGeom
 
+from service.asset.depth_cloud import MeasuredPoints, colour_image, measured_points
 from service.asset.depth_mesh import depth_mesh
 from service.asset.errors import AssetError
-from service.requests.export import FIRST_VERSION
+from service.asset.mesh import SurfaceMesh
+from service.asset.metallic import metallic_look
+from service.asset.textures import FILE_NAMES, write_textures
+from service.requests.export import FIRST_VERSION, Geometry, TextureFormat
 from service.usd.camera import define_camera
-from service.usd.files import check_suffix, install, temporary_folder_beside
-from service.usd.layers import LAYER_FILES, AssetLayers, Description
-from service.usd.points import define_points, linear_colours, set_display_color
+from service.usd.files import check_textures, install, temporary_folder_beside
+from service.usd.layers import LAYER_FILES, AssetLayers, Description, texture_folder
+from service.usd.materials import define_display_color_material, define_looks
+from service.usd.points import define_points
+from service.usd.primvars import set_primvar
 from service.usd.scene import define_mesh
-from stage.depth_maps import DepthMaps
-from stage.ply import PointCloud
+from stage.depth_maps import DEPTH_FILE, DepthMaps
+from stage.maps import SurfaceMaps
+from stage.ply import POINTS_FILE, PointCloud
 
 POINT_WIDTH = 1.5
 """Width of a point in footprints of a pixel: neighbouring points just overlap, corner to corner."""
-GREY = 0.5
+GREY = np.full((1, 3), 0.5, np.float32)
 """Linear colour where none is known."""
+UNCERTAINTY = ("sigma", "confidence")
+"""Layers of the depth that become primvars of these names."""
 
 
-def write_depth_points(maps: DepthMaps, cloud: PointCloud | None, path: str | Path, *, name: str,
-                       version: str = FIRST_VERSION) -> None:
-    """Write the measured points as a USD asset.
+class _Parts(NamedTuple):
+    """What an asset of a depth is made of."""
 
-    Args:
-        maps: a depth; its points are taken where there is no cloud.
-        cloud: what points.ply holds, or None.
-        path: .usda, .usdc or .usdz.
-        name: free text; the root prim is named after it.
-        version: of the asset, for assetInfo.
+    mesh: SurfaceMesh | None  # None: no face, and points were asked for
+    points: MeasuredPoints
+    point_step: int  # the points are of every point_step-th row and column of pixels
+    colours: np.ndarray | None  # [rows, cols, 3] float32 scene-linear Rec.709
 
-    Raises:
-        AssetError: another suffix, or no point.
-        StorageError: the disk refuses; what was there before is left as it was.
-    """
-    points = cloud.points if cloud is not None else maps.camera.points(-maps.depth)[maps.mask]
-    if len(points) == 0:
-        raise AssetError("the depth has no point, so there is nothing to export")
-    focal = min(maps.camera.focal_px) if maps.camera.focal_px is not None else None
-    widths = POINT_WIDTH * (np.abs(points[:, 2]) / focal if focal else np.full(len(points), maps.camera.pixel_size_m or 1.0))
-    colours = linear_colours(cloud.colours) if cloud is not None else np.full((1, 3), GREY, np.float32)
-
-    def fill(usd_stage: Usd.Stage, parent: Sdf.Path) -> np.ndarray:
-        prim = define_points(usd_stage, parent.AppendChild("Points"), points, widths, normals=None if cloud is None else cloud.normals)
-        set_display_color(prim, colours)
-        return np.array(prim.GetExtentAttr().Get())
-
-    _write(maps, Path(path), Description(name, maps.camera, maps.provenance, version=version), "points", fill)
+    @property
+    def extent(self) -> np.ndarray:
+        """Return the bounding box of all points, [2, 3] float32."""
+        return np.stack([self.points.points.min(axis=0), self.points.points.max(axis=0)])
 
 
-def write_depth_mesh(maps: DepthMaps, cloud: PointCloud | None, path: str | Path, *, name: str,
-                       version: str = FIRST_VERSION) -> None:
-    """Write a depth as a mesh without faces over steps of the depth.
+def write_depth(maps: DepthMaps, cloud: PointCloud | None, path: str | Path, *, name: str, geometry: Geometry = Geometry.MESH,
+                version: str = FIRST_VERSION, textures: TextureFormat = TextureFormat.PNG16) -> tuple[str, ...]:
+    """Write a depth as a USD asset with a mesh, which is cut at breaks of the depth, and the measured points as variants of `geo`.
 
     Args:
         maps: a depth.
-        cloud: what points.ply holds, for the colours of its pixels, or None.
+        cloud: what points.ply holds, or None.
         path: .usda, .usdc or .usdz.
         name: free text; the root prim is named after it.
+        geometry: the variant that is selected. Beside a mesh with a vertex for every k-th row and column, the points are those of the same
+            pixels; without any face there is no mesh beside points.
         version: of the asset, for assetInfo.
+        textures: how the texture is stored.
+
+    Returns:
+        Sentences on what the asset lacks.
 
     Raises:
-        AssetError: another suffix, or no face.
+        AssetError: another suffix; an EXR texture in a .usdz; no point, or no face for a mesh that is asked for; a cloud that is not one of
+            this depth.
         StorageError: the disk refuses; what was there before is left as it was.
     """
-    check_suffix(Path(path))
-    mesh = depth_mesh(maps)
-    colours = np.full((1, 3), GREY, np.float32)
-    if cloud is not None and len(cloud.colours) == np.count_nonzero(maps.mask):  # a point a pixel, row by row
-        of_pixel = np.zeros((*maps.mask.shape, 3), np.uint8)
-        of_pixel[maps.mask] = cloud.colours
-        colours = linear_colours(of_pixel[mesh.rows, mesh.cols])
-
-    def fill(usd_stage: Usd.Stage, parent: Sdf.Path) -> np.ndarray:
-        set_display_color(define_mesh(usd_stage, parent.AppendChild("Mesh"), mesh), colours)
-        return mesh.extent
-
-    _write(maps, Path(path), Description(name, maps.camera, maps.provenance, version=version), "mesh", fill)
-
-
-def _write(maps: DepthMaps, target: Path, description: Description, variant: str,
-           fill: Callable[[Usd.Stage, Sdf.Path], np.ndarray]) -> None:
-    """Write the asset around what `fill` defines below /Name/Geom; `fill` returns the extent of that."""
+    target = Path(path)
+    check_textures(target, textures)
+    parts = _parts(maps, cloud, geometry)
     with temporary_folder_beside(target) as temporary:
-        layers = AssetLayers(temporary, target, description)
-        with layers.geometry_variant(variant) as geom:
-            extent = fill(layers.geometry, geom)
-        define_camera(layers.geometry, layers.root.AppendChild("Camera"), maps.camera, extent)
+        folder = temporary / texture_folder(target)
+        folder.mkdir()
+        layers = AssetLayers(temporary, target, Description(name, maps.camera, maps.provenance, version=version))
+        UsdGeom.Scope.Define(layers.materials, layers.looks)
+        for variant in sorted(Geometry, key=lambda other: other != geometry):
+            if variant is Geometry.POINTS:
+                _add_points(layers, parts, maps)
+            elif parts.mesh is not None:
+                _add_mesh(layers, parts.mesh, parts.colours, maps, folder, textures)
+        define_camera(layers.geometry, layers.root.AppendChild("Camera"), maps.camera, parts.extent)
         layers.save()
         first, *others = layers.files
-        install(target, first, others, ours=LAYER_FILES)
+        install(target, first, [*others, *sorted(folder.iterdir())], ours=(*LAYER_FILES, *FILE_NAMES))
+    if parts.colours is None:
+        return (f"{DEPTH_FILE}: there is no {POINTS_FILE} beside it, which holds the colours: the asset is grey",)
+    return ()
+
+
+def _parts(maps: DepthMaps, cloud: PointCloud | None, geometry: Geometry) -> _Parts:
+    """Return the parts of an asset, of which the one that is asked for exists."""
+    points = measured_points(maps, cloud)
+    colours = colour_image(points, maps.mask)
+    if geometry is Geometry.MESH:
+        mesh = depth_mesh(maps)
+        return _Parts(mesh, points.every(mesh.step), mesh.step, colours)
+    try:
+        return _Parts(depth_mesh(maps), points, 1, colours)
+    except AssetError:
+        return _Parts(None, points, 1, colours)
+
+
+def _add_mesh(layers: AssetLayers, mesh: SurfaceMesh, colours: np.ndarray | None, maps: DepthMaps, folder: Path,
+              storage: TextureFormat) -> None:
+    """Define the variant with the mesh, and its looks if its colours are known, whose texture is written into the folder."""
+    with layers.geometry_variant(Geometry.MESH) as geom:
+        prim = define_mesh(layers.geometry, geom.AppendChild("Mesh"), mesh)
+        set_primvar(prim, "displayColor", Sdf.ValueTypeNames.Color3fArray, GREY if colours is None else colours[mesh.rows, mesh.cols])
+        _set_uncertainty(prim, maps, mesh.rows, mesh.cols)
+        layers.add_surface(prim.GetPath())
+    if colours is not None:
+        seen = SurfaceMaps(camera=maps.camera, mask=maps.mask, diffuse_albedo=colours, color_space="lin_rec709_scene")
+        look = metallic_look(seen)
+        define_looks(layers, write_textures(seen, mesh, folder, look=look, storage=storage), ior=look.ior)
+
+
+def _add_points(layers: AssetLayers, parts: _Parts, maps: DepthMaps) -> None:
+    """Define the variant with the points, and a material that shows their colours."""
+    points, rows, cols, colours, normals = parts.points
+    focal = min(maps.camera.focal_px) if maps.camera.focal_px is not None else None
+    footprints = np.abs(points[:, 2]) / focal if focal else np.full(len(points), maps.camera.pixel_size_m or 1.0)
+    material = define_display_color_material(layers.materials, layers.looks.AppendChild("PointMaterial"))
+    with layers.geometry_variant(Geometry.POINTS) as geom:
+        prim = define_points(layers.geometry, geom.AppendChild("Points"), points, POINT_WIDTH * parts.point_step * footprints,
+                             normals=normals)
+        set_primvar(prim, "displayColor", Sdf.ValueTypeNames.Color3fArray, GREY if colours is None else colours)
+        _set_uncertainty(prim, maps, rows, cols)
+        layers.bind(prim.GetPath(), material)
+
+
+def _set_uncertainty(prim: UsdGeom.Gprim, maps: DepthMaps, rows: np.ndarray, cols: np.ndarray) -> None:
+    """Write standard deviation (metres) and confidence (0…1) of each vertex or point, where the depth has them; 0: of its pixel unknown."""
+    for name in UNCERTAINTY:
+        values = getattr(maps, name)
+        if values is not None:
+            set_primvar(prim, name, Sdf.ValueTypeNames.FloatArray, values[rows, cols])

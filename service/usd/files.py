@@ -17,6 +17,7 @@ from typing import NamedTuple
 from pxr import Tf, Usd
 
 from service.asset.errors import AssetError
+from service.requests.export import TextureFormat
 from stage.errors import StorageError, storage
 
 SUFFIXES = (".usda", ".usdc", ".usdz")
@@ -38,6 +39,19 @@ def check_suffix(target: Path) -> str:
     suffix = target.suffix.lower()
     if suffix not in SUFFIXES:
         raise AssetError(f"{target} cannot be written as a USD asset: its suffix must be .usda, .usdc or .usdz")
+    return suffix
+
+
+def check_textures(target: Path, textures: TextureFormat) -> str:
+    """Return the suffix of an asset in lower case.
+
+    Raises:
+        AssetError: no USD file has this suffix, or one that does cannot hold such textures.
+    """
+    suffix = check_suffix(target)
+    if suffix == ".usdz" and textures is TextureFormat.EXR:
+        raise AssetError(f"{target} cannot hold EXR textures, which ARKit and three.js do not read in a .usdz: export a .usda or .usdc, or "
+                         "store the textures as png16")
     return suffix
 
 

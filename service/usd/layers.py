@@ -81,6 +81,7 @@ class AssetLayers:
         self._first_prims: list[Sdf.Path] = []
         self._surfaces: list[tuple[str, Sdf.Path]] = []
         self._looks: dict[str, Sdf.Path] = {}
+        self._bindings: list[tuple[str, Sdf.Path, Sdf.Path]] = []
 
     @property
     def geom(self) -> Sdf.Path:
@@ -113,6 +114,10 @@ class AssetLayers:
         """Bind the material of the selected look to a prim; called inside the block of the prim's variant."""
         self._surfaces.append((self._geometries[-1], prim))
 
+    def bind(self, prim: Sdf.Path, material: UsdShade.Material) -> None:
+        """Bind a material below `looks` to a prim, whichever look is selected; called inside the block of the prim's variant."""
+        self._bindings.append((self._geometries[-1], prim, material.GetPath()))
+
     def add_look(self, name: str, material: UsdShade.Material) -> None:
         """Make a material, which lies below `looks` on the stage `materials`, a variant of `look`; the first is the default."""
         self._looks[name] = material.GetPath()
@@ -122,6 +127,8 @@ class AssetLayers:
         for name, material in self._looks.items():
             for geometry, surface in self._surfaces:
                 self._bind(geometry, surface, name, material)
+        for geometry, prim, material in self._bindings:
+            self._bind(geometry, prim, None, material)
         if not self._packed:
             self._write_payload()
         root = self._interface.GetPrimAtPath(self.root)
@@ -137,12 +144,13 @@ class AssetLayers:
         self._interface.Save()
         del self.geometry, self.materials, self._interface
 
-    def _bind(self, geometry: str, surface: Sdf.Path, look: str, material: Sdf.Path) -> None:
-        """Bind a material in a variant of `look`, which is nested in the variant of `geo` that the surface is in."""
+    def _bind(self, geometry: str, surface: Sdf.Path, look: str | None, material: Sdf.Path) -> None:
+        """Bind a material, if a look is given in its variant of `look`, which is nested in the variant of `geo` that the surface is in."""
         with ExitStack() as variants:
             if geometry != self._geometries[0]:
                 variants.enter_context(_in_variant(self.materials, self.root, GEO, geometry))
-            variants.enter_context(_in_variant(self.materials, self.root, LOOK, look))
+            if look is not None:
+                variants.enter_context(_in_variant(self.materials, self.root, LOOK, look))
             prim = self.materials.OverridePrim(surface)
             UsdShade.MaterialBindingAPI.Apply(prim).Bind(UsdShade.Material(self.materials.GetPrimAtPath(material)))
 

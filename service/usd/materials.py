@@ -101,6 +101,20 @@ def _define_material(layers: AssetLayers, look: str, name: str, textures: Mappin
     return material
 
 
+def define_display_color_material(usd_stage: Usd.Stage, path: Sdf.Path) -> UsdShade.Material:
+    """Define a Lambertian material at `path` that takes its colour from the primvar displayColor."""
+    material = UsdShade.Material.Define(usd_stage, path)
+    surface = _shader(usd_stage, path.AppendChild("Surface"), "UsdPreviewSurface")
+    reader = _shader(usd_stage, path.AppendChild("DisplayColor"), "UsdPrimvarReader_float3")
+    reader.CreateInput("varname", _TYPES.String).Set("displayColor")
+    surface.CreateInput("diffuseColor", _TYPES.Color3f).ConnectToSource(reader.CreateOutput("result", _TYPES.Float3))
+    surface.CreateInput("useSpecularWorkflow", _TYPES.Int).Set(1)
+    surface.CreateInput("specularColor", _TYPES.Color3f).Set(Gf.Vec3f(0))
+    surface.CreateInput("roughness", _TYPES.Float).Set(1.0)
+    material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", _TYPES.Token))
+    return material
+
+
 def _shader(usd_stage: Usd.Stage, path: Sdf.Path, identifier: str) -> UsdShade.Shader:
     shader = UsdShade.Shader.Define(usd_stage, path)
     shader.CreateIdAttr(identifier)

@@ -6,11 +6,12 @@ Source: OpenUSD, UsdGeomPoints: widths are diameters of the points, in scene uni
 from pathlib import Path
 
 import numpy as np
-from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
+from pxr import Sdf, Tf, Usd, UsdGeom, Vt
 
+from service.asset.depth_cloud import linear_colours
 from service.asset.errors import AssetError
 from service.usd.files import write_layer
-from stage.colour import convert
+from service.usd.primvars import set_primvar
 from stage.ply import PointCloud
 
 SUFFIXES = (".usda", ".usdc")
@@ -48,10 +49,9 @@ def write_points(cloud: PointCloud, path: str | Path, *, name: str, provenance: 
         for key, value in sorted((provenance or {}).items()):
             usd_stage.SetMetadataByDictKey("customLayerData", key, value)
         prim = define_points(usd_stage, root.GetPath().AppendChild("Points"), cloud.points, np.array([width]), normals=cloud.normals)
-        set_display_color(prim, linear_colours(cloud.colours))
+        set_primvar(prim, "displayColor", Sdf.ValueTypeNames.Color3fArray, linear_colours(cloud.colours))
         if cloud.intensity is not None:
-            intensity = UsdGeom.PrimvarsAPI(prim).CreatePrimvar("intensity", Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.vertex)
-            intensity.Set(Vt.FloatArray.FromNumpy(np.ascontiguousarray(cloud.intensity, dtype=np.float32)))
+            set_primvar(prim, "intensity", Sdf.ValueTypeNames.FloatArray, cloud.intensity)
 
     write_layer(target, define)
 
@@ -77,14 +77,3 @@ def define_points(usd_stage: Usd.Stage, path: Sdf.Path, points: np.ndarray, widt
         prim.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(normals, dtype=np.float32)))
         prim.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     return prim
-
-
-def set_display_color(prim: UsdGeom.Gprim, colours: np.ndarray) -> None:
-    """Set the display colours [n, 3] of points or vertices, or [1, 3] of the whole prim; float32, scene-linear Rec.709."""
-    primvar = prim.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant if len(colours) == 1 else UsdGeom.Tokens.vertex)
-    primvar.Set(Vt.Vec3fArray([Gf.Vec3f(*map(float, colours[0]))]) if len(colours) == 1 else Vt.Vec3fArray.FromNumpy(colours))
-
-
-def linear_colours(codes: np.ndarray) -> np.ndarray:
-    """Return [n, 3] float32 scene-linear Rec.709 values of [n, 3] uint8 sRGB codes."""
-    return convert((codes.astype(np.float32) / 255)[None], "srgb_texture", "lin_rec709_scene")[0]

@@ -49,6 +49,16 @@ def test_perspective_rays_project_back_to_their_pixels():
     assert np.allclose(image_y * 55 + 14, v, atol=1e-8)
 
 
+@pytest.mark.parametrize("camera", [
+    perspective(distortion=Distortion(model="brown_conrady", k=(-0.1, 0.02, 0.0), p=(0.001, -0.002))), perspective(principal_px=None),
+    Camera(projection="orthographic", resolution=(40, 30), pixel_size_m=0.01, principal_px=(3.0, 8.5)),
+    Camera(projection="orthographic", resolution=(40, 30))])
+def test_points_are_seen_at_their_pixels(camera):
+    u, v = np.meshgrid(np.arange(40) + 0.5, np.arange(30) + 0.5)
+    found = camera.image_coordinates(camera.points(np.linspace(-3, -2, 1200).reshape(30, 40)))
+    assert np.allclose(found, (u, v), rtol=0, atol=2e-5)  # float32 points
+
+
 def test_perspective_points_lie_on_their_rays_in_front_of_the_camera():
     points = perspective().points(np.full((30, 40), -2.0))
     assert points.dtype == np.float32

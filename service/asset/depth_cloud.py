@@ -1,0 +1,91 @@
+"""The measured points of a depth, each with the pixel that it lies in, and what the scene looks like at these pixels."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from service.asset.errors import AssetError
+from service.asset.mesh import valid_heights
+from service.asset.textures import BLEED_TEXELS, bleed
+from stage.colour import convert
+from stage.depth_maps import DEPTH_FILE, DepthMaps
+from stage.maps import SurfaceMaps
+from stage.ply import POINTS_FILE, PointCloud
+
+LEAST_AGREEMENT = 0.9
+"""The least share of points that lie in pixels of the depth, if both are of one measurement: lasers measure some beside their pixel."""
+SAME_DEPTH = 0.1
+"""The largest relative difference between the depths of a point and of its pixel, if both are of one measurement."""
+
+
+class MeasuredPoints(NamedTuple):
+    """Points in the camera frame, and the pixels that they lie in."""
+
+    points: np.ndarray  # [n, 3] float32 metres
+    rows: np.ndarray  # [n] int
+    cols: np.ndarray  # [n] int
+    colours: np.ndarray | None  # [n, 3] float32 scene-linear Rec.709, 0…1; None: not known
+    normals: np.ndarray | None  # [n, 3] float32, unit; None: not known
+
+    def every(self, step: int) -> "MeasuredPoints":
+        """Return the points in every step-th row and column of pixels."""
+        kept = (self.rows % step == 0) & (self.cols % step == 0)
+        return MeasuredPoints(self.points[kept], self.rows[kept], self.cols[kept], None if self.colours is None else self.colours[kept],
+                              None if self.normals is None else self.normals[kept])
+
+
+def measured_points(maps: DepthMaps, cloud: PointCloud | None) -> MeasuredPoints:
+    """Return the points of a depth.
+
+    Args:
+        maps: a depth.
+        cloud: what points.ply holds; None: a point is made for each pixel of the depth, without a colour.
+
+    Raises:
+        AssetError: there is no point, or the cloud is not one of this depth.
+    """
+    if cloud is None:
+        rows, cols = np.nonzero(valid_heights(SurfaceMaps(camera=maps.camera, mask=maps.mask, height=-maps.depth)))
+        found = MeasuredPoints(maps.camera.points(-maps.depth)[rows, cols], rows, cols, None, None)
+    else:
+        found = _of_cloud(maps, cloud)
+    if len(found.points) == 0:
+        raise AssetError("the depth has no point, so there is nothing to export")
+    return found
+
+
+def colour_image(measured: MeasuredPoints, mask: np.ndarray) -> np.ndarray | None:
+    """Return the colours of the points as an image, [rows, cols, 3] float32 scene-linear Rec.709; None if they have none.
+
+    Args:
+        measured: at least one point.
+        mask: [rows, cols] bool; its pixels without a point of their own take the colour of the pixels around them.
+    """
+    if measured.colours is None:
+        return None
+    image, known = np.zeros((*mask.shape, 3), np.float32), np.zeros(mask.shape, dtype=bool)
+    image[measured.rows, measured.cols] = measured.colours
+    known[measured.rows, measured.cols] = True
+    return image if known[mask].all() else bleed(image, known, reach=BLEED_TEXELS)
+
+
+def linear_colours(codes: np.ndarray) -> np.ndarray:
+    """Return [n, 3] float32 scene-linear Rec.709 values of [n, 3] uint8 sRGB codes."""
+    return convert((codes.astype(np.float32) / 255)[None], "srgb_texture", "lin_rec709_scene")[0]
+
+
+def _of_cloud(maps: DepthMaps, cloud: PointCloud) -> MeasuredPoints:
+    """Return the points of a cloud that are finite and, under a perspective camera, in front of it."""
+    seen = np.isfinite(cloud.points).all(axis=-1)
+    if maps.camera.projection == "perspective":
+        seen &= cloud.points[:, 2] < 0
+    points = cloud.points[seen]
+    cols, rows = (np.floor(place).astype(np.int64) for place in maps.camera.image_coordinates(points))
+    inside = (rows >= 0) & (rows < maps.camera.height) & (cols >= 0) & (cols < maps.camera.width)
+    rows, cols = np.where(inside, rows, 0), np.where(inside, cols, 0)
+    depth = maps.depth[rows, cols]
+    agree = np.count_nonzero(inside & maps.mask[rows, cols] & (np.abs(depth + points[:, 2]) <= SAME_DEPTH * np.abs(depth)))
+    if agree < LEAST_AGREEMENT * len(cloud.points) or (len(cloud.points) == 0 and maps.mask.any()):
+        raise AssetError(f"{POINTS_FILE} and {DEPTH_FILE} are not of one measurement: {agree} of {len(cloud.points)} points lie on a pixel "
+                         f"of the depth: run `relit depth` again, or move {POINTS_FILE} away to export without colours")
+    return MeasuredPoints(points, rows, cols, linear_colours(cloud.colours[seen]), None if cloud.normals is None else cloud.normals[seen])
