@@ -45,7 +45,8 @@ def _lines(found: "Inspection") -> Iterator[tuple[str, str]]:
     for layer in found.layers:
         yield "layer", layer
     yield "prim", f"{found.default_prim or 'no default prim'}, {f'kind {found.kind}' if found.kind else 'no kind'}"
-    yield "assetInfo", ", ".join(f"{key} {value}" for key, value in found.asset_info.items()) or "none"
+    repeated = [key for key in found.asset_info if found.asset_info[key] == found.provenance.get(key)]
+    yield "assetInfo", ", ".join(f"{key} {value}" for key, value in found.asset_info.items() if key not in repeated) or "none"
     yield "unit", f"{found.meters_per_unit:g} m, {found.up_axis} up"
     if found.time_codes is not None:
         yield "time", "{:g} to {:g}, {:g} a second".format(*found.time_codes)

@@ -117,8 +117,7 @@ def _inspect(usd_stage: Usd.Stage, path: Path, errors: list[str]) -> Inspection:
     return Inspection(
         file=str(path), size_bytes=size, layers=tuple(sorted(_relative(layer, path) for layer in layers)),
         default_prim=str(root.GetPath()) if root else None, kind=(Usd.ModelAPI(root).GetKind() or None) if root else None,
-        asset_info={key: value.path if isinstance(value, Sdf.AssetPath) else str(value)
-                    for key, value in (Usd.ModelAPI(root).GetAssetInfo() if root else {}).items()},
+        asset_info=dict(_flat(Usd.ModelAPI(root).GetAssetInfo())) if root else {},
         up_axis=str(UsdGeom.GetStageUpAxis(usd_stage)), meters_per_unit=unit_m,
         time_codes=(start, end, usd_stage.GetTimeCodesPerSecond()) if usd_stage.HasAuthoredTimeCodeRange() else None,
         extent_m=_extent(root, unit_m) if root else None,
@@ -203,7 +202,7 @@ def _flat(data: dict[str, object], prefix: str = "") -> Iterator[tuple[str, str]
         if isinstance(value, dict):
             yield from _flat(value, f"{prefix}{key}:")
         else:
-            yield f"{prefix}{key}", str(value)
+            yield f"{prefix}{key}", value.path if isinstance(value, Sdf.AssetPath) else str(value)
 
 
 def _relative(layer: Sdf.Layer, path: Path) -> str:

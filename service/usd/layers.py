@@ -40,7 +40,7 @@ class Description(NamedTuple):
 
     name: str  # free text; the root prim is named after it
     camera: Camera  # its world_from_camera becomes the root's transform
-    provenance: Mapping[str, str]  # kept in customLayerData of every layer, with the camera
+    provenance: Mapping[str, str]  # kept in assetInfo, and in customLayerData of every layer, with the camera
     unit_m: float = 1.0  # metres of a scene unit
     version: str = FIRST_VERSION  # of the asset, for assetInfo
 
@@ -183,13 +183,15 @@ class AssetLayers:
         return usd_stage
 
     def _describe_root(self, root: UsdGeom.Xform) -> None:
-        """Write kind, assetInfo, the name for people and the pose."""
+        """Write kind, assetInfo with the provenance, the name for people and the pose."""
         description = self._description
         model = Usd.ModelAPI(root.GetPrim())
         model.SetKind(Kind.Tokens.component)
         model.SetAssetName(description.name)
         model.SetAssetIdentifier(Sdf.AssetPath(self._identifier))
         model.SetAssetVersion(description.version)
+        for key, value in sorted(description.provenance.items()):  # customLayerData is not seen through a reference
+            root.GetPrim().SetAssetInfoByKey(key, value)
         if description.name and description.name != root.GetPrim().GetName():
             root.GetPrim().SetDisplayName(description.name)
         if description.camera.world_from_camera is not None:

@@ -138,6 +138,14 @@ def test_every_layer_says_where_it_comes_from(tmp_path):
         assert layer.pseudoRoot.GetInfo("upAxis") == "Y" and layer.pseudoRoot.GetInfo("metersPerUnit") == 1
 
 
+def test_a_shot_that_refers_to_the_asset_finds_its_provenance(tmp_path):
+    write_square(tmp_path / "square.usdc")
+    shot = Usd.Stage.CreateInMemory()
+    prim = shot.DefinePrim("/Shot/Square")
+    prim.GetReferences().AddReference(str(tmp_path / "square.usdc"))
+    assert prim.GetAssetInfoByKey("relit:capture") == "sq" and Usd.ModelAPI(prim).GetAssetVersion() == "v007"
+
+
 def test_an_exported_asset_has_the_whole_path_of_its_provenance(relit, tmp_path, ball):
     ball.write(tmp_path / "maps.exr")
     outcome = relit("export", tmp_path, "--out", tmp_path / "a.usdz", "--name", "Kugel", "--version", "3")
