@@ -66,6 +66,8 @@ def export(request: ExportRequest, progress: Progress | None = None) -> Exported
         write = write_gltf_asset if suffix == GLB else write_usd_asset
         report = write(maps, request.out, name=name, version=request.version, textures=request.textures)
         warnings += report.warnings
+        if maps.diffuse_albedo is None:
+            warnings.append("the maps have no diffuse_albedo, so the asset is grey: solve with a method that gives it")
         warnings += [f"{layer}: {count} pixels have a value outside 0…1, which the texture cannot hold: they are clipped"
                      for layer, count in report.clipped_pixels.items() if count]
     timings.close()
