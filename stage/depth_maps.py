@@ -59,7 +59,7 @@ class DepthMaps:
             channel, dtype = LAYERS[name]
             kept = values if name == "status" else np.where(estimated, values, 0)
             channels[channel] = kept.astype(dtype)
-        exr.write(path, channels, color_space="lin_rec709_scene", metadata=result_metadata(self.camera, self.provenance))
+        exr.write(path, channels, color_space=exr.DATA, metadata=result_metadata(self.camera, self.provenance))
 
     @classmethod
     def read(cls, path: str | Path, *, unsure: bool = False) -> "DepthMaps":

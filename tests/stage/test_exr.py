@@ -1,6 +1,7 @@
 """OpenEXR in and out: bits kept, provenance kept, and a short file known by its bytes without a word on the terminal."""
 
 import struct
+from fractions import Fraction
 
 import numpy as np
 import OpenEXR
@@ -124,12 +125,57 @@ def test_what_is_no_exr_is_named(tmp_path, content):
         exr.read_header(tmp_path / "a.exr")
 
 
-def test_several_parts_are_refused(tmp_path):
+def test_one_channel_in_several_parts_is_refused(tmp_path):
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     parts = [OpenEXR.Part(dict(header), {"Y": PIXELS[..., 0]}, name) for name in ("left", "right")]
     OpenEXR.File(parts).write(str(tmp_path / "a.exr"))
-    with pytest.raises(ImageError, match="several parts or deep data"):
+    with pytest.raises(ImageError, match=r"a\.exr: has several parts with a channel Y: give an image with one view"):
         exr.read_header(tmp_path / "a.exr")
+
+
+def test_parts_of_different_sizes_are_refused(tmp_path):
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    windows = [(np.array([0, 0], np.int32), np.array([22, row], np.int32)) for row in (36, 9)]
+    parts = [OpenEXR.Part({**header, "dataWindow": window, "displayWindow": windows[0]}, {name: PIXELS[: window[1][1] + 1, :, 0]}, name)
+             for window, name in zip(windows, "YZ", strict=True)]
+    OpenEXR.File(parts).write(str(tmp_path / "a.exr"))
+    with pytest.raises(ImageError, match=r"a\.exr: has parts with different data windows"):
+        exr.read_header(tmp_path / "a.exr")
+
+
+def parts_file(path):
+    """A lossy picture and two parts of data, one of them in float."""
+    colour = {name: PIXELS[..., 0].astype(np.float16) for name in "RGB"}
+    exr.write_parts(path, [
+        exr.Part("rgba", colour, "lin_ap1_scene", exr.Compression.DWAA),
+        exr.Part("mask", {"mask.Y": PIXELS[..., 1].astype(np.float16)}, exr.DATA),
+        exr.Part("P", {f"P.{name}": PIXELS[..., 2] * 3 for name in "XYZ"}, exr.DATA),
+    ], metadata={"relit:capture": "öwl", "framesPerSecond": Fraction(24000, 1001), "pixelAspectRatio": 2.0})
+    return path
+
+
+def test_data_parts_are_lossless_beside_a_lossy_picture_and_are_no_colours(tmp_path):
+    path = parts_file(tmp_path / "a.exr")
+    channels, metadata = exr.read(path)
+    assert np.array_equal(channels["mask.Y"], PIXELS[..., 1].astype(np.float16)) and channels["P.Y"].dtype == np.float32
+    assert np.array_equal(channels["P.Y"], PIXELS[..., 2] * 3)
+    assert not np.array_equal(channels["R"], PIXELS[..., 0].astype(np.float16))  # noise, of which DWAA loses a lot
+    assert metadata["relit:capture"] == "öwl" and metadata["framesPerSecond"] == Fraction(24000, 1001)
+    assert exr.color_space_of(metadata) == "lin_ap1_scene"
+    with OpenEXR.File(str(path)) as file:
+        assert [part.name() for part in file.parts] == ["rgba", "mask", "P"]
+        for part in file.parts[1:]:
+            assert part.header["colorInteropID"] == "data" and "chromaticities" not in part.header
+            assert part.header["compression"] == OpenEXR.ZIP_COMPRESSION and part.header["pixelAspectRatio"] == 2
+
+
+def test_every_shorter_file_of_several_parts_is_known_as_truncated(tmp_path, capfd):
+    data = parts_file(tmp_path / "whole.exr").read_bytes()
+    for length in [len(data) - 1, *np.random.default_rng(5).integers(0, len(data), 60).tolist()]:
+        (tmp_path / "cut.exr").write_bytes(data[:length])
+        with pytest.raises(ImageError, match=r"cut\.exr: is (not an OpenEXR file|truncated|damaged or truncated)"):
+            exr.read_header(tmp_path / "cut.exr")
+    assert capfd.readouterr() == ("", "")
 
 
 def test_missing_files_and_folders(tmp_path):
