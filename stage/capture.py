@@ -98,6 +98,19 @@ class Capture:
             return np.ones((self.camera.height, self.camera.width), dtype=bool)
         return images.read_mask(self.file(self.manifest.mask), self.camera.resolution)
 
+    def mask_values(self) -> np.ndarray:
+        """Read the mask of the object with its partial values.
+
+        Returns:
+            [rows, cols] float32, 0…1, how much of each pixel is the object; all 1 when the manifest names no mask.
+
+        Raises:
+            ImageError: the mask is unreadable.
+        """
+        if self.manifest.mask is None:
+            return np.ones((self.camera.height, self.camera.width), dtype=np.float32)
+        return images.read_mask_values(self.file(self.manifest.mask), self.camera.resolution)
+
     def files(self) -> Iterator[tuple[str, str]]:
         """Yield the manifest field and the name of every file that the manifest names."""
         for field in ("mask", "dark", "flat"):

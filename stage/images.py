@@ -94,11 +94,28 @@ def read_mask(path: str | Path, resolution: tuple[int, int]) -> np.ndarray:
     Raises:
         ImageError: the mask has another size, is unreadable, or is True nowhere.
     """
-    check_resolution(path, resolution)
-    mask = read_pixels(path)[..., 0] > 0.5
+    mask = read_mask_values(path, resolution) > 0.5
     if not mask.any():
         raise ImageError(f"{path}: the mask is empty: no pixel is above one half")
     return mask
+
+
+def read_mask_values(path: str | Path, resolution: tuple[int, int]) -> np.ndarray:
+    """Read the values of a mask: the first channel of an image, where partial values stand for pixels that the object covers in part.
+
+    Args:
+        path: the image.
+        resolution: the width and height that the mask must have.
+
+    Returns:
+        [rows, cols] float32, 0…1; values outside are clipped, and what is no number is 0.
+
+    Raises:
+        ImageError: the mask has another size or is unreadable.
+    """
+    check_resolution(path, resolution)
+    values = read_pixels(path)[..., 0].astype(np.float32)
+    return np.clip(np.nan_to_num(values, nan=0.0), 0, 1)
 
 
 def write_png(path: Path, codes: np.ndarray, *, srgb: bool) -> None:

@@ -88,8 +88,9 @@ def test_a_library_lives_in_one_place(library, home):
     assert {i.importer for i in IMPORTS if top(i.target) == library and not under(i.importer, home)} == set()
 
 
-def test_opencv_lives_where_motion_is_tracked_and_rigs_are_calibrated():
-    assert {i.importer for i in IMPORTS if top(i.target) == "cv2" and not under(i.importer, "stage.motion", "stage.calibration")} == set()
+def test_opencv_lives_where_motion_is_tracked_rigs_are_calibrated_and_distances_measured():
+    allowed = "stage.motion", "stage.calibration", "stage.matte"
+    assert {i.importer for i in IMPORTS if top(i.target) == "cv2" and not under(i.importer, *allowed)} == set()
 
 
 @pytest.mark.parametrize(("package", "forbidden"), [

@@ -33,6 +33,8 @@ def _relight(request: RelightRequest, progress: ProgressOption = ProgressStyle.B
         print(f"report   {request.report}")
     if result.near_lights:
         print(f"lights   {result.near_lights} near lights are taken as distant, as the object's centre sees them")
+    if result.matte:
+        print(f"matte    {result.matte}")
     if result.clipped:
         print(f"clipped  {result.clipped} pixels are brighter than half can hold and stand at its largest value")
     print_warnings(result.warnings)

@@ -1,17 +1,24 @@
-"""Sentences about frames whose light the captured images do not hold: from beyond the captured lights, or clipped."""
+"""Sentences about frames: light that the captured images do not hold, from beyond the captured lights or clipped; and the matte."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from service.light.clipping import Clipping
+from stage.matte import Matte, MatteSource
 
 LEAST_BEYOND = 0.05
 """Least share of a frame's energy from beyond the captured lights that is told: with less, what stands in for it changes the frame by less
 than the captured lights themselves leave open (docs/figures.md)."""
 LEAST_CLIPPED = 0.005
 """Least share of a channel of a frame from clipped readings that is told."""
+LEAST_HARD = 0.005
+"""Least share of the border with a hard matte that is told."""
+UNKNOWN_MATTE = ("hard: these images, of few lights or of a thin object, do not show how much of a pixel the object covers; a mask image "
+                 "with partial values does")
+KEPT_BACKGROUND = ("none: the background is lit, so the frames keep it and A is 1; --matte mask cuts the object out, and a mask image with "
+                   "partial values does so softly")
 PLAIN_BEYOND = ("there the nearest captured lights stand in, so that shading and shadows are wrong and most pixels too bright; --maps "
                 "corrects the shading, lights captured there correct both")
 GUIDED_BEYOND = ("there the model of --maps is followed, as far as the captured lights confirm it, with the shadows of the nearest "
@@ -66,6 +73,36 @@ class FrameFindings:
                          "readings that are clipped in every frame of their light, at "
                          f"{_percent(self.clipped_pixels)} of the object's pixels: it is {known}")
         return tuple(found)
+
+
+@dataclass
+class MatteFindings:
+    """What the mattes of the captures are known from."""
+
+    counts: dict[str, int] = field(default_factory=dict)
+    """Number of captures by what the matte is known from."""
+    hard: float = 0.0
+    """Largest share of the border of an object along which the matte is hard for want of knowledge, 0…1."""
+
+    def add(self, matte: Matte | None) -> None:
+        """Take in the matte of a capture."""
+        source = "none" if matte is None else str(matte.source)
+        self.counts[source] = self.counts.get(source, 0) + 1
+        self.hard = max(self.hard, 0.0 if matte is None else matte.hard)
+
+    @property
+    def sentence(self) -> str:
+        """What the coverage of partly covered pixels is known from; empty where there is nothing to say."""
+        if MatteSource.BACKGROUND in self.counts:
+            return KEPT_BACKGROUND
+        if self.hard == 1:
+            return UNKNOWN_MATTE
+        if MatteSource.MASK_IMAGE in self.counts:
+            return "soft, from the mask image"
+        if MatteSource.IMAGES not in self.counts:
+            return ""
+        rest = f"; hard along {_percent(self.hard)} of the border, where the background is lit" if self.hard >= LEAST_HARD else ""
+        return f"soft, estimated from the captured images along the border of the mask{rest}"
 
 
 def _picture(number: int) -> str:

@@ -17,12 +17,12 @@ from service.light.schedule import ScheduledFrame
 from service.light.sequence import OpenedCapture
 from service.reporting.provenance import choices
 from service.requests.frame_range import numbered
-from service.requests.picture import Layer
+from service.requests.picture import FrameMatte, Layer
 from service.requests.relight import RelightRequest
 from stage import exr, fingerprint
 from stage.errors import StageError, StorageError
 
-ARITHMETIC = 2
+ARITHMETIC = 3
 """Version of the arithmetic, part of every request hash. It is raised when the same request gives other pixels, so that older frames are
 made again."""
 REQUEST_ATTRIBUTE = "relit:request"
@@ -31,6 +31,7 @@ RESOLVED = {
     "frames": "the schedule, which gives each frame its turn of the environment",
     "spin_degrees": "the rotation of each frame's environment",
     "exposure": "the stops of each frame, with those of the light keys",
+    "frames_per_second": "the rate of the frames, that of the light keys where the request has none",
     "aov": "the layers in any order",
     "align": "the key of the stack",
     "align_to": "the key of the stack",
@@ -83,15 +84,16 @@ def check_outputs(outputs: Sequence[tuple[str, Path]], inputs: Iterable[Path]) -
             raise StorageError(f"cannot write {path}: permission denied")
 
 
-def frame_hashes(opened: OpenedCapture, request: RelightRequest, frames: Sequence[ScheduledFrame],
-                 environments: Environments | None) -> list[str]:
-    """Return a hash for each frame of everything that its pixels depend on.
+def frame_hashes(opened: OpenedCapture, request: RelightRequest, frames: Sequence[ScheduledFrame], environments: Environments | None,
+                 rate: float) -> list[str]:
+    """Return a hash for each frame of everything that its pixels and its camera and time attributes depend on.
 
     Args:
         opened: the capture of the frames.
         request: with the weights that are used.
         frames: what lights each.
         environments: the maps that the frames name.
+        rate: frames per second.
 
     Raises:
         StorageError: a map cannot be read.
@@ -99,9 +101,9 @@ def frame_hashes(opened: OpenedCapture, request: RelightRequest, frames: Sequenc
     mask = opened.capture.manifest.mask
     scene = _hash(
         stack=opened.ingest.key, direction=_digits(opened.lights.direction), irradiance=_digits(opened.lights.irradiance),
-        layers=sorted(request.aov),
+        layers=sorted(request.aov), camera=opened.capture.camera.model_dump_json(), rate=rate,
         maps=None if opened.maps is None else fingerprint.digest(opened.maps),
-        mask=fingerprint.digest(opened.capture.file(mask)) if Layer.MASK in request.aov and mask is not None else None,
+        mask=fingerprint.digest(opened.capture.file(mask)) if mask is not None and _has_mask(request) else None,
         **{name: value for name, value in choices(request).items() if name not in RESOLVED})
     return [_hash(
         scene=scene, stops=frame.exposure_stops, captured=frame.captured,
@@ -109,6 +111,11 @@ def frame_hashes(opened: OpenedCapture, request: RelightRequest, frames: Sequenc
         [environments.content(frame.environment.path), frame.environment.exposure_stops, _digits(frame.environment.rotation)],
         discs=[[_digits(disc.direction), _digits(disc.irradiance), disc.angle_degrees, disc.color_space] for disc in frame.discs],
     ) for frame in frames]
+
+
+def _has_mask(request: RelightRequest) -> bool:
+    """Return whether the frames depend on the mask of the capture."""
+    return request.matte is not FrameMatte.NONE or Layer.MASK in request.aov
 
 
 def is_complete(path: Path, request_hash: str) -> bool:

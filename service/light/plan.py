@@ -5,13 +5,16 @@ from pathlib import Path
 from typing import NamedTuple
 
 from service.errors import RequestError
+from service.light.attributes import FRAMES_PER_SECOND
 from service.light.environments import Environments
+from service.light.groups import group_names
 from service.light.layers import check_layers, maps_file
 from service.light.outputs import check_outputs, frame_path
 from service.light.schedule import ScheduledFrame, schedule
 from service.light.sequence import capture_files, time_steps
 from service.requests.frame_range import frame_numbers, part_of
 from service.requests.light_keys import LightKeys
+from service.requests.picture import Layer
 from service.requests.relight import RelightRequest
 
 
@@ -35,6 +38,10 @@ class Plan(NamedTuple):
     """Number of frames in the whole range."""
     environments: Environments | None
     keys: LightKeys | None
+    rate: float
+    """Frames per second."""
+    groups: tuple[str, ...]
+    """The names of the layers of single lights; empty where none are wanted."""
 
     @property
     def is_sequence(self) -> bool:
@@ -63,7 +70,7 @@ def make_plan(request: RelightRequest) -> Plan:
     paths = [frame_path(request.out, number) for number in numbers]
     made = range(numbers[0], numbers[-1] + 1) if request.only is None else part_of(numbers, request.only)
     outputs = [(f"--out {request.out}", path) for path in paths]
-    check_layers(request.aov, request.maps)
+    check_layers(request, request.maps)
     if request.sheet is not None:
         if request.only is not None:
             raise RequestError(f"--sheet {request.sheet} shows the whole range, --only {request.only} makes a part of it: give one of them")
@@ -75,6 +82,7 @@ def make_plan(request: RelightRequest) -> Plan:
     keys = LightKeys.read(request.keys) if request.keys is not None else None
     environments = Environments(request.environment) if request.environment is not None else None
     scheduled = schedule(request, numbers, keys, environments)
+    groups = group_names(environments is not None, keys) if Layer.LIGHTS in request.aov else ()
     if environments is not None:
         environments.check(made)
 
@@ -88,4 +96,17 @@ def make_plan(request: RelightRequest) -> Plan:
 
     check_outputs(outputs, inputs())
     planned = (PlannedFrame(*frame) for frame in zip(paths, scheduled, range(len(paths)), strict=True))
-    return Plan(tuple(folders), tuple(frame for frame in planned if frame.scheduled.number in made), len(numbers), environments, keys)
+    return Plan(tuple(folders), tuple(frame for frame in planned if frame.scheduled.number in made), len(numbers), environments, keys,
+                _rate(request, keys), groups)
+
+
+def _rate(request: RelightRequest, keys: LightKeys | None) -> float:
+    """Return the frames per second of a request and its light keys.
+
+    Raises:
+        RequestError: the two differ.
+    """
+    wanted, keyed = request.frames_per_second, None if keys is None else keys.frames_per_second
+    if wanted is not None and keyed is not None and wanted != keyed:
+        raise RequestError(f"--frames-per-second {wanted:g}: {request.keys} has frames_per_second {keyed:g}: give one of them")
+    return wanted or keyed or FRAMES_PER_SECOND

@@ -4,6 +4,7 @@ Source: light is additive, so that images under single lights sum to an image un
 "Acquiring the Reflectance Field of a Human Face", SIGGRAPH 2000, section 3.
 """
 
+from collections.abc import Sequence
 from itertools import groupby, islice
 from pathlib import Path
 from typing import NamedTuple
@@ -12,12 +13,14 @@ import numpy as np
 
 from kernels import device as devices
 from kernels.relight.environment import Weighting
+from service.light.attributes import time_attributes
 from service.light.clipping import Clipping
 from service.light.combine import chunk_frames, linear_frames
-from service.light.findings import FrameFindings
+from service.light.findings import FrameFindings, MatteFindings
+from service.light.groups import add_up, in_groups
 from service.light.guide import Guide
-from service.light.layers import read_maps, still_layers
-from service.light.lighting import CaptureLighting
+from service.light.layers import frame_matte, read_maps, still_layers
+from service.light.lighting import CaptureLighting, FrameLight
 from service.light.outputs import REQUEST_ATTRIBUTE, frame_hashes, is_complete
 from service.light.plan import Plan, PlannedFrame, make_plan
 from service.light.sequence import OpenedCapture, open_capture
@@ -25,9 +28,11 @@ from service.light.sheet import contact_sheet
 from service.light.write import FrameFile, FrameFormat, FrameWriter
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import metadata, report
+from service.requests.picture import Layer
 from service.requests.relight import RelightRequest
 from stage.brackets import merge_brackets
 from stage.files import write_text
+from stage.stack import Stack
 
 
 class RelightResult(NamedTuple):
@@ -43,6 +48,8 @@ class RelightResult(NamedTuple):
     """Pixels of the frames made now that are beyond the largest half value, stored as that value."""
     near_lights: int
     """Point lights that were taken as distant ones, as the object's centre sees them; in a sequence the largest number of one capture."""
+    matte: str
+    """What the coverage of partly covered pixels is known from, in words; empty where there is nothing to say."""
     warnings: tuple[str, ...]
     """What does not fit in the frames made now, and what to try."""
 
@@ -69,7 +76,7 @@ def relight(request: RelightRequest, progress: Progress | None = None) -> Religh
     plan = make_plan(request)
     skipped = near_lights = 0
     captures: list[dict[str, object]] = []
-    findings = FrameFindings(guided=request.maps is not None)
+    findings, mattes = FrameFindings(guided=request.maps is not None), MatteFindings()
     if plan.is_sequence:
         timings.stage("frames", len(plan.frames))
     with FrameWriter(lambda written: timings.advance(skipped + written)) as writer:
@@ -77,14 +84,14 @@ def relight(request: RelightRequest, progress: Progress | None = None) -> Religh
             with timings.part("open"):
                 scheduled = [frame.scheduled for frame in frames]
                 opened = open_capture(folder, request, len(plan.folders), scheduled)
-                hashes = frame_hashes(opened, request, scheduled, plan.environments)
+                hashes = frame_hashes(opened, request, scheduled, plan.environments, plan.rate)
                 todo = [(frame, request_hash) for frame, request_hash in zip(frames, hashes, strict=True)
                         if request.overwrite or not is_complete(frame.path, request_hash)]
             near_lights = max(near_lights, opened.near_lights)
             skipped += len(frames) - len(todo)
             captures.append({"name": opened.capture.name, "content": opened.ingest.key, "frames": len(opened.lights.direction)})
             if todo:
-                _relight_capture(opened, todo, request, plan, writer, findings, device, timings)
+                _relight_capture(opened, todo, request, plan, writer, findings, mattes, device, timings)
         with timings.part("waiting for files"):
             writer.wait()
         if plan.is_sequence:
@@ -94,13 +101,14 @@ def relight(request: RelightRequest, progress: Progress | None = None) -> Religh
         timings.stage("sheet", 1)
         contact_sheet(request.sheet, paths)
     timings.close()
-    result = RelightResult(paths, len(plan.folders), skipped, writer.written.clipped, near_lights, findings.sentences)
+    result = RelightResult(paths, len(plan.folders), skipped, writer.written.clipped, near_lights, mattes.sentence, findings.sentences)
     if request.report is not None:
         write_text(request.report, report(
             request,
             inputs={"capture": str(request.capture), "captures": captures},
             frames={"made": writer.written.frames, "skipped": skipped, "clipped_pixels": writer.written.clipped,
                     "first": str(paths[0]), "last": str(paths[-1])},
+            matte=mattes.counts,
             warnings=result.warnings,
             device=devices.describe(device),
             timings_s={**timings.seconds, "of these": {name: round(seconds, 3) for name, seconds in timings.parts.items()},
@@ -109,10 +117,11 @@ def relight(request: RelightRequest, progress: Progress | None = None) -> Religh
 
 
 def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]], request: RelightRequest, plan: Plan,
-                     writer: FrameWriter, findings: FrameFindings, device: str, timings: Timings) -> None:
+                     writer: FrameWriter, findings: FrameFindings, mattes: MatteFindings, device: str, timings: Timings) -> None:
     """Make frames of one capture; `todo` holds each frame with the hash of its request."""
     maps = None if opened.maps is None else read_maps(opened.maps, opened.capture)
-    layers = still_layers(request.aov, opened.capture, maps, opened.maps)
+    written = str(request.color_space or opened.space)
+    layers = still_layers(request.aov, opened.capture, maps, opened.maps, written)
     environment = todo[0][0].scheduled.environment
     if environment is not None and plan.environments is not None:
         plan.environments.read(environment.path, opened.space)  # a bad environment map is known before the images are read
@@ -122,6 +131,9 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
         stack = merge_brackets(opened.ingest.stack(None if plan.is_sequence else lambda done, _: timings.advance(done)),
                                opened.capture.sources(), opened.lights)
         clipping = Clipping.of(stack, opened.capture.mask().reshape(-1))
+    with timings.part("matte"):
+        matte = frame_matte(request, opened.capture, stack)
+        mattes.add(matte)
     guide = None
     if maps is not None and opened.maps is not None:
         with timings.part("guide"):
@@ -130,14 +142,16 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
             stack = guide.stack
     if not plan.is_sequence:
         timings.stage("frames", len(plan.frames))
-    form = FrameFormat.of(request, opened.capture.camera.resolution, opened.space, layers)
+    form = FrameFormat.of(request, opened.capture.camera, opened.space, written, layers, matte)
     provenance = metadata(request, capture=opened.capture.name, inputs=stack.key, near_lights=opened.near_lights)
     if plan.keys is not None and plan.keys.frames_per_second is not None:
         provenance["relit:frames_per_second"] = f"{plan.keys.frames_per_second:g}"
     lighting = CaptureLighting(opened.lights, stack, plan.environments, opened.space, weighting=Weighting[request.weighting.name],
                                device=device, with_model=guide is not None)
     lights = lighting.frames([frame.scheduled for frame, _ in todo])
-    size = chunk_frames(stack)
+    single = [in_groups(frame.scheduled, plan.keys) for frame, _ in todo] if len(plan.groups) > 1 else []
+    single_lights = [lighting.frames(frames) for frames in zip(*single, strict=True)]
+    size = max(1, chunk_frames(stack) // max(1, len(plan.groups)))
     alone = plan.total == 1 or plan.is_sequence  # decided from the whole range, so that --only gives bit-identical frames
     for _, members in groupby(todo, key=lambda item: item[0].position // size):
         chunk = list(members)
@@ -146,14 +160,36 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
         weights, numbers = np.stack([each.weights for each in light]), [frame.scheduled.number for frame, _ in chunk]
         findings.add_beyond(numbers, [each.share_beyond for each in light], lighting.beyond_degrees)
         findings.add_clipped(numbers, weights, clipping)
+        places = None if alone else [frame.position % size for frame, _ in chunk]
         with timings.part("product"):
-            frames = linear_frames(stack, weights,
-                                   None if alone else [frame.position % size for frame, _ in chunk], device=device)
-        specular = None
+            frames = linear_frames(stack, weights, places, device=device)
+        colours: dict[str, np.ndarray] = {}
         if guide is not None:
             with timings.part("guide"):
                 specular = guide.correct(frames, [each.model for each in light if each.model is not None], specular=bool(form.parts))
+            if specular is not None:
+                colours[Layer.SPECULAR] = specular
+        if plan.groups:
+            with timings.part("single lights"):
+                given = [list(islice(each, len(chunk))) for each in single_lights]
+                colours |= _lights_alone(plan.groups, given, frames, stack, places, guide, device)
         files = [FrameFile(frame.path, 2.0**frame.scheduled.exposure_stops,
-                           {**provenance, **frame.scheduled.metadata, REQUEST_ATTRIBUTE: request_hash}) for frame, request_hash in chunk]
+                           {**provenance, **frame.scheduled.metadata, **time_attributes(frame.scheduled.number, plan.rate),
+                            REQUEST_ATTRIBUTE: request_hash}) for frame, request_hash in chunk]
         with timings.part("waiting for files"):
-            writer.put(files, frames, form, specular)
+            writer.put(files, frames, form, colours)
+
+
+def _lights_alone(names: Sequence[str], lights: Sequence[Sequence[FrameLight]], frames: np.ndarray, stack: Stack,
+                  places: Sequence[int] | None, guide: Guide | None, device: str) -> dict[str, np.ndarray]:
+    """Return the frames under each light alone, which add up to the frames [frames, 3, pixels], by the names of their layers."""
+    if len(names) == 1:
+        return {names[0]: frames.copy()}
+    found = {}
+    for name, light in zip(names, lights, strict=True):
+        found[name] = linear_frames(stack, np.stack([each.weights for each in light]), places, device=device)
+        if guide is not None:
+            guide.correct(found[name], [each.model for each in light if each.model is not None], specular=False)
+    if guide is not None and found:
+        add_up(list(found.values()), frames)
+    return found

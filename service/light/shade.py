@@ -19,7 +19,7 @@ from service.light.combine import linear_frames
 from service.light.environments import Environments
 from service.light.findings import FrameFindings
 from service.light.guide import Guide
-from service.light.layers import read_maps, still_layers
+from service.light.layers import check_layers, frame_matte, hard_matte, read_maps, still_layers
 from service.light.lighting import CaptureLighting, NearLight, far_light, far_samples, light_samples, near_lights
 from service.light.outputs import check_outputs
 from service.light.schedule import UPRIGHT, ScheduledFrame, TurnedEnvironment
@@ -28,6 +28,7 @@ from service.light.surface_model import SurfaceModel
 from service.light.write import FrameFile, FrameFormat, FrameWriter
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import metadata
+from service.requests.picture import FrameMatte, Layer
 from service.requests.shade import ShadeRequest
 from stage.brackets import merge_brackets
 from stage.capture import Capture
@@ -36,6 +37,7 @@ from stage.frames import fibonacci_sphere, rotation_about_y
 from stage.ingest import open_stack
 from stage.lighting import lights_from_centre
 from stage.maps import MAPS_FILE, SurfaceMaps
+from stage.matte import Matte
 
 SHADOW_DIRECTIONS = 64
 """Number of directions in which the shadows of broad light are marched where there are no captured lights; between them, visibility is
@@ -80,16 +82,19 @@ def shade(request: ShadeRequest, progress: Progress | None = None) -> ShadeResul
     if request.capture is None:
         maps = SurfaceMaps.read(path)
         frame, specular = _shade_maps(maps, path, lighting, environments, near, device, timings)
+        matte = None if request.matte is FrameMatte.NONE else hard_matte(maps.mask)
         warnings: tuple[str, ...] = ()
     else:
         capture = Capture.open(request.capture)
         maps = read_maps(path, capture)
-        frame, specular, warnings = _shade_capture(capture, request.cache, maps, path, lighting, environments, near, device, timings)
+        frame, specular, matte, warnings = _shade_capture(capture, request, maps, path, lighting, environments, near, device, timings)
     timings.stage("write", 1)
-    form = FrameFormat.of(request, maps.camera.resolution, maps.color_space, still_layers(request.aov, None, maps, path))
+    written = str(request.color_space or maps.color_space)
+    form = FrameFormat.of(request, maps.camera, maps.color_space, written, still_layers(request.aov, None, maps, path, written), matte)
     facts = metadata(request, capture=maps.provenance.get("relit:capture", ""), inputs=maps.provenance.get("relit:inputs", ""))
     with FrameWriter(lambda _: timings.advance(1)) as writer:
-        writer.put([FrameFile(request.out, 2.0**request.exposure, facts)], frame[None], form, specular[None] if form.parts else None)
+        writer.put([FrameFile(request.out, 2.0**request.exposure, facts)], frame[None], form,
+                   {Layer.SPECULAR: specular[None]} if form.parts else {})
     timings.close()
     return ShadeResult(request.out, maps.camera.metric, writer.written.clipped, warnings)
 
@@ -101,13 +106,16 @@ def check(request: ShadeRequest) -> Path:
         The file of the maps.
 
     Raises:
-        RequestError: no light, a file that is no .exr, or one that would replace an input.
+        RequestError: no light, a file that is no .exr or would replace an input, or layers that cannot be written.
         StageError: maps, capture or folder are not there; names them.
     """
     if not (request.light or request.sphere or request.rectangle) and request.environment is None:
         raise RequestError("there is no light: give --light, --sphere, --rectangle or --environment")
     if request.out.suffix.lower() != ".exr":
         raise RequestError(f"--out {request.out}: pictures are OpenEXR: end the name in .exr")
+    if Layer.LIGHTS in request.aov:
+        raise RequestError(f"--aov {Layer.LIGHTS} is a layer of relit frames: make one picture for each light, or use `relit relight`")
+    check_layers(request, request.maps)
     path = request.maps / MAPS_FILE if request.maps.is_dir() else request.maps
     if not path.is_file():
         raise ResultError(f"{path}: is not there: run `relit solve` first")
@@ -139,13 +147,15 @@ def _shade_maps(maps: SurfaceMaps, path: Path, lighting: ScheduledFrame, environ
     return frame, specular
 
 
-def _shade_capture(capture: Capture, cache: Path | None, maps: SurfaceMaps, path: Path, lighting: ScheduledFrame,
+def _shade_capture(capture: Capture, request: ShadeRequest, maps: SurfaceMaps, path: Path, lighting: ScheduledFrame,
                    environments: Environments | None, near: tuple[NearLight, ...], device: str,
-                   timings: Timings) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Return [3, pixels] float32 radiance of the captured images, guided by the maps, its specular part, and warnings."""
+                   timings: Timings) -> tuple[np.ndarray, np.ndarray, Matte | None, tuple[str, ...]]:
+    """Return [3, pixels] float32 radiance of the captured images, guided by the maps, its specular part, the matte, and warnings."""
     lights = lights_from_centre(capture)
     timings.stage("ingest", len(capture.sources()))
-    stack = merge_brackets(open_stack(capture, cache=cache, progress=lambda done, _: timings.advance(done)), capture.sources(), lights)
+    stack = merge_brackets(open_stack(capture, cache=request.cache, progress=lambda done, _: timings.advance(done)), capture.sources(),
+                           lights)
+    matte = frame_matte(request, capture, stack)
     clipping = Clipping.of(stack, capture.mask().reshape(-1))
     guide = Guide(maps, path, stack, lights, clipping, space=maps.color_space, device=device, progress=timings)
     timings.stage("shade", 2)
@@ -162,4 +172,4 @@ def _shade_capture(capture: Capture, cache: Path | None, maps: SurfaceMaps, path
     timings.advance(1)
     guide.add_near(frames[0], specular[0], near_lights(near, len(lights.direction)))
     timings.advance(2)
-    return frames[0], specular[0], findings.sentences
+    return frames[0], specular[0], matte, findings.sentences

@@ -1,5 +1,5 @@
-"""Linear frames become half EXR files with exposure, output space, clipping, layers and metadata; threads write them while the next frames
-are computed."""
+"""Linear frames become half EXR files with exposure, output space, matte, clipping, layers and metadata; threads write them while the next
+frames are computed."""
 
 import threading
 import time
@@ -7,17 +7,26 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
 from kernels import device as devices
+from service.light.attributes import camera_attributes
+from service.light.layers import StillLayer, in_parts
 from service.requests.picture import FrameCompression, Layer, PictureOptions
 from stage import exr
+from stage.camera import Camera
 from stage.colour import rgb_matrix
+from stage.matte import Matte
 
 COMPRESSIONS = {FrameCompression.ZIP: exr.Compression.ZIP, FrameCompression.PIZ: exr.Compression.PIZ,
                 FrameCompression.DWAA: exr.Compression.DWAA}
+
+
+BEAUTY_PART = "rgba"
+"""The name of the part that holds the picture, as Nuke calls it."""
+ALPHA = "A"
 
 
 class FrameFormat(NamedTuple):
@@ -28,16 +37,34 @@ class FrameFormat(NamedTuple):
     """Scene-linear colour space of the written frames."""
     matrix: np.ndarray | None  # [3, 3] float32 from the space that they are computed in to `space`; None: they are the same
     compression: FrameCompression
-    layers: Mapping[str, np.ndarray]  # further channels of every frame, [rows, cols] float16
+    layers: tuple[StillLayer, ...]
+    """Further layers of every frame."""
     parts: tuple[Layer, ...]
     """The wanted ones of the two layers diffuse and specular, which add up to the frame."""
+    in_parts: bool
+    """Whether each layer lies in a part of the file."""
+    alpha: np.ndarray | None  # [rows, cols] float16; None: no alpha is wanted
+    factor: np.ndarray | None  # [pixels] float32 that makes frames premultiplied; None: they are
+    attributes: dict[str, Any]
+    """Attributes of the camera."""
 
     @classmethod
-    def of(cls, options: PictureOptions, resolution: tuple[int, int], space: str, layers: Mapping[str, np.ndarray]) -> "FrameFormat":
-        """Return the format of frames that are computed in a scene-linear space, with layers that all of them share."""
-        written = str(options.color_space or space)
-        return cls(resolution, written, None if written == space else rgb_matrix(space, written), options.compression, layers,
-                   tuple(layer for layer in (Layer.DIFFUSE, Layer.SPECULAR) if layer in options.aov))
+    def of(cls, options: PictureOptions, camera: Camera, space: str, written: str, layers: tuple[StillLayer, ...],
+           matte: Matte | None) -> "FrameFormat":
+        """Return the format of frames.
+
+        Args:
+            options: of the request.
+            camera: of the capture or the maps.
+            space: the scene-linear space that the frames are computed in.
+            written: the one that they are written in.
+            layers: that all of them share.
+            matte: of the object, or None where no alpha is wanted.
+        """
+        factor = None if matte is None or (matte.factor == 1).all() else matte.factor.reshape(-1)
+        return cls(camera.resolution, written, None if written == space else rgb_matrix(space, written), options.compression, layers,
+                   tuple(layer for layer in (Layer.DIFFUSE, Layer.SPECULAR) if layer in options.aov), in_parts(options),
+                   None if matte is None else matte.coverage.astype(np.float16), factor, camera_attributes(camera))
 
 
 class FrameFile(NamedTuple):
@@ -46,7 +73,7 @@ class FrameFile(NamedTuple):
     path: Path
     gain: float
     """Factor of the frame's exposure."""
-    metadata: dict[str, str]
+    metadata: Mapping[str, Any]
 
 
 class Written(NamedTuple):
@@ -84,22 +111,22 @@ class FrameWriter:
         finally:
             self._pool.shutdown(wait=True, cancel_futures=True)
 
-    def put(self, files: Sequence[FrameFile], frames: np.ndarray, form: FrameFormat, specular: np.ndarray | None = None) -> None:
+    def put(self, files: Sequence[FrameFile], frames: np.ndarray, form: FrameFormat, colours: Mapping[str, np.ndarray]) -> None:
         """Wait until the chunk before is written, then begin to write this one.
 
         Args:
             files: one for each frame.
             frames: [frames, 3, pixels] float32 radiance; the writer may change it.
             form: the format of these frames.
-            specular: [frames, 3, pixels] float32 specular part of each; needed where `form` has parts.
+            colours: further layers of radiance by name, each [frames, 3, pixels] float32, which the writer may change; where `form` has
+                parts, `specular` is among them.
 
         Raises:
             StorageError: a frame cannot be written; those already there are whole.
         """
         self.wait()
-        parts = [None] * len(files) if specular is None else list(specular)
-        self._pending = [self._pool.submit(self._write, file, frame, part, form)
-                         for file, frame, part in zip(files, frames, parts, strict=True)]
+        self._pending = [self._pool.submit(self._write, file, frame, {name: layer[index] for name, layer in colours.items()}, form)
+                         for index, (file, frame) in enumerate(zip(files, frames, strict=True))]
 
     def wait(self) -> None:
         """Wait until everything that was handed over is written."""
@@ -107,19 +134,25 @@ class FrameWriter:
         for job in pending:
             job.result()
 
-    def _write(self, file: FrameFile, frame: np.ndarray, specular: np.ndarray | None, form: FrameFormat) -> None:
+    def _write(self, file: FrameFile, frame: np.ndarray, colours: Mapping[str, np.ndarray], form: FrameFormat) -> None:
         began = time.perf_counter()
         frame = _finished(frame, file, form)
         clipped = int(((frame > exr.HALF_MAX) | (frame < -exr.HALF_MAX)).any(axis=0).sum())
-        channels = _half(frame, form, "")
-        if specular is not None:
-            specular = _finished(specular, file, form)
-            parts = {Layer.DIFFUSE: frame - specular, Layer.SPECULAR: specular}
-            for layer in form.parts:
-                channels |= _half(parts[layer], form, f"{layer}.")
+        picture = _half(frame, form, "")
+        if form.alpha is not None:
+            picture[ALPHA] = form.alpha
+        parts = [exr.Part(BEAUTY_PART, picture, form.space, COMPRESSIONS[form.compression])]
+        layers = {name: _finished(layer, file, form) for name, layer in colours.items()}
+        if Layer.DIFFUSE in form.parts:
+            layers[Layer.DIFFUSE] = frame - layers[Layer.SPECULAR]
+        for name, layer in layers.items():
+            if name != Layer.SPECULAR or name in form.parts:
+                parts.append(exr.Part(name, _half(layer, form, f"{name}."), form.space, COMPRESSIONS[form.compression]))
+        parts += [exr.Part(layer.name, layer.channels, form.space if layer.is_colour else exr.DATA) for layer in form.layers]
         halved = time.perf_counter()
-        exr.write(file.path, {**channels, **form.layers}, color_space=form.space, metadata=file.metadata,
-                  compression=COMPRESSIONS[form.compression])
+        if not form.in_parts:
+            parts = [parts[0]._replace(channels={name: plane for part in parts for name, plane in part.channels.items()})]
+        exr.write_parts(file.path, parts, metadata={**form.attributes, **file.metadata})
         ended = time.perf_counter()
         with self._lock:
             before = self.written
@@ -129,9 +162,11 @@ class FrameWriter:
 
 
 def _finished(frame: np.ndarray, file: FrameFile, form: FrameFormat) -> np.ndarray:
-    """Return [3, pixels] float32 in the output's space and exposure; the same memory where neither changes."""
+    """Return [3, pixels] float32 in the output's space and exposure, premultiplied; the same memory where none of these changes it."""
     if form.matrix is not None:
         frame = form.matrix @ frame
+    if form.factor is not None:
+        frame *= form.factor
     return frame * np.float32(file.gain) if file.gain != 1.0 else frame
 
 

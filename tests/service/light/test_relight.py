@@ -29,7 +29,8 @@ def test_relight_under_an_even_sky_sums_to_the_sphere(relit, tmp_path):
     outcome = relit("relight", tmp_path / "cap", "--environment", tmp_path / "even.exr", "--out", tmp_path / "f" / "a.###.exr",
                     "--frames", "8-10", "--spin-degrees", "90")
     assert (outcome.code, outcome.err) == (0, "")
-    frames, warning = outcome.out.splitlines()  # the lights are all in front, the sky is not
+    frames, matte, warning = outcome.out.splitlines()  # the lights are all in front, the sky is not
+    assert matte.startswith("matte    none: the background is lit")
     assert frames == f"frames   {tmp_path}/f/a.008.exr … a.010.exr" and "comes from directions more than" in warning
     assert files_in(tmp_path / "f") == {"a.008.exr", "a.009.exr", "a.010.exr"}
     for number in (8, 9, 10):
@@ -140,7 +141,7 @@ def test_layers_of_a_frame(relit, lit, tmp_path):
     outcome, out = lit("out", "--aov", "beauty,mask,normal, confidence", "--maps", tmp_path / "maps", capture=tmp_path / "other")
     assert (outcome.code, outcome.err) == (0, "")
     channels, _ = exr.read(out / "a.01.exr")
-    assert set(channels) == {"R", "G", "B", "mask.Y", "normal.X", "normal.Y", "normal.Z", "confidence.Y"}
+    assert set(channels) == {"R", "G", "B", "A", "mask.Y", "normal.X", "normal.Y", "normal.Z", "confidence.Y"}
     assert {plane.dtype for plane in channels.values()} == {np.dtype(np.float16)}
     maps = SurfaceMaps.read(tmp_path / "maps" / "maps.exr")
     assert np.array_equal(channels["mask.Y"] > 0.5, maps.mask) and np.array_equal(channels["confidence.Y"], maps.confidence)
@@ -151,7 +152,7 @@ def test_layers_of_a_frame(relit, lit, tmp_path):
 def test_the_mask_needs_no_maps(lit):
     _, out = lit("out", "--aov", "mask")
     channels, _ = exr.read(out / "a.01.exr")
-    assert set(channels) == {"R", "G", "B", "mask.Y"} and np.array_equal(channels["mask.Y"] == 1, SCENE.mask)
+    assert set(channels) == {"R", "G", "B", "A", "mask.Y"} and np.array_equal(channels["mask.Y"] == 1, SCENE.mask)
 
 
 def test_maps_that_do_not_fit(relit, lit, tmp_path):

@@ -77,7 +77,7 @@ def test_turned_frames_are_made_and_the_unturned_one_is_kept(made):
 def hashes(request: RelightRequest) -> list[str]:
     plan = make_plan(request)
     scheduled = [frame.scheduled for frame in plan.frames]
-    return frame_hashes(open_capture(plan.folders[0], request, 1, scheduled), request, scheduled, plan.environments)
+    return frame_hashes(open_capture(plan.folders[0], request, 1, scheduled), request, scheduled, plan.environments, plan.rate)
 
 
 def test_a_choice_that_is_added_makes_frames_anew_by_itself(tmp_path):
@@ -98,7 +98,7 @@ def test_a_choice_that_is_added_makes_frames_anew_by_itself(tmp_path):
 def test_what_the_hash_holds_in_another_form_is_a_choice():
     """The other choices are in it as they are; those in another form change it, as the tests here and in test_align show."""
     assert RESOLVED.keys() <= {name for name, field in RelightRequest.model_fields.items() if role_of(field) is Role.CHOICE}
-    assert RESOLVED.keys() == {"frames", "spin_degrees", "exposure", "aov", "align", "align_to"}
+    assert RESOLVED.keys() == {"frames", "spin_degrees", "exposure", "aov", "align", "align_to", "frames_per_second"}
 
 
 @pytest.mark.parametrize("change", ["image", "light", "environment", "mask"])
@@ -139,11 +139,11 @@ SLOW = """
 import time
 import service.light.write as write
 from service.cli.main import main
-whole = write.exr.write
+whole = write.exr.write_parts
 def slow(*arguments, **options):
     time.sleep(0.1)
     whole(*arguments, **options)
-write.exr.write = slow
+write.exr.write_parts = slow
 main()
 """
 

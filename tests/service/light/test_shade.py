@@ -141,7 +141,8 @@ def test_maps_without_a_scale_are_lit_in_pixels_and_say_so(relit, tmp_path):
     (("--environment", "none.exr"), "none.exr"),
     (("--light", "0,0,1,1,1,1", "--out", "p.png"), "OpenEXR"),
     (("--light", "0,0,1,1,1,1", "--capture", "nowhere"), "nowhere"),
-    (("--light", "0,0,1,1,1,1", "--aov", "depth"), "depth"),
+    (("--light", "0,0,1,1,1,1", "--aov", "velocity"), "velocity"),
+    (("--light", "0,0,1,1,1,1", "--aov", "lights"), "lights is a layer of relit frames"),
 ])
 def test_bad_shades(relit, maps, tmp_path, options, words):
     out = () if "--out" in options else ("--out", tmp_path / "p.exr")

@@ -1,0 +1,137 @@
+"""The matte of a capture against the exact coverage of a rendered outline, and backgrounds that must not fool it."""
+
+import cv2
+import numpy as np
+import pytest
+
+from stage.capture import Capture
+from stage.ingest import open_stack
+from stage.matte import Matte, MatteSource, matte_of
+from tests.scenes.captures import write_exr, write_image, write_manifest
+from tests.scenes.coverage import Covered, render_covered
+
+NOISE = 0.003
+"""Standard deviation of the noise that is added, of radiance: half a percent of the bright texture."""
+
+
+def write_covered(folder, scene: Covered, mask, *, cut=False):
+    """Write a capture of a rendered outline with noise; `mask` is bool, or coverage that is written with 16 bits; `cut`: black outside."""
+    noise = np.random.default_rng(2).normal(0, NOISE, scene.images.shape)
+    for index, image in enumerate(np.maximum(scene.images + noise, 0)):
+        write_exr(folder / f"{index:03d}.exr", image * mask[..., None] if cut else image)
+    write_image(folder / "mask.png", np.uint8(mask * 255) if mask.dtype == bool else np.uint16(np.rint(mask * 65535)))
+    size = len(mask)
+    write_manifest(folder, {
+        "schema": "relit.capture/1", "name": "cap", "mask": "mask.png",
+        "camera": {"projection": "orthographic", "resolution": [size, size]},
+        "frames": [{"image": f"{index:03d}.exr", "light": {"type": "distant", "direction": direction, "irradiance": [np.pi] * 3}}
+                   for index, direction in enumerate(scene.directions.tolist())]})
+    return folder
+
+
+def found(folder, scene: Covered, mask=None, **options) -> Matte:
+    capture = Capture.open(write_covered(folder, scene, scene.coverage > 0.5 if mask is None else mask, **options))
+    return matte_of(capture, open_stack(capture))
+
+
+def edge_error(scene: Covered, coverage, grey=None, factor=None):
+    """Mean error over the partly covered pixels: of the coverage, or of the picture under all lights over a grey, as a share of it."""
+    partly = (scene.coverage > 0) & (scene.coverage < 1)
+    if grey is None:
+        return np.abs(coverage - scene.coverage)[partly].mean()
+    truth = scene.object.mean(axis=0) + (1 - scene.coverage[..., None]) * grey
+    over = scene.images.mean(axis=0) * factor[..., None] + (1 - coverage[..., None]) * grey
+    return (np.abs(over - truth)[partly] / grey).mean()
+
+
+@pytest.mark.parametrize(("options", "most"), [
+    ({}, 0.05), ({"lights": 96, "size": 64}, 0.05), ({"lowest": 0.5}, 0.09), ({"hole": 0.15}, 0.06),
+], ids=["lights around", "many lights", "lights in front", "a hole"])
+def test_coverage_of_a_hard_mask_is_estimated_from_the_images(tmp_path, options, most):
+    """The limits are what shading that changes within a pixel of the rim leaves open: more where no light comes from the side."""
+    scene = render_covered(**options)
+    matte = found(tmp_path, scene)
+    assert matte.source is MatteSource.IMAGES and matte.hard == 0
+    hard = np.float32(scene.coverage > 0.5)
+    assert edge_error(scene, hard) > 0.18 and edge_error(scene, matte.coverage) < most
+    assert np.abs(matte.coverage - scene.coverage).max() < 0.35
+    for grey in (0.18, 0.5):
+        assert edge_error(scene, hard, grey, hard * 0 + 1) > 0.18 and edge_error(scene, matte.coverage, grey, matte.factor) < most
+    away = cv2.distanceTransform(np.uint8(scene.coverage == 0), cv2.DIST_L2, 5) > 3
+    assert not matte.coverage[away].any() and not matte.factor[away].any()
+    assert set(np.unique(matte.factor)) == {0, 1}  # the images hold radiance times coverage already
+
+
+@pytest.mark.parametrize("change", [cv2.dilate, cv2.erode])
+def test_a_mask_that_is_a_pixel_off_has_the_same_coverage(tmp_path, change):
+    scene = render_covered(size=64)
+    mask = change(np.uint8(scene.coverage > 0.5), np.ones((3, 3))) > 0
+    assert edge_error(scene, np.float32(mask)) > 0.35
+    assert edge_error(scene, found(tmp_path, scene, mask).coverage) < 0.05
+
+
+def test_a_lit_wall_with_moving_shadows_is_kept(tmp_path):
+    """The mask cannot be softened, and a picture of the whole is whole."""
+    matte = found(tmp_path, render_covered(background=0.4))
+    assert matte.source is MatteSource.BACKGROUND and (matte.coverage == 1).all() and (matte.factor == 1).all()
+
+
+def test_a_wall_beside_a_part_of_the_object_has_a_hard_border(tmp_path):
+    scene, lit = render_covered(), render_covered(background=0.4)
+    rows = np.arange(48) < 18  # the upper part of the ellipse
+    images = np.where(rows[:, None, None], lit.images, scene.images)
+    matte = found(tmp_path, scene._replace(images=images))
+    assert matte.source is MatteSource.IMAGES and 0.05 < matte.hard < 0.5
+    assert set(np.unique(matte.coverage[:16])) == {0, 1} and (matte.factor[:16] == matte.coverage[:16]).all()
+    low = scene._replace(coverage=np.where(rows[:, None], 0, scene.coverage))
+    assert edge_error(low, matte.coverage) < 0.08  # the row beside the wall is lit by it
+
+
+def test_partial_values_of_a_mask_are_the_coverage(tmp_path):
+    dark, lit = (render_covered(background=background) for background in (0.0, 0.4))
+    for name, scene in (("dark", dark), ("lit", lit)):
+        matte = found(tmp_path / name, scene, scene.coverage)
+        assert matte.source is MatteSource.MASK_IMAGE
+        assert np.allclose(matte.coverage, scene.coverage, atol=1e-4)  # 16 bits
+        partly = (scene.coverage > 0) & (scene.coverage < 1)
+        # before a black wall the images are premultiplied; before a lit one they have to be
+        expected = np.where(scene.coverage > 0, 1, 0) if name == "dark" else scene.coverage
+        assert np.abs(matte.factor - expected)[partly].mean() < 0.02
+
+
+def test_images_that_are_cut_along_the_mask_keep_their_whole_border(tmp_path):
+    scene = render_covered()
+    whole = cv2.erode(np.uint8(scene.coverage == 1), np.ones((3, 3))) > 0
+    matte = found(tmp_path, scene, whole, cut=True)
+    assert matte.source is MatteSource.MASK and matte.hard == 0 and np.array_equal(matte.coverage, whole)
+
+
+@pytest.mark.parametrize("change", ["few lights", "a thin rod"])
+def test_what_the_images_do_not_show_stays_hard(tmp_path, change):
+    scene = render_covered(lights=5) if change == "few lights" else render_covered(radii=(0.9, 0.02))
+    matte = found(tmp_path, scene)
+    assert matte.source is MatteSource.MASK and matte.hard == 1 and np.array_equal(matte.coverage, scene.coverage > 0.5)
+
+
+@pytest.mark.parametrize("shape", ["no mask", "everything", "one pixel", "all but one"])
+def test_masks_at_their_limits(tmp_path, shape):
+    scene = render_covered(size=12, lights=8)
+    mask = np.full((12, 12), shape in ("everything", "all but one"))
+    mask[6, 6] = shape == "one pixel"
+    if shape in ("no mask", "everything"):
+        mask[:] = True
+    folder = write_covered(tmp_path, scene, mask)
+    if shape == "no mask":
+        text = (folder / "capture.json").read_text().replace('"mask": "mask.png", ', "")
+        (folder / "capture.json").write_text(text)
+    capture = Capture.open(folder)
+    matte = matte_of(capture, open_stack(capture))
+    assert np.isfinite(matte.coverage).all() and matte.coverage.min() >= 0 and matte.coverage.max() <= 1
+    if shape in ("no mask", "everything"):
+        assert (matte.coverage == 1).all() and (matte.factor == 1).all()
+
+
+def test_an_object_under_no_light_at_all(tmp_path):
+    scene = render_covered(size=24, lights=8)
+    matte = found(tmp_path, scene._replace(images=scene.images * 0))
+    assert np.isfinite(matte.coverage).all() and np.isfinite(matte.factor).all()
