@@ -179,23 +179,31 @@ class AssetLayers:
         for key, value in sorted({**description.provenance, "relit:camera": description.camera.model_dump_json()}.items()):
             usd_stage.SetMetadataByDictKey("customLayerData", key, value)
         if file == self._interface_file:
-            self._describe_root(root)
+            describe_root(root, name=description.name, identifier=self._identifier, version=description.version,
+                          provenance=description.provenance)
+            if description.camera.world_from_camera is not None:
+                root.AddTransformOp().Set(_matrix(description.camera.world_from_camera, description.unit_m))
         return usd_stage
 
-    def _describe_root(self, root: UsdGeom.Xform) -> None:
-        """Write kind, assetInfo with the provenance, the name for people and the pose."""
-        description = self._description
-        model = Usd.ModelAPI(root.GetPrim())
-        model.SetKind(Kind.Tokens.component)
-        model.SetAssetName(description.name)
-        model.SetAssetIdentifier(Sdf.AssetPath(self._identifier))
-        model.SetAssetVersion(description.version)
-        for key, value in sorted(description.provenance.items()):  # customLayerData is not seen through a reference
-            root.GetPrim().SetAssetInfoByKey(key, value)
-        if description.name and description.name != root.GetPrim().GetName():
-            root.GetPrim().SetDisplayName(description.name)
-        if description.camera.world_from_camera is not None:
-            root.AddTransformOp().Set(_matrix(description.camera.world_from_camera, description.unit_m))
+
+def describe_root(root: UsdGeom.Xform, *, name: str, identifier: str, version: str, provenance: Mapping[str, str]) -> None:
+    """Write kind, assetInfo with the provenance, and the name for people on the root prim of an asset.
+
+    Args:
+        name: free text.
+        identifier: the name of the asset's file.
+        version: of the asset.
+        provenance: kept in assetInfo too, because customLayerData is not seen through a reference.
+    """
+    model = Usd.ModelAPI(root.GetPrim())
+    model.SetKind(Kind.Tokens.component)
+    model.SetAssetName(name)
+    model.SetAssetIdentifier(Sdf.AssetPath(identifier))
+    model.SetAssetVersion(version)
+    for key, value in sorted(provenance.items()):
+        root.GetPrim().SetAssetInfoByKey(key, value)
+    if name and name != root.GetPrim().GetName():
+        root.GetPrim().SetDisplayName(name)
 
 
 def layer_folder(target: Path) -> str:

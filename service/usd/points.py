@@ -6,11 +6,15 @@ Source: OpenUSD, UsdGeomPoints: widths are diameters of the points, in scene uni
 from pathlib import Path
 
 import numpy as np
-from pxr import Sdf, Tf, Usd, UsdGeom, Vt
+from pxr import Sdf, Usd, UsdGeom, UsdShade, Vt
 
 from service.asset.depth_cloud import linear_colours
 from service.asset.errors import AssetError
+from service.requests.export import FIRST_VERSION
 from service.usd.files import write_layer
+from service.usd.layers import describe_root
+from service.usd.materials import define_display_color_material
+from service.usd.names import prim_name
 from service.usd.primvars import set_primvar
 from stage.ply import PointCloud
 
@@ -43,15 +47,21 @@ def write_points(cloud: PointCloud, path: str | Path, *, name: str, provenance: 
     def define(usd_stage: Usd.Stage) -> None:
         UsdGeom.SetStageUpAxis(usd_stage, UsdGeom.Tokens.y)
         UsdGeom.SetStageMetersPerUnit(usd_stage, 1.0)
-        root = UsdGeom.Xform.Define(usd_stage, Sdf.Path.absoluteRootPath.AppendChild(Tf.MakeValidIdentifier(name)))
-        usd_stage.SetDefaultPrim(root.GetPrim())
-        Usd.ModelAPI(root.GetPrim()).SetKind("component")
+        usd_stage.GetRootLayer().documentation = f"{name}: measured points in the world. Where they come from is in customLayerData."
         for key, value in sorted((provenance or {}).items()):
             usd_stage.SetMetadataByDictKey("customLayerData", key, value)
+        root = UsdGeom.Xform.Define(usd_stage, Sdf.Path.absoluteRootPath.AppendChild(prim_name(name)))
+        usd_stage.SetDefaultPrim(root.GetPrim())
+        describe_root(root, name=name, identifier=target.name, version=FIRST_VERSION, provenance=provenance or {})
         prim = define_points(usd_stage, root.GetPath().AppendChild("Points"), cloud.points, np.array([width]), normals=cloud.normals)
         set_primvar(prim, "displayColor", Sdf.ValueTypeNames.Color3fArray, linear_colours(cloud.colours))
         if cloud.intensity is not None:
             set_primvar(prim, "intensity", Sdf.ValueTypeNames.FloatArray, cloud.intensity)
+        looks = UsdGeom.Scope.Define(usd_stage, root.GetPath().AppendChild("Looks")).GetPath()
+        material = define_display_color_material(usd_stage, looks.AppendChild("PointMaterial"))
+        UsdShade.MaterialBindingAPI.Apply(prim.GetPrim()).Bind(material)
+        model = UsdGeom.ModelAPI.Apply(root.GetPrim())
+        model.SetExtentsHint(model.ComputeExtentsHint(UsdGeom.BBoxCache(Usd.TimeCode.Default(), [UsdGeom.Tokens.default_])))
 
     write_layer(target, define)
 

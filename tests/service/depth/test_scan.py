@@ -7,7 +7,7 @@ import sys
 import laspy
 import numpy as np
 import pytest
-from pxr import Usd, UsdGeom
+from pxr import Usd, UsdGeom, UsdShade, UsdValidation
 
 from service.depth.scan import scan
 from service.errors import RequestError
@@ -44,6 +44,29 @@ def test_a_turn_of_shots_is_a_ring(tmp_path):
     assert (low <= cloud.points.min(axis=0)).all() and (high >= cloud.points.max(axis=0)).all()
     report = json.loads(result.report_path.read_text())
     assert report["shots"]["with_points"] == 358
+
+
+def test_the_asset_is_a_component_without_a_finding(tmp_path):
+    nvidia = pytest.importorskip("usd_validation_nvidia", reason="usd-validation-nvidia is not installed")
+    shots = ring()
+    shots[:, 4] = np.arange(360) % 7  # colours and intensities repeat
+    folder = write(tmp_path, shots)
+    (folder / "scan.json").write_text((folder / "scan.json").read_text().replace("Yard 1", "庭 1"))
+    result = scan(ScanRequest(scan=folder, out=tmp_path / "out", device="cpu"))
+    usd_stage = Usd.Stage.Open(str(result.usd_path))
+    root = usd_stage.GetDefaultPrim()
+    assert root.GetName().isascii() and root.GetName().endswith("_1") and root.GetDisplayName() == "庭 1"
+    assert Usd.ModelAPI(root).GetKind() == "component" and Usd.ModelAPI(root).GetAssetName() == "庭 1"
+    assert root.GetAssetInfoByKey("relit:capture") == usd_stage.GetMetadataByDictKey("customLayerData", "relit:capture") == "庭 1"
+    points = UsdGeom.Points(root.GetChild("Points"))
+    hint = np.array(UsdGeom.ModelAPI(root).GetExtentsHint())
+    half = np.max(points.GetWidthsAttr().Get()) / 2
+    assert half > 0 and np.allclose(hint, [result.cloud.points.min(axis=0) - half, result.cloud.points.max(axis=0) + half], atol=1e-6)
+    assert (np.array(UsdGeom.PrimvarsAPI(points).GetPrimvar("intensity").ComputeFlattened()) == result.cloud.intensity).all()
+    assert UsdShade.MaterialBindingAPI(points).ComputeBoundMaterial()[0]
+    errors = UsdValidation.ValidationContext(UsdValidation.ValidationRegistry().GetOrLoadAllValidators()).Validate(usd_stage)
+    assert [(e.GetName(), e.GetMessage()) for e in errors] == []
+    assert [(i.severity.name, i.message) for i in nvidia.ValidationEngine().validate(str(result.usd_path)).issues()] == []
 
 
 def test_waveforms_give_several_returns(tmp_path):
