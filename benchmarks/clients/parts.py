@@ -44,8 +44,8 @@ class Row(NamedTuple):
     """By environment."""
 
 
-def true_maps(capture: Path) -> tuple[SurfaceMaps, np.ndarray]:
-    """Return truth.exr as maps with parts, and the share of metal [rows, cols]."""
+def true_maps(capture: Path) -> tuple[SurfaceMaps, np.ndarray | None]:
+    """Return truth.exr as maps with parts, and the share of metal [rows, cols], where the file has it."""
     layers, _ = exr.read(capture / "truth.exr")
 
     def layer(name: str, suffixes: str) -> np.ndarray:
@@ -56,7 +56,7 @@ def true_maps(capture: Path) -> tuple[SurfaceMaps, np.ndarray]:
     maps = SurfaceMaps(camera=opened.manifest.camera, mask=opened.mask(), normal=layer("normal", "XYZ"),
                        diffuse_albedo=layer("diffuse_albedo", "RGB"), specular=layer("specular", "RGB"),
                        roughness=layer("roughness", "Y")[..., 0], height=layer("height", "Z")[..., 0], part=part)
-    return maps, layers["metal.Y"].astype(np.float32)
+    return maps, layers.get("metal.Y")
 
 
 def make_assets(capture: Path, work: Path, solved: Path | None, wanted: tuple[str, ...] = tuple(ASSETS)) -> dict[str, Path]:

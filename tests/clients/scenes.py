@@ -41,7 +41,7 @@ class Ball(NamedTuple):
 
 
 PAINT = Ball((-0.012, -0.012, 0.0), 0.082, (0.55, 0.2, 0.12), 0.0, 0.45)
-STEEL = Ball((0.03, 0.032, 0.11), 0.032, (0.63, 0.60, 0.57), 1.0, 0.36)
+GOLD = Ball((0.03, 0.032, 0.11), 0.032, (0.95, 0.70, 0.30), 1.0, 0.36)
 
 
 def ball_maps(camera: Camera, balls: tuple[Ball, ...]) -> tuple[SurfaceMaps, np.ndarray]:

@@ -1,4 +1,4 @@
-"""A metal ball before a painted one: true maps, opened as they are imported, and compared with the path tracer.
+"""A metal ball before a painted one: true maps, exported, opened as they are imported, and compared with the path tracer.
 
 Validators pass an asset whose metals are black; a picture does not.
 """
@@ -11,27 +11,33 @@ import pytest
 from benchmarks.clients.by_hand import write_by_hand
 from benchmarks.clients.comparison import Comparison, compare
 from benchmarks.clients.render import Client, Environment, render, trace
+from service.export.export import export
+from service.requests.export import ExportRequest, TextureFormat
 from stage.camera import Camera
+from stage.colour import convert
+from stage.maps import MAPS_FILE
 from tests.clients.programs import require
-from tests.clients.scenes import DIELECTRIC_F0, PAINT, STEEL, ball_arrays, ball_maps, uneven
+from tests.clients.scenes import DIELECTRIC_F0, GOLD, PAINT, ball_arrays, ball_maps, uneven
 
 pytestmark = pytest.mark.long
 
 CAMERA = Camera(projection="orthographic", resolution=(64, 64), pixel_size_m=0.2 / 64)
 LIGHT = Environment(uneven())
-MOST_ERROR = {Client.BLENDER: 0.30, Client.MITSUBA: 0.30, Client.THREE: 0.45}
-"""Relative RMSE. The mesh ends at the centres of the outermost pixels and has no back; three.js has no shadows."""
+MOST_ERROR = {Client.BLENDER: 0.12, Client.MITSUBA: 0.10, Client.THREE: 0.18}
+"""Relative RMSE of exported assets, half more than was measured. What is left: objects have no back, and three.js has no shadows."""
+MOST_BY_HAND = 0.25
+"""The mesh that is written by hand ends at the centres of the outermost pixels, and leaves them half empty."""
 
 
 @pytest.fixture(scope="module")
 def maps():
-    return ball_maps(CAMERA, (PAINT, STEEL))
+    return ball_maps(CAMERA, (PAINT, GOLD))
 
 
 @pytest.fixture(scope="module")
 def truth():
     require(Client.MITSUBA)
-    return trace(ball_arrays((PAINT, STEEL)), CAMERA, LIGHT, samples=256)[..., :3]
+    return trace(ball_arrays((PAINT, GOLD)), CAMERA, LIGHT, samples=256)[..., :3]
 
 
 def figures(client, asset, truth, maps) -> Comparison:
@@ -41,6 +47,33 @@ def figures(client, asset, truth, maps) -> Comparison:
 
 def test_maps_written_by_hand_come_near_the_path_tracer(client, maps, truth, tmp_path):
     found = figures(client, write_by_hand(maps[0], tmp_path, "hand", metal=maps[1]), truth, maps)
+    assert 0.9 < found.metal < 1.1
+    assert 0.9 < found.dielectric < 1.1
+    assert 0.9 < found.scale < 1.1, "one irradiance gives one radiance everywhere"
+    assert found.rmse < MOST_BY_HAND
+
+
+WAYS = [(client, suffix, textures, space)
+        for suffix, textures, space, clients in (
+            ("usdz", "png16", "lin_rec709_scene", (Client.BLENDER, Client.THREE, Client.MITSUBA)),
+            ("glb", "png16", "lin_rec709_scene", (Client.BLENDER, Client.THREE)),
+            ("usdz", "png8", "lin_ap1_scene", (Client.BLENDER, Client.THREE)),
+            ("usda", "exr", "lin_rec709_scene", (Client.BLENDER, Client.MITSUBA)),
+            ("usdc", "exr", "lin_ap1_scene", (Client.MITSUBA,)))
+        for client in clients]
+"""Program, file, textures, and colour space of the capture. Blender 5.0 takes every linear texture for Rec.709, whatever it declares."""
+
+
+@pytest.mark.parametrize(("client", "suffix", "textures", "space"), WAYS, indirect=["client"])
+def test_exported_metals_are_as_bright_as_the_path_tracer_says(client, suffix, textures, space, maps, truth, tmp_path):
+    """Whatever the file, the textures, and the colour space of the capture."""
+    true = replace(maps[0], color_space=space, diffuse_albedo=convert(maps[0].diffuse_albedo, "lin_rec709_scene", space),
+                   specular=convert(maps[0].specular, "lin_rec709_scene", space))
+    (tmp_path / "maps").mkdir()
+    true.write(tmp_path / "maps" / MAPS_FILE)
+    asset = tmp_path / f"balls.{suffix}"
+    export(ExportRequest(maps=tmp_path / "maps", out=asset, textures=TextureFormat(textures)))
+    found = figures(client, asset, truth, maps)
     assert 0.9 < found.metal < 1.1
     assert 0.9 < found.dielectric < 1.1
     assert 0.9 < found.scale < 1.1, "one irradiance gives one radiance everywhere"
