@@ -108,7 +108,8 @@ def test_an_export(server, client, solved):
     job = submit(client, kind="export", maps=solved, format="usda", options={"name": "dome"})
     finish(server, client, job)
     usda = client.get(f"/v1/jobs/{job['id']}/results/asset.usda").raise_for_status().text
-    assert usda.startswith("#usda") and "dome" in usda
+    assert usda.startswith("#usda") and "dome" in usda and "@./asset_layers/payload.usda@" in usda
+    assert {"asset.usda", *(f"asset_layers/{name}" for name in ("payload.usda", "materials.usda", "geometry.usdc"))} <= made_by(client, job)
 
 
 def test_what_a_job_reads_has_to_be_there_and_ready(server, client, dome, sky, solved, rig):
