@@ -69,6 +69,13 @@ def colour_image(measured: MeasuredPoints, mask: np.ndarray) -> np.ndarray | Non
     return image if known[mask].all() else bleed(image, known, reach=BLEED_TEXELS)
 
 
+def colour_warnings(measured: MeasuredPoints) -> tuple[str, ...]:
+    """Return a sentence for an asset whose colours are not known."""
+    if measured.colours is None:
+        return (f"{DEPTH_FILE}: there is no {POINTS_FILE} beside it, which holds the colours: the asset is grey",)
+    return ()
+
+
 def linear_colours(codes: np.ndarray) -> np.ndarray:
     """Return [n, 3] float32 scene-linear Rec.709 values of [n, 3] uint8 sRGB codes."""
     return convert((codes.astype(np.float32) / 255)[None], "srgb_texture", "lin_rec709_scene")[0]

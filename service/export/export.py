@@ -9,11 +9,12 @@ from service.asset.errors import AssetError
 from service.asset.repair import repair_heights
 from service.errors import RequestError
 from service.gltf.asset import write_asset as write_gltf_asset
+from service.gltf.depth_asset import write_depth as write_gltf_depth
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import export_metadata
 from service.requests.export import AssetFormat, ExportRequest, Geometry
 from service.usd.asset import write_asset as write_usd_asset
-from service.usd.depth_asset import write_depth
+from service.usd.depth_asset import write_depth as write_usd_depth
 from stage.depth_maps import DEPTH_FILE, DepthMaps
 from stage.errors import ResultError
 from stage.fingerprint import digest
@@ -36,7 +37,7 @@ def export(request: ExportRequest, progress: Progress | None = None) -> Exported
 
     Raises:
         ResultError: the maps are missing or incomplete.
-        RequestError: a geometry is asked for solved maps, or a .glb of a depth.
+        RequestError: a geometry is asked for solved maps.
         AssetError: an unknown suffix, EXR textures in a .usdz or .glb, no height, a height that
             contradicts its normals, or no face.
         StorageError: the asset cannot be written; nothing is left half-written.
@@ -51,9 +52,7 @@ def export(request: ExportRequest, progress: Progress | None = None) -> Exported
     if not of_depth and not path.exists():
         raise ResultError(f"{path}: is not there: run `relit solve` or `relit depth` first")
     if of_depth:
-        if suffix == GLB:
-            raise RequestError(f"--out {request.out}: a .glb is of solved maps, {depth} holds a depth: name a .usdz, .usda or .usdc")
-        warnings += _export_depth(depth, request, timings)
+        warnings += _export_depth(depth, request, suffix, timings)
     else:
         if request.geometry is not None:
             raise RequestError(f"--geometry {request.geometry}: is for a depth, {path} holds solved maps: they become a mesh")
@@ -82,7 +81,7 @@ def _check_suffix(target: Path) -> str:
     return suffix
 
 
-def _export_depth(path: Path, request: ExportRequest, timings: Timings) -> tuple[str, ...]:
+def _export_depth(path: Path, request: ExportRequest, suffix: str, timings: Timings) -> tuple[str, ...]:
     """Write an asset of a depth, and return what its user should know of it."""
     maps = DepthMaps.read(path)
     beside = path.parent / POINTS_FILE
@@ -90,8 +89,9 @@ def _export_depth(path: Path, request: ExportRequest, timings: Timings) -> tuple
     contents = {file.stem: digest(file) for file in (path, beside) if file.exists()}
     maps = replace(maps, provenance={**maps.provenance, **export_metadata(request, contents)})
     timings.stage("asset", 1)
-    return write_depth(maps, cloud, request.out, name=_name(request, maps.provenance.get("relit:capture")),
-                       geometry=request.geometry or Geometry.MESH, version=request.version, textures=request.textures)
+    write = write_gltf_depth if suffix == GLB else write_usd_depth
+    return write(maps, cloud, request.out, name=_name(request, maps.provenance.get("relit:capture")),
+                 geometry=request.geometry or Geometry.MESH, version=request.version, textures=request.textures)
 
 
 def _name(request: ExportRequest, capture: str | None) -> str:

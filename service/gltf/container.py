@@ -5,6 +5,9 @@ Source: glTF 2.0 Specification, 3.6 "Binary Data Storage" and 4 "GLB File Format
 
 import shutil
 import struct
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -12,6 +15,7 @@ import numpy as np
 from pygltflib import GLTF2, Accessor, Buffer, BufferView, Image
 
 from service.asset.errors import AssetError
+from stage.files import replacing
 
 MAX_FILE_BYTES = 2**32 - 1
 """The header of the file gives its length in 32 bits (4.4.2)."""
@@ -85,6 +89,20 @@ class Glb:
         self._parts.append(part)
         self._size += size + -size % ALIGNMENT
         return len(self.document.bufferViews) - 1
+
+
+@contextmanager
+def writing_glb(target: Path) -> Iterator[tuple[Glb, Path]]:
+    """Yield an empty document and a folder for its images; the file replaces `target`, whole or not at all, when the block ends.
+
+    Raises:
+        AssetError: more than the 4 GiB that a .glb can hold.
+        StorageError: the disk refuses; what was there before is left as it was.
+    """
+    with replacing(target) as temporary, tempfile.TemporaryDirectory(prefix=f".{target.stem}.", dir=target.parent) as folder:
+        glb = Glb()
+        yield glb, Path(folder)
+        glb.write(temporary)
 
 
 def read_document(path: Path) -> GLTF2:

@@ -4,7 +4,7 @@ Source: glTF 2.0 Specification, 3.7.2 "Meshes".
 """
 
 import numpy as np
-from pygltflib import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, TRIANGLES, Attributes, Primitive
+from pygltflib import ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER, POINTS, TRIANGLES, Attributes, Primitive
 
 from service.asset.mesh import SurfaceMesh
 from service.asset.tangent import vertex_tangents
@@ -41,6 +41,31 @@ def add_surface(glb: Glb, mesh: SurfaceMesh, *, unit_m: float, material: int, te
         indices = indices.astype(np.uint16)
     return Primitive(attributes=attributes, indices=glb.add_array(indices.ravel(), target=ELEMENT_ARRAY_BUFFER), mode=TRIANGLES,
                      material=material)
+
+
+def add_points(glb: Glb, points: np.ndarray, colours: np.ndarray | None, *, material: int) -> Primitive:
+    """Add points and return the primitive that uses them.
+
+    Args:
+        points: [n, 3] float32 metres, camera frame.
+        colours: [n, 3] float32 scene-linear Rec.709, as COLOR_0 has them, clipped to 0…1; None: not known.
+        material: number of the material.
+    """
+    attributes = Attributes(POSITION=glb.add_array(points, target=ARRAY_BUFFER, bounds=True))
+    if colours is not None:
+        attributes.COLOR_0 = glb.add_array(np.clip(colours, 0, 1), target=ARRAY_BUFFER)
+    return Primitive(attributes=attributes, mode=POINTS, material=material)
+
+
+def add_attribute(glb: Glb, primitive: Primitive, name: str, values: np.ndarray) -> None:
+    """Add values [n] of the vertices or points of a primitive, which other programs do not know by themselves.
+
+    Args:
+        name: is written in capitals behind an underscore, as the specification asks (3.7.2.1).
+        values: those that are not finite become 0.
+    """
+    finite = np.where(np.isfinite(values), values, 0).astype(np.float32)
+    setattr(primitive.attributes, f"_{name.upper()}", glb.add_array(finite, target=ARRAY_BUFFER))
 
 
 def triangles_of(mesh: SurfaceMesh) -> np.ndarray:

@@ -17,11 +17,12 @@ NEUTRAL_GREY = 0.18
 """Base colour where the maps have no albedo: the default of UsdPreviewSurface, so that both formats look alike."""
 
 
-def add_material(glb: Glb, textures: Mapping[str, Texture], folder: Path, *, ior: float, name: str) -> int:
+def add_material(glb: Glb, textures: Mapping[str, Texture], folder: Path, *, name: str, ior: float = GLASS_IOR) -> int:
     """Add a material that uses these textures, and return its number.
 
     Args:
         textures: by name, written into `folder`.
+        name: of the material.
         ior: index of refraction of the dielectric share.
 
     Convention:
@@ -55,3 +56,17 @@ def add_material(glb: Glb, textures: Mapping[str, Texture], folder: Path, *, ior
     document.extensionsUsed += list(material.extensions)
     document.materials.append(material)
     return len(document.materials) - 1
+
+
+def add_unlit_material(glb: Glb, *, name: str, coloured: bool) -> int:
+    """Add a material that shows the colours of points as they were measured, and return its number (KHR_materials_unlit).
+
+    Args:
+        coloured: the points have colours; without, they are grey.
+    """
+    shade = 1.0 if coloured else NEUTRAL_GREY
+    glb.document.materials.append(gltf.Material(
+        name=name, extensions={"KHR_materials_unlit": {}},
+        pbrMetallicRoughness=gltf.PbrMetallicRoughness(baseColorFactor=[shade] * 3 + [1.0], metallicFactor=0.0, roughnessFactor=1.0)))
+    glb.document.extensionsUsed.append("KHR_materials_unlit")
+    return len(glb.document.materials) - 1

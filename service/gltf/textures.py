@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from service.asset.errors import AssetError
 from service.asset.mesh import SurfaceMesh
 from service.asset.metallic import MetallicLook
 from service.asset.textures import BLEED_TEXELS, DATA_SPACE, DISPLAY_SPACE, Texture, bleed, encode, side_by_side, tangent_space
@@ -20,6 +21,16 @@ from stage.maps import SurfaceMaps
 
 BASE_COLOR, METALLIC_ROUGHNESS, NORMAL = "base_color", "metallic_roughness", "normal"
 """The images of a material."""
+
+
+def check_textures(target: Path, storage: TextureFormat) -> None:
+    """Check that a .glb can hold textures that are stored so.
+
+    Raises:
+        AssetError: it cannot hold EXR images.
+    """
+    if storage is TextureFormat.EXR:
+        raise AssetError(f"{target} cannot hold EXR textures: a .glb takes PNG; store the textures as png16, or export a .usda or .usdc")
 
 
 def write_textures(maps: SurfaceMaps, mesh: SurfaceMesh, folder: Path, *, look: MetallicLook | None,

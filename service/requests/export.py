@@ -42,7 +42,7 @@ class ExportOptions(Options):
 
 
 class ExportRequest(ExportOptions):
-    """A USD or glTF asset of solved maps with their material, or a USD asset of a depth with its colours."""
+    """A USD or glTF asset of solved maps with their material, or of a depth with its colours."""
 
     maps: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="DIR")]
     """Folder with maps.exr or depth.exr, or the file."""

@@ -88,7 +88,7 @@ class ShadeJob(JobRequest):
 
 
 class ExportJob(JobRequest):
-    """An asset of a solve or depth job: asset.usdz, .usda, .usdc or, of a solve job, .glb."""
+    """An asset of a solve or depth job: asset.usdz, .usda, .usdc or .glb."""
 
     kind: Literal["export"]
     maps: Annotated[JobId, Role.INPUT, MAPS]

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from pxr import Sdf, UsdGeom
 
-from service.asset.depth_cloud import MeasuredPoints, colour_image, measured_points
+from service.asset.depth_cloud import MeasuredPoints, colour_image, colour_warnings, measured_points
 from service.asset.depth_mesh import depth_mesh
 from service.asset.errors import AssetError
 from service.asset.mesh import SurfaceMesh
@@ -20,9 +20,9 @@ from service.usd.materials import define_display_color_material, define_looks
 from service.usd.points import define_points
 from service.usd.primvars import set_primvar
 from service.usd.scene import define_mesh
-from stage.depth_maps import DEPTH_FILE, DepthMaps
+from stage.depth_maps import DepthMaps
 from stage.maps import SurfaceMaps
-from stage.ply import POINTS_FILE, PointCloud
+from stage.ply import PointCloud
 
 POINT_WIDTH = 1.5
 """Width of a point in footprints of a pixel: neighbouring points just overlap, corner to corner."""
@@ -85,9 +85,7 @@ def write_depth(maps: DepthMaps, cloud: PointCloud | None, path: str | Path, *, 
         layers.save()
         first, *others = layers.files
         install(target, first, [*others, *sorted(folder.iterdir())], ours=(*LAYER_FILES, *FILE_NAMES))
-    if parts.colours is None:
-        return (f"{DEPTH_FILE}: there is no {POINTS_FILE} beside it, which holds the colours: the asset is grey",)
-    return ()
+    return colour_warnings(parts.points)
 
 
 def _parts(maps: DepthMaps, cloud: PointCloud | None, geometry: Geometry) -> _Parts:

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from service.asset.errors import AssetError
-from service.errors import RequestError
 from service.export.export import export
 from service.gltf.container import read_document
-from service.requests.export import ExportRequest
+from service.requests.export import ExportRequest, Geometry
 from stage.camera import Camera
 from stage.depth_maps import DepthMaps
 from tests.scenes.surfaces import make_ball, make_wave
@@ -29,12 +28,13 @@ def test_warnings_of_clipping_and_of_the_camera_are_given(tmp_path):
     assert len(warnings) == 2 and "principal point" in warnings[0] and warnings[1].startswith("base_color: 600 pixels")
 
 
-def test_a_depth_is_refused(tmp_path):
+@pytest.mark.parametrize("geometry, mode", [(None, 4), (Geometry.POINTS, 0)])
+def test_a_depth_becomes_a_glb(geometry, mode, tmp_path):
     camera = Camera(projection="perspective", resolution=(4, 4), focal_px=(4.0, 4.0), principal_px=(2.0, 2.0))
     DepthMaps(camera=camera, mask=np.ones((4, 4), bool), depth=np.ones((4, 4), np.float32)).write(tmp_path / "depth.exr")
-    with pytest.raises(RequestError, match=r"depth\.exr holds a depth: name a \.usdz"):
-        export(ExportRequest(maps=tmp_path, out=tmp_path / "a.glb"))
-    assert [path.name for path in tmp_path.iterdir()] == ["depth.exr"]
+    exported = export(ExportRequest(maps=tmp_path, out=tmp_path / "a.glb", geometry=geometry))
+    assert len(exported.warnings) == 1 and "grey" in exported.warnings[0]
+    assert read_document(exported.path).meshes[0].primitives[0].mode == mode
 
 
 def test_an_unknown_suffix_names_the_known(tmp_path):
