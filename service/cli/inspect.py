@@ -48,6 +48,8 @@ def _lines(found: "Inspection") -> Iterator[tuple[str, str]]:
     repeated = [key for key in found.asset_info if found.asset_info[key] == found.provenance.get(key)]
     yield "assetInfo", ", ".join(f"{key} {value}" for key, value in found.asset_info.items() if key not in repeated) or "none"
     yield "unit", f"{found.meters_per_unit:g} m, {found.up_axis} up"
+    for key, value in found.notes.items():
+        yield "note", f"{key} {value}"
     if found.time_codes is not None:
         yield "time", "{:g} to {:g}, {:g} a second".format(*found.time_codes)
     if found.extent_m is None:

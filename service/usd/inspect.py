@@ -45,6 +45,8 @@ class Inspection:
     default_prim: str | None
     kind: str | None
     asset_info: dict[str, str]
+    notes: dict[str, str]
+    """customData of the default prim, as relit:scale where the capture has none."""
     up_axis: str
     meters_per_unit: float
     time_codes: tuple[float, float, float] | None
@@ -87,19 +89,18 @@ def inspect_asset(path: Path) -> Inspection:
         usd_stage = Usd.Stage.Open(str(path))
     except Tf.ErrorException as error:
         raise AssetError(f"{path} cannot be opened: it is no USD file, or a damaged one") from error
-    errors += arkit_findings(usd_stage.GetRootLayer()) if packed else []
+    warnings = arkit_findings(path, usd_stage.GetRootLayer()) if packed else []
     usd_stage.SetEditTarget(usd_stage.GetSessionLayer())
-    inspection = _inspect(usd_stage, path, errors)
+    inspection = _inspect(usd_stage, path, warnings, errors)
     del quiet
     return inspection
 
 
-def _inspect(usd_stage: Usd.Stage, path: Path, errors: list[str]) -> Inspection:
+def _inspect(usd_stage: Usd.Stage, path: Path, warnings: list[str], errors: list[str]) -> Inspection:
     root = usd_stage.GetDefaultPrim()
     if not root:
         errors.append("the layer has no default prim, so that nothing can refer to it")
     unit_m = UsdGeom.GetStageMetersPerUnit(usd_stage)
-    warnings: list[str] = []
     meshes, points, looks = {}, {}, {}
     for variant in _each_variant(root, GEO):
         meshes[variant] = tuple(mesh_facts(UsdGeom.Mesh(prim)) for prim in usd_stage.Traverse() if prim.IsA(UsdGeom.Mesh))
@@ -118,6 +119,7 @@ def _inspect(usd_stage: Usd.Stage, path: Path, errors: list[str]) -> Inspection:
         file=str(path), size_bytes=size, layers=tuple(sorted(_relative(layer, path) for layer in layers)),
         default_prim=str(root.GetPath()) if root else None, kind=(Usd.ModelAPI(root).GetKind() or None) if root else None,
         asset_info=dict(_flat(Usd.ModelAPI(root).GetAssetInfo())) if root else {},
+        notes=dict(_flat(root.GetCustomData())) if root else {},
         up_axis=str(UsdGeom.GetStageUpAxis(usd_stage)), meters_per_unit=unit_m,
         time_codes=(start, end, usd_stage.GetTimeCodesPerSecond()) if usd_stage.HasAuthoredTimeCodeRange() else None,
         extent_m=_extent(root, unit_m) if root else None,

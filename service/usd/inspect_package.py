@@ -16,6 +16,8 @@ from stage.errors import storage
 LAYERS = (".usd", ".usda", ".usdc")
 IMAGES = (".png", ".jpg", ".jpeg", ".exr", ".avif")
 SOUNDS = (".m4a", ".mp3", ".wav")
+BINARY = b"PXR-USDC"
+"""The first bytes of a binary layer."""
 
 _LOCAL_HEADER_SIZE = 30
 _LENGTHS_AT = 26
@@ -50,15 +52,20 @@ def package_findings(path: Path) -> list[str]:
             found.append(f"{entry.filename} is not aligned to {ALIGNMENT} bytes in the package")
         if suffix not in (*LAYERS, *IMAGES, *SOUNDS):
             found.append(f"{entry.filename}: USDZ knows no files of this type")
-    if PurePosixPath(entries[0].filename).suffix.lower() == ".usda":
-        found.append(f"ARKit: the root layer {entries[0].filename} is text; it takes a binary one")
     return found
 
 
-def arkit_findings(root_layer: Sdf.Layer) -> list[str]:
-    """Return what ARKit refuses in the root layer of a package."""
+def arkit_findings(path: Path, root_layer: Sdf.Layer) -> list[str]:
+    """Return why ARKit does not take a package that is sound otherwise."""
+    found = []
+    with zipfile.ZipFile(path) as archive, archive.open(archive.infolist()[0]) as first:
+        binary = first.read(len(BINARY)) == BINARY
+    if not binary:
+        found.append("ARKit takes a binary root layer, and that of this package is text")
     others = sorted(root_layer.GetCompositionAssetDependencies())
-    return [f"ARKit: the root layer refers to {', '.join(others)}; it takes one layer alone"] if others else []
+    if others:
+        found.append(f"ARKit takes packages of one layer, and the root layer of this one refers to {', '.join(others)}")
+    return found
 
 
 def _data_offset(path: Path, entry: zipfile.ZipInfo) -> int:

@@ -172,9 +172,8 @@ class AssetLayers:
         UsdGeom.SetStageMetersPerUnit(usd_stage, description.unit_m)
         root = UsdGeom.Xform.Define(usd_stage, self.root)
         usd_stage.SetDefaultPrim(root.GetPrim())
-        method = description.provenance.get("relit:method")
         usd_stage.GetRootLayer().documentation = (
-            f"{description.name}: a measured surface, exported by Relit{f' (method {method})' if method else ''}. Camera frame: "
+            f"{description.name}: a measured surface, exported by Relit. Camera frame: "
             "+x right, +y up, +z towards the viewer. Where it comes from is in customLayerData.")
         for key, value in sorted({**description.provenance, "relit:camera": description.camera.model_dump_json()}.items()):
             usd_stage.SetMetadataByDictKey("customLayerData", key, value)

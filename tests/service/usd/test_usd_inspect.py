@@ -136,12 +136,18 @@ def test_packages_that_arkit_does_not_take(tmp_path):
     text = Sdf.Layer.FindOrOpen(str(tmp_path / "ball.usdz")).ExportToString().encode()
     repack(tmp_path / "ball.usdz", tmp_path / "text.usdz",
            lambda name, data: ("ball.usda", text, zipfile.ZIP_STORED) if name == "ball.usdc" else (name, data, zipfile.ZIP_STORED))
-    assert any("ARKit: the root layer ball.usda is text" in sentence for sentence in inspect_asset(tmp_path / "text.usdz").errors)
+    assert "ARKit takes a binary root layer, and that of this package is text" in inspect_asset(tmp_path / "text.usdz").warnings
     write_asset(make_ball(), tmp_path / "layered.usdc", name="Ball")
     with zipfile.ZipFile(tmp_path / "layered.usdz", "w") as package:
         for file in ("layered.usdc", *(f"layered_layers/{name}" for name in LAYER_FILES)):
             package.write(tmp_path / file, file)
-    assert any("refers to ./layered_layers/payload.usda" in sentence for sentence in inspect_asset(tmp_path / "layered.usdz").errors)
+    assert any("refers to ./layered_layers/payload.usda" in sentence for sentence in inspect_asset(tmp_path / "layered.usdz").warnings)
+
+
+def test_an_unknown_scale_is_a_note(tmp_path):
+    for suffix in SUFFIXES:
+        write_asset(make_wave("orthographic"), tmp_path / f"a{suffix}", name="a")
+        assert inspect_asset(tmp_path / f"a{suffix}").notes["relit:scale"].startswith("unknown")
 
 
 @pytest.mark.parametrize(("name", "content", "words"), [
