@@ -1,0 +1,101 @@
+"""Validators find nothing, whatever is exported: each file, each kind of texture, masks with holes, parts, and maps without layers."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdUtils
+
+from service.export.export import export
+from service.requests.export import ExportRequest, TextureFormat
+from stage.camera import Camera
+from stage.colour import convert
+from stage.maps import MAPS_FILE, SurfaceMaps
+from tests.clients.scenes import GOLD, PAINT, ball_maps
+from tests.clients.validators import findings
+from tests.service.gltf import khronos
+
+SIDE = 40
+ORTHOGRAPHIC = Camera(projection="orthographic", resolution=(SIDE, SIDE), pixel_size_m=0.2 / SIDE)
+TWO = ball_maps(ORTHOGRAPHIC, (PAINT, GOLD))[0]
+
+
+def with_holes(maps: SurfaceMaps) -> SurfaceMaps:
+    """Return maps with holes, single pixels, bridges that are one pixel wide, pixels that touch at a corner, and an own island."""
+    mask = maps.mask.copy()
+    mask[12:15, 10:14] = False
+    mask[20::3, 8:20:2] = False
+    mask[25:28, 22:30] = False
+    mask[26, 22:30] = True
+    mask[30, 15], mask[31, 16] = False, False
+    mask[1, 1] = mask[1, 2] = mask[2, 1] = mask[2, 2] = True
+    height = np.where(np.isfinite(maps.height), maps.height, 0)
+    normal = maps.normal.copy()
+    normal[1:3, 1:3] = (0, 0, 1)
+    part = maps.part.copy()
+    part[1:3, 1:3] = 3
+    return replace(maps, mask=mask, height=height, normal=normal, part=part)
+
+
+def perspective(maps: SurfaceMaps) -> SurfaceMaps:
+    """Return the maps as if a turned perspective camera of known scale had seen them, one metre away."""
+    camera = Camera(projection="perspective", resolution=(SIDE, SIDE), focal_px=(4.8 * SIDE,) * 2, principal_px=(SIDE / 2, SIDE / 2 - 1),
+                    surface_z_m=-1.0, world_from_camera=((0, 0, 1, 0.5), (1, 0, 0, -2), (0, 1, 0, 0.25), (0, 0, 0, 1)))
+    return replace(maps, camera=camera, height=np.where(maps.mask, maps.height - 1, 0))
+
+
+SURFACES = {
+    "parts": TWO,
+    "holes": with_holes(TWO),
+    "no parts": replace(ball_maps(ORTHOGRAPHIC, (PAINT,))[0], part=None),
+    "perspective": perspective(TWO),
+    "no specular": replace(TWO, specular=None, roughness=None),
+    "no material": replace(TWO, specular=None, roughness=None, diffuse_albedo=None),
+    "no scale": replace(TWO, camera=Camera(projection="orthographic", resolution=(SIDE, SIDE)), height=TWO.height * SIDE / 0.2),
+    "ACEScg, clipped": replace(TWO, color_space="lin_ap1_scene",
+                               diffuse_albedo=3 * convert(TWO.diffuse_albedo, "lin_rec709_scene", "lin_ap1_scene")),
+}
+
+
+def exported(maps: SurfaceMaps, folder: Path, **options) -> Path:
+    """Write maps and export them; the name has characters that no prim may have."""
+    (folder / "maps").mkdir()
+    maps.write(folder / "maps" / MAPS_FILE)
+    asset = folder / f"asset.{options.pop('suffix')}"
+    export(ExportRequest(maps=folder / "maps", out=asset, name="梟 2/a", **options))
+    return asset
+
+
+@pytest.mark.parametrize("surface", SURFACES)
+@pytest.mark.parametrize(("suffix", "textures"), [("usdz", "png16"), ("usdz", "png8"), ("usdc", "png16"), ("usda", "exr")])
+def test_usd_validators_and_arkit_find_nothing(surface, suffix, textures, tmp_path):
+    assert findings(exported(SURFACES[surface], tmp_path, suffix=suffix, textures=TextureFormat(textures))) == []
+
+
+@pytest.mark.parametrize("surface", SURFACES)
+@pytest.mark.parametrize("textures", ["png16", "png8"])
+def test_the_gltf_validator_finds_nothing(surface, textures, tmp_path):
+    report, = khronos.validate(exported(SURFACES[surface], tmp_path, suffix="glb", textures=TextureFormat(textures)))
+    assert khronos.findings(report) == []
+
+
+def test_what_the_validators_are_for_is_found(tmp_path):
+    """A light in a package, a mesh without a material, and a wrong extent."""
+    usd_stage = Usd.Stage.CreateNew(str(tmp_path / "light.usdc"))
+    UsdGeom.SetStageUpAxis(usd_stage, UsdGeom.Tokens.y)
+    root = UsdGeom.Xform.Define(usd_stage, "/Root")
+    usd_stage.SetDefaultPrim(root.GetPrim())
+    UsdLux.DomeLight.Define(usd_stage, "/Root/Dome")
+    mesh = UsdGeom.Mesh.Define(usd_stage, "/Root/Mesh")
+    mesh.CreatePointsAttr([(0, 0, 0), (1, 0, 0), (0, 1, 0)])
+    mesh.CreateFaceVertexCountsAttr([3])
+    mesh.CreateFaceVertexIndicesAttr([0, 1, 2])
+    mesh.CreateExtentAttr([(0, 0, 0), (0.5, 0.5, 0)])
+    UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim())
+    usd_stage.Save()
+    UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(tmp_path / "light.usdc")), str(tmp_path / "light.usdz"))
+    found = " ".join(findings(tmp_path / "light.usdz"))
+    assert "DomeLight, which it does not know" in found
+    assert "bound to no material" in found
+    assert "NVIDIA" in found and "xtent" in found
