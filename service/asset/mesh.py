@@ -13,6 +13,7 @@ import numpy as np
 from service.asset.cells import CORNERS, cell_faces
 from service.asset.errors import AssetError
 from service.asset.links import Links, height_of, relief, surface_links, touched, without_islands
+from stage.camera import Camera
 from stage.depth_breaks import STEEPEST
 from stage.maps import SurfaceMaps
 
@@ -80,13 +81,18 @@ def height_mesh(maps: SurfaceMaps, *, vertex_budget: int = VERTEX_BUDGET, links:
     slope = np.where(faces.weight > 0, np.clip(nearest - other, -STEEPEST, STEEPEST), nearest - other)
     height = np.where(faces.weight == 0, maps.height[rows, cols], height_of(nearest + faces.weight * slope, camera))
     v, u = (faces.pixel + faces.shift + 0.5).T
+    points = camera_points(camera, u, v, height)
+    st = np.stack([u / camera.width, 1 - v / camera.height], axis=-1).astype(np.float32)
+    normals = vertex_normals(points, faces.quads, faces.triangles)
+    return SurfaceMesh(points, normals, st, faces.quads, faces.triangles, rows, cols, step, faces.centred)
+
+
+def camera_points(camera: Camera, u: np.ndarray, v: np.ndarray, height: np.ndarray) -> np.ndarray:
+    """Return the camera-frame points [n, 3] float32 at image coordinates u and v [n] with these camera-frame z [n]."""
     x, y = camera.plane_at(u, v)
     if camera.projection == "perspective":
         x, y = -x * height, -y * height
-    points = np.stack([x, y, height], axis=-1).astype(np.float32)
-    st = np.stack([u / camera.width, 1 - v / camera.height], axis=-1).astype(np.float32)
-    normals = _normals(points, faces.quads, faces.triangles)
-    return SurfaceMesh(points, normals, st, faces.quads, faces.triangles, rows, cols, step, faces.centred)
+    return np.stack([x, y, height], axis=-1).astype(np.float32)
 
 
 def valid_heights(maps: SurfaceMaps) -> np.ndarray:
@@ -119,6 +125,14 @@ def face_to_vertex(quad_values: np.ndarray, triangle_values: np.ndarray, quads: 
     return total / np.linalg.norm(total, axis=-1, keepdims=True)
 
 
+def vertex_normals(points: np.ndarray, quads: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Return vertex normals [V, 3] float32: the normalised sums of the area vectors of the adjacent faces."""
+    p = points.astype(np.float64)
+    quad_area = np.cross(p[quads[:, 2]] - p[quads[:, 0]], p[quads[:, 3]] - p[quads[:, 1]])
+    triangle_area = np.cross(p[triangles[:, 1]] - p[triangles[:, 0]], p[triangles[:, 2]] - p[triangles[:, 0]])
+    return face_to_vertex(quad_area, triangle_area, quads, triangles, len(points)).astype(np.float32)
+
+
 def _step(pixels: np.ndarray, vertex_budget: int) -> int:
     """Return the smallest step whose vertices fit the budget."""
     step = max(1, math.isqrt(np.count_nonzero(pixels) // vertex_budget))
@@ -131,11 +145,3 @@ def _three_neighbours(valid: np.ndarray) -> bool:
     """Return whether three pixels of any 2×2 pixels are valid."""
     count = valid[:-1, :-1].astype(np.uint8) + valid[1:, :-1] + valid[1:, 1:] + valid[:-1, 1:]
     return bool((count >= CORNERS - 1).any())
-
-
-def _normals(points: np.ndarray, quads: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Return vertex normals [V, 3] float32: the normalised sums of the area vectors of the adjacent faces."""
-    p = points.astype(np.float64)
-    quad_area = np.cross(p[quads[:, 2]] - p[quads[:, 0]], p[quads[:, 3]] - p[quads[:, 1]])
-    triangle_area = np.cross(p[triangles[:, 1]] - p[triangles[:, 0]], p[triangles[:, 2]] - p[triangles[:, 0]])
-    return face_to_vertex(quad_area, triangle_area, quads, triangles, len(points)).astype(np.float32)

@@ -8,11 +8,13 @@ from typing import NamedTuple, get_args
 from service.asset.errors import AssetError
 from service.asset.repair import repair_heights
 from service.errors import RequestError
+from service.gltf.asset import AssetReport as InGltf
 from service.gltf.asset import write_asset as write_gltf_asset
 from service.gltf.depth_asset import write_depth as write_gltf_depth
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import export_metadata
 from service.requests.export import AssetFormat, ExportRequest, Geometry
+from service.usd.asset import AssetReport as InUsd
 from service.usd.asset import write_asset as write_usd_asset
 from service.usd.depth_asset import write_depth as write_usd_depth
 from stage.depth_maps import DEPTH_FILE, DepthMaps
@@ -30,6 +32,8 @@ class Exported(NamedTuple):
     path: Path
     warnings: tuple[str, ...]
     """Sentences."""
+    sizes: dict[str, tuple[int, int]]
+    """Vertices and faces of each mesh by its name; empty for a depth."""
 
 
 def export(request: ExportRequest, progress: Progress | None = None) -> Exported:
@@ -37,7 +41,7 @@ def export(request: ExportRequest, progress: Progress | None = None) -> Exported
 
     Raises:
         ResultError: the maps are missing or incomplete.
-        RequestError: a geometry is asked for solved maps.
+        RequestError: a geometry is asked for solved maps, or levels of detail of a depth or in a .glb.
         AssetError: an unknown suffix, EXR textures in a .usdz or .glb, no height, a height that
             contradicts its normals, or no face.
         StorageError: the asset cannot be written; nothing is left half-written.
@@ -46,31 +50,40 @@ def export(request: ExportRequest, progress: Progress | None = None) -> Exported
     timings = Timings(progress)
     timings.stage("read", 1)
     warnings: list[str] = []
+    sizes: dict[str, tuple[int, int]] = {}
     path = request.maps / MAPS_FILE if request.maps.is_dir() else request.maps
     depth = request.maps / DEPTH_FILE if request.maps.is_dir() else request.maps
     of_depth = depth.name == DEPTH_FILE and depth.exists() and (request.geometry is not None or not path.exists() or path == depth)
     if not of_depth and not path.exists():
         raise ResultError(f"{path}: is not there: run `relit solve` or `relit depth` first")
     if of_depth:
+        if request.levels:
+            raise RequestError(f"--levels {request.levels}: is for solved maps, {depth} holds a depth: leave the option out")
         warnings += _export_depth(depth, request, suffix, timings)
     else:
         if request.geometry is not None:
             raise RequestError(f"--geometry {request.geometry}: is for a depth, {path} holds solved maps: they become a mesh")
+        if suffix == GLB and request.levels:
+            raise RequestError(f"--levels {request.levels}: a .glb holds one mesh: name a .usdz, .usda or .usdc, or leave the option out")
         maps = SurfaceMaps.read(path)
         maps = replace(maps, provenance={**maps.provenance, **export_metadata(request, {path.stem: digest(path)})})
         timings.stage("asset", 1)
         maps, _, repairs = repair_heights(maps)
         warnings += repairs
         name = _name(request, maps.provenance.get("relit:capture"))
-        write = write_gltf_asset if suffix == GLB else write_usd_asset
-        report = write(maps, request.out, name=name, version=request.version, textures=request.textures)
+        if suffix == GLB:
+            report: InGltf | InUsd = write_gltf_asset(maps, request.out, name=name, version=request.version, textures=request.textures)
+        else:
+            report = write_usd_asset(maps, request.out, name=name, version=request.version, textures=request.textures,
+                                     levels=request.levels)
+        sizes = report.sizes
         warnings += report.warnings
         if maps.diffuse_albedo is None:
             warnings.append("the maps have no diffuse_albedo, so the asset is grey: solve with a method that gives it")
         warnings += [f"{layer}: {count} pixels have a value outside 0…1, which the texture cannot hold: they are clipped"
                      for layer, count in report.clipped_pixels.items() if count]
     timings.close()
-    return Exported(request.out, tuple(warnings))
+    return Exported(request.out, tuple(warnings), sizes)
 
 
 def _check_suffix(target: Path) -> str:

@@ -33,6 +33,11 @@ class AssetReport(NamedTuple):
     clipped_pixels: dict[str, int]  # texture → pixels that did not fit into 0…1
     warnings: tuple[str, ...]  # sentences
 
+    @property
+    def sizes(self) -> dict[str, tuple[int, int]]:
+        """Vertices and faces of the mesh."""
+        return {"mesh": (self.vertex_count, self.triangle_count)}
+
 
 def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str = FIRST_VERSION,
                 textures: TextureFormat = TextureFormat.PNG16, progress: Progress | None = None) -> AssetReport:

@@ -13,6 +13,10 @@ FIRST_VERSION = "1"
 """Version of an asset that nobody gave one."""
 
 
+MOST_LEVELS = 4
+"""Levels of detail that an asset can have: the fourth has a 256th of the faces."""
+
+
 class Geometry(Choice):
     """What an asset of a depth is made of."""
 
@@ -39,6 +43,9 @@ class ExportOptions(Options):
     """What an asset of a depth (depth.exr in place of maps.exr) is made of; None: mesh."""
     textures: TextureFormat = TextureFormat.PNG16
     """How textures are stored."""
+    levels: Annotated[int, Field(ge=0, le=MOST_LEVELS)] = 0
+    """Levels of detail of a USD asset of solved maps, each with about a quarter of the faces of the one before: variants lod1, lod2 … of
+    geo. With any, the normals of all meshes are smooth, and the normal map, which they share, holds the rest."""
 
 
 class ExportRequest(ExportOptions):

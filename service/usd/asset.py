@@ -4,14 +4,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from service.asset.mesh import height_mesh
+from service.asset.levels import level_meshes, with_smooth_normals
+from service.asset.mesh import SurfaceMesh, height_mesh
 from service.asset.metallic import IOR_LIMITS, loss_warnings, metallic_look
 from service.asset.textures import FILE_NAMES, write_textures
 from service.asset.units import unit_in_metres
 from service.requests.export import FIRST_VERSION, TextureFormat
 from service.usd.files import check_textures, install, temporary_folder_beside
 from service.usd.layers import LAYER_FILES, AssetLayers, Description, texture_folder
-from service.usd.scene import define_asset
+from service.usd.scene import define_asset, level_name
 from stage.maps import SurfaceMaps
 
 Progress = Callable[[str, float], None]
@@ -31,10 +32,16 @@ class AssetReport(NamedTuple):
     step: int  # every step-th pixel in both directions carries a vertex
     clipped_pixels: dict[str, int]  # texture → pixels that did not fit into 0…1
     warnings: tuple[str, ...]  # sentences
+    levels: tuple[tuple[int, int], ...]  # vertices and faces of each level of detail
+
+    @property
+    def sizes(self) -> dict[str, tuple[int, int]]:
+        """Vertices and faces by variant of `geo`."""
+        return {"mesh": (self.vertex_count, self.face_count), **{level_name(k): size for k, size in enumerate(self.levels, start=1)}}
 
 
 def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str = FIRST_VERSION,
-                textures: TextureFormat = TextureFormat.PNG16, progress: Progress | None = None) -> AssetReport:
+                textures: TextureFormat = TextureFormat.PNG16, levels: int = 0, progress: Progress | None = None) -> AssetReport:
     """Write solved maps as a USD asset.
 
     Args:
@@ -44,6 +51,7 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str 
         name: free text; the root prim is named after it.
         version: of the asset, for assetInfo.
         textures: how they are stored.
+        levels: of detail, at most.
         progress: called before each part of the work.
 
     Raises:
@@ -56,6 +64,10 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str 
 
     tell("mesh", 0.0)
     mesh = height_mesh(maps)
+    coarser: list[SurfaceMesh] = []
+    if levels:
+        mesh = with_smooth_normals(mesh)
+        coarser = level_meshes(mesh, maps.camera, levels)
     description = Description(name, maps.camera, {**maps.provenance, "relit:color_space": maps.color_space},
                               unit_in_metres(maps.camera), version)
     look = metallic_look(maps) if maps.diffuse_albedo is not None else None
@@ -67,11 +79,12 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str 
         tell("layer", TEXTURES_END)
         images = [folder / texture.file_name for texture in written.values()]
         layers = AssetLayers(temporary, target, description)
-        define_asset(layers, maps, mesh, written, ior=look.ior if look is not None else IOR_LIMITS[0])
+        define_asset(layers, maps, [mesh, *coarser], written, ior=look.ior if look is not None else IOR_LIMITS[0])
         layers.save()
         first, *others = layers.files
         install(target, first, [*others, *images], ours=(*LAYER_FILES, *FILE_NAMES))
     installed = () if packed else tuple(target.parent / folder.name / image.name for image in images)
     return AssetReport(target, installed, len(mesh.points), len(mesh.face_counts), mesh.step,
                        {name: texture.clipped_pixels for name, texture in written.items()},
-                       tuple(loss_warnings(look)) if look is not None else ())
+                       tuple(loss_warnings(look)) if look is not None else (),
+                       tuple((len(level.points), len(level.triangles)) for level in coarser))

@@ -3,7 +3,7 @@
 Source: OpenUSD: UsdGeom (meshes, primvars).
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from pxr import Sdf, Usd, UsdGeom, Vt
 
@@ -16,10 +16,12 @@ from service.usd.materials import define_looks
 from stage.maps import SurfaceMaps
 
 
-def define_asset(layers: AssetLayers, maps: SurfaceMaps, mesh: SurfaceMesh, textures: Mapping[str, Texture], *, ior: float) -> None:
+def define_asset(layers: AssetLayers, maps: SurfaceMaps, meshes: Sequence[SurfaceMesh], textures: Mapping[str, Texture], *,
+                 ior: float) -> None:
     """Define the prims of an asset of solved maps.
 
     Args:
+        meshes: the full mesh, then its levels of detail.
         textures: written into the folder that `layers` names.
         ior: index of refraction of the dielectric share of the surface.
 
@@ -29,11 +31,18 @@ def define_asset(layers: AssetLayers, maps: SurfaceMaps, mesh: SurfaceMesh, text
     if not maps.camera.metric:
         layers.geometry.GetPrimAtPath(layers.root).SetCustomDataByKey("relit:scale", SCALE_NOTE)
     with layers.geometry_variant("mesh") as geom:
-        usd_mesh = define_mesh(layers.geometry, geom.AppendChild("Mesh"), mesh)
-        layers.add_surface(usd_mesh.GetPath())
+        layers.add_surface(define_mesh(layers.geometry, geom.AppendChild("Mesh"), meshes[0]).GetPath())
+    for number, level in enumerate(meshes[1:], start=1):
+        with layers.geometry_variant(level_name(number)) as geom:
+            layers.add_surface(define_mesh(layers.geometry, geom.AppendChild(level_name(number).capitalize()), level).GetPath())
     UsdGeom.Scope.Define(layers.materials, layers.looks)
     define_looks(layers, textures, ior=ior)
-    define_camera(layers.geometry, layers.root.AppendChild("Camera"), maps.camera, mesh.extent)
+    define_camera(layers.geometry, layers.root.AppendChild("Camera"), maps.camera, meshes[0].extent)
+
+
+def level_name(number: int) -> str:
+    """Return the variant of a level of detail, 1 the finest."""
+    return f"lod{number}"
 
 
 def define_mesh(usd_stage: Usd.Stage, path: Sdf.Path, mesh: SurfaceMesh) -> UsdGeom.Mesh:
