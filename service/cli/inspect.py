@@ -47,11 +47,11 @@ def _lines(found: "Inspection") -> Iterator[tuple[str, str]]:
     yield "prim", f"{found.default_prim or 'no default prim'}, {f'kind {found.kind}' if found.kind else 'no kind'}"
     repeated = [key for key in found.asset_info if found.asset_info[key] == found.provenance.get(key)]
     yield "assetInfo", ", ".join(f"{key} {value}" for key, value in found.asset_info.items() if key not in repeated) or "none"
-    yield "unit", f"{found.meters_per_unit:g} m, {found.up_axis} up"
+    yield "unit", f"metersPerUnit {found.meters_per_unit:g}, upAxis {found.up_axis}"
     for key, value in found.notes.items():
         yield "note", f"{key} {value}"
     if found.time_codes is not None:
-        yield "time", "{:g} to {:g}, {:g} a second".format(*found.time_codes)
+        yield "time", "time codes {:g} to {:g}, timeCodesPerSecond {:g}".format(*found.time_codes)
     if found.extent_m is None:
         yield "extent", "nothing"
     else:
@@ -80,6 +80,7 @@ def _lines(found: "Inspection") -> Iterator[tuple[str, str]]:
         yield "camera", f"{camera.path}, {camera.projection}, {camera.framing}"
     for key, value in found.provenance.items():
         yield "provenance", f"{key} {value if len(value) <= LONGEST_TEXT else value[:LONGEST_TEXT] + ' …'}"
+    yield "validation", f"{found.validators} validators on each variant: {len(found.errors)} errors, {len(found.warnings)} warnings"
     for sentence in found.warnings:
         yield "warning", sentence
     for sentence in found.errors:

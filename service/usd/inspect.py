@@ -12,7 +12,7 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdLux, UsdShade, UsdUtils, UsdValida
 
 from service.asset.errors import AssetError
 from service.usd.camera import APERTURE_UNIT
-from service.usd.inspect_geometry import MeshFacts, PointsFacts, mesh_facts, points_facts
+from service.usd.inspect_geometry import FIRST, MeshFacts, PointsFacts, mesh_facts, points_facts
 from service.usd.inspect_looks import MaterialFacts, material_facts
 from service.usd.inspect_package import arkit_findings, package_findings
 from service.usd.layers import GEO, LOOK, PURPOSES
@@ -65,6 +65,8 @@ class Inspection:
     cameras: tuple[CameraFacts, ...]
     provenance: dict[str, str]
     """customLayerData."""
+    validators: int
+    """How many validators of OpenUSD looked at each variant."""
     warnings: tuple[str, ...]
     errors: tuple[str, ...]
 
@@ -128,7 +130,8 @@ def _inspect(usd_stage: Usd.Stage, path: Path, warnings: list[str], errors: list
         meshes=meshes, points=points, looks=looks,
         lights=tuple(f"{prim.GetPath()} ({prim.GetTypeName()})" for prim in usd_stage.Traverse() if prim.HasAPI(UsdLux.LightAPI)),
         cameras=tuple(_camera(UsdGeom.Camera(prim), unit_m) for prim in usd_stage.Traverse() if prim.IsA(UsdGeom.Camera)),
-        provenance=dict(_flat(usd_stage.GetRootLayer().customLayerData)), warnings=tuple(sorted(set(warnings))),
+        provenance=dict(_flat(usd_stage.GetRootLayer().customLayerData)), validators=len(_validators()),
+        warnings=tuple(sorted(set(warnings))),
         errors=tuple(sorted(set(errors))))  # sorted: validators run side by side
 
 
@@ -159,8 +162,7 @@ def _materials(usd_stage: Usd.Stage) -> tuple[MaterialFacts, ...]:
 
 def _find(usd_stage: Usd.Stage, root: Usd.Prim, warnings: list[str], errors: list[str]) -> None:
     """Add what the validators find in the selected variants, and whether extentsHint is right."""
-    context = UsdValidation.ValidationContext(UsdValidation.ValidationRegistry().GetOrLoadAllValidators())
-    for found in context.Validate(usd_stage):
+    for found in UsdValidation.ValidationContext(_validators()).Validate(usd_stage):
         sentence = f"{found.GetName()}: {' '.join(found.GetMessage().split())}"
         if found.GetType() == UsdValidation.ValidationErrorType.Error:
             errors.append(sentence)
@@ -175,9 +177,13 @@ def _find(usd_stage: Usd.Stage, root: Usd.Prim, warnings: list[str], errors: lis
             errors.append(f"extentsHint of {root.GetPath()} is {given}, and the geometry of the selected variants fills {box}")
 
 
+def _validators() -> list[UsdValidation.Validator]:
+    return UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+
+
 def _bounds(root: Usd.Prim, compute: Callable[[UsdGeom.BBoxCache, Usd.Prim], Gf.BBox3d]) -> Gf.Range3d:
     """Return the bounding box of the geometry below a prim, of every purpose."""
-    return compute(UsdGeom.BBoxCache(Usd.TimeCode.EarliestTime(), PURPOSES), root).ComputeAlignedRange()
+    return compute(UsdGeom.BBoxCache(FIRST, PURPOSES), root).ComputeAlignedRange()
 
 
 def _distance(one: Gf.Range3d, other: Gf.Range3d) -> float:
@@ -190,7 +196,7 @@ def _extent(root: Usd.Prim, unit_m: float) -> tuple[tuple[float, ...], tuple[flo
 
 
 def _camera(camera: UsdGeom.Camera, unit_m: float) -> CameraFacts:
-    gf_camera = camera.GetCamera(Usd.TimeCode.EarliestTime())
+    gf_camera = camera.GetCamera(FIRST)
     if gf_camera.projection == Gf.Camera.Orthographic:
         width, height = (APERTURE_UNIT * aperture * unit_m for aperture in (gf_camera.horizontalAperture, gf_camera.verticalAperture))
         return CameraFacts(str(camera.GetPath()), "orthographic", f"{width:.6g} × {height:.6g} m")

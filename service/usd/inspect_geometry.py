@@ -8,6 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from pxr import Usd, UsdGeom
 
+FIRST = Usd.TimeCode.EarliestTime()
+"""When an asset with time samples is looked at."""
+
 
 @dataclass(frozen=True)
 class PrimvarFacts:
@@ -55,8 +58,8 @@ class PointsFacts:
 
 def mesh_facts(mesh: UsdGeom.Mesh) -> MeshFacts:
     """Return the facts about a mesh; faces that name vertices beyond its points are left out of its topology."""
-    points = mesh.GetPointsAttr().Get()
-    counts, indices = (np.array(attribute.Get() or [], np.int64) for attribute in (mesh.GetFaceVertexCountsAttr(),
+    points = mesh.GetPointsAttr().Get(FIRST)
+    counts, indices = (np.array(attribute.Get(FIRST) or [], np.int64) for attribute in (mesh.GetFaceVertexCountsAttr(),
                                                                                    mesh.GetFaceVertexIndicesAttr()))
     vertices = len(points) if points is not None else 0
     if counts.sum() != len(indices) or (len(indices) and (indices.min() < 0 or indices.max() >= vertices)):
@@ -73,8 +76,8 @@ def mesh_facts(mesh: UsdGeom.Mesh) -> MeshFacts:
 
 def points_facts(points: UsdGeom.Points, unit_m: float) -> PointsFacts:
     """Return the facts about points; `unit_m` metres are a scene unit."""
-    widths = np.array(points.GetWidthsAttr().Get() or [], np.float64) * unit_m
-    return PointsFacts(str(points.GetPath()), _purpose(points), len(points.GetPointsAttr().Get() or []),
+    widths = np.array(points.GetWidthsAttr().Get(FIRST) or [], np.float64) * unit_m
+    return PointsFacts(str(points.GetPath()), _purpose(points), len(points.GetPointsAttr().Get(FIRST) or []),
                        (float(widths.min()), float(widths.max())) if len(widths) else None, _primvars(points))
 
 
@@ -111,11 +114,11 @@ def _components(edges: np.ndarray, vertices: int) -> np.ndarray:
 def _primvars(prim: UsdGeom.PointBased) -> tuple[PrimvarFacts, ...]:
     """Return the primvars with a value, and the normals before them."""
     found = []
-    normals = prim.GetNormalsAttr().Get()
+    normals = prim.GetNormalsAttr().Get(FIRST)
     if normals is not None:
         found.append(_range("normals", str(prim.GetNormalsInterpolation()), normals))
     for primvar in UsdGeom.PrimvarsAPI(prim).GetPrimvarsWithValues():
-        found.append(_range(primvar.GetPrimvarName(), str(primvar.GetInterpolation()), primvar.Get(Usd.TimeCode.EarliestTime())))
+        found.append(_range(primvar.GetPrimvarName(), str(primvar.GetInterpolation()), primvar.Get(FIRST)))
     return tuple(found)
 
 

@@ -85,6 +85,24 @@ def test_topology(picture, pieces, boundary, holes, tmp_path):
     assert (mesh.pieces, mesh.boundary_edges, mesh.holes, mesh.non_manifold_edges) == (pieces, boundary, holes, 0)
 
 
+def test_a_moving_mesh_is_looked_at_where_it_begins(tmp_path):
+    usd_stage = Usd.Stage.CreateNew(str(tmp_path / "moving.usda"))
+    mesh = UsdGeom.Mesh.Define(usd_stage, "/Mesh")
+    usd_stage.SetDefaultPrim(mesh.GetPrim())
+    mesh.CreateFaceVertexCountsAttr([3])
+    mesh.CreateFaceVertexIndicesAttr([0, 1, 2])
+    for time in (1, 2):
+        mesh.GetPointsAttr().Set([(time, 0, 0), (time, 1, 0), (time + 1, 0, 0)], time)
+    usd_stage.SetStartTimeCode(1)
+    usd_stage.SetEndTimeCode(2)
+    usd_stage.SetTimeCodesPerSecond(25)
+    usd_stage.Save()
+    found = inspect_asset(tmp_path / "moving.usda")
+    mesh, = found.meshes[""]
+    assert (mesh.vertices, mesh.faces, mesh.boundary_edges) == (3, 1, 3)
+    assert found.time_codes == (1, 2, 25)
+
+
 def test_edges_of_three_faces_are_counted(tmp_path):
     write_mesh(tmp_path / "fin.usda", [(0, 0, 0), (0, 1, 0), (1, 0, 0), (-1, 0, 0), (0, 0, 1)], [3, 3, 3], [0, 1, 2, 0, 1, 3, 0, 1, 4])
     found = inspect_asset(tmp_path / "fin.usda")
@@ -189,7 +207,9 @@ def test_the_command_prints_facts_or_json(relit, tmp_path):
     assert (outcome.code, outcome.err) == (0, "")
     lines = outcome.out.splitlines()
     assert lines[0].startswith(f"asset        {tmp_path}/ball.usda, ") and "prim         /Ball, kind component" in lines
-    assert "variants     geo: [mesh]" in lines and not any(line.startswith("wrong") for line in lines)
+    assert "variants     geo: [mesh]" in lines and "unit         metersPerUnit 1, upAxis Y" in lines
+    assert lines[-1].startswith("validation ") and lines[-1].endswith("validators on each variant: 0 errors, 0 warnings")
+    assert not any(line.startswith("wrong") for line in lines)
     outcome = relit("inspect", tmp_path / "ball.usda", "--json")
     found = inspect_asset(tmp_path / "ball.usda")
     assert outcome.code == 0 and json.loads(outcome.out) == json.loads(json.dumps(dataclasses.asdict(found)))
