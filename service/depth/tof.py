@@ -95,7 +95,9 @@ def _corrected(found: RangeImage, options: TofOptions, calibration: TofCalibrati
     half_path = calibration.correct(found.range_m.astype(np.float64), options.temperature_c)
     sigma = found.sigma_m * calibration.scale
     if path is None:
-        return replace(found, range_m=half_path.astype(np.float32), sigma_m=sigma.astype(np.float32))
+        behind = np.isin(found.status, ESTIMATED) & ~(half_path > 0)
+        return replace(found, range_m=half_path.astype(np.float32), sigma_m=sigma.astype(np.float32),
+                       status=np.where(behind, int(Status.OUT_OF_RANGE), found.status))
     range_m, per_metre = (values.reshape(-1) for values in path.range_of(half_path.reshape(path.along_m.shape)))
     sigma = sigma * per_metre
     inside = ((range_m > 0) & (range_m >= (near_m or 0.0) - END_SIGMAS * sigma)

@@ -204,6 +204,18 @@ def test_an_orthographic_camera_has_depth_equal_to_range(tmp_path):
     assert np.ptp(points[:, 0]) == pytest.approx(0.05, rel=1e-5) and np.abs(points[:, 2] + 3).max() < 5e-5
 
 
+def test_no_depth_lies_behind_the_camera(tmp_path):
+    """An offset of the calibration makes the nearest ranges negative."""
+    settings = tof.even((20e6,), 4)
+    view = tof.View(np.linspace(0.02, 0.4, ROWS * COLS).reshape(ROWS, COLS), np.ones((ROWS, COLS)), np.ones((ROWS, COLS)))
+    file = tmp_path / "camera.json"
+    write_calibration(TofCalibration(offset_m=0.1), file)
+    result, maps, _ = run(write(tmp_path / "c", cw_frames(tof.correlations(view, 1e5, settings), settings)), calibration=file)
+    behind = view.distance < 0.1 - 1e-4
+    assert behind.sum() > 1000 and (maps.status[behind] == Status.OUT_OF_RANGE).all() and not maps.mask[behind].any()
+    assert maps.mask[view.distance > 0.1 + 1e-4].all() and (read_ply(result.points_path).points[:, 2] < 0).all()
+
+
 def test_pixels_in_trouble_have_a_status(tmp_path):
     settings = tof.even(tof.HZ, 4)
     images = tof.correlations(VIEW, 1e5, settings, ambient=300, seed=1)
