@@ -1,8 +1,8 @@
-"""relit inspect: look at an asset as a technical director does."""
+"""relit inspect: look at a USD or glTF asset as a technical director does."""
 
 import dataclasses
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import typer
@@ -11,6 +11,7 @@ from service.cli.request_commands import local_command
 from service.requests.inspect import InspectRequest
 
 if TYPE_CHECKING:
+    from service.gltf.inspect import GlbInspection
     from service.usd.inspect import Inspection
     from service.usd.inspect_geometry import PrimvarFacts
     from service.usd.inspect_looks import MaterialFacts, TextureFacts
@@ -26,13 +27,22 @@ def register(app: typer.Typer) -> None:
 
 def _inspect(request: InspectRequest) -> None:
     from service.asset.errors import AssetError
-    from service.usd.inspect import inspect_asset
 
-    found = inspect_asset(request.asset)
+    found: Inspection | GlbInspection
+    if request.asset.suffix.lower() == ".glb":
+        from service.gltf.inspect import inspect_glb
+
+        found = inspect_glb(request.asset)
+        lines = _glb_lines(found)
+    else:
+        from service.usd.inspect import inspect_asset
+
+        found = inspect_asset(request.asset)
+        lines = _lines(found)
     if request.as_json:
         print(json.dumps(dataclasses.asdict(found), ensure_ascii=False, indent=2))
     else:
-        for name, value in _lines(found):
+        for name, value in lines:
             print(f"{name:<12} {value}")
     if found.errors:
         others = f" (and {len(found.errors) - 1} more)" if len(found.errors) > 1 else ""
@@ -52,12 +62,7 @@ def _lines(found: "Inspection") -> Iterator[tuple[str, str]]:
         yield "note", f"{key} {value}"
     if found.time_codes is not None:
         yield "time", "time codes {:g} to {:g}, timeCodesPerSecond {:g}".format(*found.time_codes)
-    if found.extent_m is None:
-        yield "extent", "nothing"
-    else:
-        low, high = found.extent_m
-        size = " × ".join(f"{top - bottom:.4g}" for bottom, top in zip(low, high, strict=True))
-        yield "extent", f"{size} m, from {_vector(low)} to {_vector(high)}"
+    yield "extent", _extent(found.extent_m)
     for name, variants in found.variants.items():
         yield "variants", f"{name}: {', '.join(f'[{each}]' if each == found.selections.get(name) else each for each in variants)}"
     for variant in found.meshes:
@@ -78,13 +83,48 @@ def _lines(found: "Inspection") -> Iterator[tuple[str, str]]:
         yield "light", light
     for camera in found.cameras:
         yield "camera", f"{camera.path}, {camera.projection}, {camera.framing}"
-    for key, value in found.provenance.items():
-        yield "provenance", f"{key} {value if len(value) <= LONGEST_TEXT else value[:LONGEST_TEXT] + ' …'}"
+    yield from _provenance(found.provenance)
     yield "validation", f"{found.validators} validators on each variant: {len(found.errors)} errors, {len(found.warnings)} warnings"
     for sentence in found.warnings:
         yield "warning", sentence
     for sentence in found.errors:
         yield "wrong", sentence
+
+
+def _glb_lines(found: "GlbInspection") -> Iterator[tuple[str, str]]:
+    """Yield what is printed of a .glb, as names and values."""
+    yield "asset", f"{found.file}, {_bytes(found.size_bytes)}"
+    yield "assetInfo", ", ".join(f"{key} {value}" for key, value in found.asset_info.items()) or "none"
+    yield "extensions", ", ".join(found.extensions) or "none"
+    yield "extent", _extent(found.extent_m)
+    for primitive in found.primitives:
+        yield "mesh", (f"{primitive.mesh}, {primitive.mode}: {primitive.vertices} vertices, {primitive.faces} faces, "
+                       f"{', '.join(primitive.attributes)}")
+    for material in found.materials:
+        yield "material", material.name
+        for name, image in material.images.items():
+            size = "no PNG" if image.width is None else f"{image.width}×{image.height}, {image.channels} × {image.depth} bits"
+            yield "  texture", f"{name}: {image.name}, {size}, {_bytes(image.size_bytes)}"
+        for name, value in material.values.items():
+            yield "  value", f"{name}: {value}"
+    for camera in found.cameras:
+        yield "camera", camera
+    yield from _provenance(found.provenance)
+    for sentence in found.errors:
+        yield "wrong", sentence
+
+
+def _extent(extent_m: tuple[Sequence[float], Sequence[float]] | None) -> str:
+    if extent_m is None:
+        return "nothing"
+    low, high = extent_m
+    size = " × ".join(f"{top - bottom:.4g}" for bottom, top in zip(low, high, strict=True))
+    return f"{size} m, from {_vector(low)} to {_vector(high)}"
+
+
+def _provenance(provenance: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+    for key, value in provenance.items():
+        yield "provenance", f"{key} {value if len(value) <= LONGEST_TEXT else value[:LONGEST_TEXT] + ' …'}"
 
 
 def _primvars(primvars: "Sequence[PrimvarFacts]") -> Iterator[tuple[str, str]]:

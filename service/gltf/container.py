@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from pygltflib import GLTF2, Accessor, Buffer, BufferView, Image
@@ -27,8 +27,12 @@ _HEADER, _CHUNK_HEADER = struct.Struct("<4sII"), struct.Struct("<I4s")
 _MAGIC, _VERSION = b"glTF", 2
 _JSON, _BIN = b"JSON", b"BIN\0"
 
+COMPONENT_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
+"""Bytes of each type of component (3.6.2.2, "Accessor Data Types")."""
+ELEMENT_SIZES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+"""Components of each type of element."""
 _COMPONENT_TYPES = {"<u1": 5121, "<u2": 5123, "<u4": 5125, "<f4": 5126}
-"""The code of each NumPy type (3.6.2.2, "Accessor Data Types")."""
+"""The code of each NumPy type that is written."""
 _ELEMENT_TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 
 
@@ -105,27 +109,37 @@ def writing_glb(target: Path) -> Iterator[tuple[Glb, Path]]:
         glb.write(temporary)
 
 
-def read_document(path: Path) -> GLTF2:
-    """Return the document of a .glb file, without its binary data.
+class GlbContents(NamedTuple):
+    """A .glb file without its binary data."""
+
+    document: GLTF2
+    data_start: int  # byte of the file at which the buffer begins
+    data_size: int  # its bytes; 0: there is no buffer
+
+
+def read_glb(path: Path) -> GlbContents:
+    """Read the document of a .glb file.
 
     Raises:
         AssetError: it is not a .glb file of version 2, or it is cut off.
         OSError: it cannot be read.
     """
+    start = _HEADER.size + _CHUNK_HEADER.size
     with open(path, "rb") as stream:
-        start = stream.read(_HEADER.size + _CHUNK_HEADER.size)
+        head = stream.read(start)
         size = path.stat().st_size
-        if len(start) < _HEADER.size + _CHUNK_HEADER.size or start[:4] != _MAGIC:
+        if len(head) < start or head[:4] != _MAGIC:
             raise AssetError(f"{path}: is not a .glb file")
-        _, version, length = _HEADER.unpack_from(start)
-        text_length, kind = _CHUNK_HEADER.unpack_from(start, _HEADER.size)
+        _, version, length = _HEADER.unpack_from(head)
+        text_length, kind = _CHUNK_HEADER.unpack_from(head, _HEADER.size)
         if version != _VERSION or kind != _JSON:
             raise AssetError(f"{path}: is not glTF of version {_VERSION}: its header says {version}")
-        if length != size or text_length > size:
+        if length > size or text_length > size:
             raise AssetError(f"{path}: is cut off: it has {size} of {length} bytes")
-        text = stream.read(text_length)
+        text, next_head = stream.read(text_length), stream.read(_CHUNK_HEADER.size)
+    data_size = _CHUNK_HEADER.unpack(next_head)[0] if len(next_head) == _CHUNK_HEADER.size else 0
     try:
-        return GLTF2.gltf_from_json(text.decode())
+        return GlbContents(GLTF2.gltf_from_json(text.decode()), start + text_length + _CHUNK_HEADER.size, data_size)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise AssetError(f"{path}: holds no glTF document that can be read: {error}") from error
 

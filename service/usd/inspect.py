@@ -83,7 +83,7 @@ def inspect_asset(path: Path) -> Inspection:
     if not path.exists():
         raise AssetError(f"{path} is not there")
     if path.suffix.lower() not in SUFFIXES:
-        raise AssetError(f"{path}: relit inspect reads {', '.join(SUFFIXES)}")
+        raise AssetError(f"{path}: relit inspect reads {', '.join(SUFFIXES)} and .glb")
     packed = path.suffix.lower() == ".usdz"
     errors = package_findings(path) if packed else []
     quiet = UsdUtils.CoalescingDiagnosticDelegate()  # what USD would print about missing files is among the findings

@@ -15,7 +15,7 @@ from service.asset.mesh import height_mesh
 from service.asset.metallic import metallic_look
 from service.gltf import container, textures
 from service.gltf.asset import write_asset
-from service.gltf.container import read_document
+from service.gltf.container import read_glb
 from service.requests.export import TextureFormat
 from stage.errors import StorageError
 from tests.scenes.surfaces import make_ball, make_sheet, make_wave
@@ -224,7 +224,7 @@ def test_what_the_camera_cannot_hold_is_said(tmp_path):
 
 def test_pose_names_and_provenance(tmp_path):
     maps = dataclasses.replace(SURFACES["everything"], camera=SURFACES["everything"].camera.model_copy(update={"world_from_camera": POSE}))
-    document = read_document(write_asset(maps, tmp_path / "a.glb", name="Eule – 梟", version="v003").path)
+    document = read_glb(write_asset(maps, tmp_path / "a.glb", name="Eule – 梟", version="v003").path).document
     root = document.nodes[document.scenes[document.scene].nodes[0]]
     np.testing.assert_array_equal(np.array(root.matrix).reshape(4, 4).T, POSE)
     assert {root.name, document.meshes[0].name, document.materials[0].name} == {"Eule – 梟"}
@@ -232,7 +232,7 @@ def test_pose_names_and_provenance(tmp_path):
     assert document.asset.version == "2.0" and document.asset.generator.startswith("Relit")
     assert document.asset.extras == {"identifier": "a.glb", "version": "v003"}
     assert "relit:scale" not in root.extras
-    unknown = read_document(write_asset(SURFACES["no scale"], tmp_path / "b.glb", name="B").path)
+    unknown = read_glb(write_asset(SURFACES["no scale"], tmp_path / "b.glb", name="B").path).document
     assert unknown.nodes[0].extras["relit:scale"].startswith("unknown") and unknown.nodes[0].matrix is None
 
 
@@ -316,5 +316,5 @@ def test_damaged_files_are_refused(damage, sentence, tmp_path):
     path = write_asset(SURFACES["2x2"], tmp_path / "a.glb", name="A").path
     path.write_bytes(damage(path.read_bytes()))
     with pytest.raises(AssetError, match=sentence) as raised:
-        read_document(path)
+        read_glb(path)
     assert str(path) in str(raised.value)

@@ -5,7 +5,7 @@ import pytest
 
 from service.asset.errors import AssetError
 from service.export.export import export
-from service.gltf.container import read_document
+from service.gltf.container import read_glb
 from service.requests.export import ExportRequest, Geometry
 from stage.camera import Camera
 from stage.depth_maps import DepthMaps
@@ -16,7 +16,7 @@ def test_solved_maps_become_a_glb(tmp_path):
     make_ball(provenance={"relit:capture": "ball 1"}).write(tmp_path / "maps.exr")
     exported = export(ExportRequest(maps=tmp_path, out=tmp_path / "out" / "Ball.GLB"))
     assert exported.path == tmp_path / "out" / "Ball.GLB" and exported.warnings == ()
-    document = read_document(exported.path)
+    document = read_glb(exported.path).document
     assert document.nodes[0].name == "ball 1" and len(document.images) == 3
 
 
@@ -34,7 +34,7 @@ def test_a_depth_becomes_a_glb(geometry, mode, tmp_path):
     DepthMaps(camera=camera, mask=np.ones((4, 4), bool), depth=np.ones((4, 4), np.float32)).write(tmp_path / "depth.exr")
     exported = export(ExportRequest(maps=tmp_path, out=tmp_path / "a.glb", geometry=geometry))
     assert len(exported.warnings) == 1 and "grey" in exported.warnings[0]
-    assert read_document(exported.path).meshes[0].primitives[0].mode == mode
+    assert read_glb(exported.path).document.meshes[0].primitives[0].mode == mode
 
 
 def test_an_unknown_suffix_names_the_known(tmp_path):

@@ -172,7 +172,7 @@ def test_an_unknown_scale_is_a_note(tmp_path):
     ("a.usda", b"hello", "a.usda cannot be opened: it is no USD file, or a damaged one"),
     ("a.usdc", b"PXR-USDC", "a.usdc cannot be opened"),
     ("a.usdz", b"PK", "a.usdz is no USDZ package, or only a part of one"),
-    ("a.obj", b"v 0 0 0", "a.obj: relit inspect reads .usda, .usdc, .usd, .usdz"),
+    ("a.obj", b"v 0 0 0", "a.obj: relit inspect reads .usda, .usdc, .usd, .usdz and .glb"),
     ("none.usda", None, "none.usda is not there"),
     ("folder.usda", "folder", "folder.usda is a folder: give the asset"),
 ])
