@@ -121,7 +121,7 @@ def _inspect(usd_stage: Usd.Stage, path: Path, warnings: list[str], errors: list
         file=str(path), size_bytes=size, layers=tuple(sorted(_relative(layer, path) for layer in layers)),
         default_prim=str(root.GetPath()) if root else None, kind=(Usd.ModelAPI(root).GetKind() or None) if root else None,
         asset_info=dict(_flat(Usd.ModelAPI(root).GetAssetInfo())) if root else {},
-        notes=dict(_flat(root.GetCustomData())) if root else {},
+        notes=dict(entry for spec in reversed(root.GetPrimStack()) for entry in _flat(spec.customData)) if root else {},
         up_axis=str(UsdGeom.GetStageUpAxis(usd_stage)), meters_per_unit=unit_m,
         time_codes=(start, end, usd_stage.GetTimeCodesPerSecond()) if usd_stage.HasAuthoredTimeCodeRange() else None,
         extent_m=_extent(root, unit_m) if root else None,

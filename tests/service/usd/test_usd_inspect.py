@@ -29,6 +29,7 @@ def test_a_ball(ball, suffix, tmp_path):
     assert (found.default_prim, found.kind, found.up_axis, found.meters_per_unit) == ("/Kugel", "component", "Y", 1.0)
     assert found.asset_info == {"name": "Kugel", "identifier": f"ball{suffix}", "version": "v2", "relit:method": "svbrdf",
                                 "relit:color_space": "lin_rec709_scene"}
+    assert found.notes == {}  # not the documentation that OpenUSD has of every Xform
     assert found.layers == (() if suffix == ".usdz" else tuple(f"ball_layers/{name}" for name in (
         "geometry.usdc", "materials.usda", "payload.usda")))
     assert found.size_bytes == sum(p.stat().st_size for p in tmp_path.rglob("*") if p.is_file())
