@@ -225,22 +225,50 @@ except StorageError as error:
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs a file size limit")
-@pytest.mark.parametrize("suffix, stops_in, spared", [(".usdc", "normal.png", 300), (".usda", "layer", 1),
-                                                      (".usdc", "layer", 1), (".usdz", "package", 1)])
+@pytest.mark.parametrize("suffix, stops_in, spared", [(".usdc", "normal.png", 300), (".usda", "geometry.usdc", 1),
+                                                      (".usdc", "geometry.usdc", 1), (".usdz", "package", 1)])
 def test_a_disk_that_really_refuses(suffix, stops_in, spared, tmp_path):
     """The operating system cuts the file off shortly before its end: writers that do not look would call that done."""
     maps = tilted_ball()
     maps.write(tmp_path / "maps.exr")
     whole = write_asset(SurfaceMaps.read(tmp_path / "maps.exr"), tmp_path / f"whole{suffix}", name="Ball")
-    file = next((p for p in whole.textures if p.name == stops_in), whole.path)
+    file = next((p for p in tmp_path.rglob(stops_in)), whole.path)
     limit = file.stat().st_size - spared
-    assert all(p.stat().st_size < limit for p in whole.textures if p != file and p.name < "normal.png")
+    before = [p for p in whole.textures if p.name < "normal.png"] if stops_in == "normal.png" else whole.textures
+    assert all(p.stat().st_size < limit for p in before)  # so that they are not what is refused
     target = tmp_path / "out" / f"whole{suffix}"
     command = [sys.executable, "-c", FILE_SIZE_LIMITED, tmp_path / "maps.exr", target, str(limit)]
     done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[3])
     assert done.returncode == 1 and f"refused: cannot write {target}: " in done.stderr, done.stderr
     assert "pxr" not in done.stderr  # a sentence, not a place in the source of USD
     assert (stops_in in done.stderr) == stops_in.endswith(".png")
+    assert list(target.parent.iterdir()) == []
+
+
+TEXT_LIMITED = """
+import resource, signal, sys
+import numpy as np
+from stage.errors import StorageError
+from stage.ply import PointCloud
+from service.usd.points import write_points
+cloud = PointCloud(np.linspace(0, 1, 3000, dtype=np.float32).reshape(-1, 3), np.zeros((1000, 3), np.uint8), None)
+write_points(cloud, sys.argv[1], name="Cloud")
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+size = len(open(sys.argv[1], "rb").read())
+resource.setrlimit(resource.RLIMIT_FSIZE, (size - 1, size - 1))
+try:
+    write_points(cloud, sys.argv[2], name="Cloud")
+except StorageError as error:
+    sys.exit(f"refused: {error}")
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs a file size limit")
+def test_a_disk_that_refuses_a_layer_of_text(tmp_path):
+    target = tmp_path / "out" / "cloud.usda"
+    done = subprocess.run([sys.executable, "-c", TEXT_LIMITED, tmp_path / "whole.usda", target], capture_output=True, text=True,
+                          cwd=Path(__file__).parents[3])
+    assert done.returncode == 1 and f"refused: cannot write {target}: " in done.stderr, done.stderr
     assert list(target.parent.iterdir()) == []
 
 
