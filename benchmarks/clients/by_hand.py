@@ -1,12 +1,13 @@
 """Writes maps as a USD asset by the shortest way, sharing no code with the exporter: its materials and meshes are compared with this.
 
-A vertex for each pixel has the map's normal as vertex normal, so that there is no normal map and no tangent frame; metallic and base
-colour follow from albedo and F0 by the closed form that is known from glTF; textures have 16 bits, base colour in sRGB.
+A quad for each pixel has the mean of the maps' normals as vertex normals, so that there is no normal map and no tangent frame; metallic
+and base colour follow from albedo and F0 by the closed form that is known from glTF; textures have 16 bits, base colour in sRGB.
 
 Source: KhronosGroup/glTF, KHR_materials_pbrSpecularGlossiness, "Best practices": solveMetallic.
 """
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdUtils, Vt
@@ -16,6 +17,8 @@ from stage.maps import SurfaceMaps
 
 DIELECTRIC_F0 = 0.04
 BLEED_ROUNDS = 8
+LEAST_COSINE = 0.2
+"""Surfaces that are seen at a flatter angle are extended to their pixel's corners as if they were not."""
 CODES = 65535
 
 
@@ -68,22 +71,50 @@ def _bled(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
     return values
 
 
-def _write_stage(maps: SurfaceMaps, path: Path, textures: dict[str, str]) -> None:
-    valid = maps.mask & np.isfinite(maps.height)
-    number = np.full(valid.shape, -1)
-    number[valid] = np.arange(np.count_nonzero(valid))
-    corners = np.stack([number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]], axis=-1).reshape(-1, 4)
-    faces = np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])
-    whole = (faces >= 0).all(axis=1)
-    if maps.part is not None:
-        of_vertex = maps.part[valid]
-        whole &= (of_vertex[faces] == of_vertex[faces[:, :1]]).all(axis=1)
-    faces = faces[whole]
-    rows, cols = np.nonzero(valid)
-    height, width = valid.shape
-    points = maps.camera.points(np.where(valid, maps.height, 0))[valid].astype(np.float32)
-    st = np.stack([(cols + 0.5) / width, 1 - (rows + 0.5) / height], axis=-1).astype(np.float32)
+class _Mesh(NamedTuple):
+    points: np.ndarray  # [V, 3]
+    normals: np.ndarray  # [V, 3]
+    st: np.ndarray  # [V, 2]
+    quads: np.ndarray  # [Q, 4]
 
+
+def _mesh(maps: SurfaceMaps) -> _Mesh:
+    """Return a quad for each pixel of the mask, whose corners are the mean of where the tangent planes of the adjacent pixels of its part
+    meet the corner's ray."""
+    assert maps.height is not None and maps.normal is not None
+    valid = maps.mask & np.isfinite(maps.height)
+    height, width = valid.shape
+    perspective = maps.camera.projection == "perspective"
+    points = maps.camera.points(np.where(valid, maps.height, -1 if perspective else 0))[valid].astype(np.float64)
+    flat = maps.camera.points(np.full(valid.shape, -1.0 if perspective else 0.0)).astype(np.float64)[..., :2]  # at z -1 or 0
+    across, down = flat[0, 1] - flat[0, 0], flat[1, 0] - flat[0, 0]
+    normal = maps.normal[valid].astype(np.float64)
+    rows, cols = np.nonzero(valid)
+    part = np.zeros(len(rows), int) if maps.part is None else maps.part[valid].astype(int)
+    keys, z, places = [], [], []
+    for dr, dc in ((0, 0), (1, 0), (1, 1), (0, 1)):  # counter-clockwise as the camera sees it
+        xy = flat[rows, cols] + (dc - 0.5) * across + (dr - 0.5) * down
+        if perspective:
+            ray = np.concatenate([xy, np.full((len(xy), 1), -1.0)], axis=-1)
+            towards = np.minimum((normal * ray).sum(-1), -LEAST_COSINE * np.linalg.norm(ray, axis=-1))
+            z.append(-np.minimum((normal * points).sum(-1), 0) / towards)
+        else:
+            z.append(points[:, 2] - ((xy - points[:, :2]) * normal[:, :2]).sum(-1) / np.maximum(normal[:, 2], LEAST_COSINE))
+        keys.append((part * (height + 1) + rows + dr) * (width + 1) + cols + dc)
+        places.append(xy)
+    unique, first, quads = np.unique(np.stack(keys), return_index=True, return_inverse=True)
+    quads = quads.reshape(4, -1)
+    count = np.bincount(quads.ravel())
+    mean_z = np.bincount(quads.ravel(), np.concatenate(z)) / count
+    mean_normal = np.stack([np.bincount(quads.ravel(), np.tile(normal[:, axis], 4)) for axis in range(3)], axis=-1)
+    xy = np.concatenate(places)[first] * (-mean_z[:, None] if perspective else 1)
+    col, row = unique % (width + 1), unique // (width + 1) % (height + 1)
+    return _Mesh(np.concatenate([xy, mean_z[:, None]], axis=-1), mean_normal / np.linalg.norm(mean_normal, axis=-1, keepdims=True),
+                 np.stack([col / width, 1 - row / height], axis=-1), quads.T)
+
+
+def _write_stage(maps: SurfaceMaps, path: Path, textures: dict[str, str]) -> None:
+    made = _mesh(maps)
     usd_stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageUpAxis(usd_stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(usd_stage, 1.0 if maps.camera.metric else 0.001)
@@ -94,12 +125,13 @@ def _write_stage(maps: SurfaceMaps, path: Path, textures: dict[str, str]) -> Non
     mesh = UsdGeom.Mesh.Define(usd_stage, "/Object/Mesh")
     mesh.CreateSubdivisionSchemeAttr("none")
     mesh.CreateDoubleSidedAttr(True)
-    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
-    mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(maps.normal[valid], np.float32)))
+    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(made.points, np.float32)))
+    mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(made.normals, np.float32)))
     mesh.SetNormalsInterpolation("vertex")
-    mesh.CreateFaceVertexCountsAttr(Vt.IntArray(len(faces), 3))
-    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.astype(np.int32).ravel()))
-    UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, "vertex").Set(Vt.Vec2fArray.FromNumpy(st))
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray(len(made.quads), 4))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(made.quads.astype(np.int32).ravel()))
+    st = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, "vertex")
+    st.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(made.st, np.float32)))
     material = UsdShade.Material.Define(usd_stage, "/Object/Material")
     surface = _shader(usd_stage, "Surface", "UsdPreviewSurface")
     reader = _shader(usd_stage, "Reader", "UsdPrimvarReader_float2")
