@@ -79,8 +79,9 @@ def _lines(found: "Inspection") -> Iterator[tuple[str, str]]:
     for look, materials in found.looks.items():
         for material in materials:
             yield from _material(f"look={look} " if look else "", material)
-    for light in found.lights:
-        yield "light", light
+    for variant, lights in found.lights.items():
+        for light in lights:
+            yield "light", f"{variant} {light}".strip()
     for camera in found.cameras:
         yield "camera", f"{camera.path}, {camera.projection}, {camera.framing}"
     yield from _provenance(found.provenance)

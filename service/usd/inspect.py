@@ -61,7 +61,8 @@ class Inspection:
     points: dict[str, tuple[PointsFacts, ...]]
     looks: dict[str, tuple[MaterialFacts, ...]]
     """Materials that something is bound to, by variant of `look`."""
-    lights: tuple[str, ...]
+    lights: dict[str, tuple[str, ...]]
+    """Paths and types, by `set=variant` of the other sets; under an empty name where there are no others."""
     cameras: tuple[CameraFacts, ...]
     provenance: dict[str, str]
     """customLayerData."""
@@ -111,6 +112,12 @@ def _inspect(usd_stage: Usd.Stage, path: Path, warnings: list[str], errors: list
     for variant in _each_variant(root, LOOK):
         looks[variant] = _materials(usd_stage)
         _find(usd_stage, root, warnings, errors)
+    lights = {}
+    for name in [name for name in (root.GetVariantSets().GetNames() if root else []) if name not in (GEO, LOOK)] or [""]:
+        for variant in _each_variant(root, name):
+            lights[f"{name}={variant}" if variant else ""] = tuple(
+                f"{prim.GetPath()} ({prim.GetTypeName()})" for prim in usd_stage.Traverse() if prim.HasAPI(UsdLux.LightAPI))
+            _find(usd_stage, root, warnings, errors)
     start, end = usd_stage.GetStartTimeCode(), usd_stage.GetEndTimeCode()
     layers = [layer for layer in usd_stage.GetUsedLayers() if not layer.anonymous and layer != usd_stage.GetRootLayer()]
     files = {texture.file: texture.size_bytes or 0 for look in looks.values() for material in look for texture in material.textures()}
@@ -128,7 +135,7 @@ def _inspect(usd_stage: Usd.Stage, path: Path, warnings: list[str], errors: list
         variants={name: tuple(sets.GetVariantSet(name).GetVariantNames()) for name in sets.GetNames()} if sets else {},
         selections=dict(sets.GetAllVariantSelections()) if sets else {},
         meshes=meshes, points=points, looks=looks,
-        lights=tuple(f"{prim.GetPath()} ({prim.GetTypeName()})" for prim in usd_stage.Traverse() if prim.HasAPI(UsdLux.LightAPI)),
+        lights=lights,
         cameras=tuple(_camera(UsdGeom.Camera(prim), unit_m) for prim in usd_stage.Traverse() if prim.IsA(UsdGeom.Camera)),
         provenance=dict(_flat(usd_stage.GetRootLayer().customLayerData)), validators=len(_validators()),
         warnings=tuple(sorted(set(warnings))),

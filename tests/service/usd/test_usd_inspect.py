@@ -7,7 +7,7 @@ import zipfile
 
 import numpy as np
 import pytest
-from pxr import Sdf, Usd, UsdGeom
+from pxr import Sdf, Usd, UsdGeom, UsdLux
 
 from service.asset.errors import AssetError
 from service.asset.mesh import height_mesh
@@ -102,6 +102,23 @@ def test_a_moving_mesh_is_looked_at_where_it_begins(tmp_path):
     mesh, = found.meshes[""]
     assert (mesh.vertices, mesh.faces, mesh.boundary_edges) == (3, 1, 3)
     assert found.time_codes == (1, 2, 25)
+
+
+def test_lights_are_those_of_each_variant(tmp_path):
+    usd_stage = Usd.Stage.CreateNew(str(tmp_path / "lit.usda"))
+    root = UsdGeom.Xform.Define(usd_stage, "/Set").GetPrim()
+    usd_stage.SetDefaultPrim(root)
+    UsdLux.DomeLight.Define(usd_stage, "/Set/Sky")
+    variants = root.GetVariantSets().AddVariantSet("light")
+    for name in ("off", "key"):
+        variants.AddVariant(name)
+    variants.SetVariantSelection("key")
+    with variants.GetVariantEditContext():
+        UsdLux.DistantLight.Define(usd_stage, "/Set/Key")
+    variants.SetVariantSelection("off")
+    usd_stage.Save()
+    sky, key = "/Set/Sky (DomeLight)", "/Set/Key (DistantLight)"
+    assert inspect_asset(tmp_path / "lit.usda").lights == {"light=off": (sky,), "light=key": (key, sky)}
 
 
 def test_edges_of_three_faces_are_counted(tmp_path):
