@@ -83,7 +83,7 @@ def test_a_layer_imports_only_its_own_libraries(layer, allowed):
 @pytest.mark.parametrize(("library", "home"), [
     ("pxr", "service.usd"), ("pygltflib", "service.gltf"), ("typer", "service.cli"), ("rich", "service.cli"),
     ("fastapi", "service.server.api"), ("dbos", "service.server.jobs"), ("laspy", "stage.las"),
-    ("fast_simplification", "service.asset.levels"),
+    ("fast_simplification", "service.asset.levels"), ("MaterialX", "service.asset.openpbr"),
 ])
 def test_a_library_lives_in_one_place(library, home):
     assert {i.importer for i in IMPORTS if top(i.target) == library and not under(i.importer, home)} == set()

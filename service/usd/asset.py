@@ -7,6 +7,7 @@ from typing import NamedTuple
 from service.asset.levels import level_meshes, with_smooth_normals
 from service.asset.mesh import SurfaceMesh, height_mesh
 from service.asset.metallic import IOR_LIMITS, loss_warnings, metallic_look
+from service.asset.openpbr import DOCUMENT, openpbr_document, write_openpbr
 from service.asset.textures import FILE_NAMES, write_textures
 from service.asset.units import unit_in_metres
 from service.requests.export import FIRST_VERSION, TextureFormat
@@ -26,7 +27,7 @@ class AssetReport(NamedTuple):
     """The files and the sizes of an asset, and what its user should know of it."""
 
     path: Path  # the asset
-    textures: tuple[Path, ...]  # files beside it; empty for .usdz, which holds them
+    textures: tuple[Path, ...]  # files beside it, with the MaterialX document last; empty for .usdz, which holds them
     vertex_count: int
     face_count: int
     step: int  # every step-th pixel in both directions carries a vertex
@@ -77,13 +78,16 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str 
         written = write_textures(maps, mesh, folder, look=look, storage=textures, progress=lambda name, done: tell(
             f"texture {name}", TEXTURES_START + (TEXTURES_END - TEXTURES_START) * done))
         tell("layer", TEXTURES_END)
-        images = [folder / texture.file_name for texture in written.values()]
+        beside = [folder / texture.file_name for texture in written.values()]
+        openpbr = openpbr_document(written, ior=look.ior) if look is not None else None
+        if openpbr is not None and not packed:  # a package may hold no .mtlx
+            beside.append(write_openpbr(openpbr, folder))
         layers = AssetLayers(temporary, target, description)
-        define_asset(layers, maps, [mesh, *coarser], written, ior=look.ior if look is not None else IOR_LIMITS[0])
+        define_asset(layers, maps, [mesh, *coarser], written, ior=look.ior if look is not None else IOR_LIMITS[0], openpbr=openpbr)
         layers.save()
         first, *others = layers.files
-        install(target, first, [*others, *images], ours=(*LAYER_FILES, *FILE_NAMES))
-    installed = () if packed else tuple(target.parent / folder.name / image.name for image in images)
+        install(target, first, [*others, *beside], ours=(*LAYER_FILES, *FILE_NAMES, DOCUMENT))
+    installed = () if packed else tuple(target.parent / folder.name / file.name for file in beside)
     return AssetReport(target, installed, len(mesh.points), len(mesh.face_counts), mesh.step,
                        {name: texture.clipped_pixels for name, texture in written.items()},
                        tuple(loss_warnings(look)) if look is not None else (),

@@ -8,11 +8,13 @@ attribute, UsdColorSpaceAPI).
 """
 
 from collections.abc import Mapping
+from typing import Any
 
 from pxr import Gf, Sdf, Usd, UsdShade
 
 from service.asset.textures import DISPLAY_SPACE, Texture
 from service.usd.layers import AssetLayers
+from service.usd.openpbr import define_materialx_surface
 
 METALLIC, SPECULAR = "metallic", "specular"
 """The variants of `look`."""
@@ -37,13 +39,14 @@ _INPUT_TYPES = {
 """Input of the surface → its type; output of the texture, its type."""
 
 
-def define_looks(layers: AssetLayers, textures: Mapping[str, Texture], *, ior: float) -> None:
+def define_looks(layers: AssetLayers, textures: Mapping[str, Texture], *, ior: float, openpbr: Any = None) -> None:
     """Define a material for each look, and make them the variants of `look`.
 
     Args:
         textures: by name, written into the folder that `layers` names. Without `roughness` the surface is the fitted Lambertian: `ior` is
             1, so that nothing is reflected at normal incidence, and roughness is 1.
         ior: index of refraction of the dielectric share, in the metallic workflow.
+        openpbr: MaterialX.Document of the metallic look, which its material has for the render context `mtlx`; None: it has none.
 
     Convention:
         The normal map holds (n + 1)/2, so its texture has scale (2, 2, 2, 1) and bias (-1, -1, -1, 0) and is read raw.
@@ -55,6 +58,8 @@ def define_looks(layers: AssetLayers, textures: Mapping[str, Texture], *, ior: f
     surface.CreateInput("ior", _TYPES.Float).Set(ior)
     if "metallic" not in textures:
         surface.CreateInput("metallic", _TYPES.Float).Set(0.0)
+    if openpbr is not None:
+        define_materialx_surface(layers, metallic, openpbr)
     layers.add_look(METALLIC, metallic)
 
     specular = _define_material(layers, SPECULAR, "Specular", textures)

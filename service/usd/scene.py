@@ -4,6 +4,7 @@ Source: OpenUSD: UsdGeom (meshes, primvars).
 """
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from pxr import Sdf, Usd, UsdGeom, Vt
 
@@ -17,13 +18,14 @@ from stage.maps import SurfaceMaps
 
 
 def define_asset(layers: AssetLayers, maps: SurfaceMaps, meshes: Sequence[SurfaceMesh], textures: Mapping[str, Texture], *,
-                 ior: float) -> None:
+                 ior: float, openpbr: Any) -> None:
     """Define the prims of an asset of solved maps.
 
     Args:
         meshes: the full mesh, then its levels of detail.
         textures: written into the folder that `layers` names.
         ior: index of refraction of the dielectric share of the surface.
+        openpbr: MaterialX.Document of the surface, or None.
 
     Convention:
         The asset is in the camera frame.
@@ -36,7 +38,7 @@ def define_asset(layers: AssetLayers, maps: SurfaceMaps, meshes: Sequence[Surfac
         with layers.geometry_variant(level_name(number)) as geom:
             layers.add_surface(define_mesh(layers.geometry, geom.AppendChild(level_name(number).capitalize()), level).GetPath())
     UsdGeom.Scope.Define(layers.materials, layers.looks)
-    define_looks(layers, textures, ior=ior)
+    define_looks(layers, textures, ior=ior, openpbr=openpbr)
     define_camera(layers.geometry, layers.root.AppendChild("Camera"), maps.camera, meshes[0].extent)
 
 

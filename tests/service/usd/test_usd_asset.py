@@ -146,7 +146,7 @@ def test_the_report_says_what_was_written(suffix, tmp_path):
     assert report.path == tmp_path / f"a{suffix}" and report.step == 1
     assert report.clipped_pixels == dict.fromkeys(BALL_TEXTURES, 0) | {"diffuse_albedo": maps.mask.sum()}
     assert [warning.partition(":")[0] for warning in report.warnings] == ["material"]  # the base colour ends at 1
-    assert all(p.is_file() for p in report.textures) and len(report.textures) == (0 if suffix == ".usdz" else 5)
+    assert all(p.is_file() for p in report.textures) and len(report.textures) == (0 if suffix == ".usdz" else 6)
     fractions = [done for _, done in told]
     assert told[0] == ("mesh", 0.0) and fractions == sorted(fractions) and fractions[-1] < 1
 
@@ -169,7 +169,7 @@ def test_export_over_an_older_asset(ball, suffix, tmp_path):
     assert shader(usd_stage, "Surface").GetInput("ior").Get() == 1
     if suffix != ".usdz":
         kept = sorted(p.name for p in (tmp_path / "ball_textures").iterdir())
-        assert kept == ["base_color.png", "normal.png", "painted.png"]  # what is not ours stays
+        assert kept == ["base_color.png", "normal.png", "openpbr.mtlx", "painted.png"]  # what is not ours stays
     assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")]
 
 
