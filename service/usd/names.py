@@ -5,7 +5,6 @@ other readers of its files do not, so that words in other scripts are transliter
 """
 
 import re
-from collections.abc import Container
 
 from anyascii import anyascii
 
@@ -13,18 +12,12 @@ NAMELESS = "Asset"
 """Name of a prim whose text holds no letter and no digit."""
 
 
-def prim_name(text: str, taken: Container[str] = ()) -> str:
-    """Return a valid prim name that keeps the words of a text.
+def prim_name(text: str) -> str:
+    """Return a valid prim name that keeps the words of a text, which may be in any script.
 
-    Args:
-        text: in any script; what is no letter and no digit separates words, which are joined by _.
-        taken: names of the siblings; a number is added where the name is one of them.
+    Whatever is no letter and no digit separates words, which are joined by _. Only the root prim of an asset is named after a text, so that
+    the name needs to differ from no other.
     """
     words = re.findall(r"[A-Za-z0-9_]+", anyascii(text))
     name = "_".join(words).strip("_") or NAMELESS
-    if name[0].isdigit():
-        name = f"_{name}"
-    unique, number = name, 2
-    while unique in taken:
-        unique, number = f"{name}_{number}", number + 1
-    return unique
+    return f"_{name}" if name[0].isdigit() else name
