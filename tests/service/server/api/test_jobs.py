@@ -112,6 +112,13 @@ def test_an_export(server, client, solved):
     assert {"asset.usda", *(f"asset_layers/{name}" for name in ("payload.usda", "materials.usda", "geometry.usdc"))} <= made_by(client, job)
 
 
+def test_an_export_as_gltf(server, client, solved):
+    job = submit(client, kind="export", maps=solved, format="glb")
+    finish(server, client, job)
+    glb = client.get(f"/v1/jobs/{job['id']}/results/asset.glb").raise_for_status()
+    assert glb.content[:4] == b"glTF" and glb.headers["Content-Type"] == "model/gltf-binary"
+
+
 def test_what_a_job_reads_has_to_be_there_and_ready(server, client, dome, sky, solved, rig):
     receiving = client.post("/v1/captures", json={"name": "to come"}).raise_for_status().json()["id"]
     waiting = submit(client, kind="depth", capture=rig)
