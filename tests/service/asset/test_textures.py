@@ -41,21 +41,25 @@ def srgb_to_linear(encoded):
 
 
 def recomposed(mesh, encoded):
-    """Camera-frame normals at the vertices, on pixels, from a normal map and the mesh alone: a slow twin, face by face."""
+    """Camera-frame normals at the vertices, on pixels, from a normal map and the mesh alone: MikkTSpace, face by face."""
     points, st = mesh.points.astype(np.float64), mesh.st.astype(np.float64)
+    n = mesh.normals.astype(np.float64)
     tangent, start = np.zeros_like(points), 0
     for count in mesh.face_counts:
         corners = mesh.face_indices[start:start + count]
         start += count
-        for face in (corners[[0, k, k + 1]] for k in range(1, count - 1)):
-            # P is fitted as a plane over (s, t); the first slope is ∂P/∂s. For a rectangle that is the mean of both edges.
-            design = np.column_stack([np.ones(3), st[face]])
-            slope = np.linalg.solve(design, points[face])[1]
-            s, t = st[face].T
-            area = abs(np.dot(s, np.roll(t, -1)) - np.dot(t, np.roll(s, -1))) / 2
-            tangent[corners] += slope * area
-    n = mesh.normals.astype(np.float64)
-    tangent -= n * (tangent * n).sum(axis=1, keepdims=True)
+        diagonals = [[0, 1, 2], [0, 2, 3]], [[0, 1, 3], [1, 2, 3]]
+        across = [[np.sum((values[corners[i]] - values[corners[k % count]]) ** 2) for i, k in ((0, 2), (1, 3))] for values in (st, points)]
+        first = count == 3 or across[0][0] < across[0][1] or (across[0][0] == across[0][1] and across[1][0] <= across[1][1])
+        for face in (corners[diagonal] for diagonal in diagonals[0 if first else 1][:count - 2]):
+            # P is a plane over (s, t); the first slope is ∂P/∂s
+            slope = np.linalg.solve(np.column_stack([np.ones(3), st[face]]), points[face])[1]
+            for k in range(3):
+                flat = np.eye(3) - np.outer(n[face[k]], n[face[k]])
+                towards, one, two = (flat @ way for way in (slope, points[face[k - 1]] - points[face[k]],
+                                                            points[face[(k + 1) % 3]] - points[face[k]]))
+                angle = np.arccos(np.clip(one @ two / np.linalg.norm(one) / np.linalg.norm(two), -1, 1))
+                tangent[face[k]] += angle * towards / np.linalg.norm(towards)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     x, y, z = (encoded[mesh.rows, mesh.cols] * 2 - 1).T[..., None]
     return (x * tangent + y * np.cross(n, tangent) + z * n)[:mesh.centred]
