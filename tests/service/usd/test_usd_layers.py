@@ -138,11 +138,18 @@ def test_every_layer_says_where_it_comes_from(tmp_path):
         assert layer.pseudoRoot.GetInfo("upAxis") == "Y" and layer.pseudoRoot.GetInfo("metersPerUnit") == 1
 
 
-def test_a_shot_that_refers_to_the_asset_finds_its_provenance(tmp_path):
-    write_square(tmp_path / "square.usdc")
+@every_suffix
+def test_a_shot_that_refers_to_the_asset_chooses_variants_and_finds_its_provenance(suffix, tmp_path):
+    write_square(tmp_path / f"square{suffix}")
     shot = Usd.Stage.CreateInMemory()
     prim = shot.DefinePrim("/Shot/Square")
-    prim.GetReferences().AddReference(str(tmp_path / "square.usdc"))
+    prim.GetReferences().AddReference(str(tmp_path / f"square{suffix}"))
+    for name, value in (("geo", "lod1"), ("look", "gloss")):
+        prim.GetVariantSets().GetVariantSet(name).SetVariantSelection(value)
+    mesh, = (p for p in shot.Traverse() if p.IsA(UsdGeom.Boundable))
+    assert mesh.GetPath() == "/Shot/Square/Geom/MeshLod1"
+    assert UsdShade.MaterialBindingAPI(mesh).ComputeBoundMaterial()[0].GetPath() == "/Shot/Square/Looks/Gloss"
+    assert tuple(UsdGeom.ModelAPI(prim).GetExtentsHint()[1]) == (2, 3, 0)
     assert prim.GetAssetInfoByKey("relit:capture") == "sq" and Usd.ModelAPI(prim).GetAssetVersion() == "v007"
 
 
