@@ -51,26 +51,29 @@ def test_maps_written_by_hand_come_near_the_path_tracer(client, maps, truth, tmp
     assert found.rmse < MOST_ERROR[client]
 
 
-WAYS = [(client, suffix, textures, space)
-        for suffix, textures, space, clients in (
-            ("usdz", "png16", "lin_rec709_scene", (Client.BLENDER, Client.THREE, Client.MITSUBA)),
-            ("glb", "png16", "lin_rec709_scene", (Client.BLENDER, Client.THREE)),
-            ("usdz", "png8", "lin_ap1_scene", (Client.BLENDER, Client.THREE)),
-            ("usda", "exr", "lin_rec709_scene", (Client.BLENDER, Client.MITSUBA)),
-            ("usdc", "exr", "lin_ap1_scene", (Client.MITSUBA,)))
-        for client in clients]
-"""Program, file, textures, and colour space of the capture. Blender 5.0 takes every linear texture for Rec.709, whatever it declares."""
+PNG8, EXR = {"textures": TextureFormat.PNG8}, {"textures": TextureFormat.EXR}
+WAYS = {
+    "usdz": ({}, "lin_rec709_scene", (Client.BLENDER, Client.THREE, Client.MITSUBA)),
+    "glb": ({}, "lin_rec709_scene", (Client.BLENDER, Client.THREE)),
+    "usdz of ACEScg, 8 bits": (PNG8, "lin_ap1_scene", (Client.BLENDER, Client.THREE)),
+    "usdz with levels of detail": ({"levels": 2}, "lin_rec709_scene", (Client.BLENDER, Client.THREE)),
+    "usda with EXR": (EXR, "lin_rec709_scene", (Client.BLENDER, Client.MITSUBA)),
+    "usdc of ACEScg, EXR": (EXR, "lin_ap1_scene", (Client.MITSUBA,)),  # Blender 5.0 takes every linear texture for Rec.709
+}
+"""The options of an export, the colour space of the capture, and the programs that open it."""
 
 
-@pytest.mark.parametrize(("client", "suffix", "textures", "space"), WAYS, indirect=["client"])
-def test_exported_metals_are_as_bright_as_the_path_tracer_says(client, suffix, textures, space, maps, truth, tmp_path):
+@pytest.mark.parametrize(("client", "way"), [(client, way) for way, (*_, clients) in WAYS.items() for client in clients],
+                         indirect=["client"])
+def test_exported_metals_are_as_bright_as_the_path_tracer_says(client, way, maps, truth, tmp_path):
     """Whatever the file, the textures, and the colour space of the capture."""
+    options, space, _ = WAYS[way]
     true = replace(maps[0], color_space=space, diffuse_albedo=convert(maps[0].diffuse_albedo, "lin_rec709_scene", space),
                    specular=convert(maps[0].specular, "lin_rec709_scene", space))
     (tmp_path / "maps").mkdir()
     true.write(tmp_path / "maps" / MAPS_FILE)
-    asset = tmp_path / f"balls.{suffix}"
-    export(ExportRequest(maps=tmp_path / "maps", out=asset, textures=TextureFormat(textures)))
+    asset = tmp_path / f"balls.{way[:4].strip()}"
+    export(ExportRequest(maps=tmp_path / "maps", out=asset, **options))
     found = figures(client, asset, truth, maps)
     assert 0.9 < found.metal < 1.1
     assert 0.9 < found.dielectric < 1.1
