@@ -106,3 +106,12 @@ def test_what_the_validators_are_for_is_found(tmp_path):
     assert "DomeLight, which it does not know" in found
     assert "bound to no material" in found
     assert "NVIDIA" in found and "xtent" in found
+
+
+def test_a_wrong_materialx_document_is_found(tmp_path):
+    asset = exported(TWO, tmp_path, suffix="usda")
+    assert findings(asset) == []
+    document, = tmp_path.rglob("*.mtlx")
+    document.write_text(document.read_text().replace("base_color.png", "colour.png").replace("open_pbr_surface", "open_pbr_surfac"))
+    found = " ".join(findings(asset))
+    assert "there is no file colour.png" in found and "no definition of open_pbr_surfac" in found

@@ -7,6 +7,7 @@ from itertools import product
 from pathlib import Path, PurePosixPath
 from zipfile import ZipFile
 
+import MaterialX
 import usd_validation_nvidia
 from pxr import Usd, UsdGeom, UsdShade, UsdValidation
 
@@ -18,7 +19,10 @@ ARKIT_SHADERS = {"UsdPreviewSurface", "UsdUVTexture", "UsdTransform2d", "UsdPrim
 
 
 def findings(path: Path) -> list[str]:
-    """Return what UsdValidation, usd-validation-nvidia and ARKit's rules find in an asset: errors and warnings; none is right."""
+    """Return what UsdValidation, usd-validation-nvidia, MaterialX and ARKit's rules find in an asset: errors and warnings; none is right.
+
+    MaterialX documents are those beside the layer.
+    """
     issues = usd_validation_nvidia.ValidationEngine().validate(str(path)).issues()
     found = [f"NVIDIA: {issue.severity.name} {issue.message}" for issue in issues]
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
@@ -27,6 +31,8 @@ def findings(path: Path) -> list[str]:
             found.append(f"UsdValidation, {selected}: {each.GetName()} {each.GetMessage()}")
         if path.suffix == ".usdz":
             found += [f"ARKit, {selected}: {each}" for each in _arkit(usd_stage)]
+    for document in path.parent.rglob("*.mtlx"):
+        found += [f"MaterialX: {each}" for each in _materialx(document)]
     if path.suffix == ".usdz":
         with ZipFile(path) as package:
             names = package.namelist()
@@ -47,6 +53,22 @@ def with_variants(path: Path):
         for name, variant in zip(names, choice, strict=True):
             sets.GetVariantSet(name).SetVariantSelection(variant)
         yield usd_stage, "/".join(choice) or "as it is"
+
+
+def _materialx(path: Path):
+    document, libraries = MaterialX.createDocument(), MaterialX.createDocument()
+    MaterialX.readFromXmlFile(document, str(path))
+    MaterialX.loadLibraries(MaterialX.getDefaultDataLibraryFolders(), MaterialX.getDefaultDataSearchPath(), libraries)
+    document.setDataLibrary(libraries)
+    valid, message = document.validate()
+    if not valid:
+        yield message
+    for node in document.getNodes():
+        if node.getNodeDef() is None:
+            yield f"{node.getName()}: no definition of {node.getCategory()}"
+    for element in document.traverseTree():
+        if element.isA(MaterialX.Input) and element.getType() == "filename" and not (path.parent / element.getValueString()).is_file():
+            yield f"{element.getNamePath()}: there is no file {element.getValueString()}"
 
 
 def _arkit(usd_stage: Usd.Stage):
