@@ -17,7 +17,9 @@ from service.gltf import container, textures
 from service.gltf.asset import write_asset
 from service.gltf.container import read_glb
 from service.requests.export import TextureFormat
+from stage.camera import Camera
 from stage.errors import StorageError
+from stage.maps import SurfaceMaps
 from tests.scenes.surfaces import make_ball, make_sheet, make_wave
 from tests.service.gltf.khronos import findings, validate
 from tests.service.gltf.reading import Read
@@ -69,6 +71,37 @@ def test_khronos_validator_finds_nothing(tmp_path):
     assert {name: findings(report) for name, report in zip(SURFACES, reports, strict=True)} == {name: [] for name in SURFACES}
     for maps, report in zip(SURFACES.values(), reports, strict=True):
         assert report["info"]["totalVertexCount"] == len(height_mesh(maps).points)
+
+
+def random_surface(rng: np.random.Generator) -> SurfaceMaps:
+    """Noise of any height in a mask with holes, seen by any camera, with any layers: valid input, however unlikely."""
+    shape = rows, cols = tuple(rng.integers(2, 24, 2).tolist())
+    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    turn *= np.sign(np.linalg.det(turn))
+    pose = np.vstack([np.column_stack([turn, rng.normal(size=3)]), [0, 0, 0, 1]])
+    fields = {"resolution": (cols, rows), "world_from_camera": pose.tolist() if rng.random() < 0.5 else None}
+    height = rng.normal(size=shape) * 10 ** rng.uniform(-4, 2)
+    if rng.random() < 0.5:
+        camera = Camera(projection="perspective", focal_px=tuple(rng.uniform(20, 200, 2)), **fields)
+        height = -np.abs(height) - 1e-3
+    else:
+        camera = Camera(projection="orthographic", pixel_size_m=10 ** rng.uniform(-6, 0) if rng.random() < 0.5 else None, **fields)
+    normal = rng.normal(size=(*shape, 3))
+    layers = {"normal": normal / np.linalg.norm(normal, axis=-1, keepdims=True), "diffuse_albedo": 1.3 * rng.random((*shape, 3)),
+              "specular": rng.random((*shape, 3)), "roughness": rng.random(shape), "part": rng.integers(1, 4, shape).astype(np.uint8)}
+    kept = {name: layer if name == "part" else layer.astype(np.float32) for name, layer in layers.items() if rng.random() < 0.7}
+    return SurfaceMaps(camera=camera, mask=rng.random(shape) < rng.choice([0.6, 0.9, 1]), height=height.astype(np.float32), **kept)
+
+
+def test_khronos_validator_finds_nothing_in_noise(tmp_path):
+    rng, files = np.random.default_rng(0), []
+    for number in range(40):
+        try:
+            files.append(write_asset(random_surface(rng), tmp_path / f"{number}.glb", name="Noise").path)
+        except AssetError as error:
+            assert "no face" in str(error)  # in a small mask with holes
+    assert len(files) > 20
+    assert [findings(report) for report in validate(*files)] == [[]] * len(files)
 
 
 @pytest.mark.parametrize("maps", SURFACES.values(), ids=SURFACES)
