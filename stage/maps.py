@@ -1,6 +1,6 @@
 """The solved surface maps of one capture, and their file, maps.exr."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -94,12 +94,13 @@ class SurfaceMaps:
         exr.write(path, channels, color_space=self.color_space, metadata=result_metadata(self.camera, self.provenance))
 
     @classmethod
-    def read(cls, path: str | Path, *, unsure: bool = False) -> "SurfaceMaps":
+    def read(cls, path: str | Path, *, unsure: bool = False, layers: Collection[str] = tuple(LAYERS)) -> "SurfaceMaps":
         """Read a maps.exr that Relit wrote.
 
         Args:
             path: the file.
             unsure: keep the values of pixels that are estimated and do not count as solved; else they are 0.
+            layers: the layers to read beside `mask`; the others are None.
 
         Raises:
             ResultError: a layer is incomplete or not finite, or the metadata holds no camera.
@@ -110,12 +111,16 @@ class SurfaceMaps:
         found: dict[str, np.ndarray] = {}
         for name, (suffixes, _) in LAYERS.items():
             names = [f"{name}.{s}" for s in suffixes]
+            if name not in layers and name != "mask":
+                for unused in names:
+                    channels.pop(unused, None)
+                continue
             present = [n for n in names if n in channels]
             if not present:
                 continue
             if len(present) < len(names):
                 raise ResultError(f"{path}: layer {name} lacks channel {next(n for n in names if n not in channels)}")
-            planes = [channels[n].astype(np.float32) for n in names]
+            planes = [channels.pop(n).astype(np.float32) for n in names]
             if bad := sum(int((~np.isfinite(plane)).sum()) for plane in planes):
                 raise ResultError(f"{path}: layer {name} has {bad} values that are not finite")
             found[name] = planes[0] if len(planes) == 1 else np.stack(planes, axis=-1)

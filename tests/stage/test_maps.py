@@ -71,6 +71,13 @@ def test_a_layer_that_was_not_estimated_is_absent_not_zero(tmp_path, absent):
     assert getattr(SurfaceMaps.read(tmp_path / "maps.exr"), absent) is None
 
 
+def test_layers_that_are_not_wanted_are_left_out(tmp_path):
+    make_maps().write(tmp_path / "maps.exr")
+    whole, some = SurfaceMaps.read(tmp_path / "maps.exr"), SurfaceMaps.read(tmp_path / "maps.exr", layers=("normal", "part"))
+    assert set(some.layers()) == {"normal", "part", "mask"} and some.part is not None and some.part.dtype == np.uint8
+    assert np.array_equal(some.normal, whole.normal) and np.array_equal(some.mask, whole.mask)
+
+
 def test_every_lobe_is_changed_and_nothing_else():
     maps = make_maps(second_specular=None)
     changed = maps.with_lobes(lambda specular, roughness: (2 * specular, roughness + 1))
