@@ -13,7 +13,7 @@ from service.asset.mesh import SurfaceMesh
 from service.asset.metallic import metallic_look
 from service.asset.textures import FILE_NAMES, write_textures
 from service.requests.export import FIRST_VERSION, Geometry, TextureFormat
-from service.usd.camera import define_camera
+from service.usd.camera import define_cameras
 from service.usd.files import check_textures, install, temporary_folder_beside
 from service.usd.layers import LAYER_FILES, AssetLayers, Description, texture_folder
 from service.usd.materials import define_display_color_material, define_looks
@@ -81,7 +81,7 @@ def write_depth(maps: DepthMaps, cloud: PointCloud | None, path: str | Path, *, 
                 _add_points(layers, parts, maps)
             elif parts.mesh is not None:
                 _add_mesh(layers, parts.mesh, parts.colours, maps, folder, textures)
-        define_camera(layers.geometry, layers.root.AppendChild("Camera"), maps.camera, parts.extent)
+        define_cameras(layers.geometry, layers.root, maps.camera, parts.extent)
         layers.save()
         first, *others = layers.files
         install(target, first, [*others, *sorted(folder.iterdir())], ours=(*LAYER_FILES, *FILE_NAMES))

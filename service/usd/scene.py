@@ -11,7 +11,7 @@ from pxr import Sdf, Usd, UsdGeom, Vt
 from service.asset.mesh import SurfaceMesh
 from service.asset.textures import Texture
 from service.asset.units import SCALE_NOTE
-from service.usd.camera import define_camera
+from service.usd.camera import define_cameras
 from service.usd.layers import AssetLayers
 from service.usd.materials import define_looks
 from stage.maps import SurfaceMaps
@@ -39,7 +39,7 @@ def define_asset(layers: AssetLayers, maps: SurfaceMaps, meshes: Sequence[Surfac
             layers.add_surface(define_mesh(layers.geometry, geom.AppendChild(level_name(number).capitalize()), level).GetPath())
     UsdGeom.Scope.Define(layers.materials, layers.looks)
     define_looks(layers, textures, ior=ior, openpbr=openpbr)
-    define_camera(layers.geometry, layers.root.AppendChild("Camera"), maps.camera, meshes[0].extent)
+    define_cameras(layers.geometry, layers.root, maps.camera, meshes[0].extent)
 
 
 def level_name(number: int) -> str:

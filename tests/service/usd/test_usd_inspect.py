@@ -42,7 +42,8 @@ def test_a_ball(ball, suffix, tmp_path):
     assert (normals.name, normals.interpolation, normals.count) == ("normals", "vertex", mesh.vertices) and normals.high[2] <= 1
     assert st.name == "st" and min(st.low) > 0 and max(st.high) < 1
     assert found.provenance["relit:method"] == "svbrdf" and json.loads(found.provenance["relit:camera"])["resolution"] == [24, 24]
-    camera, = found.cameras
+    camera, far = found.cameras
+    assert far.path.endswith("/CameraPerspective")
     assert camera.path == "/Kugel/Camera" and camera.projection == "orthographic"
     side = f"{24 * ball.camera.pixel_size_m:.6g}"
     assert camera.framing == f"{side} × {side} m"
