@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from service.light.environments import SUFFIXES
 from service.light.sequence import time_steps
 from service.reporting.progress import Progress, Timings
 from stage import images, jxl
 from stage.capture import Capture
+from stage.environment_maps import SUFFIXES
 from stage.errors import ImageError, ManifestError, storage
 from stage.files import resolved
 from stage.manifest import FILE_NAME, Manifest, read_manifest

@@ -11,11 +11,8 @@ import numpy as np
 from kernels.relight.environment_sources import EnvironmentSamples, sample_environment
 from service.errors import RequestError
 from service.requests.frame_range import numbered
-from stage import exr, fingerprint, images
-from stage.colour import convert
-from stage.errors import ImageError
-
-SUFFIXES = {".exr", ".hdr"}
+from stage import fingerprint
+from stage.environment_maps import check_environment, read_environment
 
 
 class EnvironmentMap:
@@ -60,13 +57,9 @@ class Environments:
             StorageError: an environment map cannot be opened.
         """
         for path, number in {self.path(number): number for number in numbers}.items():
-            if path.suffix.lower() not in SUFFIXES:
-                raise ImageError(f"{path}: an environment is a lat-long .exr or .hdr")
             if self._sequence and not path.exists():
                 raise RequestError(f"--environment {self._pattern}: frame {number} has no map: {path} is not there")
-            header = images.read_header(path)
-            if header.width != 2 * header.height:
-                raise ImageError(f"{path}: is {header.width}x{header.height}: a lat-long map is twice as wide as high")
+            check_environment(path)
 
     def read(self, path: Path, space: str) -> EnvironmentMap:
         """Return one environment map in a working space; the last one that was read is kept.
@@ -75,7 +68,7 @@ class Environments:
             ImageError: impossible values (counted), or a colour space that is not known.
         """
         if self._last is None or self._last[:2] != (path, space):
-            self._last = (path, space, EnvironmentMap(_read_radiance(path, space)))
+            self._last = (path, space, EnvironmentMap(read_environment(path, space)))
         return self._last[2]
 
     def content(self, path: Path) -> str:
@@ -83,14 +76,3 @@ class Environments:
         if path not in self._digests:
             self._digests[path] = fingerprint.digest(path)
         return self._digests[path]
-
-
-def _read_radiance(path: Path, space: str) -> np.ndarray:
-    pixels = images.read_pixels(path).astype(np.float32)
-    images.check_radiance(path, pixels)
-    try:
-        given = exr.color_space_of(exr.read_header(path).metadata) if path.suffix.lower() == ".exr" else "lin_rec709_scene"
-        converted = convert(pixels, given, space)
-    except ValueError as error:
-        raise ImageError(f"{path}: {error}") from error
-    return np.maximum(converted, 0)  # a colour outside the working space's gamut has a negative channel
