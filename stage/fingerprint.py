@@ -64,3 +64,8 @@ def digest(path: str | Path) -> str:
         while block := stream.read(BLOCK):
             content.update(block)
     return content.hexdigest()
+
+
+def combined(digests: Iterable[str]) -> str:
+    """Return the content hash of several files from theirs, in their order."""
+    return hashlib.blake2b("".join(digests).encode(), digest_size=16).hexdigest()

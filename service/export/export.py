@@ -8,6 +8,7 @@ from typing import NamedTuple, get_args
 from service.asset.errors import AssetError
 from service.asset.repair import repair_heights
 from service.errors import RequestError
+from service.export.surroundings import content_hashes, open_surroundings, refuse_surroundings
 from service.gltf.asset import AssetReport as InGltf
 from service.gltf.asset import write_asset as write_gltf_asset
 from service.gltf.depth_asset import write_depth as write_gltf_depth
@@ -45,7 +46,8 @@ def export(request: ExportRequest, progress: Progress | None = None) -> Exported
 
     Raises:
         ResultError: the maps are missing or incomplete.
-        RequestError: a geometry is asked for solved maps, or levels of detail of a depth or in a .glb.
+        RequestError: a geometry is asked for solved maps, or levels of detail, lights or frames of a depth or in a .glb.
+        ManifestError, ImageError: the capture of the rig, the environment or the frames of the card cannot be used.
         AssetError: an unknown suffix, EXR textures in a .usdz or .glb, no height, a height that
             contradicts its normals, or no face.
         StorageError: the asset cannot be written; nothing is left half-written.
@@ -60,6 +62,8 @@ def export(request: ExportRequest, progress: Progress | None = None) -> Exported
     of_depth = depth.name == DEPTH_FILE and depth.exists() and (request.geometry is not None or not path.exists() or path == depth)
     if not of_depth and not path.exists():
         raise ResultError(f"{path}: is not there: run `relit solve` or `relit depth` first")
+    if of_depth or suffix == GLB:
+        refuse_surroundings(request)
     if of_depth:
         if request.levels:
             raise RequestError(f"--levels {request.levels}: is for solved maps, {depth} holds a depth: leave the option out")
@@ -70,7 +74,9 @@ def export(request: ExportRequest, progress: Progress | None = None) -> Exported
         if suffix == GLB and request.levels:
             raise RequestError(f"--levels {request.levels}: a .glb holds one mesh: name a .usdz, .usda or .usdc, or leave the option out")
         maps = SurfaceMaps.read(path, layers=EXPORTED_LAYERS)
-        maps = replace(maps, provenance={**maps.provenance, **export_metadata(request, {path.stem: digest(path)})})
+        around = open_surroundings(request, maps.camera)
+        contents = {path.stem: digest(path), **content_hashes(around)}
+        maps = replace(maps, provenance={**maps.provenance, **export_metadata(request, contents)})
         timings.stage("asset", 1)
         maps, _, repairs = repair_heights(maps)
         warnings += repairs
@@ -79,7 +85,7 @@ def export(request: ExportRequest, progress: Progress | None = None) -> Exported
             report: InGltf | InUsd = write_gltf_asset(maps, request.out, name=name, version=request.version, textures=request.textures)
         else:
             report = write_usd_asset(maps, request.out, name=name, version=request.version, textures=request.textures,
-                                     levels=request.levels)
+                                     levels=request.levels, surroundings=around)
         sizes = report.sizes
         warnings += report.warnings
         if maps.diffuse_albedo is None:

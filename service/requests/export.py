@@ -55,3 +55,12 @@ class ExportRequest(ExportOptions):
     """Folder with maps.exr or depth.exr, or the file."""
     out: Annotated[Path, Role.OUTPUT]
     """The asset: .usdz, .usda, .usdc or .glb (binary glTF)."""
+    rig: Annotated[Path | None, Role.INPUT, Spelling(metavar="CAPTURE")] = None
+    """Capture that was solved: its lights come along as UsdLux lights whose intensities replay it, as a variant that is off. For .usdz,
+    .usda and .usdc of solved maps."""
+    environment: Annotated[Path | None, Role.INPUT] = None
+    """Lat-long environment map, .exr or .hdr: it comes along as a DomeLight, as a variant that is off. For .usdz, .usda and .usdc of solved
+    maps."""
+    card: Annotated[Path | None, Role.INPUT, Spelling(metavar="FRAMES")] = None
+    """Relit frames of the capture, such as frame.####.exr: they come along on a rectangle in the plane of the image, as a variant of the
+    geometry. For .usdz, .usda and .usdc of solved maps."""

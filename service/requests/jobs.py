@@ -93,6 +93,10 @@ class ExportJob(JobRequest):
     kind: Literal["export"]
     maps: Annotated[JobId, Role.INPUT, MAPS]
     """The job that made the maps or the depth."""
+    rig: Annotated[CaptureId | None, Role.INPUT, Spelling(metavar="CAPTURE")] = None
+    """Capture that was solved: its lights come along as UsdLux lights whose intensities replay it, as a variant that is off."""
+    environment: Annotated[EnvironmentId | None, Role.INPUT] = None
+    """Lat-long environment: it comes along as a DomeLight, as a variant that is off."""
     format: AssetFormat = "usdz"
     """Format of the asset."""
     options: ExportOptions = ExportOptions()

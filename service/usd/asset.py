@@ -12,8 +12,9 @@ from service.asset.textures import FILE_NAMES, write_textures
 from service.asset.units import unit_in_metres
 from service.requests.export import FIRST_VERSION, TextureFormat
 from service.usd.files import check_textures, install, temporary_folder_beside
-from service.usd.layers import LAYER_FILES, AssetLayers, Description, texture_folder
+from service.usd.layers import OWN_FILES, AssetLayers, Description, texture_folder
 from service.usd.scene import define_asset, level_name
+from service.usd.surroundings import Surroundings, define_surroundings, written_before
 from stage.maps import SurfaceMaps
 
 Progress = Callable[[str, float], None]
@@ -21,6 +22,10 @@ Progress = Callable[[str, float], None]
 
 TEXTURES_START, TEXTURES_END = 0.1, 0.9
 """Fractions of the whole at which the textures begin and end, as measured for 4000 by 3000 pixels."""
+
+
+NOTHING = Surroundings()
+"""No surroundings."""
 
 
 class AssetReport(NamedTuple):
@@ -42,7 +47,8 @@ class AssetReport(NamedTuple):
 
 
 def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str = FIRST_VERSION,
-                textures: TextureFormat = TextureFormat.PNG16, levels: int = 0, progress: Progress | None = None) -> AssetReport:
+                textures: TextureFormat = TextureFormat.PNG16, levels: int = 0, surroundings: Surroundings = NOTHING,
+                progress: Progress | None = None) -> AssetReport:
     """Write solved maps as a USD asset.
 
     Args:
@@ -53,6 +59,7 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str 
         version: of the asset, for assetInfo.
         textures: how they are stored.
         levels: of detail, at most.
+        surroundings: lights and frames that the asset brings along.
         progress: called before each part of the work.
 
     Raises:
@@ -84,11 +91,14 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str 
             beside.append(write_openpbr(openpbr, folder))
         layers = AssetLayers(temporary, target, description)
         define_asset(layers, maps, [mesh, *coarser], written, ior=look.ior if look is not None else IOR_LIMITS[0], openpbr=openpbr)
+        around = define_surroundings(layers, surroundings, maps.camera, mesh.extent, folder, packed=packed)
+        beside += around.files
         layers.save()
         first, *others = layers.files
-        install(target, first, [*others, *beside], ours=(*LAYER_FILES, *FILE_NAMES, DOCUMENT))
+        install(target, first, [*others, *beside],
+                ours=(*OWN_FILES, *FILE_NAMES, DOCUMENT, *written_before(target.parent / folder.name)))
     installed = () if packed else tuple(target.parent / folder.name / file.name for file in beside)
     return AssetReport(target, installed, len(mesh.points), len(mesh.face_counts), mesh.step,
-                       {name: texture.clipped_pixels for name, texture in written.items()},
+                       {**{name: texture.clipped_pixels for name, texture in written.items()}, **around.clipped_pixels},
                        tuple(loss_warnings(look)) if look is not None else (),
                        tuple((len(level.points), len(level.triangles)) for level in coarser))

@@ -1,11 +1,12 @@
-"""The layers of an asset while it is written, with its variant sets `geo` and `look`.
+"""The layers of an asset while it is written, with its variant sets `geo`, `look` and `light`.
 
 A .usda or .usdc asset is a small interface layer (root prim, variant sets, extents) with a payload: `<stem>_layers/payload.usda`, which
 has `geometry.usdc` and `materials.usda` as sublayers. A .usdz is one layer: ARKit takes no package whose root layer refers to others, and
 three.js reads neither payloads nor sublayers of binary layers.
 
 The prims of the first variant of `geo` are ordinary prims, and each further variant deactivates them and has prims of its own. Readers that
-do not know variants therefore see the first one, and nothing twice. The variants of `look` bind one material each.
+do not know variants therefore see the first one, and nothing twice. The variants of `look` bind one material each. A variant of `light`
+refers to the layer `<stem>_layers/<variant>.usda`, and the default, `off`, to none, so that an asset brings no lights into a scene.
 
 Source: OpenUSD: UsdVariantSet, UsdModelAPI (kind, assetInfo), UsdGeomModelAPI (extentsHint), LIVERPS strength ordering (an opinion in a
 variant is weaker than one beside it, so that what variants change is stated in variants alone).
@@ -24,12 +25,19 @@ from service.usd.files import check_suffix
 from service.usd.names import prim_name
 from stage.camera import Camera
 
-GEO, LOOK = "geo", "look"
+GEO, LOOK, LIGHT = "geo", "look", "light"
 """The variant sets."""
+
+FRAME_RATE = 24.0
+"""Time codes, which are frame numbers, a second."""
 
 PAYLOAD, GEOMETRY, MATERIALS = "payload.usda", "geometry.usdc", "materials.usda"
 """Layers of a .usda or .usdc asset beside its interface: the same files whatever the suffix, so that a .usda and a .usdc can share them."""
 LAYER_FILES = (PAYLOAD, GEOMETRY, MATERIALS)
+LIGHT_OFF, RIG, ENVIRONMENT = "off", "rig", "environment"
+"""The variants of `light`; the layer of each but the first is named after it."""
+OWN_FILES = (*LAYER_FILES, *(f"{name}.usda" for name in (RIG, ENVIRONMENT)))
+"""Every file that an asset can have in its folder of layers."""
 
 PURPOSES = [UsdGeom.Tokens.default_, UsdGeom.Tokens.render, UsdGeom.Tokens.proxy, UsdGeom.Tokens.guide]
 """All of them: extents hold the geometry of every purpose."""
@@ -82,6 +90,8 @@ class AssetLayers:
         self._surfaces: list[tuple[str, Sdf.Path]] = []
         self._looks: dict[str, Sdf.Path] = {}
         self._bindings: list[tuple[str, Sdf.Path, Sdf.Path]] = []
+        self._lightings: list[str] = []
+        self._times: list[float] = []
 
     @property
     def geom(self) -> Sdf.Path:
@@ -122,8 +132,27 @@ class AssetLayers:
         """Make a material, which lies below `looks` on the stage `materials`, a variant of `look`; the first is the default."""
         self._looks[name] = material.GetPath()
 
+    @contextmanager
+    def lighting(self, name: str) -> Iterator[Usd.Stage]:
+        """Define a variant of `light`, RIG or ENVIRONMENT, inside the block: below `root`, on the yielded stage."""
+        self._lightings.append(name)
+        if self._packed:
+            with _in_variant(self._interface, self.root, LIGHT, name):
+                yield self._interface
+        else:
+            file = self._interface_file.parent / self.files[1].parent.name / f"{name}.usda"
+            lights = self._create(file, posed=True)  # so that the layer can be opened without the asset
+            self.files += (file,)
+            yield lights
+            lights.Save()
+
+    def set_times(self, usd_stage: Usd.Stage, first: float, last: float) -> None:
+        """Let a stage of the asset, and the asset with it, reach from one time code to another, both included."""
+        self._times += [first, last]
+        _set_times(usd_stage, first, last)
+
     def save(self) -> None:
-        """Bind the looks, write variant sets and extents, and save the layers; the object is of no use afterwards."""
+        """Bind the looks, write variant sets, extents and times, and save the layers; the object is of no use afterwards."""
         for name, material in self._looks.items():
             for geometry, surface in self._surfaces:
                 self._bind(geometry, surface, name, material)
@@ -138,9 +167,17 @@ class AssetLayers:
                 model.SetExtentsHint(model.ComputeExtentsHint(UsdGeom.BBoxCache(Usd.TimeCode.Default(), PURPOSES)))
         for name in self._looks:
             root.GetVariantSets().AddVariantSet(LOOK).AddVariant(name)
-        for variant_set, variants in ((GEO, self._geometries), (LOOK, [*self._looks])):
+        lightings = [LIGHT_OFF, *self._lightings] if self._lightings else []
+        for name in lightings:
+            root.GetVariantSets().AddVariantSet(LIGHT).AddVariant(name)
+            if name != LIGHT_OFF and not self._packed:
+                with _in_variant(self._interface, self.root, LIGHT, name):
+                    root.GetReferences().AddReference(f"./{self.files[1].parent.name}/{name}.usda")
+        for variant_set, variants in ((GEO, self._geometries), (LOOK, [*self._looks]), (LIGHT, lightings)):
             if variants:
                 root.GetVariantSets().GetVariantSet(variant_set).SetVariantSelection(variants[0])
+        if self._times:
+            _set_times(self._interface, min(self._times), max(self._times))
         self._interface.Save()
         del self.geometry, self.materials, self._interface
 
@@ -164,8 +201,12 @@ class AssetLayers:
         root = self._interface.GetPrimAtPath(self.root)
         root.GetPayloads().AddPayload(f"./{self.files[1].parent.name}/{PAYLOAD}")
 
-    def _create(self, file: Path) -> Usd.Stage:
-        """Return a new stage with axes, unit, default prim and provenance; the root prim of the interface says what the asset is."""
+    def _create(self, file: Path, *, posed: bool = False) -> Usd.Stage:
+        """Return a new stage with axes, unit, default prim and provenance; the root prim of the interface says what the asset is.
+
+        Args:
+            posed: whether the root prim has the pose of the camera frame, which that of the interface has in any case.
+        """
         description = self._description
         usd_stage: Usd.Stage = Usd.Stage.CreateNew(str(file))
         UsdGeom.SetStageUpAxis(usd_stage, UsdGeom.Tokens.y)
@@ -180,8 +221,8 @@ class AssetLayers:
         if file == self._interface_file:
             describe_root(root, name=description.name, identifier=self._identifier, version=description.version,
                           provenance=description.provenance)
-            if description.camera.world_from_camera is not None:
-                root.AddTransformOp().Set(_matrix(description.camera.world_from_camera, description.unit_m))
+        if (posed or file == self._interface_file) and description.camera.world_from_camera is not None:
+            root.AddTransformOp().Set(_matrix(description.camera.world_from_camera, description.unit_m))
         return usd_stage
 
 
@@ -227,6 +268,13 @@ def _in_variant(usd_stage: Usd.Stage, root: Sdf.Path, variant_set: str, name: st
         yield
     with Usd.EditContext(usd_stage, session):
         variants.ClearVariantSelection()
+
+
+def _set_times(usd_stage: Usd.Stage, first: float, last: float) -> None:
+    usd_stage.SetStartTimeCode(first)
+    usd_stage.SetEndTimeCode(last)
+    usd_stage.SetTimeCodesPerSecond(FRAME_RATE)
+    usd_stage.SetFramesPerSecond(FRAME_RATE)
 
 
 def _matrix(world_from_camera: tuple[tuple[float, ...], ...], unit_m: float) -> Gf.Matrix4d:

@@ -153,7 +153,8 @@ def _export(job: Job, request: ExportJob, context: WorkerContext, progress: Prog
     from service.requests.export import ExportRequest
 
     export(ExportRequest(maps=job_maps(job, request.maps, context, progress), out=_out(job, context) / f"{layout.ASSET}.{request.format}",
-                         **dict(request.options)), progress)
+                         rig=None if request.rig is None else _intake(job, request.rig, context, progress),
+                         environment=_environment(job, request.environment, context, progress), **dict(request.options)), progress)
 
 
 def _relight(job: Job, request: RelightJob, only: str, context: WorkerContext, progress: Progress) -> None:

@@ -1,0 +1,74 @@
+"""What an asset brings along beside its surface, each as a variant that is not selected: lights, an environment, relit frames."""
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from service.asset import card as card_images
+from service.usd.card import define_card
+from service.usd.environment import define_dome, write_dome_texture
+from service.usd.layers import ENVIRONMENT, RIG, AssetLayers
+from service.usd.rig import define_rig
+from stage.camera import Camera
+from stage.capture import Capture
+
+_FILES = re.compile(rf"{ENVIRONMENT}\.exr|{RIG}_\d+\.exr|{card_images.FILE_PATTERN}")
+"""Every file that define_surroundings can write."""
+
+
+class Surroundings(NamedTuple):
+    """What an asset brings along; the camera of the capture and of the frames is that of the asset."""
+
+    rig: Capture | None = None
+    """Whose lights become the variant `rig` of `light`."""
+    environment: Path | None = None
+    """Lat-long map, which becomes the variant `environment` of `light`."""
+    card: Mapping[int, Path] | None = None
+    """Relit frames by their numbers, which become the variant `card` of `geo`."""
+
+
+class Written(NamedTuple):
+    """The textures of the surroundings."""
+
+    files: list[Path]
+    clipped_pixels: dict[str, int]  # what → pixels that did not fit into 0…1
+
+
+def define_surroundings(layers: AssetLayers, surroundings: Surroundings, camera: Camera, extent: np.ndarray, folder: Path, *,
+                        packed: bool) -> Written:
+    """Define the variants of `light` and `geo` that are asked for, and write their textures.
+
+    Args:
+        extent: [2, 3] bounding box of the surface, camera frame, scene units.
+        folder: temporary, of the textures.
+        packed: for a .usdz, which holds the images of a card as PNG.
+
+    Raises:
+        AssetError: lights that cannot be placed.
+        ImageError: an environment or a frame that cannot be used.
+        StorageError: a file cannot be read or written.
+    """
+    files: list[Path] = []
+    clipped_pixels: dict[str, int] = {}
+    if surroundings.card is not None:
+        written = card_images.write_card(surroundings.card, folder, as_png=packed)
+        define_card(layers, written, camera, extent)
+        files += [folder / name for names in (written.colours, written.opacities) for name in names.values()]
+        clipped_pixels["card"] = written.clipped_pixels
+    if surroundings.rig is not None:
+        files += define_rig(layers, surroundings.rig, folder, extent)
+    if surroundings.environment is not None:
+        texture = folder / f"{ENVIRONMENT}.exr"
+        write_dome_texture(surroundings.environment, texture)
+        files.append(texture)
+        with layers.lighting(ENVIRONMENT) as usd_stage:
+            define_dome(usd_stage, layers.root.AppendChild("Environment"), f"{layers.texture_folder}/{texture.name}")
+    return Written(files, clipped_pixels)
+
+
+def written_before(folder: Path) -> list[str]:
+    """Return the names of the files in the texture folder of an older asset that its surroundings had."""
+    return [file.name for file in folder.iterdir() if _FILES.fullmatch(file.name)] if folder.is_dir() else []
