@@ -90,7 +90,7 @@ def test_a_library_lives_in_one_place(library, home):
 
 
 def test_opencv_lives_where_motion_is_tracked_rigs_are_calibrated_and_distances_measured():
-    allowed = "stage.motion", "stage.calibration", "stage.matte"
+    allowed = "stage.motion", "stage.calibration", "stage.mask_border"
     assert {i.importer for i in IMPORTS if top(i.target) == "cv2" and not under(i.importer, *allowed)} == set()
 
 

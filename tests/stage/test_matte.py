@@ -36,7 +36,7 @@ def found(folder, scene: Covered, mask=None, **options) -> Matte:
 
 def edge_error(scene: Covered, coverage, grey=None, factor=None):
     """Mean error over the partly covered pixels: of the coverage, or of the picture under all lights over a grey, as a share of it."""
-    partly = (scene.coverage > 0) & (scene.coverage < 1)
+    partly = (scene.coverage > 0.01) & (scene.coverage < 0.99)
     if grey is None:
         return np.abs(coverage - scene.coverage)[partly].mean()
     truth = scene.object.mean(axis=0) + (1 - scene.coverage[..., None]) * grey
@@ -68,6 +68,35 @@ def test_a_mask_that_is_a_pixel_off_has_the_same_coverage(tmp_path, change):
     mask = change(np.uint8(scene.coverage > 0.5), np.ones((3, 3))) > 0
     assert edge_error(scene, np.float32(mask)) > 0.35
     assert edge_error(scene, found(tmp_path, scene, mask).coverage) < 0.05
+
+
+def test_a_rim_that_is_black_under_every_light_follows_the_mask(tmp_path):
+    """As that of a mirror, here along the left half: the images cannot tell it from the background."""
+    scene = render_covered(size=64, lights=16)
+    depth = cv2.distanceTransform(np.uint8(scene.coverage > 0.5), cv2.DIST_L2, 5)
+    black = (depth < 2.5) & (np.arange(64) < 32)
+    matte = found(tmp_path, scene._replace(images=scene.images * np.where(black, 0.01, 1)[..., None]))
+    assert matte.source is MatteSource.IMAGES
+    left, right = (scene._replace(coverage=np.where((np.arange(64) < 32) == side, scene.coverage, 0)) for side in (True, False))
+    assert edge_error(right, matte.coverage) < 0.06
+    assert edge_error(left, matte.coverage) < 0.15 < edge_error(left, np.float32(scene.coverage > 0.5))  # a smoothed mask
+    whole = (scene.coverage == 1) & (np.arange(64) < 28)  # away from where the black rim begins
+    assert matte.coverage[whole].min() > 0.6 and matte.coverage[whole].mean() > 0.99
+
+
+@pytest.mark.parametrize("blur_px", [1.2, 3.0])
+def test_an_object_out_of_focus_has_a_wide_border(tmp_path, blur_px):
+    scene = render_covered(size=80, lights=16)
+
+    def blurred(image):
+        return cv2.GaussianBlur(image, (0, 0), blur_px)
+
+    scene = Covered(blurred(scene.coverage), scene.directions, np.stack([blurred(image) for image in scene.images]),
+                    np.stack([blurred(image) for image in scene.object]))
+    matte = found(tmp_path, scene)
+    assert matte.source is MatteSource.IMAGES
+    # of a rim that is wider than its shading is even, the more the wider
+    assert edge_error(scene, matte.coverage) < 0.05 * blur_px**0.5 < edge_error(scene, np.float32(scene.coverage > 0.5))
 
 
 def test_a_lit_wall_with_moving_shadows_is_kept(tmp_path):
