@@ -119,13 +119,13 @@ def _inspect(usd_stage: Usd.Stage, path: Path, warnings: list[str], errors: list
                 f"{prim.GetPath()} ({prim.GetTypeName()})" for prim in usd_stage.Traverse() if prim.HasAPI(UsdLux.LightAPI))
             _find(usd_stage, root, warnings, errors)
     start, end = usd_stage.GetStartTimeCode(), usd_stage.GetEndTimeCode()
-    layers = [layer for layer in usd_stage.GetUsedLayers() if not layer.anonymous and layer != usd_stage.GetRootLayer()]
-    files = {texture.file: texture.size_bytes or 0 for look in looks.values() for material in look for texture in material.textures()}
-    size = path.stat().st_size if path.suffix.lower() == ".usdz" else (
-        path.stat().st_size + sum(Path(layer.realPath).stat().st_size for layer in layers) + sum(files.values()))
+    layers, files, _ = UsdUtils.ComputeAllDependencies(str(path))  # of every variant
+    others = [layer for layer in layers if layer != usd_stage.GetRootLayer()]
+    packed = path.suffix.lower() == ".usdz"
+    size = path.stat().st_size + (0 if packed else sum(Path(file).stat().st_size for file in [*(each.realPath for each in others), *files]))
     sets = root.GetVariantSets() if root else None
     return Inspection(
-        file=str(path), size_bytes=size, layers=tuple(sorted(_relative(layer, path) for layer in layers)),
+        file=str(path), size_bytes=size, layers=tuple(sorted(_relative(layer, path) for layer in others)),
         default_prim=str(root.GetPath()) if root else None, kind=(Usd.ModelAPI(root).GetKind() or None) if root else None,
         asset_info=dict(_flat(Usd.ModelAPI(root).GetAssetInfo())) if root else {},
         notes=dict(entry for spec in reversed(root.GetPrimStack()) for entry in _flat(spec.customData)) if root else {},
@@ -134,8 +134,7 @@ def _inspect(usd_stage: Usd.Stage, path: Path, warnings: list[str], errors: list
         extent_m=_extent(root, unit_m) if root else None,
         variants={name: tuple(sets.GetVariantSet(name).GetVariantNames()) for name in sets.GetNames()} if sets else {},
         selections=dict(sets.GetAllVariantSelections()) if sets else {},
-        meshes=meshes, points=points, looks=looks,
-        lights=lights,
+        meshes=meshes, points=points, looks=looks, lights=lights,
         cameras=tuple(_camera(UsdGeom.Camera(prim), unit_m) for prim in usd_stage.Traverse() if prim.IsA(UsdGeom.Camera)),
         provenance=dict(_flat(usd_stage.GetRootLayer().customLayerData)), validators=len(_validators()),
         warnings=tuple(sorted(set(warnings))),

@@ -123,6 +123,24 @@ def test_lights_are_those_of_each_variant(tmp_path):
     assert inspect_asset(tmp_path / "lit.usda").lights == {"light=off": (sky,), "light=key": (key, sky)}
 
 
+def test_layers_of_variants_that_are_not_chosen_are_files_of_the_asset(tmp_path):
+    Sdf.Layer.CreateNew(str(tmp_path / "extra.usda")).Save()
+    usd_stage = Usd.Stage.CreateNew(str(tmp_path / "a.usda"))
+    root = UsdGeom.Xform.Define(usd_stage, "/A").GetPrim()
+    usd_stage.SetDefaultPrim(root)
+    variants = root.GetVariantSets().AddVariantSet("light")
+    for name in ("off", "on"):
+        variants.AddVariant(name)
+    variants.SetVariantSelection("on")
+    with variants.GetVariantEditContext():
+        root.GetPayloads().AddPayload("./extra.usda", "/A")
+    variants.SetVariantSelection("off")
+    usd_stage.Save()
+    found = inspect_asset(tmp_path / "a.usda")
+    assert found.layers == ("extra.usda",) and found.size_bytes == sum(p.stat().st_size for p in tmp_path.iterdir())
+    assert any("/A" in sentence and "extra.usda" in sentence for sentence in found.errors)  # it has no such prim
+
+
 def test_edges_of_three_faces_are_counted(tmp_path):
     write_mesh(tmp_path / "fin.usda", [(0, 0, 0), (0, 1, 0), (1, 0, 0), (-1, 0, 0), (0, 0, 1)], [3, 3, 3], [0, 1, 2, 0, 1, 3, 0, 1, 4])
     found = inspect_asset(tmp_path / "fin.usda")
