@@ -74,7 +74,8 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str 
     mesh = height_mesh(maps)
     coarser: list[SurfaceMesh] = []
     if levels:
-        mesh = with_smooth_normals(mesh)
+        if maps.normal is not None:  # else there is no normal map to hold what smoothing takes away
+            mesh = with_smooth_normals(mesh)
         coarser = level_meshes(mesh, maps.camera, levels)
     description = Description(name, maps.camera, {**maps.provenance, "relit:color_space": maps.color_space},
                               unit_in_metres(maps.camera), version)
