@@ -19,6 +19,9 @@ SIGMAS = 3.0
 """The largest departure from a line, or difference between neighbours, that noise explains, in its standard deviations."""
 BEND = 0.25
 """The largest departure from a line that the bend of a surface explains, as a part of the line's slope from pixel to pixel."""
+LINEAR = 0.1
+"""The largest standard deviation that counts, as a part of the depth: with a larger one that of the inverse depth has no meaning, and
+pixels close to the camera would be joined to everything behind them."""
 
 _POSITION = np.arange(SIDE) - (SIDE - 1) / 2
 """The positions of the pixels on a line, from their middle."""
@@ -92,7 +95,9 @@ def _along(depth: np.ndarray, sigma: np.ndarray | None, mask: np.ndarray, camera
     value = np.where(present, depth[index], 1).astype(np.float64)
     noise = np.zeros(value.shape) if sigma is None else sigma[index].astype(np.float64)
     noise = np.where(present & np.isfinite(noise), noise, 0)
-    return (value, noise, present) if camera.focal_px is None else (1 / value, noise / value**2, present)
+    if camera.focal_px is None:
+        return value, noise, present
+    return 1 / value, np.minimum(noise / value, LINEAR) / value, present
 
 
 def _continues(value: np.ndarray, sigma: np.ndarray, present: np.ndarray) -> np.ndarray:
@@ -102,11 +107,12 @@ def _continues(value: np.ndarray, sigma: np.ndarray, present: np.ndarray) -> np.
         value, sigma, present: what `_along` returns.
     """
     before, after = slice(0, SIDE), slice(None, SIDE - 1, -1)  # both towards the middle
-    least = np.minimum(sigma[SIDE], sigma[SIDE - 1])
+    around = np.nanmedian(np.where(present, sigma, np.nan), axis=0)  # pixels that mix two surfaces are less sure than those around them
+    least = np.minimum(np.minimum(sigma[SIDE], sigma[SIDE - 1]), around)
     found = np.abs(value[SIDE] - value[SIDE - 1]) <= SIGMAS * np.sqrt(2) * least
     for side, target in ((before, SIDE), (after, SIDE - 1)):
         slope = _SLOPE @ value[side]
-        noise, bend = SIGMAS * np.median(sigma[side], axis=0), BEND * np.abs(slope)
+        noise, bend = SIGMAS * np.minimum(np.median(sigma[side], axis=0), around), BEND * np.abs(slope)
         off_line = np.abs(value[side] - value[side].mean(axis=0) - np.outer(_POSITION, slope))
         straight = (present[side] & (off_line <= noise + bend)).all(axis=0)
         found |= straight & (np.abs(value[target] - _NEXT @ value[side]) <= noise * _PREDICTED + bend)

@@ -22,4 +22,15 @@ def depth_mesh(maps: DepthMaps) -> SurfaceMesh:
     valid = valid_heights(surface)
     depth = np.where(valid, maps.depth, 1)
     right, down = (connected(depth, valid, maps.camera, offset, sigma=maps.sigma) for offset in ((0, 1), (1, 0)))
-    return height_mesh(surface, links=Links(right[:, :-1], down[:-1]))
+    return height_mesh(surface, links=_without_mixed(Links(right[:, :-1], down[:-1])))
+
+
+def _without_mixed(links: Links) -> Links:
+    """Return the links without those of pixels that have none to the left and right, or none upwards and downwards.
+
+    Such a pixel sees the edge of one surface before another. Along a slanted edge these pixels, one more of the near and one more of the far
+    surface, would make gentle bridges between the two.
+    """
+    beside, above = np.pad(links.right, ((0, 0), (1, 1))), np.pad(links.down, ((1, 1), (0, 0)))
+    kept = (beside[:, :-1] | beside[:, 1:]) & (above[:-1] | above[1:])
+    return Links(links.right & kept[:, :-1] & kept[:, 1:], links.down & kept[:-1] & kept[1:])

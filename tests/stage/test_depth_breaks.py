@@ -99,6 +99,14 @@ def test_one_unsure_pixel_is_no_bridge():
     assert not connected(depth, np.ones(depth.shape, bool), CAMERA, RIGHT, sigma=sigma)[:, 39].any()
 
 
+def test_pixels_at_the_camera_are_not_joined_to_the_scene():
+    """As when a range wraps: their inverse depth is large, and so would be its standard deviation."""
+    depth = np.where(np.arange(96) < 40, 0.01, 2.4) * np.ones((72, 96)) + 0.002 * np.random.default_rng(6).random((72, 96))
+    for sigma in (0.004, 0.02):
+        joined = connected(depth, np.ones(depth.shape, bool), CAMERA, RIGHT, sigma=np.full(depth.shape, sigma))
+        assert not joined[:, 39].any()
+
+
 @pytest.mark.parametrize("degrees", [60, 82, 87, 89])
 def test_a_slanted_plane_holds_together_in_every_direction(degrees):
     slant = np.radians(degrees)
