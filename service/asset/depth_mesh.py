@@ -28,8 +28,8 @@ def depth_mesh(maps: DepthMaps) -> SurfaceMesh:
 def _without_mixed(links: Links) -> Links:
     """Return the links without those of pixels that have none to the left and right, or none upwards and downwards.
 
-    Such a pixel sees the edge of one surface before another. Along a slanted edge these pixels, one more of the near and one more of the far
-    surface, would make gentle bridges between the two.
+    Such a pixel sees the edge of one surface before another. Along a slanted edge these pixels see more and more of the far surface, and
+    would make gentle bridges between the two.
     """
     beside, above = np.pad(links.right, ((0, 0), (1, 1))), np.pad(links.down, ((1, 1), (0, 0)))
     kept = (beside[:, :-1] | beside[:, 1:]) & (above[:-1] | above[1:])
