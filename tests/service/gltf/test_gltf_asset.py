@@ -1,11 +1,6 @@
-"""Assets as .glb: what is in them against the maps, what the validator of Khronos says, and what is left when something fails."""
+"""Assets as .glb: what is in them against the maps, and what the validator of Khronos says."""
 
 import dataclasses
-import errno
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,55 +8,13 @@ import pytest
 from service.asset.errors import AssetError
 from service.asset.mesh import height_mesh
 from service.asset.metallic import metallic_look
-from service.gltf import container, textures
 from service.gltf.asset import write_asset
 from service.gltf.container import read_glb
 from service.requests.export import TextureFormat
-from stage.camera import Camera
-from stage.errors import StorageError
-from stage.maps import SurfaceMaps
-from tests.scenes.surfaces import make_ball, make_sheet, make_wave
+from tests.scenes.surfaces import make_ball, make_wave
 from tests.service.gltf.khronos import findings, validate
 from tests.service.gltf.reading import Read
-
-POSE = ((0.0, 0.0, 1.0, 0.3), (1.0, 0.0, 0.0, -0.1), (0.0, 1.0, 0.0, 2.0), (0.0, 0.0, 0.0, 1.0))
-
-
-def holes(size: int = 40) -> np.ndarray:
-    """A mask with a ring, a hole of one pixel, a bridge of one pixel, a lone triangle and a lone pixel."""
-    mask = np.zeros((size, size), dtype=bool)
-    mask[4:20, 4:20] = True
-    mask[8:14, 8:14], mask[16, 16] = False, False
-    mask[12, 20:26] = True
-    mask[10:16, 26:34] = True
-    mask[30, 30] = mask[31, 30] = mask[31, 31] = True
-    mask[37, 3] = True
-    return mask
-
-
-def metal_and_paint(**changes):
-    """A ball whose right half is brass and whose left half is paint."""
-    ball = make_ball(32, **changes)
-    brass = ball.normal[..., 0] > 0
-    return dataclasses.replace(
-        ball, diffuse_albedo=np.where(brass[..., None], 0, np.array([0.3, 0.5, 0.2], np.float32)) * ball.mask[..., None],
-        specular=np.where(brass[..., None], np.array([0.9, 0.7, 0.4], np.float32), np.float32(0.04)) * ball.mask[..., None])
-
-
-SURFACES = {
-    "everything": make_ball(),
-    "metal and paint": metal_and_paint(),
-    "ACEScg": metal_and_paint(color_space="lin_ap1_scene"),
-    "other dielectric": make_ball(specular=np.full((24, 24, 3), 0.08, np.float32)),
-    "diffuse only": make_ball(specular=None, roughness=None),
-    "perspective height": make_wave("perspective", world_from_camera=POSE),
-    "no scale": make_wave("orthographic"),
-    "bow tie": make_sheet(np.array([[1, 0, 0], [1, 1, 1], [0, 0, 1]], dtype=bool)),
-    "holes": make_sheet(holes(), diffuse_albedo=np.full((40, 40, 3), 0.5, np.float32), normal=np.full((40, 40, 3), 3**-0.5, np.float32)),
-    "2x2": make_sheet(np.ones((2, 2), dtype=bool), diffuse_albedo=np.full((2, 2, 3), 0.5, dtype=np.float32)),
-    "parts": dataclasses.replace(make_ball(), part=np.where(np.arange(24) < 12, 1, 2).astype(np.uint8) * np.ones((24, 1), np.uint8)),
-    "many vertices": make_sheet(np.ones((260, 260), dtype=bool)),
-}
+from tests.service.gltf.surfaces import POSE, SURFACES, metal_and_paint, random_surface
 
 
 def test_khronos_validator_finds_nothing(tmp_path):
@@ -71,26 +24,6 @@ def test_khronos_validator_finds_nothing(tmp_path):
     assert {name: findings(report) for name, report in zip(SURFACES, reports, strict=True)} == {name: [] for name in SURFACES}
     for maps, report in zip(SURFACES.values(), reports, strict=True):
         assert report["info"]["totalVertexCount"] == len(height_mesh(maps).points)
-
-
-def random_surface(rng: np.random.Generator) -> SurfaceMaps:
-    """Noise of any height in a mask with holes, seen by any camera, with any layers: valid input, however unlikely."""
-    shape = rows, cols = tuple(rng.integers(2, 24, 2).tolist())
-    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-    turn *= np.sign(np.linalg.det(turn))
-    pose = np.vstack([np.column_stack([turn, rng.normal(size=3)]), [0, 0, 0, 1]])
-    fields = {"resolution": (cols, rows), "world_from_camera": pose.tolist() if rng.random() < 0.5 else None}
-    height = rng.normal(size=shape) * 10 ** rng.uniform(-4, 2)
-    if rng.random() < 0.5:
-        camera = Camera(projection="perspective", focal_px=tuple(rng.uniform(20, 200, 2)), **fields)
-        height = -np.abs(height) - 1e-3
-    else:
-        camera = Camera(projection="orthographic", pixel_size_m=10 ** rng.uniform(-6, 0) if rng.random() < 0.5 else None, **fields)
-    normal = rng.normal(size=(*shape, 3))
-    layers = {"normal": normal / np.linalg.norm(normal, axis=-1, keepdims=True), "diffuse_albedo": 1.3 * rng.random((*shape, 3)),
-              "specular": rng.random((*shape, 3)), "roughness": rng.random(shape), "part": rng.integers(1, 4, shape).astype(np.uint8)}
-    kept = {name: layer if name == "part" else layer.astype(np.float32) for name, layer in layers.items() if rng.random() < 0.7}
-    return SurfaceMaps(camera=camera, mask=rng.random(shape) < rng.choice([0.6, 0.9, 1]), height=height.astype(np.float32), **kept)
 
 
 def test_khronos_validator_finds_nothing_in_noise(tmp_path):
@@ -276,78 +209,3 @@ def test_clipped_pixels_are_counted(tmp_path):
     assert report.clipped_pixels["base_color"] == maps.mask.sum()  # the green of ACEScg is none of Rec.709
     fractions = [done for _, done in told]
     assert told[0] == ("mesh", 0.0) and fractions == sorted(fractions) and fractions[-1] < 1
-
-
-def test_the_same_maps_give_the_same_bytes(tmp_path):
-    one, two = (write_asset(SURFACES["everything"], tmp_path / folder / "a.glb", name="A").path.read_bytes() for folder in ("1", "2"))
-    assert one == two
-
-
-@pytest.mark.parametrize("older", [False, True], ids=["nothing before", "older asset"])
-def test_full_disk_in_a_texture_leaves_no_trace(older, tmp_path, monkeypatch):
-    target = tmp_path / "a.glb"
-    if older:
-        write_asset(SURFACES["diffuse only"], target, name="A")
-    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    written = textures.write_png
-
-    def fail(path, codes, *, srgb):
-        if path.name == "normal.png":  # the last
-            raise OSError(errno.ENOSPC, "No space left on device")
-        written(path, codes, srgb=srgb)
-
-    monkeypatch.setattr(textures, "write_png", fail)
-    with pytest.raises(StorageError, match="no space left on device") as raised:
-        write_asset(SURFACES["everything"], target, name="A")
-    assert str(target) in str(raised.value)
-    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
-
-
-FILE_SIZE_LIMITED = """
-import resource, signal, sys
-from stage.errors import StorageError
-from stage.maps import SurfaceMaps
-from service.gltf.asset import write_asset
-maps = SurfaceMaps.read(sys.argv[1])
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]), int(sys.argv[3])))
-try:
-    write_asset(maps, sys.argv[2], name="A")
-except StorageError as error:
-    sys.exit(f"refused: {error}")
-"""
-
-
-@pytest.mark.skipif(os.name != "posix", reason="needs a file size limit")
-def test_a_disk_that_really_refuses(tmp_path):
-    SURFACES["everything"].write(tmp_path / "maps.exr")
-    whole = write_asset(SURFACES["everything"], tmp_path / "whole.glb", name="A").path
-    target = tmp_path / "out" / "a.glb"
-    command = [sys.executable, "-c", FILE_SIZE_LIMITED, tmp_path / "maps.exr", target, str(whole.stat().st_size - 100)]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[3])
-    assert done.returncode == 1 and f"refused: cannot write {target}: " in done.stderr, done.stderr
-    assert list(target.parent.iterdir()) == []
-
-
-def test_more_than_the_header_can_say_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(container, "MAX_FILE_BYTES", 1000)
-    with pytest.raises(AssetError, match="4 GiB"):
-        write_asset(SURFACES["everything"], tmp_path / "a.glb", name="A")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_maps_without_height_leave_nothing(tmp_path):
-    with pytest.raises(AssetError, match="height"):
-        write_asset(dataclasses.replace(SURFACES["everything"], height=None), tmp_path / "a.glb", name="A")
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("damage, sentence", [
-    (lambda data: data[:40], "is cut off"), (lambda data: b"PK" + data[2:], "is not a .glb file"), (lambda data: data[:7], "is not a .glb"),
-    (lambda data: data[:4] + b"\x01" + data[5:], "version 2"), (lambda data: data[:20] + b"]" + data[21:], "no glTF document")])
-def test_damaged_files_are_refused(damage, sentence, tmp_path):
-    path = write_asset(SURFACES["2x2"], tmp_path / "a.glb", name="A").path
-    path.write_bytes(damage(path.read_bytes()))
-    with pytest.raises(AssetError, match=sentence) as raised:
-        read_glb(path)
-    assert str(path) in str(raised.value)
