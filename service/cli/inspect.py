@@ -66,7 +66,7 @@ def _lines(found: "Inspection") -> Iterator[tuple[str, str]]:
     for name, variants in found.variants.items():
         yield "variants", f"{name}: {', '.join(f'[{each}]' if each == found.selections.get(name) else each for each in variants)}"
     for variant in found.meshes:
-        where = f"geo={variant} " if variant else ""
+        where = f"{variant} " if variant else ""
         for mesh in found.meshes[variant]:
             yield "mesh", (f"{where}{mesh.path}, purpose {mesh.purpose}: {mesh.vertices} vertices, {mesh.faces} faces, "
                            f"{mesh.pieces} pieces, {mesh.boundary_edges} boundary edges, {mesh.non_manifold_edges} non-manifold edges, "
@@ -76,9 +76,9 @@ def _lines(found: "Inspection") -> Iterator[tuple[str, str]]:
             width = "no width" if cloud.width_m is None else "widths {:.3g} to {:.3g} m".format(*cloud.width_m)
             yield "points", f"{where}{cloud.path}, purpose {cloud.purpose}: {cloud.points} points, {width}"
             yield from _primvars(cloud.primvars)
-    for look, materials in found.looks.items():
+    for variant, materials in found.materials.items():
         for material in materials:
-            yield from _material(f"look={look} " if look else "", material)
+            yield from _material(f"{variant} " if variant else "", material)
     for variant, lights in found.lights.items():
         for light in lights:
             yield "light", f"{variant} {light}".strip()

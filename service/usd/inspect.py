@@ -3,7 +3,7 @@
 Source: OpenUSD: UsdModelAPI, UsdGeomModelAPI, UsdGeomCamera (units of apertures), UsdValidation.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -57,10 +57,10 @@ class Inspection:
     """The variants of each set."""
     selections: dict[str, str]
     meshes: dict[str, tuple[MeshFacts, ...]]
-    """By variant of `geo`; under an empty name where there is no such set."""
+    """By `geo=variant`; under an empty name where there is no such set."""
     points: dict[str, tuple[PointsFacts, ...]]
-    looks: dict[str, tuple[MaterialFacts, ...]]
-    """Materials that something is bound to, by variant of `look`."""
+    materials: dict[str, tuple[MaterialFacts, ...]]
+    """Materials that something is bound to, by `set=variant`: those of each look, and what other variants of `geo` bind beside them."""
     lights: dict[str, tuple[str, ...]]
     """Paths and types, by `set=variant` of the other sets; under an empty name where there are no others."""
     cameras: tuple[CameraFacts, ...]
@@ -104,18 +104,21 @@ def _inspect(usd_stage: Usd.Stage, path: Path, warnings: list[str], errors: list
     if not root:
         errors.append("the layer has no default prim, so that nothing can refer to it")
     unit_m = UsdGeom.GetStageMetersPerUnit(usd_stage)
-    meshes, points, looks = {}, {}, {}
-    for variant in _each_variant(root, GEO):
-        meshes[variant] = tuple(mesh_facts(UsdGeom.Mesh(prim)) for prim in usd_stage.Traverse() if prim.IsA(UsdGeom.Mesh))
-        points[variant] = tuple(points_facts(UsdGeom.Points(prim), unit_m) for prim in usd_stage.Traverse() if prim.IsA(UsdGeom.Points))
-        _find(usd_stage, root, warnings, errors)
+    meshes, points, materials = {}, {}, {}
     for variant in _each_variant(root, LOOK):
-        looks[variant] = _materials(usd_stage)
+        materials[_chosen(LOOK, variant)] = _materials(usd_stage, ())
+        _find(usd_stage, root, warnings, errors)
+    for variant in _each_variant(root, GEO):
+        chosen = _chosen(GEO, variant)
+        meshes[chosen] = tuple(mesh_facts(UsdGeom.Mesh(prim)) for prim in usd_stage.Traverse() if prim.IsA(UsdGeom.Mesh))
+        points[chosen] = tuple(points_facts(UsdGeom.Points(prim), unit_m) for prim in usd_stage.Traverse() if prim.IsA(UsdGeom.Points))
+        own = _materials(usd_stage, {material.path for known in materials.values() for material in known})
+        materials.update({chosen: own} if own else {})
         _find(usd_stage, root, warnings, errors)
     lights = {}
     for name in [name for name in (root.GetVariantSets().GetNames() if root else []) if name not in (GEO, LOOK)] or [""]:
         for variant in _each_variant(root, name):
-            lights[f"{name}={variant}" if variant else ""] = tuple(
+            lights[_chosen(name, variant)] = tuple(
                 f"{prim.GetPath()} ({prim.GetTypeName()})" for prim in usd_stage.Traverse() if prim.HasAPI(UsdLux.LightAPI))
             _find(usd_stage, root, warnings, errors)
     start, end = usd_stage.GetStartTimeCode(), usd_stage.GetEndTimeCode()
@@ -134,7 +137,7 @@ def _inspect(usd_stage: Usd.Stage, path: Path, warnings: list[str], errors: list
         extent_m=_extent(root, unit_m) if root else None,
         variants={name: tuple(sets.GetVariantSet(name).GetVariantNames()) for name in sets.GetNames()} if sets else {},
         selections=dict(sets.GetAllVariantSelections()) if sets else {},
-        meshes=meshes, points=points, looks=looks, lights=lights,
+        meshes=meshes, points=points, materials=materials, lights=lights,
         cameras=tuple(_camera(UsdGeom.Camera(prim), unit_m) for prim in usd_stage.Traverse() if prim.IsA(UsdGeom.Camera)),
         provenance=dict(_flat(usd_stage.GetRootLayer().customLayerData)), validators=len(_validators()),
         warnings=tuple(sorted(set(warnings))),
@@ -155,13 +158,18 @@ def _each_variant(root: Usd.Prim, name: str) -> Iterator[str]:
     variants.ClearVariantSelection()
 
 
-def _materials(usd_stage: Usd.Stage) -> tuple[MaterialFacts, ...]:
-    """Return the materials that are bound to geometry, each once."""
+def _chosen(variant_set: str, variant: str) -> str:
+    """Return how a variant is written; nothing where there is none."""
+    return f"{variant_set}={variant}" if variant else ""
+
+
+def _materials(usd_stage: Usd.Stage, known: Container[str]) -> tuple[MaterialFacts, ...]:
+    """Return the materials that are bound to geometry, each once, without those whose path is known."""
     bound: dict[Sdf.Path, MaterialFacts] = {}
     for prim in usd_stage.Traverse():
         if prim.IsA(UsdGeom.Gprim) or prim.IsA(UsdGeom.Subset):
             material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
-            if material and material.GetPath() not in bound:
+            if material and material.GetPath() not in bound and str(material.GetPath()) not in known:
                 bound[material.GetPath()] = material_facts(material)
     return tuple(bound.values())
 

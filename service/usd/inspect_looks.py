@@ -12,6 +12,8 @@ from pathlib import Path
 import OpenImageIO as oiio
 from pxr import Ar, Sdf, UsdShade
 
+from service.usd.inspect_geometry import FIRST
+
 UNIVERSAL = "universal"
 """The render context of materials for all renderers."""
 
@@ -92,7 +94,7 @@ def _input(entry: UsdShade.Input) -> InputFacts:
     file = _file_of(entry, set())
     if file is not None:
         return InputFacts(entry.GetBaseName(), None, _texture(file))
-    value = entry.Get()
+    value = entry.Get(FIRST)
     return InputFacts(entry.GetBaseName(), None if value is None else str(value), None)
 
 
@@ -114,7 +116,7 @@ def _file_of(entry: UsdShade.Input, seen: set[Sdf.Path]) -> UsdShade.Input | Non
 
 
 def _texture(file: UsdShade.Input) -> TextureFacts:
-    asset = file.GetAttr().Get()
+    asset = file.GetAttr().Get(FIRST)
     declared = UsdShade.Shader(file.GetPrim()).GetInput("sourceColorSpace")
     color_space = (declared.Get() if declared else None) or file.GetAttr().GetColorSpace() or None
     if asset is None or not asset.resolvedPath:

@@ -7,13 +7,14 @@ import zipfile
 
 import numpy as np
 import pytest
-from pxr import Sdf, Usd, UsdGeom, UsdLux
+from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
 from service.asset.errors import AssetError
 from service.asset.mesh import height_mesh
 from service.usd.asset import write_asset
 from service.usd.inspect import inspect_asset
 from service.usd.layers import LAYER_FILES
+from stage.images import write_png
 from tests.scenes.surfaces import make_ball, make_wave
 
 SUFFIXES = (".usda", ".usdc", ".usdz")
@@ -35,7 +36,7 @@ def test_a_ball(ball, suffix, tmp_path):
     referred = [p for p in tmp_path.rglob("*") if p.is_file() and p.suffix != ".mtlx"]
     assert found.size_bytes == sum(p.stat().st_size for p in referred)
     np.testing.assert_allclose(found.extent_m, height_mesh(ball).extent, atol=1e-6)
-    mesh, = found.meshes["mesh"]
+    mesh, = found.meshes["geo=mesh"]
     assert (mesh.vertices, mesh.faces, mesh.purpose) == (report.vertex_count, report.face_count, "default")
     assert (mesh.pieces, mesh.holes, mesh.non_manifold_edges) == (1, 0, 0)
     normals, st = mesh.primvars
@@ -47,7 +48,7 @@ def test_a_ball(ball, suffix, tmp_path):
     assert camera.path == "/Kugel/Camera" and camera.projection == "orthographic"
     side = f"{24 * ball.camera.pixel_size_m:.6g}"
     assert camera.framing == f"{side} × {side} m"
-    for materials in found.looks.values():
+    for materials in found.materials.values():
         material, = materials
         assert all(texture.found and (texture.width, texture.height) == (24, 24) for texture in material.textures())
 
@@ -106,6 +107,35 @@ def test_a_moving_mesh_is_looked_at_where_it_begins(tmp_path):
     assert found.time_codes == (1, 2, 25)
 
 
+def test_a_variant_of_the_geometry_may_have_a_material_and_images_of_its_own(tmp_path):
+    write_png(tmp_path / "card.1.png", np.zeros((2, 3, 3), np.uint8), srgb=True)
+    usd_stage = Usd.Stage.CreateNew(str(tmp_path / "a.usda"))
+    root = UsdGeom.Xform.Define(usd_stage, "/A").GetPrim()
+    usd_stage.SetDefaultPrim(root)
+    for name in ("Paint", "Card"):
+        material = UsdShade.Material.Define(usd_stage, f"/A/{name}")
+        surface = UsdShade.Shader.Define(usd_stage, f"/A/{name}/Surface")
+        surface.CreateIdAttr("UsdPreviewSurface")
+        material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", Sdf.ValueTypeNames.Token))
+    image = UsdShade.Shader.Define(usd_stage, "/A/Card/Image")
+    image.CreateIdAttr("UsdUVTexture")
+    image.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(Sdf.AssetPath("./card.1.png"), 1)
+    surface.CreateInput("emissiveColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(image.CreateOutput("rgb", Sdf.ValueTypeNames.Float3))
+    square = UsdGeom.Plane.Define(usd_stage, "/A/Square").GetPrim()
+    variants = root.GetVariantSets().AddVariantSet("geo")
+    for variant, name in (("card", "Card"), ("mesh", "Paint")):
+        variants.AddVariant(variant)
+        variants.SetVariantSelection(variant)
+        with variants.GetVariantEditContext():
+            UsdShade.MaterialBindingAPI.Apply(square).Bind(UsdShade.Material(usd_stage.GetPrimAtPath(f"/A/{name}")))
+    usd_stage.Save()
+    found = inspect_asset(tmp_path / "a.usda").materials
+    assert {variant: [material.path for material in materials] for variant, materials in found.items()} == {
+        "": ["/A/Paint"], "geo=card": ["/A/Card"]}
+    texture, = found["geo=card"][0].textures()
+    assert (texture.file, texture.found, texture.width, texture.height) == ("./card.1.png", True, 3, 2)
+
+
 def test_lights_are_those_of_each_variant(tmp_path):
     usd_stage = Usd.Stage.CreateNew(str(tmp_path / "lit.usda"))
     root = UsdGeom.Xform.Define(usd_stage, "/Set").GetPrim()
@@ -156,7 +186,7 @@ def test_missing_files_are_named(tmp_path):
     gone.unlink()
     found = inspect_asset(tmp_path / "ball.usdc")
     assert any(gone.name in sentence for sentence in found.errors)
-    textures = [texture for materials in found.looks.values() for material in materials for texture in material.textures()]
+    textures = [texture for materials in found.materials.values() for material in materials for texture in material.textures()]
     assert {texture.found for texture in textures if texture.file.endswith(gone.name)} == {False}
     assert all(texture.width for texture in textures if not texture.file.endswith(gone.name))
     shutil.rmtree(tmp_path / "ball_layers")
