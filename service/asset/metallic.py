@@ -11,6 +11,7 @@ in Blender, three.js, glTF and OpenPBR, as in Relit's BRDF; the base colour for 
 Source: OpenUSD, "UsdPreviewSurface Specification", inputs metallic and ior; glTF 2.0, appendix B.2 (metal-roughness material).
 """
 
+import json
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -61,6 +62,12 @@ class MetallicLook(NamedTuple):
     ior: float  # of the dielectric share of all pixels, IOR_LIMITS; 1 without specular light
     lost_albedo: float  # RMS of the difference in diffuse albedo from the maps, over the mask and three channels
     lost_specular: float  # the same of F0
+
+    @property
+    def provenance(self) -> dict[str, str]:
+        """What was derived from the maps, for the metadata of an asset."""
+        derived = {"ior": self.ior, "lost_albedo": self.lost_albedo, "lost_specular": self.lost_specular}
+        return {"relit:metallic": json.dumps({name: round(value, 6) for name, value in derived.items()})}
 
 
 def metallic_look(maps: SurfaceMaps) -> MetallicLook:

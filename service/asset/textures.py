@@ -6,7 +6,7 @@ there, and counted. Colours of an EXR are scene-linear in the colour space of th
 Source: OpenUSD, "UsdPreviewSurface Specification", texture reader (sourceColorSpace); USDZ File Format Specification (kinds of images).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -30,6 +30,9 @@ DISPLAY_SPACE = "srgb_rec709_scene"
 
 DATA_SPACE = "data"
 """The colour space of images that are no colours."""
+
+NEUTRAL_SPACE = "lin_rec709_scene"
+"""The scene-linear space that readers take raw colours as."""
 
 BLEED_TEXELS = 8
 """How far colour is bled over the edge of the mask: bilinear filtering stays clean down to the third mip level."""
@@ -125,6 +128,13 @@ def side_by_side(writers: Mapping[str, Callable[[], Texture]], progress: Callabl
             pool.shutdown(cancel_futures=True)
             raise
     return written
+
+
+def space_warnings(textures: Mapping[str, Texture]) -> Iterator[str]:
+    """Yield which colours look wrong in readers that know less than the files declare."""
+    for space in sorted({texture.color_space for texture in textures.values()} - {DISPLAY_SPACE, DATA_SPACE, NEUTRAL_SPACE}):
+        yield (f"textures: their colours are {space}, which readers that know sourceColorSpace alone, such as Blender, take as "
+               f"{NEUTRAL_SPACE}; the colours of png16 are read alike everywhere")
 
 
 def encode(values: np.ndarray, known: np.ndarray, color_space: str | None,

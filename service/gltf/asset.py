@@ -68,7 +68,7 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str 
         tell("file", TEXTURES_END)
         material = add_material(glb, written, folder, ior=look.ior if look is not None else GLASS_IOR, name=name)
         surface = add_surface(glb, mesh, unit_m=unit_m, material=material, textured=bool(written), with_tangents=NORMAL in written)
-        provenance = {**maps.provenance, "relit:color_space": maps.color_space}
+        provenance = {**maps.provenance, "relit:color_space": maps.color_space, **(look.provenance if look is not None else {})}
         add_scene(glb, surface, maps.camera, mesh.extent, provenance, name=name, file_name=target.name, version=version, unit_m=unit_m)
     return AssetReport(target, len(mesh.points), 2 * len(mesh.quads) + len(mesh.triangles), mesh.step,
                        {name: texture.clipped_pixels for name, texture in written.items()},

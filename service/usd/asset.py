@@ -8,7 +8,7 @@ from service.asset.levels import level_meshes, with_smooth_normals
 from service.asset.mesh import SurfaceMesh, height_mesh
 from service.asset.metallic import IOR_LIMITS, loss_warnings, metallic_look
 from service.asset.openpbr import DOCUMENT, openpbr_document, write_openpbr
-from service.asset.textures import FILE_NAMES, write_textures
+from service.asset.textures import FILE_NAMES, space_warnings, write_textures
 from service.asset.units import unit_in_metres
 from service.requests.export import FIRST_VERSION, TextureFormat
 from service.usd.files import check_textures, install, temporary_folder_beside
@@ -77,9 +77,9 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str 
         if maps.normal is not None:  # else there is no normal map to hold what smoothing takes away
             mesh = with_smooth_normals(mesh)
         coarser = level_meshes(mesh, maps.camera, levels)
-    description = Description(name, maps.camera, {**maps.provenance, "relit:color_space": maps.color_space},
-                              unit_in_metres(maps.camera), version)
     look = metallic_look(maps) if maps.diffuse_albedo is not None else None
+    provenance = {**maps.provenance, "relit:color_space": maps.color_space, **(look.provenance if look is not None else {})}
+    description = Description(name, maps.camera, provenance, unit_in_metres(maps.camera), version)
     with temporary_folder_beside(target) as temporary:
         folder = temporary / texture_folder(target)
         folder.mkdir()
@@ -101,5 +101,5 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str 
     installed = () if packed else tuple(target.parent / folder.name / file.name for file in beside)
     return AssetReport(target, installed, len(mesh.points), len(mesh.face_counts), mesh.step,
                        {**{name: texture.clipped_pixels for name, texture in written.items()}, **around.clipped_pixels},
-                       tuple(loss_warnings(look)) if look is not None else (),
+                       (*(loss_warnings(look) if look is not None else ()), *space_warnings(written)),
                        tuple((len(level.points), len(level.triangles)) for level in coarser))

@@ -11,6 +11,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
 from service.asset.errors import AssetError
 from service.asset.mesh import height_mesh
+from service.asset.metallic import metallic_look
 from service.usd.asset import write_asset
 from service.usd.inspect import inspect_asset
 from service.usd.layers import LAYER_FILES
@@ -29,7 +30,7 @@ def test_a_ball(ball, suffix, tmp_path):
     assert (found.errors, found.warnings) == ((), ())
     assert (found.default_prim, found.kind, found.up_axis, found.meters_per_unit) == ("/Kugel", "component", "Y", 1.0)
     assert found.asset_info == {"name": "Kugel", "identifier": f"ball{suffix}", "version": "v2", "relit:method": "svbrdf",
-                                "relit:color_space": "lin_rec709_scene"}
+                                "relit:color_space": "lin_rec709_scene", **metallic_look(ball).provenance}
     assert found.notes == {}  # not the documentation that OpenUSD has of every Xform
     assert found.layers == (() if suffix == ".usdz" else tuple(f"ball_layers/{name}" for name in (
         "geometry.usdc", "materials.usda", "payload.usda")))

@@ -1,6 +1,7 @@
 """Materials of assets: what the surface of each look reads, and how its files are declared."""
 
 import dataclasses
+import json
 from pathlib import Path
 
 import numpy as np
@@ -94,6 +95,20 @@ def test_exr_textures_declare_the_space_of_the_capture(space, look, tmp_path):
     assert Usd.ColorSpaceAPI.ComputeColorSpaceName(material, None) == Gf.ColorSpaceNames.LinearRec709  # of its own values
     errors = UsdValidation.ValidationContext(UsdValidation.ValidationRegistry().GetOrLoadAllValidators()).Validate(usd_stage)
     assert [(error.GetName(), error.GetMessage()) for error in errors] == []
+
+
+def test_colours_that_some_readers_misread_are_said(tmp_path):
+    def warnings(space, textures):
+        return write_asset(half_metal(color_space=space), tmp_path / "ball.usda", name="Ball", textures=textures).warnings
+
+    assert "lin_ap1_scene" in warnings("lin_ap1_scene", TextureFormat.EXR)[0]
+    assert warnings("lin_ap1_scene", TextureFormat.PNG16) == warnings("srgb_texture", TextureFormat.EXR) == ()
+
+
+def test_what_was_derived_is_in_the_provenance(tmp_path):
+    write_asset(half_metal(), tmp_path / "ball.usdz", name="Ball")
+    found = json.loads(Usd.Stage.Open(str(tmp_path / "ball.usdz")).GetMetadata("customLayerData")["relit"]["metallic"])
+    assert found == {"ior": 1.5, "lost_albedo": pytest.approx(0, abs=1e-6), "lost_specular": pytest.approx(0, abs=1e-6)}
 
 
 @pytest.mark.parametrize("suffix", [".usda", ".usdz"])
