@@ -14,6 +14,8 @@ from stage.ply import POINTS_FILE, PointCloud
 
 LEAST_AGREEMENT = 0.9
 """The least share of points that lie in pixels of the depth, if both are of one measurement: lasers measure some beside their pixel."""
+UNCERTAINTY = ("sigma", "confidence")
+"""Layers of a depth that its vertices and points carry: standard deviation in metres, and confidence 0…1."""
 SAME_DEPTH = 0.1
 """The largest relative difference between the depths of a point and of its pixel, if both are of one measurement."""
 

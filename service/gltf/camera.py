@@ -8,10 +8,8 @@ import math
 import numpy as np
 import pygltflib as gltf
 
+from service.asset.view import view_of
 from stage.camera import Camera
-
-CLEARANCE = 0.5
-"""Distance of an orthographic camera from the surface, in image widths; its image does not depend on it."""
 
 FREE_OFFSET_PX = 0.5
 """How far a principal point may lie from the centre of the image before the camera is said to differ from the capturing one."""
@@ -28,20 +26,17 @@ def camera_and_place(camera: Camera, extent: np.ndarray, *, unit_m: float) -> tu
         A camera of glTF looks along -z with +y up, as the camera frame has it. An orthographic one is moved sideways by what its principal
         point is off the centre; a perspective one has no place for that (`principal_offset`), nor for lens distortion.
     """
-    nearest, farthest = float(extent[1, 2]), float(extent[0, 2])
+    view = view_of(camera, extent)
+    near, far = view.near * unit_m, view.far * unit_m
     if camera.projection == "perspective":
         assert camera.focal_px is not None  # the camera's validator saw to it
         half_width, half_height = camera.width / 2 / camera.focal_px[0], camera.height / 2 / camera.focal_px[1]
-        lens = gltf.Perspective(yfov=2 * math.atan(half_height), aspectRatio=half_width / half_height,
-                           znear=-nearest * unit_m / 2, zfar=-farthest * unit_m * 2)
+        lens = gltf.Perspective(yfov=2 * math.atan(half_height), aspectRatio=half_width / half_height, znear=near, zfar=far)
         return gltf.Camera(type="perspective", perspective=lens, name="Camera"), [0.0, 0.0, 0.0]
     pixel = (camera.pixel_size_m or 1.0) * unit_m
-    clearance, depth = CLEARANCE * camera.width * pixel, (nearest - farthest) * unit_m
-    view = gltf.Orthographic(xmag=camera.width * pixel / 2, ymag=camera.height * pixel / 2, znear=clearance / 2,
-                             zfar=2 * (clearance + depth))
+    box = gltf.Orthographic(xmag=camera.width * pixel / 2, ymag=camera.height * pixel / 2, znear=near, zfar=far)
     right, down = principal_offset(camera)
-    return (gltf.Camera(type="orthographic", orthographic=view, name="Camera"),
-            [-right * pixel, down * pixel, nearest * unit_m + clearance])
+    return gltf.Camera(type="orthographic", orthographic=box, name="Camera"), [-right * pixel, down * pixel, view.z * unit_m]
 
 
 def principal_offset(camera: Camera) -> tuple[float, float]:

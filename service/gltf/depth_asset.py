@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from pygltflib import Primitive
 
-from service.asset.depth_cloud import MeasuredPoints, colour_image, colour_warnings, measured_points
+from service.asset.depth_cloud import UNCERTAINTY, MeasuredPoints, colour_image, colour_warnings, measured_points
 from service.asset.depth_mesh import depth_mesh
 from service.asset.metallic import metallic_look
 from service.gltf.camera import camera_warnings
@@ -18,9 +18,6 @@ from service.requests.export import FIRST_VERSION, Geometry, TextureFormat
 from stage.depth_maps import DepthMaps
 from stage.maps import SurfaceMaps
 from stage.ply import PointCloud
-
-UNCERTAINTY = ("sigma", "confidence")
-"""Layers of the depth that become attributes of the vertices or points, _SIGMA (metres) and _CONFIDENCE; 0: of its pixel unknown."""
 
 
 def write_depth(maps: DepthMaps, cloud: PointCloud | None, path: str | Path, *, name: str, geometry: Geometry = Geometry.MESH,
@@ -72,7 +69,7 @@ def _add_mesh(glb: Glb, maps: DepthMaps, points: MeasuredPoints, folder: Path, n
 
 
 def _add_uncertainty(glb: Glb, primitive: Primitive, maps: DepthMaps, rows: np.ndarray, cols: np.ndarray) -> None:
-    """Add standard deviation and confidence of each vertex or point, where the depth has them."""
+    """Add standard deviation (_SIGMA, metres) and confidence (_CONFIDENCE) of each vertex, where the depth has them; 0: unknown."""
     for layer in UNCERTAINTY:
         values = getattr(maps, layer)
         if values is not None:

@@ -9,6 +9,7 @@ Source: OpenUSD, UsdGeomCamera: apertures, focal length and their units.
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom
 
+from service.asset.view import ORTHOGRAPHIC_CLEARANCE, view_of
 from stage.camera import Camera
 
 CAMERA, FAR_CAMERA = "Camera", "CameraPerspective"
@@ -19,9 +20,6 @@ FILM_WIDTH_M = 0.036
 
 APERTURE_UNIT = 0.1
 """USD gives focal lengths and apertures in tenths of a scene unit (UsdGeomCamera, "Units of Measure")."""
-
-ORTHOGRAPHIC_CLEARANCE = 0.5
-"""Distance of an orthographic camera from the surface, in image widths; its image does not depend on it."""
 
 PARALLAX_PX = 0.05
 """How far, in pixels, the far camera may show a point of the surface from where the orthographic camera shows it."""
@@ -38,6 +36,8 @@ def define_cameras(usd_stage: Usd.Stage, root: Sdf.Path, camera: Camera, extent:
         Lens distortion has no place in a UsdGeomCamera: the camera is the ideal one, as the mesh is.
     """
     prim = UsdGeom.Camera.Define(usd_stage, root.AppendChild(CAMERA))
+    view = view_of(camera, extent)
+    prim.CreateClippingRangeAttr(Gf.Vec2f(view.near, view.far))
     if camera.projection == "perspective":
         assert camera.focal_px is not None  # the camera's validator saw to it
         film_width = FILM_WIDTH_M / UsdGeom.GetStageMetersPerUnit(usd_stage)
@@ -45,16 +45,11 @@ def define_cameras(usd_stage: Usd.Stage, root: Sdf.Path, camera: Camera, extent:
         prim.CreateProjectionAttr(UsdGeom.Tokens.perspective)
         prim.CreateFocalLengthAttr(focal / APERTURE_UNIT)
         _set_aperture(prim, camera, (focal / camera.focal_px[0], focal / camera.focal_px[1]))
-        nearest, farthest = -float(extent[1, 2]), -float(extent[0, 2])
-        prim.CreateClippingRangeAttr(Gf.Vec2f(nearest / 2, farthest * 2))
     else:
         pixel = camera.pixel_size_m or 1.0
-        clearance = ORTHOGRAPHIC_CLEARANCE * camera.width * pixel
-        depth = float(extent[1, 2] - extent[0, 2])
         prim.CreateProjectionAttr(UsdGeom.Tokens.orthographic)
-        prim.AddTranslateOp().Set(Gf.Vec3d(0, 0, float(extent[1, 2]) + clearance))
+        prim.AddTranslateOp().Set(Gf.Vec3d(0, 0, view.z))
         _set_aperture(prim, camera, (pixel, pixel))
-        prim.CreateClippingRangeAttr(Gf.Vec2f(clearance / 2, 2 * (clearance + depth)))
         _define_far_camera(usd_stage, root.AppendChild(FAR_CAMERA), camera, extent)
 
 

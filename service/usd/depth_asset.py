@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from pxr import Sdf, UsdGeom
 
-from service.asset.depth_cloud import MeasuredPoints, colour_image, colour_warnings, measured_points
+from service.asset.depth_cloud import UNCERTAINTY, MeasuredPoints, colour_image, colour_warnings, measured_points
 from service.asset.depth_mesh import depth_mesh
 from service.asset.errors import AssetError
 from service.asset.mesh import SurfaceMesh
@@ -28,10 +28,6 @@ POINT_WIDTH = 1.5
 """Width of a point in footprints of a pixel: neighbouring points just overlap, corner to corner."""
 GREY = np.full((1, 3), 0.5, np.float32)
 """Linear colour where none is known."""
-UNCERTAINTY = ("sigma", "confidence")
-"""Layers of the depth that become primvars of these names."""
-
-
 class _Parts(NamedTuple):
     """What an asset of a depth is made of."""
 
