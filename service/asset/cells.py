@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.asset.fans import split_fans
+from service.asset.fans import drawn_apart, split_fans
 from service.asset.links import Links
 
 CORNERS = 4
@@ -114,6 +114,8 @@ def _with_vertices(quads: np.ndarray, triangles: np.ndarray, grid: _Grid, count:
     inner = (reach > 0) | (grid.reach[(direction + 2) % 4, row, col] > 0)
     other = np.where((on_border & inner)[:, None], pixel - ahead, pixel) + grid.step * in_cell[:, None]
     shift = np.where(in_cell[:, None], grid.step / 2, ahead * BORDER_PX)
+    if grid.step > 1:
+        shift = drawn_apart(pixel + shift, quads, triangles, source) - pixel
     weight = np.where(in_cell, -0.5, BORDER_PX * on_border)
     return CellFaces(quads, triangles, pixel, other, weight, shift, int(np.count_nonzero(used[:count])))
 

@@ -11,7 +11,7 @@ coordinates and relief, so that texture coordinates follow from the places of th
 import fast_simplification
 import numpy as np
 
-from service.asset.fans import split_fans
+from service.asset.fans import drawn_apart, split_fans
 from service.asset.links import height_of, joined, relief
 from service.asset.mesh import SurfaceMesh, camera_points, vertex_normals
 from stage.camera import Camera
@@ -134,8 +134,9 @@ def _level(places: np.ndarray, triangles: np.ndarray, mesh: SurfaceMesh, camera:
     triangles = triangles[x1 * y2 - x2 * y1 > 0].astype(np.int32)
     none = np.zeros((0, 4), dtype=np.int32)
     _, triangles, source = split_fans(none, triangles, len(places))
+    places = drawn_apart(places[source], none, triangles, source)
     used = np.unique(triangles)
-    triangles, places = np.searchsorted(used, triangles).astype(np.int32), places[source[used]]
+    triangles, places = np.searchsorted(used, triangles).astype(np.int32), places[used]
     u, v = places[:, 0], -places[:, 1]
     points = camera_points(camera, u, v, height_of(places[:, 2], camera))
     st = np.stack([u / camera.width, 1 - v / camera.height], axis=-1).astype(np.float32)

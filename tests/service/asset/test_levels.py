@@ -130,6 +130,7 @@ def test_levels_are_manifold(seed):
             while at in following and length < len(following):
                 at, length = following[at], length + 1
             assert length == len(following)
+        assert len(np.unique(level.st, axis=0)) == len(np.unique(level.points, axis=0)) == len(level.points)
 
 
 def test_there_are_no_levels_of_what_is_border_alone():

@@ -211,6 +211,7 @@ def test_meshes_are_manifold(seed, step):
     flat = np.array([0, 0, 1])
     seen = [area_vector @ flat for area_vector in face_areas(mesh)]
     assert min(seen) > 1e-4  # no face is degenerate or turned
+    assert len(np.unique(mesh.st, axis=0)) == len(mesh.st)  # the two vertices of two fans do not lie at one place
 
 
 def test_heights_that_are_no_place_get_no_vertex():
