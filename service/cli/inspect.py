@@ -80,8 +80,10 @@ def _lines(found: "Inspection") -> Iterator[tuple[str, str]]:
         for material in materials:
             yield from _material(f"{variant} " if variant else "", material)
     for variant, lights in found.lights.items():
-        for light in lights:
-            yield "light", f"{variant} {light}".strip()
+        for kind in dict.fromkeys(light.rpartition(" ")[2] for light in lights):
+            paths = [light.removesuffix(f" {kind}") for light in lights if light.endswith(f" {kind}")]
+            named = paths[0] if len(paths) == 1 else f"{len(paths)} lights, {paths[0]} to {paths[-1]}"
+            yield "light", f"{variant} {named} {kind}".strip()
     for camera in found.cameras:
         yield "camera", f"{camera.path}, {camera.projection}, {camera.framing}"
     yield from _provenance(found.provenance)

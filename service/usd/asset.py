@@ -12,7 +12,7 @@ from service.asset.textures import FILE_NAMES, space_warnings, write_textures
 from service.asset.units import unit_in_metres
 from service.requests.export import FIRST_VERSION, TextureFormat
 from service.usd.files import check_textures, install, temporary_folder_beside
-from service.usd.layers import OWN_FILES, AssetLayers, Description, texture_folder
+from service.usd.layers import LAYER_FILES, AssetLayers, Description, texture_folder
 from service.usd.scene import define_asset, level_name
 from service.usd.surroundings import Surroundings, define_surroundings, written_before
 from stage.maps import SurfaceMaps
@@ -93,11 +93,11 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str 
         layers = AssetLayers(temporary, target, description)
         define_asset(layers, maps, [mesh, *coarser], written, ior=look.ior if look is not None else IOR_LIMITS[0], openpbr=openpbr)
         around = define_surroundings(layers, surroundings, maps.camera, mesh.extent, folder, packed=packed)
-        beside += around.files
+        beside += around.images
         layers.save()
         first, *others = layers.files
-        install(target, first, [*others, *beside],
-                ours=(*OWN_FILES, *FILE_NAMES, DOCUMENT, *written_before(target.parent / folder.name)))
+        older = written_before(target.parent / folder.name, target.parent / layers.lights.name)
+        install(target, first, [*others, *beside], ours=(*LAYER_FILES, *FILE_NAMES, DOCUMENT, *older), apart=around.lights)
     installed = () if packed else tuple(target.parent / folder.name / file.name for file in beside)
     return AssetReport(target, installed, len(mesh.points), len(mesh.face_counts), mesh.step,
                        {**{name: texture.clipped_pixels for name, texture in written.items()}, **around.clipped_pixels},

@@ -15,7 +15,7 @@ from service.asset.textures import FILE_NAMES, write_textures
 from service.requests.export import FIRST_VERSION, Geometry, TextureFormat
 from service.usd.camera import define_cameras
 from service.usd.files import check_textures, install, temporary_folder_beside
-from service.usd.layers import OWN_FILES, AssetLayers, Description, texture_folder
+from service.usd.layers import LAYER_FILES, AssetLayers, Description, texture_folder
 from service.usd.materials import define_display_color_material, define_looks
 from service.usd.points import define_points
 from service.usd.primvars import set_primvar
@@ -80,7 +80,7 @@ def write_depth(maps: DepthMaps, cloud: PointCloud | None, path: str | Path, *, 
         define_cameras(layers.geometry, layers.root, maps.camera, parts.extent)
         layers.save()
         first, *others = layers.files
-        install(target, first, [*others, *sorted(folder.iterdir())], ours=(*OWN_FILES, *FILE_NAMES))
+        install(target, first, [*others, *sorted(folder.iterdir())], ours=(*LAYER_FILES, *FILE_NAMES))
     return colour_warnings(parts.points)
 
 

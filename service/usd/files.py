@@ -76,7 +76,7 @@ def write_layer(target: Path, define: Callable[[Usd.Stage], None]) -> None:
         install(target, layer, (), ours=())
 
 
-def install(target: Path, layer: Path, files: Sequence[Path], *, ours: Container[str]) -> None:
+def install(target: Path, layer: Path, files: Sequence[Path], *, ours: Container[str], apart: Sequence[Path] = ()) -> None:
     """Flush an asset to the disk and put it in place of an older one, whole or not at all; as a package where the target is a .usdz.
 
     Args:
@@ -84,21 +84,25 @@ def install(target: Path, layer: Path, files: Sequence[Path], *, ours: Container
         files: that it refers to, in folders of that folder. Unless they are packed, these folders take the place of older ones beside the
             target.
         ours: names of files that an older asset can have in such a folder; other files that lie there stay.
+        apart: files in folders of their own that are never packed. Beside a package, which does not refer to them, older ones stay too.
 
     Raises:
         AssetError: larger than a package can be.
         StorageError: there is something else in place of a folder.
         OSError: the disk refuses; what was there before is put back.
     """
+    folders = [folder for folder in sorted(layer.parent.iterdir()) if folder.is_dir()]
     if check_suffix(target) == ".usdz":
         package = layer.with_suffix(".usdz")
         _pack(package, layer, files)
-        layer, files = package, ()
+        layer, files, ours = package, (), ()
+        folders = sorted({file.parent for file in apart})
+    files = [*files, *apart]
     for file in (layer, *files):
         with open(file, "rb") as written:
             os.fsync(written.fileno())
     moves = [_Move(folder, target.parent / folder.name, folder.with_name(f"{folder.name}.replaced"))
-             for folder in sorted(layer.parent.iterdir()) if folder.is_dir() and files]
+             for folder in folders if files]
     for move in moves:
         if move.place.is_symlink() or (move.place.exists() and not move.place.is_dir()):
             raise StorageError(f"cannot write {target}: {move.place} is no folder, and the asset needs a folder of this name: move it away")
@@ -117,7 +121,7 @@ def install(target: Path, layer: Path, files: Sequence[Path], *, ours: Container
         raise
     for move in moves:
         for file in move.replaced.iterdir() if move.replaced.exists() else ():
-            if file.name not in ours:
+            if file.name not in ours and not (move.place / file.name).exists():
                 os.rename(file, move.place / file.name)
         if not any(move.place.iterdir()):
             move.place.rmdir()

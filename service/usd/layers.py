@@ -6,7 +6,8 @@ three.js reads neither payloads nor sublayers of binary layers.
 
 The prims of the first variant of `geo` are ordinary prims, and each further variant deactivates them and has prims of its own. Readers that
 do not know variants therefore see the first one, and nothing twice. The variants of `look` bind one material each. A variant of `light`
-refers to the layer `<stem>_layers/<variant>.usda`, and the default, `off`, to none, so that an asset brings no lights into a scene.
+refers to the layer `<stem>_lights/<variant>.usda`, and the default, `off`, to none, so that an asset brings no lights into a scene. ARKit
+knows no lights: those of a .usdz are layers beside it alone.
 
 Source: OpenUSD: UsdVariantSet, UsdModelAPI (kind, assetInfo), UsdGeomModelAPI (extentsHint), LIVERPS strength ordering (an opinion in a
 variant is weaker than one beside it, so that what variants change is stated in variants alone).
@@ -36,8 +37,6 @@ PAYLOAD, GEOMETRY, MATERIALS = "payload.usda", "geometry.usdc", "materials.usda"
 LAYER_FILES = (PAYLOAD, GEOMETRY, MATERIALS)
 LIGHT_OFF, RIG, ENVIRONMENT = "off", "rig", "environment"
 """The variants of `light`; the layer of each but the first is named after it."""
-OWN_FILES = (*LAYER_FILES, *(f"{name}.usda" for name in (RIG, ENVIRONMENT)))
-"""Every file that an asset can have in its folder of layers."""
 
 PURPOSES = [UsdGeom.Tokens.default_, UsdGeom.Tokens.render, UsdGeom.Tokens.proxy, UsdGeom.Tokens.guide]
 """All of them: extents hold the geometry of every purpose."""
@@ -61,6 +60,8 @@ class AssetLayers:
         materials: the stage for everything below `looks`.
         root: path of the root prim, /Name.
         texture_folder: of the textures, relative to the layer of the materials.
+        lights: temporary folder of the layers of lights and their textures.
+        light_files: the layers of lights.
     """
 
     def __init__(self, folder: Path, target: Path, description: Description) -> None:
@@ -90,7 +91,8 @@ class AssetLayers:
         self._surfaces: list[tuple[str, Sdf.Path]] = []
         self._looks: dict[str, Sdf.Path] = {}
         self._bindings: list[tuple[str, Sdf.Path, Sdf.Path]] = []
-        self._lightings: list[str] = []
+        self.lights = folder / light_folder(target)
+        self.light_files: list[Path] = []
         self._times: list[float] = []
 
     @property
@@ -134,21 +136,21 @@ class AssetLayers:
 
     @contextmanager
     def lighting(self, name: str) -> Iterator[Usd.Stage]:
-        """Define a variant of `light`, RIG or ENVIRONMENT, inside the block: below `root`, on the yielded stage."""
-        self._lightings.append(name)
-        if self._packed:
-            with _in_variant(self._interface, self.root, LIGHT, name):
-                yield self._interface
-        else:
-            file = self._interface_file.parent / self.files[1].parent.name / f"{name}.usda"
-            lights = self._create(file, posed=True)  # so that the layer can be opened without the asset
-            self.files += (file,)
-            yield lights
-            lights.Save()
+        """Define a variant of `light`, RIG or ENVIRONMENT, inside the block: below `root`, on the yielded stage.
+
+        Its layer lies in `lights` and has the pose of the camera frame, so that it can be opened without the asset.
+        """
+        self.lights.mkdir(exist_ok=True)
+        file = self.lights / f"{name}.usda"
+        usd_stage = self._create(file, posed=True)
+        yield usd_stage
+        usd_stage.Save()
+        self.light_files.append(file)
 
     def set_times(self, usd_stage: Usd.Stage, first: float, last: float) -> None:
-        """Let a stage of the asset, and the asset with it, reach from one time code to another, both included."""
-        self._times += [first, last]
+        """Let a stage, and the asset that it is a part of, reach from one time code to another, both included."""
+        if not self._packed or usd_stage == self._interface:
+            self._times += [first, last]
         _set_times(usd_stage, first, last)
 
     def save(self) -> None:
@@ -167,12 +169,12 @@ class AssetLayers:
                 model.SetExtentsHint(model.ComputeExtentsHint(UsdGeom.BBoxCache(Usd.TimeCode.Default(), PURPOSES)))
         for name in self._looks:
             root.GetVariantSets().AddVariantSet(LOOK).AddVariant(name)
-        lightings = [LIGHT_OFF, *self._lightings] if self._lightings else []
-        for name in lightings:
-            root.GetVariantSets().AddVariantSet(LIGHT).AddVariant(name)
-            if name != LIGHT_OFF and not self._packed:
-                with _in_variant(self._interface, self.root, LIGHT, name):
-                    root.GetReferences().AddReference(f"./{self.files[1].parent.name}/{name}.usda")
+        lightings = [LIGHT_OFF] if self.light_files and not self._packed else []
+        for file in self.light_files if lightings else ():
+            root.GetVariantSets().AddVariantSet(LIGHT).AddVariant(LIGHT_OFF)
+            lightings.append(file.stem)
+            with _in_variant(self._interface, self.root, LIGHT, file.stem):
+                root.GetReferences().AddReference(f"./{file.parent.name}/{file.name}")
         for variant_set, variants in ((GEO, self._geometries), (LOOK, [*self._looks]), (LIGHT, lightings)):
             if variants:
                 root.GetVariantSets().GetVariantSet(variant_set).SetVariantSelection(variants[0])
@@ -249,6 +251,11 @@ def describe_root(root: UsdGeom.Xform, *, name: str, identifier: str, version: s
 def layer_folder(target: Path) -> str:
     """Return the name of the folder beside an asset that holds the layers of its payload."""
     return f"{target.stem}_layers"
+
+
+def light_folder(target: Path) -> str:
+    """Return the name of the folder beside an asset that holds its lights."""
+    return f"{target.stem}_lights"
 
 
 def texture_folder(target: Path) -> str:

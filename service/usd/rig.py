@@ -84,15 +84,14 @@ def rig_lights(capture: Capture) -> list[RigLight]:
     return list(found.values())
 
 
-def define_rig(layers: AssetLayers, capture: Capture, folder: Path, extent: np.ndarray) -> list[Path]:
+def define_rig(layers: AssetLayers, capture: Capture, extent: np.ndarray) -> list[Path]:
     """Define the variant `rig` of `light` from the lights of a capture.
 
     Args:
-        folder: temporary, for the textures of dome lights.
         extent: [2, 3] bounding box of the surface, camera frame, scene units.
 
     Returns:
-        The textures that were written.
+        The textures of dome lights, beside the layer.
 
     Raises:
         AssetError: no light, near lights without a scale, or an extended light that surrounds the object; names the frame.
@@ -106,7 +105,7 @@ def define_rig(layers: AssetLayers, capture: Capture, folder: Path, extent: np.n
         rig.GetPrim().SetCustomDataByKey("relit:irradiance_scale", capture.manifest.irradiance_scale)
         for lit in lights:
             path = rig.GetPath().AppendChild(f"Light_{lit.frames[0]:04d}")
-            emission, texture = _define_light(usd_stage, path, lit, capture, layers, folder, extent)
+            emission, texture = _define_light(usd_stage, path, lit, capture, layers.lights, extent)
             if texture is not None:
                 textures.append(texture)
             _set_emission(emission, lit, len(capture.manifest.frames))
@@ -114,7 +113,7 @@ def define_rig(layers: AssetLayers, capture: Capture, folder: Path, extent: np.n
     return textures
 
 
-def _define_light(usd_stage: Usd.Stage, path: Sdf.Path, lit: RigLight, capture: Capture, layers: AssetLayers, folder: Path,
+def _define_light(usd_stage: Usd.Stage, path: Sdf.Path, lit: RigLight, capture: Capture, folder: Path,
                   extent: np.ndarray) -> tuple[_Emission, Path | None]:
     """Define one light without its intensity; return what it emits, and its texture where it has one."""
     light, space = lit.light, linear_space(capture.manifest.color_space)
@@ -145,7 +144,7 @@ def _define_light(usd_stage: Usd.Stage, path: Sdf.Path, lit: RigLight, capture: 
         return _Emission(define_dome(usd_stage, path, None), 1.0, (1.0, 1.0, 1.0)), None
     else:
         write_radiance(_gradient(light), texture)
-    return _Emission(define_dome(usd_stage, path, f"{layers.texture_folder}/{texture.name}"), 1.0, (1.0, 1.0, 1.0)), texture
+    return _Emission(define_dome(usd_stage, path, f"./{texture.name}"), 1.0, (1.0, 1.0, 1.0)), texture
 
 
 def _define_distant(usd_stage: Usd.Stage, path: Sdf.Path, direction: Sequence[float] | np.ndarray, angle: float,

@@ -15,7 +15,7 @@ from service.usd.rig import define_rig
 from stage.camera import Camera
 from stage.capture import Capture
 
-_FILES = re.compile(rf"{ENVIRONMENT}\.exr|{RIG}_\d+\.exr|{card_images.FILE_PATTERN}")
+_FILES = re.compile(rf"{ENVIRONMENT}\.(?:exr|usda)|{RIG}\.usda|{RIG}_\d+\.exr|{card_images.FILE_PATTERN}")
 """Every file that define_surroundings can write."""
 
 
@@ -31,9 +31,10 @@ class Surroundings(NamedTuple):
 
 
 class Written(NamedTuple):
-    """The textures of the surroundings."""
+    """The files of the surroundings."""
 
-    files: list[Path]
+    images: list[Path]  # of a card
+    lights: list[Path]  # layers and textures
     clipped_pixels: dict[str, int]  # what → pixels that did not fit into 0…1
 
 
@@ -43,7 +44,7 @@ def define_surroundings(layers: AssetLayers, surroundings: Surroundings, camera:
 
     Args:
         extent: [2, 3] bounding box of the surface, camera frame, scene units.
-        folder: temporary, of the textures.
+        folder: temporary, of the textures of the surface.
         packed: for a .usdz, which holds the images of a card as PNG.
 
     Raises:
@@ -51,24 +52,25 @@ def define_surroundings(layers: AssetLayers, surroundings: Surroundings, camera:
         ImageError: an environment or a frame that cannot be used.
         StorageError: a file cannot be read or written.
     """
-    files: list[Path] = []
+    images: list[Path] = []
+    lights: list[Path] = []
     clipped_pixels: dict[str, int] = {}
     if surroundings.card is not None:
         written = card_images.write_card(surroundings.card, folder, as_png=packed)
         define_card(layers, written, camera, extent)
-        files += [folder / name for names in (written.colours, written.opacities) for name in names.values()]
+        images = [folder / name for names in (written.colours, written.opacities) for name in names.values()]
         clipped_pixels["card"] = written.clipped_pixels
     if surroundings.rig is not None:
-        files += define_rig(layers, surroundings.rig, folder, extent)
+        lights += define_rig(layers, surroundings.rig, extent)
     if surroundings.environment is not None:
-        texture = folder / f"{ENVIRONMENT}.exr"
-        write_dome_texture(surroundings.environment, texture)
-        files.append(texture)
         with layers.lighting(ENVIRONMENT) as usd_stage:
-            define_dome(usd_stage, layers.root.AppendChild("Environment"), f"{layers.texture_folder}/{texture.name}")
-    return Written(files, clipped_pixels)
+            texture = layers.lights / f"{ENVIRONMENT}.exr"
+            write_dome_texture(surroundings.environment, texture)
+            define_dome(usd_stage, layers.root.AppendChild(ENVIRONMENT.capitalize()), f"./{texture.name}")
+        lights.append(texture)
+    return Written(images, [*layers.light_files, *lights], clipped_pixels)
 
 
-def written_before(folder: Path) -> list[str]:
-    """Return the names of the files in the texture folder of an older asset that its surroundings had."""
-    return [file.name for file in folder.iterdir() if _FILES.fullmatch(file.name)] if folder.is_dir() else []
+def written_before(*folders: Path) -> list[str]:
+    """Return the names of the files in the folders of an older asset that its surroundings had."""
+    return [file.name for folder in folders if folder.is_dir() for file in folder.iterdir() if _FILES.fullmatch(file.name)]

@@ -9,11 +9,13 @@ from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdUtils
 
 from service.export.export import export
 from service.requests.export import ExportRequest, TextureFormat
+from stage import exr
 from stage.camera import Camera
 from stage.colour import convert
 from stage.maps import MAPS_FILE, SurfaceMaps
 from tests.clients.scenes import GOLD, PAINT, ball_maps
 from tests.clients.validators import findings
+from tests.scenes.surroundings import capture_of, write_frames
 from tests.service.gltf import khronos
 
 SIDE = 40
@@ -78,6 +80,20 @@ def exported(maps: SurfaceMaps, folder: Path, **options) -> Path:
 @pytest.mark.parametrize("way", WAYS)
 def test_usd_validators_and_arkit_find_nothing(surface, way, tmp_path):
     assert findings(exported(SURFACES[surface], tmp_path, suffix=way[:4], **WAYS[way])) == []
+
+
+@pytest.mark.parametrize("suffix", ["usda", "usdz"])
+def test_usd_validators_and_arkit_find_nothing_in_lights_and_frames(suffix, tmp_path):
+    lights = [{"type": "distant", "direction": [1, 0, 1], "irradiance": [1, 2, 3]}, {"type": "gradient", "axis": "y", "sign": 1},
+              {"type": "point", "position_m": [0, 0, 1], "intensity": [1, 1, 1], "axis": [0, 0, -1], "anisotropy": 2}]
+    capture = capture_of(tmp_path / "capture", ORTHOGRAPHIC, lights)
+    frames = write_frames(tmp_path / "frames", (1001, 1002), ORTHOGRAPHIC)
+    sky = np.ones((8, 16), np.float16)
+    exr.write(tmp_path / "sky.exr", {"R": sky, "G": sky, "B": sky}, color_space="lin_ap1_scene", metadata={})
+    asset = exported(TWO, tmp_path, suffix=suffix, rig=capture.folder, environment=tmp_path / "sky.exr", card=frames)
+    layers = sorted((tmp_path / "asset_lights").glob("*.usda"))
+    assert [layer.stem for layer in layers] == ["environment", "rig"]
+    assert [finding for file in (asset, *layers) for finding in findings(file)] == []
 
 
 @pytest.mark.parametrize("surface", SURFACES)

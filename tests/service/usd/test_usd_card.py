@@ -12,23 +12,9 @@ from stage import exr
 from stage.camera import Distortion
 from stage.colour import rgb_matrix
 from tests.scenes.surfaces import make_wave
+from tests.scenes.surroundings import COVERAGE, write_frames
 
 POSE = ((0.0, 0.0, 1.0, 0.3), (1.0, 0.0, 0.0, -0.1), (0.0, 1.0, 0.0, 2.0), (0.0, 0.0, 0.0, 1.0))
-COVERAGE = np.array([0.0, 0.25, 1.0])
-"""Of the columns of a frame, again and again."""
-
-
-def write_frames(folder, numbers, camera, *, space="lin_rec709_scene", opaque=False):
-    """Frames whose colour before it is multiplied by the coverage is (number / 4, 0.5, 2)."""
-    coverage = np.broadcast_to(np.resize(COVERAGE, camera.width), (camera.height, camera.width)).astype(np.float16)
-    coverage = np.ones_like(coverage) if opaque else coverage
-    folder.mkdir(parents=True, exist_ok=True)
-    for number in numbers:
-        channels = {name: (coverage * value).astype(np.float16) for name, value in zip("RGB", (number / 4, 0.5, 2.0), strict=True)}
-        exr.write(folder / f"frame.{number:04d}.exr", {**channels, "A": coverage, "depth.Z": coverage}, color_space=space, metadata={})
-    return folder / "frame.####.exr"
-
-
 def export(tmp_path, maps, suffix=".usda", numbers=(3, 4), **frames):
     pattern = write_frames(tmp_path / "frames", numbers, maps.camera, **frames)
     report = write_asset(maps, tmp_path / f"a{suffix}", name="A", surroundings=Surroundings(card=find_frames(pattern, maps.camera)))

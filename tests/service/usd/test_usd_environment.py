@@ -26,24 +26,26 @@ def test_a_dome_light_has_the_map(suffix, relit, tmp_path):
     assert export(relit, tmp_path, write_map(tmp_path / "sky.exr"), suffix).code == 0
     usd_stage = Usd.Stage.Open(str(tmp_path / f"a{suffix}"))
     assert not any(prim.HasAPI(UsdLux.LightAPI) for prim in usd_stage.Traverse())
-    usd_stage.GetDefaultPrim().GetVariantSet("light").SetVariantSelection("environment")
+    provenance = usd_stage.GetRootLayer().customLayerData["relit"]
+    if suffix == ".usdz":  # ARKit knows no lights: they lie beside the package
+        usd_stage = Usd.Stage.Open(str(tmp_path / "a_lights" / "environment.usda"))
+    else:
+        usd_stage.GetDefaultPrim().GetVariantSet("light").SetVariantSelection("environment")
     dome = UsdLux.DomeLight(usd_stage.GetPrimAtPath("/A/Environment"))
     assert dome.GetIntensityAttr().Get() == 1 and dome.GetTextureFormatAttr().Get() == "latlong"
     assert not UsdGeom.Xformable(dome).GetOrderedXformOps()  # UsdLux orients the map as relit does
     file = dome.GetTextureFileAttr()
     assert file.GetColorSpace() == "lin_rec709_scene" and file.Get().resolvedPath
-    if suffix != ".usdz":
-        channels, metadata = exr.read(file.Get().resolvedPath)
-        np.testing.assert_allclose(np.stack([channels[name] for name in "RGB"], axis=-1), RADIANCE, atol=3e-4)  # half
-        assert metadata["colorInteropID"] == "lin_rec709_scene"
-    assert dict(usd_stage.GetRootLayer().customLayerData["relit"])["environment"]
+    channels, metadata = exr.read(file.Get().resolvedPath)
+    np.testing.assert_allclose(np.stack([channels[name] for name in "RGB"], axis=-1), RADIANCE, atol=3e-4)  # half
+    assert metadata["colorInteropID"] == "lin_rec709_scene" and provenance["environment"]
 
 
 def test_other_primaries_are_converted_and_a_bright_sun_is_kept(relit, tmp_path):
     radiance = RADIANCE.copy()
     radiance[2, 3] = 2e5  # above the largest half
     assert export(relit, tmp_path, write_map(tmp_path / "sky.exr", radiance, "lin_ap1_scene")).code == 0
-    channels, _ = exr.read(tmp_path / "a_textures" / "environment.exr")
+    channels, _ = exr.read(tmp_path / "a_lights" / "environment.exr")
     wanted = np.maximum(radiance @ rgb_matrix("lin_ap1_scene", "lin_rec709_scene").T, 0)
     np.testing.assert_allclose(np.stack([channels[name] for name in "RGB"], axis=-1), wanted, rtol=1e-4, atol=1e-6)
 

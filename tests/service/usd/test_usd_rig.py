@@ -1,6 +1,6 @@
 """The light stage as UsdLux lights: each gives what the manifest says, at its own frames, and none by default."""
 
-import json
+import zipfile
 
 import numpy as np
 import pytest
@@ -9,10 +9,9 @@ from pxr import Gf, Usd, UsdGeom, UsdLux, UsdValidation
 from service.usd.asset import write_asset
 from service.usd.surroundings import Surroundings
 from stage import exr
-from stage.capture import Capture
 from stage.colour import rgb_matrix
-from tests.scenes.captures import write_image, write_manifest
 from tests.scenes.surfaces import make_wave
+from tests.scenes.surroundings import capture_of
 
 POSE = ((0.0, 0.0, 1.0, 0.3), (1.0, 0.0, 0.0, -0.1), (0.0, 1.0, 0.0, 2.0), (0.0, 0.0, 0.0, 1.0))
 TILTED = np.array([0.6, 0.0, 0.8])
@@ -30,16 +29,6 @@ def cap(half_angle_deg, count=4000):
             "solid_angle": [2 * np.pi * (1 - top) / count] * count}
 
 
-def capture_of(folder, camera, lights, **changes):
-    """A capture whose frames have these lights and black images."""
-    for index in range(len(lights)):
-        write_image(folder / f"{index:03d}.png", np.zeros((camera.height, camera.width, 3), np.uint8))
-    frames = [{"image": f"{index:03d}.png", "light": light} for index, light in enumerate(lights)]
-    write_manifest(folder, {"schema": "relit.capture/1", "name": "lights", "camera": json.loads(camera.model_dump_json(exclude_none=True)),
-                            "frames": frames, **changes})
-    return Capture.open(folder)
-
-
 def export(tmp_path, lights, suffix=".usda", projection="perspective", camera_changes=None, **changes):
     maps = make_wave(projection, world_from_camera=POSE, **(camera_changes or {}))
     capture = capture_of(tmp_path / "capture", maps.camera, lights, **changes)
@@ -48,6 +37,8 @@ def export(tmp_path, lights, suffix=".usda", projection="perspective", camera_ch
 
 
 def open_rig(path):
+    if path.suffix == ".usdz":  # ARKit knows no lights: they lie beside the package
+        return Usd.Stage.Open(str(path.parent / "a_lights" / "rig.usda"))
     usd_stage = Usd.Stage.Open(str(path))
     usd_stage.GetDefaultPrim().GetVariantSet("light").SetVariantSelection("rig")
     return usd_stage
@@ -138,7 +129,7 @@ def test_colours_are_rec709_whatever_the_capture_has(tmp_path):
     np.testing.assert_allclose(found, np.maximum(rgb_matrix("lin_ap1_scene", "lin_rec709_scene") @ [2, 1, 0.5], 0), rtol=1e-5)
 
 
-@pytest.mark.parametrize("suffix", [".usda", ".usdz"])
+@pytest.mark.parametrize("suffix", [".usda", ".usdc"])
 def test_lights_are_off_unless_they_are_selected(suffix, tmp_path):
     export(tmp_path, [{"type": "distant", "direction": [0, 0, 1], "irradiance": [1, 1, 1]}], suffix)
     usd_stage = Usd.Stage.Open(str(tmp_path / f"a{suffix}"))
@@ -147,9 +138,24 @@ def test_lights_are_off_unless_they_are_selected(suffix, tmp_path):
     assert not any(prim.HasAPI(UsdLux.LightAPI) for prim in usd_stage.Traverse())
 
 
+def test_a_package_holds_no_lights(tmp_path):
+    export(tmp_path, [{"type": "gradient", "axis": "x", "sign": 1}], ".usdz")
+    usd_stage = Usd.Stage.Open(str(tmp_path / "a.usdz"))
+    assert "light" not in usd_stage.GetDefaultPrim().GetVariantSets().GetNames() and not usd_stage.HasAuthoredTimeCodeRange()
+    assert not [name for name in zipfile.ZipFile(tmp_path / "a.usdz").namelist() if name.endswith((".exr", ".usda"))]
+    (tmp_path / "a_lights" / "mine.txt").write_text("mine")
+    maps = make_wave("perspective", world_from_camera=POSE)
+    environment = tmp_path / "a_lights" / "rig_0001.exr"
+    write_asset(maps, tmp_path / "a.usdz", name="A", surroundings=Surroundings(environment=environment))  # the rig stays
+    assert {file.name for file in (tmp_path / "a_lights").iterdir()} == {"rig.usda", "rig_0001.exr", "environment.usda", "environment.exr",
+                                                                         "mine.txt"}
+    write_asset(maps, tmp_path / "a.usda", name="A", surroundings=Surroundings(environment=environment))  # replaces the lights
+    assert {file.name for file in (tmp_path / "a_lights").iterdir()} == {"environment.usda", "environment.exr", "mine.txt"}
+
+
 def test_the_layer_of_the_rig_stands_in_the_same_place_without_the_asset(tmp_path):
     within = export(tmp_path, [{"type": "point", "position_m": [0.3, 0.2, -0.1], "intensity": [1, 1, 1]}])
-    alone = Usd.Stage.Open(str(tmp_path / "a_layers" / "rig.usda"))
+    alone = Usd.Stage.Open(str(tmp_path / "a_lights" / "rig.usda"))
     places = [UsdGeom.XformCache().GetLocalToWorldTransform(usd_stage.GetPrimAtPath("/A/Rig/Light_0001")) for usd_stage in (within, alone)]
     assert places[0] == places[1] and alone.GetEndTimeCode() == 1
 
