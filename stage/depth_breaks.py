@@ -22,6 +22,8 @@ BEND = 0.25
 LINEAR = 0.1
 """The largest standard deviation that counts, as a part of the depth: with a larger one that of the inverse depth has no meaning, and
 pixels close to the camera would be joined to everything behind them."""
+BATCH = 1 << 17
+"""The number of steep steps that are looked at together, which bounds the memory (some 60 MB)."""
 
 _POSITION = np.arange(SIDE) - (SIDE - 1) / 2
 """The positions of the pixels on a line, from their middle."""
@@ -76,7 +78,9 @@ def connected(depth: np.ndarray, mask: np.ndarray, camera: Camera, offset: tuple
     gentle = same_surface(depth[here], depth[there], float(np.hypot(down, right)), camera)
     joined[here] = both & gentle
     pixels = np.argwhere(both & ~gentle) + np.array((0, first_col))
-    joined[tuple(pixels.T)] = _continues(*_along(depth, sigma, mask, camera, pixels, offset))
+    for start in range(0, len(pixels), BATCH):
+        batch = pixels[start:start + BATCH]
+        joined[tuple(batch.T)] = _continues(*_along(depth, sigma, mask, camera, batch, offset))
     return joined
 
 

@@ -82,6 +82,13 @@ def test_noise_is_no_break_and_no_excuse_for_one(scale):
     assert blind[1] > 5 * torn  # sigma is what tells
 
 
+def test_batches_change_nothing(monkeypatch):
+    depth, label = hall(11.0)
+    whole = connected(depth, label > 0, CAMERA, DOWN)
+    monkeypatch.setattr("stage.depth_breaks.BATCH", 7)
+    assert (connected(depth, label > 0, CAMERA, DOWN) == whole).all()
+
+
 def test_a_pixel_that_mixes_two_surfaces_joins_neither():
     depth = np.where(np.arange(96) < 40, 2.0, 5.0) * np.ones((72, 96))
     for width in (1, 2):
