@@ -70,7 +70,7 @@ def test_export_makes_an_asset_that_usd_opens(relit, tmp_path):
     write_capture(tmp_path / "cap", SCENE)
     relit("solve", tmp_path / "cap", "--out", tmp_path / "out")
     outcome = relit("export", tmp_path / "out", "--out", tmp_path / "out" / "asset.usdz", "--name", "Cap")
-    assert (outcome.code, outcome.out, outcome.err) == (0, f"asset    {tmp_path}/out/asset.usdz\n", "")
+    assert (outcome.code, outcome.out.splitlines()[0], outcome.err) == (0, f"asset    {tmp_path}/out/asset.usdz", "")
     from pxr import Usd, UsdGeom
 
     usd_stage = Usd.Stage.Open(str(tmp_path / "out" / "asset.usdz"))
