@@ -2,6 +2,10 @@
 
 import MaterialX as mx
 import pytest
+from MaterialX.PyMaterialXGenGlsl import GlslShaderGenerator
+from MaterialX.PyMaterialXGenMdl import MdlShaderGenerator
+from MaterialX.PyMaterialXGenOsl import OslShaderGenerator
+from MaterialX.PyMaterialXGenShader import DefaultColorManagementSystem, GenContext, UnitSystem
 
 from service.asset.openpbr import DOCUMENT, MATERIAL, openpbr_document, write_openpbr
 from service.asset.textures import DATA_SPACE, DISPLAY_SPACE, Texture
@@ -49,6 +53,24 @@ def test_the_surface_reads_the_textures(tmp_path):
             for given in surface.getInputs() if given.getOutputString()}
     assert read == {"base_color": "base_color", "base_metalness": "metallic", "specular_roughness": "roughness",
                     "geometry_normal": "tangent_space"}
+
+
+@pytest.mark.parametrize("kind", [GlslShaderGenerator, OslShaderGenerator, MdlShaderGenerator])
+def test_renderers_can_make_a_shader_of_it(kind):
+    document, library = openpbr_document(METAL, ior=1.6), mx.createDocument()
+    mx.loadLibraries(mx.getDefaultDataLibraryFolders(), mx.getDefaultDataSearchPath(), library)
+    generator = kind.create()
+    context = GenContext(generator)
+    context.registerSourceCodeSearchPath(mx.getDefaultDataSearchPath())
+    context.getOptions().targetDistanceUnit = "meter"
+    colours, units = DefaultColorManagementSystem.create(generator.getTarget()), UnitSystem.create(generator.getTarget())
+    colours.loadLibrary(library)
+    units.loadLibrary(library)
+    units.setUnitConverterRegistry(mx.UnitConverterRegistry.create())
+    generator.setColorManagementSystem(colours)
+    generator.setUnitSystem(units)
+    source = generator.generate("owl", document.getNode(MATERIAL), context).getSourceCode("pixel")
+    assert "srgb_texture_to_lin_rec709" in source and all(f"{name}_file" in source for name in METAL)
 
 
 def test_a_lambertian_surface_reflects_nothing():
