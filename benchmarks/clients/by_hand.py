@@ -96,8 +96,9 @@ def _mesh(maps: SurfaceMaps) -> _Mesh:
         xy = flat[rows, cols] + (dc - 0.5) * across + (dr - 0.5) * down
         if perspective:
             ray = np.concatenate([xy, np.full((len(xy), 1), -1.0)], axis=-1)
-            towards = np.minimum((normal * ray).sum(-1), -LEAST_COSINE * np.linalg.norm(ray, axis=-1))
-            z.append(-np.minimum((normal * points).sum(-1), 0) / towards)
+            faces = (normal * points).sum(-1) < -LEAST_COSINE * np.linalg.norm(points, axis=-1)
+            t = (normal * points).sum(-1) / np.minimum((normal * ray).sum(-1), -LEAST_COSINE / 2)
+            z.append(np.where(faces, -t, points[:, 2]))
         else:
             z.append(points[:, 2] - ((xy - points[:, :2]) * normal[:, :2]).sum(-1) / np.maximum(normal[:, 2], LEAST_COSINE))
         keys.append((part * (height + 1) + rows + dr) * (width + 1) + cols + dc)

@@ -1,5 +1,6 @@
 """Light and objects with known pictures for tests that open assets in other programs."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -82,3 +83,18 @@ def ball_arrays(balls: tuple[Ball, ...], rings: int = 96) -> dict[str, np.ndarra
                  "normal": np.array([0, 0, 1]), "opacity": np.array(1), "ior": np.array(1.5)}
         arrays |= {f"{index}.{name}": value.astype(np.float32) for name, value in found.items()} | {f"{index}.triangles": triangles}
     return arrays
+
+
+def seen_in_perspective(maps: SurfaceMaps) -> SurfaceMaps:
+    """Return the maps as if a turned perspective camera of known scale had seen them, one metre away."""
+    width, height = maps.camera.resolution
+    camera = Camera(projection="perspective", resolution=(width, height), focal_px=(4.8 * width,) * 2,
+                    principal_px=(width / 2, height / 2 - 1), surface_z_m=-1.0,
+                    world_from_camera=((0, 0, 1, 0.5), (1, 0, 0, -2), (0, 1, 0, 0.25), (0, 0, 0, 1)))
+    return replace(maps, camera=camera, height=np.where(maps.mask, maps.height - 1, 0))
+
+
+def without_scale(maps: SurfaceMaps) -> SurfaceMaps:
+    """Return the maps as a capture without a scale gives them: heights in pixels."""
+    camera = Camera(projection="orthographic", resolution=maps.camera.resolution)
+    return replace(maps, camera=camera, height=maps.height / maps.camera.pixel_size_m)

@@ -13,7 +13,7 @@ from stage import exr
 from stage.camera import Camera
 from stage.colour import convert
 from stage.maps import MAPS_FILE, SurfaceMaps
-from tests.clients.scenes import GOLD, PAINT, ball_maps
+from tests.clients.scenes import GOLD, PAINT, ball_maps, seen_in_perspective, without_scale
 from tests.clients.validators import findings
 from tests.scenes.surroundings import capture_of, write_frames
 from tests.service.gltf import khronos
@@ -40,21 +40,14 @@ def with_holes(maps: SurfaceMaps) -> SurfaceMaps:
     return replace(maps, mask=mask, height=height, normal=normal, part=part)
 
 
-def perspective(maps: SurfaceMaps) -> SurfaceMaps:
-    """Return the maps as if a turned perspective camera of known scale had seen them, one metre away."""
-    camera = Camera(projection="perspective", resolution=(SIDE, SIDE), focal_px=(4.8 * SIDE,) * 2, principal_px=(SIDE / 2, SIDE / 2 - 1),
-                    surface_z_m=-1.0, world_from_camera=((0, 0, 1, 0.5), (1, 0, 0, -2), (0, 1, 0, 0.25), (0, 0, 0, 1)))
-    return replace(maps, camera=camera, height=np.where(maps.mask, maps.height - 1, 0))
-
-
 SURFACES = {
     "parts": TWO,
     "holes": with_holes(TWO),
     "no parts": replace(ball_maps(ORTHOGRAPHIC, (PAINT,))[0], part=None),
-    "perspective": perspective(TWO),
+    "perspective": seen_in_perspective(TWO),
     "no specular": replace(TWO, specular=None, roughness=None),
     "no material": replace(TWO, specular=None, roughness=None, diffuse_albedo=None),
-    "no scale": replace(TWO, camera=Camera(projection="orthographic", resolution=(SIDE, SIDE)), height=TWO.height * SIDE / 0.2),
+    "no scale": without_scale(TWO),
     "ACEScg, clipped": replace(TWO, color_space="lin_ap1_scene",
                                diffuse_albedo=3 * convert(TWO.diffuse_albedo, "lin_rec709_scene", "lin_ap1_scene")),
 }
