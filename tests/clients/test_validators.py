@@ -19,6 +19,8 @@ from tests.scenes.surroundings import capture_of, write_frames
 from tests.service.gltf import khronos
 
 SIDE = 40
+pytestmark = pytest.mark.long
+
 ORTHOGRAPHIC = Camera(projection="orthographic", resolution=(SIDE, SIDE), pixel_size_m=0.2 / SIDE)
 TWO = ball_maps(ORTHOGRAPHIC, (PAINT, GOLD))[0]
 
