@@ -78,6 +78,15 @@ def test_a_solve(server, client, dome, solved):
     assert report["method"] == "lambert"
 
 
+def test_an_export_brings_lights_along(server, client, dome, sky, solved):
+    exported = submit(client, kind="export", maps=solved, format="usdz", rig=dome, environment=sky)
+    finish(server, client, exported)
+    lights = {"asset_lights/rig.usda", "asset_lights/environment.usda", "asset_lights/environment.exr"}
+    assert made_by(client, exported) == {"asset.usdz", *lights}
+    rig = client.get(f"/v1/jobs/{exported['id']}/results/asset_lights/rig.usda").raise_for_status()
+    assert rig.content.count(b"def DistantLight") >= 4
+
+
 def test_a_depth(server, client, rig):
     job = submit(client, kind="depth", capture=rig, options={"normals": True, "max_residual_px": 2.5}, name="the rig")
     assert (job["request"]["name"], job["request"]["options"]["max_residual_px"]) == ("the rig", 2.5)
