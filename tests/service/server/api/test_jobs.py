@@ -94,7 +94,8 @@ def test_a_depth(server, client, rig):
     assert made_by(client, job) == {"depth.exr", "points.ply", "report.json"}
     exported = submit(client, kind="export", maps=job["id"], format="usdc", options={"geometry": "points"})
     finish(server, client, exported)
-    assert made_by(client, exported) == {"asset.usdc"}
+    layers = {f"asset_layers/{name}" for name in ("payload.usda", "geometry.usdc", "materials.usda")}
+    assert made_by(client, exported) == {"asset.usdc", *layers, "asset_textures/base_color.png"}
 
 
 def test_a_relight_guided_by_maps_and_lit_by_keys(server, client, dome, solved):
