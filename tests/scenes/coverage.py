@@ -5,8 +5,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tests.scenes.captures import write_exr, write_image, write_manifest
+
 RAYS = 8
 """Rays along each side of a pixel: the coverage is exact to 1/64."""
+NOISE = 0.003
+"""Standard deviation of the noise that is added, of radiance: half a percent of the bright texture."""
 
 
 class Covered(NamedTuple):
@@ -64,3 +68,18 @@ def render_covered(size: int = 48, lights: int = 24, *, radii: tuple[float, floa
         alone.append(radiance)
         images.append(radiance + pixels(behind))
     return Covered(pixels(hit.astype(np.float64))[..., 0], directions, np.array(images), np.array(alone))
+
+
+def write_covered(folder, scene: Covered, mask, *, cut=False):
+    """Write a capture of a rendered outline with noise; `mask` is bool, or coverage that is written with 16 bits; `cut`: black outside."""
+    noise = np.random.default_rng(2).normal(0, NOISE, scene.images.shape)
+    for index, image in enumerate(np.maximum(scene.images + noise, 0)):
+        write_exr(folder / f"{index:03d}.exr", image * mask[..., None] if cut else image)
+    write_image(folder / "mask.png", np.uint8(mask * 255) if mask.dtype == bool else np.uint16(np.rint(mask * 65535)))
+    size = len(mask)
+    write_manifest(folder, {
+        "schema": "relit.capture/1", "name": "cap", "mask": "mask.png",
+        "camera": {"projection": "orthographic", "resolution": [size, size]},
+        "frames": [{"image": f"{index:03d}.exr", "light": {"type": "distant", "direction": direction, "irradiance": [np.pi] * 3}}
+                   for index, direction in enumerate(scene.directions.tolist())]})
+    return folder

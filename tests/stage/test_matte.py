@@ -7,26 +7,7 @@ import pytest
 from stage.capture import Capture
 from stage.ingest import open_stack
 from stage.matte import Matte, MatteSource, matte_of
-from tests.scenes.captures import write_exr, write_image, write_manifest
-from tests.scenes.coverage import Covered, render_covered
-
-NOISE = 0.003
-"""Standard deviation of the noise that is added, of radiance: half a percent of the bright texture."""
-
-
-def write_covered(folder, scene: Covered, mask, *, cut=False):
-    """Write a capture of a rendered outline with noise; `mask` is bool, or coverage that is written with 16 bits; `cut`: black outside."""
-    noise = np.random.default_rng(2).normal(0, NOISE, scene.images.shape)
-    for index, image in enumerate(np.maximum(scene.images + noise, 0)):
-        write_exr(folder / f"{index:03d}.exr", image * mask[..., None] if cut else image)
-    write_image(folder / "mask.png", np.uint8(mask * 255) if mask.dtype == bool else np.uint16(np.rint(mask * 65535)))
-    size = len(mask)
-    write_manifest(folder, {
-        "schema": "relit.capture/1", "name": "cap", "mask": "mask.png",
-        "camera": {"projection": "orthographic", "resolution": [size, size]},
-        "frames": [{"image": f"{index:03d}.exr", "light": {"type": "distant", "direction": direction, "irradiance": [np.pi] * 3}}
-                   for index, direction in enumerate(scene.directions.tolist())]})
-    return folder
+from tests.scenes.coverage import Covered, render_covered, write_covered
 
 
 def found(folder, scene: Covered, mask=None, **options) -> Matte:

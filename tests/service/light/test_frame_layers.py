@@ -14,8 +14,7 @@ from stage.camera import Camera
 from stage.colour import rgb_matrix
 from stage.maps import SurfaceMaps
 from tests.scenes.captures import edit_manifest, files_in, make_scene, write_capture, write_exr
-from tests.scenes.coverage import render_covered
-from tests.stage.test_matte import write_covered
+from tests.scenes.coverage import render_covered, write_covered
 
 SCENE = make_scene(size=20, lights=9)
 POSE = [[0, 0, 1, 0.5], [0, 1, 0, 0.25], [-1, 0, 0, 2], [0, 0, 0, 1]]
