@@ -12,7 +12,6 @@ import zipfile
 from collections.abc import Callable, Container, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
 
 from pxr import Tf, Usd
 
@@ -101,38 +100,34 @@ def install(target: Path, layer: Path, files: Sequence[Path], *, ours: Container
     for file in (layer, *files):
         with open(file, "rb") as written:
             os.fsync(written.fileno())
-    moves = [_Move(folder, target.parent / folder.name, folder.with_name(f"{folder.name}.replaced"))
-             for folder in folders if files]
-    for move in moves:
-        if move.place.is_symlink() or (move.place.exists() and not move.place.is_dir()):
-            raise StorageError(f"cannot write {target}: {move.place} is no folder, and the asset needs a folder of this name: move it away")
+    folders = folders if files else []
+    for folder in folders:
+        place = target.parent / folder.name
+        if place.is_symlink() or (place.exists() and not place.is_dir()):
+            raise StorageError(f"cannot write {target}: {place} is no folder, and the asset needs a folder of this name: move it away")
+    renamed: list[tuple[Path, Path]] = []
+
+    def rename(source: Path, destination: Path) -> None:
+        os.rename(source, destination)
+        renamed.append((source, destination))
+
     try:
-        for move in moves:
-            if move.place.exists():
-                os.rename(move.place, move.replaced)
-            os.rename(move.folder, move.place)
+        for folder in folders:
+            place, replaced = target.parent / folder.name, folder.with_name(f"{folder.name}.replaced")
+            if place.exists():
+                rename(place, replaced)
+            rename(folder, place)
+            for file in replaced.iterdir() if replaced.exists() else ():
+                if file.name not in ours and not (place / file.name).exists():
+                    rename(file, place / file.name)
         os.replace(layer, target)
-    except OSError:
-        for move in reversed(moves):
-            if not move.folder.exists():
-                os.rename(move.place, move.folder)
-            if move.replaced.exists():
-                os.rename(move.replaced, move.place)
+    except BaseException:  # whoever interrupts the program, too, finds what was there before
+        for source, destination in reversed(renamed):
+            os.rename(destination, source)
         raise
-    for move in moves:
-        for file in move.replaced.iterdir() if move.replaced.exists() else ():
-            if file.name not in ours and not (move.place / file.name).exists():
-                os.rename(file, move.place / file.name)
-        if not any(move.place.iterdir()):
-            move.place.rmdir()
-
-
-class _Move(NamedTuple):
-    """A new folder, where it goes, and where an older one is kept meanwhile."""
-
-    folder: Path
-    place: Path
-    replaced: Path
+    for folder in folders:
+        if not any((target.parent / folder.name).iterdir()):
+            (target.parent / folder.name).rmdir()
 
 
 @contextmanager

@@ -209,6 +209,29 @@ def test_failure_of_the_last_rename_brings_the_older_textures_back(ball, older, 
     assert listing(tmp_path) == before and all(not p.name.startswith(".") for p in tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("older", [False, True], ids=["nothing before", "older asset"])
+def test_failure_of_any_rename_brings_both_older_folders_back(ball, older, tmp_path, monkeypatch):
+    if older:
+        write_asset(SURFACES["diffuse only"], tmp_path / "ball.usda", name="Ball")
+        (tmp_path / "ball_layers" / "shot.usda").write_text("#usda 1.0")
+    before = listing(tmp_path)
+    rename = os.rename
+    renames = 5 if older else 2  # of layers and textures: away, and into place; of a file that is not ours
+    for failing, error in ((n, e) for n in range(renames) for e in (OSError(errno.EIO, "Input/output error"), KeyboardInterrupt())):
+        calls = []
+
+        def fail_once(source, destination, failing=failing, error=error, calls=calls):
+            calls.append(destination)
+            if len(calls) == failing + 1:
+                raise error
+            rename(source, destination)
+
+        monkeypatch.setattr(files.os, "rename", fail_once)
+        with pytest.raises((StorageError, KeyboardInterrupt)):
+            write_asset(ball, tmp_path / "ball.usda", name="Ball")
+        assert listing(tmp_path) == before and all(not p.name.startswith(".") for p in tmp_path.iterdir())
+
+
 FILE_SIZE_LIMITED = """
 import resource, signal, sys
 from stage.errors import StorageError
