@@ -5,8 +5,11 @@ import numpy as np
 from service.asset.links import Links
 from service.asset.mesh import SurfaceMesh, height_mesh, valid_heights
 from stage.depth_breaks import connected
-from stage.depth_maps import DepthMaps
+from stage.depth_maps import DEPTH_FILE, DepthMaps
 from stage.maps import SurfaceMaps
+
+LEAST_SHARE = 0.5
+"""Share of the pixels with a depth that a mesh must hold, or its user is told."""
 
 
 def depth_mesh(maps: DepthMaps) -> SurfaceMesh:
@@ -23,6 +26,15 @@ def depth_mesh(maps: DepthMaps) -> SurfaceMesh:
     depth = np.where(valid, maps.depth, 1)
     right, down = (connected(depth, valid, maps.camera, offset, sigma=maps.sigma) for offset in ((0, 1), (1, 0)))
     return height_mesh(surface, links=_without_mixed(Links(right[:, :-1], down[:-1])))
+
+
+def mesh_warnings(mesh: SurfaceMesh, maps: DepthMaps) -> tuple[str, ...]:
+    """Return a sentence if most pixels with a depth are not in the mesh, as with laser stripes that lie apart."""
+    pixels = np.count_nonzero(maps.mask[::mesh.step, ::mesh.step])
+    if mesh.centred >= LEAST_SHARE * pixels:
+        return ()
+    return (f"{DEPTH_FILE}: the mesh holds {mesh.centred} of {pixels} pixels with a depth, for the others have too few neighbours on one "
+            "surface: --geometry points shows all",)
 
 
 def _without_mixed(links: Links) -> Links:

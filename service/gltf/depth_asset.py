@@ -6,7 +6,8 @@ import numpy as np
 from pygltflib import Primitive
 
 from service.asset.depth_cloud import UNCERTAINTY, MeasuredPoints, colour_image, colour_warnings, measured_points
-from service.asset.depth_mesh import depth_mesh
+from service.asset.depth_mesh import depth_mesh, mesh_warnings
+from service.asset.mesh import SurfaceMesh
 from service.asset.metallic import metallic_look
 from service.gltf.camera import camera_warnings
 from service.gltf.container import Glb, writing_glb
@@ -43,29 +44,30 @@ def write_depth(maps: DepthMaps, cloud: PointCloud | None, path: str | Path, *, 
     target = Path(path)
     check_textures(target, textures)
     points = measured_points(maps, cloud)
+    mesh = depth_mesh(maps) if geometry is Geometry.MESH else None
     with writing_glb(target) as (glb, folder):
-        if geometry is Geometry.POINTS:
+        if mesh is None:
             material = add_unlit_material(glb, name=name, coloured=points.colours is not None)
             primitive = add_points(glb, points.points, points.colours, material=material)
             _add_uncertainty(glb, primitive, maps, points.rows, points.cols)
             extent = np.stack([points.points.min(axis=0), points.points.max(axis=0)])
         else:
-            primitive, extent = _add_mesh(glb, maps, points, folder, name, textures)
+            primitive, extent = _add_mesh(glb, mesh, maps, points, folder, name, textures), mesh.extent
         add_scene(glb, primitive, maps.camera, extent, maps.provenance, name=name, file_name=target.name, version=version)
-    return (*colour_warnings(points), *camera_warnings(maps.camera))
+    told = mesh_warnings(mesh, maps) if mesh is not None else ()
+    return (*colour_warnings(points), *told, *camera_warnings(maps.camera))
 
 
-def _add_mesh(glb: Glb, maps: DepthMaps, points: MeasuredPoints, folder: Path, name: str,
-              storage: TextureFormat) -> tuple[Primitive, np.ndarray]:
-    """Add the mesh with its texture, and return its primitive and its bounding box [2, 3]."""
-    mesh = depth_mesh(maps)
+def _add_mesh(glb: Glb, mesh: SurfaceMesh, maps: DepthMaps, points: MeasuredPoints, folder: Path, name: str,
+              storage: TextureFormat) -> Primitive:
+    """Add the mesh with its texture, and return its primitive."""
     seen = SurfaceMaps(camera=maps.camera, mask=maps.mask, diffuse_albedo=colour_image(points, maps.mask), color_space="lin_rec709_scene")
     look = metallic_look(seen) if seen.diffuse_albedo is not None else None
     written = write_textures(seen, mesh, folder, look=look, storage=storage)
     material = add_material(glb, written, folder, name=name)
     primitive = add_surface(glb, mesh, unit_m=1.0, material=material, textured=bool(written), with_tangents=False)
     _add_uncertainty(glb, primitive, maps, mesh.rows, mesh.cols)
-    return primitive, mesh.extent
+    return primitive
 
 
 def _add_uncertainty(glb: Glb, primitive: Primitive, maps: DepthMaps, rows: np.ndarray, cols: np.ndarray) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 from pxr import Sdf, UsdGeom
 
 from service.asset.depth_cloud import UNCERTAINTY, MeasuredPoints, colour_image, colour_warnings, measured_points
-from service.asset.depth_mesh import depth_mesh
+from service.asset.depth_mesh import depth_mesh, mesh_warnings
 from service.asset.errors import AssetError
 from service.asset.mesh import SurfaceMesh
 from service.asset.metallic import metallic_look
@@ -81,7 +81,8 @@ def write_depth(maps: DepthMaps, cloud: PointCloud | None, path: str | Path, *, 
         layers.save()
         first, *others = layers.files
         install(target, first, [*others, *sorted(folder.iterdir())], ours=(*LAYER_FILES, *FILE_NAMES))
-    return colour_warnings(parts.points)
+    told = mesh_warnings(parts.mesh, maps) if parts.mesh is not None and geometry is Geometry.MESH else ()
+    return (*colour_warnings(parts.points), *told)
 
 
 def _parts(maps: DepthMaps, cloud: PointCloud | None, geometry: Geometry) -> _Parts:

@@ -1,5 +1,7 @@
 """Depths as USD: a mesh with what the scene looks like and points as variants, nothing bridged over a break."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom, UsdShade, UsdValidation
@@ -180,6 +182,19 @@ def test_points_without_neighbours_are_exported_alone(tmp_path):
     assert list(tmp_path.iterdir()) == []
     write_depth(maps, None, tmp_path / "a.usda", name="a", geometry=Geometry.POINTS)
     assert opened(tmp_path / "a.usda").GetDefaultPrim().GetVariantSet("geo").GetVariantNames() == ["points"]
+
+
+@pytest.mark.parametrize("suffix", [".usdc", ".glb"])
+def test_a_mesh_of_few_pixels_is_told(relit, tmp_path, suffix):
+    """As of laser stripes that lie apart."""
+    maps = make()
+    stripes = maps.mask & ((np.arange(24) % 3 == 0) | (np.arange(24) < 3))
+    replace(maps, mask=stripes, depth=np.where(stripes, maps.depth, 0)).write(tmp_path / "depth.exr")
+    outcome = relit("export", tmp_path, "--out", tmp_path / f"a{suffix}")
+    assert outcome.code == 0
+    assert f"the mesh holds 63 of {stripes.sum()} pixels with a depth" in " ".join((outcome.out + outcome.err).split())
+    outcome = relit("export", tmp_path, "--out", tmp_path / f"a{suffix}", "--geometry", "points")
+    assert outcome.code == 0 and "the mesh holds" not in outcome.out + outcome.err
 
 
 def test_what_cannot_be_exported_is_said(tmp_path):
