@@ -8,11 +8,13 @@ import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdUtils
 
 from service.export.export import export
-from service.requests.export import ExportRequest, TextureFormat
+from service.requests.export import ExportRequest, Geometry, TextureFormat
 from stage import exr
 from stage.camera import Camera
 from stage.colour import convert
+from stage.depth_maps import DEPTH_FILE, DepthMaps
 from stage.maps import MAPS_FILE, SurfaceMaps
+from stage.ply import POINTS_FILE, PointCloud, write_ply
 from tests.clients.scenes import GOLD, PAINT, ball_maps, seen_in_perspective, without_scale
 from tests.clients.validators import findings
 from tests.scenes.surroundings import capture_of, write_frames
@@ -89,6 +91,27 @@ def test_usd_validators_and_arkit_find_nothing_in_lights_and_frames(suffix, tmp_
     layers = sorted((tmp_path / "asset_lights").glob("*.usda"))
     assert [layer.stem for layer in layers] == ["environment", "rig"]
     assert [finding for file in (asset, *layers) for finding in findings(file)] == []
+
+
+@pytest.mark.parametrize("geometry", list(Geometry))
+@pytest.mark.parametrize("suffix", ["usdz", "usda", "usdc", "glb"])
+@pytest.mark.parametrize("known", ["depth", "depth, σ and colours"])
+def test_nothing_is_found_in_depths(geometry, suffix, known, tmp_path):
+    """Parts with holes, seen in perspective."""
+    seen = seen_in_perspective(with_holes(TWO))
+    depth = np.where(seen.mask, -seen.height, 0).astype(np.float32)
+    maps = DepthMaps(camera=seen.camera, mask=seen.mask, depth=depth)
+    if known != "depth":
+        maps = replace(maps, sigma=np.full_like(depth, 0.001), confidence=np.full_like(depth, 0.5))
+        points = seen.camera.points(-depth)[seen.mask]
+        write_ply(PointCloud(points, np.full(points.shape, 128, np.uint8)), tmp_path / POINTS_FILE)
+    maps.write(tmp_path / DEPTH_FILE)
+    asset = tmp_path / f"asset.{suffix}"
+    export(ExportRequest(maps=tmp_path, out=asset, name="梟 2/a", geometry=geometry))
+    if suffix == "glb":
+        assert khronos.findings(khronos.validate(asset)[0]) == []
+    else:
+        assert findings(asset) == []
 
 
 @pytest.mark.parametrize("surface", SURFACES)
