@@ -40,6 +40,8 @@ def _export(request: ExportRequest) -> None:
     with ProgressBar() as bar:
         exported = export(request, bar)
     print(f"asset    {exported.path}")
+    for layer in exported.lights:
+        print(f"lights   {layer}")
     for name, (vertices, faces) in exported.sizes.items():
         print(f"{name:<8} {vertices} vertices, {faces} faces")
     print_warnings(exported.warnings)

@@ -39,6 +39,8 @@ class Exported(NamedTuple):
     """Sentences."""
     sizes: dict[str, tuple[int, int]]
     """Vertices and faces of each mesh by its name; empty for a depth."""
+    lights: tuple[Path, ...] = ()
+    """Layers of lights beside the asset."""
 
 
 def export(request: ExportRequest, progress: Progress | None = None) -> Exported:
@@ -57,6 +59,7 @@ def export(request: ExportRequest, progress: Progress | None = None) -> Exported
     timings.stage("read", 1)
     warnings: list[str] = []
     sizes: dict[str, tuple[int, int]] = {}
+    lights: tuple[Path, ...] = ()
     path = request.maps / MAPS_FILE if request.maps.is_dir() else request.maps
     depth = request.maps / DEPTH_FILE if request.maps.is_dir() else request.maps
     of_depth = depth.name == DEPTH_FILE and depth.exists() and (request.geometry is not None or not path.exists() or path == depth)
@@ -86,6 +89,7 @@ def export(request: ExportRequest, progress: Progress | None = None) -> Exported
         else:
             report = write_usd_asset(maps, request.out, name=name, version=request.version, textures=request.textures,
                                      levels=request.levels, surroundings=around)
+            lights = report.lights
         sizes = report.sizes
         warnings += report.warnings
         if maps.diffuse_albedo is None:
@@ -93,7 +97,7 @@ def export(request: ExportRequest, progress: Progress | None = None) -> Exported
         warnings += [f"{layer}: {count} pixels have a value outside 0…1, which the texture cannot hold: they are clipped"
                      for layer, count in report.clipped_pixels.items() if count]
     timings.close()
-    return Exported(request.out, tuple(warnings), sizes)
+    return Exported(request.out, tuple(warnings), sizes, lights)
 
 
 def _check_suffix(target: Path) -> str:

@@ -39,6 +39,7 @@ class AssetReport(NamedTuple):
     clipped_pixels: dict[str, int]  # texture → pixels that did not fit into 0…1
     warnings: tuple[str, ...]  # sentences
     levels: tuple[tuple[int, int], ...]  # vertices and faces of each level of detail
+    lights: tuple[Path, ...]  # layers beside it
 
     @property
     def sizes(self) -> dict[str, tuple[int, int]]:
@@ -93,7 +94,7 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str 
         layers = AssetLayers(temporary, target, description)
         define_asset(layers, maps, [mesh, *coarser], written, ior=look.ior if look is not None else IOR_LIMITS[0], openpbr=openpbr)
         around = define_surroundings(layers, surroundings, maps.camera, mesh.extent, folder, packed=packed)
-        beside += around.images
+        beside[:0] = around.images
         layers.save()
         first, *others = layers.files
         older = written_before(target.parent / folder.name, target.parent / layers.lights.name)
@@ -102,4 +103,5 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str 
     return AssetReport(target, installed, len(mesh.points), len(mesh.face_counts), mesh.step,
                        {**{name: texture.clipped_pixels for name, texture in written.items()}, **around.clipped_pixels},
                        (*(loss_warnings(look) if look is not None else ()), *space_warnings(written)),
-                       tuple((len(level.points), len(level.triangles)) for level in coarser))
+                       tuple((len(level.points), len(level.triangles)) for level in coarser),
+                       tuple(target.parent / layers.lights.name / file.name for file in layers.light_files))

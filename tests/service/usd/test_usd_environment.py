@@ -23,7 +23,8 @@ def export(relit, tmp_path, environment, suffix=".usda"):
 
 @pytest.mark.parametrize("suffix", [".usda", ".usdc", ".usdz"])
 def test_a_dome_light_has_the_map(suffix, relit, tmp_path):
-    assert export(relit, tmp_path, write_map(tmp_path / "sky.exr"), suffix).code == 0
+    outcome = export(relit, tmp_path, write_map(tmp_path / "sky.exr"), suffix)
+    assert outcome.code == 0 and f"lights   {tmp_path / 'a_lights' / 'environment.usda'}\n" in outcome.out
     usd_stage = Usd.Stage.Open(str(tmp_path / f"a{suffix}"))
     assert not any(prim.HasAPI(UsdLux.LightAPI) for prim in usd_stage.Traverse())
     provenance = usd_stage.GetRootLayer().customLayerData["relit"]
