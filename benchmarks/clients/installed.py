@@ -2,10 +2,10 @@
 
 `make clients` puts them into the folder .clients of the checkout; environment variables name other places:
 
-RELIT_BLENDER_PYTHON   a Python 3.11 with the package bpy (Blender as a module)
-RELIT_MITSUBA_PYTHON   a Python with the package mitsuba
-RELIT_NODE_MODULES     a node_modules folder with three and gltf-validator
-RELIT_CHROMIUM         the browser
+RELIT_TEST_BLENDER_PYTHON   a Python 3.11 with the package bpy (Blender as a module)
+RELIT_TEST_MITSUBA_PYTHON   a Python with the package mitsuba
+RELIT_TEST_NODE_MODULES     a node_modules folder with three and gltf-validator
+RELIT_TEST_CHROMIUM         the browser
 """
 
 import os
@@ -45,10 +45,10 @@ def node_modules() -> Path:
     Raises:
         MissingClientError: it is missing.
     """
-    folder = Path(os.environ.get("RELIT_NODE_MODULES", HOME / "node_modules"))
+    folder = Path(os.environ.get("RELIT_TEST_NODE_MODULES", HOME / "node_modules"))
     if not (folder / "three" / "package.json").exists():
         raise MissingClientError(f"three.js is missing: no {folder / 'three'}; `make clients` installs it, "
-                                 "RELIT_NODE_MODULES names another folder")
+                                 "RELIT_TEST_NODE_MODULES names another folder")
     return folder
 
 
@@ -58,9 +58,9 @@ def browser() -> str:
     Raises:
         MissingClientError: there is none.
     """
-    chosen = os.environ.get("RELIT_CHROMIUM") or next(filter(None, map(shutil.which, BROWSERS)), None)
+    chosen = os.environ.get("RELIT_TEST_CHROMIUM") or next(filter(None, map(shutil.which, BROWSERS)), None)
     if chosen is None:
-        raise MissingClientError("Chromium is missing: install the package chromium, or name the program in RELIT_CHROMIUM")
+        raise MissingClientError("Chromium is missing: install the package chromium, or name the program in RELIT_TEST_CHROMIUM")
     return chosen
 
 

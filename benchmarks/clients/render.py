@@ -69,7 +69,7 @@ def render(client: Client, asset: Path, camera: Camera, light: Environment | Sun
             job["environment"] = str(Path(folder) / "environment.exr")
             exr.write(job["environment"], dict(zip("RGB", np.moveaxis(light.latlong.astype(np.float32), -1, 0), strict=True)),
                       color_space="lin_rec709_scene", metadata={})
-        return _run(installed.python_with("bpy", "RELIT_BLENDER_PYTHON"), "inside_blender.py", job, Path(folder))
+        return _run(installed.python_with("bpy", "RELIT_TEST_BLENDER_PYTHON"), "inside_blender.py", job, Path(folder))
 
 
 def trace(arrays: dict[str, np.ndarray], camera: Camera, light: Environment | Sun, *, samples: int) -> np.ndarray:
@@ -94,7 +94,7 @@ def trace(arrays: dict[str, np.ndarray], camera: Camera, light: Environment | Su
         else:
             job["environment"] = str(Path(folder) / "environment.npy")
             np.save(job["environment"], light.latlong.astype(np.float32))
-        return _run(installed.python_with("mitsuba", "RELIT_MITSUBA_PYTHON"), "inside_mitsuba.py", job, Path(folder))
+        return _run(installed.python_with("mitsuba", "RELIT_TEST_MITSUBA_PYTHON"), "inside_mitsuba.py", job, Path(folder))
 
 
 def _run(python: Path, script: str, job: dict[str, Any], folder: Path) -> np.ndarray:

@@ -52,7 +52,7 @@ print("FOUND" + json.dumps(found))
 def in_blender(*assets: Path, script: str = "") -> dict:
     """What Blender has after it imported the assets one after the other, and ran a script."""
     require(Client.BLENDER)
-    python = installed.python_with("bpy", "RELIT_BLENDER_PYTHON")
+    python = installed.python_with("bpy", "RELIT_TEST_BLENDER_PYTHON")
     done = subprocess.run([python, "-P", "-c", IMPORT + script + REPORT, *assets], capture_output=True, text=True, timeout=TIME_LIMIT_S)
     assert done.returncode == 0, (done.stdout + done.stderr)[-3000:]
     return json.loads(re.search("FOUND(.*)", done.stdout)[1])

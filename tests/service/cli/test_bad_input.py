@@ -155,7 +155,7 @@ BAD_RELIGHT = {
     "not a number of stops": ({}, {"exposure": "nan"}, "exposure: is NaN"),
     "a layer without maps": ({}, {"aov": "beauty,normal"}, "--aov normal needs --maps DIR"),
     "confidence without maps": ({}, {"aov": "confidence"}, "--aov confidence needs --maps DIR"),
-    "an unknown layer": ({}, {"aov": "beauty,depth"}, 'aov[1]: is "depth": input should be \'beauty\', \'diffuse\''),
+    "an unknown layer": ({}, {"aov": "beauty,shadow"}, 'aov[1]: is "shadow": input should be \'beauty\', \'diffuse\''),
     "maps for nothing": ({}, {"maps": "cap"}, "cap/maps.exr is not there: run `relit solve` first"),
     "no maps there": ({}, {"maps": "cap", "aov": "normal"}, "cap/maps.exr is not there: run `relit solve` first"),
     "another colour space": ({}, {"color-space": "srgb_texture"}, "'srgb_texture' is not one of 'lin_rec709_scene', 'lin_ap1_scene'"),

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-PACKAGES = Path(os.environ.get("RELIT_NODE_MODULES", Path(__file__).parents[3] / ".clients" / "node_modules"))
+PACKAGES = Path(os.environ.get("RELIT_TEST_NODE_MODULES", Path(__file__).parents[3] / ".clients" / "node_modules"))
 PROGRAM = """
 const validator = require(process.argv[1]), fs = require('fs');
 (async () => {
@@ -24,8 +24,8 @@ def validate(*files: Path) -> list[dict[str, Any]]:
     """Return the validator's report on each file, or skip the test where Node or the validator is missing."""
     node, package = shutil.which("node"), PACKAGES / "gltf-validator"
     if node is None or not package.exists():
-        missing = f"the glTF validator is missing: no node, or no {package}; RELIT_NODE_MODULES names another folder"
-        if os.environ.get("RELIT_CLIENTS") == "required":
+        missing = f"the glTF validator is missing: no node, or no {package}; RELIT_TEST_NODE_MODULES names another folder"
+        if os.environ.get("RELIT_TEST_CLIENTS") == "required":
             pytest.fail(missing)
         pytest.skip(missing)
     done = subprocess.run([node, "-e", PROGRAM, str(package), *map(str, files)], capture_output=True, text=True, timeout=60, check=True)
