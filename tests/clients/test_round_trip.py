@@ -81,8 +81,8 @@ def test_exported_metals_are_as_bright_as_the_path_tracer_says(client, way, maps
     assert found.rmse < MOST_ERROR[client]
 
 
-@pytest.mark.parametrize(("client", "other"), [(Client.THREE, seen_in_perspective), (Client.THREE, without_scale),
-                                               (Client.BLENDER, without_scale)], indirect=["client"])
+@pytest.mark.parametrize(("client", "other"), [(client, other) for client in (Client.BLENDER, Client.THREE)
+                                               for other in (seen_in_perspective, without_scale)], indirect=["client"])
 def test_other_cameras_show_what_maps_written_by_hand_show(client, other, maps, tmp_path):
     """A turned perspective camera, and a capture without a scale, whose pixel is a millimetre in the asset."""
     seen = other(maps[0])
