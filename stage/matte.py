@@ -38,7 +38,7 @@ CUT, LEAST_RIM, RIM_LIGHT = 0.003, 0.1, 0.15
 all but the second number, a share of the pixels just inside, are brighter than the third, a share of those further inside. A mask that is
 wider than the object has pixels there with almost nothing. If the images are cut, all pixels of the mask count as whole."""
 LEAST_DARK = 0.5
-"""Where a smaller share of the border sees a dark background, the object cannot be told from it."""
+"""Least share of the border before a dark background; with less of it the object cannot be told from the background."""
 FOLLOWED_PX, REFUSED_PX = 0.25, 0.55
 """Where the outline of the images lies inside that of the mask, up to the first distance the images count alone, from the second on the
 mask. Light outside the mask is the object's."""

@@ -39,7 +39,7 @@ class Inspection:
 
     file: str
     size_bytes: int
-    """Of all files."""
+    """Bytes of the asset and of all files that it refers to."""
     layers: tuple[str, ...]
     """Layers beyond the first, relative to its folder."""
     default_prim: str | None

@@ -23,7 +23,7 @@ class Surroundings(NamedTuple):
     """What an asset brings along; the camera of the capture and of the frames is that of the asset."""
 
     rig: Capture | None = None
-    """Whose lights become the variant `rig` of `light`."""
+    """Capture whose lights become the variant `rig` of `light`."""
     environment: Path | None = None
     """Lat-long map, which becomes the variant `environment` of `light`."""
     card: Mapping[int, Path] | None = None

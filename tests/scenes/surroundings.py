@@ -9,7 +9,7 @@ from stage.capture import Capture
 from tests.scenes.captures import write_image, write_manifest
 
 COVERAGE = np.array([0.0, 0.25, 1.0])
-"""Of the columns of a frame, again and again."""
+"""Coverage of the columns of a frame, which repeats."""
 
 
 def capture_of(folder, camera, lights, **changes):
