@@ -7,6 +7,9 @@ import numpy as np
 from stage.mask_border import nearest
 from stage.stack import Stack
 
+DIM = 0.25
+"""The background is dark where, seen through partly covered pixels alone, it is below this share of the object's radiance: shading at the
+rim changes that estimate by about as much."""
 DARK = 0.04
 """The background is dark where its mean reading is below this share of the object's beside it: such light raises a coverage by at most
 as much."""
@@ -126,3 +129,20 @@ def before_dark(readings: Readings, border: np.ndarray, whole: np.ndarray, clear
     near = np.hypot(*(beyond - border).T) <= far
     dark = readings.mean(beyond) < DARK * readings.mean(nearest(whole)(border))
     return np.where(near, dark, np.mean(dark[near] if near.any() else dark) >= MOSTLY_DARK)
+
+
+def mixed_with_dark(readings: Readings, border: np.ndarray, coverage: np.ndarray, whole: np.ndarray) -> bool:
+    """Return whether border pixels of known coverage mix the object with a dark background, where no pixel shows the background alone.
+
+    What they have beyond their coverage of the object's radiance is the background's.
+
+    Args:
+        readings: of the capture.
+        border: [n, 2] rows and columns, at least one.
+        coverage: [rows, cols] 0…1, below 1 at the border.
+        whole: [rows, cols] bool, pixels of the object alone, at least one.
+    """
+    share = coverage[border[:, 0], border[:, 1]]
+    beside = readings.mean(nearest(whole)(border))
+    background = float(np.sum(readings.mean(border) - share * beside)) / max(float(np.sum((1 - share) * beside)), 1e-30)
+    return background < DIM

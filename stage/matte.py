@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stage.capture import Capture
-from stage.coverage import LEAST_COVERAGE, Readings, before_dark, cover
+from stage.coverage import LEAST_COVERAGE, Readings, before_dark, cover, mixed_with_dark
 from stage.mask_border import SHARP_PX, border, distance, inside, nearest, outline_coverage, outline_offset, rim
 from stage.stack import Stack
 
@@ -95,20 +95,27 @@ def matte_of(capture: Capture, stack: Stack) -> Matte:
     Raises:
         ImageError: the mask is empty or unreadable.
     """
-    mask = capture.mask()
+    mask, given = capture.mask(), capture.mask_values()
+    readings = Readings(stack, mask.shape[1])
+    if ((given > PARTIAL[0]) & (given < PARTIAL[1])).any() and given.max() >= PARTIAL[1]:
+        return _given(readings, given)
     if mask.all():
         whole = np.ones(mask.shape, dtype=np.float32)
         return Matte(whole, whole, MatteSource.FULL if capture.manifest.mask is None else MatteSource.MASK, 0.0)
-    readings = Readings(stack, mask.shape[1])
-    given = capture.mask_values()
-    if ((given > PARTIAL[0]) & (given < PARTIAL[1])).any() and given.max() >= PARTIAL[1]:
-        places = np.argwhere((given > 0) & (given < 1))
-        clear = (given <= 0) & (distance(given > 0) > 1)
-        dark = before_dark(readings, places, given >= PARTIAL[1], clear, REACHES_PX[-1] + FAR_PX)
-        factor = given.copy()
-        factor[places[dark, 0], places[dark, 1]] = 1
-        return Matte(given, factor, MatteSource.MASK_IMAGE, 0.0)
     return _estimated(readings, mask)
+
+
+def _given(readings: Readings, given: np.ndarray) -> Matte:
+    """Return the matte of a mask image with partial values."""
+    places, whole, outside = np.argwhere((given > 0) & (given < 1)), given >= PARTIAL[1], given <= 0
+    clear = outside & (distance(given > 0) > 1) if outside.any() else outside
+    if clear.any():
+        dark = before_dark(readings, places, whole, clear, REACHES_PX[-1] + FAR_PX)
+    else:  # a tight crop or a small hole: the partly covered pixels alone show the background
+        dark = np.full(len(places), mixed_with_dark(readings, places, given, whole))
+    factor = given.copy()
+    factor[places[dark, 0], places[dark, 1]] = 1
+    return Matte(given, factor, MatteSource.MASK_IMAGE, 0.0)
 
 
 def _estimated(readings: Readings, mask: np.ndarray) -> Matte:

@@ -49,7 +49,8 @@ def camera_attributes(camera: Camera) -> dict[str, Any]:
 
 
 def time_attributes(number: int, rate: float) -> dict[str, Any]:
-    """Return the rate as a fraction, and the time code of a frame; a rate above 30 has no time code.
+    """Return the rate as a fraction, and the time code of a frame; a rate above 30 has no time code, and neither has one that is not
+    whole, or whole times 1000/1001.
 
     Args:
         number: of the frame; frame 0 is at 00:00:00:00, and after 24 hours the time code begins again.
@@ -58,7 +59,7 @@ def time_attributes(number: int, rate: float) -> dict[str, Any]:
     exact = exact_rate(rate)
     found: dict[str, Any] = {"framesPerSecond": exact}
     whole = round(exact)
-    if 1 <= whole <= FASTEST_TIMECODE:
+    if exact <= FASTEST_TIMECODE and exact in (whole, whole * NTSC):
         seconds, frame = divmod(number, whole)
         code = OpenEXR.TimeCode()
         code.frame, code.seconds, code.minutes, code.hours = frame, seconds % 60, seconds // 60 % 60, seconds // 3600 % 24

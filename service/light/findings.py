@@ -36,23 +36,23 @@ class FrameFindings:
     """Whether a model of solved maps guides the frames."""
     beyond: float = 0.0
     """Largest share of a frame's energy from beyond the captured lights."""
-    beyond_frame: int = 0
-    """Number of that frame; 0 stands for a single picture without a number."""
+    beyond_frame: int | None = None
+    """Number of that frame; None: of a single picture without a number."""
     beyond_degrees: float = 0.0
     """Least angle of that light from every captured light."""
     clipped: tuple[float, ...] = (0.0, 0.0, 0.0)
     """Shares of red, green and blue of a frame from clipped readings, in the frame where the largest is largest."""
-    clipped_frame: int = 0
+    clipped_frame: int | None = None
     clipped_pixels: float = 0.0
     """Share of the object's pixels that have clipped readings in that capture."""
 
-    def add_beyond(self, numbers: Sequence[int], shares: Sequence[float], degrees: float) -> None:
+    def add_beyond(self, numbers: Sequence[int | None], shares: Sequence[float], degrees: float) -> None:
         """Take in the shares of energy of frames that come from more than some degrees beyond the captured lights."""
         for number, share in zip(numbers, shares, strict=True):
             if share > self.beyond:
                 self.beyond, self.beyond_frame, self.beyond_degrees = share, number, degrees
 
-    def add_clipped(self, numbers: Sequence[int], weights: np.ndarray, clipping: Clipping) -> None:
+    def add_clipped(self, numbers: Sequence[int | None], weights: np.ndarray, clipping: Clipping) -> None:
         """Take in frames [frames, 3, lights padded] by the weights of their stored images."""
         for number, shares in zip(numbers, clipping.share(weights), strict=True):
             if shares.max() > max(self.clipped):
@@ -105,8 +105,8 @@ class MatteFindings:
         return f"soft, estimated from the captured images along the border of the mask{rest}"
 
 
-def _picture(number: int) -> str:
-    return f"frame {number}" if number else "the picture"
+def _picture(number: int | None) -> str:
+    return "the picture" if number is None else f"frame {number}"
 
 
 def _percent(share: float) -> str:

@@ -111,6 +111,8 @@ def check(request: ShadeRequest) -> Path:
     """
     if not (request.light or request.sphere or request.rectangle) and request.environment is None:
         raise RequestError("there is no light: give --light, --sphere, --rectangle or --environment")
+    if request.environment is None and request.turn_degrees:
+        raise RequestError(f"--turn-degrees {request.turn_degrees:g} turns an environment: give --environment MAP too")
     if request.out.suffix.lower() != ".exr":
         raise RequestError(f"--out {request.out}: pictures are OpenEXR: end the name in .exr")
     if Layer.LIGHTS in request.aov:
@@ -164,8 +166,8 @@ def _shade_capture(capture: Capture, request: ShadeRequest, maps: SurfaceMaps, p
     light, = captured.frames([lighting])
     frames = linear_frames(guide.stack, light.weights[None], None, device=device)
     findings = FrameFindings(guided=True)
-    findings.add_beyond([0], [light.share_beyond], captured.beyond_degrees)
-    findings.add_clipped([0], light.weights[None], clipping)
+    findings.add_beyond([None], [light.share_beyond], captured.beyond_degrees)
+    findings.add_clipped([None], light.weights[None], clipping)
     assert light.model is not None
     specular = guide.correct(frames, [light.model], specular=True)
     assert specular is not None

@@ -7,9 +7,9 @@ from typing import Annotated, Literal, TypeVar
 
 from pydantic import AfterValidator, Field
 
-from service.requests.picture import MAX_STOPS
+from service.requests.picture import MAX_STOPS, FrameRate
 from stage.colour_spaces import ColorSpaceName, is_linear
-from stage.model import Direction, FirstFault, NotNegative, Positive, Rgb, Strict, Text
+from stage.model import Direction, FirstFault, NotNegative, Rgb, Strict, Text
 from stage.records import read_record
 
 SCHEMA = "relit.keys/1"
@@ -120,7 +120,7 @@ class LightKeys(Strict):
     """The content of a light-key file."""
 
     schema_: Literal["relit.keys/1"] = Field(alias="schema")
-    frames_per_second: Positive | None = None
+    frames_per_second: FrameRate | None = None
     """Frames per second, for whoever plays the frames: keys stand at frame numbers."""
     environment: Annotated[tuple[EnvironmentKey, ...], FirstFault, InOrder, AfterValidator(_axes)] = ()
     lights: Annotated[tuple[LightTrack, ...], FirstFault] = ()

@@ -5,10 +5,13 @@ from typing import Annotated
 from pydantic import Field
 
 from service.requests.base import Choice, Commas, Options, Spelling
-from stage.model import FirstFault
+from stage.model import FirstFault, Positive
 
 MAX_STOPS = 32.0
 """The largest exposure, up or down: more than half has between its smallest and its largest value."""
+
+FrameRate = Annotated[Positive, Field(ge=0.001, le=1000.0)]
+"""Frames per second: from one in a quarter of an hour, as in a time lapse, to a thousand."""
 
 
 class Layer(Choice):

@@ -3,14 +3,9 @@
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field
-
 from service.requests.base import CAPTURE, Choice, Request, Role, Spelling, StackOptions
-from service.requests.picture import PictureOptions
-from stage.model import Finite, Positive
-
-FASTEST = 1000.0
-"""The highest rate of frames, in frames per second."""
+from service.requests.picture import FrameRate, PictureOptions
+from stage.model import Finite
 
 CHUNK_FRAMES = 32
 """Most frames that are computed in one pass over the images: with more the product takes no less time for each frame, and writing begins
@@ -36,7 +31,7 @@ class RelightOptions(PictureOptions, StackOptions):
     spin_degrees: Finite = 0.0
     """Degrees by which the environment turns over the range, about +y from +z towards +x; the first frame is not turned, and with 360 the
     frame after the last would be the first again."""
-    frames_per_second: Annotated[Positive | None, Field(le=FASTEST)] = None
+    frames_per_second: FrameRate | None = None
     """Frames per second, which the frames record with their time code; None: those of the light keys, else 24."""
 
 

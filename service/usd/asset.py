@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+from service.asset.errors import AssetError
 from service.asset.levels import level_meshes, with_smooth_normals
 from service.asset.mesh import SurfaceMesh, height_mesh
 from service.asset.metallic import IOR_LIMITS, loss_warnings, metallic_look
@@ -64,11 +65,14 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str 
         progress: called before each part of the work.
 
     Raises:
-        AssetError: another suffix; EXR textures in a .usdz; no height layer, or no face; a colour space that is not known.
+        AssetError: another suffix; EXR textures in a .usdz; lights of a .usdz beside a .usda or .usdc of its name;
+            no height layer, or no face; a colour space that is not known.
         StorageError: the disk refuses; what was there before is left as it was.
     """
     target = Path(path)
     packed = check_textures(target, textures) == ".usdz"
+    if packed and (surroundings.rig is not None or surroundings.environment is not None):
+        _check_lights_are_free(target)
     tell = progress or (lambda what, done: None)
 
     tell("mesh", 0.0)
@@ -105,3 +109,11 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str 
                        (*(loss_warnings(look) if look is not None else ()), *space_warnings(written)),
                        tuple((len(level.points), len(level.triangles)) for level in coarser),
                        tuple(target.parent / layers.lights.name / file.name for file in layers.light_files))
+
+
+def _check_lights_are_free(package: Path) -> None:
+    """Refuse to write the lights of a package over those that another asset of its name refers to."""
+    for suffix in (".usda", ".usdc"):
+        other = package.with_suffix(suffix)
+        if other.exists():
+            raise AssetError(f"{package}: its lights would replace those of {other}: choose another name")

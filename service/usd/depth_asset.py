@@ -11,6 +11,7 @@ from service.asset.depth_mesh import depth_mesh, mesh_warnings
 from service.asset.errors import AssetError
 from service.asset.mesh import SurfaceMesh
 from service.asset.metallic import metallic_look
+from service.asset.openpbr import DOCUMENT
 from service.asset.textures import FILE_NAMES, write_textures
 from service.requests.export import FIRST_VERSION, Geometry, TextureFormat
 from service.usd.camera import define_cameras
@@ -20,6 +21,7 @@ from service.usd.materials import define_display_color_material, define_looks
 from service.usd.points import define_points
 from service.usd.primvars import set_primvar
 from service.usd.scene import define_mesh
+from service.usd.surroundings import written_before
 from stage.depth_maps import DepthMaps
 from stage.maps import SurfaceMaps
 from stage.ply import PointCloud
@@ -80,7 +82,8 @@ def write_depth(maps: DepthMaps, cloud: PointCloud | None, path: str | Path, *, 
         define_cameras(layers.geometry, layers.root, maps.camera, parts.extent)
         layers.save()
         first, *others = layers.files
-        install(target, first, [*others, *sorted(folder.iterdir())], ours=(*LAYER_FILES, *FILE_NAMES))
+        ours = (*LAYER_FILES, *FILE_NAMES, DOCUMENT, *written_before(target.parent / folder.name))
+        install(target, first, [*others, *sorted(folder.iterdir())], ours=ours)
     told = mesh_warnings(parts.mesh, maps) if parts.mesh is not None and geometry is Geometry.MESH else ()
     return (*colour_warnings(parts.points), *told)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdLux, UsdShade, UsdUtils, UsdValidation
+from pxr import Ar, Gf, Sdf, Tf, Usd, UsdGeom, UsdLux, UsdShade, UsdUtils, UsdValidation
 
 from service.asset.errors import AssetError
 from service.usd.camera import APERTURE_UNIT
@@ -125,7 +125,9 @@ def _inspect(usd_stage: Usd.Stage, path: Path, warnings: list[str], errors: list
     layers, files, _ = UsdUtils.ComputeAllDependencies(str(path))  # of every variant
     others = [layer for layer in layers if layer != usd_stage.GetRootLayer()]
     packed = path.suffix.lower() == ".usdz"
-    size = path.stat().st_size + (0 if packed else sum(Path(file).stat().st_size for file in [*(each.realPath for each in others), *files]))
+    places = {Path(Ar.SplitPackageRelativePathOuter(str(file))[0]) for file in [*(each.realPath for each in others), *files]}
+    places -= {path.resolve(), path}
+    size = path.stat().st_size + (0 if packed else sum(place.stat().st_size for place in places if place.is_file()))
     sets = root.GetVariantSets() if root else None
     return Inspection(
         file=str(path), size_bytes=size, layers=tuple(sorted(_relative(layer, path) for layer in others)),
@@ -185,9 +187,14 @@ def _find(usd_stage: Usd.Stage, root: Usd.Prim, warnings: list[str], errors: lis
     hint = UsdGeom.ModelAPI(root).GetExtentsHint() if root else None
     box = _bounds(root, UsdGeom.BBoxCache.ComputeUntransformedBound) if root else Gf.Range3d()
     if hint and not box.IsEmpty():
-        given = Gf.Range3d(Gf.Vec3d(hint[0]), Gf.Vec3d(hint[1]))
+        if len(hint) % 2:
+            errors.append(f"extentsHint of {root.GetPath()} has {len(hint)} corners: it has two for each purpose")
+            return
+        given = Gf.Range3d()
+        for low, high in zip(hint[::2], hint[1::2], strict=True):  # of each purpose
+            given.UnionWith(Gf.Range3d(Gf.Vec3d(low), Gf.Vec3d(high)))
         tolerance = HINT_TOLERANCE * max(box.GetSize().GetLength(), 1e-12)
-        if len(hint) == 2 and (_distance(box, given) > tolerance):
+        if _distance(box, given) > tolerance:
             errors.append(f"extentsHint of {root.GetPath()} is {given}, and the geometry of the selected variants fills {box}")
 
 

@@ -62,7 +62,7 @@ def mesh_facts(mesh: UsdGeom.Mesh) -> MeshFacts:
     counts, indices = (np.array(attribute.Get(FIRST) or [], np.int64) for attribute in (mesh.GetFaceVertexCountsAttr(),
                                                                                    mesh.GetFaceVertexIndicesAttr()))
     vertices = len(points) if points is not None else 0
-    if counts.sum() != len(indices) or (len(indices) and (indices.min() < 0 or indices.max() >= vertices)):
+    if counts.sum() != len(indices) or counts.min(initial=0) < 0 or (len(indices) and (indices.min() < 0 or indices.max() >= vertices)):
         edges, faces_of_edge = np.zeros((0, 2), np.int64), np.zeros(0, np.int64)
     else:
         edges, faces_of_edge = _edges(counts, indices, vertices)
@@ -128,6 +128,7 @@ def _range(name: str, interpolation: str, value: object) -> PrimvarFacts:
         numbers = np.asarray(value, np.float64)
     except (TypeError, ValueError):
         return PrimvarFacts(name, interpolation, len(value) if hasattr(value, "__len__") else 1, None, None)
+    if numbers.size == 0:
+        return PrimvarFacts(name, interpolation, 0, None, None)
     rows = numbers.reshape(len(numbers), -1) if numbers.ndim else numbers.reshape(1, 1)
-    low, high = (tuple(map(float, rows.min(axis=0))), tuple(map(float, rows.max(axis=0)))) if rows.size else (None, None)
-    return PrimvarFacts(name, interpolation, len(rows), low, high)
+    return PrimvarFacts(name, interpolation, len(rows), tuple(map(float, rows.min(axis=0))), tuple(map(float, rows.max(axis=0))))

@@ -109,6 +109,23 @@ def test_partial_values_of_a_mask_are_the_coverage(tmp_path):
         assert np.abs(matte.factor - expected)[partly].mean() < 0.02
 
 
+@pytest.mark.parametrize("background", [0.0, 0.4])
+@pytest.mark.parametrize("covered", [0.25, 0.625])
+def test_partial_values_without_a_pixel_of_the_background_alone(tmp_path, background, covered):
+    """A tight crop of which the last column is partly covered; at most pixels the mask says more than a half, or at all."""
+    scene = render_covered()
+    inner = scene.images[:, 16:32, 16:32].copy()
+    assert (scene.coverage[16:32, 16:32] == 1).all()
+    coverage = np.ones((16, 16))
+    coverage[:, -1] = covered
+    wall = background * np.maximum(scene.directions[:, 2], 0)[:, None, None]
+    inner[:, :, -1] = covered * inner[:, :, -1] + (1 - covered) * wall
+    matte = found(tmp_path, Covered(coverage, scene.directions, inner, inner), coverage)
+    assert matte.source is MatteSource.MASK_IMAGE
+    assert np.allclose(matte.coverage, coverage, atol=1e-4)  # 16 bits
+    assert np.allclose(matte.factor, 1 if background == 0 else coverage, atol=1e-4)
+
+
 def test_images_that_are_cut_along_the_mask_keep_their_whole_border(tmp_path):
     scene = render_covered()
     whole = cv2.erode(np.uint8(scene.coverage == 1), np.ones((3, 3))) > 0

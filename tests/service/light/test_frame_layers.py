@@ -176,7 +176,7 @@ def test_pictures_of_maps_have_the_matte_of_maps_or_capture(relit, lit, tmp_path
     (("--aov", "depth"), "--aov depth needs --maps DIR"), (("--aov", "position"), "--aov position needs --maps DIR"),
     (("--aov", "albedo"), "--aov albedo needs --maps DIR"), (("--aov", "world_normal"), "--aov world_normal needs --maps DIR"),
     (("--aov", "mask", "--compression", "dwaa", "--parts", "single"), "--compression dwaa would change the layer mask"),
-    (("--frames-per-second", "0"), "greater than 0"), (("--frames-per-second", "-24"), "greater than 0"),
+    (("--frames-per-second", "0"), "greater than or equal to 0.001"), (("--frames-per-second", "-24"), "greater than or equal to 0.001"),
     (("--frames-per-second", "nan"), "finite"), (("--frames-per-second", "1e9"), "1000"),
     (("--frames-per-second", "25", "--keys", "keys.json"), "keys.json has frames_per_second 23.976: give one of them"),
     (("--aov", "lights", "--keys", "many.json"), "33 lights: there are at most 32"),
@@ -202,7 +202,8 @@ def test_maps_without_height_have_no_depth(relit, lit, tmp_path):
 
 @pytest.mark.parametrize(("rate", "number", "fraction", "code"), [
     (None, 1001, Fraction(24), (0, 0, 41, 17)), ("25", 90000, Fraction(25), (1, 0, 0, 0)), ("48", 7, Fraction(48), None),
-    ("29.97", 31, Fraction(30000, 1001), (0, 0, 1, 1)), ("keys", 24, Fraction(24000, 1001), (0, 0, 1, 0))])
+    ("29.97", 31, Fraction(30000, 1001), (0, 0, 1, 1)), ("12.5", 106, Fraction(25, 2), None),
+    ("keys", 24, Fraction(24000, 1001), (0, 0, 1, 0))])
 def test_the_rate_and_the_time_code_of_a_frame(lit, tmp_path, rate, number, fraction, code):
     options = () if rate is None else ("--keys", tmp_path / "keys.json") if rate == "keys" else ("--frames-per-second", rate)
     path = lit("f", "--frames", str(number), *options, maps=False) / f"a.{number:04d}.exr"
@@ -216,6 +217,14 @@ def test_the_rate_and_the_time_code_of_a_frame(lit, tmp_path, rate, number, frac
     (23.98, Fraction(24000, 1001)), (24, 24), (59.94, Fraction(60000, 1001)), (12.5, Fraction(25, 2)), (0.5, Fraction(1, 2))])
 def test_rates_are_known_as_fractions(rate, expected):
     assert exact_rate(rate) == expected
+
+
+@pytest.mark.parametrize("rate", ["0.0004", "0", "1001"])
+def test_rates_beyond_all_cameras_are_refused(lit, relit, tmp_path, rate):
+    """The fraction of the smallest would be 0."""
+    outcome = relit("relight", tmp_path / "cap", "--environment", tmp_path / "sky.exr", "--out", tmp_path / "f" / "a.#.exr",
+                    "--frames-per-second", rate)
+    assert outcome.code == 2 and "frames_per_second" in outcome.err.replace("-", "_")
 
 
 def test_another_rate_makes_frames_anew(lit, tmp_path):

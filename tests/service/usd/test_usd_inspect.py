@@ -290,3 +290,35 @@ def test_the_command_ends_with_what_is_wrong(relit, tmp_path):
     outcome = relit("inspect", tmp_path / "ball.usda")
     assert outcome.code == 2 and "geometry.usdc" in outcome.err and outcome.err.count("\n") == 1
     assert sum(line.startswith("wrong") for line in outcome.out.splitlines()) >= 2
+
+
+@pytest.mark.parametrize("content", [
+    "int[] faceVertexCounts = [5,-2]\nint[] faceVertexIndices = [0,1,2]",
+    "normal3f[] normals = []",
+    'color3f[] primvars:displayColor = [] (interpolation = "vertex")',
+])
+def test_odd_arrays_are_facts(content, tmp_path):
+    """Counts below zero, and arrays without a value."""
+    (tmp_path / "a.usda").write_text('#usda 1.0\n(\ndefaultPrim = "A"\n)\ndef Mesh "A"\n{\npoint3f[] points = [(0,0,0), (1,0,0), (0,1,0)]\n'
+                                     f'{content}\n}}\n')
+    (mesh,), = inspect_asset(tmp_path / "a.usda").meshes.values()
+    assert mesh.boundary_edges == 0
+    assert all(primvar.count == 0 for primvar in mesh.primvars)
+
+
+@pytest.mark.parametrize(("corners", "errors"), [
+    ("(-1,-1,-1)", 1), ("(-1,-1,-1), (1,1,1)", 0), ("(0,0,0), (1,1,1)", 1), ("(-1,-1,-1), (1,1,0), (0,0,0), (1,1,1)", 0),
+])
+def test_corners_of_an_extents_hint(corners, errors, tmp_path):
+    """Two for each purpose."""
+    (tmp_path / "a.usda").write_text('#usda 1.0\n(defaultPrim = "A")\ndef Xform "A" (prepend apiSchemas = ["GeomModelAPI"]) {\n'
+                                     f'float3[] extentsHint = [{corners}]\ndef Sphere "S" {{ }}\n}}\n')
+    assert len([error for error in inspect_asset(tmp_path / "a.usda").errors if "extentsHint" in error]) == errors
+
+
+def test_a_shot_that_refers_to_a_package(ball, tmp_path):
+    """Its textures lie in the package, which counts once."""
+    write_asset(ball, tmp_path / "ball.usdz", name="Ball")
+    (tmp_path / "shot.usda").write_text('#usda 1.0\n(defaultPrim = "A")\ndef Xform "A" (references = @./ball.usdz@) { }\n')
+    found = inspect_asset(tmp_path / "shot.usda")
+    assert found.size_bytes == sum((tmp_path / name).stat().st_size for name in ("shot.usda", "ball.usdz"))

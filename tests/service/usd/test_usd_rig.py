@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from pxr import Gf, Usd, UsdGeom, UsdLux, UsdValidation
 
+from service.asset.errors import AssetError
 from service.usd.asset import write_asset
 from service.usd.surroundings import Surroundings
 from stage import exr
@@ -186,3 +187,14 @@ def test_what_is_no_rig_is_refused(relit, tmp_path):
     outcome = relit("export", tmp_path / "maps.exr", "--out", tmp_path / "a.usda", "--rig", other.folder)
     assert outcome.code == 2 and "its camera differs from that of the maps in principal_px" in outcome.err
     assert {file.name for file in tmp_path.iterdir()} == {"maps.exr", "capture0", "capture1", "capture2", "other"}
+
+
+def test_lights_of_a_package_do_not_replace_those_of_a_layer(tmp_path):
+    export(tmp_path, [{"type": "gradient", "axis": "x", "sign": 1}], ".usda")
+    before = (tmp_path / "a_lights" / "rig.usda").read_bytes()
+    maps = make_wave("perspective")
+    other = capture_of(tmp_path / "other", maps.camera, [{"type": "distant", "direction": [0, 0, 1], "irradiance": [1, 1, 1]}])
+    with pytest.raises(AssetError, match=r"a\.usdz: its lights would replace those of .*a\.usda: choose another name"):
+        write_asset(maps, tmp_path / "a.usdz", name="A", surroundings=Surroundings(rig=other))
+    assert (tmp_path / "a_lights" / "rig.usda").read_bytes() == before and not (tmp_path / "a.usdz").exists()
+    write_asset(maps, tmp_path / "a.usdz", name="A")  # without lights it has no use for the folder
