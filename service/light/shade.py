@@ -111,8 +111,6 @@ def check(request: ShadeRequest) -> Path:
     """
     if not (request.light or request.sphere or request.rectangle) and request.environment is None:
         raise RequestError("there is no light: give --light, --sphere, --rectangle or --environment")
-    if request.environment is None and request.turn_degrees:
-        raise RequestError(f"--turn-degrees {request.turn_degrees:g} turns an environment: give --environment MAP too")
     if request.out.suffix.lower() != ".exr":
         raise RequestError(f"--out {request.out}: pictures are OpenEXR: end the name in .exr")
     if Layer.LIGHTS in request.aov:

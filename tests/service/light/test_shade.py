@@ -143,7 +143,6 @@ def test_maps_without_a_scale_are_lit_in_pixels_and_say_so(relit, tmp_path):
     (("--light", "0,0,1,1,1,1", "--capture", "nowhere"), "nowhere"),
     (("--light", "0,0,1,1,1,1", "--aov", "velocity"), "velocity"),
     (("--light", "0,0,1,1,1,1", "--aov", "lights"), "lights is a layer of relit frames"),
-    (("--light", "0,0,1,1,1,1", "--turn-degrees", "30"), "--turn-degrees 30 turns an environment: give --environment MAP too"),
 ])
 def test_bad_shades(relit, maps, tmp_path, options, words):
     out = () if "--out" in options else ("--out", tmp_path / "p.exr")
