@@ -12,8 +12,8 @@ class Comparison(NamedTuple):
     """The figures of one render."""
 
     scale: float
-    """The one factor on the render, for all pixels and channels, with which its squared error is least. All clients and the truth have
-    the same units, so 1 is right."""
+    """A factor on the whole render, chosen so that its squared error is least. All clients and the truth have the same units, so 1 is
+    right."""
     rmse: float
     """Root of the mean squared error after that factor, divided by the mean of the truth."""
     mean_error: float

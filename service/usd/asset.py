@@ -8,14 +8,14 @@ from service.asset.errors import AssetError
 from service.asset.levels import level_meshes, with_smooth_normals
 from service.asset.mesh import SurfaceMesh, height_mesh
 from service.asset.metallic import IOR_LIMITS, loss_warnings, metallic_look
-from service.asset.openpbr import DOCUMENT, openpbr_document, write_openpbr
-from service.asset.textures import FILE_NAMES, space_warnings, write_textures
+from service.asset.openpbr import openpbr_document, write_openpbr
+from service.asset.textures import space_warnings, write_textures
 from service.asset.units import unit_in_metres
 from service.requests.export import FIRST_VERSION, TextureFormat
 from service.usd.files import check_textures, install, temporary_folder_beside
-from service.usd.layers import LAYER_FILES, AssetLayers, Description, texture_folder
+from service.usd.layers import AssetLayers, Description, texture_folder
 from service.usd.scene import define_asset, level_name
-from service.usd.surroundings import Surroundings, define_surroundings, written_before
+from service.usd.surroundings import Surroundings, define_surroundings, files_of_assets
 from stage.maps import SurfaceMaps
 
 Progress = Callable[[str, float], None]
@@ -101,8 +101,7 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str 
         beside[:0] = around.images
         layers.save()
         first, *others = layers.files
-        older = written_before(target.parent / folder.name, target.parent / layers.lights.name)
-        install(target, first, [*others, *beside], ours=(*LAYER_FILES, *FILE_NAMES, DOCUMENT, *older), apart=around.lights)
+        install(target, first, [*others, *beside], ours=files_of_assets(target), apart=around.lights)
     installed = () if packed else tuple(target.parent / folder.name / file.name for file in beside)
     return AssetReport(target, installed, len(mesh.points), len(mesh.face_counts), mesh.step,
                        {**{name: texture.clipped_pixels for name, texture in written.items()}, **around.clipped_pixels},

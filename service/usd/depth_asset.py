@@ -11,17 +11,16 @@ from service.asset.depth_mesh import depth_mesh, mesh_warnings
 from service.asset.errors import AssetError
 from service.asset.mesh import SurfaceMesh
 from service.asset.metallic import metallic_look
-from service.asset.openpbr import DOCUMENT
-from service.asset.textures import FILE_NAMES, write_textures
+from service.asset.textures import write_textures
 from service.requests.export import FIRST_VERSION, Geometry, TextureFormat
 from service.usd.camera import define_cameras
 from service.usd.files import check_textures, install, temporary_folder_beside
-from service.usd.layers import LAYER_FILES, AssetLayers, Description, texture_folder
+from service.usd.layers import AssetLayers, Description, texture_folder
 from service.usd.materials import define_display_color_material, define_looks
 from service.usd.points import define_points
 from service.usd.primvars import set_primvar
 from service.usd.scene import define_mesh
-from service.usd.surroundings import written_before
+from service.usd.surroundings import files_of_assets
 from stage.depth_maps import DepthMaps
 from stage.maps import SurfaceMaps
 from stage.ply import PointCloud
@@ -30,6 +29,8 @@ POINT_WIDTH = 1.5
 """Width of a point in footprints of a pixel: neighbouring points just overlap, corner to corner."""
 GREY = np.full((1, 3), 0.5, np.float32)
 """Linear colour where none is known."""
+
+
 class _Parts(NamedTuple):
     """What an asset of a depth is made of."""
 
@@ -82,8 +83,7 @@ def write_depth(maps: DepthMaps, cloud: PointCloud | None, path: str | Path, *, 
         define_cameras(layers.geometry, layers.root, maps.camera, parts.extent)
         layers.save()
         first, *others = layers.files
-        ours = (*LAYER_FILES, *FILE_NAMES, DOCUMENT, *written_before(target.parent / folder.name))
-        install(target, first, [*others, *sorted(folder.iterdir())], ours=ours)
+        install(target, first, [*others, *sorted(folder.iterdir())], ours=files_of_assets(target))
     told = mesh_warnings(parts.mesh, maps) if parts.mesh is not None and geometry is Geometry.MESH else ()
     return (*colour_warnings(parts.points), *told)
 

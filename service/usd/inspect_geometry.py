@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from pxr import Usd, UsdGeom
 
+from service.asset.links import joined
+
 FIRST = Usd.TimeCode.EarliestTime()
 """When an asset with time samples is looked at."""
 
@@ -67,8 +69,8 @@ def mesh_facts(mesh: UsdGeom.Mesh) -> MeshFacts:
     else:
         edges, faces_of_edge = _edges(counts, indices, vertices)
     boundary = edges[faces_of_edge == 1]
-    piece = _components(edges, vertices)
-    outline = _components(boundary, vertices)
+    piece = joined(vertices, *edges.T)
+    outline = joined(vertices, *boundary.T)
     open_pieces = np.unique(piece[boundary[:, 0]])
     return MeshFacts(str(mesh.GetPath()), _purpose(mesh), vertices, len(counts), len(np.unique(piece[edges[:, 0]])), len(boundary),
                      int((faces_of_edge > 2).sum()), len(np.unique(outline[boundary[:, 0]])) - len(open_pieces), _primvars(mesh))
@@ -94,21 +96,6 @@ def _edges(counts: np.ndarray, indices: np.ndarray, vertices: int) -> tuple[np.n
     pair = np.sort(np.stack([indices, indices[following]], axis=-1), axis=-1) if len(indices) else np.zeros((0, 2), np.int64)
     keys, faces = np.unique(pair[:, 0] * max(vertices, 1) + pair[:, 1], return_counts=True)
     return np.stack(np.divmod(keys, max(vertices, 1)), axis=-1), faces
-
-
-def _components(edges: np.ndarray, vertices: int) -> np.ndarray:
-    """Return a number for each vertex [V], the same for vertices that edges join: the smallest vertex of them."""
-    label = np.arange(vertices)
-    while True:
-        before = label.copy()
-        one, other = label[edges[:, 0]], label[edges[:, 1]]
-        low = np.minimum(one, other)
-        np.minimum.at(label, one, low)
-        np.minimum.at(label, other, low)
-        while (label != label[label]).any():
-            label = label[label]
-        if (label == before).all():
-            return label
 
 
 def _primvars(prim: UsdGeom.PointBased) -> tuple[PrimvarFacts, ...]:

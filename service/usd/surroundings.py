@@ -8,9 +8,11 @@ from typing import NamedTuple
 import numpy as np
 
 from service.asset import card as card_images
+from service.asset.openpbr import DOCUMENT
+from service.asset.textures import FILE_NAMES
 from service.usd.card import define_card
 from service.usd.environment import define_dome, write_dome_texture
-from service.usd.layers import ENVIRONMENT, RIG, AssetLayers
+from service.usd.layers import ENVIRONMENT, LAYER_FILES, RIG, AssetLayers, light_folder, texture_folder
 from service.usd.rig import define_rig
 from stage.camera import Camera
 from stage.capture import Capture
@@ -71,6 +73,8 @@ def define_surroundings(layers: AssetLayers, surroundings: Surroundings, camera:
     return Written(images, [*layers.light_files, *lights], clipped_pixels)
 
 
-def written_before(*folders: Path) -> list[str]:
-    """Return the names of the files in the folders of an older asset that its surroundings had."""
-    return [file.name for folder in folders if folder.is_dir() for file in folder.iterdir() if _FILES.fullmatch(file.name)]
+def files_of_assets(target: Path) -> list[str]:
+    """Return the names of files in the folders beside an asset that an older one of its name can have; other files there stay."""
+    folders = [target.parent / name for name in (texture_folder(target), light_folder(target))]
+    around = [file.name for folder in folders if folder.is_dir() for file in folder.iterdir() if _FILES.fullmatch(file.name)]
+    return [*LAYER_FILES, *FILE_NAMES, DOCUMENT, *around]
