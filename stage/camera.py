@@ -95,9 +95,14 @@ class Camera(Strict):
         """
         return self.plane_at(*pixel_centres(self.width, self.height))
 
+    @property
+    def principal_point(self) -> tuple[float, float]:
+        """Image coordinates of the principal point, pixels: `principal_px`, or the centre of the image where it is not given."""
+        return self.principal_px or (self.width / 2, self.height / 2)
+
     def plane_at(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return `plane_coordinates` of any image coordinates u and v, which may lie between pixel centres or outside the image."""
-        cu, cv = self.principal_px or (self.width / 2, self.height / 2)
+        cu, cv = self.principal_point
         if self.projection == "orthographic":
             pixel = self.pixel_size_m or 1.0
             return (u - cu) * pixel, (cv - v) * pixel
@@ -117,7 +122,7 @@ class Camera(Strict):
             u and v, each [...] float64.
         """
         x, y, z = np.moveaxis(points.astype(np.float64), -1, 0)
-        cu, cv = self.principal_px or (self.width / 2, self.height / 2)
+        cu, cv = self.principal_point
         if self.projection == "orthographic":
             pixel = self.pixel_size_m or 1.0
             return cu + x / pixel, cv - y / pixel

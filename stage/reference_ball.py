@@ -44,7 +44,7 @@ class ReferenceBall(NamedTuple):
         radius = np.minimum(np.linalg.norm(normal[:, :2], axis=1), 1 - RIM_PX / self.ball.radius_px)
         x, y = (self.ball.centre[:2] + self.ball.radius * across * radius[:, None]).T
         per_unit = 1 / (camera.pixel_size_m or 1.0)
-        centre_u, centre_v = camera.principal_px or (camera.width / 2, camera.height / 2)
+        centre_u, centre_v = camera.principal_point
         return centre_u + x * per_unit - 0.5, centre_v - y * per_unit - 0.5
 
 

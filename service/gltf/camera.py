@@ -41,7 +41,7 @@ def camera_and_place(camera: Camera, extent: np.ndarray, *, unit_m: float) -> tu
 
 def principal_offset(camera: Camera) -> tuple[float, float]:
     """Return how far the principal point lies to the right of the image centre and below it, in pixels."""
-    cu, cv = camera.principal_px or (camera.width / 2, camera.height / 2)
+    cu, cv = camera.principal_point
     return cu - camera.width / 2, cv - camera.height / 2
 
 

@@ -40,7 +40,7 @@ def camera_attributes(camera: Camera) -> dict[str, Any]:
     }
     if camera.focal_px is not None:
         focal_x, focal_y = camera.focal_px
-        cu, cv = camera.principal_px or (camera.width / 2, camera.height / 2)
+        cu, cv = camera.principal_point
         found["screenWindowWidth"] = float(camera.width / focal_x)
         found["screenWindowCenter"] = np.array([(camera.width / 2 - cu) / focal_x, (cv - camera.height / 2) / focal_y], dtype=np.float32)
         if abs(focal_y / focal_x - 1) > SQUARE:
@@ -81,7 +81,7 @@ def _ndc_from_camera(camera: Camera) -> np.ndarray:
 
     The third coordinate, which the definition leaves open, is 1 / depth for a perspective and z for an orthographic camera.
     """
-    cu, cv = camera.principal_px or (camera.width / 2, camera.height / 2)
+    cu, cv = camera.principal_point
     u, v = cu / camera.width, cv / camera.height
     if camera.focal_px is not None:
         x, y = camera.focal_px[0] / camera.width, camera.focal_px[1] / camera.height

@@ -88,7 +88,7 @@ def mean_height(camera: Camera) -> float:
 
 def projection_of(camera: Camera) -> Projection:
     """Return how camera-frame points fall on the image; lens distortion, which moves shadows by its own few pixels, is left out."""
-    centre = camera.principal_px or (camera.width / 2, camera.height / 2)
+    centre = camera.principal_point
     if camera.projection == "perspective":
         assert camera.focal_px is not None
         return Projection(True, wp.vec2(*camera.focal_px), wp.vec2(*centre))

@@ -76,7 +76,7 @@ def _define_far_camera(usd_stage: Usd.Stage, path: Sdf.Path, camera: Camera, ext
 
 def _set_aperture(prim: UsdGeom.Camera, camera: Camera, pixel: tuple[float, float]) -> None:
     """Write the size of the image and the place of its principal point, from the width and height of a pixel in scene units."""
-    cu, cv = camera.principal_px or (camera.width / 2, camera.height / 2)
+    cu, cv = camera.principal_point
     prim.CreateHorizontalApertureAttr(camera.width * pixel[0] / APERTURE_UNIT)
     prim.CreateVerticalApertureAttr(camera.height * pixel[1] / APERTURE_UNIT)
     prim.CreateHorizontalApertureOffsetAttr((camera.width / 2 - cu) * pixel[0] / APERTURE_UNIT)

@@ -190,7 +190,7 @@ def intersect(ball: Ball, camera: Camera, u: np.ndarray, v: np.ndarray) -> tuple
 
 def project(camera: Camera, point: np.ndarray) -> tuple[float, float]:
     """Return the image coordinates u and v of a camera-frame point, which is in the unit of the camera."""
-    cu, cv = camera.principal_px or (camera.width / 2, camera.height / 2)
+    cu, cv = camera.principal_point
     if camera.projection == "orthographic":
         pixel = camera.pixel_size_m or 1.0
         return float(cu + point[0] / pixel), float(cv - point[1] / pixel)
