@@ -4,6 +4,9 @@ One thread loads a whole pack at once: SIMD lanes on the CPU (32 pixels), one wi
 
 A Warp array keeps its strides as 32-bit counts of bytes, and a larger one wraps around without a word. One channel of a stack
 can be larger than that, one light of it is not: so channels and lights share the row axis of a band.
+
+A kernel loads a pack by an assignment of its own: `x = values[0, p]` copies it once. After `x, y = values[0, p], values[1, p]` both names
+refer to memory, and each lane that reads one of them loads its whole pack again, which keeps the compiler from using SIMD.
 """
 
 from functools import cache

@@ -82,12 +82,16 @@ def _albedo_kernel(pack: int, near: bool = False) -> Any:
                       # outputs
                       albedo: wp.array2d(dtype=float)):  # [3, N]
         p = first + wp.tid()
-        nx, ny, nz = normal[0, p], normal[1, p], normal[2, p]
+        nx = normal[0, p]
+        ny = normal[1, p]
+        nz = normal[2, p]
         above_r, above_g, above_b = float_pack(), float_pack(), float_pack()
         below_r, below_g, below_b = float_pack(), float_pack(), float_pack()
         lights = directions.shape[0]
         for light in range(lights):
-            red, green, blue = values[light, p], values[lights + light, p], values[2 * lights + light, p]
+            red = values[light, p]
+            green = values[lights + light, p]
+            blue = values[2 * lights + light, p]
             at = p * pack_stride + light * light_stride
             weight = weights[at]
             lx, ly, lz = directions_of(directions, toward, light, at)

@@ -107,12 +107,15 @@ def _bounce_kernel(lanes: int, near: bool) -> Any:
             at = p * pack_stride + light * light_stride
             taken, inverse = lane_type(), lane_type(1.0)  # inverse: 1 / falloff
             if wp.static(near):
-                px, py, pz = points[0, p], points[1, p], points[2, p]
+                px = points[0, p]
+                py = points[1, p]
+                pz = points[2, p]
                 for k in range(lanes):
                     fall = falloff(places[light], lobes[light], px[k], py[k], pz[k])
                     inverse[k] = wp.where(fall > 0.0, 1.0 / wp.max(fall, 1.0e-30), 0.0)
             for c in range(3):
-                y, rho = colour[c, at], albedo[c, p]
+                y = colour[c, at]
+                rho = albedo[c, p]
                 for k in range(lanes):
                     light_in = float(0.0)  # a literal could not change inside the loop
                     for corner in range(4):

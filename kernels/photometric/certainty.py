@@ -168,10 +168,18 @@ def _mass_kernel(lanes: int) -> Any:
                     # outputs
                     masses: wp.array2d(dtype=lane_type)):  # [3, P]
         p = first + wp.tid()
-        sx, sy, sz = start[0, p], start[1, p], start[2, p]
-        vx, vy, vz = view[0, p], view[1, p], view[2, p]
-        nx, ny, nz = normal[0, p], normal[1, p], normal[2, p]
-        least, soft, far = judged[0, p], judged[1, p], judged[2, p]
+        sx = start[0, p]
+        sy = start[1, p]
+        sz = start[2, p]
+        vx = view[0, p]
+        vy = view[1, p]
+        vz = view[2, p]
+        nx = normal[0, p]
+        ny = normal[1, p]
+        nz = normal[2, p]
+        least = judged[0, p]
+        soft = judged[1, p]
+        far = judged[2, p]
         for candidate in range(costs.shape[0]):
             cost = costs[candidate, p]
             for k in range(lanes):

@@ -223,15 +223,21 @@ def _search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> 
                       weights: wp.array2d(dtype=lane_type),  # [lobes, P]
                       costs: wp.array2d(dtype=lane_type)):  # [candidates, P]
         p = first + wp.tid()
-        vx, vy, vz = view[0, p], view[1, p], view[2, p]
+        vx = view[0, p]
+        vy = view[1, p]
+        vz = view[2, p]
         start = p * pack_stride
         base = p * scratch_pack
         prepare(toward, vx, vy, vz, start, light_count, light_stride, base, scratch_step, scratch)
-        cx, cy, cz = normal[0, p], normal[1, p], normal[2, p]
+        cx = normal[0, p]
+        cy = normal[1, p]
+        cz = normal[2, p]
         best, bx, by, bz = lane_type(1.0e30), lane_type(), lane_type(), lane_type()
         centre, ring, slope_x, slope_y = lane_type(), lane_type(), lane_type(), lane_type()
         twice_x, twice_y = lane_type(), lane_type()
-        ux, uy, uz = drawn[0, p], drawn[1, p], drawn[2, p]
+        ux = drawn[0, p]
+        uy = drawn[1, p]
+        uz = drawn[2, p]
         found = coefficients()
         for candidate in range(offsets.shape[0]):
             o = offsets[candidate]

@@ -59,7 +59,9 @@ def direction_lobes(lanes: int) -> Lobes:
         for light in range(light_count):
             at = base + light * wp.static(MIXTURE + GEOMETRY) * step
             element = start + light * light_stride
-            wx, wy, wz = toward[0, element], toward[1, element], toward[2, element]
+            wx = toward[0, element]
+            wy = toward[1, element]
+            wz = toward[2, element]
             inverse, rise = lane_type(), lane_type()
             for k in range(lanes):
                 lv = wx[k] * vx[k] + wy[k] * vy[k] + wz[k] * vz[k]
@@ -78,7 +80,9 @@ def direction_lobes(lanes: int) -> Lobes:
             nv[k] = nx[k] * vx[k] + ny[k] * vy[k] + nz[k] * vz[k]
         for light in range(light_count):
             element = start + light * light_stride
-            lx, ly, lz = toward[0, element], toward[1, element], toward[2, element]
+            lx = toward[0, element]
+            ly = toward[1, element]
+            lz = toward[2, element]
             at = base + light * wp.static(MIXTURE + GEOMETRY) * step
             inverse = scratch[at + wp.static(MIXTURE) * step]
             rise = scratch[at + wp.static(MIXTURE + 1) * step]
@@ -108,7 +112,9 @@ def direction_reflectance(lanes: int) -> Reflectance:
     def respond(toward: wp.array2d(dtype=lane_type), table: wp.array3d(dtype=float), form: wp.vec2,
                 nx: lane_type, ny: lane_type, nz: lane_type, vx: lane_type, vy: lane_type, vz: lane_type, rough: lane_type,
                 element: int, light: int):
-        lx, ly, lz = toward[0, element], toward[1, element], toward[2, element]
+        lx = toward[0, element]
+        ly = toward[1, element]
+        lz = toward[2, element]
         fd, fs, fixed = lane_type(), lane_type(), lane_type()
         for k in range(lanes):
             nv = wp.max(nx[k] * vx[k] + ny[k] * vy[k] + nz[k] * vz[k], 1.0e-3)
@@ -131,7 +137,9 @@ def direction_reflectance(lanes: int) -> Reflectance:
         above, below, share = lane_type(), lane_type(), lane_type()
         for light in range(light_count):
             at = start + light * light_stride
-            wx, wy, wz = toward[0, at], toward[1, at], toward[2, at]
+            wx = toward[0, at]
+            wy = toward[1, at]
+            wz = toward[2, at]
             for k in range(lanes):
                 nv = wp.max(nx[k] * vx[k] + ny[k] * vy[k] + nz[k] * vz[k], 1.0e-3)
                 lv = wx[k] * vx[k] + wy[k] * vy[k] + wz[k] * vz[k]

@@ -41,8 +41,12 @@ def mixture_kernel(lanes: int, reflectance: Reflectance) -> Any:
                    # outputs
                    fitted: wp.array2d(dtype=lane_type)):  # [6, P] albedo, abundance of the first material, pair, cost
         p = first + wp.tid()
-        vx, vy, vz = view[0, p], view[1, p], view[2, p]
-        nx, ny, nz = normal[0, p], normal[1, p], normal[2, p]
+        vx = view[0, p]
+        vy = view[1, p]
+        vz = view[2, p]
+        nx = normal[0, p]
+        ny = normal[1, p]
+        nz = normal[2, p]
         bright = level[p]
         best_cost, best_share, best_pair = lane_type(1.0e30), lane_type(), lane_type()
         best_rho = channels()

@@ -103,7 +103,9 @@ def _moments_kernel(pack: int) -> Any:
         m0, mx, my, mz = channels(), channels(), channels(), channels()  # right-hand sides, and then M₀ and M
         for frame in range(frames.shape[0]):
             light = frames[frame]
-            red, green, blue = values[light, p], values[lights + light, p], values[2 * lights + light, p]
+            red = values[light, p]
+            green = values[lights + light, p]
+            blue = values[2 * lights + light, p]
             bits = saturated[light / 8, p]
             shift = light % 8
             unit = scale[frame]

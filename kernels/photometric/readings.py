@@ -157,7 +157,9 @@ def _grey_kernel(pack: int) -> Any:
         p = first + wp.tid()
         lights = factors.shape[0]
         for light in range(lights):
-            red, green, blue = values[light, p], values[lights + light, p], values[2 * lights + light, p]
+            red = values[light, p]
+            green = values[lights + light, p]
+            blue = values[2 * lights + light, p]
             bits = saturated[light / 8, p]
             shift = light % 8
             fr, fg, fb = factors[light, 0], factors[light, 1], factors[light, 2]

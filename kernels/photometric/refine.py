@@ -118,8 +118,13 @@ def _refine_kernel(lanes: int, reflectance: Reflectance) -> Any:
                       # outputs
                       refined: wp.array2d(dtype=lane_type)):  # [5, P] normal, roughness, cost
         p = first + wp.tid()
-        vx, vy, vz = view[0, p], view[1, p], view[2, p]
-        nx, ny, nz, rough = start[0, p], start[1, p], start[2, p], start[3, p]
+        vx = view[0, p]
+        vy = view[1, p]
+        vz = view[2, p]
+        nx = start[0, p]
+        ny = start[1, p]
+        nz = start[2, p]
+        rough = start[3, p]
         bright = level[p]
         best, damping, again = lane_type(1.0e30), lane_type(DAMPING), lane_type()
         best_x, best_y, best_z, best_rough = lane_type(), lane_type(), lane_type(), lane_type()

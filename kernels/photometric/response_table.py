@@ -152,7 +152,9 @@ def _table_kernel(lanes: int) -> Any:
                      table: wp.array(dtype=lane_type)):  # [P · L · COLUMNS]
         p = first + wp.tid()
         base = p * light_count * COLUMNS
-        nx, ny, nz = normal[0, p], normal[1, p], normal[2, p]
+        nx = normal[0, p]
+        ny = normal[1, p]
+        nz = normal[2, p]
         for place in range(places.shape[0]):
             lx, ly, lz, solid = places[place][0], places[place][1], places[place][2], places[place][3]
             begin, end = begins[place], begins[place + 1]

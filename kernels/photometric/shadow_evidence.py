@@ -53,7 +53,9 @@ def _weigh(first: int,
            # outputs
            odds: wp.array2d(dtype=float)):
     p = first + wp.tid()
-    n, v, m = normal[p], view[p], material[p]
+    n = normal[p]
+    v = view[p]
+    m = material[p]
     alpha = wp.max(m[2] * m[2], LEAST_ALPHA)
     matt, shine, facing = float(0.0), float(0.0), float(0.0)  # literals could not change inside the loop
     for light in range(toward.shape[0]):

@@ -71,8 +71,13 @@ def _exclude_kernel(lanes: int) -> Any:
         for light in range(light_count):
             at = p * pack_stride + light * light_stride
             place = places[light]
-            lx, ly, lz = toward[0, at], toward[1, at], toward[2, at]
-            y, red, green, blue = grey[at], colour[0, at], colour[1, at], colour[2, at]
+            lx = toward[0, at]
+            ly = toward[1, at]
+            lz = toward[2, at]
+            y = grey[at]
+            red = colour[0, at]
+            green = colour[1, at]
+            blue = colour[2, at]
             for k in range(lanes):
                 n = pixels[p * lanes + k]
                 row, col = n / cols, n % cols

@@ -53,7 +53,8 @@ def _divide_kernel(lanes: int) -> Any:
         p = first + wp.tid()
         for light in range(light_count):
             at = p * pack_stride + light * light_stride
-            seen, y = part[light, p], grey[at]
+            seen = part[light, p]
+            y = grey[at]
             for k in range(lanes):
                 y[k] = wp.where(seen[k] >= LEAST_PART, y[k] / wp.max(seen[k], LEAST_PART), -1.0)
             grey[at] = y

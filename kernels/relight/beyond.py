@@ -155,11 +155,14 @@ def _compare_kernel(pack: int) -> Any:
             j, i = pairs[n][0], pairs[n][1]
             facing_j, gloss_j, _, _ = evaluate(values, p, places[j], wp.vec4())
             facing_i, gloss_i, _, _ = evaluate(values, p, places[i], wp.vec4())
-            lit_j, lit_i = visible[j, p], visible[i, p]
-            bits_j, bits_i = clipped[j / 8, p], clipped[i / 8, p]
+            lit_j = visible[j, p]
+            lit_i = visible[i, p]
+            bits_j = clipped[j / 8, p]
+            bits_i = clipped[i / 8, p]
             for c in range(3):
                 albedo = values[3 + c, p]
-                image_j, image_i = captured[c * padded + j, p], captured[c * padded + i, p]
+                image_j = captured[c * padded + j, p]
+                image_i = captured[c * padded + i, p]
                 factor_j, factor_i = factors[j][c], factors[i][c]
                 for k in range(pack):
                     after = modelled(float(lit_j[k]) * wp.static(1.0 / 255.0), albedo[k], facing_j[k], gloss_j[c, k])

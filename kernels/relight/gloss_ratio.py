@@ -102,7 +102,8 @@ def _sum_kernel(pack: int) -> Any:
             facing, gloss, _, _ = evaluate(values, p, places[light], wp.vec4())
             lit = visible[light, p]
             for c in range(3):
-                albedo, reading = values[3 + c, p], captured[c * padded + light, p]
+                albedo = values[3 + c, p]
+                reading = captured[c * padded + light, p]
                 given, factor = energy[light][c], factors[light][c]
                 for k in range(pack):
                     seen = float(lit[k]) * wp.static(1.0 / 255.0)

@@ -145,7 +145,8 @@ def _compare_kernel(pack: int) -> Any:
                     at = wp.where(corner == 0, near[0], wp.where(corner == 1, near[1], wp.where(corner == 2, near[2], light)))
                     part = wp.where(corner == 0, parts[0], wp.where(corner == 1, parts[1], wp.where(corner == 2, parts[2], -1.0)))
                     facing, gloss, _, _ = evaluate(values, p, places[at], wp.vec4())
-                    lit, bits = visible[at, p], clipped[at / 8, p]
+                    lit = visible[at, p]
+                    bits = clipped[at / 8, p]
                     for k in range(pack):
                         counts[k] = wp.where(bit_of(bits[k], at) == 1, 0.0, counts[k])
                     for c in range(3):

@@ -129,13 +129,18 @@ def _moments_kernel(pack: int) -> Any:
                        # outputs
                        moments: wp.array2d(dtype=lane_type)):  # [MOMENTS, P]
         p = first + wp.tid()
-        albedo_r, albedo_g, albedo_b = values[3, p], values[4, p], values[5, p]
+        albedo_r = values[3, p]
+        albedo_g = values[4, p]
+        albedo_b = values[5, p]
         sums = sums_type()
         for light in range(places.shape[0]):
             facing, gloss, _, peak = evaluate(values, p, places[light], wp.vec4())
             factor = factors[light]
-            red, green, blue = captured[light, p], captured[padded + light, p], captured[2 * padded + light, p]
-            bits, lit = clipped[light / 8, p], visible[light, p]
+            red = captured[light, p]
+            green = captured[padded + light, p]
+            blue = captured[2 * padded + light, p]
+            bits = clipped[light / 8, p]
+            lit = visible[light, p]
             for k in range(pack):
                 seen = float(lit[k]) * wp.static(1.0 / (3.0 * 255.0))
                 shine = seen * (gloss[0, k] + gloss[1, k] + gloss[2, k])

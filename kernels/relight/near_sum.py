@@ -135,15 +135,21 @@ def _sum_kernel(pack: int) -> Any:
                    out: wp.array2d(dtype=lane_type)):  # [6, P]
         p = first + wp.tid()
         count = lights.shape[0]
-        albedo_r, albedo_g, albedo_b = values[3, p], values[4, p], values[5, p]
+        albedo_r = values[3, p]
+        albedo_g = values[4, p]
+        albedo_b = values[5, p]
         image_r, image_g, image_b = lane_type(), lane_type(), lane_type()
         model_r, model_g, model_b = lane_type(), lane_type(), lane_type()
         for light in range(count):
             facing, gloss, _, _ = evaluate(values, p, lights[light], wp.vec4())
             lit = visible[light, p]
             factor = factors[light]
-            red, green, blue = captured[light, p], captured[padded + light, p], captured[2 * padded + light, p]
-            wr, wg, wb = weights[light, p], weights[count + light, p], weights[2 * count + light, p]
+            red = captured[light, p]
+            green = captured[padded + light, p]
+            blue = captured[2 * padded + light, p]
+            wr = weights[light, p]
+            wg = weights[count + light, p]
+            wb = weights[2 * count + light, p]
             for k in range(pack):
                 seen = float(lit[k]) * wp.static(1.0 / 255.0)
                 image_r[k] += wr[k] * factor[0] * float(red[k])

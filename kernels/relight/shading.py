@@ -167,11 +167,17 @@ def lobes(pack: int) -> Any:
         t = 1 / (1 + (tan θ_h / α)²), with α of the first material, is 1 at the peak of its lobe and falls to 0.
         """
         facing, gloss, arriving, peak = lane_type(), channels(), lane_type(), lane_type()
-        nx, ny, nz = values[0, p], values[1, p], values[2, p]
-        vx, vy, vz = values[9, p], values[10, p], values[11, p]
+        nx = values[0, p]
+        ny = values[1, p]
+        nz = values[2, p]
+        vx = values[9, p]
+        vy = values[10, p]
+        vz = values[11, p]
         tx, ty, tz = lane_type(), lane_type(), lane_type()
         if place[3] > 0.0:
-            px, py, pz = values[12, p], values[13, p], values[14, p]
+            px = values[12, p]
+            py = values[13, p]
+            pz = values[14, p]
             for k in range(pack):
                 lx = place[0] - px[k]
                 ly = place[1] - py[k]
@@ -204,7 +210,9 @@ def lobes(pack: int) -> Any:
             u = wp.max(1.0 - hv, 0.0)
             rise[k] = u * u * u * u * u
         rough = values[15, p]
-        whole, middle, narrow = values[21, p], values[22, p], values[23, p]
+        whole = values[21, p]
+        middle = values[22, p]
+        narrow = values[23, p]
         steady, raised, factor = lane_type(), lane_type(), lane_type()
         for k in range(pack):
             a2 = _alpha_squared(rough[k])

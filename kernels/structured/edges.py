@@ -98,8 +98,10 @@ def find_edge(readings: wp.array2d(dtype=float), rows: wp.array2d(dtype=int), nu
                 bit = int(0)  # noqa: RUF046 - declares a variable that a Warp loop may change
                 while (changed >> (bit + 1)) != 0:
                     bit = bit + 1
-                one, other = readings[rows[bit, 0], here], readings[rows[bit, 1], here]
-                next_one, next_other = readings[rows[bit, 0], there], readings[rows[bit, 1], there]
+                one = readings[rows[bit, 0], here]
+                other = readings[rows[bit, 1], here]
+                next_one = readings[rows[bit, 0], there]
+                next_other = readings[rows[bit, 1], there]
                 a, b = one - other, next_one - next_other
                 span = a - b
                 t = a / span
