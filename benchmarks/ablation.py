@@ -10,8 +10,9 @@ import numpy as np
 from benchmarks.accuracy import angles_deg, read_truth
 from kernels import packs
 from kernels.photometric.diffuse_shape import choose_diffuse
-from kernels.photometric.hypotheses import Diffuse, SearchOptions, search_normals
+from kernels.photometric.hypotheses import Diffuse, SearchOptions
 from kernels.photometric.lambert import NormalFit, solve_lambert
+from kernels.photometric.normal_search import find_normals
 from kernels.photometric.readings import Lights, grey_factors, grey_readings, pad_lights
 from kernels.photometric.robust import solve_robust
 from kernels.photometric.samples import Samples, evenly, gather
@@ -91,7 +92,7 @@ def _gather(band: packs.Band, pixels: np.ndarray, lights: Lights, factors: np.nd
 
 
 def _channels_apart(case: Case) -> np.ndarray:
-    found = [search_normals(samples, case.robust, shape=case.shape) for samples in case.channels]
+    found = [find_normals(samples, case.robust, shape=case.shape).best for samples in case.channels]
     return average_normals(np.stack([search.normal for search in found]), np.stack([search.cost for search in found]))[0]
 
 
@@ -99,9 +100,9 @@ VARIANTS: dict[str, Callable[[Case], np.ndarray]] = {
     "`lambert`": lambda case: case.lambert,
     "`robust`": lambda case: case.robust,
     "hypotheses × Lambert and five GGX lobes, Cauchy weights":
-        lambda case: search_normals(case.samples, case.robust, shape=Diffuse(), options=NO_SHADOW).normal,
-    "+ cast shadow as a separate hypothesis": lambda case: search_normals(case.samples, case.robust, shape=Diffuse()).normal,
-    "+ diffuse shape shared by the object": lambda case: search_normals(case.samples, case.robust, shape=case.shape).normal,
+        lambda case: find_normals(case.samples, case.robust, shape=Diffuse(), options=NO_SHADOW).best.normal,
+    "+ cast shadow as a separate hypothesis": lambda case: find_normals(case.samples, case.robust, shape=Diffuse()).best.normal,
+    "+ diffuse shape shared by the object": lambda case: find_normals(case.samples, case.robust, shape=case.shape).best.normal,
     "· the same with the three channels searched separately and averaged by cost (not used)": _channels_apart,
     "+ averaged over nearby shapes": lambda case: solve_svbrdf(case.samples, case.robust, shape=case.shape, single_lobe=False).normal,
     "+ a single lobe fitted jointly with the normal": lambda case: solve_svbrdf(case.samples, case.robust, shape=case.shape).normal,

@@ -36,3 +36,49 @@ def diffuse(nl: float, nv: float, hv2: float, rough: float, slope: float) -> flo
     """Return π · diffuse BRDF of albedo 1 · n·l: Burley's lobe of roughness `rough` (below 0: Lambert's) times 1 + slope · (1 - n·l)."""
     retro = wp.where(rough >= 0.0, 2.0 * rough * hv2 - 0.5, 0.0)
     return nl * (1.0 + slope * (1.0 - nl)) * (1.0 + retro * schlick(nl)) * (1.0 + retro * schlick(nv))
+
+
+@wp.func
+def masking_root(cosine: float, alpha: float) -> float:
+    """Return √(α² + (1 - α²) · cosine²), the square root of `ggx`'s masking for the light or the viewer."""
+    a2 = alpha * alpha
+    return wp.sqrt(cosine * cosine * (1.0 - a2) + a2)
+
+
+@wp.func
+def ggx_with_slopes(nl: float, nv: float, nh: float, alpha: float, view_root: float):
+    """Return `ggx` and its derivatives by nh, nl and nv; all are 0 for a light below the horizon.
+
+    `view_root` is masking_root(nv, alpha), the same for all lights. One division serves them all.
+    """
+    a2 = alpha * alpha
+    rest = 1.0 - a2
+    bottom = wp.max(1.0 - rest * nh * nh, 1.0e-9)
+    light_root = wp.sqrt(nl * nl * rest + a2)
+    masking = wp.max(nl * view_root + nv * light_root, 1.0e-6)
+    roots = view_root * light_root
+    inverse = wp.where(nl > 0.0, 1.0, 0.0) / (bottom * bottom * masking * roots)
+    top = wp.static(0.5 * INVERSE_PI) * a2 * inverse * roots  # a² / (2 π bottom² masking)
+    value = top * nl
+    per_masking = inverse * bottom * bottom * roots
+    by_nh = value * 4.0 * rest * nh * inverse * bottom * masking * roots
+    by_nl = top * nv * a2 * per_masking * inverse * bottom * bottom * masking * view_root
+    by_nv = 0.0 - value * per_masking * light_root * (1.0 + nl * rest * nv * inverse * bottom * bottom * masking)
+    return value, by_nh, by_nl, by_nv
+
+
+@wp.func
+def diffuse_with_slopes(nl: float, nv: float, hv2: float, rough: float, slope: float):
+    """Return `diffuse` and its derivatives by nl and nv; all are 0 for a light below the horizon."""
+    retro = wp.where(rough >= 0.0, 2.0 * rough * hv2 - 0.5, 0.0)
+    lit = wp.where(nl > 0.0, 1.0, 0.0)
+    u = wp.max(1.0 - nl, 0.0)
+    w = wp.max(1.0 - nv, 0.0)
+    u4 = u * u * u * u
+    w4 = w * w * w * w
+    fall = nl * (1.0 + slope * (1.0 - nl))
+    toward = 1.0 + retro * u4 * u
+    away = 1.0 + retro * w4 * w
+    by_nl = ((1.0 + slope - 2.0 * slope * nl) * toward - 5.0 * retro * u4 * fall) * away
+    by_nv = 0.0 - fall * toward * 5.0 * retro * w4
+    return lit * fall * toward * away, lit * by_nl, lit * by_nv

@@ -1,7 +1,7 @@
 """How sure a normal of the hypothesis search is: its standard deviation, and the probability that it is at the right mode.
 
-The costs are taken as twice the negative logarithm of a likelihood, of a noise that the misfit itself measures. Near the best candidate
-the last ring gives the curvature in every direction; further off the costs of the first rings are weights of candidates that the readings
+The costs are taken as twice the negative logarithm of a likelihood, of a noise that the misfit itself measures. Near the best normal
+the descent gives the curvature in every direction; further off the costs of the survey are weights of candidates that the readings
 may mean as well. A reading teaches something only beyond the unknowns that it must pay for, so that few lights, which any lobes can follow,
 leave a normal open; and misfit beyond the noise of a camera is the same under neighbouring lights, so that many lights hardly average it.
 
@@ -21,22 +21,14 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.packs import pack_type
-from kernels.photometric.hypotheses import FINE, WIDE, Search, candidate_at, rings
+from kernels.photometric.evidence import evidence
+from kernels.photometric.hypotheses import candidate_at, rings
+from kernels.photometric.normal_search import Found
 from kernels.photometric.samples import Samples, per_pixel, to_host
+from kernels.photometric.survey import RINGS, Survey
 
-RING_DEGREES = FINE[-1][0][-1]
-"""Radius of the last ring of the search, degrees; the rise of the cost towards it gives the curvature."""
 LEAST_RISE = 0.05
 """Least rise of the cost in the flattest direction as a fraction of the mean: less is rounding."""
-INFORMATIVE = 0.1
-"""Part of a pixel's level below which a reading is shadow and says little: it does not count as information."""
-USED = 1e-3
-"""Weight above which a lobe of the mixture counts as an unknown that the readings have paid for."""
-DIRECTION = 2
-"""Unknowns of a unit normal."""
-EXPECTED_COST, PSEUDO_READINGS = 0.05, 1.0
-"""Cost of a reading that is expected before any is seen, and the number of readings that this expectation counts as: real and path-traced
-objects have 0.01 to 0.15 under many lights, and a fit with as many unknowns as readings has no misfit of its own."""
 CAMERA_COST = 0.03
 """Cost of a reading that the noise of a camera explains, 2 % of it; misfit beyond is that of the model."""
 UNAVERAGED = 1 / 24
@@ -60,12 +52,11 @@ class Certainty(NamedTuple):
     probability: np.ndarray  # [n] float32, 0…1, that the normal is at the right mode
 
 
-def assess(samples: Samples, start: np.ndarray, found: Search, normal: np.ndarray, spread: np.ndarray) -> Certainty:
-    """Return how sure the normals of a search over WIDE and FINE rings are.
+def assess(samples: Samples, found: Found, normal: np.ndarray, spread: np.ndarray) -> Certainty:
+    """Return how sure the normals of a search are.
 
     Args:
         samples: the readings.
-        start: [n, 3] unit normals from which the search began.
         found: the search.
         normal: [n, 3] unit, the result, which may be an average of several searches.
         spread: [n] of that average, degrees.
@@ -74,20 +65,16 @@ def assess(samples: Samples, start: np.ndarray, found: Search, normal: np.ndarra
         Standard deviation and probability. Waits for the device.
     """
     lights = samples.light_count
-    unknowns = DIRECTION + (found.weights > USED).sum(axis=1)
-    total = found.cost.astype(np.float64) * lights
-    expected = EXPECTED_COST * PSEUDO_READINGS
-    surplus = np.maximum(_informative(samples) - unknowns, 0)  # readings that the fit could have contradicted
-    noise = (total + expected) / (surplus + PSEUDO_READINGS)
-    mean = lights * np.maximum(found.curvature.astype(np.float64), 1e-12)
-    swing = np.minimum(lights * found.swing, (1 - LEAST_RISE) * mean)
-    around = np.minimum(2 * noise * RING_DEGREES**2 * mean / (mean**2 - swing**2), FLATTEST**2)
+    total, surplus, noise = evidence(samples, found.best.cost, found.best.weights)
+    mean = lights * np.maximum(found.best.curvature.astype(np.float64), 1e-12)
+    swing = np.minimum(lights * found.best.swing, (1 - LEAST_RISE) * mean)
+    around = np.minimum(np.degrees(1.0) ** 2 * 2 * noise * mean / (mean**2 - swing**2), FLATTEST**2)
     unaveraged = UNAVERAGED * lights * np.clip(1 - CAMERA_COST / noise, 0, 1)
     variance = np.minimum(around * (1 + unaveraged) + spread.astype(np.float64) ** 2, FLATTEST**2)
     apart = np.maximum(APART_DEGREES, APART_SIGMAS * np.sqrt(variance))
     softness = 2 * noise + SOFTNESS * total
-    mass = _masses(samples, start, found, normal, np.stack([total, softness, np.cos(np.radians(np.minimum(apart, 180)))], axis=1))
-    here, there, moment = mass.astype(np.float64).T
+    judged = np.stack([total, softness, np.cos(np.radians(np.minimum(apart, 180)))], axis=1)
+    here, there, moment = _masses(found.survey, normal, judged).astype(np.float64).T
     here = np.maximum(here, math.pi * variance)
     whole = here + there
     elsewhere = there / whole * np.sqrt(moment / np.maximum(there, 1e-20))
@@ -97,25 +84,24 @@ def assess(samples: Samples, start: np.ndarray, found: Search, normal: np.ndarra
     return Certainty(sigma.astype(np.float32), (checked * explained * here / whole).astype(np.float32))
 
 
-def _informative(samples: Samples) -> np.ndarray:
-    """Return [n] the number of readings that are not shadow."""
-    counts = wp.empty(samples.packs, dtype=pack_type(samples.lanes, wp.float32), device=samples.device)
-    devices.launch(_count_kernel(samples.lanes), samples.packs,
-                   [samples.grey, samples.light_count, samples.pack_stride, samples.light_stride], [counts], device=samples.device)
-    return to_host(samples, counts)
+def _masses(surveyed: Survey | None, normal: np.ndarray, judged: np.ndarray) -> np.ndarray:
+    """Return [n, 3]: weight of the candidates at the normal, of all others, and the others' second moment about it; degrees², degrees⁴.
 
-
-def _masses(samples: Samples, start: np.ndarray, found: Search, normal: np.ndarray, judged: np.ndarray) -> np.ndarray:
-    """Return [n, 3]: weight of the candidates at the normal, of all others, and the others' second moment about it; degrees², degrees⁴."""
-    lane_type = pack_type(samples.lanes, wp.float32)
-    masses = wp.empty((3, samples.packs), dtype=lane_type, device=samples.device)
-    offsets = rings(*WIDE)
+    Pixels that were not surveyed have none.
+    """
+    whole = np.zeros((len(normal), 3), np.float32)
+    if surveyed is None:
+        return whole
+    pixels, samples, middle, costs = surveyed
+    masses = wp.empty((3, samples.packs), dtype=pack_type(samples.lanes, wp.float32), device=samples.device)
+    offsets = rings(*RINGS)
     weighed = np.column_stack([offsets, ring_areas(offsets)])
     devices.launch(_mass_kernel(samples.lanes), samples.packs,
-                   [found.survey, wp.array(weighed, dtype=wp.types.vector(5, wp.float32), device=samples.device),
-                    per_pixel(samples, start), samples.view, per_pixel(samples, normal), per_pixel(samples, judged)],
+                   [costs, wp.array(weighed, dtype=wp.types.vector(5, wp.float32), device=samples.device), per_pixel(samples, middle),
+                    samples.view, per_pixel(samples, normal[pixels]), per_pixel(samples, judged[pixels])],
                    [masses], device=samples.device)
-    return to_host(samples, masses)
+    whole[pixels] = to_host(samples, masses)
+    return whole
 
 
 def ring_areas(offsets: np.ndarray) -> np.ndarray:
@@ -128,29 +114,6 @@ def ring_areas(offsets: np.ndarray) -> np.ndarray:
     edge = np.concatenate([[0], middle, [2 * angle[-1] - middle[-1]]])
     cap = 2 * np.pi * (1 - np.cos(np.radians(edge))) * np.degrees(1.0) ** 2
     return (np.diff(cap) / count)[ring]
-
-
-@cache
-def _count_kernel(lanes: int) -> Any:
-    lane_type = pack_type(lanes, wp.float32)
-
-    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
-    def count_kernel(first: int,
-                     grey: wp.array(dtype=lane_type),  # [P · L] readings / level
-                     light_count: int,
-                     pack_stride: int,
-                     light_stride: int,
-                     # outputs
-                     counts: wp.array(dtype=lane_type)):  # [P]
-        p = first + wp.tid()
-        count = lane_type()
-        for light in range(light_count):
-            y = grey[p * pack_stride + light * light_stride]
-            for k in range(lanes):
-                count[k] += wp.where(y[k] > INFORMATIVE, 1.0, 0.0)
-        counts[p] = count
-
-    return count_kernel
 
 
 @cache

@@ -11,7 +11,9 @@ import itertools
 
 import numpy as np
 
-from kernels.photometric.hypotheses import Diffuse, SearchOptions, search_normals
+from kernels.photometric.descent import Schedule, descend
+from kernels.photometric.hypotheses import Diffuse, SearchOptions
+from kernels.photometric.normal_search import find_normals
 from kernels.photometric.samples import Samples
 
 ROUGHNESSES = (-1.0, 0.05, 0.2, 0.35, 0.5, 0.65, 0.8)
@@ -20,8 +22,8 @@ SLOPES = (-0.3, -0.2, -0.1, 0.0, 0.1)
 """Slopes of the lobe's further factor that are tried."""
 REFINEMENT = 0.5
 """Step of the second search, about the best shape of the first, as a fraction of the first search's step."""
-NEARBY = (((2.0, 4.0, 7.0), 14), (((0.9, 1.8), 8),))
-"""Rings of a search that starts from the normals found under Lambert's lobe: another shape moves normals by a few degrees."""
+FROM_LAMBERT = Schedule(softened=0, judged=7)
+"""Descent from the normal and weights found under Lambert's lobe: another shape moves normals by a few degrees."""
 
 
 def choose_diffuse(samples: Samples, start: np.ndarray, *,
@@ -36,14 +38,13 @@ def choose_diffuse(samples: Samples, start: np.ndarray, *,
     Returns:
         The shape, and [shapes tried, 3] float64: roughness, slope, mean cost of each.
     """
-    normal = search_normals(samples, start, shape=Diffuse(), options=options).normal
-    wide, fine = NEARBY
+    lambert = find_normals(samples, start, shape=Diffuse(), options=options).best
     tried: dict[Diffuse, float] = {}
 
     def cost(rough: float, slope: float) -> float:
         shape = Diffuse(rough=round(rough, 4), slope=round(slope, 4))
         if shape not in tried:
-            found = search_normals(samples, normal, shape=shape, options=options, wide=wide, fine=fine)
+            found = descend(samples, lambert.normal, shape=shape, options=options, weights=lambert.weights, schedule=FROM_LAMBERT)
             tried[shape] = float(np.mean(found.cost, dtype=np.float64))
         return tried[shape]
 

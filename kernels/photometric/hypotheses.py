@@ -50,14 +50,26 @@ class SearchOptions:
     """Noise s0 of every reading, relative to the pixel's level: it covers the part of a good pixel that the lobes cannot explain."""
     noise_slope: float = 0.02
     """Relative noise s1 of bright readings."""
-    reweightings: int = 5
-    """Rounds of the robust fit; with three, normals are 0.1° worse on real data."""
-    sweeps: int = 12
-    """Coordinate sweeps of each non-negative solve."""
     shadow_cost: float = 1.0
     """Cost of a reading that counts as cast shadow; 1.0 is the cost of a residual of 1.3 σ."""
     shadow_depth: float = 0.3
     """Fraction of its prediction below which a reading may be a cast shadow."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RingOptions(SearchOptions):
+    """How candidates on rings are judged, and how far the mixture of each is fitted."""
+
+    reweightings: int = 5
+    """Rounds of the robust fit; with three, normals are 0.1° worse on real data."""
+    sweeps: int = 12
+    """Coordinate sweeps of each non-negative solve."""
+
+    @classmethod
+    def of(cls, options: SearchOptions, *, reweightings: int) -> "RingOptions":
+        """Return options that judge alike, with a number of rounds of the robust fit."""
+        return cls(noise_floor=options.noise_floor, noise_slope=options.noise_slope, shadow_cost=options.shadow_cost,
+                   shadow_depth=options.shadow_depth, reweightings=reweightings)
 
 
 def criteria(options: SearchOptions, shape: Diffuse) -> list[Any]:
@@ -79,10 +91,9 @@ class Prior(NamedTuple):
     """A candidate at angle a from the normal costs strength · log(1 + (a / PRIOR_DEGREES)²) more, on the sum over the lights."""
 
 
-WIDE = ((5.0, 10.0, 16.0, 24.0, 34.0, 46.0), 30)
-"""Radii of the first rings about the start, degrees, and the number of candidates on the last of them."""
-FINE = (((2.5, 5.0), 10), ((0.9, 1.8), 8), ((0.4,), 6), ((0.2,), 6), ((0.06,), 6))
-"""Radii, in degrees, and candidates of the rings that follow, each about the best candidate so far."""
+def prior_pull(prior: Prior | None) -> Any:
+    """Return the strength of a prior and 1 / rad² of its angle, as the kernels take them; the strength is 0 where there is none."""
+    return wp.vec2(0.0 if prior is None else prior.strength, 1.0 / math.radians(PRIOR_DEGREES) ** 2)
 
 
 class Search(NamedTuple):
@@ -90,19 +101,8 @@ class Search(NamedTuple):
 
     normal: np.ndarray  # [n, 3] float32, unit
     cost: np.ndarray  # [n] float32, per light
-    curvature: np.ndarray  # [n] float32, mean rise of the cost over the last ring, per light
-    swing: np.ndarray  # [n] float32, how much more than its mean the cost rises where it rises most, per light
     weights: np.ndarray  # [n, lobes] float32, of the mixture, for readings relative to the pixel's level
     survey: wp.array  # [candidates, packs] float packs, on the device: cost of each candidate of the first rings, summed over the lights
-
-    def variance(self, light_count: int, ring_degrees: float) -> np.ndarray:
-        """Return the variance of the normals, degrees², by least squares: 2 · cost · ring² / (lights · rise), cost and rise per light.
-
-        Args:
-            light_count: of the samples.
-            ring_degrees: angle of the last ring.
-        """
-        return 2 * self.cost * ring_degrees**2 / (light_count * np.maximum(self.curvature, 1e-12))
 
 
 def rings(degrees: tuple[float, ...], last_count: int) -> np.ndarray:
@@ -121,17 +121,18 @@ def rings(degrees: tuple[float, ...], last_count: int) -> np.ndarray:
 
 
 def search_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse,
-                   options: SearchOptions | None = None, wide: tuple[tuple[float, ...], int] = WIDE,
-                   fine: tuple[tuple[tuple[float, ...], int], ...] = FINE, table: wp.array | None = None,
-                   prior: Prior | None = None) -> Search:
+                   wide: tuple[tuple[float, ...], int],
+                   fine: tuple[tuple[tuple[float, ...], int], ...] = (), options: RingOptions | None = None,
+                   table: wp.array | None = None, prior: Prior | None = None) -> Search:
     """Find the candidate normal of least cost for each sampled pixel.
 
     Args:
         samples: their readings.
         start: [n, 3] unit normals to begin from.
         shape: of the diffuse lobe.
+        wide: radii of the first rings, about the start, in degrees, and the number of candidates on the last of them.
+        fine: the same of the rings that follow, each about the best candidate so far.
         options: how candidates are judged.
-        wide, fine: the rings.
         table: [cells, lights, lobes] of response_table.search_table or a reference_table, in place of the samples' directions;
             its diffuse lobe is what it is, whatever the shape.
         prior: normals that candidates are drawn to, of which the costs include the cost; None: none.
@@ -142,7 +143,7 @@ def search_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse,
     Raises:
         ArrayError: shapes that do not fit.
     """
-    options = options or SearchOptions()
+    options = options or RingOptions()
     if start.shape != (samples.pixel_count, 3):
         raise ArrayError(f"start is {start.shape}: give one normal for each of the {samples.pixel_count} pixels")
     if table is not None and table.shape[1] != samples.light_count:
@@ -151,9 +152,7 @@ def search_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse,
     lane_type = pack_type(lanes, wp.float32)
     normal = per_pixel(samples, start)
     cost = wp.empty(packs, dtype=lane_type, device=device)
-    bend = wp.empty((2, packs), dtype=lane_type, device=device)
     drawn = per_pixel(samples, start if prior is None else prior.normal)
-    pull = wp.vec2(0.0 if prior is None else prior.strength, 1.0 / math.radians(PRIOR_DEGREES) ** 2)
     lobes = direction_lobes(lanes) if table is None else tabulated_lobes(lanes, table.shape[2])
     held = lobes.held
     weights = wp.empty((lobes.count, packs), dtype=lane_type, device=device)
@@ -167,10 +166,10 @@ def search_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse,
         survey = costs if survey is None else survey
         radius = math.sin(math.radians(degrees[0])) if len(degrees) == 1 else 0.0
         devices.launch(_search_kernel(lanes, lobes, options.reweightings, options.sweeps), packs,
-                       [samples.grey, samples.toward, table, samples.view, offsets, radius, drawn, pull, *criteria(options, shape),
-                        lights, samples.pack_stride, samples.light_stride, *strides],
-                       [scratch, normal, cost, bend, weights, costs], device=device, uneven=True)
-    return Search(to_host(samples, normal), to_host(samples, cost), *to_host(samples, bend).T, to_host(samples, weights), survey)
+                       [samples.grey, samples.toward, table, samples.view, offsets, radius, drawn, prior_pull(prior),
+                        *criteria(options, shape), lights, samples.pack_stride, samples.light_stride, *strides],
+                       [scratch, normal, cost, weights, costs], device=device, uneven=True)
+    return Search(to_host(samples, normal), to_host(samples, cost), to_host(samples, weights), survey)
 
 
 @wp.func
@@ -219,7 +218,6 @@ def _search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> 
                       scratch: wp.array(dtype=lane_type),  # [P · L · held]
                       normal: wp.array2d(dtype=lane_type),  # [3, P] in: start, out: best
                       cost: wp.array(dtype=lane_type),  # [P]
-                      bends: wp.array2d(dtype=lane_type),  # [2, P] rise over the last ring: its mean, and how far it swings about that
                       weights: wp.array2d(dtype=lane_type),  # [lobes, P]
                       costs: wp.array2d(dtype=lane_type)):  # [candidates, P]
         p = first + wp.tid()
@@ -234,7 +232,6 @@ def _search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> 
         cz = normal[2, p]
         best, bx, by, bz = lane_type(1.0e30), lane_type(), lane_type(), lane_type()
         centre, ring, slope_x, slope_y = lane_type(), lane_type(), lane_type(), lane_type()
-        twice_x, twice_y = lane_type(), lane_type()
         ux = drawn[0, p]
         uy = drawn[1, p]
         uz = drawn[2, p]
@@ -306,8 +303,6 @@ def _search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> 
                 ring[k] += around
                 slope_x[k] += around * o[2]
                 slope_y[k] += around * o[3]
-                twice_x[k] += around * (o[2] * o[2] - o[3] * o[3])
-                twice_y[k] += around * 2.0 * o[2] * o[3]
                 centre[k] = wp.where(candidate == 0, total[k], centre[k])
                 better = total[k] < best[k]
                 for a in range(mixture):
@@ -316,7 +311,7 @@ def _search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> 
                 bx[k] = wp.where(better, nx[k], bx[k])
                 by[k] = wp.where(better, ny[k], by[k])
                 bz[k] = wp.where(better, nz[k], bz[k])
-        share, bend, swing = lane_type(), lane_type(), lane_type()
+        share = lane_type()
         for k in range(lanes):
             members = wp.max(float(offsets.shape[0] - 1), 1.0)
             rise = ring[k] / members - centre[k]
@@ -333,14 +328,10 @@ def _search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> 
                 by[k] = moved[1]
                 bz[k] = moved[2]
             share[k] = best[k] / float(light_count)
-            bend[k] = (ring[k] / members - best[k]) / float(light_count)
-            swing[k] = 2.0 * wp.sqrt(twice_x[k] * twice_x[k] + twice_y[k] * twice_y[k]) / (members * float(light_count))
         normal[0, p] = bx
         normal[1, p] = by
         normal[2, p] = bz
         cost[p] = share
-        bends[0, p] = bend
-        bends[1, p] = swing
         for a in range(mixture):
             for k in range(lanes):
                 share[k] = found[a, k]

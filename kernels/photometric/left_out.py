@@ -11,7 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kernels.photometric.hypotheses import Diffuse, SearchOptions, search_normals
+from kernels.photometric.hypotheses import Diffuse, SearchOptions
+from kernels.photometric.normal_search import find_normals
 from kernels.photometric.prediction import predict
 from kernels.photometric.samples import Samples, device_values, host_values
 
@@ -57,7 +58,7 @@ def leave_out(samples: Samples, start: np.ndarray, *, options: SearchOptions | N
         kept = np.where(out, -1.0, readings)
         lambertian = _lambert(kept, toward)
         rest = samples._replace(grey=device_values(samples, kept))
-        found = search_normals(rest, start, shape=Diffuse(), options=options)
+        found = find_normals(rest, start, shape=Diffuse(), options=options).best
         general = predict(samples, found.normal, found.weights, shape=Diffuse())
         given = readings[:, out] >= 0
         for kept_costs, predicted in zip(costs, (general, np.einsum("nlc,nc->nl", toward, lambertian)), strict=True):

@@ -13,14 +13,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kernels.photometric.hypotheses import Diffuse, search_normals
+from kernels.photometric.descent import COLD, WARM, descend
+from kernels.photometric.hypotheses import Diffuse
 from kernels.photometric.prediction import predict
 from kernels.photometric.samples import Samples, choose, device_values, host_values
 
-RINGS = (((2.0, 4.0, 7.0), 14), (((0.9, 1.8), 8), ((0.4,), 6)))
-"""Rings of the first search: wrong intensities turn normals by some degrees."""
-NEAR = (((0.7, 1.5), 8), (((0.4,), 6),))
-"""Rings of the searches that follow."""
 TRIAL_ROUNDS, ROUNDS = 2, 12
 """Rounds of each half, which show whether factors explain anything, and of the whole object."""
 STRIDE = 1.7
@@ -79,7 +76,7 @@ def find_light_factors(samples: Samples, start: np.ndarray, directions: np.ndarr
         found = _factors(choose(samples, fitted), start[fitted], directions, shape, TRIAL_ROUNDS)
         rest = choose(samples, ~fitted)
         for cost, factor in ((before, same), (after, found)):
-            cost[~fitted] = search_normals(_divided(rest, factor), start[~fitted], shape=shape, wide=RINGS[0], fine=RINGS[1]).cost
+            cost[~fitted] = descend(_divided(rest, factor), start[~fitted], shape=shape).cost
     less = np.bincount(square, weights=before - after)
     gain = float(less.sum() / max(before.sum(), 1e-12))
     believed = gain > LEAST_GAIN and bool(less.sum() > SURE * np.sqrt((less**2).sum()))
@@ -88,14 +85,13 @@ def find_light_factors(samples: Samples, start: np.ndarray, directions: np.ndarr
 
 def _factors(samples: Samples, start: np.ndarray, directions: np.ndarray, shape: Diffuse, rounds: int) -> np.ndarray:
     """Return [lights] factors after some rounds of search and comparison."""
-    logarithm, normal = np.zeros(len(directions)), start
+    logarithm, normal, weights, schedule = np.zeros(len(directions)), start, None, COLD
     for step in range(rounds):
         divided = _divided(samples, np.exp(logarithm))
-        wide, fine = NEAR if step else RINGS
-        found = search_normals(divided, normal, shape=shape, wide=wide, fine=fine)
-        normal = found.normal
-        reading, predicted = host_values(divided, divided.grey), predict(divided, normal, found.weights, shape=shape)
-        matt = predict(divided, normal, found.weights * (np.arange(found.weights.shape[1]) == 0), shape=shape)
+        found = descend(divided, normal, shape=shape, weights=weights, schedule=schedule)
+        normal, weights, schedule = found.normal, found.weights, WARM
+        reading, predicted = host_values(divided, divided.grey), predict(divided, normal, weights, shape=shape)
+        matt = predict(divided, normal, weights * (np.arange(weights.shape[1]) == 0), shape=shape)
         lit = (matt > MATT * predicted) & (normal @ directions.T > LEAST_COSINE) & (predicted > BRIGHT) & (reading > LIT * predicted)
         ratio = np.where(lit, np.log(np.where(lit, reading, 1) / np.where(lit, predicted, 1)), np.nan)
         change = np.array([np.nanmedian(column) if told else 0.0

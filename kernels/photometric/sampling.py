@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from kernels.photometric.hypotheses import Diffuse, SearchOptions, search_normals
+from kernels.photometric.hypotheses import Diffuse, RingOptions, search_normals
 from kernels.photometric.material import Material, fit_material
 from kernels.photometric.modes import Modes, find_modes, weigh
 from kernels.photometric.posterior import Group, bounded, measure_noise, normal_posterior
@@ -27,7 +27,7 @@ from kernels.photometric.samples import Samples, choose
 
 DIELECTRIC, METAL = 0.04, 0.8
 """F0 of the two kinds of lobes. Their Fresnel rises differ, and over a wide light this moves the estimated normal by degrees."""
-OPTIONS = SearchOptions(noise_floor=0.05, noise_slope=0.05, sweeps=30)
+OPTIONS = RingOptions(noise_floor=0.05, noise_slope=0.05, sweeps=30)
 """Search options for wide lights. They cause no isolated highlights, so that a dim reading has less unexplained light than under single
 lamps; for bright readings the table is accurate to a few per cent."""
 AROUND, AROUND_OPTIONS = (((2.0, 4.0, 6.0), 16), ((1.0, 2.0), 8)), replace(
@@ -99,7 +99,7 @@ class Found(NamedTuple):
 
 
 def search_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, *, start: np.ndarray | None = None,
-                    options: SearchOptions = OPTIONS) -> Found:
+                    options: RingOptions = OPTIONS) -> Found:
     """Find the normal and the material of sampled pixels that explain their readings best.
 
     Args:
@@ -129,7 +129,7 @@ def search_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, 
 
 
 def solve_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, *, found: Found | None = None,
-                   options: SearchOptions = OPTIONS) -> SamplingFit:
+                   options: RingOptions = OPTIONS) -> SamplingFit:
     """Estimate normal, material and regime of sampled pixels.
 
     Args:

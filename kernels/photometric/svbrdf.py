@@ -1,12 +1,12 @@
 """The general solver: normal, diffuse albedo, F0 and roughness of each pixel, without learning.
 
-Normals come from the hypothesis search under the diffuse shape that the object shares and under shapes close to it, and from the joint
-fit of a single lobe; they are averaged, each weighted by how well it explains the pixel. The material then follows for the normal found.
+Normals come from `normal_search` under the diffuse shape that the object shares, from descents under shapes close to it, and from the
+joint fit of a single lobe; they are averaged, each weighted by how well it explains the pixel. The material then follows for the normal found.
 
 Sources: Relit's BRDF is GGX (Walter et al., "Microfacet models for refraction through rough surfaces", EGSR 2007) with Smith's
 height-correlated masking (Heitz, "Understanding the masking-shadowing function", JCGT 2014), Schlick's Fresnel ("An inexpensive BRDF
-model for physically-based rendering", Computer Graphics Forum 1994) and Burley's diffuse lobe (2012); the search for normals is that of
-`hypotheses`, after Hui and Sankaranarayanan, TPAMI 2017. Averaging the normals of several models is ours.
+model for physically-based rendering", Computer Graphics Forum 1994) and Burley's diffuse lobe (2012); the cost of normals is
+that of `hypotheses`, after Hui and Sankaranarayanan, TPAMI 2017. Averaging the normals of several models is ours.
 """
 
 from typing import NamedTuple
@@ -14,17 +14,17 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels.photometric.certainty import assess
-from kernels.photometric.hypotheses import Diffuse, Prior, SearchOptions, search_normals
+from kernels.photometric.descent import WARM, descend
+from kernels.photometric.hypotheses import Diffuse, Prior, SearchOptions
 from kernels.photometric.material import MATT, fit_given, fit_material, fit_tinted
 from kernels.photometric.metal_search import Metals, search_metals
 from kernels.photometric.mixtures import NO_PAIRS, Mixture, mix_materials
+from kernels.photometric.normal_search import find_normals
 from kernels.photometric.refine import refine
 from kernels.photometric.samples import Samples, choose
 
 NEIGHBOURS = ((-0.15, 0.0), (0.15, 0.0), (0.0, -0.1), (0.0, 0.1))
 """Differences in roughness and slope of the shapes that are tried besides the shared one: a material varies by as much over an object."""
-NEAR = (((0.7, 1.5, 2.5), 10), (((0.4,), 6),))
-"""Rings of the search under another shape, which starts from the normal of the shared shape."""
 TEMPERATURE = 0.4
 """Softmax temperature of the average over models, relative to the best cost: a model whose cost is this fraction above the best has 1/e of
 its weight. Costs a third apart may differ by misfit alone."""
@@ -48,7 +48,8 @@ class SvbrdfFit(NamedTuple):
 
 def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, options: SearchOptions | None = None,
                  shared: np.ndarray | None = None, pairs: np.ndarray = NO_PAIRS, metals: Metals | None = None,
-                 roughness: np.ndarray | None = None, single_lobe: bool = True, prior: Prior | None = None) -> SvbrdfFit:
+                 roughness: np.ndarray | None = None, single_lobe: bool = True, prior: Prior | None = None,
+                 beside: np.ndarray | None = None) -> SvbrdfFit:
     """Estimate the normal and the material of sampled pixels.
 
     Args:
@@ -63,6 +64,7 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, options
         single_lobe: False leaves the joint fit of one lobe out, to see what it buys.
         prior: normals to which the search is drawn, because the readings do not support the lobes; then the joint fit, which knows no
             prior, is left out, and the surface is taken as Lambertian.
+        beside: [steps, n] of propagation.neighbours; None: no pixel is another's neighbour.
 
     Returns:
         The fit. Waits for the device.
@@ -70,20 +72,19 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, options
     Raises:
         ArrayError: shapes that do not fit.
     """
-    found = search_normals(samples, start, shape=shape, options=options, prior=prior)
-    wide, fine = NEAR
-    normals, costs = [found.normal], [found.cost]
+    found = find_normals(samples, start, shape=shape, options=options, beside=beside, prior=prior)
+    normals, costs = [found.best.normal], [found.best.cost]
     for rough, slope in NEIGHBOURS:
         if rough and shape.rough < 0:
             continue
         nearby = Diffuse(rough=max(shape.rough + rough, 0.0) if shape.rough >= 0 else shape.rough, slope=shape.slope + slope)
-        other = search_normals(samples, found.normal, shape=nearby, options=options, wide=wide, fine=fine, prior=prior)
+        other = descend(samples, found.best.normal, shape=nearby, options=options, weights=found.best.weights, prior=prior, schedule=WARM)
         normals.append(other.normal)
         costs.append(other.cost)
     if single_lobe and prior is None:
         if roughness is None:
-            roughness = fit_tinted(samples, found.normal, shape=shape, options=options).roughness
-        single = refine(samples, found.normal, roughness, shape=shape, options=options)
+            roughness = fit_tinted(samples, found.best.normal, shape=shape, options=options).roughness
+        single = refine(samples, found.best.normal, roughness, shape=shape, options=options)
         normals.append(single.normal)
         costs.append(SINGLE_LOBE_CHARGE * single.cost)
     normal, spread = average_normals(np.stack(normals), np.stack(costs))
@@ -100,13 +101,12 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, options
                 normal = better
     else:
         material = fit_given(samples, normal, MATT, shape=shape, options=options)
-        start = normal
-        found = search_normals(samples, start, shape=shape, options=options)  # the readings alone say how sure the normal is
-        spread = np.hypot(spread, _angles(found.normal, normal))
+        found = find_normals(samples, normal, shape=shape, options=options)  # the readings alone say how sure the normal is
+        spread = np.hypot(spread, _angles(found.best.normal, normal))
     material, mixture = mix_materials(samples, normal, material, pairs, shape=shape, options=options)
-    certainty = assess(samples, start, found, normal, spread)
+    certainty = assess(samples, found, normal, spread)
     return SvbrdfFit(normal, material.diffuse_albedo, material.specular, material.roughness, certainty.sigma,
-                     certainty.probability / (1 + certainty.sigma), np.sqrt(found.cost), mixture)
+                     certainty.probability / (1 + certainty.sigma), np.sqrt(found.best.cost), mixture)
 
 
 def average_normals(normals: np.ndarray, costs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

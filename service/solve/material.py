@@ -11,7 +11,7 @@ import numpy as np
 
 from kernels.photometric.bounce import bounce_albedo
 from kernels.photometric.diffuse_shape import choose_diffuse
-from kernels.photometric.hypotheses import Diffuse, Prior, search_normals
+from kernels.photometric.hypotheses import Diffuse, Prior
 from kernels.photometric.lambert import solve_lambert
 from kernels.photometric.light_factors import find_light_factors
 from kernels.photometric.lobes import GEOMETRY, MIXTURE
@@ -20,6 +20,8 @@ from kernels.photometric.metal_search import Metals, metals_of
 from kernels.photometric.misfit import LARGEST_ERROR
 from kernels.photometric.mixtures import NO_PAIRS, choose_pairs
 from kernels.photometric.near import NearField
+from kernels.photometric.normal_search import find_normals
+from kernels.photometric.propagation import neighbours
 from kernels.photometric.readings import Lights, grey_factors, grey_readings
 from kernels.photometric.robust import solve_robust
 from kernels.photometric.samples import Samples, evenly
@@ -40,9 +42,6 @@ MATERIAL_PIXELS = 640
 """Pixels, spread over the object, from which the shared materials are chosen: an object has more materials than diffuse lobes."""
 INTENSITY_SQUARES = 8
 """Number of squares along the longer side of the image; intensities found in one half of them must explain the other half."""
-FIRST = (((5.0, 10.0, 16.0, 24.0, 34.0, 46.0), 20), (((2.5, 5.0), 10), ((0.9, 1.8), 8), ((0.4,), 6)))
-"""Rings of the first search, which the surface and the next search begin with. It judges two thirds of the candidates of that one: bounced
-light, which is not known yet, moves normals by more than a tenth of a degree."""
 PRIOR_STRENGTH = 10.0
 """Strength of the prior towards the normals of `lambert` where the general solver is not supported: a standard deviation of some degrees
 for a reading that misfits by the noise floor of the search."""
@@ -173,7 +172,7 @@ class _Walk:
         result = self.result
         for pixels, samples in self._batches("search"):
             start = result.normal[:, pixels] if self._supported else self._lambertian[:, pixels]
-            normal = search_normals(samples, start.T, shape=self._shape, prior=self._prior(pixels), wide=FIRST[0], fine=FIRST[1]).normal
+            normal = find_normals(samples, start.T, shape=self._shape, prior=self._prior(pixels), beside=self._beside(pixels)).best.normal
             result.normal[:, pixels] = normal.T
             if self._interreflection:
                 first = (fit_tinted(samples, normal, shape=self._shape) if self._supported else
@@ -247,7 +246,8 @@ class _Walk:
             light.keep(pixels, samples)
             roughness = self._roughness[pixels].astype(np.float32) if self._interreflection else None
             found = solve_svbrdf(samples, result.normal[:, pixels].T, shape=self._shape, shared=materials, pairs=self._pairs,
-                                 metals=self._metals, roughness=roughness, prior=self._prior(pixels))
+                                 metals=self._metals, roughness=roughness, prior=self._prior(pixels),
+                                 beside=self._beside(pixels))
             result.normal[:, pixels] = found.normal.T
             result.albedo[:, pixels] = found.diffuse_albedo.T
             self._specular[:, pixels] = found.specular.T
@@ -263,6 +263,9 @@ class _Walk:
     @property
     def _few(self) -> bool:
         return self._given.stack.light_count < FEW_LIGHTS
+
+    def _beside(self, pixels: np.ndarray) -> np.ndarray:
+        return neighbours(pixels, self._given.camera.width)
 
     def _prior(self, pixels: np.ndarray) -> Prior | None:
         """Return what is expected of the normals of some pixels."""

@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kernels.photometric.albedo_scale import ScaleFit, fit_albedo_scale
-from kernels.photometric.hypotheses import Diffuse, search_normals
+from kernels.photometric.descent import descend
+from kernels.photometric.hypotheses import Diffuse
 from kernels.photometric.readings import channel_weights
 from kernels.photometric.samples import Samples, readings_of
 from service.solve.direct_light import LARGEST_ALBEDO, DirectLight
@@ -25,8 +26,6 @@ BLOCKS = 2500
 """Most pixels that are searched again, each for a square block around it."""
 ROUNDS = 2
 """Rounds: the third changes the scale of albedo by 1 %."""
-RINGS = (((2.0, 4.0, 7.0), 14), (((0.9, 1.8), 8), ((0.4,), 6)))
-"""Rings of the search about the first normals: bounced light turns normals by some degrees."""
 LEAST_ALBEDO = 0.02
 """Pixels of less albedo say nothing of its scale: what they send on is mostly stray or specular."""
 GROUPS = 12
@@ -74,7 +73,7 @@ def settle(light: DirectLight, normal: np.ndarray, shape: Diffuse, pick: Callabl
         light = light._replace(albedo_scale=_value(_fit(light, middles, turned, whole)) if relative else 1.0)
         samples = pick(middles)
         light.keep(middles, samples)
-        turned = search_normals(samples, start, shape=shape, wide=RINGS[0], fine=RINGS[1]).normal
+        turned = descend(samples, start, shape=shape).normal
         again, dimmed = first.copy(), albedo.copy()
         again[:, pixels] = _turn(first[:, pixels].T, start[block], turned[block]).T
         dimmed[:, pixels] = albedo[:, pixels] * _direct_part(readings_of(samples), whole)[block]

@@ -127,7 +127,7 @@ def test_a_table_of_other_lights_is_refused(device, tables):
     for table in (tables[device].search[0], tables[device].responses):
         fewer = wp.array(table.numpy()[:, 1:], dtype=float, device=device)
         with pytest.raises(ArrayError, match="lights"):
-            search_normals(samples, NORMALS[:3], shape=Diffuse(), table=fewer)
+            search_normals(samples, NORMALS[:3], shape=Diffuse(), wide=((), 1), table=fewer)
         with pytest.raises(ArrayError, match="lights"):
             fit_material(samples, NORMALS[:3], shape=Diffuse(), table=fewer)
 

@@ -8,10 +8,12 @@ from kernels import packs
 from kernels.errors import ArrayError
 from kernels.microfacet import diffuse, ggx, schlick
 from kernels.photometric.diffuse_shape import choose_diffuse
-from kernels.photometric.hypotheses import Diffuse, SearchOptions, rings, search_normals
+from kernels.photometric.hypotheses import Diffuse, RingOptions, rings, search_normals
 from kernels.photometric.material import fit_material
+from kernels.photometric.normal_search import find_normals
 from kernels.photometric.readings import grey_factors, pad_lights
 from kernels.photometric.samples import gather, to_host
+from kernels.photometric.survey import RINGS
 from kernels.photometric.svbrdf import average_normals, solve_svbrdf
 from tests.kernels.scenes import GREY, bits, cap, store
 from tests.reference import hypotheses
@@ -120,7 +122,7 @@ def test_gather_refuses(device):
     with pytest.raises(ArrayError, match="view is"):
         gather(band, np.arange(3), np.tile(VIEW, (2, 1)), lights, factors, 48)
     with pytest.raises(ArrayError, match="start is"):
-        search_normals(samples, np.tile(VIEW, (3, 1)), shape=Diffuse())
+        find_normals(samples, np.tile(VIEW, (3, 1)), shape=Diffuse())
 
 
 def test_rings_lie_at_their_angles():
@@ -140,7 +142,7 @@ def test_normals_of_a_glossy_dielectric(device, alpha, f0):
     normal = tilted(150)
     samples, _ = sample(render(normal, alpha=alpha, f0=f0), device)
     start = twin.unit(normal + 0.21 * np.array([0.6, -0.8, 0.0]))
-    found = search_normals(samples, start, shape=Diffuse())
+    found = find_normals(samples, start, shape=Diffuse()).best
     error = degrees(found.normal, normal)
     assert np.median(error) < 0.25
     assert error.max() < 1.0  # lobes between two widths are a mixture of both, not quite of their shape
@@ -150,7 +152,7 @@ def test_normals_of_a_metal(device):
     """No diffuse light at all: the lobe alone says where the normal is."""
     normal = tilted(100, 40.0)
     samples, _ = sample(render(normal, albedo=np.zeros(3), alpha=0.25, f0=0.7), device)
-    found = search_normals(samples, twin.unit(normal + [0.2, 0.1, 0]), shape=Diffuse())
+    found = find_normals(samples, twin.unit(normal + [0.2, 0.1, 0]), shape=Diffuse()).best
     assert np.median(degrees(found.normal, normal)) < 0.4
 
 
@@ -160,7 +162,7 @@ def test_cast_shadows_hardly_matter(device):
     radiance = render(normal, alpha=0.25)
     radiance = radiance * (np.random.default_rng(5).random(radiance.shape[1:]) > 0.33)
     samples, _ = sample(radiance, device)
-    found = search_normals(samples, twin.unit(normal + [0.1, 0.1, 0]), shape=Diffuse())
+    found = find_normals(samples, twin.unit(normal + [0.1, 0.1, 0]), shape=Diffuse()).best
     assert np.median(degrees(found.normal, normal)) < 0.3
 
 
@@ -171,8 +173,8 @@ def test_saturated_readings_take_no_part(device):
     saturated = radiance[1] > np.quantile(radiance[1], 0.95, axis=0)
     spoiled = np.where(saturated, 0.7 * radiance, radiance)
     start = twin.unit(normal + [0.05, 0.05, 0])
-    clean = search_normals(sample(radiance, device, saturated=saturated)[0], start, shape=Diffuse())
-    cut = search_normals(sample(spoiled, device, saturated=saturated)[0], start, shape=Diffuse())
+    clean = find_normals(sample(radiance, device, saturated=saturated)[0], start, shape=Diffuse()).best
+    cut = find_normals(sample(spoiled, device, saturated=saturated)[0], start, shape=Diffuse()).best
     np.testing.assert_array_equal(clean.normal, cut.normal)
 
 
@@ -183,9 +185,9 @@ def test_perspective_views(device):
     view = twin.unit(np.array([0, 0, 1.0]) + rng.uniform(-0.3, 0.3, (80, 3)) * [1, 1, 0])
     radiance = np.stack([c * twin.diffuse(normal[None], LIGHTS[:, None], view[None])
                          + twin.specular(normal[None], LIGHTS[:, None], view[None], 0.15, 0.3) for c in COLOUR])
-    found = search_normals(sample(radiance, device, view=view)[0], twin.unit(normal + [0.1, 0, 0]), shape=Diffuse())
+    found = find_normals(sample(radiance, device, view=view)[0], twin.unit(normal + [0.1, 0, 0]), shape=Diffuse()).best
     assert np.median(degrees(found.normal, normal)) < 0.3
-    wrong = search_normals(sample(radiance, device)[0], twin.unit(normal + [0.1, 0, 0]), shape=Diffuse())
+    wrong = find_normals(sample(radiance, device)[0], twin.unit(normal + [0.1, 0, 0]), shape=Diffuse()).best
     assert np.median(degrees(wrong.normal, normal)) > 0.5  # it matters
 
 
@@ -197,12 +199,12 @@ def test_the_diffuse_shape_is_recovered(device, rough, slope):
     samples, _ = sample(render(normal, alpha=0.25, rough=rough, slope=slope), device)
     shape, tried = choose_diffuse(samples, twin.unit(normal + [0.03, 0.02, 0]))
     assert tried[:, 2].min() == tried[(tried[:, 0] == shape.rough) & (tried[:, 1] == shape.slope), 2][0]
-    chosen = degrees(search_normals(samples, normal, shape=shape).normal, normal)
+    chosen = degrees(find_normals(samples, normal, shape=shape).best.normal, normal)
     assert np.median(chosen) < 0.5
     if rough is None:
         assert shape == Diffuse()
     else:
-        lambert = degrees(search_normals(samples, normal, shape=Diffuse()).normal, normal)
+        lambert = degrees(find_normals(samples, normal, shape=Diffuse()).best.normal, normal)
         assert np.median(chosen) < 0.5 * np.median(lambert)
 
 
@@ -280,7 +282,7 @@ def test_more_rounds_are_an_option(device):
     normal = tilted(100)
     radiance = render(normal, alpha=0.25) * (np.random.default_rng(5).random((48, 100)) > 0.3)
     samples, _ = sample(radiance, device)
-    few, many = (degrees(search_normals(samples, normal, shape=Diffuse(), options=SearchOptions(reweightings=r)).normal, normal)
+    few, many = (degrees(search_normals(samples, normal, shape=Diffuse(), options=RingOptions(reweightings=r), wide=RINGS).normal, normal)
                  for r in (1, 5))
     assert few.mean() > many.mean()
 

@@ -1,0 +1,294 @@
+"""The kernel of `descent`: the turns of one pack of pixels, all lights in each."""
+
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from kernels.microfacet import diffuse_with_slopes, ggx_with_slopes, masking_root, schlick
+from kernels.packs import pack_type
+from kernels.photometric.hypotheses import LEAST_NZ, SHADOW_TRUST, tangents
+from kernels.photometric.lobes import LOBE_SCALE, LOBES, MIXTURE, MIXTURE_F0
+
+SWEEPS = 8
+"""Coordinate sweeps of the non-negative solve in each turn, from the weights of the turn before."""
+LONGEST = 0.15
+"""Longest step, radians."""
+DAMPING, DAMPING_UP, DAMPING_DOWN, LEAST_DAMPING = 0.01, 8.0, 0.2, 1e-5
+"""Initial damping relative to the curvature, the factors on it after a step that raised and one that lowered the cost, and its least."""
+INERTIA = 0.1
+"""Part of its curvature with which a weight of a GGX lobe is held where it was in the turn before. Lobes are much alike, and freely moved
+their weights follow each other and the tilt into the noise: normals of path-traced paint were 0.09 degrees worse without it."""
+LEAST_PIVOT = 1e-4
+"""Part of its curvature that a weight must keep beside the weights before it to be eliminated: lobes much alike count as one."""
+LOG_GROUP, LARGEST_SQUARE = 6, 1e6
+"""Lights whose 1 + r²/σ² are multiplied before one logarithm is taken, and the largest r²/σ²: their product stays in range."""
+UNKNOWNS = MIXTURE + 2
+"""Weights and two tilts."""
+TILT, OTHER = MIXTURE, MIXTURE + 1
+
+
+@wp.func
+def entry(row: int, column: int):
+    """Return the place of an element of a symmetric matrix, row ≥ column, in the list of its lower triangle."""
+    return row * (row + 1) / 2 + column
+
+
+@cache
+def descent_kernel(lanes: int) -> Any:
+    """Return the kernel for one width of packs."""
+    lane_type = pack_type(lanes, wp.float32)
+    mixture = wp.types.matrix(shape=(MIXTURE, lanes), dtype=wp.float32)
+    rows = wp.types.matrix(shape=(UNKNOWNS, lanes), dtype=wp.float32)
+    triangle = wp.types.matrix(shape=(UNKNOWNS * (UNKNOWNS + 1) // 2, lanes), dtype=wp.float32)
+    widths = wp.types.vector(length=len(LOBES), dtype=wp.float32)
+    gloss = len(LOBES)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
+    def descend_kernel(first: int,
+                       grey: wp.array(dtype=lane_type),  # [P · L] readings / level
+                       toward: wp.array2d(dtype=lane_type),  # [3, P · L]
+                       view: wp.array2d(dtype=lane_type),  # [3, P]
+                       drawn: wp.array2d(dtype=lane_type),  # [3, P] normal of the prior
+                       pull: wp.vec2,  # its strength, and 1 / rad² of its angle
+                       noise: wp.vec2,  # s0, s1
+                       shadow: wp.vec2,  # r²/σ² of equal cost, depth
+                       form: wp.vec2,  # diffuse roughness, slope
+                       soft: wp.vec2,  # factor on σ² in the first turn, and its own factor from turn to turn
+                       softened: int,
+                       turns: int,
+                       light_count: int,
+                       pack_stride: int,
+                       light_stride: int,
+                       # outputs
+                       normal: wp.array2d(dtype=lane_type),  # [3, P] in: start, out: best
+                       weights: wp.array2d(dtype=lane_type),  # [lobes, P] in: start, out: of the best
+                       found: wp.array2d(dtype=lane_type)):  # [3, P] cost, curvature, swing
+        p = first + wp.tid()
+        alphas = widths(wp.static(LOBES[0]), wp.static(LOBES[1]), wp.static(LOBES[2]), wp.static(LOBES[3]), wp.static(LOBES[4]))
+        vx = view[0, p]
+        vy = view[1, p]
+        vz = view[2, p]
+        ux = drawn[0, p]
+        uy = drawn[1, p]
+        uz = drawn[2, p]
+        nx = normal[0, p]
+        ny = normal[1, p]
+        nz = normal[2, p]
+        bx, by, bz = lane_type(), lane_type(), lane_type()
+        best, damping, undone = lane_type(1.0e30), lane_type(DAMPING), lane_type()
+        curvature, swing = lane_type(), lane_type()
+        x, x_best = mixture(), mixture()
+        for a in range(MIXTURE):
+            given_weight = weights[a, p]
+            for k in range(lanes):
+                x[a, k] = given_weight[k]
+        variance = float(soft[0])  # relative to that of the noise
+        for turn in range(turns):
+            narrow = 1.0 / wp.max(variance, 1.0)
+            variance = variance * soft[1]
+            judged = wp.where(turn >= softened, 1.0, 0.0)
+            free = wp.where(turn >= wp.min(softened, 1), 1.0, 0.0)  # the first turn without weights finds them alone
+            ax, ay, az, ox, oy, oz = lane_type(), lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
+            nv, va, vo, explained = lane_type(), lane_type(), lane_type(), lane_type()
+            for k in range(lanes):
+                tangent, other = tangents(wp.vec3(nx[k], ny[k], nz[k]))
+                ax[k] = tangent[0]
+                ay[k] = tangent[1]
+                az[k] = tangent[2]
+                ox[k] = other[0]
+                oy[k] = other[1]
+                oz[k] = other[2]
+            view_root = mixture()
+            for k in range(lanes):
+                nv[k] = nx[k] * vx[k] + ny[k] * vy[k] + nz[k] * vz[k]
+                va[k] = ax[k] * vx[k] + ay[k] * vy[k] + az[k] * vz[k]
+                vo[k] = ox[k] * vx[k] + oy[k] * vy[k] + oz[k] * vz[k]
+            for a in range(gloss):
+                for k in range(lanes):
+                    view_root[a, k] = masking_root(nv[k], alphas[a])
+            for a in range(MIXTURE):
+                for k in range(lanes):
+                    explained[k] = wp.max(explained[k], x[a, k])
+            # normal equations of weights and tilts, and the cost
+            total, product = lane_type(), lane_type(1.0)
+            g = triangle()
+            r = rows()
+            for light in range(light_count):
+                at = p * pack_stride + light * light_stride
+                reading = grey[at]
+                lx = toward[0, at]
+                ly = toward[1, at]
+                lz = toward[2, at]
+                nl, la, lo, nh, inverse, fresnel = lane_type(), lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
+                by_h, by_l, by_v, predicted, w = lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
+                f = rows()
+                for k in range(lanes):
+                    lv = lx[k] * vx[k] + ly[k] * vy[k] + lz[k] * vz[k]
+                    hv2 = wp.max(0.5 + 0.5 * lv, 2.5e-7)
+                    hv = wp.sqrt(hv2)
+                    inverse[k] = 0.5 / hv  # 1 / |l + v|
+                    fresnel[k] = LOBE_SCALE * (MIXTURE_F0 + (1.0 - MIXTURE_F0) * schlick(hv))
+                    cosine = nx[k] * lx[k] + ny[k] * ly[k] + nz[k] * lz[k]
+                    la[k] = ax[k] * lx[k] + ay[k] * ly[k] + az[k] * lz[k]
+                    lo[k] = ox[k] * lx[k] + oy[k] * ly[k] + oz[k] * lz[k]
+                    nl[k] = wp.max(cosine, 0.0)
+                    nh[k] = (cosine + nv[k]) * inverse[k]
+                    value, on_l, on_v = diffuse_with_slopes(nl[k], nv[k], hv2, form[0], form[1])
+                    f[0, k] = value
+                    predicted[k] = x[0, k] * value
+                    by_l[k] = x[0, k] * on_l
+                    by_v[k] = x[0, k] * on_v
+                for a in range(gloss):
+                    for k in range(lanes):
+                        lobe, on_h, along_l, along_v = ggx_with_slopes(nl[k], nv[k], nh[k], alphas[a], view_root[a, k])
+                        scaled = fresnel[k] * x[1 + a, k]
+                        f[1 + a, k] = fresnel[k] * lobe
+                        predicted[k] += scaled * lobe
+                        by_h[k] += scaled * on_h
+                        by_l[k] += scaled * along_l
+                        by_v[k] += scaled * along_v
+                for k in range(lanes):
+                    f[TILT, k] = by_h[k] * (la[k] + va[k]) * inverse[k] + by_l[k] * la[k] + by_v[k] * va[k]
+                    f[OTHER, k] = by_h[k] * (lo[k] + vo[k]) * inverse[k] + by_l[k] * lo[k] + by_v[k] * vo[k]
+                    sigma = 1.0 / (noise[0] + noise[1] * wp.max(reading[k], 0.0))
+                    off = (reading[k] - predicted[k]) * sigma
+                    off2 = wp.where(explained[k] > 0.0, wp.min(off * off * narrow, LARGEST_SQUARE), 0.0)
+                    dark = wp.where(reading[k] < shadow[1] * predicted[k], 1, 0) * wp.where(off2 > shadow[0], 1, 0)
+                    given = wp.where(reading[k] >= 0.0, 1.0, 0.0)
+                    trust = wp.where(reading[k] > 0.0, wp.where(dark == 1, SHADOW_TRUST, 1.0), SHADOW_TRUST)
+                    w[k] = given * trust * sigma * sigma / (1.0 + off2)
+                    product[k] = product[k] * (1.0 + given * wp.where(dark == 1, shadow[0], off2))
+                if light % LOG_GROUP == LOG_GROUP - 1:
+                    for k in range(lanes):
+                        total[k] += wp.log(product[k])
+                        product[k] = 1.0
+                for a in range(UNKNOWNS):
+                    wf = lane_type()
+                    for k in range(lanes):
+                        wf[k] = w[k] * f[a, k]
+                        r[a, k] += wf[k] * reading[k]
+                    for b in range(a + 1):
+                        for k in range(lanes):
+                            g[entry(a, b), k] += wf[k] * f[b, k]
+            for a in range(1, MIXTURE):
+                for k in range(lanes):
+                    r[a, k] += INERTIA * g[entry(a, a), k] * x[a, k]
+                    g[entry(a, a), k] = (1.0 + INERTIA) * g[entry(a, a), k]
+            worse = lane_type()
+            for k in range(lanes):
+                away = wp.max(2.0 - 2.0 * (nx[k] * ux[k] + ny[k] * uy[k] + nz[k] * uz[k]), 0.0)
+                total[k] += wp.log(product[k]) + pull[0] * wp.log(1.0 + pull[1] * away)
+                draw = pull[0] * pull[1] / (1.0 + pull[1] * away)
+                g[entry(TILT, TILT), k] += draw
+                g[entry(OTHER, OTHER), k] += draw
+                r[TILT, k] += draw * (ux[k] * ax[k] + uy[k] * ay[k] + uz[k] * az[k])
+                r[OTHER, k] += draw * (ux[k] * ox[k] + uy[k] * oy[k] + uz[k] * oz[k])
+                worse[k] = judged * wp.where(total[k] >= best[k], 1.0, 0.0) * wp.where(undone[k] == 0.0, 1.0, 0.0)
+            # eliminate the weights above zero: L D Lᵀ of their rows; those at zero have none
+            on, y = rows(), rows()
+            left = triangle()
+            for a in range(UNKNOWNS):
+                for k in range(lanes):
+                    on[a, k] = 1.0
+            for a in range(MIXTURE):
+                for k in range(lanes):
+                    on[a, k] = wp.where(x[a, k] > 0.0, 1.0, 0.0)
+            for a in range(UNKNOWNS):
+                for k in range(lanes):
+                    y[a, k] = on[a, k] * r[a, k]
+                for b in range(a + 1):
+                    for k in range(lanes):
+                        left[entry(a, b), k] = on[a, k] * on[b, k] * g[entry(a, b), k]
+            for b in range(MIXTURE):
+                inverse_pivot = lane_type()
+                for k in range(lanes):
+                    pivot = left[entry(b, b), k]
+                    inverse_pivot[k] = wp.where(pivot > LEAST_PIVOT * g[entry(b, b), k], 1.0 / wp.max(pivot, 1.0e-30), 0.0)
+                for a in range(b + 1, UNKNOWNS):
+                    share = lane_type()
+                    for k in range(lanes):
+                        share[k] = left[entry(a, b), k] * inverse_pivot[k]
+                        y[a, k] -= share[k] * y[b, k]
+                    for c in range(b + 1, a + 1):
+                        for k in range(lanes):
+                            left[entry(a, c), k] -= share[k] * left[entry(c, b), k]
+            # keep what costs less, go back from what costs more, and step
+            step_a, step_o = lane_type(), lane_type()
+            for k in range(lanes):
+                s00 = left[entry(TILT, TILT), k]
+                s01 = left[entry(OTHER, TILT), k]
+                s11 = left[entry(OTHER, OTHER), k]
+                back = worse[k] > 0.0
+                kept = judged * (1.0 - worse[k]) > 0.0
+                eased = wp.where(undone[k] == 0.0, wp.max(damping[k] * DAMPING_DOWN, LEAST_DAMPING), damping[k])
+                damping[k] = wp.where(back, damping[k] * DAMPING_UP, wp.where(kept, eased, damping[k]))
+                undone[k] = worse[k]
+                best[k] = wp.where(kept, total[k], best[k])
+                bx[k] = wp.where(kept, nx[k], bx[k])
+                by[k] = wp.where(kept, ny[k], by[k])
+                bz[k] = wp.where(kept, nz[k], bz[k])
+                nx[k] = wp.where(back, bx[k], nx[k])
+                ny[k] = wp.where(back, by[k], ny[k])
+                nz[k] = wp.where(back, bz[k], nz[k])
+                curvature[k] = wp.where(kept, 0.5 * (s00 + s11), curvature[k])
+                swing[k] = wp.where(kept, wp.sqrt(0.25 * (s00 - s11) * (s00 - s11) + s01 * s01), swing[k])
+                heavier = damping[k] * (s00 + s11) + 1.0e-20
+                d00 = s00 + heavier
+                d11 = s11 + heavier
+                determinant = d00 * d11 - s01 * s01
+                moves = free * (1.0 - worse[k]) * wp.where(determinant > 0.0, 1.0, 0.0)
+                scale = moves / wp.max(determinant, 1.0e-30)
+                along = (d11 * y[TILT, k] - s01 * y[OTHER, k]) * scale
+                across = (d00 * y[OTHER, k] - s01 * y[TILT, k]) * scale
+                shorter = wp.min(1.0, LONGEST / wp.max(wp.sqrt(along * along + across * across), 1.0e-20))
+                step_a[k] = along * shorter
+                step_o[k] = across * shorter
+            pivots = mixture()
+            for a in range(MIXTURE):
+                for k in range(lanes):
+                    kept = judged * (1.0 - worse[k]) > 0.0
+                    x_best[a, k] = wp.where(kept, x[a, k], x_best[a, k])
+                    x[a, k] = wp.where(worse[k] > 0.0, x_best[a, k], x[a, k])
+                    pivots[a, k] = (1.0 - worse[k]) / (g[entry(a, a), k] + 1.0e-8)
+                    r[a, k] -= g[entry(TILT, a), k] * step_a[k] + g[entry(OTHER, a), k] * step_o[k]
+            for _ in range(SWEEPS):
+                for a in range(MIXTURE):
+                    rest = lane_type()
+                    for k in range(lanes):
+                        rest[k] = r[a, k]
+                    for b in range(MIXTURE):
+                        for k in range(lanes):
+                            rest[k] -= g[entry(wp.max(a, b), wp.min(a, b)), k] * x[b, k]
+                    for k in range(lanes):
+                        x[a, k] = wp.max(x[a, k] + rest[k] * pivots[a, k], 0.0)
+            for k in range(lanes):
+                mx = nx[k] + step_a[k] * ax[k] + step_o[k] * ox[k]
+                my = ny[k] + step_a[k] * ay[k] + step_o[k] * oy[k]
+                mz = nz[k] + step_a[k] * az[k] + step_o[k] * oz[k]
+                size = wp.sqrt(mx * mx + my * my + mz * mz)
+                lift = wp.max(LEAST_NZ - (mx * vx[k] + my * vy[k] + mz * vz[k]) / size, 0.0)
+                mx = mx / size + lift * vx[k]
+                my = my / size + lift * vy[k]
+                mz = mz / size + lift * vz[k]
+                unit = 1.0 / wp.sqrt(mx * mx + my * my + mz * mz)
+                nx[k] = mx * unit
+                ny[k] = my * unit
+                nz[k] = mz * unit
+        for k in range(lanes):
+            best[k] = best[k] / float(light_count)
+            curvature[k] = curvature[k] / float(light_count)
+            swing[k] = swing[k] / float(light_count)
+        normal[0, p] = bx
+        normal[1, p] = by
+        normal[2, p] = bz
+        found[0, p] = best
+        found[1, p] = curvature
+        found[2, p] = swing
+        for a in range(MIXTURE):
+            kept_weight = lane_type()
+            for k in range(lanes):
+                kept_weight[k] = x_best[a, k]
+            weights[a, p] = kept_weight
+
+    return descend_kernel

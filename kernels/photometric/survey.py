@@ -1,0 +1,62 @@
+"""Other modes of the cost: candidates on wide rings, for pixels whose readings may mean another normal than the one found.
+
+A pixel whose readings are explained to little more than the noise of a camera, with readings to spare, has one mode: of such pixels of real
+and path-traced objects under 64 to 128 lights none had a hundredth of its probability elsewhere (docs/figures.md). The others are
+surveyed: candidates on rings about the normal found are judged as in `hypotheses`. The best of them is the start of another descent, and
+the costs of all say how probable other modes are (`certainty`).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from kernels.photometric.descent import Descent, Schedule, descend
+from kernels.photometric.evidence import evidence
+from kernels.photometric.hypotheses import Diffuse, Prior, RingOptions, SearchOptions, search_normals
+from kernels.photometric.samples import Samples, choose
+
+RINGS = ((5.0, 10.0, 16.0, 24.0, 34.0, 46.0), 20)
+"""Radii of the rings, degrees, and the number of candidates on the last of them."""
+REWEIGHTINGS = 2
+"""Rounds of the robust fit of each candidate: it shows the mode, and the descent from the best candidate the cost of its bottom."""
+AGAIN = Schedule(softened=2, judged=6, softness=4.0, cooling=0.25)
+"""Descent from the best candidate."""
+EXPLAINED = 0.03
+"""Cost of a reading beyond the unknowns up to which a pixel counts as explained."""
+SPARE = 24
+"""Readings beyond the unknowns from which on being explained means something."""
+
+
+class Survey(NamedTuple):
+    """The costs of candidates, for some of the sampled pixels."""
+
+    pixels: np.ndarray  # [m] positions among the sampled pixels
+    samples: Samples  # of these pixels
+    middle: np.ndarray  # [m, 3] float32 unit normals that the rings are about
+    costs: wp.array  # [candidates, packs] float packs, on the device: cost of each candidate, summed over the lights
+
+
+def survey(samples: Samples, found: Descent, *, shape: Diffuse, options: SearchOptions | None = None,
+           prior: Prior | None = None) -> Survey | None:
+    """Survey the pixels that may have another mode, and take over better ones into their descents, in place.
+
+    Args:
+        samples: readings of n pixels.
+        found: their descents.
+        shape, options, prior: as for the descents.
+
+    Returns:
+        The survey; None if no pixel needs one. Waits for the device.
+    """
+    told = evidence(samples, found.cost, found.weights)
+    pixels = np.flatnonzero((told.noise > EXPLAINED) | (told.surplus < SPARE))
+    if not len(pixels):
+        return None
+    chosen, middle = choose(samples, pixels), found.normal[pixels]
+    drawn = None if prior is None else prior._replace(normal=prior.normal[pixels])
+    rounds = RingOptions.of(options or SearchOptions(), reweightings=REWEIGHTINGS)
+    ringed = search_normals(chosen, middle, shape=shape, options=rounds, wide=RINGS, prior=drawn)
+    found.replace(pixels, descend(chosen, ringed.normal, shape=shape, options=options, weights=ringed.weights, prior=drawn,
+                                  schedule=AGAIN))
+    return Survey(pixels, chosen, middle, ringed.survey)
