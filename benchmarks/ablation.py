@@ -76,7 +76,7 @@ def load_case(name: str, capture: Capture, truth: np.ndarray, cache: Path) -> Ca
     samples = _gather(band, solved, lights, factors, stack.light_count)
     channels = tuple(_gather(band, solved, lights, grey_factors(lights, one), stack.light_count) for one in np.eye(3))
     few = solved[evenly(len(solved), SPREAD_PIXELS)]
-    shape, _ = choose_diffuse(_gather(band, few, lights, factors, stack.light_count), robust[0][few])
+    shape = choose_diffuse(_gather(band, few, lights, factors, stack.light_count), robust[0][few]).mean
 
     def whole(options: MaterialOptions) -> np.ndarray:
         solution = solve_material(SolveInput(stack, capture.camera, capture.mask(), "cpu", Timings(),

@@ -8,6 +8,7 @@ Source: the lobe is Burley's, "Physically-based shading at Disney", 2012, sectio
 """
 
 import itertools
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,11 +25,26 @@ REFINEMENT = 0.5
 """Step of the second search, about the best shape of the first, as a fraction of the first search's step."""
 FROM_LAMBERT = Schedule(softened=0, judged=7)
 """Descent from the normal and weights found under Lambert's lobe: another shape moves normals by a few degrees."""
+SIMPLER = 1.01
+"""Factor on the least cost up to which Lambert's lobe, with a slope or without, is kept."""
+TEMPERATURE = 0.07
+"""Softmax temperature of the average over shapes, relative to the least cost. Costs a few per cent apart do not tell shapes apart: with the
+shape of least cost alone, the normals of a real ball are 0.07 degrees worse."""
+
+
+class Shapes(NamedTuple):
+    """The shape of the diffuse lobe of an object."""
+
+    best: Diffuse
+    """The shape of least cost, under which materials are fitted."""
+    mean: Diffuse
+    """The mean of the shapes that cost little, under which normals are found: a wrong shape bends them, and the mean errs less."""
+    tried: np.ndarray  # [shapes, 3] float64: roughness, slope, mean cost of each
 
 
 def choose_diffuse(samples: Samples, start: np.ndarray, *,
-                   options: SearchOptions | None = None) -> tuple[Diffuse, np.ndarray]:
-    """Return the shape under which the sampled pixels have the least cost.
+                   options: SearchOptions | None = None) -> Shapes:
+    """Choose the shape of the diffuse lobe from sampled pixels.
 
     Args:
         samples: some hundreds of pixels, spread over the object.
@@ -36,24 +52,39 @@ def choose_diffuse(samples: Samples, start: np.ndarray, *,
         options: of the search.
 
     Returns:
-        The shape, and [shapes tried, 3] float64: roughness, slope, mean cost of each.
+        The shapes. Waits for the device.
     """
     lambert = find_normals(samples, start, shape=Diffuse(), options=options).best
     tried: dict[Diffuse, float] = {}
 
-    def cost(rough: float, slope: float) -> float:
+    def judge(rough: float, slope: float) -> None:
         shape = Diffuse(rough=round(rough, 4), slope=round(slope, 4))
         if shape not in tried:
             found = descend(samples, lambert.normal, shape=shape, options=options, weights=lambert.weights, schedule=FROM_LAMBERT)
             tried[shape] = float(np.mean(found.cost, dtype=np.float64))
-        return tried[shape]
 
     for rough, slope in itertools.product(ROUGHNESSES, SLOPES):
-        cost(rough, slope)
-    best = min(tried, key=tried.__getitem__)
+        judge(rough, slope)
+    best = _best(tried)
     rough_step, slope_step = ROUGHNESSES[2] - ROUGHNESSES[1], SLOPES[1] - SLOPES[0]
     for across, along in itertools.product((-1, 0, 1), repeat=2):
         rough = best.rough if best.rough < 0 else float(np.clip(best.rough + across * REFINEMENT * rough_step, 0, 1))
-        cost(rough, best.slope + along * REFINEMENT * slope_step)
+        judge(rough, best.slope + along * REFINEMENT * slope_step)
+    best = _best(tried)
+    return Shapes(best, _average(tried, best), np.array([(shape.rough, shape.slope, value) for shape, value in tried.items()]))
+
+
+def _best(tried: dict[Diffuse, float]) -> Diffuse:
+    """Return the shape of least cost, or the best slope of Lambert's lobe where that costs hardly more."""
     best = min(tried, key=tried.__getitem__)
-    return best, np.array([(shape.rough, shape.slope, value) for shape, value in tried.items()])
+    lambert = min((shape for shape in tried if shape.rough < 0), key=tried.__getitem__)
+    return lambert if tried[lambert] <= SIMPLER * tried[best] else best
+
+
+def _average(tried: dict[Diffuse, float], best: Diffuse) -> Diffuse:
+    """Return the mean of the shapes of the best one's lobe, Lambert's or Burley's, each weighted by how little it costs."""
+    alike = np.array([(shape.rough, shape.slope, cost) for shape, cost in tried.items() if (shape.rough < 0) == (best.rough < 0)])
+    least = alike[:, 2].min()
+    weights = np.exp(-(alike[:, 2] - least) / max(TEMPERATURE * least, 1e-12))
+    rough, slope = weights @ alike[:, :2] / weights.sum()
+    return Diffuse(rough=round(float(rough), 4), slope=round(float(slope), 4))

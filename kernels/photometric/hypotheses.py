@@ -66,7 +66,7 @@ class RingOptions(SearchOptions):
     """Coordinate sweeps of each non-negative solve."""
 
     @classmethod
-    def of(cls, options: SearchOptions, *, reweightings: int) -> "RingOptions":
+    def of(cls, options: SearchOptions, *, reweightings: int = 5) -> "RingOptions":
         """Return options that judge alike, with a number of rounds of the robust fit."""
         return cls(noise_floor=options.noise_floor, noise_slope=options.noise_slope, shadow_cost=options.shadow_cost,
                    shadow_depth=options.shadow_depth, reweightings=reweightings)

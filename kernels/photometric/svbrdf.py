@@ -1,7 +1,8 @@
 """The general solver: normal, diffuse albedo, F0 and roughness of each pixel, without learning.
 
 Normals come from `normal_search` under the diffuse shape that the object shares, from descents under shapes close to it, and from the
-joint fit of a single lobe; they are averaged, each weighted by how well it explains the pixel. The material then follows for the normal found.
+joint fit of a single lobe; they are averaged, each weighted by how well it explains the pixel. The material then follows for the normal
+found.
 
 Sources: Relit's BRDF is GGX (Walter et al., "Microfacet models for refraction through rough surfaces", EGSR 2007) with Smith's
 height-correlated masking (Heitz, "Understanding the masking-shadowing function", JCGT 2014), Schlick's Fresnel ("An inexpensive BRDF
@@ -46,16 +47,17 @@ class SvbrdfFit(NamedTuple):
     mixture: Mixture  # of pixels with two materials; F0 and roughness above are then those of one lobe close to both
 
 
-def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, options: SearchOptions | None = None,
-                 shared: np.ndarray | None = None, pairs: np.ndarray = NO_PAIRS, metals: Metals | None = None,
-                 roughness: np.ndarray | None = None, single_lobe: bool = True, prior: Prior | None = None,
+def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, lobe: Diffuse | None = None,
+                 options: SearchOptions | None = None, shared: np.ndarray | None = None, pairs: np.ndarray = NO_PAIRS,
+                 metals: Metals | None = None, roughness: np.ndarray | None = None, single_lobe: bool = True, prior: Prior | None = None,
                  beside: np.ndarray | None = None) -> SvbrdfFit:
     """Estimate the normal and the material of sampled pixels.
 
     Args:
         samples: their readings.
         start: [n, 3] unit normals to begin from, within some 50° of the truth.
-        shape: of the diffuse lobe, from diffuse_shape.choose_diffuse.
+        shape: of the diffuse lobe under which normals are found, from diffuse_shape.choose_diffuse.
+        lobe: the shape under which materials are fitted; None: the same.
         options: how candidates are judged.
         shared: [materials, 4] of shared_materials.choose_materials; None: every pixel has a material of its own.
         pairs: [pairs, 2, 4] of mixtures.choose_pairs.
@@ -72,6 +74,7 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, options
     Raises:
         ArrayError: shapes that do not fit.
     """
+    lobe = shape if lobe is None else lobe
     found = find_normals(samples, start, shape=shape, options=options, beside=beside, prior=prior)
     normals, costs = [found.best.normal], [found.best.cost]
     for rough, slope in NEIGHBOURS:
@@ -89,21 +92,21 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, options
         costs.append(SINGLE_LOBE_CHARGE * single.cost)
     normal, spread = average_normals(np.stack(normals), np.stack(costs))
     if prior is None:
-        material = fit_material(samples, normal, shape=shape, options=options, shared=shared)
+        material = fit_material(samples, normal, shape=lobe, options=options, shared=shared)
         if metals is not None:
-            better = search_metals(samples, normal, material, metals, shape=shape, options=options)
+            better = search_metals(samples, normal, material, metals, shape=lobe, options=options)
             moved = np.flatnonzero((better != normal).any(axis=1))
             if len(moved):
-                again = fit_material(choose(samples, moved), better[moved], shape=shape, options=options, shared=shared)
+                again = fit_material(choose(samples, moved), better[moved], shape=lobe, options=options, shared=shared)
                 for plane, replaced in zip(material, again, strict=True):
                     plane[moved] = replaced
                 spread = np.hypot(spread, _angles(normal, better))
                 normal = better
     else:
-        material = fit_given(samples, normal, MATT, shape=shape, options=options)
+        material = fit_given(samples, normal, MATT, shape=lobe, options=options)
         found = find_normals(samples, normal, shape=shape, options=options)  # the readings alone say how sure the normal is
         spread = np.hypot(spread, _angles(found.best.normal, normal))
-    material, mixture = mix_materials(samples, normal, material, pairs, shape=shape, options=options)
+    material, mixture = mix_materials(samples, normal, material, pairs, shape=lobe, options=options)
     certainty = assess(samples, found, normal, spread)
     return SvbrdfFit(normal, material.diffuse_albedo, material.specular, material.roughness, certainty.sigma,
                      certainty.probability / (1 + certainty.sigma), np.sqrt(found.best.cost), mixture)

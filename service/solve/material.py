@@ -124,7 +124,7 @@ class _Walk:
         self._roughness = self.result.roughness = np.zeros(count, np.float16)
         self._lambertian = np.zeros_like(self.result.normal)
         self._bouncing = np.zeros((3, count), np.float32)  # albedo of the light that other surfaces send
-        self._shape, self._supported, self._pairs = Diffuse(), True, NO_PAIRS
+        self._shape, self._lobe, self._supported, self._pairs = Diffuse(), Diffuse(), True, NO_PAIRS
         self._metals: Metals | None = None
 
     def start(self) -> None:
@@ -163,9 +163,10 @@ class _Walk:
         if self._few:
             self._supported = supports_lobes(self.result, samples, normal)
         if self._supported:
-            self._shape, tried = choose_diffuse(samples, normal)
-            self.result.facts |= {"diffuse_roughness": None if self._shape.rough < 0 else self._shape.rough,
-                                  "diffuse_slope": self._shape.slope, "shapes_tried": len(tried)}
+            shapes = choose_diffuse(samples, normal)
+            self._shape, self._lobe = shapes.mean, shapes.best
+            self.result.facts |= {"diffuse_roughness": None if self._lobe.rough < 0 else self._lobe.rough,
+                                  "diffuse_slope": self._lobe.slope, "shapes_tried": len(shapes.tried)}
 
     def search(self) -> None:
         """Search the normals a first time, and fit the material from which shadows and interreflection are told."""
@@ -175,11 +176,11 @@ class _Walk:
             normal = find_normals(samples, start.T, shape=self._shape, prior=self._prior(pixels), beside=self._beside(pixels)).best.normal
             result.normal[:, pixels] = normal.T
             if self._interreflection:
-                first = (fit_tinted(samples, normal, shape=self._shape) if self._supported else
-                         fit_given(samples, normal, MATT, shape=self._shape))
+                first = (fit_tinted(samples, normal, shape=self._lobe) if self._supported else
+                         fit_given(samples, normal, MATT, shape=self._lobe))
                 result.albedo[:, pixels], self._roughness[pixels] = first.diffuse_albedo.T, first.roughness
                 self._specular[:, pixels] = first.specular.T
-                self._bouncing[:, pixels] = bounce_albedo(samples, normal, first, shape=self._shape).T
+                self._bouncing[:, pixels] = bounce_albedo(samples, normal, first, shape=self._lobe).T
 
     def direct_light(self) -> DirectLight | None:
         """Find what the object does to its own light, from the first search; None when no pixel is solved."""
@@ -225,14 +226,14 @@ class _Walk:
         samples = self._pick(spread)
         light.keep(spread, samples)
         normal = self.result.normal[:, spread].T
-        materials = choose_materials(samples, normal, shape=self._shape)
+        materials = choose_materials(samples, normal, shape=self._lobe)
         self.result.facts["shared_materials"] = [{"specular": material[:3].tolist(), "roughness": float(material[3])}
                                                  for material in materials.round(4).astype(float)]
-        single = fit_material(samples, normal, shape=self._shape, shared=materials)
+        single = fit_material(samples, normal, shape=self._lobe, shared=materials)
         if self._options.metals:
             self._metals = metals_of(materials, single)
         if self._options.mixtures:
-            self._pairs = choose_pairs(samples, normal, materials, single, shape=self._shape)
+            self._pairs = choose_pairs(samples, normal, materials, single, shape=self._lobe)
         return materials
 
     def fit(self, light: DirectLight | None, materials: np.ndarray | None) -> None:
@@ -245,7 +246,8 @@ class _Walk:
             assert light is not None  # there are pixels
             light.keep(pixels, samples)
             roughness = self._roughness[pixels].astype(np.float32) if self._interreflection else None
-            found = solve_svbrdf(samples, result.normal[:, pixels].T, shape=self._shape, shared=materials, pairs=self._pairs,
+            found = solve_svbrdf(samples, result.normal[:, pixels].T, shape=self._shape, lobe=self._lobe, shared=materials,
+                                 pairs=self._pairs,
                                  metals=self._metals, roughness=roughness, prior=self._prior(pixels),
                                  beside=self._beside(pixels))
             result.normal[:, pixels] = found.normal.T

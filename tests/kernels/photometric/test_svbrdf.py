@@ -197,7 +197,7 @@ def test_the_diffuse_shape_is_recovered(device, rough, slope):
     roughness and 0.05 in slope apart."""
     normal = tilted(200, 65.0)
     samples, _ = sample(render(normal, alpha=0.25, rough=rough, slope=slope), device)
-    shape, tried = choose_diffuse(samples, twin.unit(normal + [0.03, 0.02, 0]))
+    shape, _, tried = choose_diffuse(samples, twin.unit(normal + [0.03, 0.02, 0]))
     assert tried[:, 2].min() == tried[(tried[:, 0] == shape.rough) & (tried[:, 1] == shape.slope), 2][0]
     chosen = degrees(find_normals(samples, normal, shape=shape).best.normal, normal)
     assert np.median(chosen) < 0.5
