@@ -28,6 +28,9 @@ UNEVEN_BLOCKS = 4
 """CPU blocks per core where some take longer than others. Where all take the same, one a core: starting a block takes a tenth of a
 millisecond of the interpreter, during which the other cores wait."""
 
+BRIEF_THREADS = 8192
+"""Brief threads that run faster on one core than it takes to start another."""
+
 CPU_BLOCK = 1
 """The block size that Warp launches CPU kernels with; loading ahead with another would compile the module twice."""
 
@@ -101,26 +104,51 @@ def launch(kernel: Any, count: int, inputs: Sequence[Any], outputs: Sequence[Any
     Convention:
         On the CPU the call returns when the work is done. On CUDA it returns at once; reading an output waits.
     """
+    record(kernel, count, inputs, outputs, device=device, uneven=uneven).run()
+
+
+class Recorded:
+    """A launch with its arguments, to be run any number of times: packing them takes longer than a small launch itself."""
+
+    def __init__(self, commands: list[Any]) -> None:
+        self._commands = commands
+
+    def run(self) -> None:
+        """Run the threads; returns as `launch` does."""
+        if len(self._commands) > 1:
+            list(_pool(worker_count()).map(lambda command: command.launch(), self._commands))
+        elif self._commands:
+            self._commands[0].launch()
+
+
+def record(kernel: Any, count: int, inputs: Sequence[Any], outputs: Sequence[Any], *, device: str, uneven: bool = False,
+           brief: bool = False) -> Recorded:
+    """Return a launch without running it.
+
+    Args:
+        kernel, count, inputs, outputs, device, uneven: as for launch. The arrays must live as long as the record.
+        brief: whether a thread takes less than a tenth of a microsecond; on the CPU few of them run on one core.
+
+    Raises:
+        ArrayError: more threads than a launch can have.
+    """
     if count <= 0:
-        return
+        return Recorded([])
     if count > MAX_THREADS:
         raise ArrayError(f"the work is {count} threads, a launch has at most {MAX_THREADS}: cut it into smaller bands")
     with _load_lock:  # two threads must not compile one module at the same time
         kernel.module.load(device, block_dim=CPU_BLOCK if device == "cpu" else CUDA_BLOCK)
     if device != "cpu":
-        wp.launch(kernel, dim=count, inputs=[0, *inputs], outputs=list(outputs), device=device, block_dim=CUDA_BLOCK)
-        return
+        return Recorded([wp.launch(kernel, dim=count, inputs=[0, *inputs], outputs=list(outputs), device=device, block_dim=CUDA_BLOCK,
+                                   record_cmd=True)])
     workers = worker_count()
-    blocks = min(count, workers * (UNEVEN_BLOCKS if uneven else 1)) if workers > 1 else 1
+    alone = workers == 1 or (brief and count < BRIEF_THREADS)
+    blocks = 1 if alone else min(count, workers * (UNEVEN_BLOCKS if uneven else 1))
     edges = [count * b // blocks for b in range(blocks + 1)]
 
     # recorded here, so that the pool's threads need the interpreter for a moment only
-    commands = [wp.launch(kernel, dim=last - first, inputs=[first, *inputs], outputs=list(outputs), device="cpu", record_cmd=True)
-                for first, last in itertools.pairwise(edges)]
-    if blocks == 1:
-        commands[0].launch()
-    else:
-        list(_pool(workers).map(lambda command: command.launch(), commands))
+    return Recorded([wp.launch(kernel, dim=last - first, inputs=[first, *inputs], outputs=list(outputs), device="cpu", record_cmd=True)
+                     for first, last in itertools.pairwise(edges)])
 
 
 @cache

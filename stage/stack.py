@@ -24,6 +24,8 @@ PIXEL_PAD = 64
 """The count of pixels is padded to this multiple, so that a band divides into whole packs (32 pixels on the CPU, 4 on CUDA)."""
 BAND_BYTES = 256 << 20
 """The bytes of the stack in one band, which bound the memory of every solver."""
+PAGE_BYTES, PICK_BYTES = 4096, 64 << 20
+"""What a scattered read brings into memory, and how much of it a pick keeps there at one time."""
 
 
 def padded(count: int, multiple: int) -> int:
@@ -98,10 +100,13 @@ class Stack:
         Returns:
             [3, lights padded, n] float16 and [lights padded / 8, n] uint8, copies.
         """
-        channels, lights, _ = self.shape
+        channels, lights, count = self.shape
         values = np.empty((channels, lights, len(pixels)), dtype=np.float16)
-        for channel, light in np.ndindex(channels, lights):  # a new map each time: scattered reads keep pages in the process
-            values[channel, light] = self._map(values_path(self.folder, self.key), self.shape)[channel, light, pixels]
+        touched = max(1, min(PAGE_BYTES * len(pixels), 2 * count))
+        for number, (channel, light) in enumerate(np.ndindex(channels, lights)):
+            if number % max(1, PICK_BYTES // touched) == 0:  # scattered reads keep pages in the process as long as the map lives
+                planes = self._map(values_path(self.folder, self.key), self.shape)
+            values[channel, light] = planes[channel, light, pixels]
         return values, self.pick_saturated(pixels)
 
     def pick_radiance(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -111,9 +111,14 @@ def _sweep(start: int, end: int, stride: int, device: str, *, threads: int | Non
     return Sweep(walk, threads, device)
 
 
+def record(kernel: Any, sweep: Sweep, inputs: list[Any], outputs: list[Any]) -> devices.Recorded:
+    """Return the launch of `run` without running it."""
+    return devices.record(kernel, sweep.threads, [sweep.walk, *inputs], outputs, device=sweep.device)
+
+
 def run(kernel: Any, sweep: Sweep, inputs: list[Any], outputs: list[Any]) -> None:
     """Launch a kernel whose arguments begin with `first: int, walk: Walk`."""
-    devices.launch(kernel, sweep.threads, [sweep.walk, *inputs], outputs, device=sweep.device)
+    record(kernel, sweep, inputs, outputs).run()
 
 
 @wp.func

@@ -84,6 +84,9 @@ def integrate_normals(
     """
     options = options or IntegrationOptions()
     _check(normal, mask, x, y, sigma, perspective=perspective, mean_z=mean_z)
+    whole, box = mask.shape, _box(mask)
+    normal, mask, x, y = normal[:, *box], mask[box], x[box], y[box]
+    sigma = None if sigma is None else sigma[box]
     rows, cols = mask.shape
     grid = make_grid(rows, cols, device)
     spacing = _spacing(x, y)
@@ -106,10 +109,24 @@ def integrate_normals(
         h, part = grid.zeros(), None
         done = improve(slopes, h)
     height = place(h, runs, grid=grid, perspective=perspective, spacing=spacing, mean_z=mean_z)
+    if part is not None:
+        part = part.reshape(-1, grid.pitch)[1 : rows + 1, 1 : cols + 1]
+    if (rows, cols) != whole:
+        inside, height = height, wp.zeros(whole, dtype=wp.float32, device=device)
+        wp.copy(height[box], inside)
+        inner, part = part, None if part is None else np.full(whole, -1, dtype=part.dtype)
+        if part is not None:
+            part[box] = inner
     if progress is not None:
         progress(1.0)
-    return Integration(height, runs.count, done.iterations, done.residual, done.converged,
-                       None if part is None else part.reshape(-1, grid.pitch)[1 : rows + 1, 1 : cols + 1])
+    return Integration(height, runs.count, done.iterations, done.residual, done.converged, part)
+
+
+def _box(mask: np.ndarray | wp.array) -> tuple[slice, slice]:
+    """Return the rows and columns between the first and the last pixel of a mask."""
+    host = mask if isinstance(mask, np.ndarray) else mask.numpy()
+    rows, cols = (np.flatnonzero(host.any(axis=axis)) for axis in (1, 0))
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(cols[0]), int(cols[-1]) + 1)
 
 
 def _check(normal: Any, mask: Any, x: Any, y: Any, sigma: Any, *, perspective: bool, mean_z: float) -> None:
@@ -149,7 +166,7 @@ def _upload(a: np.ndarray | wp.array, dtype: type, device: str) -> wp.array:
     """Return the array on the device, without a copy where it is there already."""
     if isinstance(a, np.ndarray):
         kind = np.uint8 if dtype is wp.uint8 else np.float32
-        flat = (a != 0).view(np.uint8) if kind is np.uint8 else np.ascontiguousarray(a, dtype=kind)
+        flat = np.ascontiguousarray((a != 0).view(np.uint8) if kind is np.uint8 else a, dtype=kind)
         return wp.array(flat, dtype=dtype, device=device, copy=False)
-    moved = a.to(device)
+    moved = a.contiguous().to(device)
     return moved.view(dtype) if moved.dtype is wp.bool and dtype is wp.uint8 else moved

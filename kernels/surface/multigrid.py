@@ -20,7 +20,8 @@ from typing import NamedTuple
 import warp as wp
 
 from kernels import device as devices
-from kernels.surface.grid import EdgeWeights, Grid, Walk, end_cell, first_cell, make_grid, run
+from kernels.device import Recorded
+from kernels.surface.grid import EdgeWeights, Grid, Walk, end_cell, first_cell, make_grid, record
 
 wp.set_module_options({"enable_backward": False})
 
@@ -178,35 +179,32 @@ class Multigrid:
             g = coarse.grid
             devices.launch(_coarsen, g.rows * g.cols, [fine.weights, g.cols], [coarse.weights], device=g.device)
 
+        self._commands = [*itertools.chain.from_iterable(self._down(*pair) for pair in itertools.pairwise(self.levels)), *self._coarsest(),
+                          *itertools.chain.from_iterable(self._up(*pair) for pair in itertools.pairwise(self.levels[::-1]))]
+
     def cycle(self) -> None:
         """Set value = B·target, with B a symmetric positive definite approximation of the inverse."""
-        for fine, coarse in itertools.pairwise(self.levels):
-            self._down(fine, coarse)
-        self._coarsest()
-        for coarse, fine in itertools.pairwise(self.levels[::-1]):
-            self._up(fine, coarse)
+        for command in self._commands:
+            command.run()
 
-    def _smooth(self, level: Level, parity: int) -> None:
-        run(_smooth, level.grid.colour(parity), [level.weights, level.target], [level.value])
+    def _smooth(self, level: Level, parity: int) -> Recorded:
+        return record(_smooth, level.grid.colour(parity), [level.weights, level.target], [level.value])
 
-    def _start(self, level: Level) -> None:
+    def _start(self, level: Level) -> list[Recorded]:
         """Smooth the red (odd) cells from a guess of zero, then the black ones."""
-        run(_smooth_from_zero, level.grid.odd, [level.weights, level.target], [level.value])
-        self._smooth(level, 0)
+        return [record(_smooth_from_zero, level.grid.odd, [level.weights, level.target], [level.value]), self._smooth(level, 0)]
 
-    def _down(self, fine: Level, coarse: Level) -> None:
-        self._start(fine)
+    def _down(self, fine: Level, coarse: Level) -> list[Recorded]:
         g = coarse.grid
-        run(_scaled_residual, fine.grid.odd, [fine.weights, fine.target, fine.value], [fine.scratch])
-        devices.launch(_restrict, g.rows * g.cols, [fine.weights, fine.scratch, g.cols, g.pitch], [coarse.target], device=g.device)
+        return [*self._start(fine), record(_scaled_residual, fine.grid.odd, [fine.weights, fine.target, fine.value], [fine.scratch]),
+                devices.record(_restrict, g.rows * g.cols, [fine.weights, fine.scratch, g.cols, g.pitch], [coarse.target], device=g.device,
+                               brief=True)]
 
-    def _up(self, fine: Level, coarse: Level) -> None:
-        run(_prolong, fine.grid.odd, [fine.weights, coarse.value, coarse.grid.pitch], [fine.value])
-        self._smooth(fine, 0)
-        self._smooth(fine, 1)
+    def _up(self, coarse: Level, fine: Level) -> list[Recorded]:
+        return [record(_prolong, fine.grid.odd, [fine.weights, coarse.value, coarse.grid.pitch], [fine.value]), self._smooth(fine, 0),
+                self._smooth(fine, 1)]
 
-    def _coarsest(self) -> None:
+    def _coarsest(self) -> list[Recorded]:
         level = self.levels[-1]
-        self._start(level)
-        for parity in (1, 0) * (COARSEST_SWEEPS - 1) + (0, 1) * COARSEST_SWEEPS:
-            self._smooth(level, parity)
+        sweeps = (1, 0) * (COARSEST_SWEEPS - 1) + (0, 1) * COARSEST_SWEEPS
+        return [*self._start(level), *(self._smooth(level, parity) for parity in sweeps)]

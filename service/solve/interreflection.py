@@ -23,7 +23,7 @@ from stage.stack import Stack
 PATCHES = 20_000
 """Most patches: each pixel of an object of some 140 pixels across, and the memory that their light takes (12 bytes a patch and light)."""
 PIXELS_PER_PATCH = 9
-"""Pixels whose mean stands for the radiance of a patch."""
+"""Most pixels whose mean stands for the radiance of a patch."""
 LEAST_COVER = 0.5
 """A patch counts where this part of it is solved."""
 LEAST_FACING = 0.15
@@ -97,23 +97,23 @@ def arriving_light(given: SolveInput, lights: Lights, normal: np.ndarray, height
     pixel = (-centres[:, 2] if perspective else np.ones(len(kept))) / float(np.mean(projection.scale))
     areas = count[kept] * pixel**2 / np.maximum((facing * to_viewer).sum(axis=1), LEAST_FACING)
     on_device = wp.array(solved.astype(np.uint8), dtype=wp.uint8, device=given.device)
-    radiance = _patch_radiance(given.stack, lights, pixels, patch, len(kept))
+    radiance = _patch_radiance(given.stack, lights, pixels, patch, len(kept), min(PIXELS_PER_PATCH, side * side))
     cells = np.stack(np.divmod(kept, shape[1]), axis=1)
     light = gather_light(centres, facing, areas, cells, radiance.reshape(len(kept), -1), height, on_device, projection,
                          device=given.device).reshape(radiance.shape)
     return ArrivingLight(light, number.reshape(shape), side)
 
 
-def _patch_radiance(stack: Stack, lights: Lights, pixels: np.ndarray, patch: np.ndarray, patches: int) -> np.ndarray:
-    """Return [patches, 3, lights] float32: mean radiance / irradiance of a few pixels of each patch, evenly chosen."""
+def _patch_radiance(stack: Stack, lights: Lights, pixels: np.ndarray, patch: np.ndarray, patches: int, each: int) -> np.ndarray:
+    """Return [patches, 3, lights] float32: mean radiance / irradiance of `each` pixels of each patch, evenly chosen."""
     order = np.argsort(patch, kind="stable")
     sizes = np.bincount(patch, minlength=patches)
     first = np.cumsum(sizes) - sizes
-    steps = (np.arange(PIXELS_PER_PATCH)[None] + 0.5) / PIXELS_PER_PATCH * sizes[:, None]
+    steps = (np.arange(each)[None] + 0.5) / each * sizes[:, None]
     chosen = pixels[order[first[:, None] + steps.astype(int)]]
     values, _ = stack.pick(chosen.reshape(-1))
     lit = stack.light_count
-    stored = values[:, :lit].astype(np.float32).reshape(3, lit, patches, PIXELS_PER_PATCH).mean(axis=3)
+    stored = values[:, :lit].astype(np.float32).reshape(3, lit, patches, each).mean(axis=3)
     factor = np.divide(lights.scale[:lit, None], lights.irradiance[:lit], out=np.zeros_like(lights.irradiance[:lit]),
                        where=lights.irradiance[:lit] > 0)
     return np.maximum(np.moveaxis(stored * factor.T[:, :, None], 2, 0), 0)
