@@ -7,7 +7,7 @@ import warp as wp
 
 from kernels.microfacet import diffuse_with_slopes, ggx_with_slopes, masking_root, schlick
 from kernels.packs import pack_type
-from kernels.photometric.hypotheses import LEAST_NZ, SHADOW_TRUST, tangents
+from kernels.photometric.hypotheses import LARGEST_SQUARE, LEAST_NZ, LOG_GROUP, SHADOW_TRUST, tangents
 from kernels.photometric.lobes import LOBE_SCALE, LOBES, MIXTURE, MIXTURE_F0
 
 SWEEPS = 8
@@ -21,8 +21,6 @@ INERTIA = 0.1
 their weights follow each other and the tilt into the noise: normals of path-traced paint were 0.09 degrees worse without it."""
 LEAST_PIVOT = 1e-4
 """Part of its curvature that a weight must keep beside the weights before it to be eliminated: lobes much alike count as one."""
-LOG_GROUP, LARGEST_SQUARE = 6, 1e6
-"""Lights whose 1 + r²/σ² are multiplied before one logarithm is taken, and the largest r²/σ²: their product stays in range."""
 UNKNOWNS = MIXTURE + 2
 """Weights and two tilts."""
 TILT, OTHER = MIXTURE, MIXTURE + 1

@@ -28,6 +28,8 @@ from kernels.photometric.tabulated_lobes import tabulated_lobes
 
 SHADOW_TRUST = 0.1
 """Weight in the fit of a reading that is zero or far below its prediction: such a reading bounds the radiance and hardly measures it."""
+LOG_GROUP, LARGEST_SQUARE = 6, 1e6
+"""Lights whose 1 + r²/σ² are multiplied before one logarithm is taken, and the largest r²/σ²: their product stays in range."""
 LEAST_NZ = 0.02
 """Least cosine between a candidate and the viewer: a visible surface faces the viewer."""
 
@@ -247,11 +249,11 @@ def _search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> 
             fill(toward, table, form, nx, ny, nz, vx, vy, vz, start, light_count, light_stride, base, scratch_step, scratch)
             # the robust non-negative mixture
             x_best = coefficients()
-            total = lane_type()
+            total, product = lane_type(), lane_type(1.0)
             for turn in range(reweightings + 1):
                 g = gram()
                 r = coefficients()
-                total = lane_type()
+                total, product = lane_type(), lane_type(1.0)
                 for light in range(light_count):
                     at = base + light * held * scratch_step
                     reading = grey[start + light * light_stride]
@@ -263,16 +265,16 @@ def _search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> 
                     for k in range(lanes):
                         sigma = 1.0 / (noise[0] + noise[1] * wp.max(reading[k], 0.0))
                         off = (reading[k] - predicted[k]) * sigma
-                        off2 = wp.where(turn == 0, 0.0, off * off)
+                        off2 = wp.where(turn == 0, 0.0, wp.min(off * off, LARGEST_SQUARE))
                         dark = wp.where(reading[k] < shadow[1] * predicted[k], 1, 0) * wp.where(off2 > shadow[0], 1, 0)
                         given = wp.where(reading[k] >= 0.0, 1.0, 0.0)
                         trust = wp.where(reading[k] > 0.0, wp.where(dark == 1, SHADOW_TRUST, 1.0), SHADOW_TRUST)
                         w[k] = given * trust * sigma * sigma / (1.0 + off2)
-                        off2 = wp.where(dark == 1, shadow[0], off2)
-                        predicted[k] = given * off2
-                    if turn == reweightings:
+                        product[k] = product[k] * (1.0 + given * wp.where(dark == 1, shadow[0], off2))
+                    if light % LOG_GROUP == LOG_GROUP - 1:
                         for k in range(lanes):
-                            total[k] += wp.log(1.0 + predicted[k])
+                            total[k] += wp.log(product[k])
+                            product[k] = 1.0
                     if turn < reweightings:
                         for a in range(mixture):
                             f = scratch[at + a * scratch_step]
@@ -296,7 +298,7 @@ def _search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> 
                                 x_best[a, k] = wp.max(x_best[a, k] + move, 0.0)
             for k in range(lanes):
                 away = 2.0 - 2.0 * (nx[k] * ux[k] + ny[k] * uy[k] + nz[k] * uz[k])
-                total[k] += pull[0] * wp.log(1.0 + pull[1] * wp.max(away, 0.0))
+                total[k] += wp.log(product[k]) + pull[0] * wp.log(1.0 + pull[1] * wp.max(away, 0.0))
             costs[candidate, p] = total
             for k in range(lanes):
                 around = wp.where(candidate > 0, total[k], 0.0)

@@ -7,7 +7,7 @@ from typing import Any
 import warp as wp
 
 from kernels.packs import channels_type, pack_type
-from kernels.photometric.hypotheses import SHADOW_TRUST
+from kernels.photometric.hypotheses import LARGEST_SQUARE, LOG_GROUP, SHADOW_TRUST
 from kernels.photometric.lobes import Reflectance
 
 ROUGHNESS_FIRST, ROUGHNESS_STEP, ROUGHNESS_COUNT = 0.1, 0.075, 13
@@ -39,12 +39,13 @@ def squared_misfit(reading: float, predicted: float, bright: float, noise: wp.ve
 
 @wp.func
 def weigh(shining: float, expected: float, off2: float, bright: float, noise: wp.vec2, shadow: wp.vec2):
-    """Return the weight of a light in the robust fit, one for all channels because a shadow is one in each of them, and its cost."""
+    """Return the weight of a light in the robust fit, one for all channels because a shadow is one in each of them, and the exponential of
+    its cost."""
     dark = wp.where(shining < shadow[1] * expected, 1, 0) * wp.where(off2 > shadow[0], 1, 0)
     given = wp.where(shining >= 0.0, 1.0, 0.0)
     relative = bright / wp.max(noise[0] * bright + noise[1] * wp.max(shining, 0.0) / 3.0, 1.0e-20)
     trust = wp.where(shining > 0.0, wp.where(dark == 1, SHADOW_TRUST, 1.0), SHADOW_TRUST)
-    return given * trust * relative * relative / (1.0 + off2), given * wp.log(1.0 + wp.where(dark == 1, shadow[0], off2))
+    return given * trust * relative * relative / (1.0 + off2), 1.0 + given * wp.min(wp.where(dark == 1, shadow[0], off2), LARGEST_SQUARE)
 
 
 @cache
@@ -108,7 +109,7 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
             cost = lane_type()
             for turn in range(wp.static(REWEIGHTINGS + 1)):
                 dd, ds, ss, rd, rs = channels(), channels(), channels(), channels(), channels()
-                cost = lane_type()
+                cost, product = lane_type(), lane_type(1.0)
                 for light in range(light_count):
                     at = p * pack_stride + light * light_stride
                     fd, fs, fixed = respond(toward, table, form, nx, ny, nz, vx, vy, vz, rough, at, light)
@@ -122,9 +123,13 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
                             shining[k] += y[k]
                             expected[k] += predicted
                     for k in range(lanes):
-                        weight, added = weigh(shining[k], expected[k], off2[k], bright[k], noise, shadow)
+                        weight, factor = weigh(shining[k], expected[k], off2[k], bright[k], noise, shadow)
                         w[k] = weight
-                        cost[k] += added
+                        product[k] = product[k] * factor
+                    if light % LOG_GROUP == LOG_GROUP - 1:
+                        for k in range(lanes):
+                            cost[k] += wp.log(product[k])
+                            product[k] = 1.0
                     for c in range(3):
                         y = colour[c, at]
                         for k in range(lanes):
@@ -134,6 +139,8 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
                             ss[c, k] += w[k] * fs[k] * fs[k]
                             rd[c, k] += w[k] * fd[k] * left
                             rs[c, k] += w[k] * fs[k] * left
+                for k in range(lanes):
+                    cost[k] += wp.log(product[k])
                 if turn < wp.static(REWEIGHTINGS) and freedom == TINTED:
                     for c in range(3):
                         for k in range(lanes):

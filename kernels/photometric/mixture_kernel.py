@@ -7,6 +7,7 @@ from typing import Any
 import warp as wp
 
 from kernels.packs import channels_type, pack_type
+from kernels.photometric.hypotheses import LOG_GROUP
 from kernels.photometric.lobes import Reflectance
 from kernels.photometric.material_kernel import COMMON_ROUNDS, REWEIGHTINGS, squared_misfit, weigh
 
@@ -56,7 +57,7 @@ def mixture_kernel(lanes: int, reflectance: Reflectance) -> Any:
             rho, share, cost = channels(), lane_type(), lane_type()
             for turn in range(wp.static(REWEIGHTINGS + 1)):
                 dd, ds, ss, rd, rs = channels(), channels(), channels(), channels(), channels()
-                cost = lane_type()
+                cost, product = lane_type(), lane_type(1.0)
                 for light in range(light_count):
                     at = p * pack_stride + light * light_stride
                     fd, fs, fixed = respond(toward, table, form, nx, ny, nz, vx, vy, vz, rough_one, at, light)
@@ -72,9 +73,13 @@ def mixture_kernel(lanes: int, reflectance: Reflectance) -> Any:
                             shining[k] += y[k]
                             expected[k] += predicted
                     for k in range(lanes):
-                        weight, added = weigh(shining[k], expected[k], off2[k], bright[k], noise, shadow)
+                        weight, factor = weigh(shining[k], expected[k], off2[k], bright[k], noise, shadow)
                         w[k] = weight
-                        cost[k] += added
+                        product[k] = product[k] * factor
+                    if light % LOG_GROUP == LOG_GROUP - 1:
+                        for k in range(lanes):
+                            cost[k] += wp.log(product[k])
+                            product[k] = 1.0
                     for c in range(3):
                         y = colour[c, at]
                         for k in range(lanes):
@@ -86,6 +91,8 @@ def mixture_kernel(lanes: int, reflectance: Reflectance) -> Any:
                             ss[c, k] += w[k] * apart * apart
                             rd[c, k] += w[k] * fd[k] * left
                             rs[c, k] += w[k] * apart * left
+                for k in range(lanes):
+                    cost[k] += wp.log(product[k])
                 if turn < wp.static(REWEIGHTINGS):
                     for k in range(lanes):
                         common = float(0.0)

@@ -17,7 +17,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.packs import channels_type, pack_type
-from kernels.photometric.hypotheses import LEAST_NZ, Diffuse, SearchOptions, criteria, tangents
+from kernels.photometric.hypotheses import LEAST_NZ, LOG_GROUP, Diffuse, SearchOptions, criteria, tangents
 from kernels.photometric.lobes import Reflectance, direction_reflectance
 from kernels.photometric.material_kernel import squared_misfit, weigh
 from kernels.photometric.samples import Samples, per_pixel, to_host
@@ -144,7 +144,7 @@ def _refine_kernel(lanes: int, reflectance: Reflectance) -> Any:
                 qy[k] = aside[1]
                 qz[k] = aside[2]
                 wider[k] = rough[k] + BEND
-            cost = lane_type()
+            cost, product = lane_type(), lane_type(1.0)
             dd, ds, ss, rd, rs = channels(), channels(), channels(), channels(), channels()
             jd, js, jy = triples(), triples(), triples()
             jj = squares()
@@ -163,9 +163,13 @@ def _refine_kernel(lanes: int, reflectance: Reflectance) -> Any:
                         shining[k] += y[k]
                         expected[k] += predicted
                 for k in range(lanes):
-                    weight, added = weigh(shining[k], expected[k], off2[k], bright[k], noise, shadow)
+                    weight, factor = weigh(shining[k], expected[k], off2[k], bright[k], noise, shadow)
                     w[k] = weight
-                    cost[k] += added
+                    product[k] = product[k] * factor
+                if light % LOG_GROUP == LOG_GROUP - 1:
+                    for k in range(lanes):
+                        cost[k] += wp.log(product[k])
+                        product[k] = 1.0
                 for c in range(3):
                     y = colour[c, at]
                     for k in range(lanes):
@@ -194,6 +198,8 @@ def _refine_kernel(lanes: int, reflectance: Reflectance) -> Any:
                         jj[3, k] += w[k] * j1 * j1
                         jj[4, k] += w[k] * j1 * j2
                         jj[5, k] += w[k] * j2 * j2
+            for k in range(lanes):
+                cost[k] += wp.log(product[k])
             for k in range(lanes):
                 if turn >= LINEAR_TURNS and cost[k] >= best[k] and again[k] == 0.0:
                     # the step cost more: back to the best, and a shorter one from there in the next turn
