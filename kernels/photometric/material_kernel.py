@@ -15,8 +15,9 @@ ROUGHNESS_FIRST, ROUGHNESS_STEP, ROUGHNESS_COUNT = 0.1, 0.075, 13
 rig."""
 HALVINGS = 3
 """Number of times that the step about the best roughness is halved: to a resolution of 0.01."""
-REWEIGHTINGS = 4
-"""Rounds of the robust fit at each roughness."""
+REWEIGHTINGS, WARM_REWEIGHTINGS = 4, 2
+"""Rounds of the robust fit at the first roughness, and at those that follow, which begin with the weights of the one before or of the best:
+three rounds change no error by more than a hundredth of itself."""
 COMMON_ROUNDS = 3
 """Rounds of the fit of an F0 that the channels share. Each round fixes which channels have an albedo above 0; after three this no longer
 changes."""
@@ -91,6 +92,7 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
         bright = level[p]
         best_cost, best_rough = lane_type(1.0e30), lane_type()
         best_rho, best_f0 = channels(), channels()
+        rho, f0 = channels(), channels()
         step = float(ROUGHNESS_STEP)
         trials = wp.where(freedom == GIVEN, 1, searched)
         for trial in range(trials):
@@ -105,9 +107,13 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
                 around = wp.clamp(best_rough[k] + side, wp.static(0.5 * ROUGHNESS_FIRST), 1.0)
                 tried = wp.where(late < 0, wp.where(grid < 0, 0.0, ROUGHNESS_FIRST + ROUGHNESS_STEP * float(grid)), around)
                 rough[k] = wp.where(freedom == GIVEN, known[3], tried)
-            rho, f0 = channels(), channels()
+            for c in range(3):
+                for k in range(lanes):
+                    rho[c, k] = wp.where(late == 0, best_rho[c, k], rho[c, k])
+                    f0[c, k] = wp.where(late == 0, best_f0[c, k], f0[c, k])
             cost = lane_type()
-            for turn in range(wp.static(REWEIGHTINGS + 1)):
+            rounds = wp.where(trial == 0, wp.static(REWEIGHTINGS), wp.static(WARM_REWEIGHTINGS))
+            for turn in range(rounds + 1):
                 dd, ds, ss, rd, rs = channels(), channels(), channels(), channels(), channels()
                 cost, product = lane_type(), lane_type(1.0)
                 for light in range(light_count):
@@ -119,7 +125,7 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
                         y = colour[c, at]
                         for k in range(lanes):
                             predicted = rho[c, k] * fd[k] + f0[c, k] * fs[k] + fixed[k]
-                            off2[k] += wp.where(turn == 0, 0.0, squared_misfit(y[k], predicted, bright[k], noise))
+                            off2[k] += wp.where(trial + turn == 0, 0.0, squared_misfit(y[k], predicted, bright[k], noise))
                             shining[k] += y[k]
                             expected[k] += predicted
                     for k in range(lanes):
@@ -141,7 +147,7 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
                             rs[c, k] += w[k] * fs[k] * left
                 for k in range(lanes):
                     cost[k] += wp.log(product[k])
-                if turn < wp.static(REWEIGHTINGS) and freedom == TINTED:
+                if turn < rounds and freedom == TINTED:
                     for c in range(3):
                         for k in range(lanes):
                             # two non-negative unknowns: the free solution, or the better one alone
@@ -160,7 +166,7 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
                             alone_b = wp.where(gain_a >= gain_b, 0.0, only_b)
                             rho[c, k] = wp.where(both == 1, wp.where(full == 1, rest, a), alone_a)
                             f0[c, k] = wp.where(both == 1, wp.min(b, 1.0), alone_b)
-                if turn < wp.static(REWEIGHTINGS) and freedom != TINTED:
+                if turn < rounds and freedom != TINTED:
                     for k in range(lanes):
                         common = float(0.0)
                         for _ in range(wp.where(freedom == NEUTRAL, COMMON_ROUNDS, 0)):
