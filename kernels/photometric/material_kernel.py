@@ -17,7 +17,8 @@ HALVINGS = 3
 """Number of times that the step about the best roughness is halved: to a resolution of 0.01."""
 REWEIGHTINGS, WARM_REWEIGHTINGS = 4, 2
 """Rounds of the robust fit at the first roughness, and at those that follow, which begin with the weights of the one before or of the best:
-three rounds change no error by more than a hundredth of itself."""
+three rounds change no error by more than a hundredth of itself. Under extended lights, whose tables have a surface without a lobe beside
+those with one, each roughness begins anew."""
 COMMON_ROUNDS = 3
 """Rounds of the fit of an F0 that the channels share. Each round fixes which channels have an albedo above 0; after three this no longer
 changes."""
@@ -112,7 +113,8 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
                     rho[c, k] = wp.where(late == 0, best_rho[c, k], rho[c, k])
                     f0[c, k] = wp.where(late == 0, best_f0[c, k], f0[c, k])
             cost = lane_type()
-            rounds = wp.where(trial == 0, wp.static(REWEIGHTINGS), wp.static(WARM_REWEIGHTINGS))
+            cold = wp.where(trial * wp.static(int(not bare)) == 0, 1, 0)
+            rounds = wp.where(cold == 1, wp.static(REWEIGHTINGS), wp.static(WARM_REWEIGHTINGS))
             for turn in range(rounds + 1):
                 dd, ds, ss, rd, rs = channels(), channels(), channels(), channels(), channels()
                 cost, product = lane_type(), lane_type(1.0)
@@ -125,7 +127,7 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
                         y = colour[c, at]
                         for k in range(lanes):
                             predicted = rho[c, k] * fd[k] + f0[c, k] * fs[k] + fixed[k]
-                            off2[k] += wp.where(trial + turn == 0, 0.0, squared_misfit(y[k], predicted, bright[k], noise))
+                            off2[k] += wp.where(cold * wp.where(turn == 0, 1, 0) == 1, 0.0, squared_misfit(y[k], predicted, bright[k], noise))
                             shining[k] += y[k]
                             expected[k] += predicted
                     for k in range(lanes):
