@@ -79,7 +79,7 @@ def load_case(name: str, capture: Capture, truth: np.ndarray, cache: Path) -> Ca
     shape = choose_diffuse(_gather(band, few, lights, factors, stack.light_count), robust[0][few]).mean
 
     def whole(options: MaterialOptions) -> np.ndarray:
-        solution = solve_material(SolveInput(stack, capture.camera, capture.mask(), "cpu", Timings(),
+        solution = solve_material(SolveInput(stack, capture.camera, capture.mask(), ("cpu",), Timings(),
                                              relative=capture.manifest.irradiance_scale == "relative"), lights, options=options)
         return solution.normal[:, chosen[solved]].T
 

@@ -29,7 +29,7 @@ def material_errors(folder: Path, options: MaterialOptions) -> dict[str, tuple[f
     lit = distant_lights(capture)
     with tempfile.TemporaryDirectory() as cache:
         stack = open_stack(capture, cache=Path(cache))
-        solution = solve_material(SolveInput(stack, capture.camera, capture.mask(), "cpu", Timings()),
+        solution = solve_material(SolveInput(stack, capture.camera, capture.mask(), ("cpu",), Timings()),
                                   pad_lights(lit.direction, lit.irradiance, stack.scale), options=options)
     inside = np.flatnonzero(capture.mask())
 

@@ -44,7 +44,7 @@ def picture_row(title: str, capture: Capture, truth: np.ndarray, cache: Path) ->
     """
     stack, mask, lit = open_stack(capture, cache=cache), capture.mask(), distant_lights(capture)
     lights = pad_lights(lit.direction, lit.irradiance, stack.scale)
-    given = SolveInput(stack, capture.camera, mask, "cpu", Timings(), relative=capture.manifest.irradiance_scale == "relative")
+    given = SolveInput(stack, capture.camera, mask, ("cpu",), Timings(), relative=capture.manifest.irradiance_scale == "relative")
     row = []
     for name, options in STEPS.items():
         normal = np.moveaxis(solve_material(given, lights, options=options).normal.reshape(3, *mask.shape), 0, -1)

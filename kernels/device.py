@@ -9,10 +9,10 @@ import os
 import sys
 import tempfile
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
-from typing import Any
+from functools import cache, wraps
+from typing import Any, ParamSpec, TypeVar
 
 import warp as wp
 
@@ -39,7 +39,26 @@ CUDA_BLOCK = 256
 MAX_THREADS = 2**31 - 1
 """Largest number of threads of one launch: kernels count threads in 32 bits."""
 
-_load_lock = threading.Lock()
+EVERY = "all"
+"""Stands for every CUDA device of the machine."""
+
+Given, Made = ParamSpec("Given"), TypeVar("Made")
+
+_build_lock = threading.RLock()
+"""Held while a kernel is defined or compiled: Warp's lists of functions and modules are not made for several threads."""
+
+
+def once(make: Callable[Given, Made]) -> Callable[Given, Made]:
+    """Return a function that makes a kernel or a type once for each choice of arguments: `functools.cache` that several threads, each with
+    a device of its own, may call for the first time at once."""
+    made = cache(make)
+
+    @wraps(make)
+    def get(*args: Given.args, **kwargs: Given.kwargs) -> Made:
+        with _build_lock:
+            return made(*args, **kwargs)
+
+    return get
 
 
 def resolve(name: str | None = None) -> str:
@@ -61,6 +80,29 @@ def resolve(name: str | None = None) -> str:
     if wanted not in available:
         raise DeviceError(f"device {name} is not on this machine: choose one of {', '.join(available)}")
     return wanted
+
+
+def resolve_all(name: str | None = None) -> tuple[str, ...]:
+    """Name the devices that one work is divided among.
+
+    Args:
+        name: a device as `resolve` takes it, several with commas between, or "all" for every CUDA device.
+
+    Returns:
+        Their names as Warp spells them, in the given order, each as often as it is given.
+
+    Raises:
+        DeviceError: the machine has no such device, or they are of two kinds, whose results differ in the last bits.
+    """
+    if name == EVERY:
+        found = tuple(each for each in names() if each != "cpu")
+        if not found:
+            raise DeviceError(f"device {EVERY} stands for every CUDA device, and this machine has none: choose cpu")
+        return found
+    found = (resolve(None),) if name is None else tuple(resolve(part.strip()) for part in name.split(","))
+    if len({(each == "cpu", "" if each == "cpu" else wp.get_device(each).name) for each in found}) > 1:
+        raise DeviceError(f"devices {name} are of different kinds, which round differently: choose devices of one kind")
+    return found
 
 
 def names() -> list[str]:
@@ -136,7 +178,7 @@ def record(kernel: Any, count: int, inputs: Sequence[Any], outputs: Sequence[Any
         return Recorded([])
     if count > MAX_THREADS:
         raise ArrayError(f"the work is {count} threads, a launch has at most {MAX_THREADS}: cut it into smaller bands")
-    with _load_lock:  # two threads must not compile one module at the same time
+    with _build_lock:
         kernel.module.load(device, block_dim=CPU_BLOCK if device == "cpu" else CUDA_BLOCK)
     if device != "cpu":
         return Recorded([wp.launch(kernel, dim=count, inputs=[0, *inputs], outputs=list(outputs), device=device, block_dim=CUDA_BLOCK,

@@ -9,14 +9,13 @@ A kernel loads a pack by an assignment of its own: `x = values[0, p]` copies it 
 refer to memory, and each lane that reads one of them loads its whole pack again, which keeps the compiler from using SIMD.
 """
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
-from kernels.device import PACK_CPU
+from kernels.device import PACK_CPU, once
 from kernels.errors import ArrayError
 
 STRIDE_LIMIT = 1 << 31
@@ -25,13 +24,13 @@ MAX_PIXELS = STRIDE_LIMIT // 12 // PACK_CPU * PACK_CPU - PACK_CPU
 """Pixels of one band, 178 million: a relit float32 RGB frame of them stays below the limit."""
 
 
-@cache
+@once
 def pack_type(length: int, dtype: type) -> Any:
     """Return the Warp vector type of `length` values of `dtype`."""
     return wp.types.vector(length=length, dtype=dtype)
 
 
-@cache
+@once
 def channels_type(length: int) -> Any:
     """Return the Warp matrix type of three channels of `length` float32 values."""
     return wp.types.matrix(shape=(3, length), dtype=wp.float32)

@@ -1,12 +1,12 @@
 """Diffuse albedo per channel from solved normals and the weights that the fit gave each light (Woodham 1980)."""
 
-from functools import cache
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.packs import Band, as_packs, pack_type, zeros
 from kernels.photometric.lambert import NormalFit
@@ -63,7 +63,7 @@ def albedo_of(above: float, below: float) -> float:
     return wp.where(below > 0.0, wp.pi * wp.max(above, 0.0) / below, 0.0)
 
 
-@cache
+@once
 def _albedo_kernel(pack: int, near: bool = False) -> Any:
     half_pack, float_pack = pack_type(pack, wp.float16), pack_type(pack, wp.float32)
     directions_of, step = directions_in(pack, near)

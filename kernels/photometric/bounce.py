@@ -7,13 +7,13 @@ Sources: Goral, Torrance, Greenberg and Battaile, "Modeling the interaction of l
 (radiosity); Nayar, Ikeuchi and Kanade, "Shape from interreflections", IJCV 1991 (shape and interreflection corrected in turn).
 """
 
-from functools import cache
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.packs import pack_type
 from kernels.photometric.hypotheses import Diffuse
@@ -80,7 +80,7 @@ def subtract_bounce(samples: Samples, arriving: np.ndarray, corners: np.ndarray,
                    [samples.grey, samples.colour], device=device)
 
 
-@cache
+@once
 def _bounce_kernel(lanes: int, near: bool) -> Any:
     lane_type = pack_type(lanes, wp.float32)
 

@@ -13,13 +13,13 @@ succession. The share of misfit that lights do not average is ours, measured on 
 """
 
 import math
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.packs import pack_type
 from kernels.photometric.evidence import evidence
 from kernels.photometric.hypotheses import candidate_at, rings
@@ -116,7 +116,7 @@ def ring_areas(offsets: np.ndarray) -> np.ndarray:
     return (np.diff(cap) / count)[ring]
 
 
-@cache
+@once
 def _mass_kernel(lanes: int) -> Any:
     lane_type, offset_type = pack_type(lanes, wp.float32), wp.types.vector(5, wp.float32)
 

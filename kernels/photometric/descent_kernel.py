@@ -1,10 +1,10 @@
 """The kernel of `descent`: the turns of one pack of pixels, all lights in each."""
 
-from functools import cache
 from typing import Any
 
 import warp as wp
 
+from kernels.device import once
 from kernels.microfacet import diffuse_with_slopes, ggx_with_slopes, masking_root, schlick
 from kernels.packs import pack_type
 from kernels.photometric.hypotheses import LARGEST_SQUARE, LEAST_NZ, LOG_GROUP, SHADOW_TRUST, tangents
@@ -32,7 +32,7 @@ def entry(row: int, column: int):
     return row * (row + 1) / 2 + column
 
 
-@cache
+@once
 def descent_kernel(lanes: int) -> Any:
     """Return the kernel for one width of packs."""
     lane_type = pack_type(lanes, wp.float32)

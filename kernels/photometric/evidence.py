@@ -1,12 +1,12 @@
 """What the readings of a pixel say beyond the unknowns that they had to pay for, and how much of them a fit leaves unexplained."""
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.packs import pack_type
 from kernels.photometric.samples import Samples, to_host
 
@@ -51,7 +51,7 @@ def _informative(samples: Samples) -> np.ndarray:
     return to_host(samples, counts)
 
 
-@cache
+@once
 def _count_kernel(lanes: int) -> Any:
     lane_type = pack_type(lanes, wp.float32)
 

@@ -11,13 +11,13 @@ al., "Estimating Specular Roughness and Anisotropy from Second Order Spherical G
 first order and for the lobe of Relit's BRDF.
 """
 
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.packs import zeros
 from kernels.photometric.separation import SeparatedMoments, upload_view
 
@@ -109,7 +109,7 @@ def specular_normals(parts: SeparatedMoments, grey_weights: tuple[float, float, 
 _Row = wp.types.vector(length=6, dtype=wp.float32)
 
 
-@cache
+@once
 def lobe_table() -> np.ndarray:
     """Return the responses of a GGX lobe to the full sphere and to L = ω, over roughness and angle of view.
 

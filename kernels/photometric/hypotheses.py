@@ -13,13 +13,13 @@ exemplars", TPAMI 2017; here with analytic lobes in place of measured materials,
 
 import math
 from dataclasses import dataclass
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.packs import pack_type
 from kernels.photometric.lobes import Lobes, direction_lobes
@@ -191,7 +191,7 @@ def candidate_at(n: wp.vec3, offset: wp.vec4, v: wp.vec3):
     return moved * (1.0 / wp.sqrt(wp.dot(moved, moved)))
 
 
-@cache
+@once
 def _search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> Any:
     lane_type = pack_type(lanes, wp.float32)
     mixture, held, relaxation, prepare, fill = lobes

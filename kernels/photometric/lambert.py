@@ -1,12 +1,12 @@
 """Least squares on every light that gave a reading (Woodham 1980)."""
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.normal_equations import add_reading, symmetric
 from kernels.packs import Band, pack_type, zeros
@@ -107,7 +107,7 @@ def write_normal(pixel: int, b: wp.vec3, code: int, residual: float, across: flo
         fit.agreeing[pixel] = agreeing
 
 
-@cache
+@once
 def _lambert_kernel(pack: int, near: bool = False) -> Any:
     float_pack = pack_type(pack, wp.float32)
     directions_of, step = directions_in(pack, near)

@@ -3,11 +3,11 @@
 `tabulated_lobes` has the same parts for lights of any extent, looked up in a table, so that one kernel body serves both.
 """
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import warp as wp
 
+from kernels.device import once
 from kernels.microfacet import INVERSE_PI, diffuse, ggx, schlick
 from kernels.packs import pack_type
 
@@ -47,7 +47,7 @@ class Reflectance(NamedTuple):
     """Albedo of the closest Lambertian lobe, for a fitted albedo of one."""
 
 
-@cache
+@once
 def direction_lobes(lanes: int) -> Lobes:
     """Return the mixture of lobes under lights of one direction each."""
     lane_type = pack_type(lanes, wp.float32)
@@ -103,7 +103,7 @@ def direction_lobes(lanes: int) -> Lobes:
     return Lobes(MIXTURE, MIXTURE + GEOMETRY, 1.0, prepare, fill)
 
 
-@cache
+@once
 def direction_reflectance(lanes: int) -> Reflectance:
     """Return Relit's BRDF under lights of one direction each."""
     lane_type = pack_type(lanes, wp.float32)

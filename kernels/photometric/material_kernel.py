@@ -1,11 +1,11 @@
 """The kernel of the material fit: albedo, F0 and roughness of each pixel of a pack, by re-weighted non-negative least squares at each
 roughness that is tried, and the best of them."""
 
-from functools import cache
 from typing import Any
 
 import warp as wp
 
+from kernels.device import once
 from kernels.packs import channels_type, pack_type
 from kernels.photometric.hypotheses import LARGEST_SQUARE, LOG_GROUP, SHADOW_TRUST
 from kernels.photometric.lobes import Reflectance
@@ -50,7 +50,7 @@ def weigh(shining: float, expected: float, off2: float, bright: float, noise: wp
     return given * trust * relative * relative / (1.0 + off2), 1.0 + given * wp.min(wp.where(dark == 1, shadow[0], off2), LARGEST_SQUARE)
 
 
-@cache
+@once
 def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
     """Return the kernel for one width of packs and one kind of light.
 

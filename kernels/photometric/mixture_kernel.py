@@ -1,18 +1,18 @@
 """The kernel of the mixture fit: for each pixel of a pack and each pair of given materials the abundance of the first and the albedo, by
 re-weighted least squares under their bounds, and the best pair."""
 
-from functools import cache
 from typing import Any
 
 import warp as wp
 
+from kernels.device import once
 from kernels.packs import channels_type, pack_type
 from kernels.photometric.hypotheses import LOG_GROUP
 from kernels.photometric.lobes import Reflectance
 from kernels.photometric.material_kernel import COMMON_ROUNDS, REWEIGHTINGS, squared_misfit, weigh
 
 
-@cache
+@once
 def mixture_kernel(lanes: int, reflectance: Reflectance) -> Any:
     """Return the kernel for one width of packs and one kind of light.
 

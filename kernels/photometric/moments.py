@@ -9,13 +9,13 @@ Spherical Gradient Illumination", EGSR 2007, section 3; complements: Wilson et a
 Geometry Using Photometric Alignment", TOG 2010, section 3.
 """
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.packs import Band, channels_type, pack_type, zeros
 from kernels.status import DARK, OK, TOO_FEW_LIGHTS
@@ -75,7 +75,7 @@ def fit_moments(band: Band, rows: np.ndarray, scale: np.ndarray, grey_weights: t
     return fit
 
 
-@cache
+@once
 def _moments_kernel(pack: int) -> Any:
     half_pack, byte_pack = pack_type(pack, wp.float16), pack_type(pack, wp.uint8)
     float_pack, int_pack, channels = pack_type(pack, wp.float32), pack_type(pack, wp.int32), channels_type(pack)

@@ -8,13 +8,13 @@ Source: Quéau, Durix, Wu, Cremers, Lauze and Durou, "LED-based photometric ster
 (point lights of anisotropy μ).
 """
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.packs import Band, pack_type
 from kernels.photometric.readings import Readings
@@ -115,7 +115,7 @@ def _float_pack(device: str) -> Any:
     return pack_type(devices.pack_width(device), wp.float32)
 
 
-@cache
+@once
 def directions_in(pack: int, near: bool) -> tuple[Any, int]:
     """Return the Warp function that gives the directions to a light from the pixels of a pack, as three vectors, and the step from one
     pixel to the next in them: 0 for distant lights, whose direction all pixels share.
@@ -158,7 +158,7 @@ def falloff(place: wp.vec4, lobe: wp.vec4, x: float, y: float, z: float) -> floa
     return wp.where(shining < LEAST_LOBE, 0.0, shining / squared)
 
 
-@cache
+@once
 def _near_kernel(pack: int) -> Any:
     float_pack = pack_type(pack, wp.float32)
 

@@ -12,12 +12,12 @@ times the volume that the readings leave it.
 
 import math
 from collections.abc import Sequence
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 import warp as wp
 
+from kernels.device import once
 from kernels.photometric.hypotheses import LEAST_NZ
 from kernels.photometric.response_table import nodes
 from kernels.photometric.samples import Samples, choose, evenly, readings_of, to_host
@@ -192,13 +192,13 @@ def _of_pixels(noise: Noise, level: np.ndarray) -> np.ndarray:
     return np.stack([constant, np.full_like(constant, noise.slope)], axis=1).astype(np.float32)
 
 
-@cache
+@once
 def _angles() -> tuple[float, ...]:
     count = math.ceil(math.log(OUTERMOST / INNERMOST) / math.log(RATIO))
     return tuple(INNERMOST * RATIO**ring for ring in range(count))
 
 
-@cache
+@once
 def _offsets() -> np.ndarray:
     """Return [candidates, 4] offsets as of `hypotheses.rings`: the centre, then MEMBERS on each ring, turned by half a step from ring to
     ring."""
@@ -208,21 +208,21 @@ def _offsets() -> np.ndarray:
     return np.concatenate([[[0.0, 1.0, 1.0, 0.0]], ring]).astype(np.float32)
 
 
-@cache
+@once
 def _weights() -> np.ndarray:
     """Return [candidates] the solid angle that each stands for, up to the middle between two rings, over 2π."""
     edge = np.cos(np.radians(np.array([INNERMOST / RATIO, *_angles()]) * math.sqrt(RATIO)))
     return np.concatenate([[1 - edge[0]], np.repeat((edge[:-1] - edge[1:]) / MEMBERS, MEMBERS)])
 
 
-@cache
+@once
 def _shifts() -> np.ndarray:
     """Return [candidates, 2] the angle from the centre along its two tangents, degrees."""
     offsets = _offsets()
     return np.degrees(np.arctan2(offsets[:, 0], offsets[:, 1]))[:, None] * offsets[:, 2:]
 
 
-@cache
+@once
 def _cells() -> np.ndarray:
     """Return [candidates] the mean square of the angle within the cell that each stands for, degrees²: a rectangle on a ring."""
     angle = np.repeat(_angles(), MEMBERS)

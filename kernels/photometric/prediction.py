@@ -1,12 +1,12 @@
 """Readings that a mixture of lobes predicts under a normal, as the search fits them."""
 
-from functools import cache
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.packs import pack_type
 from kernels.photometric.hypotheses import Diffuse, SearchOptions, criteria
 from kernels.photometric.lobes import direction_lobes
@@ -38,7 +38,7 @@ def predict(samples: Samples, normal: np.ndarray, weights: np.ndarray, *, shape:
     return host_values(samples, predicted)
 
 
-@cache
+@once
 def _predict_kernel(lanes: int) -> Any:
     lane_type = pack_type(lanes, wp.float32)
     mixture, held, _, prepare, fill = direction_lobes(lanes)

@@ -5,13 +5,13 @@ b = albedo / π · normal, whatever the strength and colour of the lights. A rea
 the radiance but does not measure it, and one that is not finite says nothing: it is stored as 0, which means "no reading".
 """
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.packs import Band, pack_type
 
@@ -141,7 +141,7 @@ def grey_readings(band: Band, factors: np.ndarray) -> Readings:
     return readings
 
 
-@cache
+@once
 def _grey_kernel(pack: int) -> Any:
     half_pack, byte_pack, float_pack = pack_type(pack, wp.float16), pack_type(pack, wp.uint8), pack_type(pack, wp.float32)
 

@@ -9,13 +9,13 @@ Source: Levenberg-Marquardt with eliminated linear parameters after Golub and Pe
 Problems 2003; Cauchy weights as in hypotheses.
 """
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.packs import channels_type, pack_type
 from kernels.photometric.hypotheses import LEAST_NZ, LOG_GROUP, Diffuse, SearchOptions, criteria, tangents
 from kernels.photometric.lobes import Reflectance, direction_reflectance
@@ -93,7 +93,7 @@ def solve_symmetric(m00: float, m01: float, m02: float, m11: float, m12: float, 
     return wp.where(sound, x / wp.max(bottom, 1.0e-30), wp.vec3())
 
 
-@cache
+@once
 def _refine_kernel(lanes: int, reflectance: Reflectance) -> Any:
     respond, _ = reflectance
     lane_type = pack_type(lanes, wp.float32)

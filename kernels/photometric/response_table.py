@@ -17,13 +17,13 @@ over them); Cigolle et al., "A survey of efficient representations for independe
 """
 
 import math
-from functools import cache
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.microfacet import INVERSE_PI, ggx, schlick
 from kernels.packs import pack_type
@@ -136,7 +136,7 @@ def grid_position(n: wp.vec3) -> wp.vec2:
     return wp.vec2(middle + (n[0] + n[1]) * scale, middle + (n[0] - n[1]) * scale)
 
 
-@cache
+@once
 def _table_kernel(lanes: int) -> Any:
     lane_type = pack_type(lanes, wp.float32)
 

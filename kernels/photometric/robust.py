@@ -10,12 +10,12 @@ Source: position thresholding after Shi, Tan, Matsushita and Ikeuchi, "Bi-polyno
 TPAMI 2014, section 5; Cauchy weights as in robust regression (Huber and Ronchetti, "Robust Statistics", 2009, chapter 7).
 """
 
-from functools import cache
 from typing import Any
 
 import numpy as np
 import warp as wp
 
+from kernels.device import once
 from kernels.normal_equations import add_reading, symmetric
 from kernels.packs import Band, pack_type
 from kernels.photometric.lambert import NormalArrays, NormalFit, run_normal_kernel, write_normal
@@ -91,7 +91,7 @@ def kept_weight(y: float, off: float, darkest: float, brightest: float) -> float
     return wp.where(y > darkest, 1.0, 0.0) * wp.where(y <= brightest, 1.0, 0.0) / (1.0 + off * off)
 
 
-@cache
+@once
 def _robust_kernel(pack: int, near: bool = False) -> Any:
     float_pack, int_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32)
     directions_of, apart = directions_in(pack, near)

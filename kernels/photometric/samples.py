@@ -1,12 +1,12 @@
 """Readings of chosen pixels, gathered for solvers that take long for each pixel: pixels outside the mask cost nothing."""
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.packs import Band, as_pixels, pack_type
 from kernels.photometric.near import NearField, falloff, near_direction
@@ -189,7 +189,7 @@ def _planes(samples: Samples) -> tuple[int, int, int]:
     return (packs, lights, samples.lanes) if samples.light_stride == 1 else (lights, packs, samples.lanes)
 
 
-@cache
+@once
 def _gather_kernel(lanes: int, near: bool = False) -> Any:
     lane_type = pack_type(lanes, wp.float32)
 

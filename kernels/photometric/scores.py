@@ -5,13 +5,13 @@ each pixel's own, and the weight of a lobe is bounded: without a bound, the fain
 a single reading from anywhere.
 """
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.packs import pack_type
 from kernels.photometric.hypotheses import candidate_at
@@ -87,7 +87,7 @@ def score_normals(samples: Samples, centre: np.ndarray, offsets: np.ndarray, *, 
     return Scores(to_host(samples, cost).T, rest[:, 0], rest[:, 1:3], rest[:, 3:5])
 
 
-@cache
+@once
 def _score_kernel(lanes: int, lobes: Lobes) -> Any:
     lane_type = pack_type(lanes, wp.float32)
     mixture, held, relaxation, _, fill = lobes

@@ -4,13 +4,13 @@ Source: photometric stereo without the shadowed lights of a pixel, Barsky and Pe
 three-dimensional surfaces in the presence of highlights and shadows", TPAMI 2003; here the shadows are marched over a height map.
 """
 
-from functools import cache
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.packs import pack_type
 from kernels.photometric.near import Places
@@ -46,7 +46,7 @@ def exclude_shadows(samples: Samples, pixels: np.ndarray, height: wp.array, mask
                    device=samples.device)
 
 
-@cache
+@once
 def _exclude_kernel(lanes: int) -> Any:
     lane_type = pack_type(lanes, wp.float32)
 

@@ -6,10 +6,10 @@ any lobe.
 """
 
 import math
-from functools import cache
 
 import warp as wp
 
+from kernels.device import once
 from kernels.packs import pack_type
 from kernels.photometric.lobes import Lobes, Reflectance
 from kernels.photometric.response_table import (
@@ -57,7 +57,7 @@ def width_position(roughness: float) -> float:
     return wp.clamp(wp.where(above >= 1.0, above, below), 0.0, float(WIDTH_COUNT))
 
 
-@cache
+@once
 def tabulated_lobes(lanes: int, count: int) -> Lobes:
     """Return the mixture of a search table of `count` lobes."""
     lane_type = pack_type(lanes, wp.float32)
@@ -95,7 +95,7 @@ def tabulated_lobes(lanes: int, count: int) -> Lobes:
     return Lobes(count, count, RELAXATION, prepare, fill)
 
 
-@cache
+@once
 def tabulated_reflectance(lanes: int) -> Reflectance:
     """Return Relit's BRDF from a response table; a roughness of 0 stands for a surface without a specular lobe."""
     lane_type = pack_type(lanes, wp.float32)

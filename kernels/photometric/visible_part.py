@@ -3,13 +3,13 @@
 A light of which hardly anything arrived says nothing about the rest of its extent, so its reading counts as none.
 """
 
-from functools import cache
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.packs import pack_type
 from kernels.photometric.samples import Samples, per_pixel
@@ -37,7 +37,7 @@ def divide_by_visible(samples: Samples, part: np.ndarray) -> None:
                    [samples.grey, samples.colour], device=samples.device)
 
 
-@cache
+@once
 def _divide_kernel(lanes: int) -> Any:
     lane_type = pack_type(lanes, wp.float32)
 

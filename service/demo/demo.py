@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import service
+from kernels import device as devices
 from service.demo.preview import write_preview
 from service.errors import RequestError
 from service.export.export import export
@@ -54,7 +55,7 @@ def demo(request: DemoRequest, progress: Progress | None = None) -> DemoResult:
         request: the device, and the folder for the results; its `.relit` holds the stack cache, so that nothing is written into the sample.
         progress: told how far the work is.
     """
-    sample, out, device = sample_folder(), request.out, request.device
+    sample, out, device = sample_folder(), request.out, devices.resolve(request.device)
     cache = out / CACHE_FOLDER
     solved = solve(SolveRequest(capture=sample, out=out, device=device, cache=cache), progress)
     asset = export(ExportRequest(maps=out, out=out / "asset.usdz"), progress).path

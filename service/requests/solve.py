@@ -48,5 +48,8 @@ class SolveRequest(SolveOptions, Request):
     """Folder with a capture.json."""
     out: Annotated[Path, Role.OUTPUT]
     """Folder for maps.exr and report.json."""
+    device: Annotated[str | None, Role.MACHINE] = None
+    """cpu, cuda:0, …, several of one kind with commas between, which share the work, or all for every CUDA device; None: the first CUDA
+    device, else the CPU."""
     reference_ball: Annotated[Path | None, Role.INPUT, Spelling(metavar="CAPTURE")] = None
     """Capture of a ball of the object's material under the same lights, for the method reference."""

@@ -10,9 +10,11 @@ from kernels.photometric.near import NearField, NearLights, see_near
 from kernels.photometric.readings import Lights, Readings, grey_factors, grey_readings
 from kernels.photometric.samples import Samples, gather
 from kernels.status import Status
+from service.solve.several_devices import deal
 from service.solve.solution import SolveInput
 from stage.camera import Camera
 from stage.colour import GREY_WEIGHTS
+from stage.stack import PIXEL_PAD, Stack
 
 READING_BYTES = 4
 """A grey reading, per light and pixel, beside the stack's band."""
@@ -48,50 +50,78 @@ class Batch(NamedTuple):
     samples: Samples
 
 
-def bands(given: SolveInput, lights: Lights, field: NearField | None = None) -> Iterator[ReadBand]:
-    """Yield the image band by band, without the bands that lie outside the mask, and say how far it is.
+def each_span(given: SolveInput, bytes_per_pixel: int, work: Callable[[int, int, str], None]) -> None:
+    """Do the pixel ranges of the image that touch the mask on the devices, and say how far it is.
+
+    Args:
+        given: the images.
+        bytes_per_pixel: what the work allocates for each pixel beside the stack.
+        work: takes the range's first pixel, the pixel after its last, padding included, and the device, and stores what it finds.
+    """
+    inside, total = given.mask.reshape(-1), given.stack.shape[2]
+    spans = [(start, stop) for start, stop in given.stack.bands(bytes_per_pixel) if inside[start:stop].any()]
+    done = total - sum(stop - start for start, stop in spans)
+    given.timings.advance(done)
+    for start, stop in deal(given.devices, spans, lambda span, device: work(*span, device)):
+        done += stop - start
+        given.timings.advance(done)
+
+
+def each_band(given: SolveInput, lights: Lights, field: NearField | None, work: Callable[[ReadBand], None]) -> None:
+    """Do the image band by band on the devices, without the bands that lie outside the mask, and say how far it is.
 
     Args:
         given: the images.
         lights: lights of the stack, padded.
         field: where the lights are, where some light is near.
+        work: stores what it finds in a band.
     """
     stack, inside = given.stack, given.mask.reshape(-1)
     factors = grey_factors(lights, GREY_WEIGHTS)
-    for start, stop in stack.bands((READING_BYTES if field is None else NEAR_BYTES) * stack.shape[1]):
+
+    def read(start: int, stop: int, device: str) -> None:
         span = slice(start, min(stop, stack.pixel_count))
-        if inside[span].any():
-            band = packs.upload(stack.band(start, stop), stack.saturated(start, stop), device=given.device)
-            readings = grey_readings(band, factors)
-            near = None if field is None else see_near(band, readings, field.at(np.arange(start, stop)))
-            yield ReadBand(span, inside[span], band, readings, near)
-        given.timings.advance(stop)
+        band = packs.upload(stack.band(start, stop), stack.saturated(start, stop), device=device)
+        readings = grey_readings(band, factors)
+        near = None if field is None else see_near(band, readings, field.at(np.arange(start, stop)))
+        work(ReadBand(span, inside[span], band, readings, near))
+
+    each_span(given, (READING_BYTES if field is None else NEAR_BYTES) * stack.shape[1], read)
 
 
-def pixel_batches(given: SolveInput, lights: Lights, view: View, pixels: np.ndarray, *, lobes: int,
-                  field: NearField | None = None) -> Iterator[Batch]:
-    """Yield pixels of the images with their readings, batch by batch.
+def each_batch(given: SolveInput, lights: Lights, view: View, pixels: np.ndarray, work: Callable[[Batch], None], *, lobes: int,
+               field: NearField | None = None) -> Iterator[int]:
+    """Do pixels of the images batch by batch on the devices, and yield the number of pixels of each batch when it is done.
 
     Args:
         given: the images.
         lights: lights of the stack, padded.
         view: directions to the viewer.
         pixels: [n] positions, ascending.
+        work: stores what it finds at the pixels of a batch.
         lobes: values that the solver keeps for each light and pixel.
         field: where the lights are, where some light is near.
     """
     stack, factors = given.stack, grey_factors(lights, GREY_WEIGHTS)
     size = max(1, BATCH_BYTES // (4 * (SAMPLE_FLOATS + lobes) * stack.light_count))
+
+    def read(chosen: np.ndarray, device: str) -> None:
+        start = int(chosen[0]) // PIXEL_PAD * PIXEL_PAD
+        stop = (int(chosen[-1]) // PIXEL_PAD + 1) * PIXEL_PAD
+        band = packs.upload(stack.band(start, stop), stack.saturated(start, stop), device=device)
+        work(Batch(chosen, gather(band, chosen - start, view(chosen), lights, factors, stack.light_count,
+                                  None if field is None else field.at(chosen))))
+
+    for chosen in deal(given.devices, _cut(stack, pixels, size), read):
+        yield len(chosen)
+
+
+def _cut(stack: Stack, pixels: np.ndarray, size: int) -> Iterator[np.ndarray]:
+    """Yield ascending positions in batches of at most `size`, each inside one band of the stack."""
     for start, stop in stack.bands(READING_BYTES * stack.shape[1]):
-        local = pixels[(pixels >= start) & (pixels < stop)] - start
-        if not len(local):
-            continue
-        band = packs.upload(stack.band(start, stop), stack.saturated(start, stop), device=given.device)
+        local = pixels[(pixels >= start) & (pixels < stop)]
         for first in range(0, len(local), size):
-            part = local[first : first + size]
-            chosen = start + part
-            yield Batch(chosen, gather(band, part, view(chosen), lights, factors, stack.light_count,
-                                       None if field is None else field.at(chosen)))
+            yield local[first : first + size]
 
 
 def pick_pixels(given: SolveInput, lights: Lights, view: View, pixels: np.ndarray, field: NearField | None = None) -> Samples:

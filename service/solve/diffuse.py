@@ -10,7 +10,7 @@ from kernels.photometric.misfit import uncertainty_of
 from kernels.photometric.near import NearField
 from kernels.photometric.readings import Lights
 from kernels.status import Status
-from service.solve.batches import bands
+from service.solve.batches import ReadBand, each_band
 from service.solve.misfit import object_misfit
 from service.solve.solution import Solution, SolveInput
 
@@ -28,13 +28,18 @@ def solve_diffuse(given: SolveInput, lights: Lights, field: NearField | None = N
     result = Solution.empty(given.stack.pixel_count)
     result.sigma = np.zeros(given.stack.pixel_count, np.float16)
     misfit = object_misfit(given, lights, field, fit_normals=fit_normals)
-    for span, inside, band, readings, near in bands(given, lights, field):
+    sigma = result.sigma
+
+    def solve(read: ReadBand) -> None:
+        span, inside, band, readings, near = read
         fit = fit_normals(band, readings, lights.direction, near)
         result.place(span, inside, fit)
         solved = inside & (result.status[span] == Status.OK)
         evidence = (array.numpy()[: len(inside)] for array in (fit.across, fit.squares, fit.freedom, fit.agreeing))
         sure = uncertainty_of(*evidence, misfit)
-        result.sigma[span], result.confidence[span] = np.where(solved, sure.sigma, 0), np.where(solved, sure.confidence, 0)
+        sigma[span], result.confidence[span] = np.where(solved, sure.sigma, 0), np.where(solved, sure.confidence, 0)
         albedo = fit_albedo(band, readings, fit, lights, near).numpy()[:, : len(inside)]
         result.albedo[:, span] = np.where(inside, albedo, 0)
+
+    each_band(given, lights, field, solve)
     return result

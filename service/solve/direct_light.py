@@ -41,6 +41,13 @@ class DirectLight(NamedTuple):
     albedo_scale: float = 1.0
     """Albedo of the surface over this albedo, which is relative where the scale of the lights is."""
 
+    def on(self, device: str) -> "DirectLight":
+        """Return the same for readings on another device."""
+        if device == self.given.device:
+            return self
+        solved, height = (wp.array(plane.numpy(), dtype=plane.dtype, device=device) for plane in (self.solved, self.height))
+        return self._replace(solved=solved, height=height)
+
     def keep(self, pixels: np.ndarray, samples: Samples) -> None:
         """Mark readings in cast shadow as none, and subtract the light that the object threw on itself from the others.
 

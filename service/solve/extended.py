@@ -5,8 +5,8 @@ The first search takes every source as seen by every pixel. From its height foll
 throws on itself; the next searches are made in what is left.
 """
 
-from collections.abc import Iterator
-from functools import lru_cache
+from collections.abc import Callable, Iterator
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -15,11 +15,10 @@ from kernels.photometric.misfit import LARGEST_ERROR
 from kernels.photometric.modes import GRID_FLOATS, angle_degrees
 from kernels.photometric.readings import pad_lights
 from kernels.photometric.response_table import SEARCH_LOBES, SEARCH_WIDTHS, response_table
-from kernels.photometric.samples import Samples
 from kernels.photometric.sampling import Found, Regime, SamplingTables, sampling_tables, search_sampling, solve_sampling
 from kernels.status import Status
 from service.requests.solve import MAX_SIGMA
-from service.solve.batches import View, pixel_batches, readable, view_directions
+from service.solve.batches import Batch, View, each_batch, readable, view_directions
 from service.solve.open_sources import OpenSources, open_sources
 from service.solve.solution import Solution, SolveInput
 from stage.camera import Camera
@@ -42,7 +41,7 @@ off by a third of the noise that the search assumes, where shadows that are foun
 LARGE_PART = 0.1
 """Part of the light of these pixels that the object changes above which that matters."""
 TABLES_KEPT = 4
-"""Parts of the view whose tables are kept from pass to pass, some 50 megabytes each under 24 sources."""
+"""Parts of the view whose tables are kept from pass to pass on each device, some 50 megabytes each under 24 sources."""
 
 
 def solve_extended(given: SolveInput, lights: ExtendedLights) -> Solution:
@@ -88,7 +87,7 @@ class _Walk:
         self._view = view_directions(given.camera)
         self._parts = [_Part(number, pixels, rotation_to_z(self._view(pixels).mean(axis=0, dtype=np.float64)))
                        for number, pixels in enumerate(view_parts(given.camera, given.mask))]
-        self._tables = lru_cache(TABLES_KEPT)(self._tabulate)
+        self._tables = lru_cache(TABLES_KEPT * len(given.devices))(self._tabulate)
         self._light: OpenSources | None = None
         self._doubt = np.zeros(count, np.float16)
         result = self.result = Solution.empty(count)
@@ -106,10 +105,14 @@ class _Walk:
     def search(self) -> None:
         """Search the normals over the whole visible hemisphere, as if every pixel saw every source."""
         inside = np.flatnonzero(self._given.mask.reshape(-1))
-        for part, pixels, samples in self._batches("search", inside):
+
+        def search(part: _Part, batch: Batch) -> None:
+            pixels, samples = batch
             status = self.result.status[pixels] = readable(samples)
-            found = search_sampling(samples, self._tables(part.number), self._turned_view(part)(pixels))
+            found = search_sampling(samples, self._tables(part.number, samples.device), self._turned_view(part)(pixels))
             self._place(part, pixels, found, status == Status.OK)
+
+        self._batches("search", inside, search)
 
     def refine(self) -> None:
         """Search again, near the normals so far, in the light that the object leaves, where it hides sources or throws light on itself.
@@ -124,13 +127,7 @@ class _Walk:
             light = open_sources(self._given, self._lights, self._padded, self.result.status, self._found, self._view)
             if light is None:
                 break
-            for part, pixels, samples in self._batches("normals", light.touched):
-                light.keep(pixels, samples)
-                start = self._found.normal[pixels]
-                found = search_sampling(samples, self._tables(part.number), self._turned_view(part)(pixels),
-                                        start=(start @ part.rotation.T).astype(np.float32))
-                self._place(part, pixels, found, np.ones(len(pixels), bool))
-                self._doubt[pixels] = angle_degrees(start, self._found.normal[pixels])
+            self._batches("normals", light.touched, partial(self._search_again, light))
             self._light, cost = light, self._found.cost[light.touched] / light.given_share
             costs = [float(before.cost[light.touched].mean()), float(cost.mean())]
         if self._light is None:
@@ -150,17 +147,29 @@ class _Walk:
                                         "capture single lights (type distant or point), whose shadows and bounces are told apart better")
         self._doubt[touched] = np.hypot(self._doubt[touched], np.degrees(self._light.change * np.sqrt(np.minimum(cost, 1))))
 
+    def _search_again(self, light: OpenSources, part: _Part, batch: Batch) -> None:
+        """Search near the normals so far, in what the object leaves of the light."""
+        pixels, samples = batch
+        light.keep(pixels, samples)
+        start = self._found.normal[pixels]
+        found = search_sampling(samples, self._tables(part.number, samples.device), self._turned_view(part)(pixels),
+                                start=(start @ part.rotation.T).astype(np.float32))
+        self._place(part, pixels, found, np.ones(len(pixels), bool))
+        self._doubt[pixels] = angle_degrees(start, self._found.normal[pixels])
+
     def judge(self) -> None:
         """Find how far the readings leave the normals open, and the regime of every pixel."""
         result, all_found = self.result, self._found
-        assert result.specular is not None and result.roughness is not None and result.regime is not None and result.sigma is not None
-        for part, pixels, samples in self._batches("posterior", np.flatnonzero(result.status == Status.OK)):
+
+        def judge(part: _Part, batch: Batch) -> None:
+            pixels, samples = batch
+            assert result.specular is not None and result.roughness is not None and result.regime is not None and result.sigma is not None
             if self._light is not None:
                 self._light.keep(pixels, samples)
             turned = Found(*(values[pixels].astype(np.float32) if values.dtype == np.float16 else values[pixels] for values in all_found))
             turned = turned._replace(normal=(turned.normal @ part.rotation.T).astype(np.float32),
                                      other=(turned.other @ part.rotation.T).astype(np.float32))
-            fit = solve_sampling(samples, self._tables(part.number), self._turned_view(part)(pixels), found=turned)
+            fit = solve_sampling(samples, self._tables(part.number, samples.device), self._turned_view(part)(pixels), found=turned)
             sigma = np.hypot(fit.sigma, self._doubt[pixels].astype(np.float32))
             result.normal[:, pixels] = (fit.normal @ part.rotation).T
             result.albedo[:, pixels] = fit.diffuse_albedo.T
@@ -171,32 +180,33 @@ class _Walk:
             result.sigma[pixels] = np.minimum(sigma, LARGEST_ERROR)
             result.residual[pixels] = fit.residual
 
+        self._batches("posterior", np.flatnonzero(result.status == Status.OK), judge)
+
     def _place(self, part: _Part, pixels: np.ndarray, found: Found, kept: np.ndarray) -> None:
         """Store what a search found at the pixels that are kept, [n] bool."""
         turned = found._replace(normal=found.normal @ part.rotation, other=found.other @ part.rotation)
         for values, new in zip(self._found, turned, strict=True):
             values[pixels[kept]] = new[kept]
 
-    def _batches(self, stage: str, chosen: np.ndarray) -> Iterator[tuple[_Part, np.ndarray, Samples]]:
-        """Yield chosen pixels, ascending positions, with their readings, part by part, and say how far the stage is."""
+    def _batches(self, stage: str, chosen: np.ndarray, work: Callable[[_Part, Batch], None]) -> None:
+        """Do chosen pixels, ascending positions, batch by batch and part by part, and say how far the stage is."""
         self._given.timings.stage(stage, len(chosen))
         done, lobes = 0, SEARCH_LOBES + GRID_FLOATS // self._given.stack.light_count
         for part in self._parts:
             pixels = np.intersect1d(part.pixels, chosen, assume_unique=True)
-            for some, samples in pixel_batches(self._given, self._padded, self._turned_view(part), pixels, lobes=lobes):
-                yield part, some, samples
-                done += len(some)
+            for count in each_batch(self._given, self._padded, self._turned_view(part), pixels, partial(work, part), lobes=lobes):
+                done += count
                 self._given.timings.advance(done)
 
     def _turned_view(self, part: _Part) -> View:
         """Return the function that gives the direction to the viewer in the frame of a part's tables."""
         return lambda pixels: (self._view(pixels) @ part.rotation.T).astype(np.float32)
 
-    def _tabulate(self, number: int) -> SamplingTables:
-        """Return the tables of a part of the view."""
+    def _tabulate(self, number: int, device: str) -> SamplingTables:
+        """Return the tables of a part of the view on a device."""
         lights, rotation = self._lights, self._parts[number].rotation
         return sampling_tables(response_table(lights.direction @ rotation.T, lights.solid_angle, lights.light, lights.share,
-                                              light_count=self._given.stack.light_count, device=self._given.device))
+                                              light_count=self._given.stack.light_count, device=device))
 
 
 def view_parts(camera: Camera, mask: np.ndarray) -> Iterator[np.ndarray]:

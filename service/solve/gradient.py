@@ -11,7 +11,7 @@ from kernels.photometric.highlight import fit_highlights, specular_normals
 from kernels.photometric.moments import Moments, fit_moments
 from kernels.photometric.separation import separate_by_colour, separate_polarised
 from kernels.status import Status
-from service.solve.batches import view_directions
+from service.solve.batches import each_span, view_directions
 from service.solve.solution import Solution, SolveInput
 from stage.camera import Camera
 from stage.colour import GREY_WEIGHTS
@@ -35,7 +35,7 @@ def solve_gradients(given: SolveInput, frames: GradientFrames) -> Solution:
         given: the images.
         frames: which frames of the stack measure what.
     """
-    stack, device, inside = given.stack, given.device, given.mask.reshape(-1)
+    stack, inside = given.stack, given.mask.reshape(-1)
     given.timings.stage("normals", stack.shape[2])
     pixels = stack.pixel_count
     view = view_vectors(given.camera, stack.shape[2])
@@ -47,38 +47,39 @@ def solve_gradients(given: SolveInput, frames: GradientFrames) -> Solution:
     bent = np.zeros(pixels, np.float32)
     length, separated, metal = np.zeros(pixels, np.float32), np.zeros(pixels, bool), np.zeros(pixels, bool)
     gain = CROSSED_GAIN if frames.polarised else 1.0
-    for start, stop in stack.bands(BYTES_PER_PIXEL):
+
+    def solve(start: int, stop: int, device: str) -> None:
         here = slice(start, min(stop, pixels))
         kept = inside[here]
-        if kept.any():
-            band = packs.upload(stack.band(start, stop), stack.saturated(start, stop), device=device)
-            toward = view if view.shape[1] == 1 else view[:, start:stop]
-            diffuse = _moments(band, frames.diffuse, stack)
-            if not frames.polarised:
-                parts = separate_by_colour(diffuse, toward, pixel_count=band.pixel_count, device=device)
-                diffuse = parts.diffuse
-                normal = specular_normals(parts, GREY_WEIGHTS, toward, gain=gain, pixel_count=band.pixel_count, device=device)
-                _store(result.specular_normal, here, kept, normal)
-            elif frames.parallel is not None:
-                parallel = _moments(band, frames.parallel, stack)
-                parts = separate_polarised(diffuse, parallel, GREY_WEIGHTS, pixel_count=band.pixel_count, device=device)
-                highlight = fit_highlights(parts, GREY_WEIGHTS, toward, gain=gain, pixel_count=band.pixel_count, device=device)
-                _store(result.specular_normal, here, kept, highlight.normal)
-                _store(result.specular, here, kept, highlight.f0)
-                _store(result.roughness, here, kept, highlight.roughness)
-            fit = diffuse_normals(diffuse, GREY_WEIGHTS, gain=gain, pixel_count=band.pixel_count, device=device)
-            _store(result.normal, here, kept, fit.normal)
-            _store(result.albedo, here, kept, fit.albedo)
-            _store(result.confidence, here, kept, fit.confidence)
-            _store(result.residual, here, kept, diffuse.residual)
-            _store(result.status, here, kept, fit.status)
-            _store(length, here, kept, fit.length)
-            _store(bent, here, kept, fit.bent)
-            if frames.parallel is not None:
-                metal[here] = _take_highlight(result, here, parts.specular.numpy()[:3, : len(kept)])
-                result.residual[here] = np.where(metal[here], parallel.residual.numpy()[: len(kept)], result.residual[here])
-            separated[here] = kept & (diffuse.tilt.numpy()[: len(kept)] == 0)
-        given.timings.advance(stop)
+        band = packs.upload(stack.band(start, stop), stack.saturated(start, stop), device=device)
+        toward = view if view.shape[1] == 1 else view[:, start:stop]
+        diffuse = _moments(band, frames.diffuse, stack)
+        if not frames.polarised:
+            parts = separate_by_colour(diffuse, toward, pixel_count=band.pixel_count, device=device)
+            diffuse = parts.diffuse
+            normal = specular_normals(parts, GREY_WEIGHTS, toward, gain=gain, pixel_count=band.pixel_count, device=device)
+            _store(result.specular_normal, here, kept, normal)
+        elif frames.parallel is not None:
+            parallel = _moments(band, frames.parallel, stack)
+            parts = separate_polarised(diffuse, parallel, GREY_WEIGHTS, pixel_count=band.pixel_count, device=device)
+            highlight = fit_highlights(parts, GREY_WEIGHTS, toward, gain=gain, pixel_count=band.pixel_count, device=device)
+            _store(result.specular_normal, here, kept, highlight.normal)
+            _store(result.specular, here, kept, highlight.f0)
+            _store(result.roughness, here, kept, highlight.roughness)
+        fit = diffuse_normals(diffuse, GREY_WEIGHTS, gain=gain, pixel_count=band.pixel_count, device=device)
+        _store(result.normal, here, kept, fit.normal)
+        _store(result.albedo, here, kept, fit.albedo)
+        _store(result.confidence, here, kept, fit.confidence)
+        _store(result.residual, here, kept, diffuse.residual)
+        _store(result.status, here, kept, fit.status)
+        _store(length, here, kept, fit.length)
+        _store(bent, here, kept, fit.bent)
+        if frames.parallel is not None:
+            metal[here] = _take_highlight(result, here, parts.specular.numpy()[:3, : len(kept)])
+            result.residual[here] = np.where(metal[here], parallel.residual.numpy()[: len(kept)], result.residual[here])
+        separated[here] = kept & (diffuse.tilt.numpy()[: len(kept)] == 0)
+
+    each_span(given, BYTES_PER_PIXEL, solve)
     neighbours = neighbours_doubt(bent.reshape(given.mask.shape), given.mask).reshape(-1)
     estimated = (result.status == Status.OK) & ~metal
     doubted = np.sqrt(np.maximum(result.standard_error() ** 2 - bent**2 + neighbours**2, 0))

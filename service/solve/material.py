@@ -4,7 +4,7 @@ It walks over the image several times: a start, the diffuse lobe that the object
 from the height of its normals, the materials that pixels share, and the final solve.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,7 +28,7 @@ from kernels.photometric.samples import Samples, evenly
 from kernels.photometric.shared_materials import choose_materials
 from kernels.photometric.svbrdf import solve_svbrdf
 from kernels.status import ESTIMATED, Status
-from service.solve.batches import Batch, bands, pick_pixels, pixel_batches, view_directions
+from service.solve.batches import Batch, ReadBand, each_band, each_batch, pick_pixels, view_directions
 from service.solve.direct_light import DirectLight, direct_light
 from service.solve.parts import Material
 from service.solve.settling import settle
@@ -130,13 +130,17 @@ class _Walk:
     def start(self) -> None:
         """Find the normals of `robust`, from which the search begins, and under few lights those of `lambert`."""
         self._given.timings.stage("start", self._given.stack.shape[2])
-        for span, inside, band, readings, near in bands(self._given, self._lights, self._field):
+
+        def begin(read: ReadBand) -> None:
+            span, inside, band, readings, near = read
             self.result.place(span, inside, solve_robust(band, readings, self._lights.direction, near))
             if self._few:
                 grey = grey_readings(band, grey_factors(self._lights, GREY_WEIGHTS))
                 fit = solve_lambert(band, grey, self._lights.direction, near)
                 self._lambertian[:, span] = np.where(fit.status.numpy()[: len(inside)] == Status.OK, fit.normal.numpy()[:, : len(inside)],
                                                      self.result.normal[:, span])
+
+        each_band(self._given, self._lights, self._field, begin)
         self._solvable = np.flatnonzero(self.result.status == Status.OK)
         self._spread = self._solvable[evenly(len(self._solvable), SPREAD_PIXELS)] if len(self._solvable) else self._solvable
 
@@ -171,7 +175,9 @@ class _Walk:
     def search(self) -> None:
         """Search the normals a first time, and fit the material from which shadows and interreflection are told."""
         result = self.result
-        for pixels, samples in self._batches("search"):
+
+        def search(batch: Batch) -> None:
+            pixels, samples = batch
             start = result.normal[:, pixels] if self._supported else self._lambertian[:, pixels]
             normal = find_normals(samples, start.T, shape=self._shape, prior=self._prior(pixels), beside=self._beside(pixels)).best.normal
             result.normal[:, pixels] = normal.T
@@ -181,6 +187,8 @@ class _Walk:
                 result.albedo[:, pixels], self._roughness[pixels] = first.diffuse_albedo.T, first.roughness
                 self._specular[:, pixels] = first.specular.T
                 self._bouncing[:, pixels] = bounce_albedo(samples, normal, first, shape=self._lobe).T
+
+        self._batches("search", search)
 
     def direct_light(self) -> DirectLight | None:
         """Find what the object does to its own light, from the first search; None when no pixel is solved."""
@@ -242,9 +250,11 @@ class _Walk:
         count = self._given.stack.pixel_count
         sigma = np.full(count, LARGEST_ERROR, np.float16)
         abundance, pair = np.zeros(count, np.float16), np.zeros(count, np.uint8)
-        for pixels, samples in self._batches("normals"):
-            assert light is not None  # there are pixels
-            light.keep(pixels, samples)
+        light_on = {} if light is None else {device: light.on(device) for device in self._given.devices}  # None: there are no pixels
+
+        def fit(batch: Batch) -> None:
+            pixels, samples = batch
+            light_on[samples.device].keep(pixels, samples)
             roughness = self._roughness[pixels].astype(np.float32) if self._interreflection else None
             found = solve_svbrdf(samples, result.normal[:, pixels].T, shape=self._shape, lobe=self._lobe, shared=materials,
                                  pairs=self._pairs,
@@ -257,6 +267,8 @@ class _Walk:
             abundance[pixels], pair[pixels] = found.mixture
             sigma[pixels], result.confidence[pixels] = found.sigma, found.confidence
             result.residual[pixels] = found.residual
+
+        self._batches("normals", fit)
         result.sigma, result.judged_by_surface = sigma, True
         if (mixed := abundance > 0).any():
             result.abundance, result.pair, result.pairs = abundance, pair, self._pairs
@@ -277,11 +289,10 @@ class _Walk:
         """Return the readings of a few pixels, wherever they lie in the image."""
         return pick_pixels(self._given, self._lights, self._view, pixels, self._field)
 
-    def _batches(self, stage: str) -> Iterator[Batch]:
-        """Yield the solvable pixels with their readings, and say how far the stage is."""
+    def _batches(self, stage: str, work: Callable[[Batch], None]) -> None:
+        """Do the solvable pixels batch by batch, and say how far the stage is."""
         self._given.timings.stage(stage, len(self._solvable))
         done = 0
-        for batch in pixel_batches(self._given, self._lights, self._view, self._solvable, lobes=MIXTURE + GEOMETRY, field=self._field):
-            yield batch
-            done += len(batch.pixels)
+        for count in each_batch(self._given, self._lights, self._view, self._solvable, work, lobes=MIXTURE + GEOMETRY, field=self._field):
+            done += count
             self._given.timings.advance(done)

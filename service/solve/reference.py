@@ -8,7 +8,7 @@ from kernels.photometric.readings import pad_lights
 from kernels.photometric.reference_table import reference_table, solve_reference
 from kernels.photometric.response_table import SEARCH_LOBES, nodes
 from kernels.status import Status
-from service.solve.batches import pixel_batches, readable, view_directions
+from service.solve.batches import Batch, each_batch, readable, view_directions
 from service.solve.solution import Solution, SolveInput
 from stage.colour import GREY_WEIGHTS
 from stage.ingest import open_stack
@@ -35,7 +35,7 @@ def solve_by_reference(given: SolveInput, ball: ReferenceBall) -> Solution:
                             progress=lambda done, _: timings.advance(done))
     readings = ball_readings(ball_stack, ball)
     strength = np.maximum(readings.mean(axis=0), 1e-20)  # lights in units of what the ball returns on average
-    table = reference_table(readings / strength, given.device)
+    tables = {device: reference_table(readings / strength, device) for device in given.devices}
     padded = pad_lights(np.tile([0.0, 0.0, 1.0], (count, 1)), np.repeat(strength[:, None], 3, axis=1), stack.scale)
     view = view_directions(given.camera)
     inside = np.flatnonzero(given.mask.reshape(-1))
@@ -47,18 +47,25 @@ def solve_by_reference(given: SolveInput, ball: ReferenceBall) -> Solution:
     result.sigma = np.zeros(stack.pixel_count, np.float16)
     excess = np.zeros(stack.pixel_count, np.float32)
     timings.stage("normals", len(inside))
-    for pixels, samples in pixel_batches(given, padded, view, inside, lobes=SEARCH_LOBES + GRID_FLOATS // count):
-        found = solve_reference(samples, table, view(pixels))
+    sigma = result.sigma
+
+    def search(batch: Batch) -> None:
+        pixels, samples = batch
+        found = solve_reference(samples, tables[samples.device], view(pixels))
         status = readable(samples)
         ok = status == Status.OK
         kept = pixels[ok]
         result.status[pixels] = status
         result.normal[:, kept] = found.normal.T[:, ok]
         result.confidence[kept] = found.confidence[ok]
-        result.sigma[kept] = np.minimum(found.sigma[ok], LARGEST_ERROR)
+        sigma[kept] = np.minimum(found.sigma[ok], LARGEST_ERROR)
         result.residual[kept] = found.residual[ok]
         excess[kept] = found.excess[ok]
-        timings.advance(int(np.searchsorted(inside, pixels[-1])) + 1)
+
+    done = 0
+    for some in each_batch(given, padded, view, inside, search, lobes=SEARCH_LOBES + GRID_FLOATS // count):
+        done += some
+        timings.advance(done)
     solved = result.status == Status.OK
     unexplained = float(np.sqrt(np.median(excess[solved]))) if solved.any() else 0.0
     result.facts["reference"]["unexplained_over_noise"] = round(unexplained, 2)

@@ -43,12 +43,18 @@ class SolveInput:
     stack: Stack
     camera: Camera
     mask: np.ndarray  # [rows, cols] bool: the pixels to solve
-    device: str
+    devices: tuple[str, ...]
+    """Where bands and batches are worked on, one or more; what looks at the whole object is done on the first."""
     timings: Timings
     cache: Path | None = None
     """Folder for stack caches; None: `.relit` in the folder of each capture."""
     relative: bool = False
     """Whether the irradiance of all lights lacks one common factor, so that the scale of albedo is unknown."""
+
+    @property
+    def device(self) -> str:
+        """The first device."""
+        return self.devices[0]
 
 
 class SuspectLight(NamedTuple):

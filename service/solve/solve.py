@@ -110,7 +110,7 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
         StorageError: the results cannot be written; nothing is left half-written.
     """
     timings = Timings(progress)
-    device = devices.resolve(request.device)
+    chosen = devices.resolve_all(request.device)
     timings.stage("open", 1)
     capture = Capture.open(request.capture)
     method = request.method or next(method for method, entry in METHODS.items() if entry.is_default(capture))
@@ -128,7 +128,7 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
     stack = open_stack(capture, cache=request.cache, tracking=tracking, progress=lambda done, _: timings.advance(done))
     if isinstance(lights, DistantLights | PlacedLights):
         stack, lights = one_frame_a_light(merge_brackets(stack, capture.sources(), lights), lights)
-    given = SolveInput(stack, capture.camera, mask, device, timings, request.cache,
+    given = SolveInput(stack, capture.camera, mask, chosen, timings, request.cache,
                        relative=capture.manifest.irradiance_scale == "relative")
     solution = solver(given, lights)
     mark_not_facing(capture.camera, solution)
@@ -170,7 +170,7 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
         found=solution.facts,
         warnings=solution.warnings,
         suspect_lights=[suspect._asdict() for suspect in solution.suspects],
-        device=devices.describe(device),
+        device="; ".join(map(devices.describe, chosen)),
         timings_s=timings.close(),
         pixels={"mask": int(mask.sum()), **counts},
         residual=_residual_statistics(solution.residual.reshape(mask.shape)[solved]),
