@@ -62,9 +62,13 @@ def each_span(given: SolveInput, bytes_per_pixel: int, work: Callable[[int, int,
     spans = [(start, stop) for start, stop in given.stack.bands(bytes_per_pixel) if inside[start:stop].any()]
     done = total - sum(stop - start for start, stop in spans)
     given.timings.advance(done)
-    for start, stop in deal(given.devices, spans, lambda span, device: work(*span, device)):
-        done += stop - start
+
+    def advance(span: tuple[int, int]) -> None:
+        nonlocal done
+        done += span[1] - span[0]
         given.timings.advance(done)
+
+    deal(given.devices, spans, lambda span, device: work(*span, device), advance)
 
 
 def each_band(given: SolveInput, lights: Lights, field: NearField | None, work: Callable[[ReadBand], None]) -> None:
@@ -90,8 +94,8 @@ def each_band(given: SolveInput, lights: Lights, field: NearField | None, work: 
 
 
 def each_batch(given: SolveInput, lights: Lights, view: View, pixels: np.ndarray, work: Callable[[Batch], None], *, lobes: int,
-               field: NearField | None = None) -> Iterator[int]:
-    """Do pixels of the images batch by batch on the devices, and yield the number of pixels of each batch when it is done.
+               field: NearField | None = None, done: int = 0) -> None:
+    """Do pixels of the images batch by batch on the devices, and say how far it is.
 
     Args:
         given: the images.
@@ -101,6 +105,7 @@ def each_batch(given: SolveInput, lights: Lights, view: View, pixels: np.ndarray
         work: stores what it finds at the pixels of a batch.
         lobes: values that the solver keeps for each light and pixel.
         field: where the lights are, where some light is near.
+        done: pixels of the stage that are done before.
     """
     stack, factors = given.stack, grey_factors(lights, GREY_WEIGHTS)
     size = max(1, BATCH_BYTES // (4 * (SAMPLE_FLOATS + lobes) * stack.light_count))
@@ -112,8 +117,12 @@ def each_batch(given: SolveInput, lights: Lights, view: View, pixels: np.ndarray
         work(Batch(chosen, gather(band, chosen - start, view(chosen), lights, factors, stack.light_count,
                                   None if field is None else field.at(chosen))))
 
-    for chosen in deal(given.devices, _cut(stack, pixels, size), read):
-        yield len(chosen)
+    def advance(chosen: np.ndarray) -> None:
+        nonlocal done
+        done += len(chosen)
+        given.timings.advance(done)
+
+    deal(given.devices, _cut(stack, pixels, size), read, advance)
 
 
 def _cut(stack: Stack, pixels: np.ndarray, size: int) -> Iterator[np.ndarray]:

@@ -194,9 +194,8 @@ class _Walk:
         done, lobes = 0, SEARCH_LOBES + GRID_FLOATS // self._given.stack.light_count
         for part in self._parts:
             pixels = np.intersect1d(part.pixels, chosen, assume_unique=True)
-            for count in each_batch(self._given, self._padded, self._turned_view(part), pixels, partial(work, part), lobes=lobes):
-                done += count
-                self._given.timings.advance(done)
+            each_batch(self._given, self._padded, self._turned_view(part), pixels, partial(work, part), lobes=lobes, done=done)
+            done += len(pixels)
 
     def _turned_view(self, part: _Part) -> View:
         """Return the function that gives the direction to the viewer in the frame of a part's tables."""

@@ -292,7 +292,4 @@ class _Walk:
     def _batches(self, stage: str, work: Callable[[Batch], None]) -> None:
         """Do the solvable pixels batch by batch, and say how far the stage is."""
         self._given.timings.stage(stage, len(self._solvable))
-        done = 0
-        for count in each_batch(self._given, self._lights, self._view, self._solvable, work, lobes=MIXTURE + GEOMETRY, field=self._field):
-            done += count
-            self._given.timings.advance(done)
+        each_batch(self._given, self._lights, self._view, self._solvable, work, lobes=MIXTURE + GEOMETRY, field=self._field)

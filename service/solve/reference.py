@@ -62,10 +62,7 @@ def solve_by_reference(given: SolveInput, ball: ReferenceBall) -> Solution:
         result.residual[kept] = found.residual[ok]
         excess[kept] = found.excess[ok]
 
-    done = 0
-    for some in each_batch(given, padded, view, inside, search, lobes=SEARCH_LOBES + GRID_FLOATS // count):
-        done += some
-        timings.advance(done)
+    each_batch(given, padded, view, inside, search, lobes=SEARCH_LOBES + GRID_FLOATS // count)
     solved = result.status == Status.OK
     unexplained = float(np.sqrt(np.median(excess[solved]))) if solved.any() else 0.0
     result.facts["reference"]["unexplained_over_noise"] = round(unexplained, 2)

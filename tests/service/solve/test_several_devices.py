@@ -2,6 +2,7 @@
 
 import json
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -34,10 +35,12 @@ def small_pieces(monkeypatch):
     monkeypatch.setattr(batches, "BATCH_BYTES", BATCH_BYTES)
     dealt = {1: 0, 2: 0}
 
-    def count(names, pieces, work):
-        for piece in deal(names, pieces, work):
+    def count(names, pieces, work, done):
+        def counted(piece):
             dealt[len(names)] += 1
-            yield piece
+            done(piece)
+
+        deal(names, pieces, work, counted)
 
     monkeypatch.setattr(batches, "deal", count)
     return dealt
@@ -154,15 +157,38 @@ def test_a_slow_device_gets_fewer_pieces():
         if piece == 9:
             done.set()
 
-    assert sorted(deal(["slow", "fast"], iter(range(10)), work)) == list(range(10))
+    told: list[int] = []
+    deal(["slow", "fast"], iter(range(10)), work, told.append)
+    assert sorted(told) == list(range(10))
     assert len(taken["slow"]) == 1 and len(taken["fast"]) == 9
 
 
 def test_fewer_pieces_than_devices():
-    found = []
-    assert list(deal(["a", "b", "c"], [7], lambda piece, device: found.append((piece, device)))) == [7]
-    assert found == [(7, "a")]
-    assert list(deal(["a", "b"], [], lambda piece, device: None)) == []
+    found, told = [], []
+    deal(["a", "b", "c"], [7], lambda piece, device: found.append((piece, device)), told.append)
+    assert found == [(7, "a")] and told == [7]
+    deal(["a", "b"], [], lambda piece, device: found.append((piece, device)), told.append)
+    assert told == [7]
+
+
+def test_what_is_raised_waits_for_the_other_device():
+    """So nothing works on the image any more when the caller cleans up."""
+    begun, ended = threading.Event(), []
+
+    def work(piece: int, device: str) -> None:
+        if piece == 1:
+            begun.set()
+            time.sleep(0.2)
+            ended.append(piece)
+        else:
+            assert begun.wait(30)
+
+    def stop(piece: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        deal(["a", "b"], [0, 1], work, stop)
+    assert ended == [1]
 
 
 @pytest.mark.skipif(len(devices.names()) > 1, reason="this machine has a CUDA device")
