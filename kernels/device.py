@@ -211,7 +211,7 @@ def _start() -> None:
                     print(line, file=sys.stderr)
 
 
-@cache
+@once
 def _pool(workers: int) -> ThreadPoolExecutor:
     """Return a pool of one thread for each core, bound to it where the system allows: two threads on one core would wait for each other."""
     cores = iter(sorted(os.sched_getaffinity(0))) if hasattr(os, "sched_setaffinity") else iter(())
