@@ -98,8 +98,8 @@ def resolve_all(name: str | None = None) -> tuple[str, ...]:
         found = tuple(each for each in names() if each != "cpu")
         if not found:
             raise DeviceError(f"device {EVERY} stands for every CUDA device, and this machine has none: choose cpu")
-        return found
-    found = (resolve(None),) if name is None else tuple(resolve(part.strip()) for part in name.split(","))
+    else:
+        found = (resolve(None),) if name is None else tuple(resolve(part.strip()) for part in name.split(","))
     if len({(each == "cpu", "" if each == "cpu" else wp.get_device(each).name) for each in found}) > 1:
         raise DeviceError(f"devices {name} are of different kinds, which round differently: choose devices of one kind")
     return found

@@ -36,7 +36,8 @@ def modules() -> list[Any]:
 
 def factories(module: Any) -> Iterator[tuple[str, Any]]:
     for name, value in vars(module).items():
-        if isinstance(value, _lru_cache_wrapper) and value.__module__ == module.__name__:
+        made_once = isinstance(value, _lru_cache_wrapper) or (inspect.isfunction(value) and hasattr(value, "__wrapped__"))  # cache, once
+        if made_once and value.__module__ == module.__name__:
             yield name, value
 
 
