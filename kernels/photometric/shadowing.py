@@ -15,11 +15,11 @@ from kernels.errors import ArrayError
 from kernels.packs import pack_type
 from kernels.photometric.near import Places
 from kernels.photometric.samples import Samples
-from kernels.surface.shadows import NO_REACH, Projection, in_shadow_within, unproject
+from kernels.surface.shadows import NO_REACH, Extent, Projection, extent_of, in_shadow_within, unproject
 
 
 def exclude_shadows(samples: Samples, pixels: np.ndarray, height: wp.array, mask: wp.array, projection: Projection,
-                    places: Places | None = None) -> None:
+                    places: Places | None = None, extent: Extent | None = None) -> None:
     """Mark readings whose light is hidden by the surface as no readings.
 
     Args:
@@ -29,6 +29,7 @@ def exclude_shadows(samples: Samples, pixels: np.ndarray, height: wp.array, mask
         mask: [rows, cols] uint8, where there is surface.
         projection: of the camera; the unit is that of height.
         places: of the lights, where some light is near.
+        extent: of the height and mask, from shadows.extent_of; None: it is found.
 
     Raises:
         ArrayError: positions outside the image.
@@ -41,7 +42,7 @@ def exclude_shadows(samples: Samples, pixels: np.ndarray, height: wp.array, mask
     place = np.zeros((samples.light_count, 4), dtype=np.float32) if places is None else places.place
     devices.launch(_exclude_kernel(samples.lanes), samples.packs,
                    [samples.toward, wp.array(place, dtype=wp.vec4, device=samples.device), where, height, mask,
-                    projection.perspective, projection.scale, projection.centre,
+                    projection.perspective, projection.scale, projection.centre, *(extent or extent_of(height.numpy(), mask.numpy())),
                     samples.light_count, samples.pack_stride, samples.light_stride], [samples.grey, samples.colour],
                    device=samples.device)
 
@@ -60,6 +61,8 @@ def _exclude_kernel(lanes: int) -> Any:
                        perspective: bool,
                        scale: wp.vec2,
                        centre: wp.vec2,
+                       box: wp.vec4i,
+                       highest: float,
                        light_count: int,
                        pack_stride: int,
                        light_stride: int,
@@ -83,7 +86,8 @@ def _exclude_kernel(lanes: int) -> Any:
                 row, col = n / cols, n % cols
                 start = unproject(float(col) + 0.5, float(row) + 0.5, height[row, col], perspective, scale, centre)
                 reach = wp.where(place[3] > 0.0, wp.length(wp.vec3(place[0], place[1], place[2]) - start), NO_REACH)
-                if in_shadow_within(height, mask, row, col, wp.vec3(lx[k], ly[k], lz[k]), reach, perspective, scale, centre):
+                if in_shadow_within(height, mask, row, col, wp.vec3(lx[k], ly[k], lz[k]), reach, perspective, scale, centre, box,
+                                    highest):
                     y[k] = -1.0
                     red[k] = -1.0
                     green[k] = -1.0

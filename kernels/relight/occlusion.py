@@ -9,11 +9,11 @@ import warp as wp
 from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.packs import pack_type
-from kernels.surface.shadows import NO_REACH, Projection, in_shadow_within, unproject
+from kernels.surface.shadows import NO_REACH, Extent, Projection, extent_of, in_shadow_within, unproject
 
 
 def see_lights(place: np.ndarray, pixels: np.ndarray, height: wp.array, mask: wp.array, projection: Projection, *,
-               device: str) -> wp.array:
+               extent: Extent | None = None, device: str) -> wp.array:
     """Return which pixels see which lights, by marching from every pixel to every light.
 
     Args:
@@ -22,6 +22,7 @@ def see_lights(place: np.ndarray, pixels: np.ndarray, height: wp.array, mask: wp
         height: [rows, cols] float32, camera-frame z.
         mask: [rows, cols] uint8, where there is surface.
         projection: of the camera; the unit is that of height.
+        extent: of the height and mask, from shadows.extent_of; None: it is found.
         device: where.
 
     Returns:
@@ -33,13 +34,14 @@ def see_lights(place: np.ndarray, pixels: np.ndarray, height: wp.array, mask: wp
     """
     if not len(pixels) or pixels.min() < 0 or pixels.max() >= mask.shape[0] * mask.shape[1]:
         raise ArrayError(f"pixels must be positions from 0 to {mask.shape[0] * mask.shape[1] - 1}, one or more")
+    extent = extent_of(height.numpy(), mask.numpy()) if extent is None else extent
     pack = devices.pack_width(device)
     packs = -(-len(pixels) // pack)
     where = pixels[np.minimum(np.arange(packs * pack), len(pixels) - 1)]
     visible = wp.empty((len(place), packs), dtype=pack_type(pack, wp.uint8), device=device)
     devices.launch(_see_kernel(pack), len(place) * packs,
                    [wp.array(place, dtype=wp.vec4, device=device), wp.array(where, dtype=wp.int32, device=device), height, mask,
-                    projection.perspective, projection.scale, projection.centre], [visible], device=device, uneven=True)
+                    projection.perspective, projection.scale, projection.centre, *extent], [visible], device=device, uneven=True)
     return visible
 
 
@@ -56,6 +58,8 @@ def _see_kernel(pack: int) -> Any:
                    perspective: bool,
                    scale: wp.vec2,
                    centre: wp.vec2,
+                   box: wp.vec4i,
+                   highest: float,
                    # outputs
                    visible: wp.array2d(dtype=byte_pack)):  # [N, P]
         thread = first + wp.tid()
@@ -73,7 +77,7 @@ def _see_kernel(pack: int) -> Any:
                 toward = toward - unproject(float(col) + 0.5, float(row) + 0.5, height[row, col], perspective, scale, centre)
                 reach = wp.length(toward)
                 toward = toward / wp.max(reach, 1.0e-20)
-            hidden = in_shadow_within(height, mask, row, col, toward, reach, perspective, scale, centre)
+            hidden = in_shadow_within(height, mask, row, col, toward, reach, perspective, scale, centre, box, highest)
             out[k] = wp.where(hidden, wp.uint8(0), wp.uint8(255))
         visible[light, p] = out
 

@@ -9,6 +9,7 @@ into the picture of that part to where it leaves passes behind the part.
 
 from typing import NamedTuple
 
+import numpy as np
 import warp as wp
 
 MARGIN_PIXELS = 0.3
@@ -28,6 +29,27 @@ class Projection(NamedTuple):
     perspective: bool
     scale: wp.vec2  # perspective: focal lengths in pixels; orthographic: pixels per unit
     centre: wp.vec2  # principal point in pixels
+
+
+class Extent(NamedTuple):
+    """Where a surface is: beyond it the march to a light meets nothing."""
+
+    box: wp.vec4i  # first row and column of the mask, and the last of each
+    highest: float  # camera-frame z
+
+
+def extent_of(height: np.ndarray, mask: np.ndarray) -> Extent:
+    """Return where a surface is.
+
+    Args:
+        height: [rows, cols] camera-frame z.
+        mask: [rows, cols], 0 outside the surface.
+    """
+    inside = mask != 0
+    rows, cols = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
+    if not len(rows):
+        return Extent(wp.vec4i(0, 0, -1, -1), -NO_REACH)
+    return Extent(wp.vec4i(int(rows[0]), int(cols[0]), int(rows[-1]), int(cols[-1])), float(height[inside].max()))
 
 
 @wp.func
@@ -56,8 +78,10 @@ def between_pixels(height: wp.array2d(dtype=float), u: float, v: float) -> float
 
 @wp.func
 def in_shadow_within(height: wp.array2d(dtype=float), mask: wp.array2d(dtype=wp.uint8), row: int, col: int, toward: wp.vec3,
-                     reach: float, perspective: bool, scale: wp.vec2, centre: wp.vec2) -> bool:
+                     reach: float, perspective: bool, scale: wp.vec2, centre: wp.vec2, box: wp.vec4i, highest: float) -> bool:
     """Return whether the surface hides a light in this direction from this pixel before `reach`: what lies behind a light hides nothing.
+
+    The march ends where it leaves the box of the surface, or rises above its highest point other than from behind a part.
 
     The mask is 0 outside the surface and elsewhere the number of the part that a pixel lies on; a surface without breaks is one part.
     """
@@ -72,15 +96,18 @@ def in_shadow_within(height: wp.array2d(dtype=float), mask: wp.array2d(dtype=wp.
     hidden, behind = bool(False), bool(False)  # literals could not change inside the loop
     own = int(mask[row, col])
     last = own  # the part that the line met last; `behind`, whether it ran behind that part's front
-    rows, cols = mask.shape[0], mask.shape[1]
-    for _ in range(rows + cols):
+    for _ in range(mask.shape[0] + mask.shape[1]):
         if travelled >= reach:
             break
         point = start + travelled * toward
+        if point[2] > highest and toward[2] >= 0.0 and not behind:
+            break
         at = project(point, perspective, scale, centre)
         u, v = at[0] - 0.5, at[1] - 0.5
         c, r = int(wp.floor(u)), int(wp.floor(v))
-        if c < 0 or r < 0 or c >= cols - 1 or r >= rows - 1:
+        if c < box[1] - 1 or r < box[0] - 1 or c > box[3] or r > box[2]:
+            break
+        if c < 0 or r < 0 or c >= mask.shape[1] - 1 or r >= mask.shape[0] - 1:
             break
         part = int(mask[r, c])
         if part != 0 and int(mask[r, c + 1]) == part and int(mask[r + 1, c]) == part and int(mask[r + 1, c + 1]) == part:

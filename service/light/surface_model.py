@@ -12,6 +12,7 @@ import warp as wp
 
 from kernels.relight.occlusion import see_lights
 from kernels.relight.shading import SecondLobe, Surface, upload_surface
+from kernels.surface.shadows import extent_of
 from service.solve.batches import view_directions
 from service.solve.surface import projection_of
 from stage.errors import ResultError
@@ -64,6 +65,7 @@ class SurfaceModel:
         self._height = wp.array(np.where(inside, maps.height, 0).astype(np.float32), dtype=wp.float32, device=device)
         self._mask = wp.array(inside.astype(np.uint8), dtype=wp.uint8, device=device)
         self._projection = projection_of(maps.camera)
+        self._extent = extent_of(np.where(inside, maps.height, 0), inside)
         self.profile: np.ndarray | None = None
         """[n, 3] Profile of the specular part at the solved pixels (kernels.relight.lobe_profile); None: that of the BRDF."""
 
@@ -100,4 +102,4 @@ class SurfaceModel:
             place: [n, 4] direction and 0, or position and 1.
             pixels: [m] of a batch.
         """
-        return see_lights(place, pixels, self._height, self._mask, self._projection, device=self.device)
+        return see_lights(place, pixels, self._height, self._mask, self._projection, extent=self._extent, device=self.device)
