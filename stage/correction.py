@@ -83,7 +83,8 @@ class Correction:
         if limit is None and self.full_scale and images.read_header(self.capture.file(frame.image)).integer:
             limit = FULL_SCALE
         if limit is not None:
-            saturated = np.any(recorded >= limit, axis=-1)
+            red, green, blue = (recorded[..., channel] >= limit for channel in range(3))
+            saturated = red | green | blue
         pixels = linearise(recorded, manifest.color_space)
         if self.dark is not None:
             pixels = pixels - self.dark

@@ -116,6 +116,7 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
             cold = wp.where(trial * wp.static(int(not bare)) == 0, 1, 0)
             rounds = wp.where(cold == 1, wp.static(REWEIGHTINGS), wp.static(WARM_REWEIGHTINGS))
             for turn in range(rounds + 1):
+                unweighted = cold * wp.where(turn == 0, 1, 0)
                 dd, ds, ss, rd, rs = channels(), channels(), channels(), channels(), channels()
                 cost, product = lane_type(), lane_type(1.0)
                 for light in range(light_count):
@@ -127,7 +128,7 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
                         y = colour[c, at]
                         for k in range(lanes):
                             predicted = rho[c, k] * fd[k] + f0[c, k] * fs[k] + fixed[k]
-                            off2[k] += wp.where(cold * wp.where(turn == 0, 1, 0) == 1, 0.0, squared_misfit(y[k], predicted, bright[k], noise))
+                            off2[k] += wp.where(unweighted == 1, 0.0, squared_misfit(y[k], predicted, bright[k], noise))
                             shining[k] += y[k]
                             expected[k] += predicted
                     for k in range(lanes):

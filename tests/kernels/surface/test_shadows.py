@@ -24,7 +24,8 @@ def shadows(height: np.ndarray, mask: np.ndarray, toward, projection: Projection
     out = wp.zeros(height.shape, dtype=wp.uint8, device=device)
     wp.launch(shadow_kernel, dim=height.shape,
               inputs=[wp.array(height, dtype=float, device=device), wp.array(mask.astype(np.uint8), dtype=wp.uint8, device=device),
-                      wp.vec3(*(np.array(toward) / np.linalg.norm(toward))), *projection, *extent_of(height, mask)], outputs=[out], device=device)
+                      wp.vec3(*(np.array(toward) / np.linalg.norm(toward))), *projection, *extent_of(height, mask)],
+              outputs=[out], device=device)
     return out.numpy().astype(bool)
 
 
