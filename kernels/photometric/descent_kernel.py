@@ -42,7 +42,8 @@ def descent_kernel(lanes: int) -> Any:
     widths = wp.types.vector(length=len(LOBES), dtype=wp.float32)
     gloss = len(LOBES)
 
-    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
+    # on CUDA every element must have a register of its own, on the CPU the lanes are what the compiler unrolls
+    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0 if lanes > 1 else 2 * UNKNOWNS})
     def descend_kernel(first: int,
                        grey: wp.array(dtype=lane_type),  # [P · L] readings / level
                        toward: wp.array2d(dtype=lane_type),  # [3, P · L]
@@ -81,6 +82,7 @@ def descent_kernel(lanes: int) -> Any:
             given_weight = weights[a, p]
             for k in range(lanes):
                 x[a, k] = given_weight[k]
+        sweeps = int(SWEEPS)  # a literal would be unrolled
         variance = float(soft[0])  # relative to that of the noise
         for turn in range(turns):
             narrow = 1.0 / wp.max(variance, 1.0)
@@ -250,7 +252,7 @@ def descent_kernel(lanes: int) -> Any:
                     x[a, k] = wp.where(worse[k] > 0.0, x_best[a, k], x[a, k])
                     pivots[a, k] = (1.0 - worse[k]) / (g[entry(a, a), k] + 1.0e-8)
                     r[a, k] -= g[entry(TILT, a), k] * step_a[k] + g[entry(OTHER, a), k] * step_o[k]
-            for _ in range(SWEEPS):
+            for _ in range(sweeps):
                 for a in range(MIXTURE):
                     rest = lane_type()
                     for k in range(lanes):
