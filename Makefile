@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PYTEST := $(BIN)/python -m pytest -q -n auto --maxprocesses 4 --dist loadfile
 
-.PHONY: demo serve test test-all clients lint bench figures samples lock clean
+.PHONY: demo serve test test-all clients lint bench gpu-bench figures samples lock clean
 demo: $(VENV)/installed
 	$(BIN)/relit demo
 
@@ -27,6 +27,10 @@ lint: $(VENV)/installed-dev
 
 bench: $(VENV)/installed
 	$(BIN)/relit bench
+
+# the kernels on cuda:0, after their tests; needs nothing but Warp and NumPy: python -m benchmarks.gpu in any environment with them
+gpu-bench: $(VENV)/installed
+	$(BIN)/python -m benchmarks.gpu
 
 # the tables of docs/figures.md; FIGURES="--data DIR --glossy DIR --large DIR" measures what needs data or space
 figures: $(VENV)/installed-dev
