@@ -25,7 +25,7 @@ from kernels.photometric.evidence import evidence
 from kernels.photometric.hypotheses import candidate_at, rings
 from kernels.photometric.normal_search import Found
 from kernels.photometric.samples import Samples, per_pixel, to_host
-from kernels.photometric.survey import RINGS, Survey
+from kernels.photometric.survey import Survey
 
 LEAST_RISE = 0.05
 """Least rise of the cost in the flattest direction as a fraction of the mean: less is rounding."""
@@ -92,9 +92,9 @@ def _masses(surveyed: Survey | None, normal: np.ndarray, judged: np.ndarray) -> 
     whole = np.zeros((len(normal), 3), np.float32)
     if surveyed is None:
         return whole
-    pixels, samples, middle, costs = surveyed
+    pixels, samples, middle, costs, ringed = surveyed
     masses = wp.empty((3, samples.packs), dtype=pack_type(samples.lanes, wp.float32), device=samples.device)
-    offsets = rings(*RINGS)
+    offsets = rings(*ringed)
     weighed = np.column_stack([offsets, ring_areas(offsets)])
     devices.launch(_mass_kernel(samples.lanes), samples.packs,
                    [costs, wp.array(weighed, dtype=wp.types.vector(5, wp.float32), device=samples.device), per_pixel(samples, middle),

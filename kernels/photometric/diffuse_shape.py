@@ -16,6 +16,7 @@ from kernels.photometric.descent import Schedule, descend
 from kernels.photometric.hypotheses import Diffuse, SearchOptions
 from kernels.photometric.normal_search import find_normals
 from kernels.photometric.samples import Samples
+from kernels.photometric.survey import QUICK
 
 ROUGHNESSES = (-1.0, 0.05, 0.2, 0.35, 0.5, 0.65, 0.8)
 """Roughnesses of Burley's lobe that are tried; the value below 0 stands for Lambert's lobe."""
@@ -54,7 +55,7 @@ def choose_diffuse(samples: Samples, start: np.ndarray, *,
     Returns:
         The shapes. Waits for the device.
     """
-    lambert = find_normals(samples, start, shape=Diffuse(), options=options).best
+    lambert = find_normals(samples, start, shape=Diffuse(), options=options, sweep=QUICK).best
     tried: dict[Diffuse, float] = {}
 
     def judge(rough: float, slope: float) -> None:

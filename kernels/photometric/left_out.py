@@ -15,6 +15,7 @@ from kernels.photometric.hypotheses import Diffuse, SearchOptions
 from kernels.photometric.normal_search import find_normals
 from kernels.photometric.prediction import predict
 from kernels.photometric.samples import Samples, device_values, host_values
+from kernels.photometric.survey import QUICK
 
 PARTS = 12
 """Number of parts into which the lights are divided, each left out once; fewer lights are left out singly."""
@@ -58,7 +59,7 @@ def leave_out(samples: Samples, start: np.ndarray, *, options: SearchOptions | N
         kept = np.where(out, -1.0, readings)
         lambertian = _lambert(kept, toward)
         rest = samples._replace(grey=device_values(samples, kept))
-        found = find_normals(rest, start, shape=Diffuse(), options=options).best
+        found = find_normals(rest, start, shape=Diffuse(), options=options, sweep=QUICK).best
         general = predict(samples, found.normal, found.weights, shape=Diffuse())
         given = readings[:, out] >= 0
         for kept_costs, predicted in zip(costs, (general, np.einsum("nlc,nc->nl", toward, lambertian)), strict=True):

@@ -12,7 +12,7 @@ from kernels.photometric.descent import Descent, descend
 from kernels.photometric.hypotheses import Diffuse, Prior, SearchOptions
 from kernels.photometric.propagation import STEPS, propagate
 from kernels.photometric.samples import Samples
-from kernels.photometric.survey import Survey, survey
+from kernels.photometric.survey import CLOSE, Survey, Sweep, survey
 
 
 class Found(NamedTuple):
@@ -24,7 +24,7 @@ class Found(NamedTuple):
 
 
 def find_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse, options: SearchOptions | None = None,
-                 beside: np.ndarray | None = None, prior: Prior | None = None) -> Found:
+                 beside: np.ndarray | None = None, prior: Prior | None = None, sweep: Sweep = CLOSE) -> Found:
     """Find the normal of least cost of each sampled pixel, under lights of one direction each.
 
     Args:
@@ -34,6 +34,7 @@ def find_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse, options
         options: how normals are judged.
         beside: [steps, n] of propagation.neighbours; None: no pixel is another's neighbour.
         prior: normals that the results are drawn to, of which the costs include the cost; None: none.
+        sweep: which pixels are surveyed, and how closely.
 
     Returns:
         The normals. Waits for the device.
@@ -45,7 +46,7 @@ def find_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse, options
     half = len(STEPS) // 2
     if beside is not None:
         propagate(samples, best, beside[:half], shape=shape, options=options, prior=prior)
-    surveyed = survey(samples, best, shape=shape, options=options, prior=prior)
+    surveyed = survey(samples, best, shape=shape, options=options, prior=prior, sweep=sweep)
     if beside is not None:
         propagate(samples, best, beside[half:], shape=shape, options=options, prior=prior)
     return Found(best, surveyed)

@@ -26,6 +26,7 @@ from kernels.photometric.readings import Lights, grey_factors, grey_readings
 from kernels.photometric.robust import solve_robust
 from kernels.photometric.samples import Samples, evenly
 from kernels.photometric.shared_materials import choose_materials
+from kernels.photometric.survey import QUICK
 from kernels.photometric.svbrdf import solve_svbrdf
 from kernels.status import ESTIMATED, Status
 from service.solve.batches import Batch, ReadBand, each_band, each_batch, pick_pixels, view_directions
@@ -179,7 +180,8 @@ class _Walk:
         def search(batch: Batch) -> None:
             pixels, samples = batch
             start = result.normal[:, pixels] if self._supported else self._lambertian[:, pixels]
-            normal = find_normals(samples, start.T, shape=self._shape, prior=self._prior(pixels), beside=self._beside(pixels)).best.normal
+            found = find_normals(samples, start.T, shape=self._shape, prior=self._prior(pixels), beside=self._beside(pixels), sweep=QUICK)
+            normal = found.best.normal
             result.normal[:, pixels] = normal.T
             if self._interreflection:
                 first = (fit_tinted(samples, normal, shape=self._lobe) if self._supported else

@@ -5,7 +5,7 @@ import pytest
 
 from kernels.photometric.certainty import ring_areas
 from kernels.photometric.hypotheses import Diffuse, rings
-from kernels.photometric.survey import RINGS
+from kernels.photometric.survey import CLOSE
 from kernels.photometric.svbrdf import solve_svbrdf
 from tests.kernels.photometric.test_svbrdf import COLOUR, degrees, render, sample, tilted
 from tests.kernels.scenes import cap
@@ -21,8 +21,8 @@ def noisy(radiance: np.ndarray) -> np.ndarray:
 
 def test_areas_of_the_rings_fill_a_cap():
     """Together the candidates stand for the cap out to half a ring beyond the last one."""
-    areas = ring_areas(rings(*RINGS))
-    angles = RINGS[0]
+    areas = ring_areas(rings(*CLOSE.rings))
+    angles = CLOSE.rings[0]
     edge = angles[-1] + (angles[-1] - angles[-2]) / 2
     assert (areas > 0).all()
     assert areas.sum() == pytest.approx(2 * np.pi * (1 - np.cos(np.radians(edge))) * np.degrees(1) ** 2, rel=1e-3)

@@ -11,7 +11,7 @@ from kernels.photometric.hypotheses import Diffuse, Prior, RingOptions, search_n
 from kernels.photometric.normal_search import find_normals
 from kernels.photometric.propagation import STEPS, neighbours, propagate
 from kernels.photometric.samples import host_values
-from kernels.photometric.survey import RINGS, survey
+from kernels.photometric.survey import CLOSE, survey
 from tests.kernels.photometric.test_svbrdf import COLOUR, LIGHTS, VIEW, degrees, render, sample, tilted
 from tests.reference import hypotheses, numerical
 from tests.reference import microfacet as twin
@@ -95,7 +95,7 @@ def test_it_costs_no_more_than_rings(device):
     radiance = render(normal, alpha=0.2) * rng.lognormal(0, 0.05, (48, 300)) * (rng.random((48, 300)) > 0.1)
     samples, _ = sample(radiance, device)
     start = turned(normal, 8.0)
-    rings = search_normals(samples, start, shape=Diffuse(), options=RingOptions(), wide=RINGS,
+    rings = search_normals(samples, start, shape=Diffuse(), options=RingOptions(), wide=CLOSE.rings,
                            fine=(((2.5, 5.0), 10), ((0.9, 1.8), 8), ((0.4,), 6), ((0.2,), 6)))
     found = find_normals(samples, start, shape=Diffuse()).best
     assert found.cost.mean() < 1.01 * rings.cost.mean()

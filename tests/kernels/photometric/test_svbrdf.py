@@ -13,7 +13,7 @@ from kernels.photometric.material import fit_material
 from kernels.photometric.normal_search import find_normals
 from kernels.photometric.readings import grey_factors, pad_lights
 from kernels.photometric.samples import gather, to_host
-from kernels.photometric.survey import RINGS
+from kernels.photometric.survey import CLOSE
 from kernels.photometric.svbrdf import average_normals, solve_svbrdf
 from tests.kernels.scenes import GREY, bits, cap, store
 from tests.reference import hypotheses
@@ -282,8 +282,8 @@ def test_more_rounds_are_an_option(device):
     normal = tilted(100)
     radiance = render(normal, alpha=0.25) * (np.random.default_rng(5).random((48, 100)) > 0.3)
     samples, _ = sample(radiance, device)
-    few, many = (degrees(search_normals(samples, normal, shape=Diffuse(), options=RingOptions(reweightings=r), wide=RINGS).normal, normal)
-                 for r in (1, 5))
+    found = [search_normals(samples, normal, shape=Diffuse(), options=RingOptions(reweightings=r), wide=CLOSE.rings) for r in (1, 5)]
+    few, many = (degrees(search.normal, normal) for search in found)
     assert few.mean() > many.mean()
 
 
