@@ -129,6 +129,10 @@ def speed(_: argparse.Namespace) -> list[str]:
     return [*bench(BenchRequest()), "", *search_rows()]
 
 
+def gpu(_: argparse.Namespace) -> None:
+    """Keep the section that `python -m benchmarks.gpu --write` has written on a machine with a GPU."""
+
+
 def tof(_: argparse.Namespace) -> list[str]:
     """Measure the range errors of time of flight."""
     return [*accuracy_rows(), "", *bound_rows()]
@@ -169,6 +173,7 @@ SECTIONS: dict[str, tuple[str, Section]] = {
     "spin": ("A spin of 240 frames", spin),
     "rig": ("Depth from projected light", rig),
     "speed": ("Speed", speed),
+    "gpu": ("On a GPU", gpu),
     "tof": ("Depth from time of flight", tof),
     "depth_speed": ("Speed of depth", depth_speed),
     "demo": ("The demo", demo),

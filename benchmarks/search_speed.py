@@ -6,6 +6,7 @@ import numpy as np
 
 from benchmarks.timing import run_seconds
 from kernels import packs
+from kernels.photometric.descent import descend
 from kernels.photometric.hypotheses import Diffuse, rings, search_normals
 from kernels.photometric.lambert import solve_lambert
 from kernels.photometric.readings import grey_factors, grey_readings, pad_lights
@@ -44,9 +45,11 @@ def search_rows() -> list[str]:
     search = median_seconds(lambda: search_normals(samples, start, shape=Diffuse(), wide=wide, fine=fine))
     readings = (radiance / np.median(radiance, axis=0)).T[:NUMPY_PIXELS].astype(np.float32)
     numpy = median_seconds(lambda: twin.cost(readings, start[:NUMPY_PIXELS], directions.astype(np.float32), view[:NUMPY_PIXELS]), 3)
+    descents = median_seconds(lambda: descend(samples, start, shape=Diffuse()))
     whole = median_seconds(lambda: solve_svbrdf(samples, start, shape=Diffuse()), 3)
     ours, theirs = PIXELS * candidates / search, NUMPY_PIXELS / numpy
     return [f"The general solver, {LIGHTS} lights, on the CPU:", "", "| | per second |", "|---|---|",
             f"| candidates judged, kernel | {ours:,.0f} |", f"| candidates judged, the same in vectorised NumPy | {theirs:,.0f} |",
-            f"| ratio | {ours / theirs:.1f} |", f"| pixels, search, averaging and material | {PIXELS / whole:,.0f} |",
+            f"| ratio | {ours / theirs:.1f} |", f"| pixels, descent of the normal from a start | {PIXELS / descents:,.0f} |",
+            f"| pixels, search, averaging and material | {PIXELS / whole:,.0f} |",
             f"| pixels, `lambert` normals | {PIXELS / least_squares:,.0f} |"]
