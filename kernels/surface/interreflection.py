@@ -63,16 +63,19 @@ def group_patches(points: np.ndarray, normals: np.ndarray, areas: np.ndarray, ce
     begin = np.arange(size)
     begins, ends, levels = [begin], [begin + 1], [np.zeros(size, dtype=int)]
     nodes = [(points, facing, area, radius, radiance)]
+    sums = (points * area, facing, area, radiance * area.astype(radiance.dtype))
     while len(begin) > len(np.unique(sector)):
         ended = np.r_[begin[1:], size]
         below, begin = begin, np.flatnonzero(np.r_[True, np.diff(key >> 2 * len(levels)) > 0])
         end = np.r_[begin[1:], size]
-        total = np.add.reduceat(area, begin)
-        centre, sent = (np.add.reduceat(values * area.astype(values.dtype), begin) / total for values in (points, radiance))
+        member = np.searchsorted(below, begin)  # the first member of each group on the level below, whose sums add up to the group's
+        sums = tuple(np.add.reduceat(values, member) for values in sums)
+        moment, turned, total, power = sums
+        centre = moment / total
         reach = np.linalg.norm(points - np.repeat(centre, end - begin, axis=0), axis=1, keepdims=True) + radius
-        grown = end != ended[np.searchsorted(below, begin)]  # it has members beside its first one on the level below
-        groups = (centre, np.add.reduceat(facing, begin), total / (end - begin)[:, None], np.maximum.reduceat(reach, begin), sent)
-        nodes.append(tuple(values[grown] for values in groups))
+        grown = end != ended[member]  # it has members beside its first one on the level below
+        groups = (centre, turned, total / (end - begin)[:, None], np.maximum.reduceat(reach, begin))
+        nodes.append((*(values[grown] for values in groups), power[grown] / total[grown].astype(power.dtype)))
         begins.append(begin[grown])
         ends.append(end[grown])
         levels.append(np.full(int(grown.sum()), len(levels)))
