@@ -40,10 +40,10 @@ def write_preview(path: Path, maps: SurfaceMaps, captured: np.ndarray, frames: S
         top.append(("height", _relief(maps.height, mask)))
     count = min(2 * len(top), len(frames))
     shown = [frames[i] for i in np.linspace(0, len(frames), count, endpoint=False).astype(int)]
-    relit = [read_frame(frame)[0] for frame in shown]
-    exposure = _exposure(np.stack(relit), mask)
-    bottom = [(f"relit, {frame.stem}", display(pixels * exposure, maps.color_space))
-              for frame, pixels in zip(shown, relit, strict=True)]
+    relit = np.stack([read_frame(frame)[0] for frame in shown])
+    together = (relit * _exposure(relit, mask)).reshape(-1, *relit.shape[2:])  # the transform is made once for all
+    bottom = [(f"relit, {frame.stem}", pixels)
+              for frame, pixels in zip(shown, display(together, maps.color_space).reshape(relit.shape), strict=True)]
     write_sheet(path, [row for row in (top, bottom[: len(top)], bottom[len(top) :]) if row])
 
 

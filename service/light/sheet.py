@@ -86,11 +86,16 @@ def display(pixels: np.ndarray, space: str) -> np.ndarray:
     Returns:
         [rows, cols, 3] float32, 0…1; black becomes the background of a sheet.
     """
-    source = oiio.ImageBuf(np.ascontiguousarray(pixels, dtype=np.float32))
-    shown = oiio.ImageBufAlgo.ociodisplay(source, DISPLAY, VIEW, space, colorconfig=CONFIG)
-    if shown.has_error:
-        raise ValueError(f"cannot show {space}: {shown.geterror()}")
-    return np.maximum(pixels_of(shown), BACKGROUND * (pixels.max(axis=-1, keepdims=True) <= 0))
+    lit = pixels.any(axis=-1)
+    shown = np.empty(pixels.shape, dtype=np.float32)
+    shown[~lit] = BACKGROUND
+    if lit.any():  # the transform takes a microsecond a pixel, and most of an object's picture is black
+        source = oiio.ImageBuf(np.ascontiguousarray(pixels[lit][None], dtype=np.float32))
+        buffer = oiio.ImageBufAlgo.ociodisplay(source, DISPLAY, VIEW, space, colorconfig=CONFIG)
+        if buffer.has_error:
+            raise ValueError(f"cannot show {space}: {buffer.geterror()}")
+        shown[lit] = pixels_of(buffer)[0]
+    return np.maximum(shown, BACKGROUND * (pixels.max(axis=-1, keepdims=True) <= 0))
 
 
 def fit(image: np.ndarray, height: int = TILE, *, kernel: str = "") -> np.ndarray:
