@@ -9,6 +9,7 @@ import numpy as np
 import OpenImageIO as oiio
 
 from stage.colour_spaces import is_linear, linear_space
+from stage.images import fractions
 
 CONFIG = "ocio://default"
 """The OpenColorIO configuration: the newest ACES configuration that is built into the library."""
@@ -26,20 +27,28 @@ def linearise(pixels: np.ndarray, space: str) -> np.ndarray:
     """Convert recorded values to scene-linear values with the same primaries.
 
     Args:
-        pixels: [rows, cols, channels] float32, encoded in `space`.
+        pixels: [rows, cols, channels], encoded in `space`: float32, or uint8 or uint16 as `images.read_recorded` returns them.
         space: a ColorSpaceName.
 
     Returns:
-        [rows, cols, channels] float32; `pixels` without a copy when `space` is linear already.
+        [rows, cols, channels] float32; `pixels` without a copy when they are float32 and `space` is linear already.
     """
+    if pixels.dtype.kind == "u":
+        return np.take(_linear_of_codes(space, pixels.dtype), pixels)
     if is_linear(space):
         return pixels
-    fractions, linear = _linear_of_integers(space)
+    steps, linear = _linear_of_integers(space)
     with np.errstate(invalid="ignore"):
         nearest = (np.clip(pixels, 0, 1) * np.float32(LARGEST_INTEGER) + np.float32(0.5)).astype(np.uint16)
-    if np.abs(fractions[nearest] - pixels).max(initial=0) <= ROUNDING:  # as in every integer image: a table is ten times as fast
+    if np.abs(steps[nearest] - pixels).max(initial=0) <= ROUNDING:  # as in every integer image: a table is ten times as fast
         return linear[nearest]
     return convert(pixels, space, linear_space(space))
+
+
+@cache
+def _linear_of_codes(space: str, kind: np.dtype) -> np.ndarray:
+    """Return the scene-linear value of each integer of an image: [256] or [65536] float32."""
+    return linearise(fractions(kind)[None, :, None], space).reshape(-1)
 
 
 @cache
@@ -48,8 +57,8 @@ def _linear_of_integers(space: str) -> tuple[np.ndarray, np.ndarray]:
 
     Fractions of 255 are among them: 65535 is a multiple of it. The primaries stay, so that each channel is converted alone.
     """
-    fractions = (np.arange(LARGEST_INTEGER + 1) / LARGEST_INTEGER).astype(np.float32)
-    return fractions, convert(fractions[None, :, None], space, linear_space(space))[0, :, 0]
+    steps = (np.arange(LARGEST_INTEGER + 1) / LARGEST_INTEGER).astype(np.float32)
+    return steps, convert(steps[None, :, None], space, linear_space(space))[0, :, 0]
 
 
 def convert(pixels: np.ndarray, source: str, target: str) -> np.ndarray:

@@ -23,6 +23,14 @@ class Radiance(NamedTuple):
     saturated: np.ndarray | None  # [rows, cols] bool, any channel at or above the capture's `saturation`, or its largest integer
 
 
+class CodedRadiance(NamedTuple):
+    """Corrected pixels of one image of integers, where one integer stands for the same radiance everywhere."""
+
+    codes: np.ndarray  # [rows, cols, 3] uint8 or uint16, as recorded
+    values: np.ndarray  # [256] or [65536] float32, the scene-linear radiance of each integer, which rises with it
+    saturated: np.ndarray | None  # as in Radiance
+
+
 @dataclass(frozen=True)
 class Correction:
     """The correction of every frame of a capture.
@@ -76,6 +84,17 @@ class Correction:
         Raises:
             ImageError: the file is unreadable, or a recorded value is NaN, infinite or negative; the message names the file.
         """
+        coded = self.coded(frame)
+        if isinstance(coded, Radiance):
+            return coded
+        return Radiance(np.take(coded.values, coded.codes), coded.saturated)
+
+    def coded(self, frame: Frame) -> Radiance | CodedRadiance:
+        """Read one frame and correct it, and leave integers as they are where no dark, flat or ambient frame tells pixels apart.
+
+        Raises:
+            ImageError: as `apply`.
+        """
         manifest = self.capture.manifest
         recorded = _recorded(self.capture, frame.image)
         saturated: np.ndarray | None = None
@@ -83,9 +102,14 @@ class Correction:
         if limit is None and self.full_scale and images.read_header(self.capture.file(frame.image)).integer:
             limit = FULL_SCALE
         if limit is not None:
-            red, green, blue = (recorded[..., channel] >= limit for channel in range(3))
-            saturated = red | green | blue
-        pixels = linearise(recorded, manifest.color_space)
+            saturated = _any_from(limit, recorded)
+        if recorded.dtype.kind == "u" and self.dark is None and self.flat is None and self.ambient is None:
+            every = np.arange(np.iinfo(recorded.dtype).max + 1, dtype=recorded.dtype)
+            return CodedRadiance(recorded, self._corrected(every, frame), saturated)
+        return Radiance(self._corrected(recorded, frame), saturated)
+
+    def _corrected(self, recorded: np.ndarray, frame: Frame) -> np.ndarray:
+        pixels = linearise(recorded, self.capture.manifest.color_space)
         if self.dark is not None:
             pixels = pixels - self.dark
         if self.flat is not None:
@@ -94,11 +118,32 @@ class Correction:
             pixels = pixels / np.float32(frame.exposure_s)
         if self.ambient is not None:
             pixels = pixels - self.ambient
-        return Radiance(pixels, saturated)
+        return pixels
 
 
 def _recorded(capture: Capture, name: str) -> np.ndarray:
     path = capture.file(name)
-    pixels = images.read_pixels(path)
+    pixels = images.read_recorded(path)
+    if pixels.dtype.kind == "u":
+        return pixels
     images.check_radiance(path, pixels)
     return pixels.astype(np.float32, copy=False)
+
+
+def _any_from(limit: float, recorded: np.ndarray) -> np.ndarray:
+    """Return whether any channel of a pixel is at or above a limit.
+
+    Args:
+        limit: a fraction of full scale, or a floating-point value.
+        recorded: [rows, cols, 3] uint8, uint16 or float32.
+
+    Returns:
+        [rows, cols] bool.
+    """
+    least: np.float32 | int = np.float32(limit)
+    if recorded.dtype.kind == "u":  # the first integer that stands for as much; past the last where none does
+        least = int(np.searchsorted(images.fractions(recorded.dtype), least))
+    if recorded.max() < least:
+        return np.zeros(recorded.shape[:2], dtype=bool)
+    red, green, blue = (recorded[..., channel] >= least for channel in range(3))
+    return red | green | blue

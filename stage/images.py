@@ -1,5 +1,6 @@
 """Reading of images (EXR, PNG, TIFF, HDR, JPEG, JPEG XL, DPX), the header first and then the recorded pixels; and writing of PNG."""
 
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,6 +13,8 @@ from stage.errors import ImageError, storage
 OIIO_SUFFIXES = {".png", ".tif", ".tiff", ".hdr", ".jpg", ".jpeg", ".jxl", ".dpx"}
 SUFFIXES = {".exr", *OIIO_SUFFIXES}
 FLOATING = {oiio.HALF, oiio.FLOAT, oiio.DOUBLE}
+CODES = {oiio.UINT8, oiio.UINT16}
+"""Integers that `read_recorded` leaves as they are: tables of what each stands for are short."""
 
 
 class ImageHeader(NamedTuple):
@@ -57,6 +60,32 @@ def read_pixels(path: str | Path) -> np.ndarray:
         ImageError: the file is damaged, or relit does not read such files.
         StorageError: the file cannot be opened.
     """
+    recorded = read_recorded(path)
+    return np.take(fractions(recorded.dtype), recorded) if recorded.dtype.kind == "u" else recorded
+
+
+@cache
+def fractions(kind: np.dtype) -> np.ndarray:
+    """Return the fraction of full scale that each integer of an image stands for: [256] or [65536] float32, as OpenImageIO computes it.
+
+    Args:
+        kind: uint8 or uint16.
+    """
+    full = np.iinfo(kind).max
+    return np.arange(full + 1, dtype=np.float32) * np.float32(1 / full)
+
+
+def read_recorded(path: str | Path) -> np.ndarray:
+    """Read the recorded values of an image as the file has them, which `fractions` converts to those of `read_pixels`.
+
+    Returns:
+        [rows, cols, 3] uint8 or uint16 when the file holds integers of up to so many bits, else float32 or float16 as `read_pixels`
+        returns them; grey images repeat their one channel.
+
+    Raises:
+        ImageError: the file is damaged, or relit does not read such files.
+        StorageError: the file cannot be opened.
+    """
     suffix = Path(path).suffix.lower()
     if suffix == ".exr":
         channels, _ = exr.read(path)
@@ -71,8 +100,8 @@ def read_pixels(path: str | Path) -> np.ndarray:
             integrity.check_jpeg(path)
         source = _open(path)
         try:
-            # float of the recorded value: 8- and 16-bit integers are divided by 255 or 65535
-            decoded = source.read_image(0, 0, 0, source.spec().nchannels, oiio.FLOAT)
+            spec = source.spec()
+            decoded = source.read_image(0, 0, 0, spec.nchannels, spec.format if spec.format.basetype in CODES else oiio.FLOAT)
             if decoded is None:
                 raise ImageError(f"{path}: cannot be decoded: {_reason(source.geterror())}")
         finally:

@@ -14,7 +14,7 @@ import numpy as np
 
 from stage import stack as stacks
 from stage.capture import Capture
-from stage.correction import Correction, Radiance
+from stage.correction import CodedRadiance, Correction, Radiance
 from stage.errors import ManifestError, storage
 from stage.files import replacing, write_text
 from stage.fingerprint import Fingerprints
@@ -163,15 +163,13 @@ def _build(capture: Capture, frames: list[Frame], alignment: Alignment | None, f
 
         def take(light: int, warp: Warp | None) -> None:
             nonlocal done
-            radiance = correction.apply(frames[light])
-            if warp is not None:
-                radiance = warp(light, radiance)
+            radiance = correction.coded(frames[light]) if warp is None else warp(light, correction.apply(frames[light]))
             planes, scale[light] = _to_half(radiance)
             for channel in range(CHANNELS):
                 plane = np.ascontiguousarray(planes[..., channel])
                 _write_all(file.fileno(), plane, start + 2 * (channel * lights + light) * pixels)
             with lock:
-                if radiance.saturated is not None:
+                if radiance.saturated is not None and radiance.saturated.any():
                     saturated[light // 8, :pixel_count] |= radiance.saturated.reshape(-1).astype(np.uint8) << (light % 8)
                 done += 1
                 if progress is not None:
@@ -204,13 +202,23 @@ def _build(capture: Capture, frames: list[Frame], alignment: Alignment | None, f
     return Stack(folder, key, names, scale, pixel_count, motion)
 
 
-def _to_half(radiance: Radiance) -> tuple[np.ndarray, float]:
+def _to_half(radiance: Radiance | CodedRadiance) -> tuple[np.ndarray, float]:
     """Return the half values of an image and the radiance of a stored 1.0, a power of two so that half images keep their bits."""
-    peak = max(float(radiance.pixels.max()), -float(radiance.pixels.min()))
+    if isinstance(radiance, CodedRadiance):
+        lowest, highest = int(radiance.codes.min()), int(radiance.codes.max())
+        values = np.zeros(highest + 1, dtype=np.float32)
+        values[lowest:] = radiance.values[lowest : highest + 1]
+        half, scale = _scaled(values)
+        return np.take(half, radiance.codes), scale
+    return _scaled(radiance.pixels)
+
+
+def _scaled(values: np.ndarray) -> tuple[np.ndarray, float]:
+    peak = max(float(values.max()), -float(values.min()))
     if peak == 0.0:
-        return np.zeros_like(radiance.pixels, dtype=np.float16), 1.0
+        return np.zeros_like(values, dtype=np.float16), 1.0
     exponent = math.frexp(peak)[1] - TOP_EXPONENT
-    return np.ldexp(radiance.pixels, -exponent).astype(np.float16), math.ldexp(1.0, exponent)
+    return np.ldexp(values, -exponent).astype(np.float16), math.ldexp(1.0, exponent)
 
 
 def _write_all(descriptor: int, plane: np.ndarray, offset: int) -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from stage.colour import convert, linearise, rgb_matrix
 from stage.colour_spaces import is_linear, linear_space
+from stage.images import fractions
 
 AP1_TO_REC709 = np.array([[1.70505, -0.62179, -0.08326], [-0.13026, 1.14080, -0.01055], [-0.02400, -0.12897, 1.15297]])
 """ACEScg to linear Rec.709 with Bradford adaptation, five digits, as ACES and its CTL publish it."""
@@ -26,6 +27,13 @@ def test_srgb_is_its_closed_form():
     # OpenColorIO joins the two pieces smoothly (slope 12.9232, not 12.92: 2.5e-4) and approximates the power to 2e-5; a step of
     # 8 bits is 9e-3 at the least
     assert np.allclose(linear, srgb_to_linear(pixels.astype(np.float64)), rtol=3e-4, atol=0)
+
+
+@pytest.mark.parametrize("space", ["srgb_texture", "g22_rec709_scene", "lin_rec709_scene"])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_integers_become_what_their_fractions_become(space, dtype):
+    codes = np.arange(np.iinfo(dtype).max + 1, dtype=dtype).reshape(16, -1, 1)
+    assert np.array_equal(linearise(codes, space), linearise(fractions(codes.dtype)[codes], space))
 
 
 def test_gamma_spaces_are_powers():

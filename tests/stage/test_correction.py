@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stage.capture import Capture
-from stage.correction import Correction
+from stage.correction import CodedRadiance, Correction, Radiance
 from stage.errors import ImageError
 from tests.scenes.captures import (
     edit_frame,
@@ -88,6 +88,32 @@ def test_saturation_is_judged_on_recorded_values_in_any_channel(tmp_path):
     write_exr(tmp_path / "dark.exr", DARK)
     edit_manifest(tmp_path, dark="dark.exr")  # dark does not move the limit
     assert np.argwhere(corrected(tmp_path).saturated).tolist() == [[1, 2], [3, 4]]
+
+
+@pytest.mark.parametrize(("limit", "first"), [(200 / 255, 200), (0.5, 128), (1.0, 255), (1.5, 256)])
+def test_saturation_of_integers_begins_at_the_first_that_stands_for_as_much(tmp_path, limit, first):
+    codes = np.arange(192, dtype=np.uint8).reshape(8, 8, 3) + 64
+    write_image(tmp_path / "000.png", codes)
+    data = manifest_of(SCENE, mask=None, saturation=limit)
+    write_manifest(tmp_path, {**data, "frames": [{**data["frames"][0], "image": "000.png"}]})
+    assert np.array_equal(corrected(tmp_path).saturated, (codes >= first).any(axis=-1))
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_integers_with_the_table_of_their_radiance_are_the_corrected_pixels(tmp_path, dtype):
+    write_image(tmp_path / "000.png", RNG.integers(0, np.iinfo(dtype).max, (8, 8, 3)).astype(dtype))
+    data = manifest_of(SCENE, color_space="srgb_texture", mask=None)
+    write_manifest(tmp_path, {**data, "frames": [{**data["frames"][0], "image": "000.png", "exposure_s": 0.25}]})
+    capture = Capture.open(tmp_path)
+    frame, without = capture.sources()[0], Correction.of(capture)
+    coded = without.coded(frame)
+    assert isinstance(coded, CodedRadiance)
+    assert coded.codes.dtype == dtype
+    assert (np.diff(coded.values) >= 0).all()
+    flat = Correction(capture, None, np.ones((8, 8, 3), np.float32), None)  # which divides every pixel by one
+    assert isinstance(flat.coded(frame), Radiance)
+    assert np.array_equal(without.apply(frame).pixels, coded.values[coded.codes])
+    assert np.array_equal(without.apply(frame).pixels, flat.apply(frame).pixels)
 
 
 def test_display_encoded_frames_are_linearised_dark_and_all(tmp_path):

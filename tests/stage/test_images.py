@@ -5,7 +5,7 @@ import OpenImageIO as oiio
 import pytest
 
 from stage.errors import ImageError, StorageError
-from stage.images import check_radiance, check_resolution, read_header, read_mask, read_pixels
+from stage.images import check_radiance, check_resolution, fractions, read_header, read_mask, read_pixels, read_recorded
 from stage.integrity import check_jpeg
 from tests.scenes.captures import write_exr, write_image
 
@@ -24,6 +24,18 @@ def test_integers_are_fractions_of_full_scale(tmp_path, suffix, dtype, full):
     # codes / full in float32: half a unit in the last place either way
     assert np.allclose(pixels, codes / full, rtol=1.2e-7, atol=0)
     assert (pixels[0, 0] == 0).all() and (pixels[0, 1] == 1).all()
+
+
+@pytest.mark.parametrize("suffix", ["png", "tif", "dpx"])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_every_integer_is_read_as_it_is_and_stands_for_the_fraction_that_its_library_gives(tmp_path, suffix, dtype):
+    every = np.arange(np.iinfo(dtype).max + 1, dtype=dtype).reshape(16, -1)
+    path = write_image(tmp_path / f"a.{suffix}", np.stack([every] * 3, axis=-1))
+    recorded = read_recorded(path)
+    assert recorded.dtype == dtype
+    assert (recorded == every[..., None]).all()
+    library = oiio.ImageBuf(str(path)).get_pixels(oiio.FLOAT)
+    assert np.array_equal(fractions(np.dtype(dtype))[every], library[..., 0])
 
 
 def test_float_tiff_keeps_its_bits(tmp_path):
