@@ -6,6 +6,7 @@ Captures, environments and jobs that have not ended are never deleted.
 import shutil
 import threading
 import time
+import traceback
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -48,6 +49,7 @@ class Housekeeper:
         """
         self._settings, self._database, self._storage, self._queue, self._clock = settings, database, storage, queue, clock
         self._silent: set[str] = set()
+        self._told: dict[str, str] = {}  # the last error of each piece of work that fails, which is logged once
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name="relit-housekeeping", daemon=True)
 
@@ -62,13 +64,10 @@ class Housekeeper:
 
     def round(self) -> None:
         """Do all pieces of work once; a piece that fails is tried again in the next round."""
-        for piece in (self._jobs, self._uploads, self._tokens, self._workers, self._caches, self._interrupted):
+        for piece in (self._jobs, self._uploads, self._tokens, self._workers, self._caches, self._leftovers, self._interrupted):
             if self._ended.is_set():
                 return
-            try:
-                piece()
-            except (*UNANSWERED, StorageError, OSError) as error:
-                logger.warning("housekeeping waits", piece=piece.__name__.strip("_"), error=message_of(error))
+            self._try(piece.__name__.strip("_"), piece)
 
     def _run(self) -> None:
         while True:
@@ -76,16 +75,32 @@ class Housekeeper:
             if self._ended.wait(EVERY_S):
                 return
 
+    def _try(self, piece: str, work: Callable[[], object]) -> None:
+        """Do a piece of work. Whatever error it meets, the thread goes on with the next; the same error is logged once."""
+        try:
+            work()
+        except (*UNANSWERED, StorageError, OSError) as error:
+            logger.warning("housekeeping waits", piece=piece, error=message_of(error))
+        except Exception as error:  # an error of relit itself, or a row that cannot be read: without the thread nothing is ever cleared away
+            if self._told.get(piece) != (told := message_of(error)):
+                logger.error("housekeeping failed", piece=piece, error=told, trace=traceback.format_exc())
+            self._told[piece] = told
+        else:
+            self._told.pop(piece, None)
+
     def _jobs(self) -> None:
         if self._settings.retention_days is None:
             return
         for row in jobs.ended_before(self._database, self._clock() - self._settings.retention_days * DAY_S):
             if self._ended.is_set():
                 return
-            if self._database.transact(partial(_forget, job=row["id"])):
-                self._storage.remove(layout.results(row["project"], row["id"]))
-                self._queue.forget(row["id"], row["attempt"])
-                logger.info("job removed", job=row["id"], project=row["project"])
+            self._try(row["id"], partial(self._remove_job, row))
+
+    def _remove_job(self, row: sa.RowMapping) -> None:
+        if self._database.transact(partial(_forget, job=row["id"])):
+            self._storage.remove(layout.results(row["project"], row["id"]))
+            self._queue.forget(row["id"], row["attempt"])
+            logger.info("job removed", job=row["id"], project=row["project"])
 
     def _uploads(self) -> None:
         removed = uploads.expire(self._database, part_files_folder(self._settings), self._clock() - self._settings.upload_hours * HOUR_S)
@@ -120,9 +135,20 @@ class Housekeeper:
         for name in sorted(kept, key=lambda name: kept[name]):
             if total <= self._settings.cache_bytes:
                 return
-            if not self._database.transact(partial(jobs.users_of, input_id=name, active=True)):
-                _clear(there[name])
-                total -= sizes[name]
+            self._try(name, partial(self._clear_unread, there[name]))
+            total -= 0 if there[name].exists() else sizes[name]
+
+    def _clear_unread(self, cache: Path) -> None:
+        if not self._database.transact(partial(jobs.users_of, input_id=cache.name, active=True)):
+            _clear(cache)
+
+    def _leftovers(self) -> None:
+        """Delete what a writer that was under way has made again of a prefix that was removed with its row."""
+        for prefix in self._storage.leftovers():
+            identifier = prefix.rpartition("/")[2]
+            if jobs.find(self._database, identifier) is None and not intakes.last_used(self._database, [identifier]):
+                self._storage.remove(prefix)
+                logger.info("leftover removed", prefix=prefix)
 
     def _interrupted(self) -> None:
         """Finish deletions, and delete unfinished files, that a power failure or a kill interrupted."""

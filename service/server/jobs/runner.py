@@ -141,6 +141,7 @@ class JobRunner:
                 self._context.storage.publish(layout.results(job.project, job.id), progress)
         except Stopped:
             log.info("step stopped")
+            self._clear_if_deleted(job)
             return STOPPED
         except UNANSWERED:
             raise
@@ -150,6 +151,7 @@ class JobRunner:
             log.error("step failed", error=repr(error), trace=traceback.format_exc())
             return self._fail(claim, f"{name}: an error of relit itself ({type(error).__name__}): its log has more", job)
         if not jobs.finish_step(database, claim, [*row["finished_steps"], name]):
+            self._clear_if_deleted(job)
             return STOPPED
         log.info("step done")
         return DONE
@@ -159,8 +161,14 @@ class JobRunner:
         error = self._context.without_folder(error)
         if job is not None and isinstance(job.request, CheckJob):
             intakes.refuse(self._context.database, job.request.intake, error)
-        jobs.end(self._context.database, claim, FAILED, error)
+        if not jobs.end(self._context.database, claim, FAILED, error) and job is not None:
+            self._clear_if_deleted(job)
         return FAILED
+
+    def _clear_if_deleted(self, job: Job) -> None:
+        """Delete the files that a step wrote while its job was cancelled and deleted; housekeeping does so where the worker is killed."""
+        if jobs.find(self._context.database, job.id) is None:
+            self._context.storage.remove(layout.results(job.project, job.id))
 
     def _patiently(self, claim: Claim, work: Callable[[], T]) -> T:
         """Call `work` again and again until the database answers; meanwhile give signs of life, so that the worker is not killed."""

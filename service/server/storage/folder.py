@@ -1,13 +1,21 @@
 """Storage in the data folder. Writers rename complete files into place: a file whose name has no leading dot is complete."""
 
 import os
+import secrets
 import shutil
+import time
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from service.reporting.progress import Progress
 from stage.errors import storage
+
+REMOVED = "removed"
+"""Name of the folder, in the data folder, with an empty file for each prefix that was removed lately."""
+MARKS = "projects/*/*/*"
+REMEMBERED_S = 3 * 86_400.0
+"""Seconds for which a removed prefix is remembered: longer than a writer that was under way goes on."""
 
 
 class StoredFile(NamedTuple):
@@ -51,6 +59,9 @@ class Storage(Protocol):
 
     def remove(self, prefix: str) -> None:
         """Delete all files of a prefix."""
+
+    def leftovers(self) -> list[str]:
+        """Return the prefixes that were removed in the last days and have files again, which a writer that was under way has made."""
 
     def tidy(self) -> None:
         """Finish deletions that were interrupted."""
@@ -119,14 +130,24 @@ class FolderStorage:
         return path if is_shown(name) and path.is_file() and path.resolve() == folder.resolve() / name else None  # not through a link
 
     def remove(self, prefix: str) -> None:
-        """Delete the folder; it is hidden first, so that a part of it is not shown."""
-        folder = self._root / prefix
+        """Delete the folder; it is hidden first, so that a part of it is not shown. A mark of the prefix stays for REMEMBERED_S."""
+        folder, mark = self._root / prefix, self._root / REMOVED / prefix
         with storage("remove", folder):
+            mark.parent.mkdir(parents=True, exist_ok=True)
+            mark.touch()
             drop_folder(folder)
 
+    def leftovers(self) -> list[str]:
+        """Return the prefixes that are marked as removed and are folders again."""
+        marks = self._root / REMOVED
+        return [str(prefix) for mark in marks.glob(MARKS) if (self._root / (prefix := mark.relative_to(marks))).is_dir()]
+
     def tidy(self) -> None:
-        """Delete the folders whose deletion was interrupted."""
+        """Delete the folders whose deletion was interrupted, and old marks of removed prefixes."""
         drop_hidden(self._root)
+        for mark in (self._root / REMOVED).glob(MARKS):
+            if mark.stat().st_mtime < time.time() - REMEMBERED_S:
+                mark.unlink(missing_ok=True)
 
     def check(self) -> None:
         """Write and delete a file."""
@@ -152,8 +173,7 @@ def is_shown(name: str) -> bool:
 
 def drop_folder(folder: Path) -> None:
     """Delete a folder if it exists; it is renamed to a hidden name first, so that nobody finds it half deleted."""
-    removed = folder.with_name(f".{folder.name}.removed")
-    shutil.rmtree(removed, ignore_errors=True)  # left by a process that was killed here
+    removed = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}.removed")  # two processes may delete the same folder
     try:
         folder.rename(removed)
     except FileNotFoundError:

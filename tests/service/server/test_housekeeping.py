@@ -1,5 +1,6 @@
 """What the service clears away by itself, and what it leaves alone; days pass by an injected clock."""
 
+import os
 import time
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import sqlalchemy as sa
 
 from service.requests.identifiers import CAPTURE, ENVIRONMENT, UPLOAD, new_id
 from service.requests.jobs import ExportJob, SolveJob
+from service.server import housekeeping
 from service.server.database import idempotency, intakes, jobs, tables, uploads, workers
 from service.server.database.engine import connect
 from service.server.housekeeping import DAY_S, HOUR_S, UNFINISHED_S, Housekeeper
@@ -248,3 +250,50 @@ def test_it_knows_only_its_own_database(house, tmp_path):
     house.now += 10 * DAYS * DAY_S
     house.keeper.round()
     assert stray.exists()
+
+
+def test_what_a_writer_made_again_of_a_deleted_job_is_removed(house):
+    """The worker deletes it at the end of its step, unless it is killed before."""
+    deleted, kept, restored = house.job(), house.job(), house.job()
+    house.database.transact(lambda connection: jobs.remove(connection, deleted))
+    for job in (deleted, restored):  # `restored` stands for one that a backup brought back
+        house.storage.remove(layout.results(PROJECT, job))
+        assert not house.results(job).exists()
+        house.results(job).mkdir()
+        (house.results(job) / "frame.0001.exr").write_bytes(b"frame")
+    house.keeper.round()
+    assert [house.results(job).exists() for job in (deleted, kept, restored)] == [False, True, True]
+
+
+def test_marks_of_removed_jobs_do_not_stay_for_ever(tmp_path):
+    house = House(tmp_path / "data")
+    house.storage.remove(layout.results(PROJECT, house.job()))
+    marks = [path for path in house.settings.data.glob("removed/**/*") if path.is_file()]
+    assert len(marks) == 1
+    house.keeper.round()
+    assert marks[0].exists()
+    os.utime(marks[0], (0, 0))
+    house.keeper.round()
+    assert not marks[0].exists()
+    house.database.close()
+
+
+def test_one_bad_row_stops_neither_the_other_rows_nor_the_thread(house, monkeypatch):
+    """As a value in a request that PostgreSQL cannot read did, for all projects and for good; it is logged once."""
+    bad, good = house.job(), house.job()
+    house.now += 2 * DAYS * DAY_S
+    forget = housekeeping._forget
+
+    def fail(connection, job):
+        if job == bad:
+            raise ValueError("no such character")
+        return forget(connection, job)
+
+    monkeypatch.setattr(housekeeping, "_forget", fail)
+    logged = []
+    monkeypatch.setattr(housekeeping.logger, "error", lambda event, **fields: logged.append((event, fields["piece"])))
+    stale = house.cache(new_id(CAPTURE))
+    house.keeper.round()
+    house.keeper.round()
+    assert jobs.find(house.database, bad) and jobs.find(house.database, good) is None and not stale.exists()
+    assert logged == [("housekeeping failed", bad)]

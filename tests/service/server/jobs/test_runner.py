@@ -9,7 +9,11 @@ from service.server.database.jobs import Claim
 from service.server.jobs import runner as runner_module
 from service.server.jobs.runner import DONE, STOPPED, JobRunner
 from service.server.jobs.steps import JobStep, WorkerContext
+from service.server.storage import layout
 from service.server.storage.open import open_storage
+from stage.errors import StorageError
+from stage.files import write_text
+from tests.service.server.jobs.harness import PROJECT
 
 NO_ANSWER = OperationalError("SELECT 1", {}, Exception("the server is away"))
 NAMES = ["frames 1-5", "frames 6-10"]
@@ -94,3 +98,27 @@ def test_a_worker_that_was_given_up_for_dead_publishes_nothing(idle_harness, run
     assert made.run(claim) == STOPPED
     row = idle_harness.row(claim.job)
     assert (row["state"], row["worker"], row["finished_steps"]) == (jobs.QUEUED, None, [])
+
+
+@pytest.mark.parametrize("end", ["stopped", "done", "failed"])
+def test_what_a_step_wrote_after_its_job_was_deleted_is_removed(idle_harness, runner, monkeypatch, end):
+    """A writer that is under way makes the folder of the results again, as `stage.files.replacing` makes missing folders."""
+    made, claim = runner
+    folder = idle_harness.results(claim.job)
+
+    def run(progress):
+        write_text(folder / "frame.0001.exr", "before")
+        idle_harness.database.transact(lambda connection: jobs.cancel(connection, claim.job))
+        idle_harness.database.transact(lambda connection: jobs.remove(connection, claim.job))
+        open_storage(idle_harness.settings).remove(layout.results(PROJECT, claim.job))
+        assert not folder.exists()
+        write_text(folder / "frame.0002.exr", "after")
+        if end == "stopped":
+            monkeypatch.setattr(progress, "_record_at", 0.0)
+            progress.advance(2)
+        if end == "failed":
+            raise StorageError("the disk is full")
+
+    do_nothing(monkeypatch, run)
+    assert made.run(claim) in (STOPPED, jobs.FAILED)
+    assert not folder.exists()
