@@ -264,7 +264,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         folder = Path(name)
         server = None if chosen.sqlite or programs is None else stack.enter_context(postgres(programs))
         new_database: NewDatabase = (lambda: None) if server is None else server.new_database
-        scene = make_scene_files(folder)
+        scene = make_scene_files(folder / "scene")
         faults = kills(folder / "kills", new_database, scene, random.Random(chosen.seed))
         rows: list[tuple[str, int, Callable[[Harness, str], float | None], dict[str, float]]] = [
             ("SIGKILL of all workers at once", 3, kill_all, {}),

@@ -33,9 +33,10 @@ def look(settings: Settings) -> Iterator[Finding]:
     for name, near in unknown_variables(os.environ).items():
         yield Finding("settings", f"{name} is no setting" + (f": is {near} meant?" if near else ""), True)
     yield from _storage(settings)
-    for root in settings.roots:
+    for project, root in (*((None, root) for root in settings.roots), *settings.project_roots):
         there = root.is_dir() and os.access(root, os.R_OK | os.X_OK)
-        yield Finding("root", f"{root} " + ("can be read" if there else "is no folder that can be read"), not there)
+        owner = "" if project is None else f" of {project}"
+        yield Finding("root", f"{root}{owner} " + ("can be read" if there else "is no folder that can be read"), not there)
     if settings.is_sqlite and not settings.sqlite_file.exists():
         yield Finding("database", f"{settings.sqlite_file} is not there yet: relit serve makes it")
         return

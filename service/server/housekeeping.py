@@ -81,7 +81,7 @@ class Housekeeper:
             work()
         except (*UNANSWERED, StorageError, OSError) as error:
             logger.warning("housekeeping waits", piece=piece, error=message_of(error))
-        except Exception as error:  # an error of relit itself, or a row that cannot be read: without the thread nothing is ever cleared away
+        except Exception as error:  # of relit itself, or of a row that cannot be read
             if self._told.get(piece) != (told := message_of(error)):
                 logger.error("housekeeping failed", piece=piece, error=told, trace=traceback.format_exc())
             self._told[piece] = told

@@ -152,7 +152,7 @@ def _configure(settings: Settings) -> None:
     log.configure(settings.log_level, settings.log_format)
     for name, near in unknown_variables(os.environ).items():
         logger.warning("a variable of the environment is no setting", variable=name, **({"meant": near} if near else {}))
-    for root in settings.roots:
+    for root in (*settings.roots, *(root.folder for root in settings.project_roots)):
         if not root.is_dir():
             logger.warning("a root is no folder", root=str(root))
 

@@ -4,19 +4,21 @@ A test compares this list with that of docs/service.md.
 """
 
 import os
+import re
 import tomllib
 from collections.abc import Mapping
 from difflib import get_close_matches
 from functools import cached_property
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
-from urllib.parse import urlsplit
+from typing import Annotated, Any, Literal, NamedTuple, Self
+from urllib.parse import unquote, urlsplit
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from pydantic_settings import BaseSettings, InitSettingsSource, NoDecode, PydanticBaseSettingsSource, SettingsConfigDict
 
 from service.errors import RequestError
+from service.requests.identifiers import PROJECT_PATTERN
 from service.requests.jobs import DEFAULT_PORT
 from stage.model import Count, Positive
 
@@ -33,6 +35,26 @@ def _absolute(path: Path) -> Path:
 
 
 Folder = Annotated[Path, AfterValidator(_absolute)]
+
+
+class ProjectRoot(NamedTuple):
+    """A folder below which one project may register captures and environments."""
+
+    project: str
+    folder: Path
+
+    @classmethod
+    def read(cls, given: object) -> object:
+        """Return what PROJECT=/folder stands for."""
+        if not isinstance(given, str):
+            return given
+        project, mark, folder = given.partition("=")
+        if not mark or not folder or not re.fullmatch(PROJECT_PATTERN, project):
+            raise ValueError(f"is {given}: give PROJECT=/folder")
+        return cls(project, _absolute(Path(folder)))
+
+
+ProjectFolder = Annotated[ProjectRoot, BeforeValidator(ProjectRoot.read)]
 
 
 class Settings(BaseSettings):
@@ -60,6 +82,8 @@ class Settings(BaseSettings):
     """Accept requests without a key, in the project `default`; only on loopback addresses."""
     roots: Annotated[tuple[Folder, ...], NoDecode] = ()
     """Folders of the server whose captures and environments may be registered without an upload; in the environment separated by `:`."""
+    project_roots: Annotated[tuple[ProjectFolder, ...], NoDecode] = ()
+    """As `roots`, each for one project: PROJECT=/folder; in the environment separated by `:`."""
     devices: Annotated[tuple[str, ...], NoDecode] = ()
     """Devices on which `relit serve` starts a worker, separated by commas; without it every GPU, else the CPU; `none` for no worker."""
 
@@ -107,7 +131,7 @@ class Settings(BaseSettings):
     @model_validator(mode="before")
     @classmethod
     def _split(cls, given: dict[str, object]) -> dict[str, object]:
-        for name, mark in (("roots", os.pathsep), ("devices", ",")):
+        for name, mark in (("roots", os.pathsep), ("project_roots", os.pathsep), ("devices", ",")):
             if isinstance(value := given.get(name), str):
                 given[name] = tuple(part.strip() for part in value.split(mark) if part.strip())
         return given
@@ -126,6 +150,22 @@ class Settings(BaseSettings):
                                                or not urlsplit(self.otel_endpoint).hostname):
             raise ValueError(f"otel_endpoint: {self.otel_endpoint} is no address of the form http://host:4318")
         return self
+
+    @model_validator(mode="after")
+    def _data_is_apart(self) -> Self:
+        kept = {"data": self.data}
+        if self.storage_url is not None and self.storage_url.startswith("file:"):
+            kept["storage_url"] = _absolute(Path(unquote(urlsplit(self.storage_url).path)))
+        for root in (*self.roots, *(root.folder for root in self.project_roots)):
+            for name, folder in kept.items():
+                if folder.is_relative_to(root) or root.is_relative_to(folder):
+                    raise ValueError(f"roots: {root} and {name} ({folder}) lie one within the other, so that a project could register "
+                                     "the captures of another: give folders beside each other")
+        return self
+
+    def roots_of(self, project: str) -> tuple[Path, ...]:
+        """Return the folders below which a project may register captures and environments."""
+        return (*self.roots, *(root.folder for root in self.project_roots if root.project == project))
 
     @cached_property
     def loopback(self) -> bool:

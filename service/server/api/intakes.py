@@ -140,7 +140,7 @@ def _registered(service: Service, caller: Caller, field: str, given: str) -> Pat
     if "\0" in given or not path.is_absolute() or ".." in path.parts:
         raise ApiError("invalid", f"{field}: give an absolute path of the server, without ..")
     place = resolved(path)
-    if place is None or not any(place.is_relative_to(root) for root in service.settings.roots):
+    if place is None or not any(place.is_relative_to(root) for root in service.settings.roots_of(caller.project)):
         raise ApiError("invalid", f"{field}: lies in none of the folders that the operator allows")
     return place
 

@@ -28,8 +28,8 @@ class WorkerContext(NamedTuple):
     """Folder of the image stacks, one for each capture."""
     device: str
     max_pixels: int
-    roots: tuple[Path, ...]
-    """Folders below which registered captures and environments lie."""
+    roots_of: Callable[[str], tuple[Path, ...]]
+    """Returns the folders below which the registered captures and environments of a project lie."""
 
     def without_folder(self, sentence: str) -> str:
         """Return a sentence for users, in which files are named below the data folder, whose place is not theirs to know."""
@@ -196,7 +196,7 @@ def _place(job: Job, identifier: str, context: WorkerContext, progress: Progress
     if row["folder"] is None:
         return context.storage.local(layout.intake(job.project, identifier), progress=progress), False
     folder = Path(row["folder"])
-    if resolved(folder) != folder or not any(folder.is_relative_to(root) for root in context.roots):
+    if resolved(folder) != folder or not any(folder.is_relative_to(root) for root in context.roots_of(job.project)):
         raise RequestError(f"{identifier}: lies in none of the folders that the operator allows any more")
     return folder, True
 

@@ -56,7 +56,7 @@ def run_worker(settings: Settings, device: str, heartbeat: Heartbeat) -> None:
     if lock.hold() is LockState.REFUSED:
         raise RuntimeError(f"another process holds the lock of {name}")  # its name is random
     queue = JobQueue(database)
-    context = WorkerContext(database, open_storage(settings), cache_folder(settings), device, settings.max_pixels, settings.roots)
+    context = WorkerContext(database, open_storage(settings), cache_folder(settings), device, settings.max_pixels, settings.roots_of)
     runner = JobRunner(context, name, alive=heartbeat.step)
     config: DBOSConfig = {
         "name": APPLICATION, "system_database_url": settings.sqlalchemy_url, "system_database_engine": database.engine,

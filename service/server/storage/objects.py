@@ -9,7 +9,7 @@ from typing import TypeVar
 
 from service.reporting.progress import Progress
 from service.server.storage.bucket import Bucket, Object
-from service.server.storage.folder import StoredFile, is_shown, stored_below, sweep
+from service.server.storage.folder import REMOVED, StoredFile, is_shown, stored_below, sweep
 from service.server.storage.scratch import Entry, Scratch
 from stage.files import replacing
 
@@ -18,8 +18,6 @@ TRANSFERS = 8
 """Files that are transferred at one time."""
 LOOK_S = 0.5
 """Seconds between two reports of progress."""
-REMOVED = "removed"
-"""The object removed/PREFIX exists while a prefix is being deleted, so that a part of it is not shown."""
 PROBE = "probe"
 CHECK_S = 30.0
 """Seconds for which the result of a check counts: each check costs two requests."""
@@ -98,7 +96,7 @@ class ObjectStorage:
         return self._scratch.files(prefix) / name
 
     def remove(self, prefix: str) -> None:
-        """Delete the objects; the prefix is hidden first, so that a part of it is not shown."""
+        """Delete the objects; the object removed/PREFIX exists meanwhile, so that a part of the prefix is not shown."""
         self._bucket.mark(f"{REMOVED}/{prefix}")
         self._scratch.remove(prefix)
         self._bucket.delete([found.path for found in self._bucket.below(prefix)])

@@ -39,15 +39,24 @@ def lines_of(outcome) -> dict[str, str]:
 
 def test_a_sound_service(relit, data, database, tmp_path, monkeypatch):
     workers.insert(database, "w1", host="h", pid=1, device="cuda:1")
-    monkeypatch.setenv("RELIT_ROOTS", str(tmp_path))
+    (tmp_path / "captures").mkdir()
+    monkeypatch.setenv("RELIT_PROJECT_ROOTS", f"larch={tmp_path / 'captures'}")
     outcome = relit("doctor", "--device", "cpu", "--data", data)
     assert (outcome.code, outcome.err) == (0, ""), outcome.out
     lines = lines_of(outcome)
     assert "dbos" in lines["service"] and "fastapi" in lines["service"]
     assert lines["storage"] == f"{data} can be written" and lines["database"] == f"{data / 'relit.sqlite'} answers"
-    assert lines["keys"] == "1, of 1 projects" and lines["worker"] == "w1 on cuda:1, ready" and lines["root"] == f"{tmp_path} can be read"
+    assert lines["keys"] == "1, of 1 projects" and lines["worker"] == "w1 on cuda:1, ready"
+    assert lines["root"] == f"{tmp_path / 'captures'} of larch can be read"
     assert "GiB free" in lines["space"] and lines["jobs"] == "none"
     assert outcome.out.splitlines()[-1] == "sound"
+
+
+@pytest.mark.parametrize("command", [["doctor", "--device", "cpu"], ["serve", "--port", "0"], ["worker", "--device", "cpu"]], ids="-".join)
+def test_a_data_folder_below_a_root_is_refused(relit, data, monkeypatch, command):
+    monkeypatch.setenv("RELIT_ROOTS", str(data.parent))
+    outcome = relit(*command, "--data", data)
+    assert outcome.code == 2 and "could register the captures of another" in outcome.err and outcome.err.count("\n") == 1
 
 
 def test_nothing_is_asked_of_a_service_that_is_not_there(relit, tmp_path, monkeypatch):

@@ -76,6 +76,38 @@ def test_what_cannot_be_is_refused_by_name(given, words):
     assert words in sentence(error.value)
 
 
+@pytest.mark.parametrize("given", [
+    {"data": "/srv/relit", "roots": "/srv"}, {"data": "/srv/relit", "roots": "/"}, {"data": "/srv/relit", "roots": "/captures:/srv/relit"},
+    {"data": "/srv/relit", "roots": "/srv/relit/projects"}, {"data": "/srv/relit", "project_roots": "larch=/srv"},
+    {"data": "/srv/relit", "storage_url": "file:///mnt/store", "roots": "/mnt"}])
+def test_a_root_that_holds_the_data_is_refused(given):
+    """Else an administrator of one project registers the captures of the others, and receives their images."""
+    with pytest.raises(ValidationError) as error:
+        Settings(**given)
+    assert "could register the captures of another" in sentence(error.value)
+    Settings(**given | {"data": "/srv/relit", "roots": "/srv/captures:/srv/relit2", "project_roots": ""})
+
+
+def test_a_root_that_links_to_the_data_is_refused(tmp_path):
+    (tmp_path / "data").mkdir()
+    (tmp_path / "root").symlink_to(tmp_path)
+    with pytest.raises(ValidationError):
+        Settings(data=tmp_path / "data", roots=str(tmp_path / "root"))
+
+
+def test_roots_of_projects(monkeypatch, tmp_path):
+    monkeypatch.setenv("RELIT_ROOTS", "/shared")
+    monkeypatch.setenv("RELIT_PROJECT_ROOTS", "larch=/l:birch=/b/../c:larch=/l=2")
+    settings = Settings(data=tmp_path)
+    assert settings.roots_of("larch") == (Path("/shared"), Path("/l"), Path("/l=2"))
+    assert settings.roots_of("birch") == (Path("/shared"), Path("/c")) and settings.roots_of("oak") == (Path("/shared"),)
+    for wrong in ("larch", "=/l", "larch=", "Larch=/l"):
+        monkeypatch.setenv("RELIT_PROJECT_ROOTS", wrong)
+        with pytest.raises(ValidationError) as error:
+            Settings(data=tmp_path)
+        assert f"project_roots[0]: is {wrong}: give PROJECT=/folder" in sentence(error.value)
+
+
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.7", "relit.example.com", "127.0.0.1.example.com", ""])
 def test_no_key_is_asked_for_on_loopback_alone(host):
     with pytest.raises(ValidationError) as error:

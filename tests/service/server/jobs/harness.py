@@ -34,7 +34,8 @@ class Harness:
 
     def __init__(self, folder: Path, database_url: str | None, **settings: Any) -> None:
         self.folder = folder
-        settings = {"roots": folder.anchor} | settings  # captures may lie anywhere
+        beside = [str(path) for path in folder.parent.iterdir() if path.is_dir() and path.resolve() != folder.resolve()]
+        settings = {"roots": os.pathsep.join(beside)} | settings  # captures may lie anywhere beside, as no root may hold the data folder
         self.settings = Settings(data=folder / "data", database_url=database_url, **settings)
         self.database = connect(self.settings.sqlalchemy_url)
         prepare(self.settings, self.database)

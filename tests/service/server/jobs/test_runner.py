@@ -23,7 +23,8 @@ NAMES = ["frames 1-5", "frames 6-10"]
 def runner(idle_harness, monkeypatch):
     """A worker `one` that has taken a job of two steps."""
     monkeypatch.setattr(runner_module, "FIRST_PAUSE_S", 0.0)
-    context = WorkerContext(idle_harness.database, open_storage(idle_harness.settings), idle_harness.settings.data / "cache", "cpu", 1, ())
+    context = WorkerContext(idle_harness.database, open_storage(idle_harness.settings), idle_harness.settings.data / "cache", "cpu", 1,
+                            idle_harness.settings.roots_of)
     made = JobRunner(context, "one", alive=lambda oldest: None)
     job = idle_harness.relight(new_id(CAPTURE), new_id(ENVIRONMENT), 10, chunk_frames=5)
     idle_harness.take(job, "one")
