@@ -14,15 +14,16 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from queue import SimpleQueue
-from typing import TypeVar
+from typing import Any, TypeVar, cast
 
 import uvicorn
-from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from service.errors import RequestError
 from service.server import log, telemetry
 from service.server.api.app import create_app
+from service.server.connections import ConnectionLimits, Connections, GuardedConnection, limits_of, raise_descriptors
 from service.server.database.engine import Database, open_database
 from service.server.housekeeping import Housekeeper
 from service.server.jobs.queue import JobQueue, prepare
@@ -35,10 +36,6 @@ from service.server.storage.open import open_storage
 T = TypeVar("T")
 CLOSE_S = 5
 """Seconds that open requests, streams of events among them, may take to end when the service ends."""
-BACKLOG = 2048
-"""Connections that may wait to be accepted; the default of uvicorn."""
-READ_BYTES = 1 << 20
-"""Bytes read from a connection at once: with the 256 KiB of asyncio an upload takes a quarter longer."""
 SIGNALS = (signal.SIGTERM, signal.SIGINT)
 SAME_S = 1.0
 """Seconds within which signals count as one: terminals, `timeout` and supervisors signal a process and its group."""
@@ -58,14 +55,14 @@ def serve(settings: Settings, *, before_answering: Callable[[str, Database, JobQ
     asked = _signals(supervisors)
     keep_freed_blocks()
     _configure(settings)
-    listening = _listen(settings)
+    limits = limits_of(settings, raise_descriptors())
+    listening = _listen(settings, limits.backlog)
     database = open_database(settings, prepare)
     supervisor = Supervisor(settings, _devices(settings))
     supervisors.append(supervisor)
     tracing = telemetry.provider(settings)
-    app = create_app(settings, database, tracing)
-    server = _Server(uvicorn.Config(app, http=_Connection, log_config=None, access_log=False, timeout_graceful_shutdown=CLOSE_S,
-                                    server_header=False))
+    app = create_app(settings, database, tracing, max_streams=limits.connections // 2)
+    server = http_server(app, settings, limits)
     housekeeper = Housekeeper(settings, database, open_storage(settings), JobQueue(database))
     address = _address(settings.host, listening.getsockname()[1])
     print(f"relit    {address}/v1", flush=True)
@@ -111,21 +108,21 @@ def work(settings: Settings, device: str | None) -> None:
     supervisors[0].stop()
 
 
-class _Connection(H11Protocol):
-    """A connection of a client: HTTP/1.1 as uvicorn speaks it, read in larger pieces."""
-
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        if hasattr(transport, "max_size"):  # of asyncio's own loop, which has no public way to set it
-            transport.max_size = READ_BYTES
-        super().connection_made(transport)
-
-
 class _Server(uvicorn.Server):
     """A server without signal handlers: those of uvicorn would end it at the first signal."""
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
         yield
+
+
+def http_server(app: Any, settings: Settings, limits: ConnectionLimits) -> uvicorn.Server:
+    """Return the HTTP server around an ASGI app, without signal handlers."""
+    connection = partial(GuardedConnection, Connections(limits))
+    return _Server(uvicorn.Config(
+        app, http=cast(type[asyncio.Protocol], connection), ws="none", log_config=None, access_log=False, server_header=False,
+        timeout_graceful_shutdown=CLOSE_S, backlog=limits.backlog, proxy_headers=bool(settings.trusted_proxies),
+        forwarded_allow_ips=list(settings.trusted_proxies)))
 
 
 def _signals(supervisors: list[Supervisor]) -> "SimpleQueue[int]":
@@ -157,10 +154,10 @@ def _configure(settings: Settings) -> None:
             logger.warning("a root is no folder", root=str(root))
 
 
-def _listen(settings: Settings) -> socket.socket:
+def _listen(settings: Settings, backlog: int) -> socket.socket:
     try:
         family, *_, address = socket.getaddrinfo(settings.host, settings.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
-        listening = socket.create_server((str(address[0]), settings.port), family=family, backlog=BACKLOG)
+        listening = socket.create_server((str(address[0]), settings.port), family=family, backlog=backlog)
         # connections inherit it: without it the body of an answer waits 40 ms for the client to acknowledge the headers
         listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         return listening

@@ -9,7 +9,7 @@ import tomllib
 from collections.abc import Mapping
 from difflib import get_close_matches
 from functools import cached_property
-from ipaddress import ip_address
+from ipaddress import ip_address, ip_network
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self
 from urllib.parse import unquote, urlsplit
@@ -101,6 +101,16 @@ class Settings(BaseSettings):
     """Requests of one key a second, on average, in each API process."""
     request_burst: Count = 200
     """Requests of one key that may come at once."""
+    max_connections: Count | None = None
+    """Connections of clients at most; without it 8192, or as many as the open files that the system allows leave room for."""
+    max_address_connections: Count | None = None
+    """Connections of one address at most; without it half of all."""
+    max_streams: Count = 128
+    """Event streams of one key at most, in each API process."""
+    max_project_streams: Count = 512
+    """Event streams of one project at most, in each API process."""
+    trusted_proxies: Annotated[tuple[str, ...], NoDecode] = ()
+    """Addresses or networks of proxies whose `X-Forwarded-For` is believed, separated by commas; without it that of none."""
     min_free_bytes: Annotated[int, Field(ge=0)] = 1024**3
     """Bytes that must be free in the data folder; uploads and jobs are refused when less is left."""
 
@@ -131,7 +141,7 @@ class Settings(BaseSettings):
     @model_validator(mode="before")
     @classmethod
     def _split(cls, given: dict[str, object]) -> dict[str, object]:
-        for name, mark in (("roots", os.pathsep), ("project_roots", os.pathsep), ("devices", ",")):
+        for name, mark in (("roots", os.pathsep), ("project_roots", os.pathsep), ("devices", ","), ("trusted_proxies", ",")):
             if isinstance(value := given.get(name), str):
                 given[name] = tuple(part.strip() for part in value.split(mark) if part.strip())
         return given
@@ -146,8 +156,12 @@ class Settings(BaseSettings):
     def _consistent(self) -> Self:
         if NO_WORKER in self.devices and len(self.devices) > 1:
             raise ValueError(f"devices: {NO_WORKER} stands alone, and they are {', '.join(self.devices)}")
-        if self.otel_endpoint is not None and (urlsplit(self.otel_endpoint).scheme not in ("http", "https")
-                                               or not urlsplit(self.otel_endpoint).hostname):
+        for proxy in self.trusted_proxies:
+            try:
+                ip_network(proxy)
+            except ValueError:
+                raise ValueError(f"trusted_proxies: {proxy} is no address and no network such as 10.0.0.0/8") from None
+        if self.otel_endpoint is not None and not _is_http(self.otel_endpoint):
             raise ValueError(f"otel_endpoint: {self.otel_endpoint} is no address of the form http://host:4318")
         return self
 
@@ -212,6 +226,14 @@ def is_loopback(host: str) -> bool:
     try:
         return ip_address(host).is_loopback
     except ValueError:
+        return False
+
+
+def _is_http(url: str) -> bool:
+    try:
+        parts = urlsplit(url)
+        return parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
+    except ValueError:  # a port that is no number, or an address with one bracket
         return False
 
 

@@ -37,15 +37,19 @@ class Server:
 
 
 @contextmanager
-def serving(folder: Path, *options: str, **settings: str) -> Iterator[Server]:
-    """Start a server, and end it. `settings` without RELIT_, as text; options of `relit serve` beside --data and --port."""
+def serving(folder: Path, *options: str, descriptors: int | None = None, **settings: str) -> Iterator[Server]:
+    """Start a server, and end it.
+
+    `settings` without RELIT_, as text; options of `relit serve` beside --data and --port; files that it may have open at most.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     log = folder / "log.txt"
     environment = {name: value for name, value in os.environ.items() if not name.startswith("RELIT_")}
     environment |= {f"RELIT_{name.upper()}": value for name, value in settings.items()}
     with open(log, "a") as errors:
         process = subprocess.Popen(
-            [sys.executable, "-m", "service.cli.main", "serve", "--data", str(folder / "data"), "--port", "0", *options],
+            [*([] if descriptors is None else ["prlimit", f"--nofile={descriptors}:{descriptors}"]),
+             sys.executable, "-m", "service.cli.main", "serve", "--data", str(folder / "data"), "--port", "0", *options],
             stdout=subprocess.PIPE, stderr=errors, text=True, env=environment, start_new_session=True)
     try:
         assert process.stdout is not None

@@ -11,7 +11,7 @@ from service.server.api import document, events, intakes, jobs, middleware, oper
 from service.server.api.access import RateLimiter
 from service.server.api.context import Service
 from service.server.api.metrics import Metrics
-from service.server.api.watch import Watcher
+from service.server.api.watch import MAX_STREAMS, StreamLimits, Watcher
 from service.server.database.engine import Database
 from service.server.jobs.queue import JobQueue
 from service.server.settings import Settings
@@ -20,21 +20,23 @@ from service.server.storage.open import open_storage
 DESCRIPTION = """Captures in, durable jobs, USD assets and relit frames out. docs/service.md has a walk through it."""
 
 
-def create_app(settings: Settings, database: Database, tracing: TracerProvider | None = None) -> FastAPI:
+def create_app(settings: Settings, database: Database, tracing: TracerProvider | None = None, *, max_streams: int = MAX_STREAMS) -> FastAPI:
     """Create the app over a prepared database.
 
     Args:
         settings: of the service.
         database: of the service.
         tracing: makes the spans of requests; None: there are none.
+        max_streams: event streams of this process at most.
     """
     app = FastAPI(title="Relit", version=__version__, description=DESCRIPTION, openapi_url="/v1/openapi.json",
                   docs_url=None, redoc_url=None,  # these pages would load scripts from elsewhere
                   telemetry=_telemetry(tracing), generate_unique_id_function=lambda route: route.name)
     closing = threading.Event()
+    streams = StreamLimits(min(max_streams, MAX_STREAMS), settings.max_project_streams, settings.max_streams)
     app.state.service = Service(
         settings, database, JobQueue(database), open_storage(settings), RateLimiter(settings.requests_per_second, settings.request_burst),
-        draining=threading.Event(), closing=closing, watcher=Watcher(database, closing))
+        draining=threading.Event(), closing=closing, watcher=Watcher(database, closing, streams))
     app.state.metrics, app.state.readiness = Metrics(settings, database), operations.Readiness()
     problems.install(app)
     document.install(app)

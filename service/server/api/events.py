@@ -6,11 +6,12 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Response
 from fastapi.sse import KEEPALIVE_COMMENT, EventSourceResponse, format_sse_event
+from starlette.types import Receive, Scope, Send
 
 from service.server.api.context import Reader, ServiceDep
 from service.server.api.jobs import get_job
 from service.server.api.problems import responses
-from service.server.api.watch import Change, Watcher
+from service.server.api.watch import Change, Listener, Watcher
 from service.views.jobs import JobView
 from service.views.states import ENDED
 
@@ -30,34 +31,42 @@ LastEvent = Annotated[str | None, Header(
 
 @router.get("/v1/jobs/{job}/events", responses={**responses(404, 422), 200: STREAM, 204: NOTHING_MORE}, response_class=Response,
             summary="Watch a job")
-async def stream_job(service: ServiceDep, found: Annotated[JobView, Depends(get_job)], last: LastEvent = None) -> Response:
+async def stream_job(service: ServiceDep, caller: Reader, found: Annotated[JobView, Depends(get_job)], last: LastEvent = None) -> Response:
     """Send the job as it is, and then with every change; the stream ends when the job has ended."""
     known = int(last) if last is not None and int(last) <= found.revision else 0
     if found.state in ENDED and known == found.revision:
         return Response(status_code=204)
-    service.watcher.require_room()
-    return EventSourceResponse(_stream(service.watcher, found.id, known=known, to_its_end=True), headers=HEADERS)
+    return _Stream(service.watcher, service.watcher.listen(found.id, after=known, caller=caller), to_its_end=True)
 
 
 @router.get("/v1/events", responses={200: STREAM}, response_class=Response, summary="Watch all jobs of the project")
 async def stream_jobs(service: ServiceDep, caller: Reader) -> Response:
     """Send the jobs that have not ended or ended lately, then every job of the project as it changes; the stream does not end."""
-    service.watcher.require_room()
-    return EventSourceResponse(_stream(service.watcher, caller.project, to_its_end=False), headers=HEADERS)
+    return _Stream(service.watcher, service.watcher.listen(caller.project, caller=caller), to_its_end=False)
 
 
-async def _stream(watcher: Watcher, topic: str, *, known: int = 0, to_its_end: bool) -> AsyncIterator[bytes]:
-    listener = watcher.listen(topic, after=known)
-    try:
-        while (news := await listener.take(SILENCE_S)) is not None:
-            if not news:
-                yield KEEPALIVE_COMMENT
-            for change in news:
-                yield _event(change, identified=to_its_end)
-            if to_its_end and any(change.ended for change in news):
-                return
-    finally:
-        watcher.remove(listener)
+class _Stream(EventSourceResponse):
+    """The events of a listener, which is removed when the answer ends, also if it never began."""
+
+    def __init__(self, watcher: Watcher, listener: Listener, *, to_its_end: bool) -> None:
+        self._watcher, self._listener = watcher, listener
+        super().__init__(_events(listener, to_its_end=to_its_end), headers=HEADERS)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            self._watcher.remove(self._listener)
+
+
+async def _events(listener: Listener, *, to_its_end: bool) -> AsyncIterator[bytes]:
+    while (news := await listener.take(SILENCE_S)) is not None:
+        if not news:
+            yield KEEPALIVE_COMMENT
+        for change in news:
+            yield _event(change, identified=to_its_end)
+        if to_its_end and any(change.ended for change in news):
+            return
 
 
 def _event(change: Change, *, identified: bool) -> bytes:

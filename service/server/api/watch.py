@@ -2,6 +2,7 @@
 
 import asyncio
 import threading
+import time
 from typing import NamedTuple
 
 import sqlalchemy as sa
@@ -9,17 +10,28 @@ import sqlalchemy as sa
 from service.requests.identifiers import JOB
 from service.server.api.problems import RETRY_S, ApiError
 from service.server.api.views import job_view
-from service.server.database import jobs
+from service.server.database import jobs, keys
 from service.server.database.engine import UNANSWERED, Database, message_of
+from service.server.database.keys import Caller
 from service.server.log import logger
 from service.views.states import ENDED
 
 TICK_S = 0.25
 """Seconds between two queries; of several changes between them, the last is sent."""
-MAX_LISTENERS = 4096
+KEYS_S = 2.0
+"""Seconds for which the keys of streams count as valid while nothing changes; before a change is sent they are looked at in any case."""
+MAX_STREAMS = 4096
 """Listeners of this process at most."""
 MAX_PENDING = 2000
 """Changed jobs that a listener has not taken at most: the stream of a slower one ends, and its client connects again."""
+
+
+class StreamLimits(NamedTuple):
+    """Listeners at most."""
+
+    of_process: int = MAX_STREAMS
+    of_project: int = MAX_STREAMS
+    of_key: int = MAX_STREAMS
 
 
 class Change(NamedTuple):
@@ -35,9 +47,9 @@ class Change(NamedTuple):
 class Listener:
     """A listener to a job or to all jobs of a project. It keeps only the last change of each job."""
 
-    def __init__(self, topic: str, after: int) -> None:
-        """Args: topic: a job or a project. after: revision of the job that the client has."""
-        self.topic, self.fresh = topic, True
+    def __init__(self, topic: str, after: int, caller: Caller | None = None) -> None:
+        """Args: topic: a job or a project. after: revision of the job that the client has. caller: who listens; None: this program."""
+        self.topic, self.caller, self.fresh = topic, caller, True
         self._after = after
         self._pending: dict[str, Change] = {}
         self._closed = False
@@ -73,26 +85,36 @@ class Listener:
 class Watcher:
     """Queries the jobs that have listeners. Everything except the queries runs in the event loop."""
 
-    def __init__(self, database: Database, closing: threading.Event) -> None:
-        """Args: database: of the service. closing: set when the service ends, and streams with it."""
-        self._database, self._closing = database, closing
+    def __init__(self, database: Database, closing: threading.Event, limits: StreamLimits | None = None) -> None:
+        """Args: database: of the service. closing: set when the service ends, and streams with it. limits: of listeners."""
+        self._database, self._closing, self._limits = database, closing, limits or StreamLimits()
         self._listeners: dict[str, set[Listener]] = {}
         self._seen: dict[str, tuple[str, int]] = {}  # project and revision of jobs as they were told last
         self._task: asyncio.Task[None] | None = None
+        self._keys_until = 0.0
 
-    def require_room(self) -> None:
-        """Raises: ApiError: there are too many listeners, or the service ends."""
-        if self._closing.is_set() or sum(map(len, self._listeners.values())) >= MAX_LISTENERS:
-            raise ApiError("unavailable", "no further stream of events can be opened here now", headers={"Retry-After": str(RETRY_S)})
-
-    def listen(self, topic: str, *, after: int = 0) -> Listener:
+    def listen(self, topic: str, *, after: int = 0, caller: Caller | None = None) -> Listener:
         """Add a listener, which `remove` must remove.
 
         Args:
             topic: a job; or a project, for all its jobs that have not ended or ended lately.
             after: revision of the job that the client has.
+            caller: who listens, whose key and project may have so many listeners and no more; None: this program.
+
+        Raises:
+            ApiError: there are too many listeners, or the service ends.
         """
-        listener = Listener(topic, after)
+        present = self._all()
+        if self._closing.is_set() or len(present) >= self._limits.of_process:
+            raise ApiError("unavailable", "no further stream of events can be opened here now", headers={"Retry-After": str(RETRY_S)})
+        if caller is not None:
+            others = (listener.caller for listener in present if listener.caller is not None)
+            theirs = [other.key for other in others if other.project == caller.project]
+            if theirs.count(caller.key) >= self._limits.of_key:
+                raise _too_many(f"this key has {self._limits.of_key} streams of events")
+            if len(theirs) >= self._limits.of_project:
+                raise _too_many(f"this project has {self._limits.of_project} streams of events")
+        listener = Listener(topic, after, caller)
         self._listeners.setdefault(topic, set()).add(listener)
         if self._task is None or self._task.done():
             self._task = asyncio.get_running_loop().create_task(self._run())
@@ -134,6 +156,7 @@ class Watcher:
                    or self._seen[job][1] != row["revision"]}
         missing = (known | {topic for topic in fresh if topic.startswith(f"{JOB}_")}) - set(found)  # deleted, or ended some time ago
         rows = await asyncio.to_thread(jobs.revisions, self._database, list(changed | missing)) if changed | missing else {}
+        await self._close_revoked(now=bool(changed | missing))
         for job in changed | missing:
             if (row := rows.get(job)) is not None:
                 self._tell(row, present)
@@ -143,6 +166,17 @@ class Watcher:
                       if job not in changed or job in rows}
         for listener in present:
             listener.fresh = False
+
+    async def _close_revoked(self, *, now: bool) -> None:
+        """End the streams of keys that were revoked; unless `now`, look at the keys every KEYS_S only."""
+        if not now and time.monotonic() < self._keys_until:
+            return
+        used = {listener.caller.key for listener in self._all() if listener.caller is not None and listener.caller.key is not None}
+        valid = await asyncio.to_thread(keys.still_valid, self._database, used) if used else set[str]()
+        for listener in self._all():
+            if listener.caller is not None and listener.caller.key in used - valid:
+                listener.close()
+        self._keys_until = time.monotonic() + KEYS_S
 
     def _tell(self, row: sa.RowMapping, present: set[Listener]) -> None:
         listeners = self._of(row["id"], row["project"]) & present
@@ -164,3 +198,7 @@ class Watcher:
 
     def _all(self) -> list[Listener]:
         return [listener for listeners in self._listeners.values() for listener in listeners]
+
+
+def _too_many(sentence: str) -> ApiError:
+    return ApiError("too-many", f"{sentence}, and no more may be open", headers={"Retry-After": str(RETRY_S)})

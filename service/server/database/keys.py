@@ -4,6 +4,7 @@ import hashlib
 import hmac
 import secrets
 import time
+from collections.abc import Collection
 from typing import NamedTuple
 
 import sqlalchemy as sa
@@ -52,6 +53,11 @@ def find(database: Database, presented: str) -> Caller | None:
     if row is None or not hmac.compare_digest(row["digest"], _digest(secret)):
         return None
     return Caller(row["project"], Scope(row["scope"]), identifier)
+
+
+def still_valid(database: Database, identifiers: Collection[str]) -> set[str]:
+    """Return those of the keys that have not been revoked."""
+    return {row["id"] for row in database.rows(sa.select(keys.c.id).where(keys.c.id.in_(identifiers), keys.c.revoked_at.is_(None)))}
 
 
 def revoke(database: Database, identifier: str) -> bool:

@@ -18,7 +18,7 @@ from service.server import log
 from service.server.api import events, watch
 from service.server.api.app import create_app
 from service.server.api.problems import ApiError
-from service.server.api.watch import Change, Listener, Watcher
+from service.server.api.watch import Change, Listener, StreamLimits, Watcher
 from service.server.database import jobs, tables
 from service.server.database.engine import Database, connect
 from service.server.jobs.queue import prepare
@@ -295,23 +295,21 @@ def test_a_project_is_told_of_its_own_jobs_alone(database, quick):
     asyncio.run(follow())
 
 
-def test_there_is_a_limit_and_an_end(database, quick, monkeypatch):
-    monkeypatch.setattr(watch, "MAX_LISTENERS", 2)
+def test_there_is_a_limit_and_an_end(database, quick):
     closing = threading.Event()
 
     async def follow() -> None:
-        watcher = Watcher(database, closing)
+        watcher = Watcher(database, closing, StreamLimits(of_process=2))
         first, _second = watcher.listen(PROJECT), watcher.listen(OTHER)
         with pytest.raises(ApiError) as refused:
-            watcher.require_room()
+            watcher.listen(OTHER)
         assert refused.value.kind == "unavailable" and "Retry-After" in refused.value.headers
         watcher.remove(first)
-        watcher.require_room()
         last = watcher.listen(PROJECT)
         closing.set()
         assert await last.take(WAIT_S) is None
         with pytest.raises(ApiError):
-            watcher.require_room()
+            watcher.listen(PROJECT)
 
     asyncio.run(follow())
 
