@@ -5,7 +5,7 @@ and its `Spelling`, where the rule does not give the wanted one. By the rule a f
 that is on by default `--refine/--no-refine`, a tuple with `Commas` as one text with commas between, and any other tuple by giving the
 option several times. The fields of a model within a model are options like its own.
 
-The command line, `relit submit`, the templates for farms and the provenance of results are made from this; forms can be.
+The command line, `relit submit`, the templates for farms, the forms of the pages and the provenance of results are made from this.
 """
 
 import re
@@ -63,6 +63,16 @@ def options_of(model: type[BaseModel]) -> tuple[Option, ...]:
         for option in options:
             found.setdefault(option.name, option)
     return tuple(found.values())
+
+
+def places_of(model: type[BaseModel]) -> Iterator[tuple[tuple[str, ...], Option]]:
+    """Yield the options of a model with the place of each in its JSON: the names of the fields that lead to it."""
+    for name, field in _fields(model):
+        inner = nested(field)
+        if inner is not None:
+            yield from (((name, *path), option) for path, option in places_of(inner))
+        elif not _is_constant(field):
+            yield (name,), _option(name, field)
 
 
 def build(model: type[Model], given: Mapping[str, Any]) -> Model:

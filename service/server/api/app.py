@@ -14,6 +14,7 @@ from service.server.api.metrics import Metrics
 from service.server.api.watch import MAX_STREAMS, StreamLimits, Watcher
 from service.server.database.engine import Database
 from service.server.jobs.queue import JobQueue
+from service.server.pages import routes as pages
 from service.server.settings import Settings
 from service.server.storage.open import open_storage
 
@@ -43,6 +44,7 @@ def create_app(settings: Settings, database: Database, tracing: TracerProvider |
     for router in (intakes.captures, intakes.environments, uploads.router, uploads.listings, uploads.options, jobs.router, events.router,
                    results.router, operations.router):
         app.include_router(router)
+    pages.install(app)
     app.add_middleware(middleware.JsonBodies)
     app.add_middleware(tus.TusHeaders)
     app.add_middleware(middleware.RequestLog, metrics=app.state.metrics)

@@ -1,0 +1,120 @@
+"""Forms of jobs, made from the request models: a field of a model becomes a control with its name, words, choices, limits and default.
+
+A form sends the JSON of the API (static/form.js). It holds the flags of `relit submit` too, so that the page can show the same job as a
+command.
+"""
+
+from enum import Enum
+from types import NoneType
+from typing import Any, Literal, NamedTuple, get_args, get_origin
+
+from annotated_types import Ge, Gt, Le, Lt
+from pydantic import BaseModel
+
+from service.requests.base import Choice, Role
+from service.requests.identifiers import CAPTURE, ENVIRONMENT, JOB, pattern
+from service.requests.jobs import DepthJob, ExportJob, JobRequest, PipelineJob, RelightJob, ShadeJob, SolveJob
+from service.requests.light_keys import LightKeys
+from service.requests.options import Option, help_text, places_of, typed
+
+CAPTURE_JOBS: dict[str, type[JobRequest]] = {"solve": SolveJob, "pipeline": PipelineJob, "depth": DepthJob, "relight": RelightJob}
+"""Jobs that begin with a capture, by kind."""
+MAPS_JOBS: dict[str, type[JobRequest]] = {"export": ExportJob, "shade": ShadeJob}
+"""Jobs that begin with the maps of another job, by kind."""
+TITLES = {"solve": "Solve normals and materials", "pipeline": "Solve, export and relight", "depth": "Decode depth",
+          "relight": "Relight frames", "export": "Export an asset", "shade": "Shade one picture"}
+IDENTIFIERS = {pattern(CAPTURE): "capture", pattern(ENVIRONMENT): "environment", pattern(JOB): "job"}
+"""What the identifiers of a pattern name."""
+
+
+class Field(NamedTuple):
+    """One control of a form."""
+
+    name: str
+    paths: tuple[str, ...]
+    """Places of the value in the JSON, each the names of the fields that lead to it, with dots between; an option that two parts of a job
+    have in common has two."""
+    label: str
+    help: str
+    control: str
+    """checkbox, select, number, text, lines (several values, one a line), json, or the kind of thing that an identifier names: capture,
+    environment, job."""
+    value_type: str
+    """Type in JSON: boolean, integer, number, string, strings or json."""
+    flag: str
+    off: str
+    is_argument: bool
+    choices: tuple[tuple[str, str], ...]
+    """Values and their words, of a select."""
+    default: str
+    required: bool
+    low: str
+    high: str
+
+
+class Form(NamedTuple):
+    """The form of one kind of job."""
+
+    kind: str
+    title: str
+    about: str
+    main: tuple[Field, ...]
+    """What the job reads."""
+    more: tuple[Field, ...]
+    """Options, which all have defaults."""
+
+
+def form_of(kind: str, model: type[JobRequest]) -> Form:
+    """Return the form of a kind of job."""
+    places: dict[str, list[str]] = {}
+    options: dict[str, Option] = {}
+    for path, option in places_of(model):
+        places.setdefault(option.name, []).append(".".join(path))
+        options.setdefault(option.name, option)
+    fields = [(option.role, _field(model, tuple(places[name]), option)) for name, option in options.items()]
+    return Form(kind, TITLES[kind], " ".join((model.__doc__ or "").split()), tuple(field for role, field in fields if role is Role.INPUT),
+                tuple(field for role, field in fields if role is not Role.INPUT))
+
+
+def _field(model: type[BaseModel], paths: tuple[str, ...], option: Option) -> Field:
+    control, value_type, choices = _control(option)
+    default = option.field.default
+    shown = "" if option.field.is_required() or default in (None, ()) or isinstance(default, bool) else typed(default)
+    limits = {kind: f"{value:g}" for limit in option.constraints for kind, value in _limits(limit)}
+    label = paths[0].rpartition(".")[2].replace("_", " ").capitalize()
+    return Field(option.name, paths, label, help_text(option, model), control, value_type, option.flag, option.off,
+                 option.spelling.argument, choices, "true" if default is True else shown, option.field.is_required(),
+                 limits.get("low", ""), limits.get("high", ""))
+
+
+def _control(option: Option) -> tuple[str, str, tuple[tuple[str, str], ...]]:
+    """Return control, JSON type and choices of an option."""
+    kind = option.kind
+    for limit in option.constraints:
+        if (named := IDENTIFIERS.get(getattr(limit, "pattern", None) or "")) is not None:
+            return named, "string", ()
+    if kind is LightKeys:
+        return "json", "json", ()
+    if option.is_repeated:
+        return "lines", "strings", ()
+    if kind is bool:
+        return "checkbox", "boolean", ()
+    if isinstance(kind, type) and issubclass(kind, Enum):
+        words = [(str(each.value), each.words if isinstance(each, Choice) else "") for each in kind]
+        return "select", "string", tuple(words)
+    if get_origin(kind) is Literal:
+        return "select", "string", tuple((str(value), "") for value in get_args(kind) if value is not NoneType)
+    if kind is int:
+        return "number", "integer", ()
+    if kind is float:
+        return "number", "number", ()
+    return "text", "string", ()
+
+
+def _limits(limit: Any) -> list[tuple[str, float]]:
+    found = []
+    for name, place in (("ge", "low"), ("gt", "low"), ("le", "high"), ("lt", "high")):
+        value = getattr(limit, name, None)
+        if isinstance(limit, Ge | Gt | Le | Lt) and value is not None:
+            found.append((place, float(value)))
+    return found

@@ -1,0 +1,95 @@
+"""Routes of the pages. A page holds nothing of a project: its modules ask the API for that, with the key of the person who looks.
+
+Pages load nothing from another server: the content security policy allows scripts, styles and connections of this origin alone.
+"""
+
+import base64
+import hashlib
+import json
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from fastapi import APIRouter, FastAPI, Request, Response
+from fastapi.staticfiles import StaticFiles
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
+
+from service import __version__
+from service.requests.identifiers import CaptureId, JobId
+from service.server.pages.forms import CAPTURE_JOBS, MAPS_JOBS, form_of
+
+HOME = Path(str(files("service.server.pages")))
+STATIC = "/static"
+THREE = f"{STATIC}/vendor/three"
+IMPORT_MAP = json.dumps({"imports": {"three": f"{THREE}/three.module.min.js", "three/addons/": f"{THREE}/addons/"}})
+"""Where modules find three.js, which is vendored."""
+IMPORT_MAP_HASH = base64.b64encode(hashlib.sha256(IMPORT_MAP.encode()).digest()).decode()
+HEADERS = {
+    "Content-Security-Policy": "; ".join([
+        "default-src 'none'", f"script-src 'self' 'sha256-{IMPORT_MAP_HASH}'", "style-src 'self'", "img-src 'self' blob: data:",
+        "connect-src 'self' blob:", "form-action 'none'", "frame-ancestors 'none'", "base-uri 'none'"]),
+    "X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer", "Cross-Origin-Opener-Policy": "same-origin",
+    "Cache-Control": "no-cache",
+}
+"""Headers of every page. Loaders of three.js read textures through blob: addresses, which they make themselves."""
+
+router = APIRouter(include_in_schema=False)
+templates = Environment(loader=FileSystemLoader(HOME / "templates"), autoescape=select_autoescape(), undefined=StrictUndefined,
+                        trim_blocks=True, lstrip_blocks=True)
+templates.globals.update(version=__version__, static=STATIC, import_map=IMPORT_MAP)
+
+
+class StaticModules(StaticFiles):
+    """The files that pages load; a browser asks each time whether its copy is the newest."""
+
+    def file_response(self, *args: Any, **kwargs: Any) -> Response:
+        """Return a file, with headers that forbid a guess of its type and a use without question."""
+        response = super().file_response(*args, **kwargs)
+        response.headers.update({"Cache-Control": "no-cache", "X-Content-Type-Options": "nosniff"})
+        return response
+
+
+def install(app: FastAPI) -> None:
+    """Add the pages and their files to the app."""
+    app.include_router(router)
+    app.mount(STATIC, StaticModules(directory=HOME / "static"), name="static")
+
+
+@router.get("/")
+async def home() -> Response:
+    """Show the object that was prepared last, to be lit; without one, the captures."""
+    return _page("home.html")
+
+
+@router.get("/captures")
+async def captures() -> Response:
+    """Show the captures and environments, and take new ones."""
+    return _page("captures.html")
+
+
+@router.get("/captures/{capture}")
+async def capture(capture: CaptureId) -> Response:
+    """Show a capture and its lights, and the forms of the jobs that begin with it."""
+    return _page("capture.html", identifier=capture, forms=[form_of(kind, model) for kind, model in CAPTURE_JOBS.items()])
+
+
+@router.get("/jobs")
+async def jobs() -> Response:
+    """Show the jobs as they change."""
+    return _page("jobs.html")
+
+
+@router.get("/jobs/{job}")
+async def job(job: JobId) -> Response:
+    """Show a job and its results, and the forms of the jobs that begin with its maps."""
+    return _page("job.html", identifier=job, forms=[form_of(kind, model) for kind, model in MAPS_JOBS.items()])
+
+
+@router.get("/favicon.ico")
+async def icon(request: Request) -> Response:
+    """Return the icon, which browsers ask for at this place."""
+    return Response((HOME / "static" / "icon.svg").read_bytes(), media_type="image/svg+xml", headers={"X-Content-Type-Options": "nosniff"})
+
+
+def _page(template: str, **values: Any) -> Response:
+    return Response(templates.get_template(template).render(**values), media_type="text/html", headers=HEADERS)

@@ -1,0 +1,75 @@
+/** Elements of a page, and values as people read them. */
+
+/**
+ * Make an element.
+ * @param {string} tag Name of the element.
+ * @param {Object<string, any>} [attributes] Attributes; `on…` are listeners, `class` the classes; false and null leave one out.
+ * @param {...(Node|string|null)} children Content.
+ * @returns {HTMLElement}
+ */
+export function element(tag, attributes = {}, ...children) {
+  const made = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) {
+    if (value === false || value === null || value === undefined) continue;
+    if (name.startsWith("on")) made.addEventListener(name.slice(2), value);
+    else made.setAttribute(name, value === true ? "" : String(value));
+  }
+  made.append(...children.filter((child) => child !== null && child !== undefined));
+  return made;
+}
+
+/** Return the element with an identifier, which the template has. */
+export function byId(id) {
+  const found = document.getElementById(id);
+  if (found === null) throw new Error(`the page has no #${id}`);
+  return found;
+}
+
+/** Show or hide an element. */
+export function show(target, visible) {
+  target.hidden = !visible;
+}
+
+/** Return a number of bytes as a person reads it. */
+export function bytes(count) {
+  const units = ["bytes", "kB", "MB", "GB", "TB"];
+  let at = 0;
+  while (count >= 1000 && at < units.length - 1) {
+    count /= 1000;
+    at += 1;
+  }
+  return `${at === 0 ? count : count.toFixed(count < 10 ? 1 : 0)} ${units[at]}`;
+}
+
+/** Return a duration as a person reads it. */
+export function duration(seconds) {
+  if (seconds < 60) return `${seconds.toFixed(seconds < 10 ? 1 : 0)} s`;
+  const minutes = Math.round(seconds / 60);
+  return minutes < 60 ? `${minutes} min` : `${Math.floor(minutes / 60)} h ${minutes % 60} min`;
+}
+
+/** Return a time element of an ISO time. */
+export function time(iso) {
+  const when = new Date(iso);
+  return element("time", { datetime: iso, title: when.toString() }, when.toLocaleString([], { dateStyle: "medium", timeStyle: "short" }));
+}
+
+/** Return the words of a fact's name: `color_space` is `Color space`. */
+export function words(name) {
+  const text = name.replaceAll("_", " ");
+  return text.charAt(0).toUpperCase() + text.slice(1);
+}
+
+/** Return a fact's value as text: lists with commas, several dimensions with ×. */
+export function factText(name, value) {
+  if (Array.isArray(value)) return value.join(name === "resolution" ? " × " : ", ");
+  if (value === null || value === undefined) return "–";
+  return typeof value === "object" ? JSON.stringify(value) : String(value);
+}
+
+/** Tell the person something, below the page and to screen readers. */
+export function tell(sentence, kind = "fault") {
+  const line = element("p", { class: kind }, sentence);
+  line.append(element("button", { type: "button", class: "quiet", "aria-label": "Dismiss", onclick: () => line.remove() }, "×"));
+  byId("message").replaceChildren(line);
+}

@@ -1,0 +1,132 @@
+/** The page of one job: progress, stages, log and results, and what can be done with it. */
+
+import { attempt, listing, post, read, remove, resultsOf, send } from "./api.js";
+import { byId, bytes, duration, element, factText, show, words } from "./element.js";
+import { watch } from "./events.js";
+import { enableForms } from "./form.js";
+import { titleOf } from "./jobs_table.js";
+
+const identifier = byId("main").dataset.identifier;
+const ENDED = ["succeeded", "failed", "cancelled"];
+const MAPS = ["maps.exr", "depth.exr"];
+const LOG_LINES = 1000;
+let logged = "";
+
+function present(job) {
+  document.title = `${titleOf(job)} · Relit`;
+  byId("name").textContent = titleOf(job);
+  byId("state").replaceChildren(element("span", { class: `state ${job.state}` }, job.state), job.attempt > 1 ? ` attempt ${job.attempt}` : "");
+  show(byId("progress"), job.state === "running");
+  const bar = byId("bar");
+  if (job.progress !== null && job.progress.total > 0) {
+    bar.max = job.progress.total;
+    bar.value = job.progress.done;
+    const left = job.progress.remaining_s === null ? "" : `, ${duration(job.progress.remaining_s)} left`;
+    byId("stage").textContent = `${job.progress.stage} ${job.progress.done} of ${job.progress.total}${left}`;
+  } else {
+    bar.removeAttribute("value");
+    byId("stage").textContent = "";
+  }
+  show(byId("error"), job.error !== null);
+  byId("error").textContent = job.error ?? "";
+  const ended = ENDED.includes(job.state);
+  show(byId("cancel"), !ended);
+  show(byId("retry"), job.state === "failed" && job.request.kind !== "check");
+  show(byId("resume"), job.state === "cancelled" && job.request.kind !== "check");
+  show(byId("delete"), ended);
+  log(job);
+}
+
+function presentRequest(job) {
+  const rows = [];
+  const add = (name, value) => {
+    if (value === null || value === "" || (Array.isArray(value) && value.length === 0)) return;
+    if (typeof value === "object" && !Array.isArray(value)) Object.entries(value).forEach(([inner, each]) => add(inner, each));
+    else rows.push(element("dt", {}, words(name)), element("dd", {}, link(name, value)));
+  };
+  Object.entries(job.request).forEach(([name, value]) => add(name, value));
+  byId("request").replaceChildren(...rows);
+}
+
+function link(name, value) {
+  if (/^cap_/.test(value)) return element("a", { href: `/captures/${value}` }, value);
+  if (/^job_/.test(value)) return element("a", { href: `/jobs/${value}` }, value);
+  return factText(name, value);
+}
+
+function log(job) {
+  const said = job.state === "running" && job.progress !== null ? `${job.progress.stage} ${job.progress.done} of ${job.progress.total}` : job.error ?? job.state;
+  if (said === logged) return;
+  logged = said;
+  const list = byId("log");
+  list.append(element("li", {}, element("time", {}, new Date().toLocaleTimeString()), " ", said));
+  while (list.childElementCount > LOG_LINES) list.firstElementChild.remove();
+}
+
+async function presentResults(job) {
+  const rows = [];
+  const names = [];
+  for await (const result of listing(`/v1/jobs/${identifier}/results`, "results", "after")) {
+    names.push(result.name);
+    rows.push(element("tr", {}, element("td", {}, element("a", { href: result.url, onclick: (event) => download(event, result) }, result.name)),
+      element("td", {}, bytes(result.size))));
+  }
+  byId("results").tBodies[0].replaceChildren(...(rows.length > 0 ? rows : [element("tr", {}, element("td", { colspan: 2 }, "No files yet."))]));
+  const solved = job.state === "succeeded" && MAPS.some((name) => names.includes(name));
+  offer("look", solved, `/maps/${identifier}`);
+  offer("asset", job.state === "succeeded" && names.some((name) => /^asset\.(usdz|glb)$/.test(name)), `/asset/${identifier}`);
+  offer("light", job.request.capture !== undefined && job.request.kind !== "depth", `/light/${job.request.capture}`);
+  if (solved && byId("work").hidden) {
+    show(byId("work"), true);
+    enableForms(byId("work"), identifier);
+  }
+  if (names.includes("report.json")) presentReport(await resultsOf(identifier).json("report.json"));
+}
+
+function presentReport(report) {
+  const stages = Object.entries(report.timings_s ?? report.timings ?? {});
+  byId("stages").tBodies[0].replaceChildren(...stages.map(([name, seconds]) => element("tr", {}, element("td", {}, name),
+    element("td", {}, typeof seconds === "number" ? seconds.toFixed(2) : String(seconds)))));
+  byId("warnings").replaceChildren(...(report.warnings ?? []).map((warning) => element("li", {}, warning)));
+}
+
+function offer(id, possible, href) {
+  byId(id).href = href;
+  show(byId(id), possible);
+}
+
+/** Save a result with the key of this tab, which a plain link would not send. */
+function download(event, result) {
+  event.preventDefault();
+  attempt(async () => {
+    const answer = await send(result.url);
+    const address = URL.createObjectURL(await answer.blob());
+    element("a", { href: address, download: result.name.split("/").at(-1) }).click();
+    setTimeout(() => URL.revokeObjectURL(address), 60_000);
+  });
+}
+
+async function follow() {
+  let job = await read(`/v1/jobs/${identifier}`);
+  presentRequest(job);
+  present(job);
+  await presentResults(job);
+  if (ENDED.includes(job.state)) return;
+  await watch(`/v1/jobs/${identifier}/events`, { job: (now) => { job = now; present(now); } });
+  job = await read(`/v1/jobs/${identifier}`);
+  present(job);
+  await presentResults(job);
+}
+
+for (const [id, action] of Object.entries({ cancel: "cancel", retry: "retry", resume: "resume" })) {
+  byId(id).addEventListener("click", () => attempt(async () => {
+    present(await post(`/v1/jobs/${identifier}/${action}`));
+    if (action !== "cancel") await follow();
+  }));
+}
+byId("delete").addEventListener("click", () => attempt(async () => {
+  if (!confirm("Delete this job and its results?")) return;
+  await remove(`/v1/jobs/${identifier}`);
+  location.assign("/jobs");
+}));
+await attempt(follow);

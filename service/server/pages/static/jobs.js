@@ -1,0 +1,20 @@
+/** The page of all jobs. */
+
+import { attempt, read } from "./api.js";
+import { byId, show } from "./element.js";
+import { watch } from "./events.js";
+import { JobsTable } from "./jobs_table.js";
+
+const table = new JobsTable(byId("jobs"));
+let next = null;
+
+async function more() {
+  const page = await read(next === null ? "/v1/jobs" : `/v1/jobs?before=${next}`);
+  page.jobs.forEach((job) => table.put(job));
+  next = page.next;
+  show(byId("more"), next !== null);
+}
+
+byId("more").addEventListener("click", () => attempt(more));
+await attempt(more);
+await attempt(() => watch("/v1/events", { job: (job) => table.put(job), gone: ({ id }) => table.drop(id) }));

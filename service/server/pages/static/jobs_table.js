@@ -1,0 +1,70 @@
+/** Rows of jobs in a table, which follow the events of the server. */
+
+import { duration, element, time } from "./element.js";
+
+/** Return what a job is called. */
+export function titleOf(job) {
+  return job.request.name || job.request.kind;
+}
+
+/** Return how far a job is, in words. */
+export function progressOf(job) {
+  if (job.error !== null) return job.error;
+  const { progress } = job;
+  if (job.state !== "running" || progress === null) return "";
+  const left = progress.remaining_s === null ? "" : `, ${duration(progress.remaining_s)} left`;
+  return `${progress.stage} ${progress.done} of ${progress.total}${left}`;
+}
+
+/** Jobs in the body of a table, the newest first. */
+export class JobsTable {
+  #rows = new Map();
+  #body;
+  #wanted;
+
+  /**
+   * @param {HTMLTableElement} table With a head of four columns.
+   * @param {function(any): boolean} [wanted] Which jobs are shown.
+   */
+  constructor(table, wanted = () => true) {
+    this.#body = table.tBodies[0];
+    this.#wanted = wanted;
+  }
+
+  /** Return how many jobs are shown. */
+  get size() {
+    return this.#rows.size;
+  }
+
+  /** Show a job as it is now. */
+  put(job) {
+    if (!this.#wanted(job)) return;
+    const row = element("tr", { "data-created": job.created_at },
+      element("td", {}, element("a", { href: `/jobs/${job.id}` }, titleOf(job)), " ", element("small", {}, job.id)),
+      element("td", {}, element("span", { class: `state ${job.state}` }, job.state)),
+      element("td", {}, ...bar(job), progressOf(job)),
+      element("td", {}, time(job.created_at)));
+    const before = this.#rows.get(job.id);
+    if (before === undefined) {
+      const older = [...this.#body.rows].find((other) => other.dataset.created < job.created_at);
+      this.#body.insertBefore(row, older ?? null);
+    } else if (before.contains(document.activeElement)) {
+      before.replaceWith(row);
+      row.querySelector("a").focus();
+    } else {
+      before.replaceWith(row);
+    }
+    this.#rows.set(job.id, row);
+  }
+
+  /** Remove a job that was deleted. */
+  drop(identifier) {
+    this.#rows.get(identifier)?.remove();
+    this.#rows.delete(identifier);
+  }
+}
+
+function bar(job) {
+  if (job.state !== "running" || job.progress === null || job.progress.total === 0) return [];
+  return [element("progress", { value: job.progress.done, max: job.progress.total, "aria-label": `Progress of ${titleOf(job)}` }), " "];
+}

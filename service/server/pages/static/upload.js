@@ -1,0 +1,141 @@
+/** Uploads of captures and environments by tus 1.0 (https://tus.io/protocols/resumable-upload), continued after an interruption. */
+
+import { listing, post, read, Refusal, send } from "./api.js";
+
+const PIECE_BYTES = 8 << 20;
+const PARALLEL = 4;
+const DIGEST_BYTES = 256 << 20; // a larger file would have to be in memory as a whole to be hashed
+const LONGEST_WAIT_S = 15;
+const TUS = { "Tus-Resumable": "1.0.0" };
+
+/** A file with its path within the capture. @typedef {{path: string, file: File}} LocalFile */
+
+/** Thrown where an upload was stopped by the person. */
+export class Stopped extends Error {}
+
+/**
+ * Upload the files of a capture or environment, and have them checked.
+ *
+ * An upload of the same name that was interrupted is continued: files that the server has are not sent again.
+ * @param {"captures"|"environments"} listingName What is created.
+ * @param {string} name Of the capture.
+ * @param {LocalFile[]} files All of them.
+ * @param {function(number, number, string): void} progress Told bytes sent, bytes in all, and what is being done.
+ * @param {AbortSignal} signal Stops the upload; the server keeps what it has.
+ * @returns {Promise<any>} The capture, ready or refused.
+ */
+export async function upload(listingName, name, files, progress, signal) {
+  const intake = await begun(listingName, name);
+  const known = new Map();
+  for await (const file of listing(`/v1/${listingName}/${intake.id}/files`, "files", "after")) known.set(file.path, file);
+  const total = files.reduce((sum, { file }) => sum + file.size, 0);
+  const sent = new Map();
+  const tell = (path, bytes) => {
+    sent.set(path, bytes);
+    progress([...sent.values()].reduce((sum, each) => sum + each, 0), total, "uploading");
+  };
+  const waiting = [...files];
+  const one = async () => {
+    for (let next = waiting.shift(); next !== undefined; next = waiting.shift()) {
+      await uploadFile(`/v1/${listingName}/${intake.id}/files`, next, known.get(next.path), (bytes) => tell(next.path, bytes), signal);
+    }
+  };
+  await Promise.all(Array.from({ length: PARALLEL }, one));
+  progress(total, total, "checking");
+  let found = await post(`/v1/${listingName}/${intake.id}/validate`);
+  while (found.state === "checking") {
+    await pause(0.5, signal);
+    found = await persist(() => read(`/v1/${listingName}/${intake.id}`), signal);
+  }
+  return found;
+}
+
+async function begun(listingName, name) {
+  for await (const intake of listing(`/v1/${listingName}`, "items")) {
+    if (intake.name === name && intake.state === "receiving") return intake;
+  }
+  return post(`/v1/${listingName}`, { name });
+}
+
+async function uploadFile(place, { path, file }, known, progress, signal) {
+  const digest = file.size <= DIGEST_BYTES ? await sha256(await file.arrayBuffer()) : null;
+  if (known?.done && known.length === file.size && (digest === null || known.sha256 === hex(digest))) {
+    progress(file.size);
+    return;
+  }
+  let target = known !== undefined && !known.done && known.length === file.size ? `/v1/uploads/${known.upload}` : null;
+  if (target === null) {
+    if (known !== undefined && !known.done) await send(`/v1/uploads/${known.upload}`, { method: "DELETE", headers: TUS });
+    target = await create(place, path, file.size, digest, signal);
+  }
+  let offset = await persist(() => offsetOf(target), signal);
+  while (offset < file.size) {
+    progress(offset);
+    const piece = await file.slice(offset, offset + PIECE_BYTES).arrayBuffer();
+    try {
+      offset = await patch(target, offset, piece, signal);
+    } catch (error) {
+      if (!(error instanceof Refusal) || ![0, 409, 423, 429, 460, 503].includes(error.status)) throw error;
+      await pause(1, signal);
+      offset = await persist(() => offsetOf(target), signal);
+    }
+  }
+  progress(file.size);
+}
+
+async function create(place, path, size, digest, signal) {
+  const metadata = [`path ${base64(new TextEncoder().encode(path))}`];
+  if (digest !== null) metadata.push(`sha256 ${base64(new TextEncoder().encode(hex(digest)))}`);
+  const token = crypto.getRandomValues(new Uint32Array(4)).join("-");
+  const made = await persist(() => send(place, { method: "POST", headers: {
+    ...TUS, "Upload-Length": String(size), "Upload-Metadata": metadata.join(","), "Idempotency-Key": token } }), signal);
+  await made.json(); // a body that is not read counts as a broken request
+  return new URL(made.headers.get("Location"), location.origin).pathname;
+}
+
+async function offsetOf(target) {
+  const answer = await send(target, { method: "HEAD", headers: TUS });
+  return Number(answer.headers.get("Upload-Offset"));
+}
+
+async function patch(target, offset, piece, signal) {
+  const digest = await sha256(piece);
+  const checksum = digest === null ? {} : { "Upload-Checksum": `sha256 ${base64(digest)}` };
+  const answer = await send(target, { method: "PATCH", body: piece, signal, headers: {
+    ...TUS, "Upload-Offset": String(offset), "Content-Type": "application/offset+octet-stream", ...checksum } });
+  return Number(answer.headers.get("Upload-Offset"));
+}
+
+/** Do something until the server can be reached. */
+async function persist(action, signal) {
+  for (let wait = 1; ; wait = Math.min(2 * wait, LONGEST_WAIT_S)) {
+    try {
+      return await action();
+    } catch (error) {
+      if (!(error instanceof Refusal) || ![0, 429, 503].includes(error.status)) throw error;
+    }
+    await pause(wait, signal);
+  }
+}
+
+function pause(seconds, signal) {
+  return new Promise((resolve, reject) => {
+    const stop = () => { clearTimeout(timer); reject(new Stopped()); };
+    const timer = setTimeout(() => { signal.removeEventListener("abort", stop); resolve(); }, seconds * 1000);
+    if (signal.aborted) stop();
+    signal.addEventListener("abort", stop, { once: true });
+  });
+}
+
+/** Return a digest; null where the browser has none, which is so on pages without TLS from another machine. */
+async function sha256(data) {
+  return crypto.subtle === undefined ? null : new Uint8Array(await crypto.subtle.digest("SHA-256", data));
+}
+
+function hex(digest) {
+  return Array.from(digest, (byte) => byte.toString(16).padStart(2, "0")).join("");
+}
+
+function base64(data) {
+  return btoa(Array.from(data, (byte) => String.fromCharCode(byte)).join(""));
+}

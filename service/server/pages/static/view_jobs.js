@@ -1,0 +1,52 @@
+/** Views, which jobs of the kind `view` prepare: of a capture, or of the maps that a job has made. */
+
+import { listing, post, read, resultsOf } from "./api.js";
+import { byId, show } from "./element.js";
+import { watch } from "./events.js";
+
+/**
+ * Return the newest view of a capture or of maps that is prepared or being prepared; null: there is none.
+ * @param {{capture?: string, maps?: string|null}} wanted `maps: null` asks for a view without maps, no `maps` for any.
+ */
+export async function findView(wanted) {
+  for await (const job of listing("/v1/jobs?limit=500&state=succeeded&state=queued&state=running", "jobs")) {
+    const { kind, capture, maps = null } = job.request;
+    if (kind === "view" && (wanted.capture ?? capture) === capture && (wanted.maps === undefined || wanted.maps === maps)) return job;
+  }
+  return null;
+}
+
+/**
+ * Return the files of a view, which is prepared first if it is not yet; the page shows how far that is.
+ * @param {string} capture Identifier.
+ * @param {string|null} maps Identifier of the job that made the maps; null: the capture alone.
+ * @returns {Promise<{job: any, files: ReturnType<typeof resultsOf>}>}
+ */
+export async function openView(capture, maps) {
+  const body = maps === null ? { kind: "view", capture } : { kind: "view", capture, maps };
+  let job = (await findView({ capture, maps })) ?? (await post("/v1/jobs", body));
+  if (job.state !== "succeeded") {
+    byId("state").textContent = "This is looked at for the first time: its view is being prepared.";
+    show(byId("progress"), true);
+    await watch(`/v1/jobs/${job.id}/events`, { job: (now) => { job = now; progress(now); } });
+    job = await read(`/v1/jobs/${job.id}`);
+    show(byId("progress"), false);
+    if (job.state !== "succeeded") {
+      throw new Error(`the view was not prepared: ${job.error ?? `its job ${job.id} is ${job.state}`}`);
+    }
+    byId("state").textContent = "";
+  }
+  return { job, files: resultsOf(job.id) };
+}
+
+function progress(job) {
+  const bar = byId("bar");
+  if (job.progress === null) {
+    bar.removeAttribute("value");
+    byId("stage").textContent = job.state;
+    return;
+  }
+  bar.max = Math.max(job.progress.total, 1);
+  bar.value = job.progress.done;
+  byId("stage").textContent = `${job.progress.stage} ${job.progress.done} of ${job.progress.total}`;
+}

@@ -1,0 +1,57 @@
+"""Forms have every option of the request models, with names, defaults and limits of the models."""
+
+import pytest
+
+from service.requests.base import Role
+from service.requests.jobs import ANY_JOB, RelightJob, SolveJob
+from service.requests.options import build, options_of
+from service.server.pages.forms import CAPTURE_JOBS, MAPS_JOBS, Form, form_of
+
+KINDS = CAPTURE_JOBS | MAPS_JOBS
+CAPTURE, JOB = "cap_0123456789abcdefghjk", "job_0123456789abcdefghjk"
+
+
+def fields(form: Form):
+    return {field.name: field for field in (*form.main, *form.more)}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_option_has_a_control(kind):
+    assert set(fields(form_of(kind, KINDS[kind]))) == {option.name for option in options_of(KINDS[kind])}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_read_stands_first(kind):
+    form = form_of(kind, KINDS[kind])
+    assert {field.name for field in form.main} == {option.name for option in options_of(KINDS[kind]) if option.role is Role.INPUT}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_places_lead_to_the_values_of_the_command_line(kind):
+    """A value put at its places is read as the same request that `relit submit` builds from the flag."""
+    model = KINDS[kind]
+    inputs = {"capture": CAPTURE} if kind in CAPTURE_JOBS else {"maps": JOB}
+    for field in fields(form_of(kind, model)).values():
+        value = {"boolean": field.default != "true", "integer": 1, "number": 1.0}.get(field.value_type)
+        if value is None and field.choices:
+            value = next(each for each, _ in field.choices if each != field.default)
+        if value is None:
+            continue
+        request = {"kind": kind, **inputs}
+        for path in field.paths:
+            target = request
+            *parents, last = path.split(".")
+            for name in parents:
+                target = target.setdefault(name, {})
+            target[last] = value
+        assert ANY_JOB.validate_python(request) == build(model, inputs | {field.name: value}), field.name
+
+
+def test_limits_and_defaults_are_those_of_the_model():
+    found = fields(form_of("relight", RelightJob))
+    assert (found["exposure"].low, found["exposure"].high, found["exposure"].default) == ("-32", "32", "0")
+    assert (found["priority"].low, found["priority"].high, found["priority"].default) == ("0", "100", "50")
+    assert found["compression"].default == "zip"
+    solve = fields(form_of("solve", SolveJob))
+    assert [value for value, _ in solve["method"].choices] == ["lambert", "robust", "gradient", "reference", "svbrdf"]
+    assert solve["capture"].required and solve["capture"].control == "capture"

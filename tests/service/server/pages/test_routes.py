@@ -1,0 +1,78 @@
+"""Pages are complete, load nothing from elsewhere, and hold nothing of a project."""
+
+import re
+from html.parser import HTMLParser
+
+import pytest
+
+CAPTURE, JOB = "cap_0123456789abcdefghjk", "job_0123456789abcdefghjk"
+PAGES = ["/", "/captures", f"/captures/{CAPTURE}", "/jobs", f"/jobs/{JOB}"]
+
+
+class Document(HTMLParser):
+    """What matters of a document here."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.loads: list[str] = []
+        self.identifiers: list[str] = []
+        self.labelled: set[str] = set()
+        self.controls: list[str] = []
+        self.inline: list[str] = []
+        self._script: dict[str, str | None] | None = None
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attributes) -> None:
+        found = dict(attributes)
+        self.loads += [found[name] for name in ("src", "href") if tag in ("script", "link", "img") and name in found]
+        self.inline += [name for name in found if name.startswith("on") or name == "style"]
+        if "id" in found:
+            self.identifiers.append(found["id"])
+        if tag == "label" and "for" in found:
+            self.labelled.add(found["for"])
+        if tag in ("select", "textarea") or (tag == "input" and "id" in found and found["id"].count("-")):
+            self.controls.append(found["id"])
+        self._script = found if tag == "script" else None
+
+    def handle_data(self, data: str) -> None:
+        if self._script is not None and self._script.get("type") != "importmap" and data.strip():
+            self.inline.append(data)
+
+
+@pytest.mark.parametrize("path", PAGES)
+def test_a_page_is_complete(server, path):
+    with server.client() as client:
+        answer = client.get(path)
+        assert answer.status_code == 200 and answer.headers["content-type"].startswith("text/html")
+        found = Document(answer.text)
+        assert found.inline == []
+        assert len(found.identifiers) == len(set(found.identifiers))
+        assert set(found.controls) - {"key-value"} <= found.labelled
+        for address in found.loads:
+            assert address.startswith("/static/")
+            assert client.get(address).status_code == 200, address
+
+
+@pytest.mark.parametrize("path", PAGES)
+def test_the_content_security_policy_allows_this_origin_alone(server, path):
+    with server.client() as client:
+        headers = client.get(path).headers
+    policy = dict(part.split(" ", 1) for part in headers["content-security-policy"].split("; "))
+    assert policy["default-src"] == "'none'" and policy["frame-ancestors"] == "'none'" and policy["base-uri"] == "'none'"
+    assert re.fullmatch(r"'self' 'sha256-[A-Za-z0-9+/=]{44}'", policy["script-src"])
+    assert policy["style-src"] == "'self'"
+    for sources in policy.values():
+        assert not re.search(r"https?:|\*|unsafe", sources)
+    assert headers["x-content-type-options"] == "nosniff"
+
+
+def test_an_identifier_that_cannot_be_is_no_page(server):
+    with server.client() as client:
+        assert client.get("/captures/<script>").status_code == 422
+        assert client.get("/nothing").status_code == 404
+
+
+def test_the_document_of_the_api_lists_no_pages(server):
+    with server.client() as client:
+        paths = set(client.get("/v1/openapi.json").json()["paths"])
+    assert paths - {"/healthz", "/readyz", "/metrics"} == {path for path in paths if path.startswith("/v1/")}
