@@ -23,12 +23,12 @@ def _create(wanted: NewKey, data: DataOption = None, config: ConfigOption = None
     import sys
 
     from service.server.database import keys
-    from service.server.database.engine import create as create_tables
     from service.server.database.engine import open_database
+    from service.server.database.schema import upgrade
 
     def prepare(settings: Any, database: Any) -> None:
         settings.data.mkdir(parents=True, exist_ok=True)
-        create_tables(database)
+        upgrade(database)
 
     print(keys.create(open_database(settings_of(config, data=data), prepare), wanted))
     print("keep it: it is not shown again", file=sys.stderr)
@@ -70,9 +70,9 @@ def revoke(
 def _open(settings: Any) -> Any:
     """Open the database of an existing service; a wrong --data makes no new one."""
     from service.errors import RequestError
-    from service.server.database.engine import create as create_tables
     from service.server.database.engine import open_database
+    from service.server.database.schema import require_current
 
     if settings.is_sqlite and not settings.sqlite_file.exists():
         raise RequestError(f"data {settings.data}: there is no service in this folder")
-    return open_database(settings, lambda _settings, database: create_tables(database))
+    return open_database(settings, lambda _settings, database: require_current(database))

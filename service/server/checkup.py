@@ -9,7 +9,8 @@ from typing import NamedTuple
 from sqlalchemy.exc import DBAPIError
 
 from service.server.database import jobs, keys, workers
-from service.server.database.engine import Database, DatabaseError, connect, require_version
+from service.server.database.engine import Database, DatabaseError, connect
+from service.server.database.schema import require_current
 from service.server.settings import Settings, unknown_variables
 from service.server.storage.open import open_storage
 from service.views.states import ACTIVE, ENDED
@@ -42,7 +43,7 @@ def look(settings: Settings) -> Iterator[Finding]:
         return
     try:
         database = connect(settings.sqlalchemy_url, connections=1)
-        require_version(database)
+        require_current(database)
         yield Finding("database", f"{settings.sqlite_file if settings.is_sqlite else 'PostgreSQL'} answers")
         yield from _database(settings, database)
     except DatabaseError as error:

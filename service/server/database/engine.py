@@ -9,14 +9,11 @@ from sqlalchemy.exc import DBAPIError, InterfaceError, InternalError, Operationa
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 
 from service.errors import RequestError
-from service.server.database import tables
 from service.server.settings import Settings
 
 T = TypeVar("T")
 BUSY_MS = 30_000
 """Milliseconds for which a write on SQLite waits for that of another process."""
-CREATE_LOCK = 0x72656C6974
-"""Number of the advisory lock of PostgreSQL under which the tables are made."""
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 2.0
 UNANSWERED = (OperationalError, InterfaceError, InternalError, PoolTimeoutError)
 """Exceptions of a database that may answer later: it restarts, its disk is full, or it is locked for long."""
@@ -132,43 +129,6 @@ def open_database(settings: Settings, prepare: Callable[[Settings, Database], No
         what = f"data {settings.data}: the database in it" if settings.is_sqlite else "database_url: the database"
         raise RequestError(f"{what} cannot be used ({' '.join(str(error.orig).split())})") from None
     return database
-
-
-def create(database: Database) -> None:
-    """Make the tables if there are none.
-
-    Raises:
-        DatabaseError: the tables are those of another version of the program.
-    """
-    with database.engine.begin() as connection:
-        if database.is_sqlite:
-            connection.execute(sa.text("BEGIN IMMEDIATE"))
-        else:
-            connection.execute(sa.text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": CREATE_LOCK})
-        tables.metadata.create_all(connection)
-        version = connection.execute(sa.select(tables.about.c.version)).scalar()
-        if version is None:
-            connection.execute(tables.about.insert().values(version=tables.SCHEMA_VERSION))
-        else:
-            _require(version)
-
-
-def require_version(database: Database) -> None:
-    """Check that the tables exist; nothing is created.
-
-    Raises:
-        DatabaseError: there are no tables, or they are those of another version of the program.
-    """
-    with database.engine.connect() as connection:
-        if not sa.inspect(connection).has_table(tables.about.name):
-            raise DatabaseError("the database has no tables of relit: relit serve makes them")
-        _require(connection.execute(sa.select(tables.about.c.version)).scalar())
-
-
-def _require(version: int | None) -> None:
-    if version != tables.SCHEMA_VERSION:
-        raise DatabaseError(f"the database is of schema {version}, this program of {tables.SCHEMA_VERSION}: "
-                            "use the program that made it, or another data folder or database")
 
 
 def _sqlite(connection: Any, _record: Any) -> None:

@@ -1,11 +1,11 @@
-"""The tables of the service. They are in the same database as those of DBOS, so that one transaction can write both."""
+"""The tables of the service. They are in the same database as those of DBOS, so that one transaction can write both.
+
+A change of a table needs a revision in `migrations/versions`, which changes the databases that exist (service.server.database.schema).
+"""
 
 from typing import Any
 
 import sqlalchemy as sa
-
-SCHEMA_VERSION = 1
-"""Increased with every change of a table; the program refuses a database of another version."""
 
 metadata = sa.MetaData()
 Bytewise = sa.Text().with_variant(sa.Text(collation="C"), "postgresql")
@@ -19,8 +19,6 @@ def _id() -> "sa.Column[str]":
 def _project() -> "sa.Column[str]":
     return sa.Column("project", sa.String(64), nullable=False)
 
-
-about = sa.Table("relit_about", metadata, sa.Column("version", sa.Integer, primary_key=True))
 
 keys = sa.Table(
     "relit_keys", metadata, _id(), _project(),

@@ -11,8 +11,9 @@ from dbos._schemas.system_database import SystemSchema
 
 from service.requests.jobs import CheckJob, JobRequest
 from service.server.database import jobs
-from service.server.database.engine import Database, create
+from service.server.database.engine import Database
 from service.server.database.jobs import Claim
+from service.server.database.schema import upgrade
 from service.server.settings import Settings
 
 WORK, CHECKS = "work", "checks"
@@ -34,7 +35,7 @@ def prepare(settings: Settings, database: Database) -> None:
         DatabaseError: the tables are those of another version.
     """
     settings.data.mkdir(parents=True, exist_ok=True)
-    create(database)
+    upgrade(database)
     DBOS.migrate(settings.sqlalchemy_url)
 
 

@@ -8,7 +8,7 @@ from service.requests.jobs import CheckJob
 from service.requests.keys import NewKey, Scope
 from service.server.database import keys, workers
 from service.server.database.engine import connect
-from service.server.database.tables import about
+from service.server.database.schema import REVISIONS
 from service.server.jobs.queue import JobQueue, prepare
 from service.server.settings import Settings
 
@@ -101,8 +101,8 @@ def test_jobs_that_wait_for_nobody(relit, data, database):
 
 
 def test_a_database_of_another_version(relit, data, database):
-    database.transact(lambda connection: connection.execute(about.update().values(version=99)))
-    assert wrong(relit, "--data", data)[0].startswith("database: the database is of schema 99, this program of ")
+    database.transact(lambda connection: connection.exec_driver_sql(f"UPDATE {REVISIONS} SET version_num = '99'"))
+    assert wrong(relit, "--data", data)[0].startswith("database: the database has the tables of a newer relit (revision 99)")
 
 
 def test_a_database_of_something_else(relit, data):

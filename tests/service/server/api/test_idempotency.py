@@ -10,7 +10,8 @@ import pytest
 from service.requests.identifiers import new_id
 from service.requests.keys import NewKey, Scope
 from service.server.database import idempotency, intakes, keys
-from service.server.database.engine import Database, connect, create
+from service.server.database.engine import Database, connect
+from service.server.database.schema import upgrade
 from service.server.settings import Settings
 from tests.service.postgres import binaries, postgres
 from tests.service.server.api.conftest import SAMPLES
@@ -145,7 +146,7 @@ def test_a_token_that_cannot_be_is_refused(client, token):
 def database(request, tmp_path) -> Iterator[Database]:
     if request.param == "sqlite":
         made = connect(f"sqlite:///{tmp_path / 'test.sqlite'}", connections=AT_ONCE)
-        create(made)
+        upgrade(made)
         yield made
         made.close()
         return
@@ -153,7 +154,7 @@ def database(request, tmp_path) -> Iterator[Database]:
         pytest.skip("no PostgreSQL server programs: neither on the PATH nor in /usr/lib/postgresql")
     with postgres(programs) as server:
         made = connect(Settings(data=tmp_path, database_url=server.new_database()).sqlalchemy_url, connections=AT_ONCE)
-        create(made)
+        upgrade(made)
         yield made
         made.close()
 

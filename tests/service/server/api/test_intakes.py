@@ -5,8 +5,9 @@ import pytest
 from service.requests.identifiers import CAPTURE, new_id
 from service.requests.jobs import CheckJob
 from service.server.database import intakes, jobs
-from service.server.database.engine import connect, create
+from service.server.database.engine import connect
 from service.server.database.jobs import Claim
+from service.server.database.schema import upgrade
 from tests.service.server.api.captures import write_capture
 from tests.service.server.api.conftest import SAMPLES
 
@@ -98,7 +99,7 @@ def test_a_check_begins_again_by_another_validation_alone(server, client):
 def test_a_check_that_ends_unseen_leaves_nothing_waiting(tmp_path, end):
     """Cancelled, or the death of worker after worker: what it was to look at is refused, and does not check for ever."""
     database, capture = connect(f"sqlite:///{tmp_path / 'test.sqlite'}"), new_id(CAPTURE)
-    create(database)
+    upgrade(database)
 
     def begin(connection) -> str:
         intakes.insert(connection, identifier=capture, project="p", kind=CAPTURE, name="test", folder="/somewhere")

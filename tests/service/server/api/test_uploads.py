@@ -17,8 +17,9 @@ import pytest
 from service.requests.identifiers import CAPTURE, new_id
 from service.requests.keys import NewKey, Scope
 from service.server.database import keys, uploads
-from service.server.database.engine import connect, create
+from service.server.database.engine import connect
 from service.server.database.intakes import insert as insert_intake
+from service.server.database.schema import upgrade
 from service.server.storage.part_files import PartFile, PartFileLocked
 from tests.service.postgres import binaries, postgres
 from tests.service.server.api.conftest import SAMPLES
@@ -460,7 +461,7 @@ def test_a_server_without_space_takes_nothing(tmp_path):
 
 def test_what_nobody_adds_to_expires(tmp_path):
     database, folder = connect(f"sqlite:///{tmp_path / 'test.sqlite'}"), tmp_path / "uploads"
-    create(database)
+    upgrade(database)
     ids = {name: f"up_{name:0>20}" for name in ("old", "busy", "new", "done")}
 
     def fill(connection) -> None:

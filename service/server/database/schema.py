@@ -1,0 +1,83 @@
+"""The schema of the database: made anew, or upgraded by Alembic when a newer program opens the database.
+
+A new database gets the tables of `tables` as they are. Each change of them since the first release is a revision in `migrations/versions`,
+which `upgrade` applies to a database that lacks it, in one transaction. To write one: change `tables`, add a file with the next number
+there, and run tests/service/server/database, which compare an upgraded database with a new one.
+"""
+
+from pathlib import Path
+
+import sqlalchemy as sa
+from alembic import command
+from alembic.config import Config
+from alembic.migration import MigrationContext
+from alembic.script import ScriptDirectory
+
+from service.server.database import tables
+from service.server.database.engine import Database, DatabaseError
+
+REVISIONS = "relit_schema"
+"""Table in which Alembic keeps the revision of the database."""
+ABOUT = sa.Table("relit_about", sa.MetaData(), sa.Column("version", sa.Integer, primary_key=True))
+"""How programs without migrations knew the schema: they made databases with the number 1, and refuse every other number."""
+BEFORE_MIGRATIONS, SINCE_MIGRATIONS = 1, 2
+UPGRADE_LOCK = 0x72656C6974
+"""Number of the advisory lock of PostgreSQL under which the tables are made and changed."""
+
+
+def upgrade(database: Database) -> None:
+    """Make the tables if there are none, or change those of an older program.
+
+    Raises:
+        DatabaseError: the tables are those of a newer program.
+    """
+    with database.engine.begin() as connection:
+        if database.is_sqlite:
+            connection.execute(sa.text("BEGIN IMMEDIATE"))
+        else:
+            connection.execute(sa.text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": UPGRADE_LOCK})
+        found, config = _revision(connection), _alembic(connection)
+        if found is None and not sa.inspect(connection).has_table(ABOUT.name):
+            tables.metadata.create_all(connection)
+            ABOUT.create(connection)
+            connection.execute(ABOUT.insert().values(version=SINCE_MIGRATIONS))
+            command.stamp(config, "head")
+        elif found != _newest():
+            _require_known(found)
+            command.upgrade(config, "head")
+
+
+def require_current(database: Database) -> None:
+    """Check that the tables are those of this program; nothing is changed.
+
+    Raises:
+        DatabaseError: there are no tables, or they are those of an older or newer program.
+    """
+    with database.engine.connect() as connection:
+        if not sa.inspect(connection).has_table(ABOUT.name):
+            raise DatabaseError("the database has no tables of relit: relit serve makes them")
+        found = _revision(connection)
+    if found != _newest():
+        _require_known(found)
+        raise DatabaseError("the database has the tables of an older relit: relit serve of this version upgrades them")
+
+
+def _revision(connection: sa.Connection) -> str | None:
+    """Return the revision of the tables; None: there are none, or they are older than the first revision."""
+    return MigrationContext.configure(connection, opts={"version_table": REVISIONS}).get_current_revision()
+
+
+def _newest() -> str | None:
+    return ScriptDirectory.from_config(_alembic()).get_current_head()
+
+
+def _require_known(found: str | None) -> None:
+    if found is not None and found not in {script.revision for script in ScriptDirectory.from_config(_alembic()).walk_revisions()}:
+        raise DatabaseError(f"the database has the tables of a newer relit (revision {found}): "
+                            "use that program, or another data folder or database")
+
+
+def _alembic(connection: sa.Connection | None = None) -> Config:
+    config = Config(attributes={"connection": connection})
+    config.set_main_option("script_location", str(Path(__file__).parent / "migrations").replace("%", "%%"))
+    return config

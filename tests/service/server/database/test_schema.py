@@ -1,0 +1,118 @@
+"""Databases of older programs, upgraded when they are opened; and databases that are refused."""
+
+from pathlib import Path
+
+import pytest
+import sqlalchemy as sa
+from alembic.autogenerate import compare_metadata
+from alembic.migration import MigrationContext
+
+from service.server.database import intakes, jobs, keys, tables, uploads
+from service.server.database.engine import Database, DatabaseError, connect
+from service.server.database.schema import REVISIONS, require_current, upgrade
+from service.server.jobs.queue import prepare
+from service.server.settings import Settings
+
+FIRST = Path(__file__).parent / "first_schema.sql"
+CAPTURE, RECEIVING, UPLOAD = "cap_0123456789abcdefghjk", "cap_1123456789abcdefghjk", "upl_0123456789abcdefghjk"
+DONE, WAITING, KEY = "job_0123456789abcdefghjk", "job_1123456789abcdefghjk", "key_0123456789abcdefghjk"
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def settings(request, tmp_path) -> Settings:
+    url = None if request.param == "sqlite" else request.getfixturevalue("server_postgres").new_database()
+    made = Settings(data=tmp_path / "data", database_url=url)
+    made.data.mkdir()
+    return made
+
+
+@pytest.fixture
+def database(settings):
+    made = connect(settings.sqlalchemy_url)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def yesterday(database) -> Database:
+    """The database of the first release, with something in every table."""
+    text = "\n".join(line for line in FIRST.read_text().splitlines() if not line.startswith("--"))
+    text = text.replace("<BYTEWISE>", "" if database.is_sqlite else 'COLLATE "C"')
+    with database.engine.begin() as connection:
+        for statement in text.split(";\n"):
+            if statement.strip():
+                connection.exec_driver_sql(statement)
+    return database
+
+
+def differences(database: Database) -> list:
+    """Between the tables of the database and those that the program declares."""
+    with database.engine.connect() as connection:
+        ours = tables.metadata.tables
+        options = {"include_name": lambda name, kind, _: kind != "table" or name in ours}  # the others are those of DBOS and Alembic
+        return compare_metadata(MigrationContext.configure(connection, opts=options), tables.metadata)
+
+
+def test_yesterdays_database_is_upgraded_and_keeps_all_it_has(settings, yesterday):
+    prepare(settings, yesterday)
+    require_current(yesterday)
+    assert differences(yesterday) == []
+    caller = keys.find(yesterday, f"{KEY}.yesterday")
+    assert caller is not None and (caller.project, caller.scope.value, caller.key) == ("larch", "write", KEY)
+    assert intakes.find(yesterday, CAPTURE, "larch")["facts"] == {"captures": 1}
+    assert uploads.find(yesterday, UPLOAD, "larch")["received"] == 40
+    assert [row["path"] for row in uploads.listing(yesterday, RECEIVING, limit=9)] == ["Capture.json"]
+    assert [row["id"] for row in jobs.latest(yesterday, "larch", limit=9)] == [WAITING, DONE]
+    waiting = jobs.find(yesterday, WAITING, "larch")
+    assert (waiting["state"], waiting["attempt"], waiting["lost"], waiting["priority"]) == ("queued", 2, 2, 60)
+    assert yesterday.transact(lambda connection: jobs.users_of(connection, CAPTURE, active=True)) == [WAITING]
+    assert yesterday.row(sa.select(tables.idempotency.c.made))["made"] == DONE
+    assert yesterday.transact(lambda connection: jobs.cancel(connection, WAITING))  # it can be changed, too
+
+
+def test_a_new_database_equals_an_upgraded_one(settings, database):
+    prepare(settings, database)
+    prepare(settings, database)  # a second process finds nothing to do
+    require_current(database)
+    assert differences(database) == []
+
+
+def test_an_upgrade_that_fails_changes_nothing(yesterday, monkeypatch):
+    monkeypatch.setattr("alembic.command.upgrade", fail)
+    with pytest.raises(ZeroDivisionError):
+        upgrade(yesterday)
+    with yesterday.engine.connect() as connection:
+        assert connection.exec_driver_sql("SELECT version FROM relit_about").scalar() == 1
+        assert not sa.inspect(connection).has_table(REVISIONS)
+
+
+def fail(config, _revision):
+    config.attributes["connection"].exec_driver_sql("UPDATE relit_about SET version = 7")
+    raise ZeroDivisionError
+
+
+def test_who_only_reads_upgrades_nothing(yesterday):
+    with pytest.raises(DatabaseError, match="tables of an older relit: relit serve of this version upgrades them"):
+        require_current(yesterday)
+
+
+def test_programs_without_migrations_are_kept_away(yesterday):
+    """They refuse every number but 1."""
+    upgrade(yesterday)
+    with yesterday.engine.connect() as connection:
+        assert connection.exec_driver_sql("SELECT version FROM relit_about").scalar() == 2
+
+
+@pytest.mark.parametrize("opened", [upgrade, require_current])
+def test_the_database_of_a_newer_program_is_refused(database, opened):
+    upgrade(database)
+    with database.engine.begin() as connection:
+        connection.exec_driver_sql(f"UPDATE {REVISIONS} SET version_num = '9999'")
+    with pytest.raises(DatabaseError, match=r"tables of a newer relit \(revision 9999\): use that program"):
+        opened(database)
+
+
+def test_a_database_without_tables_is_not_filled_by_who_only_reads(database):
+    with pytest.raises(DatabaseError, match="has no tables of relit: relit serve makes them"):
+        require_current(database)
+    assert sa.inspect(database.engine).get_table_names() == []
