@@ -8,6 +8,7 @@ from typing import Annotated, Any, NamedTuple
 import sqlalchemy as sa
 from fastapi import Depends, Header, Request, Security
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+from fastapi.security.utils import get_authorization_scheme_param
 
 from service.requests.keys import Scope
 from service.server.api.access import RateLimiter, require_local
@@ -51,23 +52,33 @@ ServiceDep = Annotated[Service, Depends(service_of)]
 bearer = HTTPBearer(auto_error=False, scheme_name="key", description="A key of `relit keys create`.")
 
 
-def caller_of(service: ServiceDep, request: Request, given: Annotated[HTTPAuthorizationCredentials | None, Security(bearer)]) -> Caller:
-    """Return who sent the request.
+def authenticate(request: Request) -> Caller:
+    """Return who sent the request; a second call of the same request returns the same.
 
     Raises:
         ApiError: there is no valid key and none may be left out, or the key asks too often.
     """
+    known: Caller | None = getattr(request.state, "caller", None)
+    if known is not None:
+        return known
+    service: Service = request.app.state.service
+    scheme, given = get_authorization_scheme_param(request.headers.get("Authorization"))
     caller = None
-    if given is not None:
-        caller = keys.find(service.database, given.credentials)
+    if scheme.lower() == "bearer" and given:
+        caller = keys.find(service.database, given)
     elif service.settings.anonymous:
         require_local(request)
         caller = ANONYMOUS
     if caller is None:
         raise ApiError("unauthenticated", "give a key that is valid as Authorization: Bearer KEY", headers={"WWW-Authenticate": "Bearer"})
-    request.state.caller = caller  # for the log
+    request.state.caller = caller  # for the log, too
     service.limiter.take(caller.key)
     return caller
+
+
+def caller_of(request: Request, _given: Annotated[HTTPAuthorizationCredentials | None, Security(bearer)]) -> Caller:
+    """Return who sent the request, as `authenticate` does; the scheme is for the OpenAPI document."""
+    return authenticate(request)
 
 
 def _scoped(scope: Scope) -> Callable[[Caller], Awaitable[Caller]]:

@@ -12,6 +12,7 @@ from service.requests.identifiers import CAPTURE, ENVIRONMENT, CaptureId, Enviro
 from service.requests.jobs import CheckJob
 from service.requests.keys import Scope
 from service.server.api.context import FOR_WORK, IdempotencyKey, Reader, Service, ServiceDep, Writer, create_once, require_space
+from service.server.api.json_body import JsonRoute
 from service.server.api.problems import ApiError, responses
 from service.server.api.submission import submit
 from service.server.api.views import intake_view
@@ -24,8 +25,9 @@ from service.views import states
 from service.views.intakes import IntakePage, IntakeView
 from stage.files import resolved
 
-captures = APIRouter(prefix="/v1/captures", tags=["captures"], responses=responses(401, 403, 422, 429, 503))
-environments = APIRouter(prefix="/v1/environments", tags=["environments"], responses=responses(401, 403, 422, 429, 503))
+captures = APIRouter(prefix="/v1/captures", tags=["captures"], responses=responses(401, 403, 422, 429, 503), route_class=JsonRoute)
+environments = APIRouter(prefix="/v1/environments", tags=["environments"], responses=responses(401, 403, 422, 429, 503),
+                         route_class=JsonRoute)
 
 Limit = Annotated[int, Query(ge=1, le=500)]
 Name = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]+$")]

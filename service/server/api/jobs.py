@@ -23,6 +23,7 @@ from service.server.api.context import (
     created_before,
     require_space,
 )
+from service.server.api.json_body import JsonRoute
 from service.server.api.problems import ApiError, responses
 from service.server.api.submission import inputs_of, require_queue, spelled_out, submit
 from service.server.api.views import job_view
@@ -32,7 +33,7 @@ from service.server.storage import layout
 from service.views import states
 from service.views.jobs import JobPage, JobView
 
-router = APIRouter(prefix="/v1/jobs", tags=["jobs"], responses=responses(401, 403, 422, 429, 503))
+router = APIRouter(prefix="/v1/jobs", tags=["jobs"], responses=responses(401, 403, 422, 429, 503), route_class=JsonRoute)
 
 CAPTURE, SKY, SOLVED = "cap_0123456789abcdefghjk", "env_0123456789abcdefghjk", "job_0123456789abcdefghjk"
 EXAMPLES: dict[str, Example] = {
