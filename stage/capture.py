@@ -129,8 +129,9 @@ class Capture:
             field, name = item
             try:
                 path = self.file(name)
-                if not path.exists():
-                    return ManifestError(f"{self.folder / FILE_NAME}: {field}: {name} is not in the folder")
+                with storage("read", path):
+                    if not path.exists():
+                        return ManifestError(f"{self.folder / FILE_NAME}: {field}: {name} is not in the folder")
                 if field in arrays and path.suffix.lower() == ".npy":
                     return None  # time-of-flight arrays: checked by their own reader
                 if field.endswith(".light.image"):

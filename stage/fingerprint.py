@@ -28,7 +28,7 @@ class Fingerprints:
         try:
             remembered = json.loads(memory.read_text(encoding="utf-8"))
             self._known = {name: [*entry] for name, entry in remembered.items() if len(entry) == 3}
-        except (OSError, ValueError, AttributeError, TypeError):
+        except (OSError, ValueError, AttributeError, TypeError, RecursionError):
             pass  # damaged hashes are computed again
 
     def of(self, names: Iterable[str]) -> dict[str, str]:

@@ -5,6 +5,8 @@ from typing import Annotated
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+from stage.text import name_fault
+
 
 class Strict(BaseModel):
     """A frozen model in which an unknown key and a number that is not finite are errors."""
@@ -28,6 +30,12 @@ def _lit(colour: tuple[float, float, float]) -> tuple[float, float, float]:
     return colour
 
 
+def _in_line(text: str) -> str:
+    if (fault := name_fault(text)) is not None:
+        raise ValueError(fault)
+    return text
+
+
 def _not_blank(text: str) -> str:
     if not text.strip():
         raise ValueError("is blank")
@@ -36,7 +44,9 @@ def _not_blank(text: str) -> str:
 
 FirstFault = Field(fail_fast=True)
 """Marks a list that may be long: only its first fault is reported, because the faults of a million entries fill the memory."""
-Text = Annotated[str, AfterValidator(_not_blank)]
+Line = Annotated[str, AfterValidator(_in_line)]
+"""A text that `name_fault` finds no fault with. Every text that is read from a file or a request is one."""
+Text = Annotated[Line, AfterValidator(_not_blank)]
 """A text that is not blank."""
 Vector = tuple[float, float, float]
 """The x, y and z of a point or a direction."""

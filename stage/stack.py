@@ -169,7 +169,7 @@ def find(folder: Path, key: str) -> Stack | None:
         index = json.loads(index_path(folder, key).read_text(encoding="utf-8"))
         found = Stack(folder, key, tuple(index["frames"]), np.array(index["scale"], dtype=np.float32), int(index["pixel_count"]),
                       index.get("motion"))
-    except (OSError, ValueError, KeyError, TypeError):  # a damaged cache is built again
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):  # a damaged cache is built again
         return None
     if not values_path(folder, key).exists():
         return None

@@ -148,6 +148,6 @@ def _earlier(path: Path) -> dict[str, Any]:
     """Return the sections of an existing report; nothing of a file that is something else."""
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return {}
     return data if isinstance(data, dict) and data.get("schema") == SCHEMA else {}

@@ -1,5 +1,6 @@
 """The `relit` program: its commands, and one place that turns errors into a sentence and an exit code."""
 
+import io
 import os
 import signal
 import sys
@@ -29,6 +30,8 @@ def _root(version: Annotated[bool, typer.Option("--version", help="Print the ver
 
 def main() -> None:
     """Run the program; exit 2 with one sentence on bad input, 130 when interrupted."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # paths may hold bytes that are not text
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # whoever ends us gets the same tidy end as one who types Ctrl-C
     try:
         code = app(standalone_mode=False)  # so that wrong options, too, are one sentence
@@ -45,9 +48,12 @@ def main() -> None:
     except Exception as error:
         from service.errors import USER_ERRORS, sentence
 
-        if not isinstance(error, USER_ERRORS):
+        if isinstance(error, OSError) and error.filename is not None and error.strerror:  # of a path that was given: too long, no folder …
+            print(f"relit: {ascii(str(error.filename))[1:-1]}: {error.strerror.lower()}", file=sys.stderr)
+        elif isinstance(error, USER_ERRORS):
+            print(f"relit: {sentence(error)}", file=sys.stderr)
+        else:
             raise
-        print(f"relit: {sentence(error)}", file=sys.stderr)
         sys.exit(BAD_INPUT)
 
 

@@ -119,6 +119,6 @@ def refusal(answer: httpx2.Response) -> ClientError:
 def _problem(body: bytes) -> dict[str, Any] | None:
     try:
         found = json.loads(body)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     return found if isinstance(found, dict) else None

@@ -13,6 +13,8 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, GetJsonSchemaHandle
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
+from stage.model import Line
+
 
 def _split_commas(given: Any) -> Any:
     """Return the parts of a text with commas between them, and a list as a tuple, which strict validation of JSON asks for."""
@@ -108,7 +110,7 @@ class Options(BaseModel):
 class DeviceRequest(Options):
     """Base of the requests whose work is done on a device."""
 
-    device: Annotated[str | None, Role.MACHINE] = None
+    device: Annotated[Line | None, Role.MACHINE] = None
     """cpu, cuda:0, …; None: the first CUDA device, else the CPU."""
 
 
@@ -124,7 +126,7 @@ class StackOptions(Options):
 
     align: bool = False
     """The subject moves: warp every frame to the time of the middle tracking frame (light type full). The mask belongs to that time."""
-    align_to: Annotated[str | None, Spelling(metavar="IMAGE")] = None
+    align_to: Annotated[Line | None, Spelling(metavar="IMAGE")] = None
     """As `align`, but to the time of this tracking frame."""
 
     @property

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from service.requests.base import Choice, Options, Role, Spelling
+from stage.model import Line
 
 AssetFormat = Literal["usdz", "usda", "usdc", "glb"]
 
@@ -35,9 +36,9 @@ class TextureFormat(Choice):
 class ExportOptions(Options):
     """What an asset is called and made of."""
 
-    name: str | None = None
+    name: Line | None = None
     """Name of the asset; None: the name that the maps have, else the stem of the file's name."""
-    version: Annotated[str, Field(min_length=1)] = FIRST_VERSION
+    version: Annotated[Line, Field(min_length=1)] = FIRST_VERSION
     """Version of the asset, written into its assetInfo: what a pipeline counts, as in 3 or v003."""
     geometry: Geometry | None = None
     """What an asset of a depth (depth.exr in place of maps.exr) is made of; None: mesh."""

@@ -12,6 +12,7 @@ from service.requests.light_keys import LightKeys
 from service.requests.relight import RelightOptions
 from service.requests.shade import ShadeOptions
 from service.requests.solve import SolveOptions
+from stage.model import Line
 
 DEFAULT_PORT = 8470
 DEFAULT_SERVER = f"http://127.0.0.1:{DEFAULT_PORT}"
@@ -34,7 +35,7 @@ class CheckJob(JobRequest):
     """Whether a capture or environment can be used: manifest, headers and the size of images. Made by the service itself."""
 
     kind: Literal["check"]
-    intake: str
+    intake: Line
 
 
 class SolveJob(JobRequest):
@@ -54,7 +55,7 @@ class DepthJob(JobRequest):
     kind: Literal["depth"]
     capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
     """The capture."""
-    tof_calibration: Annotated[str | None, Role.INPUT, Spelling(metavar="NAME")] = None
+    tof_calibration: Annotated[Line | None, Role.INPUT, Spelling(metavar="NAME")] = None
     """Name of a relit.tof/1 file in the capture's folder."""
     options: DepthOptions = DepthOptions()
 

@@ -5,7 +5,7 @@ from typing import Annotated
 
 from service.requests.base import CAPTURE, Choice, Request, Role, Spelling, StackOptions
 from service.requests.picture import FrameRate, PictureOptions
-from stage.model import Finite
+from stage.model import Finite, Line
 
 CHUNK_FRAMES = 32
 """Most frames that are computed in one pass over the images: with more the product takes no less time for each frame, and writing begins
@@ -23,7 +23,7 @@ class LightWeights(Choice):
 class RelightOptions(PictureOptions, StackOptions):
     """Which frames, and how light is shared out over the captured lights."""
 
-    frames: str | None = None
+    frames: Line | None = None
     """A number, or first-last; None: 1, or for a sequence 1 to the number of its time steps."""
     weights: LightWeights | None = None
     """How light from a direction between the captured lights is shared out over them; None: smooth where solved maps guide the frames,
@@ -47,7 +47,7 @@ class RelightRequest(RelightOptions, Request):
     """Lat-long environment map, .exr or .hdr; with #### in its name, a map for each frame."""
     keys: Annotated[Path | None, Role.INPUT, Spelling(metavar="FILE")] = None
     """Light keys (JSON, schema relit.keys/1): animated lights, environment, captured images and exposure; docs/relight.md."""
-    only: Annotated[str | None, Role.PART, Spelling(metavar="FRAMES")] = None
+    only: Annotated[Line | None, Role.PART, Spelling(metavar="FRAMES")] = None
     """Make only this part of `frames`, such as 9-16: a farm gives each machine such a part; None: all."""
     maps: Annotated[Path | None, Role.INPUT, Spelling(metavar="DIR")] = None
     """Folder of the solved maps, which guide the frames: light from between the captured lights is taken from a model of the maps, as far

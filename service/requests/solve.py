@@ -6,7 +6,7 @@ from typing import Annotated
 from pydantic import Field
 
 from service.requests.base import CAPTURE, Choice, Request, Role, Spelling, StackOptions
-from stage.model import Fraction, Positive
+from stage.model import Fraction, Line, Positive
 
 SVBRDF_LIGHTS = 12
 """From this many lights on svbrdf is the default: it fits six lobes and a direction to each pixel, and was better than robust on
@@ -48,7 +48,7 @@ class SolveRequest(SolveOptions, Request):
     """Folder with a capture.json."""
     out: Annotated[Path, Role.OUTPUT]
     """Folder for maps.exr and report.json."""
-    device: Annotated[str | None, Role.MACHINE] = None
+    device: Annotated[Line | None, Role.MACHINE] = None
     """cpu, cuda:0, …, several of one kind with commas between, which share the work, or all for every CUDA device; None: the first CUDA
     device, else the CPU."""
     reference_ball: Annotated[Path | None, Role.INPUT, Spelling(metavar="CAPTURE")] = None

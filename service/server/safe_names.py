@@ -6,6 +6,7 @@ Results and captures are opened from Windows, macOS and Linux, so a name is refu
 import unicodedata
 
 from service.errors import RequestError
+from stage.text import name_fault
 
 MAX_PART_BYTES = 255
 """Bytes of the name of a file or folder at most, as in common file systems."""
@@ -16,9 +17,7 @@ MAX_DEPTH = 8
 FORBIDDEN = '<>:"\\|?*'
 """Characters that Windows forbids, or that lead elsewhere there."""
 HIDDEN_CATEGORIES = {
-    "Cc": "a control character",
     "Cf": "a character that is not seen and changes how the others are",
-    "Cs": "half a character",
     "Cn": "a character that is not assigned",
     "Zl": "a line separator",
     "Zp": "a paragraph separator",
@@ -47,7 +46,7 @@ def check_path(path: str) -> None:
 
 def shown(path: str) -> str:
     """Return a name for a sentence: in quotes, with unprintable characters as escapes, and shortened."""
-    plain = (character if character.isprintable() and not _hidden(character) else ascii(character)[1:-1] for character in path[:SHOWN])
+    plain = (character if character.isprintable() else ascii(character)[1:-1] for character in path[:SHOWN])
     text = "".join(plain)
     return f'"{text}"' if len(path) <= SHOWN else f'"{text}…"'
 
@@ -66,8 +65,10 @@ def folders_of(path: str) -> list[str]:
 def _fault(path: str) -> str | None:
     if not path:
         return "is empty: a file has a name"
+    if fault := name_fault(path):
+        return fault
     for character in path:
-        if what := _hidden(character):
+        if what := HIDDEN_CATEGORIES.get(unicodedata.category(character)):
             return f"has {what} (U+{ord(character):04X}): leave it out"
     if path.startswith("/"):
         return "is absolute: give it relative to the capture"
@@ -100,7 +101,3 @@ def _part_fault(part: str) -> str | None:
     if part.partition(".")[0].rstrip().casefold() in DEVICES:
         return "has the name of a device of Windows"
     return None
-
-
-def _hidden(character: str) -> str | None:
-    return HIDDEN_CATEGORIES.get(unicodedata.category(character))

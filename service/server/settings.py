@@ -249,6 +249,8 @@ def _of_file(file: Path) -> dict[str, Any]:
         found = tomllib.loads(file.read_text(encoding="utf-8"))
     except OSError as error:
         raise RequestError(f"settings {file}: cannot be read ({error.strerror})") from None
+    except RecursionError:
+        raise RequestError(f"settings {file}: is nested too deeply") from None
     except ValueError as error:  # no TOML, or no UTF-8
         raise RequestError(f"settings {file}: is no TOML ({error})") from None
     for name in found:

@@ -56,6 +56,8 @@ def read_matrices(path: Path) -> dict[str, np.ndarray]:
 def _from_json(path: Path, text: str) -> dict[str, np.ndarray]:
     try:
         data = json.loads(text)
+    except RecursionError as error:
+        raise ManifestError(f"{path}: is nested too deeply") from error
     except ValueError as error:
         raise ManifestError(f"{path}: is not JSON") from error
     if not isinstance(data, dict):

@@ -13,6 +13,7 @@ import numpy as np
 from stage.errors import ManifestError, storage
 from stage.importers.layout import image_resolution, write_capture
 from stage.manifest import SCHEMA
+from stage.text import name_fault
 
 
 def import_folder(source: Path, destination: Path) -> Path:
@@ -75,9 +76,12 @@ def _frame(path: Path, folder: Path, number: int, row: str) -> dict[str, Any]:
         raise ManifestError(f"{path}: line {number}: {row[:60]!r} is not an image name and three numbers")
     if not any(direction):
         raise ManifestError(f"{path}: line {number}: the light direction has zero length")
+    if (fault := name_fault(parts[0])) is not None:
+        raise ManifestError(f"{path}: line {number}: the image name {fault}")
     # names often hold folders of the machine that made the file, while the images lie beside the file
     name = parts[0].replace("\\", "/")
-    relative = name if not name.startswith("/") and ":" not in name and (folder / name).is_file() else name.rsplit("/", 1)[-1]
+    with storage("read", folder / name):  # a name that is too long is an error of the file system
+        relative = name if not name.startswith("/") and ":" not in name and (folder / name).is_file() else name.rsplit("/", 1)[-1]
     return {"image": relative, "light": {"type": "distant", "direction": direction, "irradiance": [1.0, 1.0, 1.0]}}
 
 

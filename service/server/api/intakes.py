@@ -24,6 +24,7 @@ from service.server.storage.part_files import PartFile, part_files_folder
 from service.views import states
 from service.views.intakes import IntakePage, IntakeView
 from stage.files import resolved
+from stage.model import Line
 
 captures = APIRouter(prefix="/v1/captures", tags=["captures"], responses=responses(401, 403, 422, 429, 503), route_class=JsonRoute)
 environments = APIRouter(prefix="/v1/environments", tags=["environments"], responses=responses(401, 403, 422, 429, 503),
@@ -39,7 +40,7 @@ class NewCapture(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     name: Name
-    folder: str | None = None
+    folder: Line | None = None
     """Folder of the server below one of its roots; the capture is used where it lies. Needs the scope admin; null: files are uploaded."""
 
 
@@ -49,7 +50,7 @@ class NewEnvironment(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     name: Name
-    file: str | None = None
+    file: Line | None = None
     """File of the server below one of its roots, as `folder` of a capture."""
 
 
@@ -139,7 +140,7 @@ def _registered(service: Service, caller: Caller, field: str, given: str) -> Pat
     if not caller.may(Scope.ADMIN):
         raise ApiError("forbidden", f"{field}: the key has the scope {caller.scope}, to register what lies on the server needs admin")
     path = Path(given)
-    if "\0" in given or not path.is_absolute() or ".." in path.parts:
+    if not path.is_absolute() or ".." in path.parts:
         raise ApiError("invalid", f"{field}: give an absolute path of the server, without ..")
     place = resolved(path)
     if place is None or not any(place.is_relative_to(root) for root in service.settings.roots_of(caller.project)):

@@ -35,7 +35,7 @@ class Entry:
         self._saved_at = time.monotonic()
         try:
             self._record: dict[str, list[object]] = json.loads(self._path.read_text(encoding="utf-8"))
-        except (FileNotFoundError, json.JSONDecodeError):
+        except (FileNotFoundError, ValueError, RecursionError):
             self._record = {}
 
     def version(self, name: str) -> str | None:

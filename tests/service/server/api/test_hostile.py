@@ -78,6 +78,8 @@ def test_bad_requests_are_refused_by_name_and_logged_once(server, client, regist
         ("/v1/captures", {"name": "x", "folder": f"{registered}/file"}, "folder"),
         ("/v1/captures", {"name": "x", "folder": f"{registered}/{'x' * 5000}"}, "folder"),
         ("/v1/environments", {"name": "x", "file": str(registered)}, "file"),
+        ("/v1/jobs", {"kind": "depth", "capture": "cap_0123456789abcdefghjk", "tof_calibration": "a\0b"}, "tof_calibration"),
+        ("/v1/jobs", {"kind": "relight", "capture": "cap_0123456789abcdefghjk", "options": {"frames": "1\0"}}, "frames"),
         ("/v1/environments", {"name": "x", "file": "/etc/passwd"}, "file"),
         ("/v1/environments", {"name": "x", "folder": "/etc"}, "folder"),
     ]
@@ -210,7 +212,10 @@ HUGE = 32_768  # squared: a billion pixels
 HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
     "parent": (named("../../data/relit.sqlite"), r"frames\[0\].*leads out of the capture's folder|leads out of the capture's folder"),
     "absolute": (named("/etc/passwd"), "leads out of the capture's folder"),
-    "nul": (named("a\0b.exr"), r"a\\x00b.exr leads out of the capture's folder"),
+    "nul": (named("a\0b.exr"), r"frames\[0\].image: has a control character \(U\+0000\)"),
+    "name": (edited(name="a\0b\ud800"), r"capture.json: name: has a control character \(U\+0000\)"),  # GET /v1/captures was 500 for the project
+    "half": (edited(name="b\ud800"), r"capture.json: name: has half a character \(U\+D800\)"),
+    "long name": (named("x" * 5000), r"frames\[0\].image: has 5000 characters"),
     "missing": (named("nothing.exr"), "nothing.exr is not in the folder"),
     "directory": (named("."), "is no file"),
     "frame link": (linked("001.exr", SAMPLES / "lambert" / "001.exr"), r"frames\[1\].image: 001.exr leads out"),
