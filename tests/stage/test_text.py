@@ -19,13 +19,14 @@ from stage.model import Line, Strict
 from stage.text import name_fault
 from tests.service.server.api.captures import manifest
 
-BAD = {"NUL": "a\0b", "newline": "a\nb", "escape": "\x1b[2J", "delete": "a\x7f", "C1": "a\x9b", "half": "b\ud800", "byte": "b\udcff", "long": "x" * 1001}
+BAD = {"NUL": "a\0b", "newline": "a\nb", "escape": "\x1b[2J", "delete": "a\x7f", "C1": "a\x9b", "half": "b\ud800",
+       "byte": "b\udcff", "long": "x" * 1001}
 
 
 @pytest.mark.parametrize("text", BAD.values(), ids=BAD)
 def test_what_is_no_name(text):
     assert str(name_fault(text)).startswith("has ")
-    with pytest.raises(ValidationError, match="leave it out|give 1000 or fewer"):
+    with pytest.raises(ValidationError, match=r"leave it out|give 1000 or fewer"):
         TypeAdapter(Line).validate_python(text)
 
 

@@ -213,7 +213,7 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
     "parent": (named("../../data/relit.sqlite"), r"frames\[0\].*leads out of the capture's folder|leads out of the capture's folder"),
     "absolute": (named("/etc/passwd"), "leads out of the capture's folder"),
     "nul": (named("a\0b.exr"), r"frames\[0\].image: has a control character \(U\+0000\)"),
-    "name": (edited(name="a\0b\ud800"), r"capture.json: name: has a control character \(U\+0000\)"),  # GET /v1/captures was 500 for the project
+    "name": (edited(name="a\0b\ud800"), r"capture.json: name: has a control character \(U\+0000\)"),
     "half": (edited(name="b\ud800"), r"capture.json: name: has half a character \(U\+D800\)"),
     "long name": (named("x" * 5000), r"frames\[0\].image: has 5000 characters"),
     "missing": (named("nothing.exr"), "nothing.exr is not in the folder"),
