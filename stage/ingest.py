@@ -5,6 +5,7 @@ import json
 import math
 import os
 import threading
+import zlib
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -13,10 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from stage import stack as stacks
+from stage import stack_checksums
 from stage.capture import Capture
 from stage.correction import CodedRadiance, Correction, Radiance
 from stage.errors import ManifestError, storage
-from stage.files import replacing, write_text
+from stage.files import replacing
 from stage.fingerprint import Fingerprints
 from stage.light import OffLight
 from stage.manifest import Frame
@@ -24,7 +26,7 @@ from stage.motion.align import VERSION, Alignment, Warp
 from stage.motion.tracking import Tracking
 from stage.stack import CHANNELS, LIGHT_PAD, PIXEL_PAD, Stack
 
-LAYOUT = 1
+LAYOUT = 2
 """The version of the cache; a change of the layout or the arithmetic raises it, so that older caches are rebuilt."""
 CACHE_FOLDER = ".relit"
 """The folder of the cache inside the folder of a capture."""
@@ -149,6 +151,8 @@ def _build(capture: Capture, frames: list[Frame], alignment: Alignment | None, f
     lights, pixels = stacks.padded(len(frames), LIGHT_PAD), stacks.padded(pixel_count, PIXEL_PAD)
     scale = np.zeros(lights, dtype=np.float32)
     saturated = np.zeros((lights // 8, pixels), dtype=np.uint8)
+    padding = 2 * (pixels - pixel_count)
+    checksums = np.full((CHANNELS, lights), stack_checksums.of_plane(np.zeros(pixel_count, dtype=np.float16), padding))
     correction = Correction.of(capture, full_scale=True)
     done = 0
     lock = threading.Lock()
@@ -167,6 +171,7 @@ def _build(capture: Capture, frames: list[Frame], alignment: Alignment | None, f
             planes, scale[light] = _to_half(radiance)
             for channel in range(CHANNELS):
                 plane = np.ascontiguousarray(planes[..., channel])
+                checksums[channel, light] = stack_checksums.of_plane(plane, padding)
                 _write_all(file.fileno(), plane, start + 2 * (channel * lights + light) * pixels)
             with lock:
                 if radiance.saturated is not None and radiance.saturated.any():
@@ -190,16 +195,16 @@ def _build(capture: Capture, frames: list[Frame], alignment: Alignment | None, f
                 raise
     names = tuple(frame.image for frame in frames)
     motion = None if alignment is None else alignment.statistics()
-    index = {"frames": names, "scale": [float(s) for s in scale], "pixel_count": pixel_count, "motion": motion}
+    built = Stack(folder, key, names, scale, pixel_count, motion)
     try:
         if saturated.any():
             with replacing(stacks.saturated_path(folder, key)) as temporary:
                 np.save(temporary, saturated)
-        write_text(stacks.index_path(folder, key), json.dumps(index))
+        stacks.write_index(built, checksums.ravel().tolist(), zlib.crc32(saturated.data) if saturated.any() else None)
     except BaseException:
-        _remove(folder, key)
+        stacks.remove(folder, key)
         raise
-    return Stack(folder, key, names, scale, pixel_count, motion)
+    return built
 
 
 def _to_half(radiance: Radiance | CodedRadiance) -> tuple[np.ndarray, float]:
@@ -242,10 +247,4 @@ def _drop_others(folder: Path, key: str) -> None:
     for index in folder.glob("stack-*.json"):
         old = index.stem.removeprefix("stack-")
         if old != key and old.startswith(ALIGNED) == key.startswith(ALIGNED):
-            _remove(folder, old)
-
-
-def _remove(folder: Path, key: str) -> None:
-    """Remove a stack from the cache, its index first, so that a partly removed stack is never found."""
-    for path in (stacks.index_path(folder, key), stacks.values_path(folder, key), stacks.saturated_path(folder, key)):
-        path.unlink(missing_ok=True)
+            stacks.remove(folder, old)

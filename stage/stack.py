@@ -3,18 +3,21 @@
 Layout of `stack-<key>.npy`: [channel, light padded to a multiple of 8, pixel padded to a multiple of 64] half. Each light has
 a power-of-two scale of its own, so that half covers it from its brightest value down 29 stops: radiance = stored · scale[light].
 Beside it lie `stack-<key>.saturated.npy`, [light / 8, pixel] uint8, whose bit l % 8 (least significant first) is set where light l
-has no usable reading (it saturates, or alignment lost it), and the index `stack-<key>.json`. Padding is 0.
+has no usable reading (it saturates, or alignment lost it), and the index `stack-<key>.json`, with checksums of all three. Padding is 0.
 """
 
 import json
-from collections.abc import Iterator
+import zlib
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from stage import stack_checksums
 from stage.errors import StorageError, storage
+from stage.files import write_text
 
 CHANNELS = 3
 """Red, green and blue."""
@@ -164,13 +167,47 @@ def index_path(folder: Path, key: str) -> Path:
 
 
 def find(folder: Path, key: str) -> Stack | None:
-    """Return the complete stack of a key, or None."""
+    """Return the complete and undamaged stack of a key, or None. A damaged stack is removed, so that it is made again."""
+    if not index_path(folder, key).exists():
+        return None
     try:
         index = json.loads(index_path(folder, key).read_text(encoding="utf-8"))
+        checksum = index.pop("checksum")
         found = Stack(folder, key, tuple(index["frames"]), np.array(index["scale"], dtype=np.float32), int(index["pixel_count"]),
                       index.get("motion"))
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):  # a damaged cache is built again
-        return None
-    if not values_path(folder, key).exists():
+        saturated = index["checksums"]["saturated"]
+        bits = saturated_path(folder, key)
+        sound = (checksum == _checksum(index)
+                 and stack_checksums.is_sound(values_path(folder, key), found.shape, np.float16, index["checksums"]["values"])
+                 and (not bits.exists() if saturated is None else
+                      stack_checksums.is_sound(bits, (found.shape[1] // 8, found.shape[2]), np.uint8, [saturated])))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        sound = False
+    if not sound:
+        remove(folder, key)
         return None
     return found
+
+
+def write_index(stack: Stack, values: Sequence[int], saturated: int | None) -> None:
+    """Write the index of a stack, which completes it.
+
+    Args:
+        stack: whose values and saturation bits are in its folder.
+        values: the checksums of its planes, in the order of channels and padded lights.
+        saturated: the checksum of the saturation bits, or None where there are none.
+    """
+    index = {"frames": stack.frames, "scale": [float(scale) for scale in stack.scale], "pixel_count": stack.pixel_count,
+             "motion": stack.motion, "checksums": {"values": list(values), "saturated": saturated}}
+    write_text(index_path(stack.folder, stack.key), json.dumps(index | {"checksum": _checksum(index)}))
+
+
+def remove(folder: Path, key: str) -> None:
+    """Remove a stack from the cache, its index first, so that a partly removed stack is never found."""
+    for path in (index_path(folder, key), values_path(folder, key), saturated_path(folder, key)):
+        path.unlink(missing_ok=True)
+
+
+def _checksum(index: dict[str, Any]) -> int:
+    """Return the checksum of the content of an index."""
+    return zlib.crc32(json.dumps(index, sort_keys=True).encode())

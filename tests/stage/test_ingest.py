@@ -255,7 +255,7 @@ def test_a_failure_after_the_values_takes_them_away_too(tmp_path, monkeypatch):
     def full(path, text):
         raise StorageError(f"cannot write {path}: no space left on device")
 
-    monkeypatch.setattr(ingest, "write_text", full)
+    monkeypatch.setattr(stack, "write_text", full)
     with pytest.raises(StorageError, match="no space left"):
         open_stack(Capture.open(tmp_path))
     assert cache_files(tmp_path) == set()

@@ -1,0 +1,65 @@
+"""The checksums of a stack cache: one for the plane of each channel and light, and one for the saturation bits.
+
+They are compared once in a process before a cache is read for the first time, so that a damaged or truncated cache is made again instead
+of giving other values. CRC-32 finds every change of up to 32 neighbouring bits, and others but for one in 2^32; it reads 4 GB a second.
+"""
+
+import os
+import threading
+import zlib
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+THREADS = 4
+"""The threads that compare checksums: memory and disks are not faster with more."""
+
+_sound: dict[Path, tuple[int, ...]] = {}
+"""The files that were compared in this process, with their state then."""
+_sound_lock = threading.Lock()
+
+
+def of_plane(plane: np.ndarray, padding: int) -> int:
+    """Return the checksum of a plane that is followed by zeros.
+
+    Args:
+        plane: contiguous values.
+        padding: the bytes of zeros behind it.
+    """
+    return zlib.crc32(bytes(padding), zlib.crc32(plane.data))
+
+
+def is_sound(path: Path, shape: tuple[int, ...], kind: type[np.generic], checksums: Iterable[int]) -> bool:
+    """Return whether a cache file holds an array of this shape and type whose planes have these checksums.
+
+    Args:
+        path: a .npy file.
+        shape: of the array; the last axis and, for half values, the light axis are padded.
+        kind: the type of the values.
+        checksums: of the planes along the last axis in C order, or of the whole array where there is one.
+    """
+    expected = list(checksums)
+    try:
+        state = _state(path)
+        with _sound_lock:
+            if _sound.get(path) == state:
+                return True
+        values = np.load(path, mmap_mode="r", allow_pickle=False)
+        if values.shape != shape or values.dtype != np.dtype(kind) or not values.flags.c_contiguous or not expected:
+            return False
+        planes = np.asarray(values).reshape(len(expected), -1)
+        with ThreadPoolExecutor(THREADS, thread_name_prefix="relit-checksums") as pool:
+            if not all(pool.map(lambda plane, checksum: zlib.crc32(plane) == checksum, planes, expected)):
+                return False
+    except (OSError, ValueError, EOFError, SyntaxError, MemoryError):  # gone, truncated, or the header is damaged
+        return False
+    with _sound_lock:
+        _sound[path] = state
+    return True
+
+
+def _state(path: Path) -> tuple[int, ...]:
+    status = os.stat(path)
+    return status.st_ino, status.st_size, status.st_mtime_ns
