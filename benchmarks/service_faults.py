@@ -1,7 +1,7 @@
 """What the service loses when its processes are killed, hang or are without their database: the table of docs/service_faults.md.
 
 python -m benchmarks.service_faults [--seed N] [--sqlite | --write docs/service_faults.md]; some minutes. Without --sqlite it needs the
-server programs of PostgreSQL; with it the rows of PostgreSQL's restarts are left out.
+server programs of PostgreSQL, and repeats the kills on SQLite; with it everything is on SQLite, without the restarts of PostgreSQL.
 """
 
 import argparse
@@ -131,13 +131,13 @@ def _lives(pid: int) -> bool:
     return True
 
 
-def kills(folder: Path, new_database: NewDatabase, scene: Scene, chance: random.Random) -> list[Fault]:
-    """The 30 kills in one job: each when so many frames are there, and up to a second later."""
+def kills(folder: Path, new_database: NewDatabase, scene: Scene, chance: random.Random, where: str) -> list[Fault]:
+    """The 30 kills in one job, with the default settings: each when so many frames are there, and up to a second later."""
     order = [kind for kind, times in KILLS.items() for _ in range(times)]
     chance.shuffle(order)
     frames = sorted(chance.randrange(FRAMES - 2 * CHUNK_FRAMES) for _ in order)
     takeovers: dict[str, list[float]] = {kind: [] for kind in KILLS}
-    with harness(folder, new_database(), max_lost=len(order)) as made:
+    with harness(folder, new_database()) as made:
         for _ in range(WORKERS):
             made.start()
         made.ready(WORKERS)
@@ -151,7 +151,7 @@ def kills(folder: Path, new_database: NewDatabase, scene: Scene, chance: random.
         wanted, identical, lost = settle(made, scene, job)
     rows = [Fault(kind, times, 0, 0, takeovers[kind], 0) for kind, times in KILLS.items()]
     dead = [each for kind in KILLS if kind != SUPERVISOR for each in takeovers[kind]]
-    return [*rows, Fault("**these together, in one job, in random order**", len(order), wanted, identical, dead, lost)]
+    return [*rows, Fault(f"**these together, in one job, in random order, on {where}**", len(order), wanted, identical, dead, lost)]
 
 
 def disturbed(folder: Path, new_database: NewDatabase, scene: Scene, kind: str, times: int,
@@ -237,15 +237,17 @@ on a private PostgreSQL, during which faults happen; the kills come at random mo
 *identical* if its file equals, bit by bit, the file that `relit relight` makes undisturbed. The script fails if a frame
 is missing or different, if there is any other file (hidden ones too), if two workers had one job at the same time, if a
 job is lost or left over in the queue, or if a takeover from a killed worker takes {TAKEOVER_LIMIT_S:g} s or longer.
-With `--sqlite` it has the rows without restarts, on SQLite. `tests/service/server/jobs` has these faults at small size, and others: a job
+All settings have their defaults, unless a row says otherwise; the kills are repeated on SQLite. `tests/service/server/jobs` has these
+faults at small size, and others: a job
 that kills its workers, a full disk, a killed API.
 
 {chr(10).join(table(faults))}
 
 A worker that hangs is killed after `stall_s`, here {STALL_S:g} s, and its time contains that. A worker that is asked to stop, or
 whose `relit worker` is killed, first finishes its step and then returns the job to the queue, and its time contains that. When
-PostgreSQL restarts, the workers keep their jobs. In the run of kills `max_lost` is their number; with the default value, a job that loses
-four workers without a new frame between them fails, because the job may be what kills them.
+PostgreSQL restarts, the workers keep their jobs. A job fails that loses four workers (`max_lost` 3) without progress between them, because
+the job may be what kills them: without a new frame, a finished step, or a stage that the step had not come to. A worker that dies before
+the furthest stage of the step counts a tenth.
 """
 
 
@@ -265,7 +267,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         server = None if chosen.sqlite or programs is None else stack.enter_context(postgres(programs))
         new_database: NewDatabase = (lambda: None) if server is None else server.new_database
         scene = make_scene_files(folder / "scene")
-        faults = kills(folder / "kills", new_database, scene, random.Random(chosen.seed))
+        faults = kills(folder / "kills", new_database, scene, random.Random(chosen.seed), "SQLite" if server is None else "PostgreSQL")
+        if server is not None:
+            faults.append(kills(folder / "sqlite", lambda: None, scene, random.Random(chosen.seed + 1), "SQLite")[-1])
         rows: list[tuple[str, int, Callable[[Harness, str], float | None], dict[str, float]]] = [
             ("SIGKILL of all workers at once", 3, kill_all, {}),
             ("SIGSTOP of the worker at work", 2, stop_one, {"stall_s": STALL_S}),

@@ -119,7 +119,7 @@ class Settings(BaseSettings):
     stall_s: Positive = 900.0
     """Seconds without progress in a step after which its worker is killed; the job begins the step again."""
     max_lost: Count = 3
-    """Workers that a job may lose in one step before it fails."""
+    """Workers that a job may lose without progress before it fails."""
     takeover_s: Positive = 2.0
     """Seconds between two looks of a worker for jobs whose worker died."""
     drain_s: Positive = 60.0

@@ -32,6 +32,12 @@ class Claim(NamedTuple):
     worker: str
 
 
+NOTHING_LOST: dict[str, Any] = {"lost": 0, "lost_repeating": 0, "stages_begun": [], "repeating": False}
+"""Values of a job at the beginning of a step."""
+REPEATED = 10
+"""How many times `max_lost` workers may die one after the other in stages that earlier workers came through."""
+
+
 class StageProgress(NamedTuple):
     """How far a job is in its stage."""
 
@@ -154,24 +160,38 @@ def is_claimed(database: Database, claim: Claim) -> bool:
     return database.row(sa.select(jobs.c.id).where(*_held(claim))) is not None
 
 
-def advance(database: Database, claim: Claim, progress: StageProgress) -> bool:
+def advance(database: Database, claim: Claim, progress: StageProgress, *, repeating: bool | None = None,
+            begun: Sequence[str] | None = None) -> bool:
     """Record the progress of a running job; return False if the worker no longer has it.
 
-    More frames than the attempt ever had set `lost` to 0, as a finished step does: a job that makes progress does not kill its workers.
+    More frames than the attempt ever had, and a stage that the step never came to, set `lost` to 0, as a finished step does: a job that
+    makes progress does not kill its workers.
+
+    Args:
+        database: of the service.
+        claim: of the worker.
+        progress: of the stage under way.
+        repeating: whether an earlier worker went on from this stage to a further one; None: as recorded.
+        begun: names of the stages that the step has come to, where one is new; None: as recorded.
 
     Raises:
         DBAPIError: the database does not answer; it is not asked again.
     """
-    reached: dict[str, Any] = {}
+    values: dict[str, Any] = progress._asdict()
     if progress.stage == FRAMES:
         further = jobs.c.reached < progress.done
-        reached = {"reached": sa.case((further, progress.done), else_=jobs.c.reached), "lost": sa.case((further, 0), else_=jobs.c.lost)}
-    return _change(database, claim, patience_s=0.0, **progress._asdict(), **reached)
+        values |= {"reached": sa.case((further, progress.done), else_=jobs.c.reached), "lost": sa.case((further, 0), else_=jobs.c.lost),
+                   "lost_repeating": sa.case((further, 0), else_=jobs.c.lost_repeating)}
+    if repeating is not None:
+        values["repeating"] = repeating
+    if begun is not None:
+        values |= {"stages_begun": list(begun), "lost": 0, "lost_repeating": 0}
+    return _change(database, claim, patience_s=0.0, **values)
 
 
 def finish_step(database: Database, claim: Claim, steps: Sequence[str]) -> bool:
     """Record the names of all finished steps; return False if the worker no longer has the job."""
-    return _change(database, claim, finished_steps=list(steps), lost=0)
+    return _change(database, claim, finished_steps=list(steps), **NOTHING_LOST)
 
 
 def end(database: Database, claim: Claim, state: str, error: str | None = None) -> bool:
@@ -180,26 +200,31 @@ def end(database: Database, claim: Claim, state: str, error: str | None = None) 
     return _change(database, claim, state=state, error=None if error is None else storable(error), finished_at=time.time(), **done)
 
 
-def record_lost_worker(connection: sa.Connection, claim: Claim, limit: int, sentence: str) -> str | None:
-    """Record that a worker died while it had a job: the job is queued again, or fails if it has lost too many workers.
+def record_lost_worker(connection: sa.Connection, claim: Claim, limit: int) -> str | None:
+    """Record that a worker died while it had a job: the job is queued again, or fails if it has lost too many workers without progress.
+
+    A worker that died in a stage that an earlier worker came through was hardly killed by the job. So it does not count, unless there are
+    REPEATED times `limit` of them.
 
     Args:
         connection: of the caller's transaction.
         claim: of the dead worker.
-        limit: number of workers that a job may lose in one step.
-        sentence: error of a job that has lost more.
+        limit: number of workers that a job may lose without progress.
 
     Returns:
         The new state of the job; None if it had ended.
     """
     active = [jobs.c.id == claim.job, jobs.c.attempt == claim.attempt, jobs.c.state.in_(ACTIVE)]
-    row = connection.execute(sa.select(jobs.c.lost, jobs.c.worker).where(*active).with_for_update()).one_or_none()
+    row = connection.execute(sa.select(jobs).where(*active).with_for_update()).one_or_none()
     if row is None:
         return None
-    lost = row.lost + (row.worker == claim.worker)  # a worker that died before it began does not count, and none counts twice
-    state, now = FAILED if lost > limit else QUEUED, time.time()
+    counts = row.worker == claim.worker  # a worker that died before it began does not count, and none counts twice
+    lost, repeating = row.lost + (counts and not row.repeating), row.lost_repeating + (counts and row.repeating)
+    state, now = FAILED if lost > limit or repeating > REPEATED * limit else QUEUED, time.time()
+    sentence = f"lost {lost + repeating} workers without progress ({row.stage or 'begin'}): it may need more memory than they have"
     done = connection.execute(jobs.update().where(*active).values(
-        state=state, lost=lost, worker=None, updated_at=now, revision=jobs.c.revision + 1,
+        state=state, lost=lost, lost_repeating=repeating, repeating=bool(row.stages_begun), worker=None, updated_at=now,
+        revision=jobs.c.revision + 1,
         **({"error": sentence, "finished_at": now} if state == FAILED else {})))
     if state == FAILED:
         _end_check(connection, claim.job, sentence)
@@ -232,7 +257,7 @@ def queue_again(connection: sa.Connection, job: str, state: str) -> int | None:
     """
     done = connection.execute(jobs.update().where(jobs.c.id == job, jobs.c.state == state).values(
         state=QUEUED, attempt=jobs.c.attempt + 1, revision=jobs.c.revision + 1, updated_at=time.time(), finished_at=None,
-        error=None, lost=0, reached=0, worker=None, stage=None, done=None, total=None, rate=None))
+        error=None, reached=0, **NOTHING_LOST, worker=None, stage=None, done=None, total=None, rate=None))
     if done.rowcount != 1:
         return None
     return int(connection.execute(sa.select(jobs.c.attempt).where(jobs.c.id == job)).scalar_one())

@@ -80,6 +80,11 @@ jobs = sa.Table(
     # workflow, also those after a drain or a restart of the database (test_more_frames_than_ever_before_count_as_a_finished_step)
     sa.Column("lost", sa.Integer, nullable=False),
     sa.Column("reached", sa.Integer, nullable=False),
+    # names of the stages that the step under way has come to, with any worker; whether the worker is still in one that an earlier worker
+    # left behind it; and the workers that died there (test_a_worker_that_dies_before_the_furthest_stage_is_not_held_against_the_job)
+    sa.Column("stages_begun", sa.JSON, nullable=False, server_default="[]"),
+    sa.Column("repeating", sa.Boolean, nullable=False, server_default=sa.false()),
+    sa.Column("lost_repeating", sa.Integer, nullable=False, server_default="0"),
     # names, of all attempts. DBOS could record the steps of one workflow. To keep them for a retry the workflow would have to be forked,
     # which DBOS does not do in a transaction of ours, and which drops the priority; and it records Python names, so that a renamed
     # function would end the jobs that are under way (test_a_job_that_was_given_back_goes_on_with_the_steps_that_are_left)

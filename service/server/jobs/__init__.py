@@ -8,7 +8,8 @@ over where a lock is free (takeover). The supervisor sees that the process ended
 keeps its lock: the supervisor kills it after `stall_s` seconds without a sign of life or of progress (heartbeat, supervisor).
 
 What is recorded. The row of the job says queued again, without a worker, and counts the lost one; then DBOS queues the workflow of the same
-attempt again. A job that loses more than `max_lost` workers without finishing a step or making a new frame fails.
+attempt again. A job that loses more than `max_lost` workers without progress fails: without finishing a step, coming to a further stage of
+it, or making a new frame.
 
 What is done again. The next worker begins the workflow, skips the steps that the row names as finished, and does the step that was under
 way again (runner). A relight keeps each frame that exists with the hash of the same request. With `storage_url`, a worker on another

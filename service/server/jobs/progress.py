@@ -2,13 +2,15 @@
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from service.server.database import jobs
 from service.server.database.engine import UNANSWERED, Database, message_of
 from service.server.database.jobs import FRAMES, Claim
 from service.server.log import logger
 
+BEGIN = "begin"
+"""The stage of a step before its product begins one."""
 EVERY_S = 0.5
 """Seconds between two records of the progress."""
 UNANSWERED_S = 5.0
@@ -26,7 +28,7 @@ class JobProgress:
     """
 
     def __init__(self, database: Database, claim: Claim, *, alive: Callable[[], None], frame_offset: int = 0,
-                 frame_count: int | None = None) -> None:
+                 frame_count: int | None = None, begun: Sequence[str] = (), reached: int | None = None) -> None:
         """Create the progress of a step.
 
         Args:
@@ -35,18 +37,33 @@ class JobProgress:
             alive: called at every sign of progress.
             frame_offset: frames of the steps before this one.
             frame_count: frames of the whole job; None: it makes no frames.
+            begun: names of the stages that the step came to with workers that died.
+            reached: frames that the job has had, if workers died since: one more is recorded at once; None: in its turn.
         """
         self._database, self._claim = database, claim
         self._alive, self._frame_offset, self._frame_count = alive, frame_offset, frame_count
         self._lock = threading.Lock()  # several threads of a step may report
         self._record_at = 0.0
-        self._stage, self._offset, self._total, self._began = "begin", 0, 0, time.monotonic()
+        self._stage, self._offset, self._total, self._began = BEGIN, 0, 0, time.monotonic()
         self._counted = 0
         self._opening = self._stopped = False
+        self._begun, self._new_stage, self._repeating = list(begun), False, bool(begun)
+        self._reached = reached
+
+    def begin(self, kind: str) -> None:
+        """Begin the step, which is shown as a stage of this name; no product has begun."""
+        self._begin(BEGIN, kind, 1)
 
     def stage(self, name: str, total: int) -> None:
         """Begin a stage of the step."""
+        self._begin(name, name, total)
+
+    def _begin(self, stage: str, name: str, total: int) -> None:
         with self._lock:
+            if stage not in self._begun:
+                self._begun.append(stage)
+                self._new_stage = True
+            self._repeating = stage != self._begun[-1]
             self._began, self._record_at = time.monotonic(), 0.0
             if self._stage == FRAMES and name != FRAMES:  # the frames of this step are made
                 self._frame_offset += self._counted
@@ -69,15 +86,19 @@ class JobProgress:
                 raise Stopped
             self._counted = 0 if self._opening else done
             now = time.monotonic()
-            if now < self._record_at:
+            further = self._stage == FRAMES and self._reached is not None and self._offset + self._counted > self._reached
+            if now < self._record_at and not further:
                 return
             spent = now - self._began
             counted = self._counted
             rate = counted / spent if counted and spent > 0 else None
             progress = jobs.StageProgress(self._stage, self._offset + counted, self._total, rate)
             try:
-                self._stopped = not jobs.advance(self._database, self._claim, progress)
+                self._stopped = not jobs.advance(self._database, self._claim, progress, repeating=self._repeating,
+                                                 begun=self._begun if self._new_stage else None)
                 self._record_at = time.monotonic() + EVERY_S
+                self._new_stage = False
+                self._reached = None if further else self._reached
             except UNANSWERED as error:
                 logger.warning("progress is not told", job=self._claim.job, error=message_of(error))
                 self._record_at = time.monotonic() + UNANSWERED_S

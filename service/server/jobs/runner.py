@@ -128,11 +128,12 @@ class JobRunner:
         job = Job.of(dict(row))
         step = next(step for step in steps_of(job, self._context) if step.name == name)
         progress = JobProgress(database, claim, alive=lambda: self._sign(claim), frame_offset=step.frame_offset,
-                               frame_count=step.frame_count)
+                               frame_count=step.frame_count, begun=row["stages_begun"],
+                               reached=row["reached"] if row["lost"] or row["lost_repeating"] else None)
         log = logger.bind(job=job.id, project=job.project, step=name, attempt=claim.attempt, worker=self._worker)
         log.info("step begins")
         try:
-            progress.stage(name.partition(" ")[0], 1)
+            progress.begin(name.partition(" ")[0])
             with telemetry.span(step.name, row["trace"], job=job.id, attempt=claim.attempt, worker=self._worker):
                 step.run(progress)
             if not self._patiently(claim, lambda: jobs.is_claimed(database, claim)):  # another worker may be writing the same files

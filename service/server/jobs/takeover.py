@@ -37,7 +37,7 @@ class Takeover:
             lock: of this worker, held.
             worker: name of this worker.
             every_s: seconds between two rounds.
-            max_lost: workers that a job may lose in one step.
+            max_lost: workers that a job may lose without progress.
             running: returns the workflows that run in this process.
             beat: called every round.
             lock_lost: called when another process has this worker's lock for good.
@@ -105,11 +105,7 @@ class Takeover:
     def _take(self, workflow: str, worker: str) -> None:
         """Queue a workflow of a dead worker again, or end its job if it has lost too many workers."""
         job, attempt = job_and_attempt(workflow)
-        row = jobs.find(self._database, job)
-        sentence = f"lost {self._max_lost + 1} workers in one step ({row['stage'] or 'begin' if row else ''}): " \
-                   "it may need more memory than they have"
-        state = self._database.transact(lambda connection: jobs.record_lost_worker(
-            connection, Claim(job, attempt, worker), self._max_lost, sentence))
+        state = self._database.transact(lambda connection: jobs.record_lost_worker(connection, Claim(job, attempt, worker), self._max_lost))
         if state == QUEUED:
             self._queue.requeue(workflow)
         else:

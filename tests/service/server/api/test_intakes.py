@@ -112,10 +112,10 @@ def test_a_check_that_ends_unseen_leaves_nothing_waiting(tmp_path, end):
     else:
         claim = Claim(job, 1, "worker")
         assert jobs.begin(database, claim)
-        assert database.transact(lambda connection: jobs.record_lost_worker(connection, claim, 0, "lost too many")) == jobs.FAILED
+        assert database.transact(lambda connection: jobs.record_lost_worker(connection, claim, 0)) == jobs.FAILED
     found = intakes.find(database, capture, "p")
     assert found is not None and found["state"] == "refused"
-    assert ("cancelled" if end == "cancelled" else "lost too many") in found["problem"]
+    assert ("cancelled" if end == "cancelled" else "lost 1 workers") in found["problem"]
     assert database.transact(lambda connection: intakes.begin_check(connection, capture))
     assert not database.transact(lambda connection: jobs.cancel(connection, job))
     found = intakes.find(database, capture, "p")

@@ -20,7 +20,7 @@ def test_every_frame_is_there_once_and_as_undisturbed(tmp_path, database_url, ki
     seed = random.randrange(2**32)
     print(f"seed {seed}")
     chance = random.Random(seed)
-    with harness(tmp_path, database_url, takeover_s=0.5, max_lost=kills) as made:
+    with harness(tmp_path, database_url, takeover_s=0.5) as made:
         for _ in range(WORKERS):
             made.start()
         made.ready(WORKERS)

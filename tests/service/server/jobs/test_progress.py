@@ -41,6 +41,20 @@ def test_frames_are_counted_over_all_steps(claim):
     assert told(made, claim) == ("frames", 7, 10)
 
 
+def test_the_first_new_frame_after_a_lost_worker_is_told_at_once(claim, monkeypatch):
+    made, claim = claim
+    monkeypatch.setattr(progress, "EVERY_S", 3600.0)
+    step = JobProgress(made.database, claim, alive=lambda: None, frame_count=10, begun=["begin", "open", "frames"], reached=2)
+    step.begin("frames")
+    step.stage("frames", 10)
+    step.advance(2)
+    assert told(made, claim) == ("frames", 0, 10)  # two frames were there
+    step.advance(3)
+    assert told(made, claim) == ("frames", 3, 10)
+    step.advance(4)
+    assert told(made, claim) == ("frames", 3, 10)
+
+
 def test_a_database_that_does_not_answer_does_not_end_the_step(claim):
     made, claim = claim
     signs = []
@@ -61,7 +75,7 @@ def test_a_step_that_is_not_wanted_stops_and_stays_so(claim, end):
     if end == "cancel":
         made.database.transact(lambda connection: jobs.cancel(connection, claim.job))
     else:
-        made.database.transact(lambda connection: jobs.record_lost_worker(connection, claim, 3, ""))
+        made.database.transact(lambda connection: jobs.record_lost_worker(connection, claim, 3))
         jobs.begin(made.database, Claim(claim.job, 1, "two"))
     before = dict(made.row(claim.job))
     for done in (1, 2):

@@ -92,7 +92,7 @@ def test_a_worker_that_was_given_up_for_dead_publishes_nothing(idle_harness, run
     made, claim = runner
 
     def lose(progress):
-        idle_harness.database.transact(lambda connection: jobs.record_lost_worker(connection, claim, 3, ""))
+        idle_harness.database.transact(lambda connection: jobs.record_lost_worker(connection, claim, 3))
 
     do_nothing(monkeypatch, lose)
     monkeypatch.setattr(made._context.storage, "publish", lambda *_: pytest.fail("another may be writing there"))

@@ -8,6 +8,7 @@ import sqlalchemy as sa
 from service.requests.identifiers import CAPTURE, ENVIRONMENT, new_id
 from service.server.database import jobs
 from service.server.database.jobs import Claim, StageProgress
+from service.server.jobs.progress import JobProgress
 from service.server.jobs.queue import job_and_attempt, workflow_id
 from service.server.jobs.takeover import FORGOTTEN_ROUNDS, GRACE_ROUNDS, Takeover
 from service.server.jobs.worker_lock import LockState, open_worker_lock
@@ -100,7 +101,7 @@ def test_a_change_that_waits_for_the_takeover_changes_nothing(on_postgres, tmp_p
         ended = []
         late = threading.Thread(target=lambda: ended.append(jobs.end(made.database, gone, jobs.SUCCEEDED)))
         with made.database.engine.begin() as connection:
-            assert jobs.record_lost_worker(connection, gone, MAX_LOST, "lost") == jobs.QUEUED
+            assert jobs.record_lost_worker(connection, gone, MAX_LOST) == jobs.QUEUED
             late.start()
             made.until(lambda: made.database.row(sa.select(sa.text("1")).select_from(sa.text("pg_locks")).where(
                 sa.text("NOT granted"))), "waiting for the row")
@@ -138,7 +139,7 @@ def test_a_changed_priority_is_that_of_the_queue(idle_harness):
 def test_a_worker_is_lost_once_whoever_finds_it_and_however_often(idle_harness, job):
     gone = Claim(job, 1, "gone")
     for _ in range(2):  # one who died between the two halves of taking over leaves them to the next
-        idle_harness.database.transact(lambda connection: jobs.record_lost_worker(connection, gone, MAX_LOST, "lost"))
+        idle_harness.database.transact(lambda connection: jobs.record_lost_worker(connection, gone, MAX_LOST))
     assert idle_harness.row(job)["lost"] == 1
     lock, one = takeover(idle_harness, "one")
     one.round()
@@ -175,7 +176,7 @@ def test_a_job_that_loses_too_many_workers_fails(idle_harness, job):
             idle_harness.take(job, "gone")
             jobs.begin(idle_harness.database, Claim(job, 1, "gone"))
     row = idle_harness.row(job)
-    assert (row["state"], row["error"]) == (jobs.FAILED, "lost 4 workers in one step (open): it may need more memory than they have")
+    assert (row["state"], row["error"]) == (jobs.FAILED, "lost 4 workers without progress (open): it may need more memory than they have")
     assert idle_harness.in_queue(job)[0] == "CANCELLED"
     lock.close()
 
@@ -195,10 +196,51 @@ def test_more_frames_than_ever_before_count_as_a_finished_step(idle_harness, job
     lose()
     jobs.advance(database, gone, StageProgress("frames", 4, 10, None))  # the next worker comes as far, and no further
     assert idle_harness.row(job)["lost"] == 1
-    jobs.advance(database, gone, StageProgress("normals", 9, 10, None))  # stages that begin at their beginning again are no progress
+    jobs.advance(database, gone, StageProgress("normals", 9, 10, None), repeating=False)  # a stage that begins again is no progress
     assert idle_harness.row(job)["lost"] == 1
     jobs.finish_step(database, gone, ["frames 1-5"])
     assert idle_harness.row(job)["lost"] == 0
+    lock.close()
+
+
+def test_a_worker_that_dies_before_the_furthest_stage_is_not_held_against_the_job(idle_harness, job):
+    """The job came through that stage once, so that something else kills the workers; but not without end."""
+    database, gone = idle_harness.database, Claim(job, 1, "gone")
+    lock, one = takeover(idle_harness, "one")
+
+    def come_to(*stages):
+        row = idle_harness.row(job)
+        step = JobProgress(database, gone, alive=lambda: None, frame_count=10, begun=row["stages_begun"])
+        step.begin("frames")
+        for stage in stages:
+            step.stage(stage, 5)
+
+    def lose():
+        one.round()
+        if idle_harness.row(job)["state"] == jobs.QUEUED:
+            idle_harness.take(job, "gone")
+            jobs.begin(database, gone)
+        row = idle_harness.row(job)
+        return row["lost"], row["lost_repeating"]
+
+    come_to("open", "frames")
+    assert lose() == (1, 0)
+    assert lose() == (1, 1)  # before its first sign
+    come_to()
+    assert lose() == (1, 2)
+    come_to("open")
+    assert lose() == (1, 3)
+    come_to("open", "frames")
+    assert lose() == (2, 3)
+    come_to("open", "frames", "sheet")  # a stage that no worker came to
+    assert lose() == (1, 0)
+    for repeated in range(1, jobs.REPEATED * MAX_LOST + 1):
+        come_to("open")
+        assert lose() == (1, repeated)
+    assert idle_harness.row(job)["state"] == jobs.RUNNING
+    lose()
+    row = idle_harness.row(job)
+    assert (row["state"], row["error"].partition(":")[0]) == (jobs.FAILED, "lost 32 workers without progress (open)")
     lock.close()
 
 
