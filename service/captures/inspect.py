@@ -4,6 +4,7 @@ import os
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,10 +16,10 @@ from stage.capture import Capture
 from stage.correction import Correction
 from stage.errors import StageError
 from stage.gradients import gradient_frames, has_gradients
-from stage.light import DistantLight
+from stage.light import DistantLight, PointLight
 from stage.lighting import check_solvable
 from stage.manifest import Frame
-from stage.point_lights import PlacedLights
+from stage.point_lights import PlacedLights, place_lights
 
 
 class Inspection(NamedTuple):
@@ -55,34 +56,48 @@ def inspect(path: Path, progress: Progress | None = None) -> Inspection:
             timings.advance(len(levels))
     timings.close()
     faults = [level.fault for level in levels if level.fault is not None]
-    lights: object = None
-    if capture.sources():
-        try:
-            if has_gradients(capture):
-                gradient_frames(capture)
-            else:
-                lights = check_solvable(capture)
-        except StageError as error:
-            faults.append(str(error))
+    faults += standing_faults(capture, readable=not faults)
     facts = list(_facts(capture))
     if levels:
         facts.append(("brightest", f"{max(level.peak for level in levels):.4g} recorded"))
     if capture.manifest.saturation is not None:
         count = sum(level.saturated for level in levels)
         facts.append(("saturated", f"{count} readings at or above {capture.manifest.saturation:g}"))
-    try:
+    with suppress(StageError):
         mask = capture.mask()
         facts.append(("mask", f"{int(mask.sum())} of {mask.size} pixels"))
+    if capture.lit_by(PointLight):
+        with suppress(StageError):
+            facts.append(("near lights", _near_lights(place_lights(capture))))
+    return Inspection(facts, faults)
+
+
+def standing_faults(capture: Capture, *, readable: bool = True) -> list[str]:
+    """Return what is wrong with a capture beside its frames: lights that determine no normal, the mask, the dark and flat frames.
+
+    Args:
+        capture: an opened capture.
+        readable: whether all frames are; else dark and flat frames are not looked at, because they are read with the ambient frames.
+    """
+    faults = []
+    if capture.sources():
+        try:
+            if has_gradients(capture):
+                gradient_frames(capture)
+            else:
+                check_solvable(capture)
+        except StageError as error:
+            faults.append(str(error))
+    try:
+        capture.mask()
     except StageError as error:
         faults.append(str(error))
-    if isinstance(lights, PlacedLights):
-        facts.append(("near lights", _near_lights(lights)))
-    if not faults:
+    if readable and not faults:
         try:
             Correction.of(capture)
         except StageError as error:
             faults.append(str(error))
-    return Inspection(facts, faults)
+    return faults
 
 
 def _facts(capture: Capture) -> Iterator[tuple[str, str]]:

@@ -26,6 +26,7 @@ from service.requests import (
     shade,
     simulate,
     solve,
+    view,
 )
 from service.requests.base import Choice, Options, Role
 from service.requests.options import build, options_of, typed, values_of
@@ -36,7 +37,8 @@ COMMANDS: dict[str, list[type[Options]]] = {
     "separate": [separate.SeparateRequest],
     "simulate cw": [simulate.SimulateCwRequest], "simulate pulsed": [simulate.SimulatePulsedRequest],
     "patterns": [patterns.PatternsRequest, patterns.PlanRequest], "relight": [relight.RelightRequest], "shade": [shade.ShadeRequest],
-    "basis": [basis.BasisRequest], "import": [captures.ImportRequest], "demo": [demo.DemoRequest], "bench": [demo.BenchRequest],
+    "basis": [basis.BasisRequest], "view": [view.ViewRequest], "import": [captures.ImportRequest], "demo": [demo.DemoRequest],
+    "bench": [demo.BenchRequest],
     "keys create": [keys.NewKey], "calibrate mirror-ball": [calibrate.MirrorBallRequest],
     "calibrate light-positions": [calibrate.LightPositionsRequest], "calibrate grey-ball": [calibrate.GreyBallRequest],
     "calibrate intensity": [calibrate.IntensityRequest], "calibrate dark": [calibrate.DarkRequest],

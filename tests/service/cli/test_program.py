@@ -12,8 +12,8 @@ import service
 from stage.capture import Capture
 from tests.scenes.captures import edit_manifest, make_scene, write_capture, write_exr, write_image
 
-COMMANDS = ["demo", "import", "info", "calibrate", "solve", "depth", "separate", "relight", "basis", "export", "inspect", "doctor", "bench",
-            "serve", "worker", "keys"]
+COMMANDS = ["demo", "import", "info", "calibrate", "solve", "depth", "separate", "relight", "basis", "view", "export", "inspect", "doctor",
+            "bench", "serve", "worker", "keys"]
 ROOT = Path(service.__file__).parents[1]
 
 
@@ -38,7 +38,7 @@ def test_help_of_each_command(relit, command):
 @pytest.mark.parametrize("command", [
     ["demo", "--out", "OUT"], ["import", "lp", "CAPTURE", "OUT"], ["info", "CAPTURE"], ["solve", "CAPTURE", "--out", "OUT"],
     ["relight", "CAPTURE", "--environment", "CAPTURE/000.exr", "--out", "OUT/f.####.exr"], ["export", "CAPTURE", "--out", "OUT/a.usdz"],
-    ["basis", "CAPTURE", "--out", "OUT/b.exr"], ["separate", "CAPTURE", "--out", "OUT"],
+    ["basis", "CAPTURE", "--out", "OUT/b.exr"], ["view", "CAPTURE", "--out", "OUT"], ["separate", "CAPTURE", "--out", "OUT"],
     ["calibrate", "mirror-ball", "CAPTURE", "--ball", "8,8,4"], ["calibrate", "intensity", "CAPTURE"], ["doctor"], ["bench"],
 ], ids=lambda command: " ".join(command[:2]))
 def test_every_command_takes_a_device_and_refuses_one_that_is_not_there(relit, tmp_path, command):

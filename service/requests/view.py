@@ -1,0 +1,30 @@
+"""What `relit view` takes."""
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+
+from service.requests.base import CAPTURE, Request, Role, Spelling, StackOptions
+
+MOST_TERMS = 256
+"""Layers that a texture of any browser with WebGL2 can have (OpenGL ES 3.0, table 6.29)."""
+
+
+class ViewOptions(StackOptions):
+    """How a capture is shown."""
+
+    terms: Annotated[int, Field(ge=1, le=MOST_TERMS)] = 32
+    """Most coefficient images that the object is relit with in the browser; fewer where fewer show the captured images as well. Objects
+    with sharp highlights and shadows need about as many as there are lights."""
+
+
+class ViewRequest(ViewOptions, Request):
+    """What a browser needs to show a capture, its maps, its object under new light, and its depth as points."""
+
+    capture: Annotated[Path, Role.INPUT, CAPTURE]
+    """Folder with a capture.json."""
+    maps: Annotated[Path | None, Role.INPUT, Spelling(metavar="DIR")] = None
+    """Folder with the maps.exr or depth.exr of the capture, or the file; None: the capture alone is shown."""
+    out: Annotated[Path, Role.OUTPUT]
+    """Folder for view.json, view.bin and thumbnails.jpg."""

@@ -1,0 +1,188 @@
+"""What each captured frame shows: its light in words and numbers, how bright it is, and a small picture of it."""
+
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from service.reporting.progress import Timings
+from service.viewing.reduction import block_means, step_within
+from stage.capture import Capture
+from stage.correction import Correction
+from stage.errors import ImageError, StageError, storage
+from stage.ingest import BYTES_PER_PIXEL, DECODE_BYTES
+from stage.light import DistantLight, PointLight
+from stage.light_basis import numbers
+from stage.lighting import lights_from_centre
+from stage.manifest import Frame
+
+PREVIEW_PIXELS = 144 * 144
+"""Most pixels of the reduced image of a frame, from which its thumbnail and the exposure are taken."""
+WHITE_PERCENTILE = 99.0
+"""The percentile of the object's brightest channel that is shown as white."""
+DARK_SHARE = 0.01
+"""A pixel counts as dark where its brightest channel is below this share of white."""
+
+
+class FrameImage(NamedTuple):
+    """One frame, made small."""
+
+    preview: np.ndarray  # [rows, cols, 3] float32, scene-linear; mean over the object's pixels of each block
+    mean: np.ndarray  # [3] float64, over the mask
+    saturated: float
+    """Share of the mask, 0…1."""
+
+
+class CaptureImages(NamedTuple):
+    """All frames of a capture, made small."""
+
+    images: list[FrameImage | None]
+    """One for each frame of the manifest; None: it cannot be read."""
+    faults: list[str]
+    """Why frames cannot be read."""
+    inside: np.ndarray  # [rows, cols] bool of the previews: blocks with a pixel of the object
+    measured: list[bool]
+    """Which frames are measurements, and not ambient light, a tracking frame or a photograph under an environment."""
+
+    @property
+    def white(self) -> float:
+        """Return the radiance of white: a percentile of the brightest channel of the mean image; 0 where everything is dark."""
+        shown = [image.preview for image, measured in zip(self.images, self.measured, strict=True) if image is not None and measured]
+        if not shown or not self.inside.any():
+            return 0.0
+        mean = np.asarray(np.mean(shown, axis=0, dtype=np.float64))
+        return max(0.0, float(np.percentile(mean[self.inside].max(axis=-1), WHITE_PERCENTILE)))
+
+
+def read_images(capture: Capture, mask: np.ndarray, timings: Timings) -> CaptureImages:
+    """Decode every frame of a capture once.
+
+    Args:
+        capture: an opened capture.
+        mask: [rows, cols] bool.
+        timings: told of every frame.
+    """
+    frames = capture.manifest.frames
+    sources = {frame.image for frame in capture.sources()}
+    measured = [not sources or frame.image in sources for frame in frames]
+    timings.stage("frames", len(frames))
+    step, weight = step_within(mask.size, PREVIEW_PIXELS), mask.astype(np.float32)
+    inside = block_means(np.ones((*mask.shape, 1), dtype=np.float32), step, weight)[..., 0] > 0
+    try:
+        correction = Correction.of(capture, full_scale=True)
+    except StageError as error:
+        return CaptureImages([None] * len(frames), [str(error)], inside, measured)
+
+    def small(frame: Frame) -> FrameImage | str:
+        try:
+            pixels, saturated = _radiance(capture, correction, frame)
+        except StageError as error:
+            return str(error)
+        return FrameImage(block_means(pixels, step, weight), pixels[mask].mean(axis=0, dtype=np.float64),
+                          0.0 if saturated is None else float(saturated[mask].mean()))
+
+    images: list[FrameImage | None] = []
+    faults = []
+    workers = max(1, min(os.cpu_count() or 1, DECODE_BYTES // (BYTES_PER_PIXEL * mask.size)))
+    with ThreadPoolExecutor(workers, thread_name_prefix="relit-view") as pool:
+        for image in pool.map(small, frames):
+            faults += [image] if isinstance(image, str) else []
+            images.append(None if isinstance(image, str) else image)
+            timings.advance(len(images))
+    return CaptureImages(images, faults, inside, measured)
+
+
+def describe_frames(capture: Capture, found: CaptureImages, thumbnails: list[list[int] | None],
+                    suspects: dict[str, str]) -> list[dict[str, Any]]:
+    """Return what view.json says of every frame.
+
+    Args:
+        capture: an opened capture.
+        found: its images.
+        thumbnails: where the picture of each frame lies in the atlas.
+        suspects: a sentence for each image whose light disagrees with the others.
+    """
+    centre = _centre_lights(capture)
+    white = found.white
+    described = []
+    for frame, image, place in zip(capture.manifest.frames, found.images, thumbnails, strict=True):
+        direction, irradiance = centre.get(frame.image, (None, None))
+        brightest = None if image is None else image.preview[found.inside].max(axis=-1)
+        described.append({
+            "image": frame.image, "kind": kind_of(frame), "label": label_of(frame),
+            "direction": None if direction is None else numbers(direction),
+            "near": isinstance(frame.light, PointLight),
+            "irradiance": None if irradiance is None else numbers(irradiance),
+            "exposure_s": frame.exposure_s,
+            "saturated": None if image is None else round(image.saturated, 6),
+            "dark": None if brightest is None else round(float((brightest < DARK_SHARE * white).mean()), 6) if white > 0 else 1.0,
+            "mean": None if image is None else numbers(image.mean),
+            "thumbnail": place,
+            "suspect": suspects.get(frame.image),
+        })
+    return described
+
+
+def kind_of(frame: Frame) -> str:
+    """Return light, pattern, laser or tof."""
+    return next(name for name in ("light", "pattern", "laser", "tof") if getattr(frame, name) is not None)
+
+
+def label_of(frame: Frame) -> str:
+    """Return what lit a frame, in a few words."""
+    if isinstance(frame.light, DistantLight):
+        return f"distant light, {_angles(np.array(frame.light.direction))}"
+    if isinstance(frame.light, PointLight):
+        return "near light at {:.3g}, {:.3g}, {:.3g} m".format(*frame.light.position_m)
+    source = getattr(frame, kind_of(frame))
+    facts = source.model_dump(mode="json", exclude_defaults=True)
+    first = facts.pop("type", None) or facts.pop("code", "")
+    short = [f"{name.removesuffix('_px')} {value}" if name != "axis" else str(value)
+             for name, value in facts.items() if isinstance(value, str | int | float) and not isinstance(value, bool)]
+    short += [name for name, value in facts.items() if value is True]
+    return ", ".join([f"{first} {kind_of(frame)}" if kind_of(frame) != "tof" else f"time of flight {first}", *short])
+
+
+def _angles(direction: np.ndarray) -> str:
+    """Return a direction as azimuth and elevation in degrees: 0 and 0 is the camera, azimuth grows to the right."""
+    azimuth = np.degrees(np.arctan2(direction[0], direction[2]))
+    elevation = np.degrees(np.arcsin(np.clip(direction[1] / np.linalg.norm(direction), -1, 1)))
+    return f"azimuth {azimuth:.0f}°, elevation {elevation:.0f}°"
+
+
+def _centre_lights(capture: Capture) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Return direction and irradiance at the object's centre of every distant or point light by its image."""
+    try:
+        lights = lights_from_centre(capture)
+        return {frame.image: (direction, irradiance)
+                for frame, direction, irradiance in zip(capture.sources(), lights.direction, lights.irradiance, strict=True)}
+    except StageError:  # lights of other kinds among them, or near ones without a scale: the distant ones are known all the same
+        return {frame.image: (np.array(light.direction), np.array(light.irradiance)) for frame, light in capture.lit_by(DistantLight)}
+
+
+def _radiance(capture: Capture, correction: Correction, frame: Frame) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return [rows, cols, 3] radiance of a frame, and which pixels saturate; of an array of a time-of-flight camera, its sum."""
+    path = capture.file(frame.image)
+    if path.suffix.lower() != ".npy":
+        return correction.apply(frame)
+    shape = capture.camera.height, capture.camera.width
+    try:
+        with storage("read", path):
+            values = np.load(path, mmap_mode="r")
+    except (ValueError, EOFError) as error:
+        raise ImageError(f"{path}: is no array that NumPy reads") from error
+    if values.shape[:2] != shape or values.ndim not in (2, 3) or values.dtype.kind not in "fiu":
+        raise ImageError(f"{path}: has the shape {values.shape}: expected {shape} with or without bins")
+    plane = np.concatenate(list(_row_sums(values)))
+    if not np.isfinite(plane).all():
+        raise ImageError(f"{path}: holds values that are not finite")
+    return np.repeat(plane[..., None], 3, axis=-1), None
+
+
+def _row_sums(values: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield the sums over the bins, some rows at a time."""
+    for row in range(0, len(values), 64):
+        part = np.abs(values[row : row + 64].astype(np.float32))
+        yield part if part.ndim == 2 else part.sum(axis=2)

@@ -1,0 +1,137 @@
+"""The layers of maps.exr or depth.exr as they are stored, taken one at a time, and how each is shown."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from kernels.status import Status
+from stage import depth_maps, exr, maps
+from stage.camera import Camera
+from stage.capture import Capture
+from stage.errors import ResultError
+from stage.result_metadata import camera_and_provenance
+
+VECTOR, COLOUR, SCALAR, CODES, MASK = "vector", "colour", "scalar", "codes", "mask"
+"""Kinds of layers: unit vectors, scene-linear colours, quantities, whole numbers that stand for something, and the mask."""
+
+
+class Appearance(NamedTuple):
+    """How a layer is shown."""
+
+    title: str
+    kind: str
+    unit: str | None = None
+
+
+SURFACE = {
+    "normal": Appearance("Normals", VECTOR),
+    "diffuse_albedo": Appearance("Diffuse albedo", COLOUR),
+    "specular": Appearance("Specular (F0)", COLOUR),
+    "roughness": Appearance("Roughness", SCALAR),
+    "height": Appearance("Height", SCALAR, "m"),
+    "specular_normal": Appearance("Specular normals", VECTOR),
+    "abundance": Appearance("Share of the first material", SCALAR),
+    "first_specular": Appearance("First material: specular (F0)", COLOUR),
+    "first_roughness": Appearance("First material: roughness", SCALAR),
+    "second_specular": Appearance("Second material: specular (F0)", COLOUR),
+    "second_roughness": Appearance("Second material: roughness", SCALAR),
+    "regime": Appearance("Reflection regime", CODES),
+    "part": Appearance("Parts", CODES),
+    "sigma": Appearance("Standard error of the normal", SCALAR, "degrees"),
+    "confidence": Appearance("Confidence", SCALAR),
+    "status": Appearance("Status", CODES),
+    "mask": Appearance("Mask", MASK),
+}
+"""The layers of maps.exr in the order in which a person looks at them."""
+DEPTH = {
+    "depth": Appearance("Depth", SCALAR, "m"),
+    "range": Appearance("Range", SCALAR, "m"),
+    "sigma": Appearance("Standard deviation of the depth", SCALAR, "m"),
+    "projector_u": Appearance("Projector column", SCALAR, "px"),
+    "projector_v": Appearance("Projector row", SCALAR, "px"),
+    "amplitude": Appearance("Amplitude", SCALAR),
+    "confidence": Appearance("Confidence", SCALAR),
+    "status": Appearance("Status", CODES),
+    "mask": Appearance("Mask", MASK),
+}
+"""The same of depth.exr."""
+PIXELS = "px"
+"""The unit of heights where the capture gives no scale."""
+
+
+class ResultLayers:
+    """A result file of a capture, open for its layers."""
+
+    def __init__(self, path: Path, capture: Capture) -> None:
+        """Read a maps.exr or depth.exr.
+
+        Raises:
+            ResultError: a layer is incomplete, the mask is missing, or the file is of another camera than the capture.
+            ImageError: the file is not a readable EXR.
+        """
+        self.path = path
+        self._channels, metadata = exr.read(path)
+        self.of_depth = "depth.Z" in self._channels
+        file_name = depth_maps.DEPTH_FILE if self.of_depth else maps.MAPS_FILE
+        self.camera, self.provenance = camera_and_provenance(metadata, path, file_name=file_name)
+        self.color_space = exr.color_space_of(metadata)
+        _check_camera(path, self.camera, capture.camera)
+        self._names = channels_of_layers(self.of_depth)
+        for name, channels in self._names.items():
+            lacking = [channel for channel in channels if channel not in self._channels]
+            if lacking and (len(lacking) < len(channels) or name == "mask"):
+                raise ResultError(f"{path}: has no channel {lacking[0]}")
+        self.mask: np.ndarray = self._channels["mask.Y"] > 0.5  # [rows, cols] bool
+        self.status = self._status()  # [rows, cols] uint8, or None
+        seen = self._channels["depth.Z"] != 0 if self.of_depth else np.logical_or.reduce(
+            [self._channels[channel] != 0 for channel in self._names["normal"] if channel in self._channels] or [self.mask])
+        self.estimated: np.ndarray = self.mask | seen
+        """[rows, cols] bool, where values are kept."""
+        self.on_object: np.ndarray = self.mask if self.status is None else self.mask | (self.status != Status.UNSOLVED)
+        """[rows, cols] bool, the pixels that were to be solved, as far as the status tells."""
+
+    def names(self) -> list[str]:
+        """Return the layers of the file in the order in which they are shown."""
+        return [name for name in (DEPTH if self.of_depth else SURFACE) if self._names[name][0] in self._channels]
+
+    def appearance(self, name: str) -> Appearance:
+        """Return how a layer is shown."""
+        shown = (DEPTH if self.of_depth else SURFACE)[name]
+        return shown._replace(unit=PIXELS) if name == "height" and not self.camera.metric else shown
+
+    def suffixes(self, name: str) -> list[str]:
+        """Return the channels of a layer without its name, such as X, Y and Z."""
+        return [channel.partition(".")[2] for channel in self._names[name]]
+
+    def take(self, name: str) -> np.ndarray:
+        """Return a layer, [channels, rows, cols] in its stored type, which is read once and then forgotten.
+
+        Raises:
+            ResultError: the layer holds values that are not finite.
+        """
+        values = np.stack([self._channels.pop(channel) for channel in self._names[name]])
+        if bad := int((~np.isfinite(values)).sum()):
+            raise ResultError(f"{self.path}: layer {name} has {bad} values that are not finite")
+        return values
+
+    def _status(self) -> np.ndarray | None:
+        if "status.Y" not in self._channels:
+            return None
+        codes = self._channels["status.Y"]
+        if not np.isin(codes, list(Status)).all():
+            raise ResultError(f"{self.path}: layer status holds codes that this version does not know: solve again")
+        return codes.astype(np.uint8)
+
+
+def channels_of_layers(of_depth: bool) -> dict[str, list[str]]:
+    """Return the channels of every layer that a depth.exr or a maps.exr may have."""
+    if of_depth:
+        return {name: [channel] for name, (channel, _) in depth_maps.LAYERS.items()}
+    return {name: [f"{name}.{suffix}" for suffix in suffixes] for name, (suffixes, _) in maps.LAYERS.items()}
+
+
+def _check_camera(path: Path, theirs: Camera, ours: Camera) -> None:
+    if theirs.resolution != ours.resolution:
+        sizes = ("x".join(map(str, camera.resolution)) for camera in (theirs, ours))
+        raise ResultError("{}: is {}, the capture {}: these are not its maps".format(path, *sizes))

@@ -1,0 +1,59 @@
+"""A reader of relit.view/1, which knows the format by its documentation alone."""
+
+import json
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+class View:
+    """The files of a view."""
+
+    def __init__(self, folder: Path) -> None:
+        """Read view.json and view.bin."""
+        self.facts: dict[str, Any] = json.loads((folder / "view.json").read_text())
+        self.bytes = (folder / "view.bin").read_bytes()
+
+    def block(self, place: list[int], dtype: str, *shape: int) -> np.ndarray:
+        """A compressed block."""
+        offset, length = place
+        values = np.frombuffer(zlib.decompress(self.bytes[offset : offset + length]), dtype=np.dtype(dtype).newbyteorder("<"))
+        return values.reshape(shape)
+
+    def layer(self, name: str) -> dict[str, Any]:
+        """What view.json says of a layer."""
+        return next(layer for layer in self.facts["layers"] if layer["name"] == name)
+
+    def image(self, name: str, level: int = 0) -> np.ndarray:
+        """[channels, rows, cols] of a level, put together from its tiles."""
+        layer = self.layer(name)
+        facts, channels = layer["levels"][level], len(layer["channels"])
+        rows, cols, side = facts["rows"], facts["cols"], facts["tile"]
+        image = np.full((channels, rows, cols), np.nan, dtype=layer["dtype"])
+        places = iter(facts["tiles"])
+        for row in range(0, rows, side):
+            for col in range(0, cols, side):
+                height, width = min(side, rows - row), min(side, cols - col)
+                image[:, row : row + height, col : col + width] = self.block(next(places), layer["dtype"], channels, height, width)
+        assert next(places, None) is None
+        return image
+
+    def basis(self) -> np.ndarray:
+        """[terms, 3, rows, cols] float64 coefficient images."""
+        facts = self.facts["relight"]
+        return np.stack([self.block(place, "f2", 3, facts["rows"], facts["cols"]) for place in facts["basis"]]).astype(np.float64)
+
+    def lit(self, coefficients: np.ndarray) -> np.ndarray:
+        """[rows, cols, 3] the picture of coefficients [terms, 3]."""
+        return np.einsum("kcrq,kc->rqc", self.basis(), coefficients.astype(np.float64))
+
+    def captured(self) -> np.ndarray:
+        """[lights, terms, 3] coefficients of the captured images."""
+        return self.block(self.facts["relight"]["captured"], "f4", -1, self.facts["relight"]["terms"], 3)
+
+    def transfer(self) -> np.ndarray:
+        """[rows, cols, terms, 3] coefficients of a unit of irradiance from each direction of the grid."""
+        cols, rows = self.facts["relight"]["directions"]
+        return self.block(self.facts["relight"]["transfer"], "f4", rows, cols, self.facts["relight"]["terms"], 3)
