@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PYTEST := $(BIN)/python -m pytest -q -n auto --maxprocesses 4 --dist loadfile
 
-.PHONY: demo serve test test-all clients lint bench gpu-bench figures samples lock clean
+.PHONY: demo serve test test-all clients lint bench gpu-bench figures samples lock vendor clean
 demo: $(VENV)/installed
 	$(BIN)/relit demo
 
@@ -52,6 +52,17 @@ lock:
 	uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-annotate \
 	  --custom-compile-command "make lock" tests/clients/requirements.in -o tests/clients/requirements.lock
 	cd tests/clients && npm install --silent --package-lock-only --omit-lockfile-registry-resolved
+
+# the files of three.js that the pages load, of the version that tests/clients locks; needs npm. VENDORED/SHA256SUMS says which files
+VENDORED = service/server/pages/static/vendor/three
+vendor:
+	rm -rf .vendor && mkdir .vendor && cp tests/clients/package.json tests/clients/package-lock.json .vendor
+	cd .vendor && npm ci --silent --no-audit --no-fund --ignore-scripts
+	cd $(VENDORED) && awk '{print $$2}' SHA256SUMS | while read -r file; do \
+	  case $$file in LICENSE) from=LICENSE;; addons/*) from=examples/jsm/$${file#addons/};; *) from=build/$$file;; esac; \
+	  install -D -m 644 "$(CURDIR)/.vendor/node_modules/three/$$from" "$$file" || exit 1; done
+	cd $(VENDORED) && sha256sum $$(awk '{print $$2}' SHA256SUMS) > SHA256SUMS.new && mv SHA256SUMS.new SHA256SUMS
+	rm -rf .vendor
 
 clean:
 	rm -rf $(VENV) .clients relit-demo
