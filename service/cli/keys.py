@@ -25,8 +25,10 @@ def _create(wanted: NewKey, data: DataOption = None, config: ConfigOption = None
     from service.server.database import keys
     from service.server.database.engine import open_database
     from service.server.database.schema import upgrade
+    from service.server.permissions import keep_private
 
     def prepare(settings: Any, database: Any) -> None:
+        keep_private()
         settings.data.mkdir(parents=True, exist_ok=True)
         upgrade(database)
 

@@ -62,7 +62,7 @@ class Connection:
             url = httpx2.URL(self.server)
         except httpx2.InvalidURL:
             url = httpx2.URL()
-        if url.scheme not in ("http", "https") or not url.host:
+        if url.scheme not in ("http", "https") or not url.host or not 0 < (url.port or 80) < 65_536:
             raise Unreachable(f"{server}: is no URL of a service: give one such as https://relit.example")
         self.http = httpx2.Client(base_url=url, headers={} if key is None else {"Authorization": f"Bearer {key}"}, timeout=timeout_s,
                                   transport=transport)

@@ -38,13 +38,14 @@ def files_of(path: Path) -> list[tuple[Path, str]]:
     Files and folders whose names begin with a dot are left out.
 
     Raises:
-        FileError: there is no such file or folder, the folder has no files, or it has a link to a folder.
+        FileError: there is no such file or folder, the folder has no files, or it has a link that leads out of it or to a folder, or
+            something else that is no file.
     """
     if path.is_file():
         return [(path, path.name)]
     if not path.is_dir():
         raise FileError(f"{path}: there is no such file or folder")
-    found = sorted(_below(path, ""), key=lambda one: one[1])
+    found = sorted(_below(path, "", path.resolve()), key=lambda one: one[1])
     if not found:
         raise FileError(f"{path}: has no files")
     return found
@@ -78,14 +79,25 @@ def _hash_file(path: Path, name: str, progress: TransferProgress) -> LocalFile:
     return LocalFile(path, name, size, digest.hexdigest())
 
 
-def _below(folder: Path, before: str) -> Iterator[tuple[Path, str]]:
+def _below(folder: Path, before: str, root: Path) -> Iterator[tuple[Path, str]]:
     with file_errors(folder):
         entries = [entry for entry in os.scandir(folder) if not entry.name.startswith(".")]
     for entry in entries:
         path = Path(entry.path)
-        if entry.is_dir() and entry.is_symlink():
+        if path.is_dir() and path.is_symlink():
             raise FileError(f"{path}: is a link to a folder: put the folder itself there")
-        if entry.is_dir():
-            yield from _below(path, f"{before}{entry.name}/")
-        else:
-            yield path, before + entry.name
+        if path.is_dir():
+            yield from _below(path, f"{before}{entry.name}/", root)
+            continue
+        if path.is_symlink() and not _leads_below(path, root):
+            raise FileError(f"{path}: is a link that leads out of {root}: put the file itself there")
+        if not path.is_file():
+            raise FileError(f"{path}: is no file")
+        yield path, before + entry.name
+
+
+def _leads_below(link: Path, root: Path) -> bool:
+    try:
+        return link.resolve().is_relative_to(root)
+    except (OSError, RuntimeError):  # links in a circle
+        return False

@@ -2,8 +2,11 @@
 
 import json
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Any
 
 from service import __version__
@@ -13,6 +16,8 @@ from service.requests.options import role_of
 REPORTED = ("relit", "warp-lang", "numpy", "OpenEXR", "OpenImageIO", "opencv-python-headless", "usd-core")
 """The distributions whose versions a report names."""
 REPORT_FILE = "report.json"
+
+_names: ContextVar[dict[str, str] | None] = ContextVar("names of places", default=None)
 
 UNREPORTED = (Role.OUTPUT, Role.MACHINE, Role.PART)
 """Roles of fields that a report does not repeat."""
@@ -83,5 +88,25 @@ def requested(request: Options) -> dict[str, Any]:
 
 def report(request: Options, *, inputs: Mapping[str, Any], **sections: Any) -> str:
     """Return the text of a report.json: inputs, options, the other sections in the order given, and software versions."""
-    return json.dumps({"schema": "relit.report/1", "inputs": inputs, "options": requested(request), **sections,
+    text = json.dumps({"schema": "relit.report/1", "inputs": inputs, "options": requested(request), **sections,
                        "versions": versions()}, indent=2) + "\n"
+    for path, name in sorted((_names.get() or {}).items(), key=lambda item: -len(item[0])):  # a folder after what lies in it
+        text = text.replace(json.dumps(path)[1:-1], name)
+    return text
+
+
+@contextmanager
+def places_named() -> Iterator[None]:
+    """Let reports that are made within this context write the names that `name_place` gives in place of paths."""
+    token = _names.set({})
+    try:
+        yield
+    finally:
+        _names.reset(token)
+
+
+def name_place(path: Path, name: str) -> None:
+    """Give a file or folder of the server the name by which the user of the service knows it; outside `places_named` it has no effect."""
+    names = _names.get()
+    if names is not None:
+        names[str(path)] = name

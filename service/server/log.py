@@ -57,8 +57,8 @@ def configure(level: str, form: str) -> None:
                         cache_logger_on_first_use=True)
 
 
-def adopt(library: str, *, without: type[BaseException]) -> None:
-    """Write what a library logs, which may have set up handlers of its own, as this log; leave out its reports of one exception."""
+def adopt(library: str, *, without: tuple[type[BaseException], ...]) -> None:
+    """Write what a library logs, which may have set up handlers of its own, as this log; leave out its reports of some exceptions."""
     theirs = logging.getLogger(library)
     theirs.handlers.clear()
     theirs.propagate = True

@@ -30,6 +30,7 @@ from service.server.jobs.queue import JobQueue, prepare
 from service.server.jobs.supervisor import Supervisor
 from service.server.log import logger
 from service.server.malloc import keep_freed_blocks
+from service.server.permissions import keep_private
 from service.server.settings import NO_WORKER, Settings, unknown_variables
 from service.server.storage.open import open_storage
 
@@ -146,6 +147,7 @@ def _signals(supervisors: list[Supervisor]) -> "SimpleQueue[int]":
 
 
 def _configure(settings: Settings) -> None:
+    keep_private()
     log.configure(settings.log_level, settings.log_format)
     for name, near in unknown_variables(os.environ).items():
         logger.warning("a variable of the environment is no setting", variable=name, **({"meant": near} if near else {}))

@@ -47,6 +47,7 @@ def create_app(settings: Settings, database: Database, tracing: TracerProvider |
     pages.install(app)
     app.add_middleware(middleware.JsonBodies)
     app.add_middleware(tus.TusHeaders)
+    app.add_middleware(middleware.OneLength)
     app.add_middleware(middleware.RequestLog, metrics=app.state.metrics)
     return app
 

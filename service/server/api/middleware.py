@@ -71,6 +71,23 @@ class RequestLog:
                 **({} if caller is None else {"project": caller.project, "key": caller.key}))
 
 
+class OneLength:
+    """Refuses a request that says twice how long its body is: a proxy before the service may believe the other header (RFC 9112, 6.3)."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        """Args: app: the next application."""
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Refuse the request and close its connection, or pass it on."""
+        names = [name for name, _ in scope["headers"]] if scope["type"] == "http" else []
+        if b"transfer-encoding" in names and b"content-length" in names:
+            await answer(Request(scope), "bad-request", "the request has both Content-Length and Transfer-Encoding: send one of them",
+                         headers={"Connection": "close"})(scope, receive, send)
+        else:
+            await self._app(scope, receive, send)
+
+
 class JsonBodies:
     """Refuses bodies that are not JSON or larger than MAX_BYTES, except those of uploads."""
 

@@ -185,6 +185,8 @@ def _create(service: Service, caller: Caller, intake: str, length: int, given: M
         if before is not None and before["done"]:
             uploads.remove(connection, before["id"])
             service.storage.delete(layout.intake(caller.project, intake), given.path)
+        elif before is not None and _expired(service, dict(before)):
+            uploads.remove(connection, before["id"])  # its part file, which nobody can continue, goes with the next housekeeping
         elif before is not None:
             raise ApiError("conflict", f"path {shown(given.path)}: is being uploaded as {before['id']}: go on with it, or delete it")
         _require_room(service, connection, intake)
@@ -199,7 +201,7 @@ def _create(service: Service, caller: Caller, intake: str, length: int, given: M
     asked = ["upload", intake, given.path, length, given.sha256]
     upload, _ = create_once(service, caller, token, asked, make)
     row = uploads.find(service.database, upload, caller.project)
-    if row is None and token is not None:  # the upload was deleted or replaced since: the same request makes another
+    if token is not None and (row is None or _expired(service, row)):  # or deleted or replaced since: the same request makes another
         service.database.transact(partial(idempotency.forget_token, project=caller.project, token=token, gone=upload))
         upload, _ = create_once(service, caller, token, asked, make)
         row = uploads.find(service.database, upload, caller.project)
@@ -252,9 +254,13 @@ def _row(service: Service, caller: Caller, upload: str) -> Row:
     if row is None:
         raise ApiError("not-found", f"there is no {upload} in this project")
     row = settled(service, row)
-    if not row["done"] and expires_at(row, service.settings.upload_hours) < time.time():
+    if _expired(service, row):
         raise ApiError("gone", f"{upload}: nothing came for {service.settings.upload_hours:g} hours: begin it again")
     return row
+
+
+def _expired(service: Service, row: Row) -> bool:
+    return not row["done"] and expires_at(row, service.settings.upload_hours) < time.time()
 
 
 def _page(service: Service, caller: Caller, intake: str, limit: int, after: str | None) -> FilePage:

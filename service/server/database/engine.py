@@ -103,7 +103,7 @@ def connect(url: str, *, connections: int = 10) -> Database:
                                                     "keepalives_interval": 2, "keepalives_count": 3})
         else:
             raise DatabaseError(f"database_url: {parsed.get_backend_name()} is not supported: give postgresql://…, or none for SQLite")
-    except (sa.exc.ArgumentError, sa.exc.NoSuchModuleError) as error:
+    except (sa.exc.ArgumentError, sa.exc.NoSuchModuleError, ValueError) as error:  # ValueError: a port that is no number
         raise DatabaseError("database_url: is not of the form postgresql://user:password@host/name") from error
     return Database(engine)
 

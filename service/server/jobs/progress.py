@@ -28,7 +28,7 @@ class JobProgress:
     """
 
     def __init__(self, database: Database, claim: Claim, *, alive: Callable[[], None], frame_offset: int = 0,
-                 frame_count: int | None = None, begun: Sequence[str] = (), reached: int | None = None) -> None:
+                 frame_count: int | None = None, begun: Sequence[str] = (), reached: int | None = None, shown: int = 0) -> None:
         """Create the progress of a step.
 
         Args:
@@ -39,9 +39,10 @@ class JobProgress:
             frame_count: frames of the whole job; None: it makes no frames.
             begun: names of the stages that the step came to with workers that died.
             reached: frames that the job has had, if workers died since: one more is recorded at once; None: in its turn.
+            shown: frames that the job has had in any case: no fewer are shown while a worker that took over looks at them again.
         """
         self._database, self._claim = database, claim
-        self._alive, self._frame_offset, self._frame_count = alive, frame_offset, frame_count
+        self._alive, self._frame_offset, self._frame_count, self._shown = alive, frame_offset, frame_count, shown
         self._lock = threading.Lock()  # several threads of a step may report
         self._record_at = 0.0
         self._stage, self._offset, self._total, self._began = BEGIN, 0, 0, time.monotonic()
@@ -67,8 +68,9 @@ class JobProgress:
             self._began, self._record_at = time.monotonic(), 0.0
             if self._stage == FRAMES and name != FRAMES:  # the frames of this step are made
                 self._frame_offset += self._counted
-            self._opening = self._frame_count is not None and name != FRAMES and self._frame_offset > 0
-            if self._frame_count is not None and (name == FRAMES or self._frame_offset > 0):  # so that frames are never counted backwards
+            begun = self._frame_offset > 0 or self._shown > 0
+            self._opening = self._frame_count is not None and name != FRAMES and begun
+            if self._frame_count is not None and (name == FRAMES or begun):  # so that frames are never counted backwards
                 self._stage, self._offset, self._total = FRAMES, self._frame_offset, self._frame_count
             else:
                 self._stage, self._offset, self._total = name, 0, total
@@ -92,7 +94,10 @@ class JobProgress:
             spent = now - self._began
             counted = self._counted
             rate = counted / spent if counted and spent > 0 else None
-            progress = jobs.StageProgress(self._stage, self._offset + counted, self._total, rate)
+            shown = self._offset + counted
+            if self._stage == FRAMES:
+                shown = max(shown, self._shown)
+            progress = jobs.StageProgress(self._stage, shown, self._total, rate)
             try:
                 self._stopped = not jobs.advance(self._database, self._claim, progress, repeating=self._repeating,
                                                  begun=self._begun if self._new_stage else None)

@@ -14,6 +14,7 @@ from typing import TypeVar
 from dbos import DBOS
 
 from service.errors import USER_ERRORS, sentence
+from service.reporting.provenance import places_named
 from service.requests.jobs import CheckJob
 from service.server import telemetry
 from service.server.database import intakes, jobs
@@ -129,12 +130,12 @@ class JobRunner:
         step = next(step for step in steps_of(job, self._context) if step.name == name)
         progress = JobProgress(database, claim, alive=lambda: self._sign(claim), frame_offset=step.frame_offset,
                                frame_count=step.frame_count, begun=row["stages_begun"],
-                               reached=row["reached"] if row["lost"] or row["lost_repeating"] else None)
+                               reached=row["reached"] if row["lost"] or row["lost_repeating"] else None, shown=row["reached"])
         log = logger.bind(job=job.id, project=job.project, step=name, attempt=claim.attempt, worker=self._worker)
         log.info("step begins")
         try:
             progress.begin(name.partition(" ")[0])
-            with telemetry.span(step.name, row["trace"], job=job.id, attempt=claim.attempt, worker=self._worker):
+            with telemetry.span(step.name, row["trace"], job=job.id, attempt=claim.attempt, worker=self._worker), places_named():
                 step.run(progress)
             if not self._patiently(claim, lambda: jobs.is_claimed(database, claim)):  # another worker may be writing the same files
                 raise Stopped

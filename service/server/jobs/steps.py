@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from service.errors import USER_ERRORS, RequestError, sentence
 from service.reporting.progress import Progress
+from service.reporting.provenance import name_place
 from service.requests.frame_range import frame_numbers
 from service.requests.identifiers import CAPTURE
 from service.requests.jobs import ANY_JOB, CheckJob, DepthJob, ExportJob, JobRequest, PipelineJob, RelightJob, ShadeJob, SolveJob
@@ -88,7 +89,7 @@ def steps_of(job: Job, context: WorkerContext) -> list[JobStep]:
 
 def job_maps(job: Job, maps: str, context: WorkerContext, progress: Progress) -> Path:
     """Return the folder with the maps of `maps`, a job of the same project or this job."""
-    return context.storage.local(layout.results(job.project, maps), layout.SOLVED, progress)
+    return _named(context.storage.local(layout.results(job.project, maps), layout.SOLVED, progress), maps)
 
 
 def _frames(job: Job, request: RelightJob, context: WorkerContext) -> list[JobStep]:
@@ -173,7 +174,13 @@ def _relight(job: Job, request: RelightJob, only: str, context: WorkerContext, p
 
 
 def _out(job: Job, context: WorkerContext) -> Path:
-    return context.storage.workspace(layout.results(job.project, job.id))
+    return _named(context.storage.workspace(layout.results(job.project, job.id)), job.id)
+
+
+def _named(place: Path, identifier: str) -> Path:
+    """Return a place of the server, which reports then name by its identifier."""
+    name_place(place, identifier)
+    return place
 
 
 def _intake(job: Job, identifier: str, context: WorkerContext, progress: Progress) -> Path:
@@ -194,11 +201,11 @@ def _place(job: Job, identifier: str, context: WorkerContext, progress: Progress
     if row is None:
         raise RequestError(f"{identifier}: is not there any more")
     if row["folder"] is None:
-        return context.storage.local(layout.intake(job.project, identifier), progress=progress), False
+        return _named(context.storage.local(layout.intake(job.project, identifier), progress=progress), identifier), False
     folder = Path(row["folder"])
     if resolved(folder) != folder or not any(folder.is_relative_to(root) for root in context.roots_of(job.project)):
         raise RequestError(f"{identifier}: lies in none of the folders that the operator allows any more")
-    return folder, True
+    return _named(folder, identifier), True
 
 
 def _environment(job: Job, identifier: str | None, context: WorkerContext, progress: Progress) -> Path | None:

@@ -64,7 +64,8 @@ def run_worker(settings: Settings, device: str, heartbeat: Heartbeat) -> None:
         "use_listen_notify": False,
     }
     dbos = DBOS(config=config)
-    log.adopt("dbos", without=dbos_error.DBOSAwaitedWorkflowCancelledError)  # DBOS reports it for every job that is cancelled while it runs
+    # DBOS reports them for every job that is cancelled, or cancelled and deleted, while it runs
+    log.adopt("dbos", without=(dbos_error.DBOSAwaitedWorkflowCancelledError, dbos_error.DBOSNonExistentWorkflowError))
     runner.register()
     takeover = Takeover(database, queue, lock, name, every_s=settings.takeover_s, max_lost=settings.max_lost,
                         running=lambda: runner.running, beat=heartbeat.beat, lock_lost=_end_without_lock)

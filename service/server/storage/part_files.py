@@ -39,7 +39,7 @@ class PartFile:
         path = _path(folder, upload)
         with storage("write", path):
             folder.mkdir(parents=True, exist_ok=True)
-            descriptor = file_lock.take(path, 0o644)
+            descriptor = file_lock.take(path, 0o640)
         if descriptor is None:
             raise PartFileLocked
         return cls(path, descriptor)

@@ -1,5 +1,6 @@
 """Files in: whole, once, and gone on with after a break."""
 
+import os
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from service.client import Client, ClientError, FileError, IntakeRefused, Invalid, NotFound
+from service.client.local_files import files_of
 from tests.scenes.captures import edit_manifest, files_in, write_capture, write_exr
 from tests.service.client.conftest import OWL, SKY, Between, Cut
 from tests.service.server_process import Server
@@ -179,6 +181,20 @@ def test_files_that_cannot_be_sent(client: Client, tmp_path: Path):
     (capture / "more").symlink_to(tmp_path / "empty", target_is_directory=True)
     with pytest.raises(FileError, match="more: is a link to a folder"):
         client.captures.upload(capture)
+    (capture / "more").unlink()
+    (tmp_path / "secret.txt").write_text("a key")
+    for target, sentence in ((tmp_path / "secret.txt", "notes.txt: is a link that leads out of"), ("notes.txt", "notes.txt: is a link"),
+                             ("missing.txt", "notes.txt: is no file")):
+        (capture / "notes.txt").symlink_to(target)
+        with pytest.raises(FileError, match=sentence):
+            client.captures.upload(capture)
+        (capture / "notes.txt").unlink()
+    os.mkfifo(capture / "pipe")  # reading it would wait for ever
+    with pytest.raises(FileError, match="pipe: is no file"):
+        client.captures.upload(capture)
+    (capture / "pipe").unlink()
+    (capture / "again.exr").symlink_to("000.exr")  # within the folder it is a file like others
+    assert "again.exr" in [name for _, name in files_of(capture)]
 
 
 def test_what_lies_on_the_server_is_registered(client: Client, server: Server):

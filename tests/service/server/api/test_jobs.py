@@ -317,3 +317,15 @@ def test_what_a_job_reads_stays_until_it_has_ended(server, client, long, solved)
     if client.delete(f"/v1/jobs/{solved}").status_code == 204:
         pytest.fail("maps of a job that waits were deleted")
     finish(server, client, job)
+
+
+def test_a_job_that_is_cancelled_and_deleted_while_it_runs_is_no_error_in_the_log(server, client, dome, sky):
+    """DBOS wrote a traceback, since the workflow that it ends is not there any more."""
+    job = submit(client, kind="relight", capture=dome, environment=sky, options={"frames": "1-5000"})["id"]
+    server.wait(client, f"/v1/jobs/{job}", ("running",))
+    client.post(f"/v1/jobs/{job}/cancel").raise_for_status()
+    assert client.delete(f"/v1/jobs/{job}").status_code == 204
+    finish(server, client, submit(client, kind="solve", capture=dome))
+    lines = [json.loads(line) for line in server.log.read_text().splitlines()]
+    assert any(line["event"] == "step stopped" and line["job"] == job for line in lines)
+    assert [line for line in lines if line["level"] == "error" and line.get("logger") == "dbos"] == []

@@ -22,6 +22,7 @@ from service.server.settings import Settings
 from service.server.storage.folder import FolderStorage
 from stage.errors import StorageError
 from tests.service.server.api.asgi import Call
+from tests.service.server.api.conftest import SAMPLES
 from tests.service.server_process import Server
 
 ENDED = ("succeeded", "failed", "cancelled")
@@ -52,6 +53,23 @@ def raw(server: Server, method: str, path: str) -> tuple[int, bytes]:
         return response.status, response.read()
     finally:
         connection.close()
+
+
+def test_results_name_no_place_of_the_server(server, client, dome, sky):
+    """Whoever may read a project need not learn where the server keeps it; captures are named by their identifiers."""
+    jobs = [{"kind": "pipeline", "capture": dome, "environment": sky, "guided": True, "relight": {"frames": "1-2"},
+             "solve": {"method": "lambert"}}]
+    made = [client.post("/v1/jobs", json=job).raise_for_status().json()["id"] for job in jobs]
+    for job in made:
+        assert server.wait(client, f"/v1/jobs/{job}", ENDED)["state"] == "succeeded"
+        names = [result["name"] for result in client.get(f"/v1/jobs/{job}/results").json()["results"]]
+        assert {"report.json", "maps.exr", "frame.0001.exr"} <= set(names)
+        for name in names:
+            content = client.get(f"/v1/jobs/{job}/results/{name}").content
+            for place in (str(server.data.parent), str(SAMPLES), os.getcwd()):
+                assert place.encode() not in content, (name, place)
+    report = client.get(f"/v1/jobs/{made[0]}/results/report.json").json()
+    assert report["options"]["capture"] == dome
 
 
 def test_what_is_listed_while_a_job_runs_is_complete(server, client, frames):

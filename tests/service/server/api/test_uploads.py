@@ -16,7 +16,7 @@ import pytest
 
 from service.requests.identifiers import CAPTURE, new_id
 from service.requests.keys import NewKey, Scope
-from service.server.database import keys, uploads
+from service.server.database import keys, tables, uploads
 from service.server.database.engine import connect
 from service.server.database.intakes import insert as insert_intake
 from service.server.database.schema import upgrade
@@ -446,6 +446,49 @@ def test_limits_and_projects(tmp_path):
             soon(lambda: tus.ask("HEAD", upload, **key).status == 410)  # 1.8 s after it was touched
             assert tus.patch(upload, 0, b"data", **key).status == 410
         database.close()
+
+
+@pytest.mark.parametrize("headers", [{}, {"Idempotency_Key": "once"}], ids=["plain", "with a token"])
+def test_an_expired_upload_is_begun_again_at_once(server, client, tus, capture, headers):
+    """410 says so; it was 409 until the next housekeeping."""
+    content = b"12345678"
+    first = tus.create(capture, len(content), encoded(path="a.bin"), **headers).headers["location"]
+    assert tus.patch(first, 0, content[:3]).offset == 3
+    database = connect(f"sqlite:///{server.data / 'relit.sqlite'}")
+    database.transact(lambda connection: connection.execute(tables.uploads.update().where(
+        tables.uploads.c.id == first.rpartition("/")[2]).values(touched_at=time.time() - 49 * 3600)))
+    database.close()
+    assert tus.patch(first, 3, content[3:]).status == tus.head(first).status == 410
+    again = tus.create(capture, len(content), encoded(path="a.bin"), **headers)
+    assert (again.status, again.offset) == (201, 0)
+    assert again.headers["location"] != first
+    assert tus.patch(again.headers["location"], 0, content).offset == len(content)
+    assert stored(server, capture, "a.bin").read_bytes() == content
+    assert tus.head(first).status == 404
+
+
+def test_a_length_that_is_said_twice_is_refused(server, capture):
+    """A proxy before the service may have believed the other header, and taken the rest of the body for the next request."""
+    upload = Tus(server.url).create(capture, 8, encoded(path="a.bin")).headers["location"]
+    port = int(server.url.rpartition(":")[2])
+    smuggled = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    for method, path in (("PATCH", upload), ("POST", "/v1/captures"), ("GET", "/healthz")):
+        with socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S) as connection:
+            connection.sendall((f"{method} {path} HTTP/1.1\r\nHost: localhost\r\nTus-Resumable: 1.0.0\r\nUpload-Offset: 0\r\n"
+                                "Content-Type: application/offset+octet-stream\r\nContent-Length: 4\r\nTransfer-Encoding: chunked\r\n\r\n"
+                                "0\r\n\r\n").encode() + smuggled)
+            answer = b"".join(iter(lambda: connection.recv(4096), b""))
+        assert answer.startswith(b"HTTP/1.1 400") and answer.count(b"HTTP/1.1") == 1, (path, answer)
+        assert b"both Content-Length and Transfer-Encoding" in answer
+
+
+def test_files_are_not_for_everybody(server, tus, capture):
+    tus.send(capture, "a.bin", b"12345678")
+    half = tus.create(capture, 8, encoded(path="b.bin")).headers["location"]
+    tus.patch(half, 0, b"1234")
+    files = [*server.data.glob("relit.sqlite*"), stored(server, capture, "a.bin"), part(server, half)]
+    folders = {folder for file in files for folder in file.parents if folder.is_relative_to(server.data)}
+    assert len(files) >= 3 and [path for path in (*files, *folders) if path.stat().st_mode & 0o027] == []
 
 
 def test_a_server_without_space_takes_nothing(tmp_path):

@@ -55,6 +55,25 @@ def test_the_first_new_frame_after_a_lost_worker_is_told_at_once(claim, monkeypa
     assert told(made, claim) == ("frames", 3, 10)
 
 
+def test_a_worker_that_takes_over_shows_no_fewer_frames(claim):
+    """It opens the capture again and looks at the frames that are there: the user sees neither nought nor another stage."""
+    made, claim = claim
+    JobProgress(made.database, claim, alive=lambda: None, frame_count=10).stage("frames", 5)
+    step = JobProgress(made.database, claim, alive=lambda: None, frame_count=10)
+    step.stage("frames", 5)
+    step.advance(4)
+    again = JobProgress(made.database, claim, alive=lambda: None, frame_count=10, shown=made.row(claim.job)["reached"])
+    again.begin("frames")
+    assert told(made, claim) == ("frames", 4, 10)
+    again.stage("open", 3)
+    again.advance(2)
+    assert told(made, claim) == ("frames", 4, 10)
+    again.stage("frames", 5)
+    for done, shown in ((1, 4), (4, 4), (5, 5)):
+        again.advance(done)
+        assert told(made, claim) == ("frames", shown, 10)
+
+
 def test_a_database_that_does_not_answer_does_not_end_the_step(claim):
     made, claim = claim
     signs = []
