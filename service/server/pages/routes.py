@@ -85,6 +85,18 @@ async def job(job: JobId) -> Response:
     return _page("job.html", identifier=job, forms=[form_of(kind, model) for kind, model in MAPS_JOBS.items()])
 
 
+@router.get("/light/{capture}")
+async def light(capture: CaptureId) -> Response:
+    """Relight a capture live."""
+    return _page("light.html", identifier=capture)
+
+
+@router.get("/maps/{job}")
+async def maps(job: JobId) -> Response:
+    """Show the maps that a job has solved or decoded."""
+    return _page("maps.html", identifier=job)
+
+
 @router.get("/favicon.ico")
 async def icon(request: Request) -> Response:
     """Return the icon, which browsers ask for at this place."""

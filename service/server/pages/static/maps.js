@@ -1,0 +1,22 @@
+/** The page of the maps of a job: their layers, and the readings behind each pixel. */
+
+import { attempt, read } from "./api.js";
+import { byId, element } from "./element.js";
+import { mount as mountMaps } from "./view/map_viewer.js";
+import { mount as mountPlot } from "./view/pixel_plot.js";
+import { ViewFile } from "./view/view_file.js";
+import { openView } from "./view_jobs.js";
+
+const identifier = byId("main").dataset.identifier;
+
+await attempt(async () => {
+  const job = await read(`/v1/jobs/${identifier}`);
+  const { files } = await openView(job.request.capture, identifier);
+  const view = await ViewFile.open(files);
+  byId("name").textContent = `Maps of ${view.info.name}`;
+  document.title = `Maps of ${view.info.name} · Relit`;
+  const [maps, plot] = [element("div"), element("section", { "aria-label": "Readings of a pixel" })];
+  byId("view").replaceChildren(maps, plot);
+  const readings = mountPlot(plot, view);
+  mountMaps(maps, view, { onpick: (row, col) => attempt(() => readings?.show(row, col)) });
+});

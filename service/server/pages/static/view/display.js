@@ -1,0 +1,113 @@
+/** Values as colours of the screen: named colour maps for numbers, and a named view transform for scene-linear colours. */
+
+const ANCHORS = { // matplotlib's viridis at every sixteenth
+  viridis: "440154 48186a 472d7b 424086 3b528b 33638d 2c728e 26828e 21918c 1fa088 28ae80 3fbc73 5ec962 84d44b addc30 d8e219 fde725",
+  grey: "000000 ffffff",
+};
+const STEPS = 256;
+
+/** Names of the colour maps. */
+export const COLOUR_MAPS = Object.keys(ANCHORS);
+/** Name of the view transform, as pages show it. */
+export const VIEW_TRANSFORM = "sRGB (linear Rec.709, clipped, no tone mapping)";
+/** Colours of codes, which differ for people with any colour vision as far as nine colours can (Okabe and Ito 2008, and grey). */
+const CODE_COLOURS = ["009e73", "e69f00", "56b4e9", "f0e442", "0072b2", "d55e00", "cc79a7", "777777", "202020"].map(bytesOf);
+/** From each working space to linear Rec.709. */
+const TO_REC709 = {
+  lin_rec709_scene: null,
+  lin_ap1_scene: [1.70505, -0.62179, -0.08326, -0.13026, 1.1408, -0.01055, -0.024, -0.12897, 1.15297], // ACEScg, Bradford-adapted (ACES TB-2014-004)
+};
+
+function bytesOf(hex) {
+  return [0, 2, 4].map((at) => parseInt(hex.slice(at, at + 2), 16));
+}
+
+const tables = new Map();
+
+/** Return the 256 × 3 bytes of a colour map. */
+export function colourTable(name) {
+  if (!tables.has(name)) {
+    const anchors = ANCHORS[name].split(" ").map(bytesOf);
+    const table = new Uint8ClampedArray(3 * STEPS);
+    for (let step = 0; step < STEPS; step += 1) {
+      const at = (step / (STEPS - 1)) * (anchors.length - 1);
+      const low = Math.min(Math.floor(at), anchors.length - 2);
+      for (let c = 0; c < 3; c += 1) table[3 * step + c] = anchors[low][c] + (at - low) * (anchors[low + 1][c] - anchors[low][c]);
+    }
+    tables.set(name, table);
+  }
+  return tables.get(name);
+}
+
+/** Return the colour of a code as bytes; null: the code 0, which stands for nothing. */
+export function codeColour(layer, code) {
+  return code === 0 ? null : CODE_COLOURS[layer.range.filter((each) => each !== 0).indexOf(code) % CODE_COLOURS.length] ?? CODE_COLOURS.at(-1);
+}
+
+/** Return the byte of a linear value, encoded as sRGB does (IEC 61966-2-1). */
+export function srgbByte(linear) {
+  return ENCODED[Math.max(0, Math.min(4095, Math.round(linear * 4095)))];
+}
+
+const ENCODED = Uint8ClampedArray.from({ length: 4096 }, (_, index) => {
+  const value = index / 4095;
+  return Math.round(255 * (value <= 0.0031308 ? 12.92 * value : 1.055 * value ** (1 / 2.4) - 0.055));
+});
+
+/** Return the matrix from a working space to linear Rec.709, row by row; null: it is that space. */
+export function displayMatrix(space) {
+  return TO_REC709[space] ?? null;
+}
+
+/** Return whether colours of a space can be shown as they are meant. */
+export function isKnownSpace(space) {
+  return space in TO_REC709;
+}
+
+/**
+ * Paint a tile.
+ * @param {any} layer Of view.json.
+ * @param {import("./view_file.js").Tile} tile
+ * @param {{low: number, high: number, stops: number, colours: string, space: string}} look
+ * @returns {ImageData}
+ */
+export function paint(layer, tile, look) {
+  const image = new ImageData(tile.cols, tile.rows);
+  const { data } = image;
+  const count = tile.rows * tile.cols;
+  const [x, y, z] = tile.planes;
+  if (layer.kind === "vector") {
+    for (let at = 0, to = 0; at < count; at += 1, to += 4) {
+      data[to] = 127.5 * (x[at] + 1);
+      data[to + 1] = 127.5 * (y[at] + 1);
+      data[to + 2] = 127.5 * (z[at] + 1);
+      data[to + 3] = 255;
+    }
+  } else if (layer.kind === "colour") {
+    const gain = 2 ** look.stops;
+    const m = displayMatrix(look.space);
+    for (let at = 0, to = 0; at < count; at += 1, to += 4) {
+      const [r, g, b] = m === null ? [x[at], y[at], z[at]] : [0, 3, 6].map((row) => m[row] * x[at] + m[row + 1] * y[at] + m[row + 2] * z[at]);
+      data[to] = srgbByte(gain * r);
+      data[to + 1] = srgbByte(gain * g);
+      data[to + 2] = srgbByte(gain * b);
+      data[to + 3] = 255;
+    }
+  } else if (layer.kind === "codes") {
+    for (let at = 0, to = 0; at < count; at += 1, to += 4) {
+      const colour = codeColour(layer, Math.round(x[at]));
+      if (colour !== null) data.set([...colour, 255], to);
+    }
+  } else {
+    const table = colourTable(look.colours);
+    const scale = (STEPS - 1) / (look.high - look.low || 1);
+    for (let at = 0, to = 0; at < count; at += 1, to += 4) {
+      const step = 3 * Math.max(0, Math.min(STEPS - 1, Math.round((x[at] - look.low) * scale)));
+      data[to] = table[step];
+      data[to + 1] = table[step + 1];
+      data[to + 2] = table[step + 2];
+      data[to + 3] = 255;
+    }
+  }
+  return image;
+}

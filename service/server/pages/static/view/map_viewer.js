@@ -1,0 +1,211 @@
+/** Layers of a view as an image that can be zoomed and compared, with the value under the cursor. */
+
+import { element, tell } from "../element.js";
+import { COLOUR_MAPS, isKnownSpace, VIEW_TRANSFORM } from "./display.js";
+import { mountHistogram, short } from "./histogram.js";
+import { codeWords, OUTSIDE, REFUSED, stateOf, UNSURE } from "./pixel_states.js";
+import { TiledImage } from "./tiled_image.js";
+
+const STATE_WORDS = { [UNSURE]: "unsure: the value is not vouched for", [REFUSED]: "refused", [OUTSIDE]: "outside the object" };
+const LARGEST_SCALE = 64;
+const ZOOM = 1.25;
+const PAN = 0.1; // of the canvas, for one press of an arrow key
+const NONE = "";
+
+/**
+ * Show the layers of a view.
+ * @param {HTMLElement} parent Takes the viewer.
+ * @param {import("./view_file.js").ViewFile} view
+ * @param {{onpick?: function(number, number): void}} [options] `onpick` is called with row and column of a pixel that was chosen.
+ * @returns {{destroy: function(): void, pixelAt: function(number, number): Promise<any>}}
+ */
+export function mount(parent, view, { onpick = () => {} } = {}) {
+  const { rows, cols } = view.info;
+  const canvas = element("canvas", { class: "map", tabindex: 0, role: "img",
+    "aria-label": "Map. Plus and minus zoom, arrow keys move, 0 shows all, Enter chooses the pixel in the middle." });
+  const context = canvas.getContext("2d");
+  const value = element("output", { class: "value", "aria-live": "polite" }, "Point at a pixel to read its values.");
+  const histogram = element("div", { class: "histogram" });
+  const layerSelect = layerChoice("Layer");
+  const otherSelect = layerChoice("Compare with", true);
+  const wipe = element("input", { type: "range", min: 0, max: 100, value: 50, "aria-label": "Where the two layers meet" });
+  const colours = element("select", {}, ...COLOUR_MAPS.map((name) => element("option", { value: name }, name)));
+  const stops = element("input", { type: "range", min: -6, max: 6, step: 0.1, value: 0, "aria-label": "Exposure in stops" });
+  const stopsText = element("output", {}, "0 stops");
+  const hatched = { unsure: checkbox(true), refused: checkbox(true) };
+  const named = (text, control, ...more) => element("label", {}, `${text} `, control, ...more);
+  const colourRow = named("Colour map", colours);
+  const stopsRow = element("label", {}, "Exposure ", stops, " ", stopsText);
+  const wipeRow = named("Wipe", wipe);
+  const panel = element("div", { class: "panel" }, named("Layer", layerSelect), named("Compare with", otherSelect), wipeRow,
+    named("Hatch unsure pixels", hatched.unsure), named("Hatch refused pixels", hatched.refused), colourRow, stopsRow, histogram,
+    element("p", { class: "actions" }, button("Zoom in", () => zoom(ZOOM)), button("Zoom out", () => zoom(1 / ZOOM)), button("Show all", fit)),
+    element("p", { class: "help" }, `Colours are shown through ${VIEW_TRANSFORM}.`,
+      isKnownSpace(view.info.color_space) ? "" : ` The space ${view.info.color_space} is shown as if it were linear Rec.709.`));
+  parent.replaceChildren(element("div", { class: "viewer" }, element("div", { class: "stage" }, canvas, value), panel));
+
+  let place = { x: 0, y: 0, scale: 1 };
+  let image = null;
+  let other = null;
+  let asked = false;
+  let looked = 0;
+
+  function layerChoice(name, none = false) {
+    return element("select", { "aria-label": name }, none ? element("option", { value: NONE }, "nothing") : null,
+      ...view.info.layers.map((layer) => element("option", { value: layer.name }, layer.title)));
+  }
+
+  function checkbox(checked) {
+    return element("input", { type: "checkbox", checked });
+  }
+
+  function button(text, action) {
+    return element("button", { type: "button", class: "quiet", onclick: action }, text);
+  }
+
+  function draw() {
+    if (asked) return;
+    asked = true;
+    requestAnimationFrame(() => {
+      asked = false;
+      const { width, height } = canvas;
+      context.clearRect(0, 0, width, height);
+      const marks = { unsure: hatched.unsure.checked, refused: hatched.refused.checked };
+      const border = other === null ? width : Math.round((width * Number(wipe.value)) / 100);
+      image.draw(context, place, { left: 0, right: border }, marks);
+      other?.draw(context, place, { left: border, right: width }, marks);
+      if (other !== null) {
+        context.fillStyle = getComputedStyle(canvas).color;
+        context.fillRect(border - 1, 0, 2, height);
+      }
+    });
+  }
+
+  function select() {
+    const look = image === null ? {} : { colours: colours.value, stops: Number(stops.value) };
+    const failed = (error) => tell(error.message);
+    const made = (name) => new TiledImage(view, view.layer(name), draw, failed);
+    image = made(layerSelect.value);
+    other = otherSelect.value === NONE ? null : made(otherSelect.value);
+    for (const each of [image, other]) each?.setLook(look);
+    const kinds = [image, other].map((each) => each?.layer.kind);
+    colourRow.hidden = !kinds.includes("scalar") && !kinds.includes("mask");
+    stopsRow.hidden = !kinds.includes("colour");
+    wipeRow.hidden = other === null;
+    mountHistogram(histogram, image.layer, view.info.codes, image.look, (range) => image.setLook(range));
+    draw();
+  }
+
+  function fit() {
+    const scale = Math.min(canvas.width / cols, canvas.height / rows);
+    place = { scale, x: (canvas.width - scale * cols) / 2, y: (canvas.height - scale * rows) / 2 };
+    draw();
+  }
+
+  function zoom(factor, x = canvas.width / 2, y = canvas.height / 2) {
+    const smallest = Math.min(canvas.width / cols, canvas.height / rows) / 2;
+    const scale = Math.max(smallest, Math.min(LARGEST_SCALE, place.scale * factor));
+    place = { scale, x: x - ((x - place.x) * scale) / place.scale, y: y - ((y - place.y) * scale) / place.scale };
+    draw();
+  }
+
+  function pan(x, y) {
+    place = { ...place, x: place.x + x, y: place.y + y };
+    draw();
+    read(canvas.width / 2, canvas.height / 2);
+  }
+
+  function pixelOf(x, y) {
+    const [row, col] = [Math.floor((y - place.y) / place.scale), Math.floor((x - place.x) / place.scale)];
+    return row < 0 || col < 0 || row >= rows || col >= cols ? null : [row, col];
+  }
+
+  function onCanvas(event) {
+    const box = canvas.getBoundingClientRect();
+    return [((event.clientX - box.left) * canvas.width) / box.width, ((event.clientY - box.top) * canvas.height) / box.height];
+  }
+
+  async function pixelAt(row, col) {
+    const found = {};
+    for (const layer of new Set([image.layer, other?.layer, view.layer("status"), view.layer("mask")])) {
+      if (layer !== undefined) found[layer.name] = await view.pixel(layer, row, col);
+    }
+    return found;
+  }
+
+  async function read(x, y) {
+    const mine = ++looked;
+    const pixel = pixelOf(x, y);
+    if (pixel === null) return;
+    const found = await pixelAt(...pixel).catch((error) => { tell(error.message); return null; });
+    if (found === null || mine !== looked) return;
+    const parts = [image, other].filter((each) => each !== null && each.layer.name !== "status").map(({ layer }) => `${layer.title} ${words(layer, found[layer.name])}`);
+    const code = found.status?.[0];
+    const state = found.mask === undefined ? undefined : STATE_WORDS[stateOf(view.info.codes, code, found.mask[0])];
+    if (code !== undefined && state !== STATE_WORDS[OUTSIDE]) parts.push(`status: ${codeWords(view.info.codes, code)}`);
+    if (state !== undefined) parts.push(state);
+    value.textContent = `row ${pixel[0]}, column ${pixel[1]}: ${parts.join("; ")}`;
+  }
+
+  function words(layer, values) {
+    return values.map(short).join(", ") + (layer.unit === null ? "" : ` ${layer.unit}`);
+  }
+
+  let dragged = null;
+  canvas.addEventListener("pointerdown", (event) => {
+    dragged = { at: onCanvas(event), place, moved: false };
+    canvas.setPointerCapture(event.pointerId);
+  });
+  canvas.addEventListener("pointermove", (event) => {
+    const [x, y] = onCanvas(event);
+    if (dragged !== null) {
+      const [dx, dy] = [x - dragged.at[0], y - dragged.at[1]];
+      dragged.moved ||= Math.hypot(dx, dy) > 4;
+      if (dragged.moved) place = { ...dragged.place, x: dragged.place.x + dx, y: dragged.place.y + dy };
+      draw();
+    }
+    read(x, y);
+  });
+  canvas.addEventListener("pointerup", (event) => {
+    const pixel = pixelOf(...onCanvas(event));
+    if (dragged !== null && !dragged.moved && pixel !== null) onpick(...pixel);
+    dragged = null;
+  });
+  canvas.addEventListener("wheel", (event) => {
+    event.preventDefault();
+    zoom(event.deltaY < 0 ? ZOOM : 1 / ZOOM, ...onCanvas(event));
+  }, { passive: false });
+  const keys = {
+    "+": () => zoom(ZOOM), "=": () => zoom(ZOOM), "-": () => zoom(1 / ZOOM), 0: fit,
+    ArrowLeft: () => pan(PAN * canvas.width, 0), ArrowRight: () => pan(-PAN * canvas.width, 0),
+    ArrowUp: () => pan(0, PAN * canvas.height), ArrowDown: () => pan(0, -PAN * canvas.height),
+    Enter: () => {
+      const pixel = pixelOf(canvas.width / 2, canvas.height / 2);
+      if (pixel !== null) onpick(...pixel);
+    },
+  };
+  canvas.addEventListener("keydown", (event) => {
+    if (!(event.key in keys)) return;
+    event.preventDefault();
+    keys[event.key]();
+  });
+  layerSelect.addEventListener("change", select);
+  otherSelect.addEventListener("change", select);
+  wipe.addEventListener("input", draw);
+  for (const each of Object.values(hatched)) each.addEventListener("change", draw);
+  colours.addEventListener("change", () => [image, other].forEach((each) => each?.setLook({ colours: colours.value })));
+  stops.addEventListener("input", () => {
+    stopsText.textContent = `${stops.value} stops`;
+    for (const each of [image, other]) each?.setLook({ stops: Number(stops.value) });
+  });
+  const resized = new ResizeObserver(() => {
+    const box = canvas.getBoundingClientRect();
+    const ratio = globalThis.devicePixelRatio ?? 1;
+    canvas.width = Math.max(1, Math.round(box.width * ratio));
+    canvas.height = Math.max(1, Math.round(box.height * ratio));
+    fit();
+  });
+  select();
+  resized.observe(canvas);
+  return { destroy: () => resized.disconnect(), pixelAt };
+}

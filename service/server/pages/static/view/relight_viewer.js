@@ -1,0 +1,241 @@
+/** Relights a capture live: a key light that is dragged, an environment that is spun, and captured lights to compare with. */
+
+import { element, tell } from "../element.js";
+import { BasisRenderer, canRender } from "./basis_renderer.js";
+import { isKnownSpace, VIEW_TRANSFORM } from "./display.js";
+import { mountDomeControl } from "./dome_control.js";
+import { previewOf, readEnvironment } from "./environment_map.js";
+import { EnvironmentProfile, LightModel, unit } from "./light_model.js";
+import { floats } from "./view_file.js";
+
+const BEYOND_SHARE = 0.05; // from which the commands warn too
+const SPIN_DEGREES_PER_S = 30;
+const FIRST_LIGHT = [0.45, 0.5, 0.74]; // above right of the camera
+const WHITE_PERCENTILE = 0.99;
+const SAMPLES = 2000; // pixels that the first exposure is taken from
+const NO_WEBGL = "This browser has no WebGL2, which live relighting needs. The frames can still be made by a job, and the captured images looked at.";
+
+/**
+ * Show the live relighting of a view.
+ * @param {HTMLElement} parent Takes it.
+ * @param {import("./view_file.js").ViewFile} view With `relight`.
+ * @param {{environments: {id: string, name: string}[], load: function(string): Promise<{name: string, data: ArrayBuffer}>,
+ *          onchange: function(any): void}} options Environments of the server and how their files are read; `onchange` is told the light.
+ * @returns {Promise<{destroy: function(): void, state: function(): any, pixels: function(): Uint8Array, set: function(any): void}>}
+ */
+export async function mount(parent, view, { environments, load, onchange }) {
+  const { relight } = view.info;
+  if (!canRender()) {
+    parent.replaceChildren(element("p", { class: "fault" }, NO_WEBGL));
+    return { destroy: () => {}, state: () => null, pixels: () => null, set: () => {} };
+  }
+  const lights = view.info.frames.filter((frame) => frame.direction !== null);
+  const canvas = element("canvas", { class: "picture", width: relight.cols, height: relight.rows, tabindex: 0, role: "img",
+    "aria-label": "The object under the chosen light. Drag to move the light." });
+  const warning = element("p", { class: "beyond", role: "status", hidden: true });
+  const dome = element("div");
+  const preview = element("div");
+  const control = {
+    lit: element("input", { type: "checkbox", checked: true }),
+    brightness: range("Brightness of the light", -6, 6, 0.1, 0), colour: element("input", { type: "color", value: "#ffffff" }),
+    size: range("Size of the light in degrees", 0, 90, 0.5, 0.5), environment: element("select", {}, element("option", { value: "" }, "none"),
+      ...environments.map(({ id, name }) => element("option", { value: id }, name))),
+    file: element("input", { type: "file", accept: ".exr,.hdr", class: "visually-hidden" }),
+    environmentStops: range("Brightness of the environment", -10, 10, 0.1, 0), turn: range("Turn of the environment in degrees", 0, 360, 1, 0),
+    exposure: range("Exposure in stops", -10, 10, 0.1, 0),
+    compare: element("select", {}, element("option", { value: "" }, "nothing"),
+      ...lights.map((frame, index) => element("option", { value: index }, frame.image))),
+    wipe: range("Where the two pictures meet", 0, 100, 1, 50),
+  };
+  const play = element("button", { type: "button", class: "quiet", "aria-pressed": "false" }, "Spin");
+  const row = (text, each, ...more) => element("label", {}, `${text} `, each, ...more);
+  const wipeRow = row("Wipe", control.wipe);
+  const panel = element("div", { class: "panel" },
+    element("fieldset", {}, element("legend", {}, "Light"), row("On", control.lit), dome, row("Brightness (stops)", control.brightness),
+      row("Colour", control.colour), row("Size (degrees)", control.size)),
+    element("fieldset", {}, element("legend", {}, "Environment"), row("Map", control.environment),
+      element("label", { class: "button quiet" }, "Open a file", control.file), preview, row("Brightness (stops)", control.environmentStops),
+      row("Turn (degrees)", control.turn), play),
+    element("fieldset", {}, element("legend", {}, "Picture"), row("Exposure (stops)", control.exposure),
+      element("button", { type: "button", class: "quiet", onclick: () => { expose(); change(); } }, "Expose for this light"), row("Compare with the photograph", control.compare), wipeRow,
+      element("p", { class: "help" }, `Shown through ${VIEW_TRANSFORM}, from ${relight.terms} coefficient images, which keep the captured images within ${(100 * relight.relative_rms).toPrecision(2)} % (RMS).`,
+        isKnownSpace(view.info.color_space) ? "" : ` The space ${view.info.color_space} is shown as if it were linear Rec.709.`)));
+  parent.replaceChildren(element("div", { class: "viewer" }, element("div", { class: "stage" }, canvas, warning), panel));
+
+  const [transfer, beyond, captured] = await Promise.all([relight.transfer, relight.beyond, relight.captured].map((block) => view.block(block)));
+  const model = new LightModel(relight, new Float32Array(transfer), new Uint8Array(beyond));
+  const photographs = new Float32Array(captured);
+  const renderer = new BasisRenderer(canvas, relight, view.info.color_space);
+  const matte = new Uint8Array(await view.block(relight.matte));
+  renderer.setMatte(matte);
+  const unitIrradiance = Math.max(...(lights[0]?.irradiance ?? [1]));
+  const light = { direction: unit(FIRST_LIGHT) };
+  let map = null; // { id, name, profile }
+  let asked = false;
+  const domeControl = mountDomeControl(dome, model, lights.map((frame) => frame.direction), move);
+
+  function move(direction) {
+    light.direction = unit(direction);
+    control.lit.checked = true;
+    change();
+  }
+
+  /** Return the light as the batch takes it. */
+  function state() {
+    const linear = [1, 3, 5].map((at) => decoded(parseInt(control.colour.value.slice(at, at + 2), 16) / 255));
+    const gain = unitIrradiance * 2 ** Number(control.brightness.value);
+    return {
+      light: control.lit.checked ? { direction: light.direction, irradiance: linear.map((each) => gain * each), angle_degrees: Number(control.size.value) } : null,
+      environment: map === null ? null : { id: map.id, name: map.name, turn_degrees: Number(control.turn.value), exposure: Number(control.environmentStops.value) },
+      exposure: Number(control.exposure.value),
+    };
+  }
+
+  function change() {
+    domeControl.set(control.lit.checked ? light.direction : null);
+    wipeRow.hidden = control.compare.value === "";
+    onchange(state());
+    if (asked) return;
+    asked = true;
+    requestAnimationFrame(() => {
+      asked = false;
+      draw();
+    });
+  }
+
+  function draw() {
+    const now = state();
+    const energy = energyOf(now);
+    const shown = model.coefficients(energy);
+    const chosen = control.compare.value;
+    const compared = chosen === "" ? shown : photographs.subarray(3 * relight.terms * Number(chosen), 3 * relight.terms * (Number(chosen) + 1));
+    const dark = globalThis.matchMedia("(prefers-color-scheme: dark)").matches;
+    renderer.draw({ shown, compared, border: chosen === "" ? 1 : Number(control.wipe.value) / 100, gain: 2 ** now.exposure, backdrop: dark ? [0.09, 0.09, 0.1] : [0.2, 0.2, 0.2] });
+    const share = model.shareBeyond(energy);
+    warning.hidden = share < BEYOND_SHARE;
+    canvas.classList.toggle("hatched", share >= BEYOND_SHARE);
+    warning.textContent = warning.hidden ? "" : `${Math.round(100 * share)} % of the light comes from beyond the captured lights (more than ${relight.beyond_degrees.toFixed(0)}° from each): the nearest of them stand in for it, with their own shading and shadows.`;
+  }
+
+  /** Set the exposure at which all but the brightest pixels of the picture are below white. */
+  function expose() {
+    const coefficients = model.coefficients(energyOf(state()));
+    const levels = covered.map((_, index) => Math.max(...[0, 1, 2].map((c) => terms.reduce((sum, term, k) => sum + coefficients[3 * k + c] * term[3 * index + c], 0))));
+    const white = levels.sort((a, b) => a - b)[Math.floor(WHITE_PERCENTILE * (levels.length - 1))];
+    if (white > 0) control.exposure.value = String(Math.round(-10 * Math.log2(white)) / 10);
+  }
+
+  function energyOf(now) {
+    const energy = new Float64Array(3 * model.cells);
+    if (now.light !== null) model.addDisc(energy, now.light);
+    if (map !== null) model.addEnvironment(energy, map.profile, now.environment.turn_degrees, 2 ** now.environment.exposure);
+    return energy;
+  }
+
+  async function useEnvironment(id, name, data) {
+    const found = await readEnvironment(data, name);
+    map = { id, name, profile: new EnvironmentProfile(found, model.rows) };
+    preview.replaceChildren(previewOf(found));
+    change();
+  }
+
+  function dropEnvironment() {
+    map = null;
+    preview.replaceChildren();
+    change();
+  }
+
+  function onPicture(event) {
+    const box = canvas.getBoundingClientRect();
+    const half = Math.min(box.width, box.height) / 2;
+    const [x, y] = [(event.clientX - box.left - box.width / 2) / half, (box.top + box.height / 2 - event.clientY) / half];
+    const across = Math.min(Math.hypot(x, y), 1);
+    const scale = across / (Math.hypot(x, y) || 1);
+    move([x * scale, y * scale, Math.sqrt(1 - across * across)]);
+  }
+
+  canvas.addEventListener("pointerdown", (event) => {
+    canvas.setPointerCapture(event.pointerId);
+    onPicture(event);
+  });
+  canvas.addEventListener("pointermove", (event) => event.buttons !== 0 && onPicture(event));
+  for (const each of [control.lit, control.brightness, control.colour, control.size, control.environmentStops, control.turn, control.exposure, control.wipe, control.compare]) {
+    each.addEventListener("input", change);
+  }
+  control.environment.addEventListener("change", () => attemptHere(async () => {
+    const id = control.environment.value;
+    if (id === "") dropEnvironment();
+    else {
+      const { name, data } = await load(id);
+      await useEnvironment(id, name, data);
+    }
+  }));
+  control.file.addEventListener("change", () => attemptHere(async () => {
+    const [file] = control.file.files;
+    if (file === undefined) return;
+    control.environment.value = "";
+    await useEnvironment(null, file.name, await file.arrayBuffer());
+  }));
+  let spinning = null;
+  play.addEventListener("click", () => {
+    play.setAttribute("aria-pressed", String(spinning === null));
+    if (spinning !== null) {
+      cancelAnimationFrame(spinning);
+      spinning = null;
+      return;
+    }
+    let before = performance.now();
+    const step = (time) => {
+      control.turn.value = String((Number(control.turn.value) + ((time - before) / 1000) * SPIN_DEGREES_PER_S) % 360);
+      before = time;
+      change();
+      spinning = requestAnimationFrame(step);
+    };
+    spinning = requestAnimationFrame(step);
+  });
+
+  const covered = spread(matte, SAMPLES);
+  const terms = await Promise.all(relight.basis.map(async (block, term) => {
+    const planes = await view.block(block);
+    renderer.setTerm(term, new Uint16Array(planes));
+    return at(floats(planes, "float16"), covered);
+  }));
+  expose();
+  change();
+  return {
+    destroy: () => spinning !== null && cancelAnimationFrame(spinning),
+    state,
+    pixels: () => { draw(); return renderer.pixels(); },
+    set: (direction) => move(direction),
+  };
+}
+
+/** Return the places of at most `count` covered pixels, evenly spread. */
+function spread(matte, count) {
+  const inside = [];
+  matte.forEach((cover, at) => { if (cover === 255) inside.push(at); });
+  const step = Math.max(1, Math.floor(inside.length / count));
+  return inside.filter((_, index) => index % step === 0);
+}
+
+/** Return the colours [places, 3] of planes [3, pixels]. */
+function at(planes, places) {
+  const count = planes.length / 3;
+  return places.flatMap((place) => [planes[place], planes[count + place], planes[2 * count + place]]);
+}
+
+function range(name, low, high, step, value) {
+  return element("input", { type: "range", min: low, max: high, step, value, "aria-label": name });
+}
+
+function decoded(value) {
+  return value <= 0.04045 ? value / 12.92 : ((value + 0.055) / 1.055) ** 2.4;
+}
+
+async function attemptHere(action) {
+  try {
+    await action();
+  } catch (error) {
+    tell(error.message);
+  }
+}

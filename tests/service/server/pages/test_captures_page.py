@@ -1,0 +1,133 @@
+"""Captures are uploaded by the page: whole, continued, stopped, and refused with a sentence."""
+
+import hashlib
+import json
+import shutil
+
+import pytest
+
+from tests.service.server.pages.conftest import SAMPLES
+
+UPLOAD_MS = 60_000
+"""Time for an upload of two megabytes and its check; it takes a second on a machine that does nothing else."""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A copy of a small sample, whose name no other test uses."""
+    return shutil.copytree(SAMPLES / "lambert", tmp_path / tmp_path.name)
+
+
+def stored(server, name: str) -> dict:
+    """The newest capture of this name, with its files."""
+    with server.client() as client:
+        found = next(item for item in client.get("/v1/captures").json()["items"] if item["name"] == name)
+        return found | {"files": client.get(f"/v1/captures/{found['id']}/files").json()["files"]}
+
+
+def test_a_folder_is_uploaded_whole(server, page, folder):
+    page.goto("/captures")
+    page.set_input_files("#folder", folder)
+    page.get_by_role("link", name="Look at it").click(timeout=UPLOAD_MS)
+    page.get_by_role("heading", name=folder.name, level=1).wait_for()
+    found = stored(server, folder.name)
+    assert found["state"] == "ready"
+    local = {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.rglob("*") if path.is_file()}
+    assert {file["path"]: file["sha256"] for file in found["files"]} == local
+    assert page.locator("#facts").inner_text().split("\n") >= ["Identifier"]
+    assert "128 × 128" in page.locator("#facts").inner_text()
+
+
+def test_hidden_files_stay_here(server, page, folder):
+    (folder / ".relit").mkdir()
+    (folder / ".relit" / "cache").write_bytes(b"0")
+    (folder / ".DS_Store").write_bytes(b"0")
+    page.goto("/captures")
+    page.set_input_files("#folder", folder)
+    page.get_by_role("link", name="Look at it").wait_for(timeout=UPLOAD_MS)
+    assert not [file for file in stored(server, folder.name)["files"] if file["path"].startswith(".")]
+
+
+def test_an_upload_goes_on_after_broken_requests(server, page, folder):
+    """Every third request that carries bytes is cut, as by a bad network."""
+    seen = []
+
+    def cut(route):
+        seen.append(route.request.method)
+        if route.request.method == "PATCH" and seen.count("PATCH") % 3 == 1:
+            route.abort("connectionreset")
+        else:
+            route.continue_()
+
+    page.route("**/v1/uploads/*", cut)
+    page.goto("/captures")
+    page.set_input_files("#folder", folder)
+    page.get_by_role("link", name="Look at it").wait_for(timeout=2 * UPLOAD_MS)
+    assert stored(server, folder.name)["state"] == "ready"
+
+
+def test_a_stopped_upload_is_continued_with_what_is_missing(server, page, folder):
+    begun = []
+    page.on("request", lambda request: begun.append(request.url) if request.method == "POST" and request.url.endswith("/files") else None)
+    page.route("**/v1/uploads/*", lambda route: route.abort("connectionreset") if len(begun) > 8 else route.continue_())
+    page.goto("/captures")
+    page.set_input_files("#folder", folder)
+    page.wait_for_function("() => document.querySelector('#uploads progress')?.value > 0")
+    page.get_by_role("button", name="Stop").click()
+    page.get_by_text("Drop the same folder again to continue").wait_for()
+    before = {file["path"] for file in stored(server, folder.name)["files"] if file["done"]}
+    assert 0 < len(before) < len(list(folder.iterdir()))
+    page.unroute("**/v1/uploads/*")
+    begun.clear()
+    page.set_input_files("#folder", folder)
+    page.get_by_role("link", name="Look at it").wait_for(timeout=UPLOAD_MS)
+    found = stored(server, folder.name)
+    assert found["state"] == "ready"
+    assert len(begun) <= len(found["files"]) - len(before)
+    with server.client() as client:
+        assert [item["name"] for item in client.get("/v1/captures").json()["items"]].count(folder.name) == 1
+
+
+def test_a_folder_without_images_is_refused_here(page, tmp_path):
+    folder = tmp_path / "notes"
+    folder.mkdir()
+    (folder / "notes.txt").write_text("nothing")
+    page.goto("/captures")
+    page.set_input_files("#folder", folder)
+    page.get_by_text("notes: the folder has no images").wait_for()
+
+
+def test_a_folder_without_a_manifest_is_refused_here(page, folder):
+    (folder / "capture.json").unlink()
+    page.goto("/captures")
+    page.set_input_files("#folder", folder)
+    page.get_by_text("the folder has no capture.json: relit import writes one").wait_for()
+
+
+def test_a_broken_manifest_is_named(page, folder):
+    manifest = json.loads((folder / "capture.json").read_text())
+    manifest["frames"][3]["light"]["direction"] = [0, 0]
+    (folder / "capture.json").write_text(json.dumps(manifest))
+    page.goto("/captures")
+    page.set_input_files("#folder", folder)
+    fault = page.locator("#uploads .fault")
+    fault.wait_for(timeout=UPLOAD_MS)
+    assert "frames" in fault.inner_text() and "direction" in fault.inner_text()
+
+
+def test_an_environment_is_uploaded(server, page):
+    page.goto("/captures")
+    page.set_input_files("#file", SAMPLES / "owl" / "environment.exr")
+    page.locator("#environments tr", has_text="environment").locator(".state.ready").first.wait_for(timeout=UPLOAD_MS)
+    with server.client() as client:
+        assert client.get("/v1/environments").json()["items"][0]["state"] == "ready"
+
+
+def test_names_are_text(page, tmp_path):
+    """A folder whose name is markup is shown as its name."""
+    folder = tmp_path / "<img src=x onerror=alert(1)>"
+    folder.mkdir()
+    page.goto("/captures")
+    (folder / "a.txt").write_text("nothing")
+    page.set_input_files("#folder", folder)
+    page.get_by_text("<img src=x onerror=alert(1)>: the folder has no images").wait_for()

@@ -1,0 +1,158 @@
+"""Jobs are submitted by forms, followed, cancelled and continued; a lost connection is said and regained."""
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+
+import pytest
+
+from tests.service.server.pages.conftest import SAMPLES
+from tests.service.server.pages.cuttable import cuttable
+
+JOB_MS = 120_000
+"""Time for a small job on a loaded machine."""
+
+
+@pytest.fixture(scope="session")
+def capture(server) -> str:
+    """A small capture, registered and ready."""
+    with server.client() as client:
+        made = client.post("/v1/captures", json={"name": "lambert", "folder": str(SAMPLES / "lambert")}).raise_for_status().json()
+        assert server.wait(client, f"/v1/captures/{made['id']}", ("ready", "refused"))["state"] == "ready"
+    return made["id"]
+
+
+@pytest.fixture(scope="session")
+def sky(server) -> str:
+    with server.client() as client:
+        file = str(SAMPLES / "owl" / "environment.exr")
+        made = client.post("/v1/environments", json={"name": "sky", "file": file}).raise_for_status().json()
+        return server.wait(client, f"/v1/environments/{made['id']}", ("ready", "refused"))["id"]
+
+
+def opened_form(page, title: str, options: bool = True):
+    """Open the form of a job, its options and what shows it as a command."""
+    page.locator("summary", has_text=title).first.click()
+    form = page.locator(".job-form[open] form")
+    if options:
+        form.locator("> details:not(.same-as) > summary").click()
+    form.locator(".same-as > summary").click()
+    return form
+
+
+def submitted(page) -> str:
+    page.locator(".job-form[open] button[type=submit]").click()
+    page.wait_for_url("**/jobs/job_*")
+    return page.url.rpartition("/")[2]
+
+
+def slow_job(client, capture: str, sky: str) -> str:
+    """A job of many frames, which lasts until it is cancelled."""
+    return client.post("/v1/jobs", json={"kind": "relight", "capture": capture, "environment": sky, "options": {
+        "frames": "1-5000", "spin_degrees": 360}}).raise_for_status().json()["id"]
+
+
+def test_a_form_submits_a_job_that_is_followed_to_its_results(server, page, capture):
+    page.goto(f"/captures/{capture}")
+    form = opened_form(page, "Solve normals")
+    form.get_by_label("Method").select_option("lambert")
+    form.get_by_label("Priority").fill("60")
+    job = submitted(page)
+    page.locator(".state.succeeded").wait_for(timeout=JOB_MS)
+    page.locator("#results").get_by_text("maps.exr").wait_for()
+    with server.client() as client:
+        found = client.get(f"/v1/jobs/{job}").json()
+        assert (found["request"]["options"]["method"], found["priority"]) == ("lambert", 60)
+        report = client.get(f"/v1/jobs/{job}/results/report.json").json()
+    shown = page.locator("#stages tbody tr").all_inner_texts()
+    assert [row.split()[0] for row in shown] == list(report["timings_s"])
+    with page.expect_download() as download:
+        page.locator("#results").get_by_text("report.json").click()
+    assert json.loads(download.value.path().read_text()) == report
+
+
+def test_what_a_form_sends_is_shown_as_a_command_and_as_curl(server, page, capture, sky):
+    """Both are run as they are shown, and make the same request as the form."""
+    page.goto(f"/captures/{capture}")
+    form = opened_form(page, "Relight frames")
+    form.get_by_label("Environment").select_option(sky)
+    form.get_by_label("Frames", exact=True).fill("1-2")
+    form.get_by_label("Exposure").fill("-1.5")
+    form.get_by_label("Name").fill("it's a test")
+    form.get_by_label("Align", exact=True).uncheck()
+    command, curl = (form.locator(f"[data-shows={name}]").inner_text() for name in ("command", "curl"))
+    job = submitted(page)
+    done = subprocess.run([sys.executable, "-m", "service.cli.main", *shlex.split(command)[1:]], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    by_command = re.search(r"job_\w+", done.stdout)[0]
+    by_curl = json.loads(subprocess.run(shlex.split(curl), capture_output=True, text=True, timeout=60, check=True).stdout)["id"]
+    with server.client() as client:
+        requests = [client.get(f"/v1/jobs/{each}").json()["request"] for each in (job, by_command, by_curl)]
+    assert requests[0] == requests[1] == requests[2]
+    assert requests[0]["options"]["exposure"] == -1.5 and requests[0]["name"] == "it's a test"
+
+
+def test_a_value_that_cannot_be_is_named_and_nothing_is_sent(page, capture):
+    page.goto(f"/captures/{capture}")
+    form = opened_form(page, "Solve normals")
+    form.get_by_label("Least confidence").fill("2")
+    form.get_by_role("button", name="Submit").click()
+    form.get_by_text("Least confidence: is 2: give 0 to 1").first.wait_for()
+    form.get_by_label("Least confidence").fill("")
+    form.get_by_label("Align to").fill("nothing.png")
+    form.get_by_role("button", name="Submit").click()
+    page.wait_for_url("**/jobs/job_*")
+    page.locator("#error").wait_for(timeout=JOB_MS)  # the service says what it is that it does not find
+    assert page.locator("#error").inner_text().strip()
+
+
+def test_a_job_is_cancelled_and_resumed(server, page, capture, sky):
+    with server.client() as client:
+        job = slow_job(client, capture, sky)
+        page.goto(f"/jobs/{job}")
+        page.locator("#stage").get_by_text("frames").wait_for(timeout=JOB_MS)
+        page.get_by_role("button", name="Cancel").click()
+        page.locator(".state.cancelled").wait_for()
+        page.get_by_role("button", name="Resume").click()
+        page.locator("#state").get_by_text("attempt 2").wait_for()
+        page.get_by_role("button", name="Cancel").click()
+        page.locator(".state.cancelled").wait_for()
+        server.wait(client, f"/v1/jobs/{job}", ("cancelled",))
+        page.on("dialog", lambda dialog: dialog.accept())
+        page.get_by_role("button", name="Delete").click()
+        page.wait_for_url("**/jobs")
+        assert client.get(f"/v1/jobs/{job}").status_code == 404
+
+
+def test_a_lost_connection_is_said_and_regained(server, browser, capture, sky):
+    """The connections of the page are cut, and new ones refused for a while; the job ends meanwhile."""
+    with server.client() as client, cuttable(server.url) as way:
+        job = slow_job(client, capture, sky)
+        page = browser.new_page(base_url=way.url)
+        page.goto(f"/jobs/{job}")
+        page.locator("#stage").get_by_text("frames").wait_for(timeout=JOB_MS)
+        way.cut()
+        page.get_by_role("status").filter(has_text="The connection is lost").wait_for(timeout=JOB_MS)
+        client.post(f"/v1/jobs/{job}/cancel")
+        way.mend()
+        page.locator(".state.cancelled").wait_for(timeout=JOB_MS)
+        assert page.locator("#connection").is_hidden()
+        page.close()
+
+
+def test_the_list_follows_all_jobs(server, page, capture):
+    page.goto("/jobs")
+    with server.client() as client:
+        request = {"kind": "solve", "capture": capture, "name": "seen", "options": {"method": "lambert"}}
+        job = client.post("/v1/jobs", json=request).raise_for_status().json()["id"]
+        row = page.locator("#jobs tr", has_text=job)
+        row.locator(".state.succeeded").wait_for(timeout=JOB_MS)
+        client.delete(f"/v1/jobs/{job}").raise_for_status()
+        row.wait_for(state="detached")
+
+
+def test_what_is_not_there_is_said(page):
+    page.goto("/jobs/job_0123456789abcdefghjk")
+    page.get_by_role("alert").get_by_text("there is no job_0123456789abcdefghjk in this project").wait_for()
