@@ -1,4 +1,4 @@
-"""A way to a server that can be cut: a TCP proxy on a loopback port, which closes its connections and accepts no more until it is mended."""
+"""A way to a server that can be cut: a TCP proxy on a loopback port, which closes its connections and takes none until it is mended."""
 
 import socket
 import threading
