@@ -1,4 +1,4 @@
-"""relit submit: the work of solve, depth, relight, shade and export, done by a service; and most of it in one job, pipeline."""
+"""relit submit: the work of solve, depth, relight, shade, export and view, done by a service; and most of it in one job, pipeline."""
 
 import re
 from collections.abc import Callable
@@ -22,6 +22,7 @@ from service.requests.jobs import (
     RelightJob,
     ShadeJob,
     SolveJob,
+    ViewJob,
 )
 from service.requests.light_keys import LightKeys
 from service.requests.options import Option, help_text, options_of
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from service.client import Client
 
 JOBS: dict[str, type[JobRequest]] = {"solve": SolveJob, "depth": DepthJob, "relight": RelightJob, "shade": ShadeJob, "export": ExportJob,
-                                     "pipeline": PipelineJob}
+                                     "view": ViewJob, "pipeline": PipelineJob}
 REGISTERED = "server:"
 SOURCES = "Give a path of this machine, which is uploaded; an identifier, {prefix}_…; or server:/path, which is registered."
 

@@ -12,6 +12,7 @@ from service.requests.light_keys import LightKeys
 from service.requests.relight import RelightOptions
 from service.requests.shade import ShadeOptions
 from service.requests.solve import SolveOptions
+from service.requests.view import ViewOptions
 from stage.model import Line
 
 DEFAULT_PORT = 8470
@@ -103,6 +104,17 @@ class ExportJob(JobRequest):
     options: ExportOptions = ExportOptions()
 
 
+class ViewJob(JobRequest):
+    """What a browser needs to show a capture and its maps: view.json, view.bin, thumbnails.jpg."""
+
+    kind: Literal["view"]
+    capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
+    """The capture."""
+    maps: Annotated[JobId | None, Role.INPUT, Spelling(metavar="JOB")] = None
+    """A solve, pipeline or depth job of the capture: its maps are shown too."""
+    options: ViewOptions = ViewOptions()
+
+
 class PipelineJob(JobRequest):
     """Solve, then export, then relight, in one job: maps.exr, report.json, asset.usdz and frame.####.exr; no frames without an environment
     or light keys."""
@@ -123,7 +135,7 @@ class PipelineJob(JobRequest):
     relight: RelightOptions = RelightOptions()
 
 
-UserJob = Annotated[SolveJob | DepthJob | RelightJob | ShadeJob | ExportJob | PipelineJob, Field(discriminator="kind")]
+UserJob = Annotated[SolveJob | DepthJob | RelightJob | ShadeJob | ExportJob | ViewJob | PipelineJob, Field(discriminator="kind")]
 """Every kind of job that the API accepts."""
-AnyJob = Annotated[CheckJob | SolveJob | DepthJob | RelightJob | ShadeJob | ExportJob | PipelineJob, Field(discriminator="kind")]
-ANY_JOB: TypeAdapter[CheckJob | SolveJob | DepthJob | RelightJob | ShadeJob | ExportJob | PipelineJob] = TypeAdapter(AnyJob)
+AnyJob = Annotated[CheckJob | SolveJob | DepthJob | RelightJob | ShadeJob | ExportJob | ViewJob | PipelineJob, Field(discriminator="kind")]
+ANY_JOB: TypeAdapter[CheckJob | SolveJob | DepthJob | RelightJob | ShadeJob | ExportJob | ViewJob | PipelineJob] = TypeAdapter(AnyJob)

@@ -43,6 +43,7 @@ EXAMPLES: dict[str, Example] = {
     "shade": {"value": {"kind": "shade", "maps": SOLVED, "options": {
         "light": [{"position_m": [0.2, 0.3, 0.5], "intensity": [1, 1, 1]}], "exposure": -1}}},
     "export": {"value": {"kind": "export", "maps": SOLVED, "format": "usdz"}},
+    "view": {"value": {"kind": "view", "capture": CAPTURE, "maps": SOLVED}},
     "pipeline": {"value": {"kind": "pipeline", "capture": CAPTURE, "environment": SKY, "guided": True,
                            "relight": {"frames": "1-240", "spin_degrees": 360}}},
 }

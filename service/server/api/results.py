@@ -31,7 +31,7 @@ MAX_PAGE = 1000
 PIECE_BYTES = 1 << 20
 """Bytes that are read and sent at once."""
 MEDIA_TYPES = {".exr": "image/x-exr", ".usdz": "model/vnd.usdz+zip", ".usda": "model/vnd.usda", ".glb": "model/gltf-binary",
-               ".json": "application/json", ".png": "image/png"}
+               ".json": "application/json", ".png": "image/png", ".jpg": "image/jpeg"}
 BYTES = "application/octet-stream"
 CONTENT: dict[str, Any] = {kind: {"schema": {} if kind == "application/json" else {"type": "string", "format": "binary"}}
                            for kind in (*sorted(MEDIA_TYPES.values()), BYTES)}

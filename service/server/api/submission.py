@@ -3,7 +3,7 @@
 import sqlalchemy as sa
 
 from service.requests.frame_range import frame_numbers
-from service.requests.jobs import ExportJob, JobRequest, PipelineJob, RelightJob, ShadeJob
+from service.requests.jobs import ExportJob, JobRequest, PipelineJob, RelightJob, ShadeJob, ViewJob
 from service.requests.relight import RelightOptions
 from service.server import telemetry
 from service.server.api.context import Service
@@ -46,8 +46,8 @@ def inputs_of(service: Service, project: str, request: JobRequest) -> list[str]:
         if identifier is not None:
             _require_ready(service, project, field, identifier)
             read.append(identifier)
-    if isinstance(request, RelightJob | ShadeJob | ExportJob) and request.maps is not None:
-        _require_maps(service, project, request.maps, depth=isinstance(request, ExportJob))
+    if isinstance(request, RelightJob | ShadeJob | ExportJob | ViewJob) and request.maps is not None:
+        _require_maps(service, project, request.maps, depth=isinstance(request, ExportJob | ViewJob))
         read.append(request.maps)
     return read
 

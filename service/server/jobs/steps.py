@@ -9,7 +9,7 @@ from service.reporting.progress import Progress
 from service.reporting.provenance import name_place
 from service.requests.frame_range import frame_numbers
 from service.requests.identifiers import CAPTURE
-from service.requests.jobs import ANY_JOB, CheckJob, DepthJob, ExportJob, JobRequest, PipelineJob, RelightJob, ShadeJob, SolveJob
+from service.requests.jobs import ANY_JOB, CheckJob, DepthJob, ExportJob, JobRequest, PipelineJob, RelightJob, ShadeJob, SolveJob, ViewJob
 from service.server.database import intakes
 from service.server.database.engine import Database
 from service.server.storage import layout
@@ -75,6 +75,8 @@ def steps_of(job: Job, context: WorkerContext) -> list[JobStep]:
         return [JobStep("shade", lambda progress: _shade(job, request, context, progress))]
     if isinstance(request, ExportJob):
         return [JobStep("export", lambda progress: _export(job, request, context, progress))]
+    if isinstance(request, ViewJob):
+        return [JobStep("view", lambda progress: _view(job, request, context, progress))]
     if isinstance(request, RelightJob):
         return _frames(job, request, context)
     assert isinstance(request, PipelineJob), request
@@ -156,6 +158,15 @@ def _export(job: Job, request: ExportJob, context: WorkerContext, progress: Prog
     export(ExportRequest(maps=job_maps(job, request.maps, context, progress), out=_out(job, context) / f"{layout.ASSET}.{request.format}",
                          rig=None if request.rig is None else _intake(job, request.rig, context, progress),
                          environment=_environment(job, request.environment, context, progress), **dict(request.options)), progress)
+
+
+def _view(job: Job, request: ViewJob, context: WorkerContext, progress: Progress) -> None:
+    from service.requests.view import ViewRequest
+    from service.viewing.view import view
+
+    view(ViewRequest(capture=_intake(job, request.capture, context, progress),
+                     maps=None if request.maps is None else job_maps(job, request.maps, context, progress), out=_out(job, context),
+                     device=context.device, cache=context.cache / request.capture, **dict(request.options)), progress)
 
 
 def _relight(job: Job, request: RelightJob, only: str, context: WorkerContext, progress: Progress) -> None:

@@ -8,7 +8,7 @@ projects/PROJECT/jobs/ID/…            results: maps.exr, report.json, asset.us
 from service.requests.identifiers import CAPTURE, ENVIRONMENT
 
 MAPS = "maps.exr"
-SOLVED = (MAPS, "depth.exr", "points.ply")
+SOLVED = (MAPS, "depth.exr", "points.ply", "report.json")
 """Files of a solve or a depth that other jobs and later steps read."""
 FRAMES = "frame.####.exr"
 PICTURE = "picture.exr"

@@ -46,7 +46,7 @@ COMMANDS: dict[str, list[type[Options]]] = {
     "calibrate procam": [calibrate.ProcamRequest], "calibrate response": [calibrate.ResponseRequest],
     "calibrate tof": [calibrate.TofCalibrationRequest],
     "submit solve": [jobs.SolveJob], "submit depth": [jobs.DepthJob], "submit relight": [jobs.RelightJob], "submit shade": [jobs.ShadeJob],
-    "submit export": [jobs.ExportJob], "submit pipeline": [jobs.PipelineJob],
+    "submit export": [jobs.ExportJob], "submit view": [jobs.ViewJob], "submit pipeline": [jobs.PipelineJob],
     "farm template relight": [relight.RelightRequest], "farm template shade": [shade.ShadeRequest],
 }
 OWN = {
@@ -55,7 +55,8 @@ OWN = {
     "farm template relight": {"job", "chunk_frames", "gpu"}, "farm template shade": {"job", "turns", "gpu"},
 }
 """Options that a command has beside those of its models."""
-KINDS = {"solve": jobs.SolveJob, "depth": jobs.DepthJob, "relight": jobs.RelightJob, "shade": jobs.ShadeJob, "export": jobs.ExportJob}
+KINDS = {"solve": jobs.SolveJob, "depth": jobs.DepthJob, "relight": jobs.RelightJob, "shade": jobs.ShadeJob, "export": jobs.ExportJob,
+         "view": jobs.ViewJob}
 
 
 class Shown(NamedTuple):

@@ -205,6 +205,7 @@ def test_a_project_lists_and_names_nothing_of_another(site):
 @pytest.mark.parametrize("job", [
     {"kind": "solve", "capture": "capture"}, {"kind": "relight", "capture": "capture", "environment": "environment"},
     {"kind": "export", "maps": "job", "rig": "capture"}, {"kind": "shade", "maps": "job", "environment": "environment"},
+    {"kind": "view", "capture": "capture", "maps": "job"},
 ], ids=lambda job: job["kind"])
 def test_a_job_cannot_read_what_is_anothers(site, job):
     made = {"capture": new_id(CAPTURE), "environment": new_id(ENVIRONMENT), "job": new_id(JOB)}

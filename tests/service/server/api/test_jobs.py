@@ -3,6 +3,7 @@
 import json
 import re
 import time
+import zlib
 
 import httpx2
 import pytest
@@ -112,6 +113,25 @@ def test_a_shade_under_near_lights(server, client, solved, sky):
         job = submit(client, kind="shade", maps=solved, environment=sky, options={"light": [light], "turn_degrees": 90})
         finish(server, client, job)
         assert made_by(client, job) == {"picture.exr"}
+
+
+def test_a_view_of_maps_of_a_depth_and_of_a_capture_alone(server, client, dome, solved, rig):
+    depth = submit(client, kind="depth", capture=rig)
+    finish(server, client, depth)
+    shown = {}
+    for name, request in {"maps": {"capture": dome, "maps": solved, "options": {"terms": 4}},
+                          "depth": {"capture": rig, "maps": depth["id"]}, "capture": {"capture": dome}}.items():
+        job = submit(client, kind="view", **request)
+        finish(server, client, job)
+        assert made_by(client, job) == {"view.json", "view.bin", "thumbnails.jpg"}
+        results = f"/v1/jobs/{job['id']}/results"
+        shown[name] = client.get(f"{results}/view.json").raise_for_status().json()
+        for offset, length in [place for layer in shown[name]["layers"] for place in layer["levels"][0]["tiles"]]:
+            tile = client.get(f"{results}/view.bin", headers={"Range": f"bytes={offset}-{offset + length - 1}"})
+            assert tile.status_code == 206 and len(zlib.decompress(tile.content)) > 0
+    assert [layer["name"] for layer in shown["maps"]["layers"]][:2] == ["normal", "diffuse_albedo"]
+    assert shown["maps"]["relight"]["terms"] <= 4 and shown["capture"]["layers"] == []
+    assert shown["depth"]["layers"][0]["name"] == "depth" and shown["depth"]["relight"] is None
 
 
 def test_an_export(server, client, solved):

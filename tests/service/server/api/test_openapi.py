@@ -117,7 +117,7 @@ def test_schemas_name_their_fields_and_take_no_others(document):
 def test_the_examples_of_jobs_are_jobs():
     adapter = TypeAdapter(UserJob)
     kinds = {adapter.validate_python(example["value"]).kind for example in EXAMPLES.values()}
-    assert kinds == {"solve", "depth", "relight", "shade", "export", "pipeline"}
+    assert kinds == {"solve", "depth", "relight", "shade", "export", "view", "pipeline"}
 
 
 @pytest.mark.parametrize("model", [JobView, IntakeView, ResultView])
