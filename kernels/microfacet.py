@@ -22,13 +22,26 @@ def schlick(hv: float) -> float:
 
 
 @wp.func
-def ggx(nl: float, nv: float, nh: float, alpha: float) -> float:
-    """Return D · V · n·l without Fresnel; 0 for a light below the horizon."""
+def masking_root(cosine: float, alpha: float) -> float:
+    """Return √(α² + (1 - α²) · cosine²), the square root of `ggx`'s masking for the light or the viewer."""
+    a2 = alpha * alpha
+    return wp.sqrt(cosine * cosine * (1.0 - a2) + a2)
+
+
+@wp.func
+def ggx_seen(nl: float, nv: float, nh: float, alpha: float, view_root: float) -> float:
+    """Return `ggx`; `view_root` is masking_root(nv, alpha), the same for all lights."""
     a2 = alpha * alpha
     bottom = nh * nh * (a2 - 1.0) + 1.0
-    distribution = a2 * INVERSE_PI / (bottom * bottom)
-    masking = nl * wp.sqrt(nv * nv * (1.0 - a2) + a2) + nv * wp.sqrt(nl * nl * (1.0 - a2) + a2)
-    return wp.where(nl > 0.0, distribution * 0.5 * nl / wp.max(masking, 1.0e-6), 0.0)
+    masking = nl * view_root + nv * masking_root(nl, alpha)
+    lobe = wp.static(0.5 * INVERSE_PI) * a2 * nl / (bottom * bottom * wp.max(masking, 1.0e-6))
+    return wp.where(nl > 0.0, lobe, 0.0)
+
+
+@wp.func
+def ggx(nl: float, nv: float, nh: float, alpha: float) -> float:
+    """Return D · V · n·l without Fresnel; 0 for a light below the horizon."""
+    return ggx_seen(nl, nv, nh, alpha, masking_root(nv, alpha))
 
 
 @wp.func
@@ -39,17 +52,10 @@ def diffuse(nl: float, nv: float, hv2: float, rough: float, slope: float) -> flo
 
 
 @wp.func
-def masking_root(cosine: float, alpha: float) -> float:
-    """Return √(α² + (1 - α²) · cosine²), the square root of `ggx`'s masking for the light or the viewer."""
-    a2 = alpha * alpha
-    return wp.sqrt(cosine * cosine * (1.0 - a2) + a2)
-
-
-@wp.func
 def ggx_with_slopes(nl: float, nv: float, nh: float, alpha: float, view_root: float):
-    """Return `ggx` and its derivatives by nh, nl and nv; all are 0 for a light below the horizon.
+    """Return `ggx` and its derivatives by nh, nl, nv and α²; all are 0 for a light below the horizon.
 
-    `view_root` is masking_root(nv, alpha), the same for all lights. One division serves them all.
+    `view_root` is as for `ggx_seen`. One division serves them all.
     """
     a2 = alpha * alpha
     rest = 1.0 - a2
@@ -64,7 +70,10 @@ def ggx_with_slopes(nl: float, nv: float, nh: float, alpha: float, view_root: fl
     by_nh = value * 4.0 * rest * nh * inverse * bottom * masking * roots
     by_nl = top * nv * a2 * per_masking * inverse * bottom * bottom * masking * view_root
     by_nv = 0.0 - value * per_masking * light_root * (1.0 + nl * rest * nv * inverse * bottom * bottom * masking)
-    return value, by_nh, by_nl, by_nv
+    bend = nl * (1.0 - nv * nv) * light_root + nv * (1.0 - nl * nl) * view_root  # of the masking, over 1 / (2 · roots)
+    by_a2 = wp.static(0.5 * INVERSE_PI) * nl * inverse * roots - value * inverse * bottom * (
+        2.0 * nh * nh * masking * roots + 0.5 * bottom * bend)
+    return value, by_nh, by_nl, by_nv, by_a2
 
 
 @wp.func

@@ -5,6 +5,7 @@ from typing import Any
 import warp as wp
 
 from kernels.device import once
+from kernels.logarithm import log_of
 from kernels.microfacet import diffuse_with_slopes, ggx_with_slopes, masking_root, schlick
 from kernels.packs import pack_type
 from kernels.photometric.hypotheses import LARGEST_SQUARE, LEAST_NZ, LOG_GROUP, SHADOW_TRUST, tangents
@@ -141,7 +142,7 @@ def descent_kernel(lanes: int) -> Any:
                     by_v[k] = x[0, k] * on_v
                 for a in range(gloss):
                     for k in range(lanes):
-                        lobe, on_h, along_l, along_v = ggx_with_slopes(nl[k], nv[k], nh[k], alphas[a], view_root[a, k])
+                        lobe, on_h, along_l, along_v, _ = ggx_with_slopes(nl[k], nv[k], nh[k], alphas[a], view_root[a, k])
                         scaled = fresnel[k] * x[1 + a, k]
                         f[1 + a, k] = fresnel[k] * lobe
                         predicted[k] += scaled * lobe
@@ -161,7 +162,7 @@ def descent_kernel(lanes: int) -> Any:
                     product[k] = product[k] * (1.0 + given * wp.where(dark == 1, shadow[0], off2))
                 if light % LOG_GROUP == LOG_GROUP - 1:
                     for k in range(lanes):
-                        total[k] += wp.log(product[k])
+                        total[k] += log_of(product[k])
                         product[k] = 1.0
                 for a in range(UNKNOWNS):
                     wf = lane_type()
@@ -178,7 +179,7 @@ def descent_kernel(lanes: int) -> Any:
             worse = lane_type()
             for k in range(lanes):
                 away = wp.max(2.0 - 2.0 * (nx[k] * ux[k] + ny[k] * uy[k] + nz[k] * uz[k]), 0.0)
-                total[k] += wp.log(product[k]) + pull[0] * wp.log(1.0 + pull[1] * away)
+                total[k] += log_of(product[k]) + pull[0] * log_of(1.0 + pull[1] * away)
                 draw = pull[0] * pull[1] / (1.0 + pull[1] * away)
                 g[entry(TILT, TILT), k] += draw
                 g[entry(OTHER, OTHER), k] += draw

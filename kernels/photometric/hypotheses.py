@@ -21,9 +21,10 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import once
 from kernels.errors import ArrayError
+from kernels.logarithm import log_of
 from kernels.packs import pack_type
 from kernels.photometric.lobes import Lobes, direction_lobes
-from kernels.photometric.samples import Samples, per_pixel, to_host
+from kernels.photometric.samples import Samples, per_pixel, scratch_memory, to_host
 from kernels.photometric.tabulated_lobes import tabulated_lobes
 
 SHADOW_TRUST = 0.1
@@ -156,11 +157,9 @@ def search_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse,
     cost = wp.empty(packs, dtype=lane_type, device=device)
     drawn = per_pixel(samples, start if prior is None else prior.normal)
     lobes = direction_lobes(lanes) if table is None else tabulated_lobes(lanes, table.shape[2])
-    held = lobes.held
     weights = wp.empty((lobes.count, packs), dtype=lane_type, device=device)
     table = wp.empty((0, 0, 0), dtype=wp.float32, device=device) if table is None else table
-    scratch = wp.empty(packs * lights * held, dtype=lane_type, device=device)
-    strides = (lights * held, 1) if device == "cpu" else (1, packs)
+    scratch, strides = scratch_memory(samples, lobes.held)
     survey = None
     for degrees, count in (wide, *fine):
         offsets = wp.array(rings(degrees, count), dtype=wp.vec4, device=device)
@@ -271,9 +270,9 @@ def _search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> 
                         trust = wp.where(reading[k] > 0.0, wp.where(dark == 1, SHADOW_TRUST, 1.0), SHADOW_TRUST)
                         w[k] = given * trust * sigma * sigma / (1.0 + off2)
                         product[k] = product[k] * (1.0 + given * wp.where(dark == 1, shadow[0], off2))
-                    if light % LOG_GROUP == LOG_GROUP - 1:
+                    if turn == reweightings and light % LOG_GROUP == LOG_GROUP - 1:
                         for k in range(lanes):
-                            total[k] += wp.log(product[k])
+                            total[k] += log_of(product[k])
                             product[k] = 1.0
                     if turn < reweightings:
                         for a in range(mixture):
@@ -287,18 +286,25 @@ def _search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> 
                                 for k in range(lanes):
                                     g[a * (a + 1) / 2 + b, k] += wf[k] * h[k]
                 if turn < reweightings:
+                    pivots = coefficients()
+                    for a in range(mixture):
+                        for k in range(lanes):
+                            pivots[a, k] = relaxation / (g[a * (a + 1) / 2 + a, k] + 1.0e-8)
                     for _ in range(sweeps):
                         for a in range(mixture):
+                            rest = lane_type()
                             for k in range(lanes):
-                                rest = r[a, k]
-                                for b in range(mixture):
-                                    high = wp.max(a, b)
-                                    rest -= g[high * (high + 1) / 2 + wp.min(a, b), k] * x_best[b, k]
-                                move = relaxation * rest / (g[a * (a + 1) / 2 + a, k] + 1.0e-8)
-                                x_best[a, k] = wp.max(x_best[a, k] + move, 0.0)
+                                rest[k] = r[a, k]
+                            for b in range(mixture):
+                                high = wp.max(a, b)
+                                row = high * (high + 1) / 2 + wp.min(a, b)
+                                for k in range(lanes):
+                                    rest[k] -= g[row, k] * x_best[b, k]
+                            for k in range(lanes):
+                                x_best[a, k] = wp.max(x_best[a, k] + rest[k] * pivots[a, k], 0.0)
             for k in range(lanes):
                 away = 2.0 - 2.0 * (nx[k] * ux[k] + ny[k] * uy[k] + nz[k] * uz[k])
-                total[k] += wp.log(product[k]) + pull[0] * wp.log(1.0 + pull[1] * wp.max(away, 0.0))
+                total[k] += log_of(product[k]) + pull[0] * log_of(1.0 + pull[1] * wp.max(away, 0.0))
             costs[candidate, p] = total
             for k in range(lanes):
                 around = wp.where(candidate > 0, total[k], 0.0)

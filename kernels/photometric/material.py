@@ -26,7 +26,8 @@ from kernels.photometric.hypotheses import Diffuse, SearchOptions, criteria
 from kernels.photometric.lobes import direction_reflectance
 from kernels.photometric.material_kernel import GIVEN, NEUTRAL, TINTED, material_kernel
 from kernels.photometric.response_table import COLUMNS
-from kernels.photometric.samples import Samples, per_pixel, to_host
+from kernels.photometric.robust_weights import WEIGHT_ROWS
+from kernels.photometric.samples import Samples, per_pixel, scratch_memory, to_host
 from kernels.photometric.tabulated_lobes import tabulated_reflectance
 
 NEUTRAL_RISE = 1.25
@@ -121,10 +122,11 @@ def _fit(samples: Samples, normal: np.ndarray, shape: Diffuse, options: SearchOp
     fitted = wp.empty((8, packs), dtype=pack_type(lanes, wp.float32), device=device)
     responses = wp.empty((0, 0, 0), dtype=wp.float32, device=device) if table is None else table
     known = wp.vec4() if given is None else wp.vec4(*map(float, given))
+    scratch, strides = scratch_memory(samples, reflectance.held + WEIGHT_ROWS)
     devices.launch(material_kernel(lanes, reflectance, table is not None), packs,
                    [samples.colour, samples.toward, responses, samples.level, samples.view, per_pixel(samples, normal),
-                    *criteria(options, shape), freedom, known, samples.light_count, samples.pack_stride, samples.light_stride],
-                   [fitted], device=device)
+                    *criteria(options, shape), freedom, known, samples.light_count, samples.pack_stride, samples.light_stride, *strides],
+                   [scratch, fitted], device=device)
     values = to_host(samples, fitted)
     return Material(values[:, :3], values[:, 3:6], np.where(values[:, 6] > 0, values[:, 6], 1).astype(np.float32),
                     values[:, 7] / samples.light_count)

@@ -6,9 +6,11 @@ from typing import Any
 import warp as wp
 
 from kernels.device import once
+from kernels.logarithm import log_of
 from kernels.packs import channels_type, pack_type
-from kernels.photometric.hypotheses import LARGEST_SQUARE, LOG_GROUP, SHADOW_TRUST
+from kernels.photometric.hypotheses import LOG_GROUP
 from kernels.photometric.lobes import Reflectance
+from kernels.photometric.robust_weights import WEIGHT_ROWS, plain_weights, weigh
 
 ROUGHNESS_FIRST, ROUGHNESS_STEP, ROUGHNESS_COUNT = 0.1, 0.075, 13
 """First value, step and length of the grid of roughness, 0.1 to 1: a lobe below 0.1 is narrower than the spacing of the lights of any
@@ -32,24 +34,6 @@ GIVEN = wp.constant(2)
 """Fit mode in which F0 and roughness are given and the albedo alone is fitted."""
 
 
-@wp.func
-def squared_misfit(reading: float, predicted: float, bright: float, noise: wp.vec2):
-    """Return a third of r²/σ² of one channel's reading."""
-    off = (reading - predicted) / wp.max(noise[0] * bright + noise[1] * wp.max(reading, 0.0), 1.0e-20)
-    return off * off / 3.0
-
-
-@wp.func
-def weigh(shining: float, expected: float, off2: float, bright: float, noise: wp.vec2, shadow: wp.vec2):
-    """Return the weight of a light in the robust fit, one for all channels because a shadow is one in each of them, and the exponential of
-    its cost."""
-    dark = wp.where(shining < shadow[1] * expected, 1, 0) * wp.where(off2 > shadow[0], 1, 0)
-    given = wp.where(shining >= 0.0, 1.0, 0.0)
-    relative = bright / wp.max(noise[0] * bright + noise[1] * wp.max(shining, 0.0) / 3.0, 1.0e-20)
-    trust = wp.where(shining > 0.0, wp.where(dark == 1, SHADOW_TRUST, 1.0), SHADOW_TRUST)
-    return given * trust * relative * relative / (1.0 + off2), 1.0 + given * wp.min(wp.where(dark == 1, shadow[0], off2), LARGEST_SQUARE)
-
-
 @once
 def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
     """Return the kernel for one width of packs and one kind of light.
@@ -59,7 +43,8 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
         reflectance: expected readings.
         bare: whether a surface without any specular lobe is a candidate of its own.
     """
-    respond, lambertian = reflectance
+    held, prepare, respond, lambertian = reflectance
+    write_weights = plain_weights(lanes)
     lane_type = pack_type(lanes, wp.float32)
     channels = channels_type(lanes)
     bare_trials = int(bare)
@@ -81,7 +66,10 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
                    light_count: int,
                    pack_stride: int,
                    light_stride: int,
+                   scratch_pack: int,
+                   scratch_step: int,
                    # outputs
+                   scratch: wp.array(dtype=lane_type),  # [P · L · (held + WEIGHT_ROWS)]
                    fitted: wp.array2d(dtype=lane_type)):  # [8, P] albedo, F0, roughness, cost
         p = first + wp.tid()
         vx = view[0, p]
@@ -91,6 +79,12 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
         ny = normal[1, p]
         nz = normal[2, p]
         bright = level[p]
+        start = p * pack_stride
+        base = p * scratch_pack
+        light_step = wp.static(held + WEIGHT_ROWS) * scratch_step
+        weight_rows = base + held * scratch_step
+        prepare(toward, table, form, nx, ny, nz, vx, vy, vz, start, light_count, light_stride, base, light_step, scratch_step, scratch)
+        write_weights(colour, bright, noise, start, light_count, light_stride, weight_rows, light_step, scratch_step, scratch)
         best_cost, best_rough = lane_type(1.0e30), lane_type()
         best_rho, best_f0 = channels(), channels()
         rho, f0 = channels(), channels()
@@ -112,59 +106,65 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
                 for k in range(lanes):
                     rho[c, k] = wp.where(late == 0, best_rho[c, k], rho[c, k])
                     f0[c, k] = wp.where(late == 0, best_f0[c, k], f0[c, k])
-            cost = lane_type()
+            respond(table, nx, ny, nz, vx, vy, vz, rough, light_count, base, light_step, scratch_step, scratch)
+            cost, product = lane_type(), lane_type()
             cold = wp.where(trial * wp.static(int(not bare)) == 0, 1, 0)
             rounds = wp.where(cold == 1, wp.static(REWEIGHTINGS), wp.static(WARM_REWEIGHTINGS))
             for turn in range(rounds + 1):
-                unweighted = cold * wp.where(turn == 0, 1, 0)
-                dd, ds, ss, rd, rs = channels(), channels(), channels(), channels(), channels()
+                heeded = wp.where(cold * wp.where(turn == 0, 1, 0) == 1, 0.0, 1.0)  # at first nothing is known of the misfit
+                dd, ds, ss = lane_type(), lane_type(), lane_type()
+                rd, rs = channels(), channels()
                 cost, product = lane_type(), lane_type(1.0)
                 for light in range(light_count):
-                    at = p * pack_stride + light * light_stride
-                    fd, fs, fixed = respond(toward, table, form, nx, ny, nz, vx, vy, vz, rough, at, light)
-                    # one weight a light for all channels: a shadow is one in each of them
-                    off2, shining, expected, w = lane_type(), lane_type(), lane_type(), lane_type()
+                    element = start + light * light_stride
+                    at = base + light * light_step
+                    fd = scratch[at]
+                    fs = scratch[at + scratch_step]
+                    fixed = scratch[at + 2 * scratch_step]
+                    plain = scratch[at + held * scratch_step]
+                    off2, shining, expected, wd, ws = lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
                     for c in range(3):
-                        y = colour[c, at]
+                        y = colour[c, element]
+                        inverse = scratch[at + (held + 1 + c) * scratch_step]
                         for k in range(lanes):
                             predicted = rho[c, k] * fd[k] + f0[c, k] * fs[k] + fixed[k]
-                            off2[k] += wp.where(unweighted == 1, 0.0, squared_misfit(y[k], predicted, bright[k], noise))
+                            off = (y[k] - predicted) * inverse[k]
+                            off2[k] += off * off
                             shining[k] += y[k]
                             expected[k] += predicted
                     for k in range(lanes):
-                        weight, factor = weigh(shining[k], expected[k], off2[k], bright[k], noise, shadow)
-                        w[k] = weight
+                        w, factor = weigh(shining[k], expected[k], heeded * off2[k], plain[k], shadow)
                         product[k] = product[k] * factor
-                    if light % LOG_GROUP == LOG_GROUP - 1:
-                        for k in range(lanes):
-                            cost[k] += wp.log(product[k])
-                            product[k] = 1.0
+                        wd[k] = w * fd[k]
+                        ws[k] = w * fs[k]
+                        dd[k] += wd[k] * fd[k]
+                        ds[k] += wd[k] * fs[k]
+                        ss[k] += ws[k] * fs[k]
                     for c in range(3):
-                        y = colour[c, at]
+                        y = colour[c, element]
                         for k in range(lanes):
                             left = y[k] - fixed[k]
-                            dd[c, k] += w[k] * fd[k] * fd[k]
-                            ds[c, k] += w[k] * fd[k] * fs[k]
-                            ss[c, k] += w[k] * fs[k] * fs[k]
-                            rd[c, k] += w[k] * fd[k] * left
-                            rs[c, k] += w[k] * fs[k] * left
-                for k in range(lanes):
-                    cost[k] += wp.log(product[k])
+                            rd[c, k] += wd[k] * left
+                            rs[c, k] += ws[k] * left
+                    if turn == rounds and light % LOG_GROUP == LOG_GROUP - 1:
+                        for k in range(lanes):
+                            cost[k] += log_of(product[k])
+                            product[k] = 1.0
                 if turn < rounds and freedom == TINTED:
                     for c in range(3):
                         for k in range(lanes):
                             # two non-negative unknowns: the free solution, or the better one alone
-                            bottom = dd[c, k] * ss[c, k] - ds[c, k] * ds[c, k]
-                            safe = bottom > 1.0e-6 * dd[c, k] * ss[c, k]
-                            a = (ss[c, k] * rd[c, k] - ds[c, k] * rs[c, k]) / wp.where(safe, bottom, 1.0)
-                            b = (dd[c, k] * rs[c, k] - ds[c, k] * rd[c, k]) / wp.where(safe, bottom, 1.0)
-                            only_a = wp.max(rd[c, k], 0.0) / wp.max(dd[c, k], 1.0e-20)
-                            only_b = wp.clamp(wp.max(rs[c, k], 0.0) / wp.max(ss[c, k], 1.0e-20), 0.0, 1.0)
-                            gain_a = only_a * (2.0 * rd[c, k] - only_a * dd[c, k])
-                            gain_b = only_b * (2.0 * rs[c, k] - only_b * ss[c, k])
+                            bottom = dd[k] * ss[k] - ds[k] * ds[k]
+                            safe = bottom > 1.0e-6 * dd[k] * ss[k]
+                            a = (ss[k] * rd[c, k] - ds[k] * rs[c, k]) / wp.where(safe, bottom, 1.0)
+                            b = (dd[k] * rs[c, k] - ds[k] * rd[c, k]) / wp.where(safe, bottom, 1.0)
+                            only_a = wp.max(rd[c, k], 0.0) / wp.max(dd[k], 1.0e-20)
+                            only_b = wp.clamp(wp.max(rs[c, k], 0.0) / wp.max(ss[k], 1.0e-20), 0.0, 1.0)
+                            gain_a = only_a * (2.0 * rd[c, k] - only_a * dd[k])
+                            gain_b = only_b * (2.0 * rs[c, k] - only_b * ss[k])
                             both = wp.where(safe, 1, 0) * wp.where(a >= 0.0, 1, 0) * wp.where(b >= 0.0, 1, 0)
                             full = wp.where(b > 1.0, 1, 0)  # F0 at its bound: the albedo takes what is left
-                            rest = wp.max(rd[c, k] - ds[c, k], 0.0) / wp.max(dd[c, k], 1.0e-20)
+                            rest = wp.max(rd[c, k] - ds[k], 0.0) / wp.max(dd[k], 1.0e-20)
                             alone_a = wp.where(gain_a >= gain_b, only_a, 0.0)
                             alone_b = wp.where(gain_a >= gain_b, 0.0, only_b)
                             rho[c, k] = wp.where(both == 1, wp.where(full == 1, rest, a), alone_a)
@@ -176,15 +176,17 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
                             # F0 explains what the diffuse lobe cannot in channels with albedo above 0, and everything in the others
                             top, bottom, whole = float(0.0), float(0.0), float(0.0)
                             for c in range(3):
-                                shared = wp.where(rd[c, k] > common * ds[c, k], ds[c, k] / wp.max(dd[c, k], 1.0e-20), 0.0)
+                                shared = wp.where(rd[c, k] > common * ds[k], ds[k] / wp.max(dd[k], 1.0e-20), 0.0)
                                 top += rs[c, k] - shared * rd[c, k]
-                                bottom += ss[c, k] - shared * ds[c, k]
-                                whole += ss[c, k]
+                                bottom += ss[k] - shared * ds[k]
+                                whole += ss[k]
                             common = wp.where(bottom > 1.0e-6 * whole, wp.clamp(top / wp.max(bottom, 1.0e-20), 0.0, known[3]), 0.0)
                         for c in range(3):
                             shine = wp.where(freedom == NEUTRAL, common, known[c])
                             f0[c, k] = shine
-                            rho[c, k] = wp.max(rd[c, k] - shine * ds[c, k], 0.0) / wp.max(dd[c, k], 1.0e-20)
+                            rho[c, k] = wp.max(rd[c, k] - shine * ds[k], 0.0) / wp.max(dd[k], 1.0e-20)
+            for k in range(lanes):
+                cost[k] += log_of(product[k])
             for k in range(lanes):
                 better = cost[k] < best_cost[k]
                 best_cost[k] = wp.where(better, cost[k], best_cost[k])

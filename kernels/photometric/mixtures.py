@@ -17,10 +17,11 @@ import warp as wp
 from kernels import device as devices
 from kernels.packs import pack_type
 from kernels.photometric.hypotheses import Diffuse, SearchOptions, criteria
-from kernels.photometric.lobes import direction_reflectance
+from kernels.photometric.lobes import RESPONSES, direction_reflectance
 from kernels.photometric.material import COST_FLOOR, Material
-from kernels.photometric.mixture_kernel import mixture_kernel
-from kernels.photometric.samples import Samples, choose, per_pixel, to_host
+from kernels.photometric.mixture_kernel import MIXED_ROWS, mixture_kernel
+from kernels.photometric.robust_weights import WEIGHT_ROWS
+from kernels.photometric.samples import Samples, choose, per_pixel, scratch_memory, to_host
 from kernels.photometric.shared_materials import LEAST_GAIN
 
 MIXED_RISE = 1.25
@@ -30,6 +31,8 @@ LEAST_SHARE = 0.02
 """Least share of a material in a pixel that mixes two; with less the pixel has one material."""
 MOST_PAIRS = 4
 """Largest number of pairs of materials that pixels mix."""
+HELD = RESPONSES + WEIGHT_ROWS + MIXED_ROWS
+"""Values that the scratch memory of the fit holds for each light and pixel, more than any other step of the general solver."""
 
 NO_PAIRS = np.zeros((0, 2, 4), dtype=np.float32)
 """No pair of materials: every pixel has one material."""
@@ -135,10 +138,11 @@ def _better(fit: _Mixed, single_cost: np.ndarray) -> np.ndarray:
 def _fit(samples: Samples, normal: np.ndarray, pairs: np.ndarray, shape: Diffuse, options: SearchOptions | None) -> _Mixed:
     device, lanes, packs = samples.device, samples.lanes, samples.packs
     fitted = wp.empty((6, packs), dtype=pack_type(lanes, wp.float32), device=device)
+    scratch, strides = scratch_memory(samples, HELD)
     devices.launch(mixture_kernel(lanes, direction_reflectance(lanes)), packs,
                    [samples.colour, samples.toward, wp.empty((0, 0, 0), dtype=wp.float32, device=device), samples.level, samples.view,
                     per_pixel(samples, normal), *criteria(options or SearchOptions(), shape), wp.array(pairs, dtype=wp.vec4, device=device),
-                    samples.light_count, samples.pack_stride, samples.light_stride],
-                   [fitted], device=device)
+                    samples.light_count, samples.pack_stride, samples.light_stride, *strides],
+                   [scratch, fitted], device=device)
     values = to_host(samples, fitted)
     return _Mixed(values[:, :3], values[:, 3], values[:, 4].astype(np.uint8), values[:, 5] / samples.light_count)

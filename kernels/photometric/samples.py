@@ -114,6 +114,19 @@ def per_pixel(samples: Samples, values: np.ndarray) -> wp.array:
     return wp.array(planes, dtype=pack_type(samples.lanes, wp.float32), device=samples.device)
 
 
+def scratch_memory(samples: Samples, held: int) -> tuple[wp.array, tuple[int, int]]:
+    """Return memory for some values of each light and sampled pixel, and where they lie: value v of light l of pack p is at
+    p · strides[0] + (l · held + v) · strides[1].
+
+    Args:
+        samples: the readings beside which the values lie.
+        held: values for each light.
+    """
+    size = samples.light_count * held
+    scratch = wp.empty(samples.packs * size, dtype=pack_type(samples.lanes, wp.float32), device=samples.device)
+    return scratch, (size, 1) if samples.device == "cpu" else (1, samples.packs)
+
+
 def to_host(samples: Samples, packs: wp.array) -> np.ndarray:
     """Return [k, packs] or [packs] packs as [n, k] or [n] host values; waits for the device."""
     values = packs.numpy()

@@ -99,26 +99,49 @@ def tabulated_lobes(lanes: int, count: int) -> Lobes:
 def tabulated_reflectance(lanes: int) -> Reflectance:
     """Return Relit's BRDF from a response table; a roughness of 0 stands for a surface without a specular lobe."""
     lane_type = pack_type(lanes, wp.float32)
+    pairs = wp.types.matrix(shape=(2, lanes), dtype=wp.float32)
 
     @wp.func
-    def respond(toward: wp.array2d(dtype=lane_type), table: wp.array3d(dtype=float), form: wp.vec2,
-                nx: lane_type, ny: lane_type, nz: lane_type, vx: lane_type, vy: lane_type, vz: lane_type, rough: lane_type,
-                element: int, light: int):
-        fd, fs, fixed = lane_type(), lane_type(), lane_type()
+    def prepare(toward: wp.array2d(dtype=lane_type), table: wp.array3d(dtype=float), form: wp.vec2,
+                nx: lane_type, ny: lane_type, nz: lane_type, vx: lane_type, vy: lane_type, vz: lane_type, start: int,
+                light_count: int, light_stride: int, base: int, light_step: int, step: int, scratch: wp.array(dtype=lane_type)):
+        places = pairs()
         for k in range(lanes):
-            n = wp.vec3(nx[k], ny[k], nz[k])
-            place = grid_position(reflecting_normal(n, wp.vec3(vx[k], vy[k], vz[k])))
-            width = width_position(rough[k])
-            narrow = wp.min(int(width), wp.static(WIDTH_COUNT - 1))
-            part = width - float(narrow)
-            column = 1 + 2 * narrow
-            shines = wp.where(rough[k] > 0.0, 1.0, 0.0)
-            fd[k] = look_up(table, grid_position(n), light, 0)
-            fs[k] = shines * ((1.0 - part) * look_up(table, place, light, column)
-                              + part * look_up(table, place, light, column + 2))
-            fixed[k] = shines * ((1.0 - part) * look_up(table, place, light, column + 1)
-                                 + part * look_up(table, place, light, column + 3))
-        return fd, fs, fixed
+            place = grid_position(wp.vec3(nx[k], ny[k], nz[k]))
+            places[0, k] = place[0]
+            places[1, k] = place[1]
+        for light in range(light_count):
+            fd = lane_type()
+            for k in range(lanes):
+                fd[k] = look_up(table, wp.vec2(places[0, k], places[1, k]), light, 0)
+            scratch[base + light * light_step] = fd
+
+    @wp.func
+    def respond(table: wp.array3d(dtype=float),
+                nx: lane_type, ny: lane_type, nz: lane_type, vx: lane_type, vy: lane_type, vz: lane_type, rough: lane_type,
+                light_count: int, base: int, light_step: int, step: int, scratch: wp.array(dtype=lane_type)):
+        places = pairs()
+        width = lane_type()
+        for k in range(lanes):
+            place = grid_position(reflecting_normal(wp.vec3(nx[k], ny[k], nz[k]), wp.vec3(vx[k], vy[k], vz[k])))
+            places[0, k] = place[0]
+            places[1, k] = place[1]
+            width[k] = width_position(rough[k])
+        for light in range(light_count):
+            fs, fixed = lane_type(), lane_type()
+            for k in range(lanes):
+                place = wp.vec2(places[0, k], places[1, k])
+                narrow = wp.min(int(width[k]), wp.static(WIDTH_COUNT - 1))
+                part = width[k] - float(narrow)
+                column = 1 + 2 * narrow
+                shines = wp.where(rough[k] > 0.0, 1.0, 0.0)
+                fs[k] = shines * ((1.0 - part) * look_up(table, place, light, column)
+                                  + part * look_up(table, place, light, column + 2))
+                fixed[k] = shines * ((1.0 - part) * look_up(table, place, light, column + 1)
+                                     + part * look_up(table, place, light, column + 3))
+            at = base + light * light_step
+            scratch[at + step] = fs
+            scratch[at + 2 * step] = fixed
 
     @wp.func
     def lambertian(toward: wp.array2d(dtype=lane_type), form: wp.vec2,
@@ -129,4 +152,4 @@ def tabulated_reflectance(lanes: int) -> Reflectance:
             one[k] = 1.0
         return one
 
-    return Reflectance(respond, lambertian)
+    return Reflectance(3, prepare, respond, lambertian)

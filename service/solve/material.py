@@ -14,11 +14,10 @@ from kernels.photometric.diffuse_shape import choose_diffuse
 from kernels.photometric.hypotheses import Diffuse, Prior
 from kernels.photometric.lambert import solve_lambert
 from kernels.photometric.light_factors import find_light_factors
-from kernels.photometric.lobes import GEOMETRY, MIXTURE
 from kernels.photometric.material import MATT, fit_given, fit_material, fit_tinted
 from kernels.photometric.metal_search import Metals, metals_of
 from kernels.photometric.misfit import LARGEST_ERROR
-from kernels.photometric.mixtures import NO_PAIRS, choose_pairs
+from kernels.photometric.mixtures import HELD, NO_PAIRS, choose_pairs
 from kernels.photometric.near import NearField
 from kernels.photometric.normal_search import find_normals
 from kernels.photometric.propagation import neighbours
@@ -294,4 +293,4 @@ class _Walk:
     def _batches(self, stage: str, work: Callable[[Batch], None]) -> None:
         """Do the solvable pixels batch by batch, and say how far the stage is."""
         self._given.timings.stage(stage, len(self._solvable))
-        each_batch(self._given, self._lights, self._view, self._solvable, work, lobes=MIXTURE + GEOMETRY, field=self._field)
+        each_batch(self._given, self._lights, self._view, self._solvable, work, lobes=HELD, field=self._field)

@@ -33,22 +33,24 @@ def test_slopes_are_those_of_the_model(device):
     def evaluate(nl: wp.array(dtype=float), nv: wp.array(dtype=float), nh: wp.array(dtype=float), hv: wp.array(dtype=float),
                  a: wp.array(dtype=float), r: wp.array(dtype=float), s: wp.array(dtype=float), out: wp.array2d(dtype=float)):
         i = wp.tid()
-        value, by_h, by_l, by_v = ggx_with_slopes(nl[i], nv[i], nh[i], a[i], masking_root(nv[i], a[i]))
+        value, by_h, by_l, by_v, by_a2 = ggx_with_slopes(nl[i], nv[i], nh[i], a[i], masking_root(nv[i], a[i]))
         out[0, i] = value
         out[1, i] = by_h
         out[2, i] = by_l
         out[3, i] = by_v
+        out[4, i] = by_a2
         matt, on_l, on_v = diffuse_with_slopes(nl[i], nv[i], hv[i] * hv[i], r[i], s[i])
-        out[4, i] = matt
-        out[5, i] = on_l
-        out[6, i] = on_v
+        out[5, i] = matt
+        out[6, i] = on_l
+        out[7, i] = on_v
 
-    out = wp.zeros((7, 400), dtype=float, device=device)
+    out = wp.zeros((8, 400), dtype=float, device=device)
     wp.launch(evaluate, dim=400, inputs=[wp.array(v, dtype=float, device=device) for v in (nl, nv, nh, hv, alpha, rough, slope)],
               outputs=[out], device=device)
     got = out.numpy()
 
-    def gloss(nh, nl, nv):
+    def gloss(nh, nl, nv, a2):
+        alpha = np.sqrt(a2)
         masking = 1 / (1 + twin.smith_lambda(nl, alpha) + twin.smith_lambda(nv, alpha))
         return twin.distribution(nh, alpha) * masking / (4 * nv)
 
@@ -56,7 +58,7 @@ def test_slopes_are_those_of_the_model(device):
         grazing = 2 * rough * hv**2 - 0.5
         return nl * (1 + slope * (1 - nl)) * (1 + grazing * (1 - nl) ** 5) * (1 + grazing * (1 - nv) ** 5)
 
-    for rows, function, at in ((got[:4], gloss, (nh, nl, nv)), (got[4:], matt, (nl, nv))):
+    for rows, function, at in ((got[:5], gloss, (nh, nl, nv, alpha**2)), (got[5:], matt, (nl, nv))):
         np.testing.assert_allclose(rows[0], function(*at), rtol=2e-3)
         for row, expected in zip(rows[1:], numerical.slopes(function, at), strict=True):
             np.testing.assert_allclose(row, expected, rtol=5e-3, atol=5e-3 * np.abs(expected).mean())

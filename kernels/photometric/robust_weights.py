@@ -1,0 +1,56 @@
+"""Weights of the lights in the robust fits of reflectance: Cauchy weights of the colour readings, one a light, and the cost that follows.
+
+What the readings alone decide is written to scratch memory once, so that the rounds of a fit divide once a light.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from kernels.device import once
+from kernels.packs import pack_type
+from kernels.photometric.hypotheses import LARGEST_SQUARE, SHADOW_TRUST
+
+WEIGHT_ROWS = 4
+"""Values that scratch memory holds for each light: the weight of a reading without misfit, and 1 / σ of each channel over √3."""
+ROOT_OF_THIRD = 3.0**-0.5
+
+
+@wp.func
+def weigh(shining: float, expected: float, off2: float, plain: float, shadow: wp.vec2):
+    """Return the weight of a light in a robust fit, one for all channels because a shadow is one in each of them, and the exponential of
+    its cost.
+
+    `shining` and `expected` are sums over the channels of readings and of predictions, `off2` is the mean r²/σ², `plain` the weight of
+    the light without misfit.
+    """
+    dark = wp.where(shining < shadow[1] * expected, 1, 0) * wp.where(off2 > shadow[0], 1, 0)
+    trust = wp.where(shining > 0.0, wp.where(dark == 1, SHADOW_TRUST, 1.0), 1.0)
+    given = wp.where(plain > 0.0, 1.0, 0.0)
+    return trust * plain / (1.0 + off2), 1.0 + given * wp.min(wp.where(dark == 1, shadow[0], off2), LARGEST_SQUARE)
+
+
+@once
+def plain_weights(lanes: int) -> Any:
+    """Return the Warp function that writes the WEIGHT_ROWS of every light of a pack, the first of them at `base`."""
+    lane_type = pack_type(lanes, wp.float32)
+
+    @wp.func
+    def write_weights(colour: wp.array2d(dtype=lane_type), bright: lane_type, noise: wp.vec2, start: int, light_count: int,
+                      light_stride: int, base: int, light_step: int, step: int, scratch: wp.array(dtype=lane_type)):
+        for light in range(light_count):
+            element = start + light * light_stride
+            at = base + light * light_step
+            shining, value = lane_type(), lane_type()
+            for c in range(3):
+                y = colour[c, element]
+                for k in range(lanes):
+                    value[k] = ROOT_OF_THIRD / wp.max(noise[0] * bright[k] + noise[1] * wp.max(y[k], 0.0), 1.0e-20)
+                    shining[k] += y[k]
+                scratch[at + (1 + c) * step] = value
+            for k in range(lanes):
+                relative = bright[k] / wp.max(noise[0] * bright[k] + noise[1] * wp.max(shining[k], 0.0) / 3.0, 1.0e-20)
+                value[k] = wp.where(shining[k] >= 0.0, wp.where(shining[k] > 0.0, 1.0, SHADOW_TRUST), 0.0) * relative * relative
+            scratch[at] = value
+
+    return write_weights
