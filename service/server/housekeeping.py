@@ -14,6 +14,7 @@ from pathlib import Path
 import sqlalchemy as sa
 
 from service.server.database import idempotency, intakes, jobs, uploads, workers
+from service.server.database.clock import ClockWatch
 from service.server.database.engine import UNANSWERED, Database, message_of
 from service.server.jobs.queue import JobQueue
 from service.server.jobs.worker import cache_folder
@@ -40,14 +41,16 @@ class Housekeeper:
     """A thread that does the housekeeping every EVERY_S."""
 
     def __init__(self, settings: Settings, database: Database, storage: Storage, queue: JobQueue, *,
-                 clock: Callable[[], float] = time.time) -> None:
+                 clock: Callable[[], float] = time.time, monotonic: Callable[[], float] = time.monotonic) -> None:
         """Create the thread; `start` starts it.
 
         Args:
             settings, database, storage, queue: of the service.
             clock: returns seconds since 1970.
+            monotonic: returns seconds that do not jump when the clock is set.
         """
         self._settings, self._database, self._storage, self._queue, self._clock = settings, database, storage, queue, clock
+        self._watch = ClockWatch(database, now=clock, monotonic=monotonic)
         self._silent: set[str] = set()
         self._told: dict[str, str] = {}  # the last error of each piece of work that fails, which is logged once
         self._ended = threading.Event()
@@ -64,7 +67,7 @@ class Housekeeper:
 
     def round(self) -> None:
         """Do all pieces of work once; a piece that fails is tried again in the next round."""
-        for piece in (self._jobs, self._uploads, self._tokens, self._workers, self._caches, self._leftovers, self._interrupted):
+        for piece in (self._aged, self._workers, self._caches, self._leftovers, self._interrupted):
             if self._ended.is_set():
                 return
             self._try(piece.__name__.strip("_"), piece)
@@ -87,6 +90,12 @@ class Housekeeper:
             self._told[piece] = told
         else:
             self._told.pop(piece, None)
+
+    def _aged(self) -> None:
+        """Remove what is old, unless the clock that says so has jumped."""
+        if self._watch.steady():
+            for piece in (self._jobs, self._uploads, self._tokens):
+                self._try(piece.__name__.strip("_"), piece)
 
     def _jobs(self) -> None:
         if self._settings.retention_days is None:

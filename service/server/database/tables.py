@@ -119,6 +119,11 @@ workers = sa.Table(  # for operators: DBOS keeps no list of them, and the locks 
     sa.Column("seen_at", sa.Float, nullable=False),
     sa.Column("state", sa.String(16), nullable=False))
 
+clock = sa.Table(  # of the housekeeping, one row: by it a jump of the machine's clock is noticed
+    "relit_clock", metadata, sa.Column("id", sa.Integer, primary_key=True),
+    sa.Column("seen_at", sa.Float, nullable=False),  # the time at the last round
+    sa.Column("waits_s", sa.Float, nullable=False))  # seconds for which nothing is removed for its age, after a jump
+
 
 def newest_first(query: "sa.Select[Any]", table: sa.Table, *, limit: int, before: tuple[float, str] | None) -> "sa.Select[Any]":
     """Return the query of one page of rows, the newest first.

@@ -31,8 +31,9 @@ class House:
         self.database = connect(self.settings.sqlalchemy_url)
         prepare(self.settings, self.database)
         self.storage, self.queue = open_storage(self.settings), JobQueue(self.database)
-        self.now = time.time()
-        self.keeper = Housekeeper(self.settings, self.database, self.storage, self.queue, clock=lambda: self.now)
+        self.now, self.jumped = time.time(), 0.0
+        self.keeper = Housekeeper(self.settings, self.database, self.storage, self.queue, clock=lambda: self.now,
+                                  monotonic=lambda: self.now - self.jumped)
 
     def capture(self, kind: str = CAPTURE) -> str:
         made = new_id(kind)
@@ -297,3 +298,61 @@ def test_one_bad_row_stops_neither_the_other_rows_nor_the_thread(house, monkeypa
     house.keeper.round()
     assert jobs.find(house.database, bad) and jobs.find(house.database, good) is None and not stale.exists()
     assert logged == [("housekeeping failed", bad)]
+
+
+def jump(house, seconds):
+    """The clock is set, and no time passes."""
+    house.now += seconds
+    house.jumped += seconds
+
+
+def test_a_clock_that_jumps_removes_nothing_at_once(house):
+    job = house.job()
+    house.keeper.round()
+    jump(house, 20 * 365 * DAY_S)
+    for hours in (0, 10, 23):
+        house.now += hours * HOUR_S / 2
+        house.keeper.round()
+        assert house.results(job).is_dir() and jobs.find(house.database, job) is not None
+    jump(house, -20 * 365 * DAY_S)  # the operator has seen it
+    house.keeper.round()
+    house.now += 0.9 * DAYS * DAY_S  # as time passes, and nobody touches the clock
+    house.keeper.round()
+    assert house.results(job).is_dir()
+    house.now += 0.1 * DAYS * DAY_S
+    house.keeper.round()
+    assert not house.results(job).exists() and jobs.find(house.database, job) is None
+
+
+def test_a_clock_that_stays_ahead_is_believed_after_a_day(house):
+    job = house.job()
+    house.keeper.round()
+    jump(house, 60 * DAY_S)
+    house.keeper.round()
+    house.now += 0.9 * DAY_S
+    house.keeper.round()
+    assert house.results(job).is_dir()
+    house.now += 0.2 * DAY_S
+    house.keeper.round()
+    assert not house.results(job).exists()
+
+
+def test_a_machine_that_starts_with_another_year_removes_nothing_at_once(house):
+    """The process that saw the time before is gone."""
+    job = house.job()
+    house.keeper.round()
+    for seconds in (9 * 365 * DAY_S, 0.0):
+        house.now += seconds
+        house.keeper = Housekeeper(house.settings, house.database, house.storage, house.queue, clock=lambda: house.now,
+                                   monotonic=lambda: house.now)
+        house.keeper.round()
+        assert house.results(job).is_dir()
+
+
+def test_a_clock_that_is_set_right_by_minutes_is_no_jump(house):
+    job = house.job()
+    house.keeper.round()
+    house.now += 1.01 * DAYS * DAY_S
+    jump(house, -600)
+    house.keeper.round()
+    assert not house.results(job).exists()
