@@ -1,5 +1,6 @@
 """Reading and writing of OpenEXR files of one part or several: named channels, metadata, colour space and compression."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -7,8 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import OpenEXR
 
+from stage import inputs
 from stage.errors import ImageError, StorageError, storage
 from stage.exr_chunks import missing_bytes
+from stage.exr_scan import scan_header
 from stage.files import replacing
 
 HALF_MAX = 65504.0
@@ -61,7 +64,13 @@ def read_header(path: str | Path) -> Header:
         ImageError: the file is not an EXR, is truncated, or has deep data, parts of different sizes, or one channel in several parts.
         StorageError: the file cannot be opened.
     """
-    with storage("read", path), open(path, "rb") as stream:
+    with inputs.opened(path) as source:
+        return _header(source)
+
+
+def _header(source: inputs.Source) -> Header:
+    path, stream = source.path, source.file
+    with storage("read", path):
         start = stream.read(8)
     if start[:4] != b"\x76\x2f\x31\x01":
         raise ImageError(f"{path}: is not an OpenEXR file")
@@ -69,20 +78,21 @@ def read_header(path: str | Path) -> Header:
         raise ImageError(f"{path}: is damaged or truncated: its header cannot be read")
     if start[5] & DEEP_DATA:
         raise ImageError(f"{path}: has deep data: give a flat image")
+    table = scan_header(path, stream)
     try:
-        with OpenEXR.File(str(path), header_only=True) as file:
+        with source.reopened() as same, OpenEXR.File(same, header_only=True) as file:
             parts = [dict(file.header(index)) for index in range(len(file.parts))]
         windows = [tuple(int(edge) for corner in attributes["dataWindow"] for edge in corner) for attributes in parts]
         left, top, right, bottom = windows[0]
         names = tuple(channel.name for attributes in parts for channel in attributes["channels"])
-        missing = missing_bytes(path, parts)
+        missing = missing_bytes(stream, table, parts)
     except (RuntimeError, ValueError, TypeError, KeyError, IndexError) as error:
         raise ImageError(f"{path}: is damaged or truncated: its header cannot be read") from error
     if missing:
         raise ImageError(f"{path}: is truncated: {missing} or more bytes are missing")
     if len(set(windows)) > 1:
         raise ImageError(f"{path}: has parts with different data windows: give an image whose parts have one size")
-    if (twice := next((name for index, name in enumerate(names) if name in names[:index]), None)) is not None:
+    if (twice := next((name for name, count in Counter(names).items() if count > 1), None)) is not None:
         raise ImageError(f"{path}: has several parts with a channel {twice}: give an image with one view")
     return Header(right - left + 1, bottom - top + 1, names, parts[0])
 
@@ -97,12 +107,14 @@ def read(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         ImageError: the file is not a readable EXR of flat data.
         StorageError: the file cannot be opened.
     """
-    header = read_header(path)
-    try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            channels = {name: channel.pixels for index in range(len(file.parts)) for name, channel in file.channels(index).items()}
-    except (RuntimeError, ValueError) as error:
-        raise ImageError(f"{path}: cannot be decoded: its data is damaged") from error
+    with inputs.opened(path) as source:
+        header = _header(source)
+        source.check_pixels(header.width, header.height)
+        try:
+            with source.reopened() as same, OpenEXR.File(same, separate_channels=True) as file:
+                channels = {name: channel.pixels for index in range(len(file.parts)) for name, channel in file.channels(index).items()}
+        except (RuntimeError, ValueError) as error:
+            raise ImageError(f"{path}: cannot be decoded: its data is damaged") from error
     if len(channels) < len(header.channels):  # the library leaves out a part that it cannot decode
         raise ImageError(f"{path}: cannot be decoded: its data is damaged")
     return channels, header.metadata

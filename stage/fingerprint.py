@@ -5,6 +5,7 @@ import json
 from collections.abc import Iterable
 from pathlib import Path
 
+from stage import inputs
 from stage.errors import storage
 from stage.files import write_text
 
@@ -60,8 +61,8 @@ def digest(path: str | Path) -> str:
         StorageError: the file cannot be read.
     """
     content = hashlib.blake2b(digest_size=16)
-    with storage("read", path), open(path, "rb") as stream:
-        while block := stream.read(BLOCK):
+    with inputs.opened(path) as source, storage("read", path):
+        while block := source.file.read(BLOCK):
             content.update(block)
     return content.hexdigest()
 

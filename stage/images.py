@@ -1,5 +1,7 @@
 """Reading of images (EXR, PNG, TIFF, HDR, JPEG, JPEG XL, DPX), the header first and then the recorded pixels; and writing of PNG."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -7,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 import OpenImageIO as oiio
 
-from stage import exr, integrity
-from stage.errors import ImageError, storage
+from stage import exr, inputs, integrity, jxl
+from stage.errors import ImageError
 
 OIIO_SUFFIXES = {".png", ".tif", ".tiff", ".hdr", ".jpg", ".jpeg", ".jxl", ".dpx"}
 SUFFIXES = {".exr", *OIIO_SUFFIXES}
@@ -40,14 +42,15 @@ def read_header(path: str | Path) -> ImageHeader:
         return ImageHeader(header.width, header.height, len(_colour_channels(path, header.channels)), len(header.channels), False)
     if suffix not in OIIO_SUFFIXES:
         raise ImageError(f"{path}: has an unknown suffix: relit reads {', '.join(sorted(SUFFIXES))}")
-    if suffix == ".png":
-        integrity.check_png(path, contents=False)
-    source = _open(path)
-    try:
-        spec = source.spec()
-        return ImageHeader(spec.width, spec.height, 1 if spec.nchannels < 3 else 3, spec.nchannels, spec.format.basetype not in FLOATING)
-    finally:
-        source.close()
+    with inputs.opened(path) as source:
+        if suffix == ".png":
+            integrity.check_png(path, source.file, contents=False)
+        elif suffix == ".jxl":
+            source.check_pixels(*jxl.resolution_of(path, source.file))
+        with _decoder(source) as decoder:
+            spec = decoder.spec()
+            return ImageHeader(spec.width, spec.height, 1 if spec.nchannels < 3 else 3, spec.nchannels,
+                               spec.format.basetype not in FLOATING)
 
 
 def read_pixels(path: str | Path) -> np.ndarray:
@@ -94,20 +97,27 @@ def read_recorded(path: str | Path) -> np.ndarray:
             raise ImageError(f"{path}: holds integer identifiers, not radiance")
         pixels = np.stack(planes, axis=-1)
     else:
-        if suffix == ".png":
-            integrity.check_png(path, contents=True)
-        elif suffix in (".jpg", ".jpeg"):
-            integrity.check_jpeg(path)
-        source = _open(path)
-        try:
-            spec = source.spec()
-            decoded = source.read_image(0, 0, 0, spec.nchannels, spec.format if spec.format.basetype in CODES else oiio.FLOAT)
-            if decoded is None:
-                raise ImageError(f"{path}: cannot be decoded: {_reason(source.geterror())}")
-        finally:
-            source.close()
-        pixels = decoded[..., : 1 if decoded.shape[-1] < 3 else 3]  # drop alpha
+        with inputs.opened(path) as source:
+            pixels = _decoded(source, suffix)
     return np.repeat(pixels, 3, axis=-1) if pixels.shape[-1] == 1 else pixels
+
+
+def _decoded(source: inputs.Source, suffix: str) -> np.ndarray:
+    """Return the channels of an image that is open, without alpha: [rows, cols, 1 or 3]."""
+    if suffix == ".png":
+        integrity.check_png(source.path, source.file, contents=True)
+    elif suffix in (".jpg", ".jpeg"):
+        integrity.check_jpeg(source.path, source.file)
+    elif suffix == ".jxl":
+        source.check_pixels(*jxl.resolution_of(source.path, source.file))
+    with _decoder(source) as decoder:
+        spec = decoder.spec()
+        source.check_pixels(spec.width, spec.height)
+        channels = 1 if spec.nchannels < 3 else 3
+        decoded = decoder.read_image(0, 0, 0, channels, spec.format if spec.format.basetype in CODES else oiio.FLOAT)
+        if decoded is None:
+            raise ImageError(f"{source.path}: cannot be decoded: {_reason(decoder.geterror())}")
+        return np.asarray(decoded)
 
 
 def read_mask(path: str | Path, resolution: tuple[int, int]) -> np.ndarray:
@@ -168,7 +178,8 @@ def write_png(path: Path, codes: np.ndarray, *, srgb: bool) -> None:
     if not (output.open(str(path), spec) and output.write_image(pixels) and output.close()):
         raise OSError(f"{path.name}: {output.geterror() or 'the PNG writer gave up'}")
     try:
-        integrity.check_png(path, contents=False)
+        with inputs.opened(path) as source:
+            integrity.check_png(path, source.file, contents=False)
     except ImageError as error:  # the writer reports success when the disk is full
         raise OSError(f"{path.name}: the disk took only part of it") from error
 
@@ -201,15 +212,19 @@ def check_radiance(path: str | Path, pixels: np.ndarray) -> None:
                              "mend the image, or clip it if this is noise around zero")
 
 
-def _open(path: str | Path) -> oiio.ImageInput:
-    with storage("read", path), open(path, "rb"):
-        pass  # a clear reason when it is missing or unreadable
+@contextmanager
+def _decoder(source: inputs.Source) -> Iterator[oiio.ImageInput]:
+    """Open the decoder of an image that is open."""
     config = oiio.ImageSpec()
     config.attribute("oiio:UnassociatedAlpha", 1)  # colours as recorded, not multiplied by alpha
-    source = oiio.ImageInput.open(str(path), config)
-    if source is None:
-        raise ImageError(f"{path}: cannot be read: {_reason(oiio.geterror())}")
-    return source
+    with source.reopened() as same:
+        decoder = oiio.ImageInput.open(same, config)
+        if decoder is None:
+            raise ImageError(f"{source.path}: cannot be read: {_reason(oiio.geterror()).replace(same, source.path.name)}")
+        try:
+            yield decoder
+        finally:
+            decoder.close()
 
 
 def _colour_channels(path: str | Path, names: tuple[str, ...]) -> tuple[str, ...]:

@@ -3,10 +3,12 @@
 libpng reports damage on the terminal, and libjpeg fills missing data with grey and reports success.
 """
 
+import os
 import re
 import struct
 import zlib
 from pathlib import Path
+from typing import BinaryIO
 
 from stage.errors import ImageError, storage
 
@@ -16,11 +18,12 @@ JPEG_MARKER = re.compile(rb"\xff+([^\x00\xd0-\xd7\xff])")
 JPEG_START, JPEG_END, JPEG_SCAN = b"\xd8", b"\xd9", b"\xda"
 
 
-def check_png(path: str | Path, *, contents: bool) -> None:
+def check_png(path: str | Path, stream: BinaryIO, *, contents: bool) -> None:
     """Check that the chunks of a PNG file follow each other up to the end chunk.
 
     Args:
-        path: the file.
+        path: of the file, for messages.
+        stream: the file.
         contents: True compares the checksum of every chunk; False reads the lengths and types of the chunks only.
 
     Raises:
@@ -29,10 +32,11 @@ def check_png(path: str | Path, *, contents: bool) -> None:
 
     Source: W3C, "Portable Network Graphics (PNG) Specification", third edition, section 5.
     """
-    with storage("read", path), open(path, "rb") as stream:
+    with storage("read", path):
+        stream.seek(0)
         if stream.read(8) != PNG_SIGNATURE:
             raise ImageError(f"{path}: is not a PNG file")
-        size = Path(path).stat().st_size
+        size = os.fstat(stream.fileno()).st_size
         kind = b""
         while kind != b"IEND":
             start = stream.read(8)
@@ -48,8 +52,12 @@ def check_png(path: str | Path, *, contents: bool) -> None:
                 stream.seek(end)
 
 
-def check_jpeg(path: str | Path) -> None:
+def check_jpeg(path: str | Path, stream: BinaryIO) -> None:
     """Check that the segments of a JPEG file follow each other up to the end marker; data after the marker is ignored.
+
+    Args:
+        path: of the file, for messages.
+        stream: the file.
 
     Raises:
         ImageError: the file is not a JPEG, or is truncated.
@@ -58,7 +66,8 @@ def check_jpeg(path: str | Path) -> None:
     Source: ITU-T recommendation T.81, annex B.
     """
     with storage("read", path):
-        data = Path(path).read_bytes()
+        stream.seek(0)
+        data = stream.read()
     if data[:2] != b"\xff" + JPEG_START:
         raise ImageError(f"{path}: is not a JPEG file")
     found = JPEG_MARKER.match(data, 2)

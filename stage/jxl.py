@@ -1,8 +1,11 @@
 """The size of a JPEG XL image from its first bytes, because the library behind OpenImageIO decodes all pixels to report it."""
 
+import os
 import struct
 from pathlib import Path
+from typing import BinaryIO
 
+from stage import inputs
 from stage.errors import ImageError, storage
 
 CODESTREAM = b"\xff\x0a"
@@ -22,14 +25,21 @@ def resolution(path: str | Path) -> tuple[int, int]:
         ImageError: the file is not a JPEG XL file, or its header is damaged or truncated.
         StorageError: the file cannot be read.
     """
-    with storage("read", path), open(path, "rb") as stream:
+    with inputs.opened(path) as source:
+        return resolution_of(path, source.file)
+
+
+def resolution_of(path: str | Path, stream: BinaryIO) -> tuple[int, int]:
+    """Return the width and height of a JPEG XL image that is open; errors are those of `resolution`."""
+    with storage("read", path):
+        stream.seek(0)
         start = stream.read(len(CONTAINER))
         if start[:2] == CODESTREAM:
             stream.seek(0)
             return _size(path, stream.read(SIZE_BYTES))
         if start != CONTAINER:
             raise ImageError(f"{path}: is not a JPEG XL file")
-        end = Path(path).stat().st_size
+        end = os.fstat(stream.fileno()).st_size
         while len(header := stream.read(8)) == 8:
             length, kind = struct.unpack(">I4s", header)
             begin = stream.tell()

@@ -6,7 +6,8 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from stage.errors import ManifestError, storage
+from stage import inputs
+from stage.errors import ManifestError
 
 Record = TypeVar("Record", bound=BaseModel)
 MAX_KEYS = 1000
@@ -25,8 +26,7 @@ def read_record(path: str | Path, model: type[Record], schema: str) -> Record:
         StorageError: the file cannot be read.
         ManifestError: the file is not JSON, has another schema, or a field is wrong; the message names file and field.
     """
-    with storage("read", path):
-        text = Path(path).read_bytes()
+    text = inputs.read_bytes(path)
     try:
         data = json.loads(text, object_pairs_hook=_unique_keys, parse_constant=_refuse_constant)
     except UnicodeDecodeError as error:

@@ -1,15 +1,12 @@
 """Admission of uploaded captures and environments: places of files, headers and sizes, in little memory and without decoding a pixel."""
 
-import math
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any
-
-import numpy as np
 
 from service.light.sequence import time_steps
 from service.reporting.progress import Progress, Timings
-from stage import images, jxl
+from stage import images, inputs, jxl
+from stage.arrays import array_shape
 from stage.capture import Capture
 from stage.environment_maps import SUFFIXES
 from stage.errors import ImageError, ManifestError, storage
@@ -168,19 +165,9 @@ def _check_size(path: Path, width: int, height: int, channels: int, max_pixels: 
 
 def _check_array(path: Path, max_pixels: int) -> None:
     """Check the header of a .npy file: real numbers, in two or three dimensions, as many as its bytes hold."""
-    with storage("read", path), open(path, "rb") as stream:
-        try:
-            version = np.lib.format.read_magic(stream)
-            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-            shape, _, dtype = read(stream)
-        except (ValueError, EOFError, SyntaxError, TokenError, RecursionError, MemoryError) as error:  # NumPy reads it as Python
-            raise ImageError(f"{path}: is not a .npy array") from error
-        present = path.stat().st_size - stream.tell()
-    if dtype.kind not in "iuf":
-        raise ImageError(f"{path}: is not an array of real numbers")
+    with inputs.opened(path) as source:
+        shape = array_shape(path, source.file)
     if len(shape) not in (2, 3) or min(shape) < 1:
         raise ImageError(f"{path}: has the shape {shape}: give (rows, cols) or (rows, cols, bins)")
     if shape[0] * shape[1] > max_pixels:
         raise ImageError(f"{path}: has {shape[1]}x{shape[0]} pixels, {max_pixels} are allowed")
-    if math.prod(shape) * dtype.itemsize != present:
-        raise ImageError(f"{path}: is not a whole .npy array: it has {present} bytes of {math.prod(shape) * dtype.itemsize}")

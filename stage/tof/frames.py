@@ -2,12 +2,12 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from tokenize import TokenError
 from typing import TypeVar
 
 import numpy as np
 
-from stage import images
+from stage import images, inputs
+from stage.arrays import array_shape
 from stage.capture import Capture
 from stage.errors import ImageError, ManifestError, storage
 from stage.manifest import FILE_NAME, Frame
@@ -168,11 +168,7 @@ def read_array(path: Path) -> np.ndarray:
         ImageError: the file is no whole .npy file, or not of real numbers; the message names the file.
         StorageError: the file cannot be read.
     """
-    with storage("read", path):
-        try:
-            values = np.load(path, allow_pickle=False)
-        except (ValueError, EOFError, SyntaxError, TokenError, MemoryError) as error:  # its header is read as Python
-            raise ImageError(f"{path}: is not a whole .npy array") from error
-    if not isinstance(values, np.ndarray) or not (np.issubdtype(values.dtype, np.floating) or np.issubdtype(values.dtype, np.integer)):
-        raise ImageError(f"{path}: is not an array of real numbers")
-    return values
+    with inputs.opened(path) as source:
+        array_shape(path, source.file)
+        with storage("read", path):
+            return np.asarray(np.load(source.file, allow_pickle=False))

@@ -2,6 +2,7 @@
 
 import json
 import random
+import struct
 import tracemalloc
 from pathlib import Path
 
@@ -52,6 +53,38 @@ def test_an_exr_header_is_refused_in_little_memory(tmp_path, content):
         assert tracemalloc.get_traced_memory()[1] < MIB
     finally:
         tracemalloc.stop()
+
+
+def attribute(name: str, kind: str, value: bytes) -> bytes:
+    return name.encode() + b"\0" + kind.encode() + b"\0" + struct.pack("<i", len(value)) + value
+
+
+def many(content: bytes, count: int, what: str) -> bytes:
+    """The header of `lying_exr` with so many more channels, attributes or parts, or with one attribute of so many bytes."""
+    if what == "channels":
+        end = content.index(b"compression\0")
+        entries = b"".join(f"x{number}".encode() + b"\0" + struct.pack("<iiii", 1, 0, 1, 1) for number in range(count))
+        return content[:8] + attribute("channels", "chlist", entries + b"\0") + content[end:]
+    if what == "attributes":
+        return content[:8] + b"".join(attribute(f"a{number}", "int", bytes(4)) for number in range(count)) + content[8:]
+    if what == "parts":
+        return content[:5] + b"\x10" + content[6:8] + count * (content[8:-64]) + bytes(65)
+    return content[:8] + attribute("a", "string", bytes(count)) + content[8:]
+
+
+@pytest.mark.parametrize(("what", "count", "words"), [
+    ("channels", 100_000, "has more than 1024 channels"), ("attributes", 200_000, "has more than 4000 attributes in its header"),
+    ("parts", 10_000, "has more than 256 parts"), ("bytes", 5 << 20, "has a header that is damaged, or longer than 4 MiB")])
+def test_a_long_exr_header_is_not_read_whole(tmp_path, monkeypatch, what, count, words):
+    """The library takes 21 s for the channels and 49 s for the attributes."""
+    path = tmp_path / "a.exr"
+    path.write_bytes(many(lying_exr(64, 64), 3, what))
+    with pytest.raises(ImageError, match="truncated"):  # as it is read on
+        exr.read_header(path)
+    path.write_bytes(many(lying_exr(64, 64), count, what))
+    monkeypatch.setattr(exr.OpenEXR, "File", lambda *_, **__: pytest.fail("the header was read whole"))
+    with pytest.raises(ImageError, match=words):
+        exr.read_header(path)
 
 
 def test_fuzzed_exr_headers_are_refused_or_read(tmp_path):

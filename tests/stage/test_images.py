@@ -152,9 +152,11 @@ def test_a_thumbnail_inside_a_jpeg_is_not_its_end(tmp_path):
     data = write_image(tmp_path / "a.jpg", (UNIT * 255).astype(np.uint8)).read_bytes()
     thumbnail = b"Exif\0\0" + data
     with_thumbnail = data[:2] + b"\xff\xe1" + (len(thumbnail) + 2).to_bytes(2, "big") + thumbnail + data[2:]
-    check_jpeg(write_bytes(tmp_path / "whole.jpg", with_thumbnail))
-    with pytest.raises(ImageError, match=r"cut\.jpg: is truncated"):
-        check_jpeg(write_bytes(tmp_path / "cut.jpg", with_thumbnail[:-2]))
+    with open(path := write_bytes(tmp_path / "whole.jpg", with_thumbnail), "rb") as stream:
+        check_jpeg(path, stream)
+    with open(path := write_bytes(tmp_path / "cut.jpg", with_thumbnail[:-2]), "rb") as stream, \
+            pytest.raises(ImageError, match=r"cut\.jpg: is truncated"):
+        check_jpeg(path, stream)
 
 
 def write_bytes(path, data):

@@ -1,6 +1,7 @@
 """The steps of a job: each finds the files of the captures, environments and jobs that the request names, and calls a product."""
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,6 +15,7 @@ from service.server.database import intakes
 from service.server.database.engine import Database
 from service.server.storage import layout
 from service.server.storage.folder import Storage
+from stage import inputs
 from stage.files import resolved
 
 KEYS_FILE = "keys.json"
@@ -31,6 +33,8 @@ class WorkerContext(NamedTuple):
     max_pixels: int
     roots_of: Callable[[str], tuple[Path, ...]]
     """Returns the folders below which the registered captures and environments of a project lie."""
+    held: ExitStack = ExitStack()
+    """Closes the folders of registered captures when a step ends."""
 
     def without_folder(self, sentence: str) -> str:
         """Return a sentence for users, in which files are named below the data folder, whose place is not theirs to know."""
@@ -64,6 +68,19 @@ class Job(NamedTuple):
 
 def steps_of(job: Job, context: WorkerContext) -> list[JobStep]:
     """Return the steps of a job, which are always the same for the same job."""
+    held = ExitStack()
+
+    def closing(run: Callable[[Progress], None]) -> Callable[[Progress], None]:
+        def step(progress: Progress) -> None:
+            with held:
+                run(progress)
+
+        return step
+
+    return [step._replace(run=closing(step.run)) for step in _steps_of(job, context._replace(held=held))]
+
+
+def _steps_of(job: Job, context: WorkerContext) -> list[JobStep]:
     request = job.request
     if isinstance(request, CheckJob):
         return [JobStep("check", lambda progress: _check(job, request, context, progress))]
@@ -207,15 +224,21 @@ def _intake(job: Job, identifier: str, context: WorkerContext, progress: Progres
 
 
 def _place(job: Job, identifier: str, context: WorkerContext, progress: Progress) -> tuple[Path, bool]:
-    """Return the folder (or the file of an environment) of an intake of the job's project, and whether it was registered."""
+    """Return the folder (or the file of an environment) of an intake of the job's project, and whether it was registered.
+
+    The files of a registered one are opened beneath its folder until the step ends, whatever becomes links meanwhile.
+    """
     row = intakes.find(context.database, identifier, job.project)
     if row is None:
         raise RequestError(f"{identifier}: is not there any more")
     if row["folder"] is None:
         return _named(context.storage.local(layout.intake(job.project, identifier), progress=progress), identifier), False
     folder = Path(row["folder"])
-    if resolved(folder) != folder or not any(folder.is_relative_to(root) for root in context.roots_of(job.project)):
+    root = next((root for root in context.roots_of(job.project) if folder.is_relative_to(root)), None)
+    if resolved(folder) != folder or root is None:
         raise RequestError(f"{identifier}: lies in none of the folders that the operator allows any more")
+    top = folder if identifier.startswith(CAPTURE) else folder.parent
+    context.held.enter_context(inputs.confined(top, root, max_pixels=context.max_pixels))
     return _named(folder, identifier), True
 
 

@@ -60,7 +60,7 @@ def test_histograms_of_several_frames_are_added(tmp_path):
 @pytest.mark.parametrize(("values", "message"), [
     (np.ones((COLS, ROWS)), "is (4, 3), the camera's image is (3, 4)"),
     (np.ones((ROWS, COLS), complex), "not an array of real numbers"),
-    (np.array([{"a": 1}], dtype=object), "not a whole .npy array"),
+    (np.array([{"a": 1}], dtype=object), "not an array of real numbers"),
 ])
 def test_arrays_that_are_no_correlation_are_refused(values, message, tmp_path):
     found = capture(tmp_path, [{"image": save(tmp_path, "a.npy", values), "tof": cw()}])

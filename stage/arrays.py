@@ -1,0 +1,40 @@
+"""The headers of .npy files, which are checked before what they claim is asked of the memory."""
+
+import math
+import os
+from pathlib import Path
+from tokenize import TokenError
+from typing import BinaryIO
+
+import numpy as np
+
+from stage.errors import ImageError, storage
+
+
+def array_shape(path: str | Path, stream: BinaryIO) -> tuple[int, ...]:
+    """Return the shape of a .npy file of real numbers, and leave the stream at its beginning.
+
+    Args:
+        path: of the file, for messages.
+        stream: the file.
+
+    Raises:
+        ImageError: the file is no .npy file, not of real numbers, or does not hold as many bytes as its header says.
+        StorageError: the file cannot be read.
+    """
+    with storage("read", path):
+        try:
+            version = np.lib.format.read_magic(stream)
+            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            shape, _, dtype = read(stream)
+        except (ValueError, EOFError, SyntaxError, TypeError, TokenError, RecursionError, MemoryError) as error:  # it is read as Python
+            raise ImageError(f"{path}: is not a .npy array") from error
+        present = os.fstat(stream.fileno()).st_size - stream.tell()
+        stream.seek(0)
+    if dtype.kind not in "iuf":
+        raise ImageError(f"{path}: is not an array of real numbers")
+    if min(shape, default=1) < 1:
+        raise ImageError(f"{path}: has the shape {shape}: give one without empty sides")
+    if math.prod(shape) * dtype.itemsize != present:
+        raise ImageError(f"{path}: is not a whole .npy array: it has {present} bytes of {math.prod(shape) * dtype.itemsize}")
+    return shape

@@ -1,0 +1,70 @@
+"""Steps read the files of a registered capture beneath its folder, whatever becomes a link while they run."""
+
+import os
+
+import numpy as np
+import pytest
+
+from service.requests.identifiers import CAPTURE
+from service.requests.jobs import SolveJob
+from service.requests.solve import SolveOptions
+from service.server.jobs.steps import Job, WorkerContext, steps_of
+from service.server.storage.open import open_storage
+from stage import exr
+from stage.errors import StageError
+from tests.scenes.captures import make_scene, write_capture
+from tests.service.server.jobs.harness import PROJECT
+
+
+class Silent:
+    """A progress that nobody follows."""
+
+    def stage(self, name: str, total: int) -> None:
+        pass
+
+    def advance(self, done: int) -> None:
+        pass
+
+
+@pytest.fixture
+def capture(tmp_path_factory):
+    return write_capture(tmp_path_factory.mktemp("registered") / "capture", make_scene(size=8, lights=5))
+
+
+def step_of(harness, capture, roots):
+    identifier = harness.register(capture, CAPTURE)
+    context = WorkerContext(harness.database, open_storage(harness.settings), harness.settings.data / "cache", "cpu", 64,
+                            lambda project: roots)
+    job = Job("job_0123456789abcdefghjk", PROJECT, SolveJob(kind="solve", capture=identifier, options=SolveOptions(method="lambert")), 1)
+    step, = steps_of(job, context)
+    return step
+
+
+@pytest.mark.parametrize("name", ["002.exr", "capture.json", "mask.png"])
+def test_a_file_that_becomes_a_link_after_it_was_checked_is_not_read(idle_harness, capture, tmp_path, monkeypatch, name):
+    from service.solve import solve as product
+
+    outside, solve = tmp_path / "outside", product.solve
+    outside.mkdir()
+    if name.endswith(".exr"):
+        exr.write(outside / name, dict.fromkeys("RGB", np.full((8, 8), 0.5, np.float16)), color_space="lin_rec709_scene", metadata={})
+    else:
+        (outside / name).write_bytes((capture / name).read_bytes())
+
+    def swapped(request, progress):
+        (capture / name).unlink()
+        (capture / name).symlink_to(outside / name)
+        solve(request, progress)
+
+    monkeypatch.setattr(product, "solve", swapped)
+    with pytest.raises(StageError, match=f"{name}: leads out of the folder"):
+        step_of(idle_harness, capture, (capture.parent,)).run(Silent())
+
+
+def test_the_folder_is_closed_when_the_step_ends(idle_harness, capture):
+    before = len(os.listdir("/proc/self/fd"))
+    step = step_of(idle_harness, capture, (capture.parent,))
+    for _ in range(3):
+        step.run(Silent())
+    assert len(os.listdir("/proc/self/fd")) <= before + 5  # connections of the database
+    assert (idle_harness.results("job_0123456789abcdefghjk") / "maps.exr").exists()
