@@ -11,15 +11,16 @@ import numpy as np
 from stage.errors import ImageError, storage
 
 
-def array_shape(path: str | Path, stream: BinaryIO) -> tuple[int, ...]:
+def array_shape(path: str | Path, stream: BinaryIO, max_pixels: int | None = None) -> tuple[int, ...]:
     """Return the shape of a .npy file of real numbers, and leave the stream at its beginning.
 
     Args:
         path: of the file, for messages.
         stream: the file.
+        max_pixels: the most rows × columns, its first two sides; None for any.
 
     Raises:
-        ImageError: the file is no .npy file, not of real numbers, or does not hold as many bytes as its header says.
+        ImageError: the file is no .npy file, not of real numbers, has too many pixels, or does not hold as many bytes as its header says.
         StorageError: the file cannot be read.
     """
     with storage("read", path):
@@ -35,6 +36,8 @@ def array_shape(path: str | Path, stream: BinaryIO) -> tuple[int, ...]:
         raise ImageError(f"{path}: is not an array of real numbers")
     if min(shape, default=1) < 1:
         raise ImageError(f"{path}: has the shape {shape}: give one without empty sides")
+    if max_pixels is not None and math.prod(shape[:2]) > max_pixels:
+        raise ImageError(f"{path}: has {'x'.join(map(str, shape[1::-1]))} pixels, {max_pixels} are allowed")
     if math.prod(shape) * dtype.itemsize != present:
         raise ImageError(f"{path}: is not a whole .npy array: it has {present} bytes of {math.prod(shape) * dtype.itemsize}")
     return shape

@@ -166,8 +166,6 @@ def _check_size(path: Path, width: int, height: int, channels: int, max_pixels: 
 def _check_array(path: Path, max_pixels: int) -> None:
     """Check the header of a .npy file: real numbers, in two or three dimensions, as many as its bytes hold."""
     with inputs.opened(path) as source:
-        shape = array_shape(path, source.file)
+        shape = array_shape(path, source.file, max_pixels)
     if len(shape) not in (2, 3) or min(shape) < 1:
         raise ImageError(f"{path}: has the shape {shape}: give (rows, cols) or (rows, cols, bins)")
-    if shape[0] * shape[1] > max_pixels:
-        raise ImageError(f"{path}: has {shape[1]}x{shape[0]} pixels, {max_pixels} are allowed")

@@ -169,6 +169,6 @@ def read_array(path: Path) -> np.ndarray:
         StorageError: the file cannot be read.
     """
     with inputs.opened(path) as source:
-        array_shape(path, source.file)
+        array_shape(path, source.file, source.max_pixels)
         with storage("read", path):
             return np.asarray(np.load(source.file, allow_pickle=False))
