@@ -32,7 +32,7 @@ class ModelBatch(NamedTuple):
 class SurfaceModel:
     """A surface that can be lit."""
 
-    def __init__(self, maps: SurfaceMaps, where: Path, device: str) -> None:
+    def __init__(self, maps: SurfaceMaps, where: Path, device: str, *, chosen: np.ndarray | None = None) -> None:
         """Keep solved maps for lighting.
 
         Args:
@@ -40,9 +40,10 @@ class SurfaceModel:
                 is above 0 there are those of two materials.
             where: their file, for messages.
             device: where.
+            chosen: [rows, cols] bool, the pixels that will be lit; the others only cast shadows. None: all.
 
         Raises:
-            ResultError: a layer is not there, or no pixel is solved.
+            ResultError: a layer is not there, or none of the pixels is solved.
         """
         for name in ("normal", "diffuse_albedo", "height"):
             if getattr(maps, name) is None:
@@ -53,13 +54,14 @@ class SurfaceModel:
         self.maps, self.device = maps, device
         normal = maps.normal.reshape(-1, 3)
         whole = maps.mask.reshape(-1) & np.isfinite(maps.height).reshape(-1) & (np.abs(normal).sum(axis=1) > 0)
-        self.pixels = np.flatnonzero(whole)
-        """[n] Row-major positions of the solved pixels."""
+        self.pixels = np.flatnonzero(whole if chosen is None else whole & chosen.reshape(-1))
+        """[n] Row-major positions of the solved pixels that will be lit."""
         if not len(self.pixels):
             raise ResultError(f"{where}: no pixel is solved")
-        self._points = maps.camera.points(maps.height).reshape(-1, 3)
-        self.middle = self._points[self.pixels].mean(axis=0)
-        """[3] Mean place of the solved pixels."""
+        self.points = maps.camera.points(maps.height).reshape(-1, 3)
+        """[rows · cols, 3] Place of every pixel, camera frame."""
+        self.middle = self.points[self.pixels].mean(axis=0)
+        """[3] Mean place of these pixels."""
         self._view = view_directions(maps.camera)
         inside = whole.reshape(maps.mask.shape)
         self._height = wp.array(np.where(inside, maps.height, 0).astype(np.float32), dtype=wp.float32, device=device)
@@ -91,7 +93,7 @@ class SurfaceModel:
                 roughness = np.where(abundance > 0, first_roughness, roughness)
                 second = SecondLobe(*other, np.where(abundance > 0, 1 - abundance, 0))
             yield ModelBatch(pixels, upload_surface(rows(maps.normal), rows(maps.diffuse_albedo), specular, roughness, self._view(pixels),
-                                                    self._points[pixels], second=second,
+                                                    self.points[pixels], second=second,
                                                     profile=None if self.profile is None else self.profile[start : start + BATCH_PIXELS],
                                                     device=self.device))
 

@@ -104,6 +104,10 @@ class ResultLayers:
         """Return the channels of a layer without its name, such as X, Y and Z."""
         return [channel.partition(".")[2] for channel in self._names[name]]
 
+    def plane(self, name: str) -> np.ndarray:
+        """Return the first channel of a layer, [rows, cols] in its stored type, which is kept."""
+        return self._channels[self._names[name][0]]
+
     def take(self, name: str) -> np.ndarray:
         """Return a layer, [channels, rows, cols] in its stored type, which is read once and then forgotten.
 

@@ -1,14 +1,15 @@
 """Write what the pages of the service show of a capture and of its maps: view.json, view.bin and thumbnails.jpg (docs/view.md)."""
 
 import json
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from kernels import device as devices
-from kernels.errors import KernelError
+from kernels.errors import DeviceError, KernelError
 from service.captures.inspect import standing_faults
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import metadata
@@ -16,23 +17,24 @@ from service.requests.view import ViewRequest
 from service.viewing.block_file import BlockFile
 from service.viewing.capture_frames import describe_frames, read_images
 from service.viewing.layers import status_codes, write_layers
+from service.viewing.points import write_points
+from service.viewing.readings import Readings, open_readings
 from service.viewing.relighting import LEAST_LIGHTS, write_relighting
 from service.viewing.result_layers import ResultLayers
+from service.viewing.samples import write_samples
+from service.viewing.solve_report import SolveReport, read_report
 from service.viewing.thumbnails import write_thumbnails
-from stage.brackets import merge_brackets
 from stage.capture import Capture
 from stage.colour_spaces import linear_space
 from stage.depth_maps import DEPTH_FILE
-from stage.errors import ResultError, StageError, storage
+from stage.errors import ResultError, StageError, StorageError, storage
 from stage.files import replacing, write_text
-from stage.ingest import open_stack
-from stage.light import DistantLight, PointLight
+from stage.fingerprint import digest
 from stage.light_basis import numbers
-from stage.lighting import lights_from_centre
 from stage.maps import MAPS_FILE
 from stage.matte import matte_of
-from stage.motion.tracking import tracking_frames
 
+Made = TypeVar("Made")
 SCHEMA = "relit.view/1"
 VIEW_FILE, BLOCKS_FILE, THUMBNAILS_FILE = "view.json", "view.bin", "thumbnails.jpg"
 MOST_FINDINGS = 100
@@ -70,40 +72,66 @@ def view(request: ViewRequest, progress: Progress | None = None) -> ViewResult:
     timings.stage("open", 1)
     capture = Capture.open(request.capture)
     result = None if request.maps is None else ResultLayers(result_file(request.maps), capture)
-    findings = standing_faults(capture)
+    report = SolveReport([], {}, None) if result is None else read_report(result.path)
     mask = _mask(capture)
     images = read_images(capture, mask, timings)
-    findings = [*images.faults, *(fault for fault in findings if fault not in images.faults)]
+    findings = list(dict.fromkeys([*images.faults, *standing_faults(capture)]))
     space = linear_space(capture.manifest.color_space)
     target = request.out / VIEW_FILE
+    sections: dict[str, Any] = {"layers": [], "relight": None, "samples": None, "points": None}
     with storage("write", target), replacing(request.out / BLOCKS_FILE) as temporary, BlockFile(temporary) as file:
-        layers = [] if result is None else write_layers(result, file, timings)
-        relight = None
-        if sum(isinstance(frame.light, DistantLight | PointLight) for frame in capture.sources()) >= LEAST_LIGHTS:
-            try:
-                relight = _relight(capture, request, file, device, timings)
-            except (StageError, KernelError) as error:
-                findings += [str(error)] if str(error) not in findings else []
+        if result is not None and result.of_depth:
+            timings.stage("points", 1)
+            sections["points"] = write_points(result, file)
+        if result is not None:
+            sections["layers"] = write_layers(result, file, timings)
+        readings = _attempt(findings, lambda: open_readings(capture, request, timings)) if capture.sources() else None
+        if readings is not None:
+            sections["relight"] = _attempt(findings, lambda: _relight(readings, request, file, device, timings))
+            if result is not None and not result.of_depth:
+                sections["samples"] = _attempt(findings, lambda: write_samples(
+                    readings.stack, mask.shape, result, readings.model_lights(report.factors), file, device=device, timings=timings))
         timings.stage("write", 1)
         target.unlink(missing_ok=True)  # it would describe other blocks
     thumbnails = write_thumbnails(request.out / THUMBNAILS_FILE, images, space)
     findings = [*findings[:MOST_FINDINGS], *([f"and {len(findings) - MOST_FINDINGS} more"] if len(findings) > MOST_FINDINGS else [])]
+    contents = {} if result is None else {"maps": digest(result.path)}
     write_text(target, json.dumps({
         "schema": SCHEMA, "name": capture.name, "rows": capture.camera.height, "cols": capture.camera.width, "color_space": space,
         "camera": capture.camera.model_dump(mode="json", exclude_none=True),
         "exposure": numbers(1 / images.white) if images.white > 0 else 1.0,
-        "layers": layers,
         "codes": status_codes(),
-        "frames": describe_frames(capture, images, thumbnails, {}),
+        "frames": describe_frames(capture, images, thumbnails, report.suspects),
         "findings": findings,
-        "relight": relight,
-        "samples": None,
-        "points": None,
-        "provenance": metadata(request, capture=capture.name, inputs="" if result is None else result.provenance.get("relit:inputs", "")),
+        "warnings": report.warnings,
+        **sections,
+        "provenance": metadata(request, capture=capture.name, inputs="" if readings is None else readings.stack.key,
+                               contents=contents),
     }, allow_nan=False) + "\n")
     timings.close()
-    return ViewResult(target, tuple(layer["name"] for layer in layers), len(images.images), 0 if relight is None else relight["terms"],
-                      None if relight is None else relight["relative_rms"], tuple(findings))
+    relight = sections["relight"] or {"terms": 0, "relative_rms": None}
+    return ViewResult(target, tuple(layer["name"] for layer in sections["layers"]), len(images.images), relight["terms"],
+                      relight["relative_rms"], tuple(findings))
+
+
+def _attempt(findings: list[str], work: Callable[[], Made]) -> Made | None:
+    """Return what some work makes, or None where the capture does not allow it, which the findings then say."""
+    try:
+        return work()
+    except (StageError, KernelError) as error:
+        if isinstance(error, StorageError | DeviceError):
+            raise
+        findings += [str(error)] if str(error) not in findings else []
+        return None
+
+
+def _relight(readings: Readings, request: ViewRequest, file: BlockFile, device: str, timings: Timings) -> dict[str, Any] | None:
+    """Write what an object is lit with; None: it has too few lights."""
+    if readings.lights is None or len(readings.lights.direction) < LEAST_LIGHTS:
+        return None
+    timings.stage("matte", 1)
+    return write_relighting(readings.stack, readings.lights, matte_of(readings.capture, readings.stack), file, most_terms=request.terms,
+                            device=device, timings=timings)
 
 
 def result_file(maps: Path) -> Path:
@@ -127,13 +155,3 @@ def _mask(capture: Capture) -> np.ndarray:
     with suppress(StageError):
         return capture.mask()
     return np.ones((capture.camera.height, capture.camera.width), dtype=bool)
-
-
-def _relight(capture: Capture, request: ViewRequest, file: BlockFile, device: str, timings: Timings) -> dict[str, Any] | None:
-    lights = lights_from_centre(capture)
-    tracking = tracking_frames(capture, to=request.align_to) if request.aligned else None
-    timings.stage("ingest", len(capture.sources()))
-    stack = merge_brackets(open_stack(capture, cache=request.cache, tracking=tracking, progress=lambda done, _: timings.advance(done)),
-                           capture.sources(), lights)
-    timings.stage("matte", 1)
-    return write_relighting(stack, lights, matte_of(capture, stack), file, most_terms=request.terms, device=device, timings=timings)

@@ -57,3 +57,12 @@ class View:
         """[rows, cols, terms, 3] coefficients of a unit of irradiance from each direction of the grid."""
         cols, rows = self.facts["relight"]["directions"]
         return self.block(self.facts["relight"]["transfer"], "f4", rows, cols, self.facts["relight"]["terms"], 3)
+
+    def samples(self, name: str) -> np.ndarray:
+        """[rows, cols, lights, 3] float64 of `measured` or `model`, times the scale; [rows, cols, lights] uint8 of `used`."""
+        facts = self.facts["samples"]
+        shape = facts["rows"], facts["cols"], facts["lights"]
+        if name == "used":
+            return np.frombuffer(self.bytes, np.uint8, int(np.prod(shape)), facts[name]).reshape(shape)
+        values = np.frombuffer(self.bytes, np.dtype("<f2"), 3 * int(np.prod(shape)), facts[name])
+        return values.reshape(*shape, 3).astype(np.float64) * facts["scale"]

@@ -1,0 +1,71 @@
+"""What report.json says of the maps beside it: warnings, lights that disagree with the others, and intensities that the solve refined."""
+
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from service.reporting.provenance import REPORT_FILE
+from stage.errors import ResultError, storage
+
+
+class _Suspect(BaseModel):
+    image: str
+    misfit: float
+
+
+class _Factors(BaseModel):
+    model_config = ConfigDict(extra="ignore")
+
+    believed: bool
+    factors: list[float] = []
+
+
+class _Found(BaseModel):
+    model_config = ConfigDict(extra="ignore")
+
+    light_factors: _Factors | None = None
+
+
+class _Report(BaseModel):
+    model_config = ConfigDict(extra="ignore")
+
+    warnings: list[str] = []
+    suspect_lights: list[_Suspect] = []
+    found: _Found = _Found()
+
+
+class SolveReport(NamedTuple):
+    """What the report of a solve or a depth says."""
+
+    warnings: list[str]
+    """Sentences."""
+    suspects: dict[str, str]
+    """A sentence for each image whose light disagrees with the others."""
+    factors: np.ndarray | None
+    """[lights] factors on the intensities of the manifest that the maps were solved with; None: all are 1."""
+
+
+def read_report(maps: Path) -> SolveReport:
+    """Read the report.json beside a maps.exr or depth.exr; where there is none, nothing is known.
+
+    Raises:
+        ResultError: the file is not a report of Relit.
+        StorageError: it cannot be read.
+    """
+    path = maps.parent / REPORT_FILE
+    if not path.is_file():
+        return SolveReport([], {}, None)
+    with storage("read", path):
+        text = path.read_bytes()
+    try:
+        found = _Report.model_validate(json.loads(text))
+    except (ValueError, ValidationError) as error:
+        raise ResultError(f"{path}: is not a report of relit: solve again, or take it away") from error
+    light_factors = found.found.light_factors
+    suspects = {suspect.image: f"disagrees with the other lights by {100 * suspect.misfit:.0f} %: check its direction and irradiance"
+                for suspect in found.suspect_lights}
+    factors = None if light_factors is None or not light_factors.believed else np.array(light_factors.factors)
+    return SolveReport(found.warnings, suspects, factors)
