@@ -13,7 +13,7 @@ from pathlib import Path
 
 import sqlalchemy as sa
 
-from service.server.database import idempotency, intakes, jobs, uploads, workers
+from service.server.database import idempotency, intakes, jobs, workers
 from service.server.database.clock import ClockWatch
 from service.server.database.engine import UNANSWERED, Database, message_of
 from service.server.jobs.queue import JobQueue
@@ -23,7 +23,7 @@ from service.server.log import logger
 from service.server.settings import Settings
 from service.server.storage import layout
 from service.server.storage.folder import Storage, drop_folder
-from service.server.storage.part_files import part_files_folder
+from service.server.storage.upload_parts import open_upload_parts
 from stage.errors import StorageError
 
 EVERY_S = 600.0
@@ -51,6 +51,7 @@ class Housekeeper:
         """
         self._settings, self._database, self._storage, self._queue, self._clock = settings, database, storage, queue, clock
         self._watch = ClockWatch(database, now=clock, monotonic=monotonic)
+        self._parts = open_upload_parts(settings, database, storage)
         self._silent: set[str] = set()
         self._told: dict[str, str] = {}  # the last error of each piece of work that fails, which is logged once
         self._ended = threading.Event()
@@ -112,7 +113,7 @@ class Housekeeper:
             logger.info("job removed", job=row["id"], project=row["project"])
 
     def _uploads(self) -> None:
-        removed = uploads.expire(self._database, part_files_folder(self._settings), self._clock() - self._settings.upload_hours * HOUR_S)
+        removed = self._parts.expire(self._clock() - self._settings.upload_hours * HOUR_S)
         if removed:
             logger.info("uploads removed", count=removed)
 

@@ -17,6 +17,7 @@ from service.server.jobs.queue import JobQueue
 from service.server.pages import routes as pages
 from service.server.settings import Settings
 from service.server.storage.open import open_storage
+from service.server.storage.upload_parts import open_upload_parts
 
 DESCRIPTION = """Captures in, durable jobs, USD assets and relit frames out. docs/service.md has a walk through it."""
 
@@ -35,9 +36,11 @@ def create_app(settings: Settings, database: Database, tracing: TracerProvider |
                   telemetry=_telemetry(tracing), generate_unique_id_function=lambda route: route.name)
     closing = threading.Event()
     streams = StreamLimits(min(max_streams, MAX_STREAMS), settings.max_project_streams, settings.max_streams)
+    storage = open_storage(settings)
     app.state.service = Service(
-        settings, database, JobQueue(database), open_storage(settings), RateLimiter(settings.requests_per_second, settings.request_burst),
-        draining=threading.Event(), closing=closing, watcher=Watcher(database, closing, streams))
+        settings, database, JobQueue(database), storage, open_upload_parts(settings, database, storage),
+        RateLimiter(settings.requests_per_second, settings.request_burst), draining=threading.Event(), closing=closing,
+        watcher=Watcher(database, closing, streams))
     app.state.metrics, app.state.readiness = Metrics(settings, database), operations.Readiness()
     problems.install(app)
     document.install(app)

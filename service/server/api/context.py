@@ -20,6 +20,7 @@ from service.server.database.keys import DEFAULT_PROJECT, Caller
 from service.server.jobs.queue import JobQueue
 from service.server.settings import Settings
 from service.server.storage.folder import Storage
+from service.server.storage.upload_parts import UploadParts
 
 ANONYMOUS = Caller(DEFAULT_PROJECT, Scope.ADMIN, None)
 SPACE_RETRY_S = 600
@@ -34,6 +35,7 @@ class Service(NamedTuple):
     database: Database
     queue: JobQueue
     storage: Storage
+    parts: UploadParts
     limiter: RateLimiter
     draining: threading.Event
     """Set when the service is asked to end: it still answers while its workers finish their steps, and says that it is not ready."""

@@ -20,7 +20,6 @@ from service.server.database import intakes, jobs, uploads
 from service.server.database.keys import Caller
 from service.server.safe_names import shown
 from service.server.storage import layout
-from service.server.storage.part_files import PartFile, part_files_folder
 from service.views import states
 from service.views.intakes import IntakePage, IntakeView
 from stage.files import resolved
@@ -203,5 +202,5 @@ def _delete(service: Service, caller: Caller, identifier: str) -> None:
     parts = service.database.transact(work)
     if parts is not None and row["folder"] is None:
         for upload in parts:
-            PartFile.discard(part_files_folder(service.settings), upload)
+            service.parts.discard(upload)
         service.storage.remove(layout.intake(caller.project, identifier))

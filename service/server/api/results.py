@@ -70,19 +70,13 @@ def opened(service: ServiceDep, caller: Reader, request: Request, job: JobName, 
         raise nothing from None
     if not request.scope["path"].endswith(f"/{name}"):  # the router drops a line break at the end
         raise nothing
-    path = service.storage.open(layout.results(caller.project, job), name)
-    if path is None:
+    file = service.storage.open_file(layout.results(caller.project, job), name)
+    if file is None:
         raise nothing
     try:
-        descriptor = os.open(path, os.O_RDONLY)
-    except FileNotFoundError:
-        raise nothing from None
-    try:
-        status = os.fstat(descriptor)
-        etag = f'"{status.st_ino:x}-{status.st_mtime_ns:x}-{status.st_size:x}"'  # results are replaced, and never written to again
-        yield Opened(name, descriptor, status.st_size, etag, status.st_mtime)
+        yield Opened(name, file.descriptor, file.size, f'"{file.version}"', file.modified_at)
     finally:
-        os.close(descriptor)
+        os.close(file.descriptor)
 
 
 @router.get("", summary="List the results of a job")

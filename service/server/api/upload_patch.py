@@ -9,12 +9,12 @@ from service.server.api.context import FOR_UPLOAD, Service, require_space
 from service.server.api.problems import ApiError
 from service.server.api.tus import Checksum
 from service.server.api.upload_body import PartFileWriter, RunningHashes
-from service.server.database import uploads
+from service.server.database import intakes, uploads
 from service.server.database.uploads import Row
 from service.server.log import logger
 from service.server.safe_names import shown
 from service.server.storage import layout
-from service.server.storage.part_files import PartFile, PartFileLocked, part_files_folder, stored_bytes
+from service.server.storage.part_files import PartFile, PartFileLocked
 
 BUSY_RETRY_S = 1
 
@@ -51,10 +51,9 @@ class UploadPatch:
             ApiError: it is locked, was deleted, has another offset, or there is no space.
         """
         try:
-            self._part = PartFile.open(part_files_folder(self._service.settings), self._row["id"])
+            self._part = self._service.parts.open(self._row)
         except PartFileLocked:
-            raise ApiError("locked", f"{self._row['id']}: another request is adding to it",
-                           headers={"Retry-After": str(BUSY_RETRY_S)}) from None
+            raise _locked(self._row) from None
         being_written.add(self._row["id"])
         self._row = row = self._still_there()
         start = self._saved = safe_offset(row, self._part.size)
@@ -65,10 +64,13 @@ class UploadPatch:
         if not row["done"]:
             require_space(self._service, FOR_UPLOAD)
             self._part.cut(start)
-        self._whole = None if row["sha256"] is None or row["done"] else self._hashes.take(row["id"], start)
+        # another process may have added other bytes since this one kept a hash of what were then the first
+        known = row["sha256"] is not None and not row["done"] and (start == 0 or self._service.parts.saves_while_writing)
+        self._whole = self._hashes.take(row["id"], start) if known else None
         digests = [digest for digest in (self._digest, self._whole) if digest is not None]
         self.writer = PartFileWriter(self._part, start, row["length"], digests=digests,
-                             save=self._save if self._checksum is None else None, guard=lambda: require_space(self._service, FOR_UPLOAD))
+                             save=self._save if self._checksum is None and self._service.parts.saves_while_writing else None,
+                             guard=lambda: require_space(self._service, FOR_UPLOAD))
 
     def end(self, broken: str | None) -> Row:
         """Verify and count the bytes that came.
@@ -119,7 +121,8 @@ class UploadPatch:
 
     def _save(self, at: int) -> None:
         self._saved = at
-        if not uploads.advance(self._service.database, self._row["id"], at):
+        assert self._part is not None
+        if not self._service.parts.save(self._part, self._row["id"], at):
             self._gone()
 
     def _complete(self) -> None:
@@ -131,9 +134,10 @@ class UploadPatch:
             raise ApiError("checksum-mismatch", f"{shown(row['path'])}: has another sha256 than was said: all its bytes are dropped")
         self._still_there()
         prefix = layout.intake(row["project"], row["intake"])
-        service.storage.put(self._part.path, prefix, row["path"])
-        if not uploads.finish(service.database, row["id"], row["length"]):
-            service.storage.remove(prefix)  # the capture was deleted: nothing else removes the row while the part file is locked
+        service.storage.put(service.parts.whole(self._part), prefix, row["path"])
+        if not service.parts.finish(self._part, row["id"], row["length"]):
+            if intakes.find(service.database, row["intake"], row["project"]) is None:  # which finds no row of what it would have to delete
+                service.storage.remove(prefix)
             self._gone()
         logger.info("upload complete", upload=row["id"], intake=row["intake"], path=row["path"], length=row["length"])
 
@@ -151,8 +155,14 @@ class UploadPatch:
 
     def _gone(self) -> Row:
         assert self._part is not None
+        if uploads.find(self._service.database, self._row["id"], self._row["project"]) is not None:  # of another writer, now
+            raise _locked(self._row)
         self._part.drop()
         raise ApiError("not-found", f"{self._row['id']}: was deleted")
+
+
+def _locked(row: Row) -> ApiError:
+    return ApiError("locked", f"{row['id']}: another request is adding to it", headers={"Retry-After": str(BUSY_RETRY_S)})
 
 
 def safe_offset(row: Row, there: int) -> int:
@@ -168,7 +178,7 @@ def safe_offset(row: Row, there: int) -> int:
 
 def settled(service: Service, row: Row) -> Row:
     """Return the row of an upload, corrected if the service ended after it moved the complete file and before it recorded that."""
-    if row["done"] or stored_bytes(part_files_folder(service.settings), row["id"]) >= row["received"]:
+    if row["done"] or service.parts.size(row) >= row["received"]:
         return row
     # not an older file of this path: that was deleted when the upload began
     moved = service.storage.open(layout.intake(row["project"], row["intake"]), row["path"])
@@ -179,4 +189,4 @@ def settled(service: Service, row: Row) -> Row:
 
 def received_of(service: Service, row: Row) -> int:
     """Return the number of bytes of an upload that the client need not send again."""
-    return safe_offset(row, 0 if row["done"] else stored_bytes(part_files_folder(service.settings), row["id"]))
+    return safe_offset(row, 0 if row["done"] else service.parts.size(row))

@@ -33,7 +33,7 @@ from service.server.database.keys import Caller
 from service.server.database.uploads import Row
 from service.server.safe_names import check_path, shown
 from service.server.storage import layout
-from service.server.storage.part_files import PartFile, PartFileLocked, part_files_folder
+from service.server.storage.part_files import PartFileLocked
 from service.views.intakes import FilePage, FileView
 
 router = APIRouter(prefix="/v1", tags=["uploads"], responses=responses(401, 403, 404, 412, 422, 429, 503), dependencies=[Speaking])
@@ -124,9 +124,8 @@ async def patch_upload(
 def delete_upload(service: ServiceDep, caller: Writer, upload: UploadId) -> None:
     """Delete an upload; or delete a complete file from a capture that is receiving or refused."""
     row = _row(service, caller, upload)
-    folder = part_files_folder(service.settings)
     try:
-        part = PartFile.open(folder, upload)
+        part = service.parts.open(row)
     except PartFileLocked:
         raise ApiError("locked", f"{upload}: a request is adding to it", headers={"Retry-After": "1"}) from None
     with part:

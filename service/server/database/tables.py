@@ -49,6 +49,10 @@ uploads = sa.Table(
     sa.Column("sha256", sa.String(64)),  # of the whole file, hexadecimal; NULL: the client did not say it
     sa.Column("touched_at", sa.Float, nullable=False),
     sa.Column("done", sa.Boolean, nullable=False),
+    # with an object store: the request that may change the row, and until when; name and bytes of each piece in the store
+    sa.Column("writer", sa.String(32)),
+    sa.Column("writer_until", sa.Float),
+    sa.Column("pieces", sa.JSON, nullable=False, server_default="[]"),
     sa.UniqueConstraint("intake", "folded", name="relit_uploads_of_path"))
 
 jobs = sa.Table(

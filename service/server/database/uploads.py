@@ -4,7 +4,7 @@
 """
 
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -74,14 +74,46 @@ def listing(database: Database, intake: str, *, limit: int, after: str | None = 
     return [dict(row) for row in database.rows(query.order_by(uploads.c.folded).limit(limit))]
 
 
-def advance(database: Database, identifier: str, received: int) -> bool:
-    """Record the number of bytes that are safe; return False if the upload was deleted."""
-    return _change(database, identifier, received=received)
+def take(database: Database, identifier: str, writer: str, *, now: float, until: float) -> bool:
+    """Let a writer change an upload until a time (seconds since 1970); return False if another has it, or it was deleted."""
+    free = uploads.c.writer.is_(None) | (uploads.c.writer_until < now)
+    return database.transact(lambda connection: connection.execute(uploads.update().where(uploads.c.id == identifier, free).values(
+        writer=writer, writer_until=until))).rowcount == 1
 
 
-def finish(database: Database, identifier: str, length: int) -> bool:
-    """Record that the complete file is in the storage; return False if the upload was deleted."""
-    return _change(database, identifier, received=length, done=True)
+def renew(database: Database, writers: Collection[str], until: float) -> None:
+    """Let writers change their uploads until a later time."""
+    database.transact(lambda connection: connection.execute(uploads.update().where(uploads.c.writer.in_(writers)).values(
+        writer_until=until)))
+
+
+def release(database: Database, identifier: str, writer: str) -> None:
+    """Let others change an upload that this writer has."""
+    database.transact(lambda connection: connection.execute(uploads.update().where(
+        uploads.c.id == identifier, uploads.c.writer == writer).values(writer=None, writer_until=None)))
+
+
+def advance(database: Database, identifier: str, received: int, *, writer: str | None = None,
+            pieces: Sequence[tuple[str, int]] | None = None) -> bool:
+    """Record the number of bytes that are safe.
+
+    Args:
+        database: of the service.
+        identifier: of the upload.
+        received: the number of bytes.
+        writer: who must have the upload; None: anybody may change it.
+        pieces: names and lengths of the objects that hold the bytes; None: they are not in objects.
+
+    Returns:
+        False if the upload was deleted, or another writer has it.
+    """
+    values: dict[str, Any] = {"received": received} | ({} if pieces is None else {"pieces": [list(piece) for piece in pieces]})
+    return _change(database, identifier, writer, values)
+
+
+def finish(database: Database, identifier: str, length: int, *, writer: str | None = None) -> bool:
+    """Record that the complete file is in the storage; the arguments and the answer are those of `advance`."""
+    return _change(database, identifier, writer, {"received": length, "done": True, "pieces": []})
 
 
 def remove(connection: sa.Connection, identifier: str) -> bool:
@@ -101,12 +133,33 @@ def expire(database: Database, folder: Path, before: float) -> int:
         The number of deleted uploads.
     """
     removed = 0
-    for row in database.rows(sa.select(uploads.c.id).where(uploads.c.done.is_(False), uploads.c.touched_at < before)):
+    for row in untouched(database, before):
         removed += _expire(database, folder, row["id"], before)
-    for identifier in leftovers(folder, before):
-        if database.row(sa.select(uploads.c.id).where(uploads.c.id == identifier, uploads.c.done.is_(False))) is None:
-            PartFile.discard(folder, identifier)
+    drop_leftovers(database, folder, before)
     return removed
+
+
+def untouched(database: Database, before: float) -> list[Row]:
+    """Return the uploads that were not continued since a time."""
+    return [dict(row) for row in database.rows(sa.select(uploads).where(uploads.c.done.is_(False), uploads.c.touched_at < before))]
+
+
+def unfinished_of(database: Database, identifiers: Collection[str]) -> set[str]:
+    """Return those of the uploads that exist and are not complete."""
+    return {row["id"] for row in database.rows(sa.select(uploads.c.id).where(uploads.c.id.in_(identifiers), uploads.c.done.is_(False)))}
+
+
+def drop_leftovers(database: Database, folder: Path, before: float) -> None:
+    """Delete the part files that were not written since a time and have no upload."""
+    old = set(leftovers(folder, before))
+    for identifier in old - unfinished_of(database, old):
+        PartFile.discard(folder, identifier)
+
+
+def drop_untouched(database: Database, identifier: str, before: float) -> bool:
+    """Delete the row of an upload unless it was continued since a time; return whether it was deleted."""
+    return database.transact(lambda connection: connection.execute(uploads.delete().where(
+        uploads.c.id == identifier, uploads.c.done.is_(False), uploads.c.touched_at < before))).rowcount == 1
 
 
 def _expire(database: Database, folder: Path, identifier: str, before: float) -> bool:
@@ -115,8 +168,7 @@ def _expire(database: Database, folder: Path, identifier: str, before: float) ->
     except PartFileLocked:  # a request is adding to it
         return False
     with part:
-        gone = database.transact(lambda connection: connection.execute(uploads.delete().where(
-            uploads.c.id == identifier, uploads.c.done.is_(False), uploads.c.touched_at < before))).rowcount == 1
+        gone = drop_untouched(database, identifier, before)
         if gone:
             part.drop()
     return gone
@@ -141,6 +193,7 @@ def _require_free(connection: sa.Connection, intake: str, path: str) -> None:
             raise PathTaken(f"path {shown(path)}: lies in the folder of {shown(other)} where upper and lower case are not told apart")
 
 
-def _change(database: Database, identifier: str, **values: int | bool) -> bool:
-    return database.transact(lambda connection: connection.execute(uploads.update().where(uploads.c.id == identifier).values(
+def _change(database: Database, identifier: str, writer: str | None, values: Mapping[str, Any]) -> bool:
+    mine = [uploads.c.id == identifier] + ([] if writer is None else [uploads.c.writer == writer])
+    return database.transact(lambda connection: connection.execute(uploads.update().where(*mine).values(
         touched_at=time.time(), **values))).rowcount == 1

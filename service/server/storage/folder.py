@@ -27,6 +27,16 @@ class StoredFile(NamedTuple):
     modified_at: float
 
 
+class OpenFile(NamedTuple):
+    """An open file of the storage, which whoever gets it closes. Its bytes are those of its version, whatever replaces it."""
+
+    descriptor: int
+    size: int
+    modified_at: float
+    version: str
+    """The same from every machine as long as the content is the same: letters, digits and hyphens."""
+
+
 class Storage(Protocol):
     """What the service needs of a storage. A prefix is one of service.server.storage.layout."""
 
@@ -56,6 +66,9 @@ class Storage(Protocol):
 
     def open(self, prefix: str, name: str) -> Path | None:
         """Return a file of this machine with the content of one file; None: there is no such file."""
+
+    def open_file(self, prefix: str, name: str) -> OpenFile | None:
+        """Open one file for reading; None: there is no such file."""
 
     def remove(self, prefix: str) -> None:
         """Delete all files of a prefix."""
@@ -128,6 +141,18 @@ class FolderStorage:
         folder = self._root / prefix
         path = folder / name
         return path if is_shown(name) and path.is_file() and path.resolve() == folder.resolve() / name else None  # not through a link
+
+    def open_file(self, prefix: str, name: str) -> OpenFile | None:
+        """Open one file; its version is that of its inode, which is never written to again."""
+        path = self.open(prefix, name)
+        if path is None:
+            return None
+        try:
+            descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+        except FileNotFoundError:  # deleted meanwhile
+            return None
+        status = os.fstat(descriptor)
+        return OpenFile(descriptor, status.st_size, status.st_mtime, f"{status.st_ino:x}-{status.st_mtime_ns:x}-{status.st_size:x}")
 
     def remove(self, prefix: str) -> None:
         """Delete the folder; it is hidden first, so that a part of it is not shown. A mark of the prefix stays for REMEMBERED_S."""

@@ -3,6 +3,7 @@
 projects/PROJECT/captures/ID/…        an uploaded capture
 projects/PROJECT/environments/ID/…    an uploaded environment, one image
 projects/PROJECT/jobs/ID/…            results: maps.exr, report.json, asset.usdz, frame.0001.exr …
+uploads/ID/…                          in an object store: pieces of incomplete uploads
 """
 
 from service.requests.identifiers import CAPTURE, ENVIRONMENT
@@ -13,12 +14,19 @@ SOLVED = (MAPS, "depth.exr", "points.ply", "report.json")
 FRAMES = "frame.####.exr"
 PICTURE = "picture.exr"
 ASSET = "asset"
+PIECES = "uploads"
+"""Prefix of the pieces of incomplete uploads, in an object store."""
 FOLDERS = {CAPTURE: "captures", ENVIRONMENT: "environments"}
 
 
 def intake(project: str, identifier: str) -> str:
     """Return the prefix of a capture or an environment."""
     return f"projects/{project}/{FOLDERS[identifier.partition('_')[0]]}/{identifier}"
+
+
+def pieces(upload: str) -> str:
+    """Return the prefix of the pieces of an incomplete upload."""
+    return f"{PIECES}/{upload}"
 
 
 def results(project: str, job: str) -> str:

@@ -1,5 +1,7 @@
 """Storage in an object store. Workers read and write copies on their own disks; objects appear complete or not at all."""
 
+import hashlib
+import os
 import threading
 import time
 from collections.abc import Callable, Collection, Sequence
@@ -9,7 +11,7 @@ from typing import TypeVar
 
 from service.reporting.progress import Progress
 from service.server.storage.bucket import Bucket, Object
-from service.server.storage.folder import REMOVED, StoredFile, is_shown, stored_below, sweep
+from service.server.storage.folder import REMOVED, OpenFile, StoredFile, is_shown, stored_below, sweep
 from service.server.storage.scratch import Entry, Scratch
 from stage.files import replacing
 
@@ -85,6 +87,14 @@ class ObjectStorage:
 
     def open(self, prefix: str, name: str) -> Path | None:
         """Return a copy of one object, which is fetched if it has changed; None: there is no such object."""
+        opened = self.open_file(prefix, name)
+        if opened is None:
+            return None
+        os.close(opened.descriptor)
+        return self._scratch.files(prefix) / name
+
+    def open_file(self, prefix: str, name: str) -> OpenFile | None:
+        """Open a copy of one object, which is fetched if it has changed; its version is that of the object, on every machine."""
         if not is_shown(name) or self._is_removed(prefix):
             return None
         found = self._bucket.find(f"{prefix}/{name}")
@@ -93,7 +103,8 @@ class ObjectStorage:
         with self._scratch.entry(prefix, lambda: None) as entry:
             if entry.version(name) != found.version:
                 self._fetch(entry, {name: found}, None)
-        return self._scratch.files(prefix) / name
+            descriptor = os.open(entry.files / name, os.O_RDONLY | os.O_CLOEXEC)
+        return OpenFile(descriptor, found.size, found.modified_at, hashlib.sha256(found.version.encode()).hexdigest()[:32])
 
     def remove(self, prefix: str) -> None:
         """Delete the objects; the object removed/PREFIX exists meanwhile, so that a part of the prefix is not shown."""

@@ -34,7 +34,7 @@ def test_frames_are_not_counted_backwards_while_they_are_sent(monkeypatch):
     """A later chunk of a relight: what the store is told while its frames are made, and then sent."""
     told = []
     monkeypatch.setattr(progresses, "EVERY_S", 0.0)
-    monkeypatch.setattr(progresses.jobs, "advance", lambda database, claim, progress: told.append(progress[:3]) or True)
+    monkeypatch.setattr(progresses.jobs, "advance", lambda database, claim, progress, **_: told.append(progress[:3]) or True)
     progress = JobProgress(None, None, alive=lambda: None, frame_offset=4, frame_count=10)
     progress.stage("open", 1)
     for stage, total in ((FRAMES, 2), ("upload", 2)):
