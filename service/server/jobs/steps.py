@@ -5,7 +5,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import NamedTuple
 
-from service.errors import USER_ERRORS, RequestError, sentence
+from service.errors import RequestError
 from service.reporting.progress import Progress
 from service.reporting.provenance import name_place
 from service.requests.frame_range import frame_numbers
@@ -124,16 +124,11 @@ def _frames(job: Job, request: RelightJob, context: WorkerContext) -> list[JobSt
 
 
 def _check(job: Job, request: CheckJob, context: WorkerContext, progress: Progress) -> None:
-    from service.captures.admit import admit_capture, admit_environment
+    from service.captures.check_process import check_in_process
 
-    folder, _ = _place(job, request.intake, context, progress)
-    try:
-        if request.intake.startswith(CAPTURE):
-            facts = admit_capture(folder, max_pixels=context.max_pixels, progress=progress)
-        else:
-            facts = admit_environment(folder, max_pixels=context.max_pixels)
-    except USER_ERRORS as error:  # the user knows the files by the names given, not by their place on the server
-        raise RequestError(sentence(error).replace(f"{folder}/", "")) from error
+    folder, root = _place(job, request.intake, context, progress)
+    facts = check_in_process(folder, environment=not request.intake.startswith(CAPTURE), root=root, max_pixels=context.max_pixels,
+                             progress=progress)
     intakes.accept(context.database, request.intake, facts)
 
 
@@ -215,16 +210,16 @@ def _intake(job: Job, identifier: str, context: WorkerContext, progress: Progres
     """Return the folder of a capture or environment of the job's project; a registered one is checked again, as it may have changed."""
     from service.captures.admit import admit_environment, recheck_capture
 
-    folder, registered = _place(job, identifier, context, progress)
-    if registered and identifier.startswith(CAPTURE):
+    folder, root = _place(job, identifier, context, progress)
+    if root is not None and identifier.startswith(CAPTURE):
         recheck_capture(folder, max_pixels=context.max_pixels)
-    elif registered:
+    elif root is not None:
         admit_environment(folder, max_pixels=context.max_pixels)
     return folder
 
 
-def _place(job: Job, identifier: str, context: WorkerContext, progress: Progress) -> tuple[Path, bool]:
-    """Return the folder (or the file of an environment) of an intake of the job's project, and whether it was registered.
+def _place(job: Job, identifier: str, context: WorkerContext, progress: Progress) -> tuple[Path, Path | None]:
+    """Return the folder (or the file of an environment) of an intake of the job's project, and the root of a registered one.
 
     The files of a registered one are opened beneath its folder until the step ends, whatever becomes links meanwhile.
     """
@@ -232,14 +227,14 @@ def _place(job: Job, identifier: str, context: WorkerContext, progress: Progress
     if row is None:
         raise RequestError(f"{identifier}: is not there any more")
     if row["folder"] is None:
-        return _named(context.storage.local(layout.intake(job.project, identifier), progress=progress), identifier), False
+        return _named(context.storage.local(layout.intake(job.project, identifier), progress=progress), identifier), None
     folder = Path(row["folder"])
     root = next((root for root in context.roots_of(job.project) if folder.is_relative_to(root)), None)
     if resolved(folder) != folder or root is None:
         raise RequestError(f"{identifier}: lies in none of the folders that the operator allows any more")
     top = folder if identifier.startswith(CAPTURE) else folder.parent
     context.held.enter_context(inputs.confined(top, root, max_pixels=context.max_pixels))
-    return _named(folder, identifier), True
+    return _named(folder, identifier), root
 
 
 def _environment(job: Job, identifier: str | None, context: WorkerContext, progress: Progress) -> Path | None:

@@ -1,0 +1,182 @@
+"""A process that checks one capture or environment: the files are those of strangers, and their decoders may crash, hang or ask for memory.
+
+`check_in_process` starts it with an environment of its own, without the settings of the service (the database's password among them). It
+has limits of memory, processor time and the size of files. What becomes of it concerns only the check that it does.
+
+It reads one line of JSON from its standard input, and answers with lines of JSON: {"stage": …, "total": …} and {"done": …} as it goes on,
+and at last {"facts": …}, {"error": sentence} or {"fault": traceback}.
+"""
+
+import json
+import os
+import resource
+import selectors
+import signal
+import subprocess
+import sys
+import threading
+import time
+import traceback
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import Any
+
+from service.errors import USER_ERRORS, RequestError, sentence
+from service.reporting.progress import Progress
+
+MEMORY_BYTES = 2 << 30
+"""Bytes of data that a check may have; the largest capture.json takes a third."""
+CPU_S = 300
+"""Seconds of processor time of a check: headers of 20 000 images take 20."""
+FILE_BYTES = 1 << 16
+"""Bytes of a file that a check may write: Python tries out its folder for temporary files."""
+WALL_S = 1800.0
+"""Seconds after which a check is ended, whatever it waits for."""
+ANSWER_BYTES = 1 << 20
+"""Bytes that a check may answer with."""
+LOOK_S = 0.5
+"""Seconds between two signs of life to the job."""
+COMMAND = (sys.executable, "-P", "-m", __name__)
+END_S = 5.0
+"""Seconds that a process which has closed its output may take to end."""
+KEPT = ("PATH", "LANG", "LC_ALL", "LC_CTYPE", "TMPDIR", "LD_LIBRARY_PATH")
+"""Variables of the environment that the process inherits."""
+
+
+def check_in_process(folder: Path, *, environment: bool, root: Path | None, max_pixels: int, progress: Progress) -> dict[str, Any]:
+    """Check a capture or an environment in a process of its own.
+
+    Args:
+        folder: of the capture or the environment, or the file of a registered environment.
+        environment: whether it is an environment.
+        root: the folder below which a registered one lies, so that no link is followed out of its folder; None: it was uploaded.
+        max_pixels: most pixels of an image.
+        progress: of the check; an exception that it raises ends the process.
+
+    Returns:
+        The description that `service.captures.admit` returns.
+
+    Raises:
+        RequestError: the files cannot be used; the sentence names them below the folder.
+        RuntimeError: an error of relit itself; the message is its traceback.
+    """
+    kept = {name: os.environ[name] for name in KEPT if name in os.environ}
+    path = os.pathsep.join(os.path.abspath(entry) for entry in sys.path)
+    asked = {"folder": str(folder), "environment": environment, "root": None if root is None else str(root), "max_pixels": max_pixels}
+    process = subprocess.Popen(
+        COMMAND, env=kept | {"PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1", "OPENBLAS_NUM_THREADS": "1"}, cwd=os.sep,
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, start_new_session=True)
+    assert process.stdin is not None and process.stdout is not None
+    with process, ExitStack() as ended:
+        ended.callback(process.kill)
+        try:
+            process.stdin.write(json.dumps(asked).encode() + b"\n")
+            process.stdin.flush()
+        except BrokenPipeError:  # it could not start: the exit code tells
+            pass
+        answer = _answer(process, progress)
+        if answer is None:
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(END_S)
+            raise RequestError(_end(process.returncode))
+    if "error" in answer:
+        raise RequestError(str(answer["error"]))
+    if "facts" not in answer:
+        raise RuntimeError(str(answer.get("fault")))
+    return dict(answer["facts"])
+
+
+def _answer(process: "subprocess.Popen[bytes]", progress: Progress) -> dict[str, Any] | None:
+    """Return the last line of the process, or None if it ended without one."""
+    assert process.stdout is not None
+    descriptor, rest, read, done = process.stdout.fileno(), b"", 0, 0
+    deadline = time.monotonic() + WALL_S
+    with selectors.DefaultSelector() as waiting:
+        waiting.register(descriptor, selectors.EVENT_READ)
+        while True:
+            progress.advance(done)
+            if time.monotonic() > deadline:
+                raise RequestError(f"the check of the files was ended after {WALL_S:g} seconds")
+            if not waiting.select(LOOK_S):
+                continue
+            block = os.read(descriptor, 1 << 16)
+            read += len(block)
+            if not block or read > ANSWER_BYTES:
+                return None
+            *lines, rest = (rest + block).split(b"\n")
+            for line in lines:
+                found = json.loads(line)
+                if "stage" in found:
+                    done = 0
+                    progress.stage(str(found["stage"]), int(found["total"]))
+                elif "done" in found:
+                    done = int(found["done"])
+                else:
+                    return dict(found)
+
+
+def _end(code: int | None) -> str:
+    """Return a sentence about a process that ended without an answer."""
+    if code is not None and -code in (signal.SIGXCPU, signal.SIGKILL):
+        return (f"the check of the files was ended: it takes more than {CPU_S} seconds of processor time "
+                f"or {MEMORY_BYTES >> 30} GiB of memory")
+    return f"the check of the files broke off (exit code {code}): one of them is damaged"
+
+
+class _Lines:
+    """A Progress that is written to the standard output."""
+
+    def stage(self, name: str, total: int) -> None:
+        """Write that a stage begins."""
+        _write({"stage": name, "total": total})
+
+    def advance(self, done: int) -> None:
+        """Write how many steps of the stage are done."""
+        _write({"done": done})
+
+
+def _write(line: dict[str, Any]) -> None:
+    os.write(sys.stdout.fileno(), json.dumps(line).encode() + b"\n")
+
+
+def _limit() -> None:
+    for kind, most in ((resource.RLIMIT_DATA, MEMORY_BYTES), (resource.RLIMIT_CPU, CPU_S), (resource.RLIMIT_CORE, 0),
+                       (resource.RLIMIT_FSIZE, FILE_BYTES)):
+        _, hard = resource.getrlimit(kind)
+        allowed = most if hard == resource.RLIM_INFINITY else min(most, hard)
+        resource.setrlimit(kind, (allowed, allowed))
+
+
+def _end_with_parent() -> None:
+    sys.stdin.buffer.read()  # until its end: the worker is gone
+    os._exit(1)
+
+
+def main() -> None:
+    """Do the check that the first line of the standard input names."""
+    _limit()
+    asked = json.loads(sys.stdin.buffer.readline())
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    folder = Path(asked["folder"])
+    try:
+        from service.captures.admit import admit_capture, admit_environment
+        from stage import inputs
+
+        with ExitStack() as held:
+            if asked["root"] is not None:
+                top = folder.parent if asked["environment"] else folder
+                held.enter_context(inputs.confined(top, Path(asked["root"]), max_pixels=asked["max_pixels"]))
+            facts = (admit_environment(folder, max_pixels=asked["max_pixels"]) if asked["environment"] else
+                     admit_capture(folder, max_pixels=asked["max_pixels"], progress=_Lines()))
+        _write({"facts": facts})
+    except MemoryError:
+        _write({"error": f"the files take more than {MEMORY_BYTES >> 30} GiB of memory to be checked"})
+    except USER_ERRORS as error:  # the user knows the files by the names given, not by their place on the server
+        _write({"error": sentence(error).replace(f"{folder}/", "")})
+    except Exception:
+        _write({"fault": traceback.format_exc()[-100_000:]})
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,132 @@
+"""Checks in a process of their own: the same answers, no secrets, and an end that concerns nobody else."""
+
+import json
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from service.captures import check_process
+from service.captures.admit import admit_capture, admit_environment
+from service.captures.check_process import check_in_process
+from service.errors import RequestError
+from tests.scenes.captures import edit_manifest, make_scene, write_capture
+
+SAMPLES = Path(__file__).parents[3] / "samples"
+PIXELS = 200_000_000
+FACTS = "print(json.dumps({'facts': %s}))"
+
+
+class Told:
+    """A progress that keeps what it is told."""
+
+    def __init__(self, stop_after_s: float | None = None) -> None:
+        self.stages: list[tuple[str, int]] = []
+        self._stop_at = None if stop_after_s is None else time.monotonic() + stop_after_s
+
+    def stage(self, name: str, total: int) -> None:
+        self.stages.append((name, total))
+
+    def advance(self, done: int) -> None:
+        if self._stop_at is not None and time.monotonic() > self._stop_at:
+            raise InterruptedError
+
+
+def check(folder: Path, *, environment: bool = False, root: Path | None = None, progress: Told | None = None) -> dict:
+    return check_in_process(folder, environment=environment, root=root, max_pixels=PIXELS, progress=progress or Told())
+
+
+def running(monkeypatch, code: str) -> None:
+    """Let other code run in place of the check."""
+    monkeypatch.setattr(check_process, "COMMAND", (sys.executable, "-c", f"import json, os, signal, sys, time\n{code}"))
+
+
+@pytest.mark.parametrize("registered", [False, True])
+def test_it_finds_what_a_check_finds(registered):
+    told = Told()
+    root = SAMPLES if registered else None
+    assert check(SAMPLES / "owl", root=root, progress=told) == admit_capture(SAMPLES / "owl", max_pixels=PIXELS)
+    assert told.stages == [("check", 1)]
+    sky = SAMPLES / "owl" / "environment.exr"
+    assert check(sky, environment=True, root=root) == admit_environment(sky, max_pixels=PIXELS)
+
+
+def test_a_fault_is_one_sentence_without_the_folder(tmp_path):
+    write_capture(tmp_path / "cap", make_scene(size=8, lights=5))
+    edit_manifest(tmp_path / "cap", mask="nothing.png")
+    with pytest.raises(RequestError) as error:
+        check(tmp_path / "cap")
+    assert str(error.value) == "capture.json: mask: nothing.png is not in the folder"
+
+
+def test_a_link_out_of_a_registered_folder_is_not_followed(tmp_path):
+    write_capture(tmp_path / "root" / "cap", make_scene(size=8, lights=5))
+    (tmp_path / "root" / "link").symlink_to(tmp_path / "root" / "cap")
+    with pytest.raises(RequestError, match="a link leads to it"):
+        check(tmp_path / "root" / "link", root=tmp_path / "root")
+
+
+def test_it_has_no_secrets(monkeypatch):
+    """/proc/PID/environ shows what a process was started with, whatever it deletes."""
+    monkeypatch.setenv("RELIT_DATABASE_URL", "postgresql://user:secret@host/name")
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "secret")
+    running(monkeypatch, FACTS % "dict(os.environ) | {'arguments': sys.argv, 'files': len(os.listdir('/proc/self/fd'))}")
+    found = check(SAMPLES / "owl")
+    assert "secret" not in json.dumps(found)
+    assert found["files"] <= 4  # its input, output and errors, and the folder that is listed
+
+
+@pytest.mark.parametrize(("code", "words"), [
+    ("os.kill(os.getpid(), signal.SIGSEGV)", rf"broke off \(exit code -{int(signal.SIGSEGV)}\): one of them is damaged"),
+    ("sys.exit(7)", r"broke off \(exit code 7\)"),
+    ("os.kill(os.getpid(), signal.SIGKILL)", "more than 300 seconds of processor time or 2 GiB of memory"),
+    ("os.kill(os.getpid(), signal.SIGXCPU)", "more than 300 seconds of processor time"),
+    ("print('x' * (3 << 20))", "broke off"),
+])
+def test_a_process_that_ends_is_a_sentence(monkeypatch, code, words):
+    running(monkeypatch, code)
+    with pytest.raises(RequestError, match=words):
+        check(SAMPLES / "owl")
+
+
+def test_its_memory_and_its_files_are_bounded(monkeypatch, tmp_path):
+    running(monkeypatch, f"""
+sys.path.insert(0, {str(Path(__file__).parents[3])!r})
+from service.captures import check_process
+check_process._limit()
+found = []
+for size in (1 << 30, 2 << 30):
+    try:
+        found.append(len(bytes(size)))
+    except MemoryError:
+        found.append(None)
+try:
+    open({str(tmp_path / "file")!r}, "wb", buffering=0).write(bytes(1 << 16))
+    open({str(tmp_path / "file")!r}, "ab", buffering=0).write(b"x")
+    found.append("written")
+except OSError as error:
+    found.append(error.errno)
+print(json.dumps({{"facts": {{"found": found}}}}))""")
+    import errno
+
+    assert check(SAMPLES / "owl")["found"] == [1 << 30, None, errno.EFBIG]
+
+
+def test_a_process_that_takes_too_long_or_is_not_wanted_is_ended(monkeypatch, tmp_path):
+    running(monkeypatch, f"open({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid())); time.sleep(600)")
+    with pytest.raises(InterruptedError):
+        check(SAMPLES / "owl", progress=Told(stop_after_s=2))
+    monkeypatch.setattr(check_process, "WALL_S", 1.0)
+    with pytest.raises(RequestError, match="was ended after 1 seconds"):
+        check(SAMPLES / "owl")
+    with pytest.raises(ProcessLookupError):
+        os.kill(int((tmp_path / "pid").read_text()), 0)
+
+
+def test_an_error_of_relit_itself_is_told_with_its_place(monkeypatch):
+    running(monkeypatch, "print(json.dumps({'fault': 'Traceback: line 7'}))")
+    with pytest.raises(RuntimeError, match="line 7"):
+        check(SAMPLES / "owl")
