@@ -6,12 +6,14 @@ cut into blocks that a thread pool runs side by side. On CUDA a launch is one la
 
 import itertools
 import os
+import platform
 import sys
 import tempfile
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, wraps
+from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 import warp as wp
@@ -114,6 +116,22 @@ def names() -> list[str]:
 def describe(device: str) -> str:
     """Return one line that names the device, for reports."""
     return f"cpu, {worker_count()} threads" if device == "cpu" else f"{device}, {wp.get_device(device).name}"
+
+
+def kind(device: str) -> str:
+    """Return what devices have in common that find the same to the last bit: the model, and on the CPU the count of threads."""
+    return f"cpu, {_cpu_model()}, {worker_count()} threads" if device == "cpu" else wp.get_device(device).name
+
+
+@cache
+def _cpu_model() -> str:
+    """Return the model of the processor and its instruction sets, for which Warp compiles kernels."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    found = {line.partition(":")[0].strip(): line.partition(":")[2].strip() for line in reversed(lines)}
+    return f"{found.get('model name', platform.machine())} {found.get('flags', found.get('Features', ''))}"
 
 
 def pack_width(device: str) -> int:

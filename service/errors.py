@@ -2,6 +2,7 @@
 
 RequestError       a request asks for something impossible (frames that run backwards, a name without ####); names the option
 ValidationError    pydantic's: a field of a request has an invalid value; names the field
+DivergedError      a worker that helps finds something else than the one that has the job; only the log says so
 """
 
 from pydantic import ValidationError
@@ -14,6 +15,10 @@ from stage.records import describe
 
 class RequestError(ValueError):
     """A request asks for something impossible; the message names the option."""
+
+
+class DivergedError(Exception):
+    """This worker finds something else than the one that has the job, so that it cannot help."""
 
 
 USER_ERRORS: tuple[type[Exception], ...] = (RequestError, ValidationError, StageError, KernelError, AssetError)

@@ -109,6 +109,7 @@ class Housekeeper:
     def _remove_job(self, row: sa.RowMapping) -> None:
         if self._database.transact(partial(_forget, job=row["id"])):
             self._storage.remove(layout.results(row["project"], row["id"]))
+            self._storage.remove(layout.shared(row["project"], row["id"]))
             self._queue.forget(row["id"], row["attempt"])
             logger.info("job removed", job=row["id"], project=row["project"])
 

@@ -1,7 +1,7 @@
 """The pixels of an image as readings on the device, as many at a time as memory allows."""
 
-from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from kernels.photometric.readings import Lights, Readings, grey_factors, grey_re
 from kernels.photometric.samples import Samples, gather
 from kernels.status import Status
 from service.solve.several_devices import deal
+from service.solve.sharing import Results
 from service.solve.solution import SolveInput
 from stage.camera import Camera
 from stage.colour import GREY_WEIGHTS
@@ -27,6 +28,7 @@ BATCH_BYTES = 256 << 20
 LEAST_READINGS = 3
 """Frames with a reading, dark or not, that a normal needs."""
 
+Piece = TypeVar("Piece")
 View = Callable[[np.ndarray], np.ndarray]
 """From pixel positions (row-major, [n]) to unit directions to the viewer [n, 3] float32."""
 
@@ -50,28 +52,39 @@ class Batch(NamedTuple):
     samples: Samples
 
 
-def each_span(given: SolveInput, bytes_per_pixel: int, work: Callable[[int, int, str], None]) -> None:
+def each_span(given: SolveInput, bytes_per_pixel: int, work: Callable[[int, int, str], None], results: Results) -> None:
     """Do the pixel ranges of the image that touch the mask on the devices, and say how far it is.
 
     Args:
         given: the images.
         bytes_per_pixel: what the work allocates for each pixel beside the stack.
         work: takes the range's first pixel, the pixel after its last, padding included, and the device, and stores what it finds.
+        results: where it stores it.
     """
     inside, total = given.mask.reshape(-1), given.stack.shape[2]
     spans = [(start, stop) for start, stop in given.stack.bands(bytes_per_pixel) if inside[start:stop].any()]
-    done = total - sum(stop - start for start, stop in spans)
-    given.timings.advance(done)
+    _deal(given, spans, lambda span, device: work(*span, device), results, size=lambda span: span[1] - span[0],
+          done=total - sum(stop - start for start, stop in spans),
+          pixels_of=lambda span: slice(span[0], min(span[1], given.stack.pixel_count)))
 
-    def advance(span: tuple[int, int]) -> None:
+
+def _deal(given: SolveInput, pieces: Sequence[Piece], work: Callable[[Piece, str], None], results: Results, *,
+          size: Callable[[Piece], int], done: int, pixels_of: Callable[[Piece], Any]) -> None:
+    """Do pieces on the devices of this worker, and of others that share the solve; `done` pixels of the stage are done before."""
+    def tell(pixels: int) -> None:
         nonlocal done
-        done += span[1] - span[0]
+        done += pixels
         given.timings.advance(done)
 
-    deal(given.devices, spans, lambda span, device: work(*span, device), advance)
+    tell(0)
+    if given.sharing is None:
+        deal(given.devices, pieces, work, lambda piece: tell(size(piece)))
+    else:
+        given.sharing.deal(given.devices, pieces, work, lambda piece: tell(size(piece)), waiting=lambda: tell(0), pixels_of=pixels_of,
+                           results=results)
 
 
-def each_band(given: SolveInput, lights: Lights, field: NearField | None, work: Callable[[ReadBand], None]) -> None:
+def each_band(given: SolveInput, lights: Lights, field: NearField | None, work: Callable[[ReadBand], None], results: Results) -> None:
     """Do the image band by band on the devices, without the bands that lie outside the mask, and say how far it is.
 
     Args:
@@ -79,6 +92,7 @@ def each_band(given: SolveInput, lights: Lights, field: NearField | None, work: 
         lights: lights of the stack, padded.
         field: where the lights are, where some light is near.
         work: stores what it finds in a band.
+        results: where it stores it, and what it follows from besides the arguments.
     """
     stack, inside = given.stack, given.mask.reshape(-1)
     factors = grey_factors(lights, GREY_WEIGHTS)
@@ -90,11 +104,12 @@ def each_band(given: SolveInput, lights: Lights, field: NearField | None, work: 
         near = None if field is None else see_near(band, readings, field.at(np.arange(start, stop)))
         work(ReadBand(span, inside[span], band, readings, near))
 
-    each_span(given, (READING_BYTES if field is None else NEAR_BYTES) * stack.shape[1], read)
+    each_span(given, (READING_BYTES if field is None else NEAR_BYTES) * stack.shape[1], read,
+              results._replace(follows_from=(lights, field, results.follows_from)))
 
 
-def each_batch(given: SolveInput, lights: Lights, view: View, pixels: np.ndarray, work: Callable[[Batch], None], *, lobes: int,
-               field: NearField | None = None, done: int = 0) -> None:
+def each_batch(given: SolveInput, lights: Lights, view: View, pixels: np.ndarray, work: Callable[[Batch], None], results: Results, *,
+               lobes: int, field: NearField | None = None, done: int = 0) -> None:
     """Do pixels of the images batch by batch on the devices, and say how far it is.
 
     Args:
@@ -103,6 +118,7 @@ def each_batch(given: SolveInput, lights: Lights, view: View, pixels: np.ndarray
         view: directions to the viewer.
         pixels: [n] positions, ascending.
         work: stores what it finds at the pixels of a batch.
+        results: where it stores it, and what it follows from besides the arguments.
         lobes: values that the solver keeps for each light and pixel.
         field: where the lights are, where some light is near.
         done: pixels of the stage that are done before.
@@ -110,27 +126,25 @@ def each_batch(given: SolveInput, lights: Lights, view: View, pixels: np.ndarray
     stack, factors = given.stack, grey_factors(lights, GREY_WEIGHTS)
     size = max(1, BATCH_BYTES // (4 * (SAMPLE_FLOATS + lobes) * stack.light_count))
 
-    def read(chosen: np.ndarray, device: str) -> None:
+    def read(piece: slice, device: str) -> None:
+        chosen = pixels[piece]
         start = int(chosen[0]) // PIXEL_PAD * PIXEL_PAD
         stop = (int(chosen[-1]) // PIXEL_PAD + 1) * PIXEL_PAD
         band = packs.upload(stack.band(start, stop), stack.saturated(start, stop), device=device)
         work(Batch(chosen, gather(band, chosen - start, view(chosen), lights, factors, stack.light_count,
                                   None if field is None else field.at(chosen))))
 
-    def advance(chosen: np.ndarray) -> None:
-        nonlocal done
-        done += len(chosen)
-        given.timings.advance(done)
-
-    deal(given.devices, _cut(stack, pixels, size), read, advance)
+    _deal(given, _cut(stack, pixels, size), read, results._replace(follows_from=(lights, field, pixels, results.follows_from)),
+          size=lambda piece: piece.stop - piece.start, done=done, pixels_of=lambda piece: pixels[piece])
 
 
-def _cut(stack: Stack, pixels: np.ndarray, size: int) -> Iterator[np.ndarray]:
-    """Yield ascending positions in batches of at most `size`, each inside one band of the stack."""
+def _cut(stack: Stack, pixels: np.ndarray, size: int) -> list[slice]:
+    """Cut ascending positions into batches of at most `size`, each inside one band of the stack."""
+    found = []
     for start, stop in stack.bands(READING_BYTES * stack.shape[1]):
-        local = pixels[(pixels >= start) & (pixels < stop)]
-        for first in range(0, len(local), size):
-            yield local[first : first + size]
+        first, last = (int(place) for place in np.searchsorted(pixels, (start, stop)))
+        found += [slice(begin, min(begin + size, last)) for begin in range(first, last, size)]
+    return found
 
 
 def pick_pixels(given: SolveInput, lights: Lights, view: View, pixels: np.ndarray, field: NearField | None = None) -> Samples:

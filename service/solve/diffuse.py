@@ -12,6 +12,7 @@ from kernels.photometric.readings import Lights
 from kernels.status import Status
 from service.solve.batches import ReadBand, each_band
 from service.solve.misfit import object_misfit
+from service.solve.sharing import Results
 from service.solve.solution import Solution, SolveInput
 
 
@@ -41,5 +42,6 @@ def solve_diffuse(given: SolveInput, lights: Lights, field: NearField | None = N
         albedo = fit_albedo(band, readings, fit, lights, near).numpy()[:, : len(inside)]
         result.albedo[:, span] = np.where(inside, albedo, 0)
 
-    each_band(given, lights, field, solve)
+    each_band(given, lights, field, solve,
+              Results((result.normal, result.albedo, result.confidence, result.residual, result.status, sigma), misfit))
     return result

@@ -41,6 +41,11 @@ class DirectLight(NamedTuple):
     albedo_scale: float = 1.0
     """Albedo of the surface over this albedo, which is relative where the scale of the lights is."""
 
+    @property
+    def found(self) -> tuple[object, ...]:
+        """Return what was found about the whole object, by which workers compare what they have."""
+        return self.solved, self.height, self.shadows, self.arriving, self.albedo, self.albedo_scale
+
     def on(self, device: str) -> "DirectLight":
         """Return the same for readings on another device."""
         if device == self.given.device:

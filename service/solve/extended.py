@@ -20,6 +20,7 @@ from kernels.status import Status
 from service.requests.solve import MAX_SIGMA
 from service.solve.batches import Batch, View, each_batch, readable, view_directions
 from service.solve.open_sources import OpenSources, open_sources
+from service.solve.sharing import Results
 from service.solve.solution import Solution, SolveInput
 from stage.camera import Camera
 from stage.extended_lights import ExtendedLights
@@ -112,7 +113,7 @@ class _Walk:
             found = search_sampling(samples, self._tables(part.number, samples.device), self._turned_view(part)(pixels))
             self._place(part, pixels, found, status == Status.OK)
 
-        self._batches("search", inside, search)
+        self._batches("search", inside, search, Results((self.result.status, *self._stored)))
 
     def refine(self) -> None:
         """Search again, near the normals so far, in the light that the object leaves, where it hides sources or throws light on itself.
@@ -127,7 +128,8 @@ class _Walk:
             light = open_sources(self._given, self._lights, self._padded, self.result.status, self._found, self._view)
             if light is None:
                 break
-            self._batches("normals", light.touched, partial(self._search_again, light))
+            self._batches("normals", light.touched, partial(self._search_again, light),
+                          Results((*self._stored, self._doubt), light.found))
             self._light, cost = light, self._found.cost[light.touched] / light.given_share
             costs = [float(before.cost[light.touched].mean()), float(cost.mean())]
         if self._light is None:
@@ -180,7 +182,10 @@ class _Walk:
             result.sigma[pixels] = np.minimum(sigma, LARGEST_ERROR)
             result.residual[pixels] = fit.residual
 
-        self._batches("posterior", np.flatnonzero(result.status == Status.OK), judge)
+        assert result.specular is not None and result.roughness is not None and result.regime is not None and result.sigma is not None
+        self._batches("posterior", np.flatnonzero(result.status == Status.OK), judge, Results(
+            (result.normal, result.albedo, result.specular, result.roughness, result.regime, result.confidence, result.sigma,
+             result.residual), (None if self._light is None else self._light.found, self._doubt)))
 
     def _place(self, part: _Part, pixels: np.ndarray, found: Found, kept: np.ndarray) -> None:
         """Store what a search found at the pixels that are kept, [n] bool."""
@@ -188,13 +193,19 @@ class _Walk:
         for values, new in zip(self._found, turned, strict=True):
             values[pixels[kept]] = new[kept]
 
-    def _batches(self, stage: str, chosen: np.ndarray, work: Callable[[_Part, Batch], None]) -> None:
+    @property
+    def _stored(self) -> list[np.ndarray]:
+        """Return what the searches have found, each [..., pixels]."""
+        return [values.T for values in self._found]
+
+    def _batches(self, stage: str, chosen: np.ndarray, work: Callable[[_Part, Batch], None], results: Results) -> None:
         """Do chosen pixels, ascending positions, batch by batch and part by part, and say how far the stage is."""
         self._given.timings.stage(stage, len(chosen))
         done, lobes = 0, SEARCH_LOBES + GRID_FLOATS // self._given.stack.light_count
         for part in self._parts:
             pixels = np.intersect1d(part.pixels, chosen, assume_unique=True)
-            each_batch(self._given, self._padded, self._turned_view(part), pixels, partial(work, part), lobes=lobes, done=done)
+            each_batch(self._given, self._padded, self._turned_view(part), pixels, partial(work, part), results, lobes=lobes,
+                       done=done)
             done += len(pixels)
 
     def _turned_view(self, part: _Part) -> View:

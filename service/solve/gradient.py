@@ -12,6 +12,7 @@ from kernels.photometric.moments import Moments, fit_moments
 from kernels.photometric.separation import separate_by_colour, separate_polarised
 from kernels.status import Status
 from service.solve.batches import each_span, view_directions
+from service.solve.sharing import Results
 from service.solve.solution import Solution, SolveInput
 from stage.camera import Camera
 from stage.colour import GREY_WEIGHTS
@@ -79,7 +80,9 @@ def solve_gradients(given: SolveInput, frames: GradientFrames) -> Solution:
             result.residual[here] = np.where(metal[here], parallel.residual.numpy()[: len(kept)], result.residual[here])
         separated[here] = kept & (diffuse.tilt.numpy()[: len(kept)] == 0)
 
-    each_span(given, BYTES_PER_PIXEL, solve)
+    found = (result.normal, result.albedo, result.confidence, result.residual, result.status, result.specular_normal, result.specular,
+             result.roughness, bent, length, separated, metal)
+    each_span(given, BYTES_PER_PIXEL, solve, Results([array for array in found if array is not None]))
     neighbours = neighbours_doubt(bent.reshape(given.mask.shape), given.mask).reshape(-1)
     estimated = (result.status == Status.OK) & ~metal
     doubted = np.sqrt(np.maximum(result.standard_error() ** 2 - bent**2 + neighbours**2, 0))

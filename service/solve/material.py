@@ -32,6 +32,7 @@ from service.solve.batches import Batch, ReadBand, each_band, each_batch, pick_p
 from service.solve.direct_light import DirectLight, direct_light
 from service.solve.parts import Material
 from service.solve.settling import settle
+from service.solve.sharing import Results
 from service.solve.solution import Solution, SolveInput
 from service.solve.support import FEW_LIGHTS, supports_lobes
 from stage.colour import GREY_WEIGHTS
@@ -140,7 +141,8 @@ class _Walk:
                 self._lambertian[:, span] = np.where(fit.status.numpy()[: len(inside)] == Status.OK, fit.normal.numpy()[:, : len(inside)],
                                                      self.result.normal[:, span])
 
-        each_band(self._given, self._lights, self._field, begin)
+        each_band(self._given, self._lights, self._field, begin,
+                  Results((self.result.normal, self.result.residual, self.result.status, self._lambertian)))
         self._solvable = np.flatnonzero(self.result.status == Status.OK)
         self._spread = self._solvable[evenly(len(self._solvable), SPREAD_PIXELS)] if len(self._solvable) else self._solvable
 
@@ -189,7 +191,8 @@ class _Walk:
                 self._specular[:, pixels] = first.specular.T
                 self._bouncing[:, pixels] = bounce_albedo(samples, normal, first, shape=self._lobe).T
 
-        self._batches("search", search)
+        self._batches("search", search, Results((result.normal, result.albedo, self._specular, self._roughness, self._bouncing),
+                                                (self._shape, self._lobe, self._supported)))
 
     def direct_light(self) -> DirectLight | None:
         """Find what the object does to its own light, from the first search; None when no pixel is solved."""
@@ -269,7 +272,9 @@ class _Walk:
             sigma[pixels], result.confidence[pixels] = found.sigma, found.confidence
             result.residual[pixels] = found.residual
 
-        self._batches("normals", fit)
+        self._batches("normals", fit, Results(
+            (result.normal, result.albedo, self._specular, self._roughness, abundance, pair, sigma, result.confidence, result.residual),
+            (None if light is None else light.found, self._shape, self._lobe, self._supported, materials, self._pairs, self._metals)))
         result.sigma, result.judged_by_surface = sigma, True
         if (mixed := abundance > 0).any():
             result.abundance, result.pair, result.pairs = abundance, pair, self._pairs
@@ -290,7 +295,7 @@ class _Walk:
         """Return the readings of a few pixels, wherever they lie in the image."""
         return pick_pixels(self._given, self._lights, self._view, pixels, self._field)
 
-    def _batches(self, stage: str, work: Callable[[Batch], None]) -> None:
+    def _batches(self, stage: str, work: Callable[[Batch], None], results: Results) -> None:
         """Do the solvable pixels batch by batch, and say how far the stage is."""
         self._given.timings.stage(stage, len(self._solvable))
-        each_batch(self._given, self._lights, self._view, self._solvable, work, lobes=HELD, field=self._field)
+        each_batch(self._given, self._lights, self._view, self._solvable, work, results, lobes=HELD, field=self._field)

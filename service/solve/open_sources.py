@@ -56,6 +56,11 @@ class OpenSources(NamedTuple):
     """Pixels of a row of the image."""
 
     @property
+    def found(self) -> tuple[object, ...]:
+        """Return what was found about the whole object, by which workers compare what they have."""
+        return self.touched, self.part, self.change, self.albedo, self.arriving
+
+    @property
     def given_share(self) -> np.ndarray:
         """Return [n] the share of the sources that leave a touched pixel a reading."""
         return np.maximum((self.part >= 255 * LEAST_PART).mean(axis=1), 1 / self.part.shape[1])

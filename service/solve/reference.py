@@ -9,6 +9,7 @@ from kernels.photometric.reference_table import reference_table, solve_reference
 from kernels.photometric.response_table import SEARCH_LOBES, nodes
 from kernels.status import Status
 from service.solve.batches import Batch, each_batch, readable, view_directions
+from service.solve.sharing import Results
 from service.solve.solution import Solution, SolveInput
 from stage.colour import GREY_WEIGHTS
 from stage.ingest import open_stack
@@ -62,7 +63,8 @@ def solve_by_reference(given: SolveInput, ball: ReferenceBall) -> Solution:
         result.residual[kept] = found.residual[ok]
         excess[kept] = found.excess[ok]
 
-    each_batch(given, padded, view, inside, search, lobes=SEARCH_LOBES + GRID_FLOATS // count)
+    results = Results((result.status, result.normal, result.confidence, sigma, result.residual, excess), readings)
+    each_batch(given, padded, view, inside, search, results, lobes=SEARCH_LOBES + GRID_FLOATS // count)
     solved = result.status == Status.OK
     unexplained = float(np.sqrt(np.median(excess[solved]))) if solved.any() else 0.0
     result.facts["reference"]["unexplained_over_noise"] = round(unexplained, 2)

@@ -13,6 +13,7 @@ from kernels.photometric.samples import evenly
 from kernels.status import Status, refuse_unsure
 from kernels.surface.integrate import Integration
 from service.reporting.progress import Timings
+from service.solve.sharing import SharedSolve
 from stage.camera import Camera
 from stage.colour import GREY_WEIGHTS
 from stage.stack import Stack
@@ -50,6 +51,8 @@ class SolveInput:
     """Folder for stack caches; None: `.relit` in the folder of each capture."""
     relative: bool = False
     """Whether the irradiance of all lights lacks one common factor, so that the scale of albedo is unknown."""
+    sharing: SharedSolve | None = None
+    """The part of this worker in a solve that several share; None: it is alone."""
 
     @property
     def device(self) -> str:

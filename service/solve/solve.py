@@ -26,6 +26,7 @@ from service.solve.material import refine_material, solve_material
 from service.solve.near import MATERIAL_ROUNDS, Rounds, solve_near
 from service.solve.parts import numbered, place_solution
 from service.solve.reference import solve_by_reference
+from service.solve.sharing import SharedSolve
 from service.solve.solution import Solution, SolveInput, SuspectLight, mark_not_facing, refine_status
 from service.solve.surface import guessed_part, height_warnings, integrate
 from stage.brackets import merge_brackets, one_frame_a_light
@@ -98,38 +99,31 @@ class SolveResult(NamedTuple):
     """A sentence for each thing that does not fit on the whole object."""
 
 
-def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResult:
+class _Opened(NamedTuple):
+    """A capture that is ready to be solved."""
+
+    capture: Capture
+    method: Method
+    lights: Any
+    solver: Solver
+    given: SolveInput
+
+
+def solve(request: SolveRequest, progress: Progress | None = None, *, sharing: SharedSolve | None = None) -> SolveResult:
     """Solve a capture, and write its maps and a report.
 
     Args:
         request: the capture, the method and the folder of the results.
         progress: told how far the work is.
+        sharing: the part of this process where several share the solve; the others call `help_solve`.
 
     Raises:
         StageError, KernelError: the input is wrong; nothing is written.
         StorageError: the results cannot be written; nothing is left half-written.
     """
     timings = Timings(progress)
-    chosen = devices.resolve_all(request.device)
-    timings.stage("open", 1)
-    capture = Capture.open(request.capture)
-    method = request.method or next(method for method, entry in METHODS.items() if entry.is_default(capture))
-    if (method is Method.REFERENCE) != (request.reference_ball is not None):
-        raise RequestError("--method reference and --reference-ball CAPTURE go together: give both or neither")
-    balls = [] if request.reference_ball is None else [Capture.open(request.reference_ball)]
-    lights = METHODS[method].read_lights(capture, *balls)
-    solver = METHODS[method].solvers.get(type(lights))
-    if solver is None:  # only extended lights can be missing here: every method takes distant and near ones
-        raise ManifestError(f"{capture.folder / FILE_NAME}: frames[].light: some are extended: --method svbrdf solves these, "
-                            f"{method} needs lights of one direction each")
-    mask = capture.mask()
-    tracking = tracking_frames(capture, to=request.align_to) if request.aligned else None
-    timings.stage("ingest", len(capture.sources()))
-    stack = open_stack(capture, cache=request.cache, tracking=tracking, progress=lambda done, _: timings.advance(done))
-    if isinstance(lights, DistantLights | PlacedLights):
-        stack, lights = one_frame_a_light(merge_brackets(stack, capture.sources(), lights), lights)
-    given = SolveInput(stack, capture.camera, mask, chosen, timings, request.cache,
-                       relative=capture.manifest.irradiance_scale == "relative")
+    capture, method, lights, solver, given = _open(request, timings, sharing)
+    stack, mask = given.stack, given.mask
     solution = solver(given, lights)
     mark_not_facing(capture.camera, solution)
     timings.stage("diagnosis", 1)
@@ -170,7 +164,7 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
         found=solution.facts,
         warnings=solution.warnings,
         suspect_lights=[suspect._asdict() for suspect in solution.suspects],
-        device="; ".join(map(devices.describe, chosen)),
+        device="; ".join(map(devices.describe, given.devices)),
         timings_s=timings.close(),
         pixels={"mask": int(mask.sum()), **counts},
         residual=_residual_statistics(solution.residual.reshape(mask.shape)[solved]),
@@ -180,6 +174,49 @@ def solve(request: SolveRequest, progress: Progress | None = None) -> SolveResul
         **({} if stack.motion is None else {"motion": stack.motion}),
     ))
     return SolveResult(maps, maps_path, report_path, counts, tuple(solution.suspects), tuple(solution.warnings))
+
+
+def help_solve(request: SolveRequest, progress: Progress, sharing: SharedSolve) -> None:
+    """Do pieces of a solve that another process has begun; nothing is written but what it reads of them.
+
+    Args:
+        request: that of the other process, on a device of the same kind.
+        progress: told how far the solve is; it ends the help by an exception.
+        sharing: the part of this process.
+
+    Raises:
+        StageError, KernelError: the input is wrong.
+        DivergedError: this process finds something else than the other.
+    """
+    *_, lights, solver, given = _open(request, Timings(progress), sharing)
+    solver(given, lights)
+
+
+def _open(request: SolveRequest, timings: Timings, sharing: SharedSolve | None) -> _Opened:
+    """Open the capture of a request and read its images into a stack."""
+    chosen = devices.resolve_all(request.device)
+    timings.stage("open", 1)
+    capture = Capture.open(request.capture)
+    method = request.method or next(method for method, entry in METHODS.items() if entry.is_default(capture))
+    if (method is Method.REFERENCE) != (request.reference_ball is not None):
+        raise RequestError("--method reference and --reference-ball CAPTURE go together: give both or neither")
+    balls = [] if request.reference_ball is None else [Capture.open(request.reference_ball)]
+    lights = METHODS[method].read_lights(capture, *balls)
+    solver = METHODS[method].solvers.get(type(lights))
+    if solver is None:  # only extended lights can be missing here: every method takes distant and near ones
+        raise ManifestError(f"{capture.folder / FILE_NAME}: frames[].light: some are extended: --method svbrdf solves these, "
+                            f"{method} needs lights of one direction each")
+    mask = capture.mask()
+    tracking = tracking_frames(capture, to=request.align_to) if request.aligned else None
+    timings.stage("ingest", len(capture.sources()))
+    stack = open_stack(capture, cache=request.cache, tracking=tracking, progress=lambda done, _: timings.advance(done))
+    if isinstance(lights, DistantLights | PlacedLights):
+        stack, lights = one_frame_a_light(merge_brackets(stack, capture.sources(), lights), lights)
+    if sharing is not None:
+        sharing.identify(chosen[0], str(method), stack.key, mask, stack.scale, capture.manifest.model_dump_json())
+    return _Opened(capture, method, lights, solver, SolveInput(
+        stack, capture.camera, mask, chosen, timings, request.cache, relative=capture.manifest.irradiance_scale == "relative",
+        sharing=sharing))
 
 
 def _maps(solution: Solution, solved: np.ndarray, estimated: np.ndarray, method: Method, capture: Capture,

@@ -166,6 +166,7 @@ def delete_job(service: ServiceDep, caller: Writer, job: JobName) -> None:
     if not service.database.transact(work):
         raise ApiError("conflict", f"{job} is {before.state}: cancel it first")
     service.storage.remove(layout.results(caller.project, job))
+    service.storage.remove(layout.shared(caller.project, job))
     service.queue.forget(job, before.attempt)
 
 

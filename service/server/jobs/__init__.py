@@ -12,10 +12,15 @@ attempt again. A job that loses more than `max_lost` workers without progress fa
 it, or making a new frame.
 
 What is done again. The next worker begins the workflow, skips the steps that the row names as finished, and does the step that was under
-way again (runner). A relight keeps each frame that exists with the hash of the same request. With `storage_url`, a worker on another
-machine finds only the files of finished steps, because files are sent at the end of a step.
+way again (runner). A solve reads the pieces of its passes that are done (pieces, service.solve.sharing). A relight keeps each frame that
+exists with the hash of the same request. With `storage_url`, a worker on another machine finds only the frames of finished steps, because
+files are sent at the end of a step.
 
 What is not done twice. A job is changed only by the worker that its row names, in the attempt that it names (database.jobs.Claim). So a
 worker that wakes after another took over its job neither ends a step nor sends files, and it ends when it finds its lock taken. Two
 workers may write the same file for a moment; a file gets its name only when it is complete, and both have the same content.
+
+What several workers do at once. The worker that has a job asks others for help, by workflows of their own in the same queue, which come
+after the jobs that wait (queue). A helper does pieces of a solve or chunks of frames (helping), and changes nothing in the row of the job.
+The help of a worker that dies is not queued again: the worker that has the job does what is left.
 """

@@ -4,6 +4,8 @@ DBOS keeps the queue: a workflow for each attempt of a job. The row of the job a
 neither exists without the other.
 """
 
+import secrets
+
 import sqlalchemy as sa
 from dbos import DBOS, DBOSClient, DBOSPortableJSONSerializer
 from dbos._schemas import SCHEMA_PLACEHOLDER
@@ -19,6 +21,8 @@ from service.server.settings import Settings
 WORK, CHECKS = "work", "checks"
 """The queues: jobs that need a device, and quick checks of captures and environments."""
 WORKFLOW = "relit.job"
+HELP = "relit.help"
+"""The workflow of a worker that helps another with its job."""
 VERSION = "1"
 """Version of the workflow: a worker takes only jobs that were queued by the same version."""
 SERIALIZER = DBOSPortableJSONSerializer()
@@ -46,8 +50,13 @@ def workflow_id(job: str, attempt: int) -> str:
 
 def job_and_attempt(workflow: str) -> tuple[str, int]:
     """Return the job and the attempt of a workflow."""
-    job, _, attempt = workflow.rpartition(".")
+    job, attempt, *_ = workflow.split(".")
     return job, int(attempt)
+
+
+def is_help(workflow: str) -> bool:
+    """Return whether a workflow is that of a worker that helps another with its job."""
+    return workflow.count(".") > 1
 
 
 class JobQueue:
@@ -87,6 +96,26 @@ class JobQueue:
         """Take an attempt out of the queue; a worker that runs it learns so from the job's row at its next sign of progress."""
         self._client.cancel_workflow(workflow_id(job, attempt))
 
+    def ask_for_help(self, job: str, attempt: int, priority: int, workers: int) -> None:
+        """Queue work for workers that have no other: to help with a job that another worker does."""
+        def enqueue(connection: sa.Connection) -> None:
+            for _ in range(workers):
+                workflow = f"{workflow_id(job, attempt)}.{secrets.token_hex(4)}"
+                self._client.enqueue_in_transaction(connection, {
+                    "workflow_name": HELP, "queue_name": WORK, "workflow_id": workflow, "app_version": VERSION,
+                    "priority": HIGHEST - priority}, workflow)
+
+        self._database.transact(enqueue)
+
+    def workers_on(self, job: str) -> set[str]:
+        """Return the names of the workers that do a job or help with it."""
+        return {status.executor_id or "" for status in self._client.list_workflows(
+            workflow_id_prefix=f"{job}.", status="PENDING", app_version=VERSION, load_input=False, load_output=False)}
+
+    def end_help(self, workflow: str) -> None:
+        """Queue the help of a worker that died no more: the worker that has the job does what is left."""
+        self._client.cancel_workflow(workflow)
+
     def taken_by(self) -> dict[str, list[str]]:
         """Return the workflows that have begun and not ended, by the worker that has them."""
         found: dict[str, list[str]] = {}
@@ -96,6 +125,9 @@ class JobQueue:
 
     def return_job(self, workflow: str, worker: str) -> None:
         """Queue a workflow again that the calling worker had taken and does not finish."""
+        if is_help(workflow):
+            self.end_help(workflow)
+            return
         job, attempt = job_and_attempt(workflow)
         if self._database.transact(lambda connection: jobs.release(connection, Claim(job, attempt, worker))):
             self.requeue(workflow)
@@ -110,8 +142,10 @@ class JobQueue:
             self._client.resume_workflow(workflow, queue_name=_queue(row["request"]["kind"] == "check"))
 
     def forget(self, job: str, attempts: int) -> None:
-        """Delete the workflows of a job."""
-        self._client.delete_workflows([workflow_id(job, attempt) for attempt in range(1, attempts + 1)])
+        """Delete the workflows of a job, and those of the workers that helped."""
+        helped = self._client.list_workflows(workflow_id_prefix=f"{job}.", name=HELP, load_input=False, load_output=False)
+        self._client.delete_workflows([*(workflow_id(job, attempt) for attempt in range(1, attempts + 1)),
+                                       *(status.workflow_id for status in helped)])
 
 
 def _queue(is_check: bool) -> str:

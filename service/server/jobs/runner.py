@@ -13,22 +13,29 @@ from typing import TypeVar
 
 from dbos import DBOS
 
-from service.errors import USER_ERRORS, sentence
+from service.errors import USER_ERRORS, DivergedError, sentence
 from service.reporting.provenance import places_named
 from service.requests.jobs import CheckJob
 from service.server import telemetry
 from service.server.database import intakes, jobs
 from service.server.database.engine import FIRST_PAUSE_S, LONGEST_PAUSE_S, UNANSWERED, message_of
 from service.server.database.jobs import Claim
+from service.server.jobs.context import Job, WorkerContext
+from service.server.jobs.helping import HelpProgress, help_with
+from service.server.jobs.pieces import JobPieces
 from service.server.jobs.progress import JobProgress, Stopped
-from service.server.jobs.queue import WORKFLOW, workflow_id
-from service.server.jobs.steps import Job, WorkerContext, steps_of
+from service.server.jobs.queue import HELP, WORKFLOW, job_and_attempt, workflow_id
+from service.server.jobs.steps import JobStep, steps_of
 from service.server.log import logger
 from service.server.storage import layout
-from service.views.states import FAILED, SUCCEEDED
+from service.views.states import ENDED, FAILED, SUCCEEDED
+from stage.errors import StorageError
 
 T = TypeVar("T")
-DONE, STOPPED = "done", "stopped"
+DONE, STOPPED, LATER = "done", "stopped", "later"
+"""What became of a job or a step: it is done; this worker has the job no longer; another worker does the step."""
+LOOK_S = 0.5
+"""Seconds between two looks for a step that another worker does."""
 
 
 class JobRunner:
@@ -48,6 +55,7 @@ class JobRunner:
         self._changed = threading.Condition()
         self._signs: dict[Claim, float] = {}  # last sign of progress of each running step; two attempts of a job may overlap
         self._running: set[str] = set()
+        self._pieces: dict[Claim, JobPieces] = {}
 
     @property
     def running(self) -> frozenset[str]:
@@ -56,10 +64,14 @@ class JobRunner:
             return frozenset(self._running)
 
     def register(self) -> None:
-        """Register the workflow with DBOS; call this before DBOS is launched."""
+        """Register the workflows with DBOS; call this before DBOS is launched."""
         @DBOS.workflow(name=WORKFLOW, max_recovery_attempts=None)
         def run(job: str, attempt: int) -> str:
             return self.run(Claim(job, attempt, self._worker))
+
+        @DBOS.workflow(name=HELP, max_recovery_attempts=None)
+        def help_job(workflow: str) -> None:
+            self.help(workflow)
 
     def run(self, claim: Claim) -> str:
         """Do a job and return its outcome: DONE, STOPPED, or the state in which it ended."""
@@ -71,8 +83,38 @@ class JobRunner:
         try:
             return self._run(claim)
         finally:
+            self._forget(claim)
             with self._changed:
                 self._running.discard(workflow)
+
+    def help(self, workflow: str) -> None:
+        """Help the worker that has a job until nothing is left to help with; what goes wrong here is of no concern to the job."""
+        claim = Claim(*job_and_attempt(workflow), self._worker)
+        log = logger.bind(job=claim.job, attempt=claim.attempt, worker=self._worker)
+        self._sign(claim)
+        with self._changed:
+            self._running.add(workflow)
+        try:
+            row = jobs.find(self._context.database, claim.job)
+            if row is not None and row["attempt"] == claim.attempt and row["worker"] != self._worker:
+                log.info("help begins")
+                job = Job.of(dict(row))
+                progress = HelpProgress(self._context, job, alive=lambda: self._sign(claim), ending=self._draining.is_set)
+                with places_named():
+                    help_with(job, self._context, progress)
+            log.info("help done")
+        except Stopped:
+            log.info("help stopped")
+        except DivergedError as error:
+            log.warning("help diverged", error=str(error))
+        except Exception as error:
+            log.warning("help failed", error=repr(error), trace=traceback.format_exc())
+        finally:
+            with self._changed:
+                self._running.discard(workflow)
+                del self._signs[claim]
+                self._alive(min(self._signs.values(), default=0.0))
+                self._changed.notify_all()
 
     def drain(self, within_s: float) -> bool:
         """Start no further step and wait for the running ones; return whether they ended in time."""
@@ -86,11 +128,18 @@ class JobRunner:
             names = self._patiently(claim, lambda: self._begin(claim))
             if names is None:
                 return STOPPED
-            for name in names:
-                outcome = self._step(claim, name)
-                if outcome != DONE:
-                    return outcome
-            if self._patiently(claim, lambda: jobs.end(self._context.database, claim, SUCCEEDED)):
+            while names:
+                left = []
+                for name in names:
+                    outcome = self._step(claim, name)
+                    if outcome == LATER:
+                        left.append(name)
+                    elif outcome != DONE:
+                        return outcome
+                if left == names:
+                    time.sleep(LOOK_S)
+                names = left
+            if self._patiently(claim, lambda: self._succeed(claim)):
                 log.info("job succeeded")
             return DONE
         except USER_ERRORS as error:
@@ -127,20 +176,26 @@ class JobRunner:
         if name in row["finished_steps"]:
             return DONE
         job = Job.of(dict(row))
-        step = next(step for step in steps_of(job, self._context) if step.name == name)
-        progress = JobProgress(database, claim, alive=lambda: self._sign(claim), frame_offset=step.frame_offset,
-                               frame_count=step.frame_count, begun=row["stages_begun"],
+        steps = steps_of(job, self._context)
+        step = next(step for step in steps if step.name == name)
+        if step.frames or step.help is not None:
+            self._pieces.setdefault(claim, JobPieces(self._context, job))
+        progress = JobProgress(database, claim, alive=lambda: self._sign(claim),
+                               frame_offset=sum(other.frames for other in steps if other.name in row["finished_steps"]),
+                               frame_count=sum(other.frames for other in steps) if step.frames else None, begun=row["stages_begun"],
                                reached=row["reached"] if row["lost"] or row["lost_repeating"] else None, shown=row["reached"])
         log = logger.bind(job=job.id, project=job.project, step=name, attempt=claim.attempt, worker=self._worker)
-        log.info("step begins")
         try:
+            if step.frames and (outcome := self._leave_to_others(claim, step, steps, row["finished_steps"])) is not None:
+                return outcome
+            log.info("step begins")
             progress.begin(name.partition(" ")[0])
             with telemetry.span(step.name, row["trace"], job=job.id, attempt=claim.attempt, worker=self._worker), places_named():
                 step.run(progress)
             if not self._patiently(claim, lambda: jobs.is_claimed(database, claim)):  # another worker may be writing the same files
                 raise Stopped
             if not isinstance(job.request, CheckJob):
-                self._context.storage.publish(layout.results(job.project, job.id), progress)
+                self._publish(claim, job, step, progress)
         except Stopped:
             log.info("step stopped")
             self._clear_if_deleted(job)
@@ -157,6 +212,44 @@ class JobRunner:
             return STOPPED
         log.info("step done")
         return DONE
+
+    def _leave_to_others(self, claim: Claim, step: JobStep, steps: list[JobStep], finished: list[str]) -> str | None:
+        """Ask others to help with the frames of a job; return None if this worker is to make those of this step."""
+        pieces = self._pieces[claim]
+        pieces.invite_to_steps(sum(other.frames > 0 and other.name not in finished for other in steps))
+        if pieces.is_finished(step.name):
+            return DONE if jobs.finish_step(self._context.database, claim, [*finished, step.name]) else STOPPED
+        return LATER if pieces.are_shared and not pieces.claim_step(step.name) else None
+
+    def _publish(self, claim: Claim, job: Job, step: JobStep, progress: JobProgress) -> None:
+        """Make the files of a step part of the storage, and tell the workers that help."""
+        shared = step.frames > 0 and self._pieces[claim].are_shared
+        self._context.storage.publish(layout.results(job.project, job.id), progress, alone=not shared)
+        if shared:
+            self._pieces[claim].finish_step(step.name)
+
+    def _succeed(self, claim: Claim) -> bool:
+        """End a job whose steps are finished; return False if it was cancelled or another worker has it."""
+        if not jobs.is_claimed(self._context.database, claim):
+            return False
+        pieces = self._pieces.get(claim)
+        if pieces is not None:
+            if pieces.are_shared:
+                self._context.storage.publish(pieces.results)
+            pieces.remove()
+        return jobs.end(self._context.database, claim, SUCCEEDED)
+
+    def _forget(self, claim: Claim) -> None:
+        """Delete the pieces of a job that has ended; those of one that goes on elsewhere are needed there."""
+        pieces = self._pieces.pop(claim, None)
+        if pieces is None:
+            return
+        try:
+            row = jobs.find(self._context.database, claim.job)
+            if row is None or (row["attempt"] == claim.attempt and row["state"] in ENDED):
+                pieces.remove()
+        except (*UNANSWERED, StorageError) as error:  # they are deleted with the job
+            logger.warning("pieces stay", job=claim.job, error=message_of(error))
 
     def _fail(self, claim: Claim, error: str, job: Job | None = None) -> str:
         logger.info("job failed", job=claim.job, attempt=claim.attempt, error=error)

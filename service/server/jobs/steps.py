@@ -3,42 +3,26 @@
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from service.errors import RequestError
 from service.reporting.progress import Progress
 from service.reporting.provenance import name_place
 from service.requests.frame_range import frame_numbers
 from service.requests.identifiers import CAPTURE
-from service.requests.jobs import ANY_JOB, CheckJob, DepthJob, ExportJob, JobRequest, PipelineJob, RelightJob, ShadeJob, SolveJob, ViewJob
+from service.requests.jobs import CheckJob, DepthJob, ExportJob, PipelineJob, RelightJob, ShadeJob, SolveJob, ViewJob
 from service.server.database import intakes
-from service.server.database.engine import Database
+from service.server.jobs.context import Job, WorkerContext
+from service.server.jobs.pieces import JobPieces
 from service.server.storage import layout
-from service.server.storage.folder import Storage
 from stage import inputs
 from stage.files import resolved
 
+if TYPE_CHECKING:
+    from service.requests.solve import SolveRequest
+
 KEYS_FILE = "keys.json"
 """Name of the file with the light keys of a job, which lies beside its frames."""
-
-
-class WorkerContext(NamedTuple):
-    """What the steps of a worker need."""
-
-    database: Database
-    storage: Storage
-    cache: Path
-    """Folder of the image stacks, one for each capture."""
-    device: str
-    max_pixels: int
-    roots_of: Callable[[str], tuple[Path, ...]]
-    """Returns the folders below which the registered captures and environments of a project lie."""
-    held: ExitStack = ExitStack()
-    """Closes the folders of registered captures when a step ends."""
-
-    def without_folder(self, sentence: str) -> str:
-        """Return a sentence for users, in which files are named below the data folder, whose place is not theirs to know."""
-        return sentence.replace(f"{self.cache.parent}/", "")
 
 
 class JobStep(NamedTuple):
@@ -46,24 +30,10 @@ class JobStep(NamedTuple):
 
     name: str
     run: Callable[[Progress], None]
-    frame_offset: int = 0
-    """Number of frames that the steps before this one make."""
-    frame_count: int | None = None
-    """Number of frames of the whole job; None: the step makes no frames."""
-
-
-class Job(NamedTuple):
-    """The parts of a job's row that its steps need."""
-
-    id: str
-    project: str
-    request: JobRequest
-    chunk_frames: int
-
-    @classmethod
-    def of(cls, row: "dict[str, object]") -> "Job":
-        """Read a row of the jobs table."""
-        return cls(str(row["id"]), str(row["project"]), ANY_JOB.validate_python(row["request"]), int(str(row["chunk_frames"])))
+    frames: int = 0
+    """Number of frames that the step makes, at the same time as other workers make those of other steps."""
+    help: Callable[[Progress], None] | None = None
+    """Does pieces of the step beside the worker that runs it; None: it cannot be divided."""
 
 
 def steps_of(job: Job, context: WorkerContext) -> list[JobStep]:
@@ -77,7 +47,8 @@ def steps_of(job: Job, context: WorkerContext) -> list[JobStep]:
 
         return step
 
-    return [step._replace(run=closing(step.run)) for step in _steps_of(job, context._replace(held=held))]
+    return [step._replace(run=closing(step.run), help=None if step.help is None else closing(step.help))
+            for step in _steps_of(job, context._replace(held=held))]
 
 
 def _steps_of(job: Job, context: WorkerContext) -> list[JobStep]:
@@ -85,7 +56,7 @@ def _steps_of(job: Job, context: WorkerContext) -> list[JobStep]:
     if isinstance(request, CheckJob):
         return [JobStep("check", lambda progress: _check(job, request, context, progress))]
     if isinstance(request, SolveJob):
-        return [JobStep("solve", lambda progress: _solve(job, request, context, progress))]
+        return [_solve_step(job, request, context)]
     if isinstance(request, DepthJob):
         return [JobStep("depth", lambda progress: _depth(job, request, context, progress))]
     if isinstance(request, ShadeJob):
@@ -101,7 +72,7 @@ def _steps_of(job: Job, context: WorkerContext) -> list[JobStep]:
     export = ExportJob(kind="export", maps=job.id, format=request.format, options=request.export)
     relight = RelightJob(kind="relight", capture=request.capture, environment=request.environment, keys=request.keys,
                          maps=job.id if request.guided else None, options=request.relight)
-    return [JobStep("solve", lambda progress: _solve(job, solve, context, progress)),
+    return [_solve_step(job, solve, context),
             JobStep("export", lambda progress: _export(job, export, context, progress)),
             *(_frames(job, relight, context) if request.environment is not None or request.keys is not None else [])]
 
@@ -111,14 +82,18 @@ def job_maps(job: Job, maps: str, context: WorkerContext, progress: Progress) ->
     return _named(context.storage.local(layout.results(job.project, maps), layout.SOLVED, progress), maps)
 
 
+def _solve_step(job: Job, request: SolveJob, context: WorkerContext) -> JobStep:
+    return JobStep("solve", lambda progress: _solve(job, request, context, progress),
+                   help=lambda progress: _help_solve(job, request, context, progress))
+
+
 def _frames(job: Job, request: RelightJob, context: WorkerContext) -> list[JobStep]:
     numbers = frame_numbers(request.options.frames, 1)
     chunks = [numbers[at : at + job.chunk_frames] for at in range(0, len(numbers), job.chunk_frames)]
 
     def step(chunk: list[int]) -> JobStep:
         only = f"{chunk[0]}-{chunk[-1]}"
-        return JobStep(f"frames {only}", lambda progress: _relight(job, request, only, context, progress), chunk[0] - numbers[0],
-                       len(numbers))
+        return JobStep(f"frames {only}", lambda progress: _relight(job, request, only, context, progress), len(chunk))
 
     return [step(chunk) for chunk in chunks]
 
@@ -133,12 +108,27 @@ def _check(job: Job, request: CheckJob, context: WorkerContext, progress: Progre
 
 
 def _solve(job: Job, request: SolveJob, context: WorkerContext, progress: Progress) -> None:
-    from service.requests.solve import SolveRequest
+    from service.solve.sharing import SharedSolve
     from service.solve.solve import solve
 
+    pieces = JobPieces(context, job)
+    solve(_solve_request(job, request, context, progress), progress, sharing=SharedSolve(pieces, leads=True, invite=pieces.invite))
+    pieces.remove()
+
+
+def _help_solve(job: Job, request: SolveJob, context: WorkerContext, progress: Progress) -> None:
+    from service.solve.sharing import SharedSolve
+    from service.solve.solve import help_solve
+
+    help_solve(_solve_request(job, request, context, progress), progress, SharedSolve(JobPieces(context, job), leads=False))
+
+
+def _solve_request(job: Job, request: SolveJob, context: WorkerContext, progress: Progress) -> "SolveRequest":
+    from service.requests.solve import SolveRequest
+
     ball = None if request.reference_ball is None else _intake(job, request.reference_ball, context, progress)
-    solve(SolveRequest(capture=_intake(job, request.capture, context, progress), out=_out(job, context), reference_ball=ball,
-                       device=context.device, cache=context.cache / request.capture, **dict(request.options)), progress)
+    return SolveRequest(capture=_intake(job, request.capture, context, progress), out=_out(job, context), reference_ball=ball,
+                        device=context.device, cache=context.cache / request.capture, **dict(request.options))
 
 
 def _depth(job: Job, request: DepthJob, context: WorkerContext, progress: Progress) -> None:

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from service.server.database import jobs, workers
 from service.server.database.engine import UNANSWERED, Database, message_of
 from service.server.database.jobs import Claim
-from service.server.jobs.queue import JobQueue, job_and_attempt
+from service.server.jobs.queue import JobQueue, is_help, job_and_attempt
 from service.server.jobs.worker_lock import LockState, WorkerLock
 from service.server.log import logger
 from service.views.states import QUEUED
@@ -104,6 +104,9 @@ class Takeover:
 
     def _take(self, workflow: str, worker: str) -> None:
         """Queue a workflow of a dead worker again, or end its job if it has lost too many workers."""
+        if is_help(workflow):
+            self._queue.end_help(workflow)
+            return
         job, attempt = job_and_attempt(workflow)
         state = self._database.transact(lambda connection: jobs.record_lost_worker(connection, Claim(job, attempt, worker), self._max_lost))
         if state == QUEUED:

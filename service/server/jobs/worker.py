@@ -14,10 +14,10 @@ from dbos import error as dbos_error
 from service.server import log, telemetry
 from service.server.database import workers
 from service.server.database.engine import LONGEST_PAUSE_S, UNANSWERED, Database, connect, message_of
+from service.server.jobs.context import WorkerContext
 from service.server.jobs.heartbeat import Heartbeat
 from service.server.jobs.queue import CHECKS, SERIALIZER, VERSION, WORK, JobQueue, prepare
 from service.server.jobs.runner import JobRunner
-from service.server.jobs.steps import WorkerContext
 from service.server.jobs.takeover import Takeover
 from service.server.jobs.worker_lock import LockState, open_worker_lock
 from service.server.log import logger
@@ -56,7 +56,8 @@ def run_worker(settings: Settings, device: str, heartbeat: Heartbeat) -> None:
     if lock.hold() is LockState.REFUSED:
         raise RuntimeError(f"another process holds the lock of {name}")  # its name is random
     queue = JobQueue(database)
-    context = WorkerContext(database, open_storage(settings), cache_folder(settings), device, settings.max_pixels, settings.roots_of)
+    context = WorkerContext(database, open_storage(settings), cache_folder(settings), device, settings.max_pixels, settings.roots_of,
+                            worker=name, queue=queue)
     runner = JobRunner(context, name, alive=heartbeat.step)
     config: DBOSConfig = {
         "name": APPLICATION, "system_database_url": settings.sqlalchemy_url, "system_database_engine": database.engine,

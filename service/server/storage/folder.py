@@ -52,8 +52,14 @@ class Storage(Protocol):
     def workspace(self, prefix: str) -> Path:
         """Return a folder of this machine into which files of a prefix are written; `local` puts existing files there."""
 
-    def publish(self, prefix: str, progress: Progress | None = None) -> None:
-        """Make the files in the workspace part of the storage; `progress` is that of the files that are sent."""
+    def publish(self, prefix: str, progress: Progress | None = None, *, alone: bool = True) -> None:
+        """Make the files in the workspace part of the storage.
+
+        Args:
+            prefix: of the files.
+            progress: of the files that are sent.
+            alone: whether no other worker writes there, so that temporary files are those of a killed one, and are deleted.
+        """
 
     def put(self, file: Path, prefix: str, name: str) -> None:
         """Move a complete file into the storage."""
@@ -101,11 +107,12 @@ class FolderStorage:
             folder.mkdir(parents=True, exist_ok=True)
         return folder
 
-    def publish(self, prefix: str, progress: Progress | None = None) -> None:
+    def publish(self, prefix: str, progress: Progress | None = None, *, alone: bool = True) -> None:
         """Delete the temporary files of a killed writer, and flush the folder; the files are already in place."""
         folder = self._root / prefix
         if folder.is_dir():
-            sweep(folder)
+            if alone:
+                sweep(folder)
             with storage("write", folder):
                 _sync(folder)
 

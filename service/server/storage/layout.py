@@ -3,6 +3,7 @@
 projects/PROJECT/captures/ID/…        an uploaded capture
 projects/PROJECT/environments/ID/…    an uploaded environment, one image
 projects/PROJECT/jobs/ID/…            results: maps.exr, report.json, asset.usdz, frame.0001.exr …
+projects/PROJECT/shared/ID/…          of a job that runs: pieces of its solve that are done, and who makes which frames
 uploads/ID/…                          in an object store: pieces of incomplete uploads
 """
 
@@ -32,3 +33,8 @@ def pieces(upload: str) -> str:
 def results(project: str, job: str) -> str:
     """Return the prefix of the results of a job."""
     return f"projects/{project}/jobs/{job}"
+
+
+def shared(project: str, job: str) -> str:
+    """Return the prefix of what the workers of a running job have done so far; it is deleted when the job ends."""
+    return f"projects/{project}/shared/{job}"

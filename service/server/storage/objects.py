@@ -53,14 +53,15 @@ class ObjectStorage:
         """Return the folder of the copies, into which results are written."""
         return self._scratch.files(prefix)
 
-    def publish(self, prefix: str, progress: Progress | None = None) -> None:
-        """Send the files that are new or have changed.
+    def publish(self, prefix: str, progress: Progress | None = None, *, alone: bool = True) -> None:
+        """Send the files that are new or have changed; `alone` is that of Storage.
 
         Raises:
             StorageError: a file cannot be sent; those that were sent are complete.
         """
         with self._scratch.entry(prefix, _sign_of_life(progress)) as entry:
-            sweep(entry.files)
+            if alone:
+                sweep(entry.files)
             new = [stored for stored in stored_below(entry.files) if entry.version(stored.name) is None]
 
             def send(stored: StoredFile, moved: Callable[[], None]) -> tuple[str, str]:

@@ -1,6 +1,8 @@
 """Found by Python at its start where this folder is on PYTHONPATH: makes the frames of a worker's jobs do what SABOTAGE says.
 
 kill  end the process by SIGKILL, as want of memory would      hang  stand still      slow  take a tenth of a second for each frame
+
+With PIECES the bands and batches of solves are small, and each takes that many seconds more.
 """
 
 import os
@@ -39,3 +41,16 @@ def slow(job, request, only, context, progress):
 
 if "SABOTAGE" in os.environ:
     steps._relight = {"kill": kill, "hang": hang, "slow": slow}[os.environ["SABOTAGE"]]
+
+if "PIECES" in os.environ:
+    import service.solve.batches as batches
+    import stage.stack as stack
+
+    stack.BAND_BYTES, batches.BATCH_BYTES = 1 << 14, 1 << 15
+    upload = batches.packs.upload
+
+    def slow_upload(*arguments, **options):
+        time.sleep(float(os.environ["PIECES"]))
+        return upload(*arguments, **options)
+
+    batches.packs.upload = slow_upload

@@ -1,0 +1,50 @@
+"""What the steps of a job are given: the worker that does them, and the job."""
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import NamedTuple
+
+from service.requests.jobs import ANY_JOB, JobRequest
+from service.server.database.engine import Database
+from service.server.jobs.queue import JobQueue
+from service.server.storage.folder import Storage
+
+
+class WorkerContext(NamedTuple):
+    """What the steps of a worker need."""
+
+    database: Database
+    storage: Storage
+    cache: Path
+    """Folder of the image stacks, one for each capture."""
+    device: str
+    max_pixels: int
+    roots_of: Callable[[str], tuple[Path, ...]]
+    """Returns the folders below which the registered captures and environments of a project lie."""
+    held: ExitStack = ExitStack()
+    """Closes the folders of registered captures when a step ends."""
+    worker: str = ""
+    """Name of the worker."""
+    queue: JobQueue | None = None
+    """Where other workers are asked to help; None: nobody is asked."""
+
+    def without_folder(self, sentence: str) -> str:
+        """Return a sentence for users, in which files are named below the data folder, whose place is not theirs to know."""
+        return sentence.replace(f"{self.cache.parent}/", "")
+
+
+class Job(NamedTuple):
+    """The parts of a job's row that its steps need."""
+
+    id: str
+    project: str
+    request: JobRequest
+    chunk_frames: int
+    attempt: int = 1
+
+    @classmethod
+    def of(cls, row: "dict[str, object]") -> "Job":
+        """Read a row of the jobs table."""
+        return cls(str(row["id"]), str(row["project"]), ANY_JOB.validate_python(row["request"]), int(str(row["chunk_frames"])),
+                   int(str(row["attempt"])))

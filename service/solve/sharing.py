@@ -1,0 +1,214 @@
+"""A solve that several workers share: each runs the same solve, and every piece of a pass over the image is done by one of them.
+
+What a pass finds at the pixels of a piece is stored under the number of the pass and the number of the piece, from where the other workers
+read it. So all have the same arrays when a pass ends, and the next begins. What looks at the whole object is done by every worker: kernels
+add nothing up in the order in which threads happen to end, so workers on devices of one kind find the same. A digest of what a pass follows
+from is part of its name; a worker that finds something else shares nothing any more.
+"""
+
+import dataclasses
+import hashlib
+import io
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple, Protocol, TypeVar
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from service.errors import DivergedError
+from service.reporting.provenance import versions
+from service.solve.several_devices import deal
+
+Piece = TypeVar("Piece")
+LOOK_S = 0.2
+"""Seconds between two looks for the pieces that others do."""
+LEAST_PIECES = 2
+"""A pass of fewer pieces is done by every worker."""
+DIGEST_BYTES = 32
+"""Length of the SHA-256 before the arrays of a piece."""
+
+
+class PieceStore(Protocol):
+    """Where the workers of a solve store what they find. The methods are called by several threads."""
+
+    def read(self, name: str) -> bytes | None:
+        """Return what was stored under a name, or None."""
+
+    def write(self, name: str, content: bytes) -> None:
+        """Store something under a name, whole or not at all."""
+
+    def claim(self, name: str) -> bool:
+        """Return whether this worker is to do a piece: False while another, which is still at work, has claimed it."""
+
+
+class Results(NamedTuple):
+    """What a pass over the image makes, and what it follows from."""
+
+    arrays: Sequence[np.ndarray]  # each [..., pixels]: where the work of a piece stores what it finds, at the pixels of the piece
+    follows_from: object = None
+    """What the work reads besides the images and what earlier passes have stored: numbers, strings, arrays, and tuples of these."""
+
+
+class SharedSolve:
+    """The part of one worker in a solve."""
+
+    def __init__(self, store: PieceStore, *, leads: bool, invite: Callable[[int], None] = lambda pieces: None) -> None:
+        """Create the part of a worker.
+
+        Args:
+            store: that of all workers.
+            leads: whether this worker has the job; it alone says what a pass follows from.
+            invite: called with the number of pieces before each pass that can be shared.
+        """
+        self._store, self._leads, self._invite = store, leads, invite
+        self._solve, self._passes, self._has_agreed = "", 0, False
+
+    def identify(self, device: str, *given: object) -> None:
+        """Take note of what is solved: workers with other inputs, programs or kinds of device share nothing."""
+        self._solve = digest((kind_of_worker(device), given))
+
+    def deal(self, names: Sequence[str], pieces: Sequence[Piece], work: Callable[[Piece, str], None], done: Callable[[Piece], None], *,
+             waiting: Callable[[], None], pixels_of: Callable[[Piece], Any], results: Results) -> None:
+        """Do the pieces of a pass that no other worker does, and read those of the others.
+
+        Args:
+            names, pieces, work, done: as of several_devices.deal; `done` is told the pieces of other workers too.
+            waiting: called now and then while pieces of other workers are waited for.
+            pixels_of: returns the place of a piece on the last axis of the arrays.
+            results: where the work stores what it finds.
+
+        Raises:
+            DivergedError: this worker does not lead, and the pass follows from something else than that of the worker that leads.
+        """
+        self._passes += 1
+        if len(pieces) < LEAST_PIECES:
+            deal(names, pieces, work, done)
+            return
+        shared = _Pass(self._store, f"{self._solve[:16]}/{self._passes:03d}", digest(results.follows_from), self._leads, results.arrays)
+        shared.agree(is_begun=not self._has_agreed)
+        self._has_agreed = True
+        self._invite(len(pieces))
+
+        def keep(piece: tuple[int, Piece], device: str) -> None:
+            work(piece[1], device)
+            shared.write(piece[0], pixels_of(piece[1]))
+
+        def left() -> Iterator[tuple[int, Piece]]:
+            open_pieces = list(enumerate(pieces))
+            while open_pieces:
+                others = []
+                for number, piece in open_pieces:
+                    if shared.read(number, pixels_of(piece)):
+                        done(piece)
+                    elif shared.claim(number):
+                        yield number, piece
+                    else:
+                        others.append((number, piece))
+                if len(others) == len(open_pieces):
+                    waiting()
+                    time.sleep(LOOK_S)
+                open_pieces = others
+
+        deal(names, left(), keep, lambda piece: done(piece[1]))
+
+
+class _Pass:
+    """What the workers have found in one pass."""
+
+    def __init__(self, store: PieceStore, name: str, follows_from: str, leads: bool, arrays: Sequence[np.ndarray]) -> None:
+        self._store, self._name, self._leads, self._arrays = store, name, leads, arrays
+        self._follows_from = follows_from.encode()
+        self._folder = f"{name}-{follows_from[:16]}"
+
+    def agree(self, *, is_begun: bool = False) -> None:
+        """Record what the pass follows from, or compare it with what the worker that leads has recorded.
+
+        Args:
+            is_begun: whether the worker that leads has begun this pass, if it solves the same.
+
+        Raises:
+            DivergedError: this worker does not lead, and has something else.
+        """
+        found = self._store.read(self._name)
+        if self._leads and found != self._follows_from:
+            self._store.write(self._name, self._follows_from)
+        elif not self._leads and found != self._follows_from and (is_begun or found is not None):
+            raise DivergedError("inputs, versions, device or findings are not those of the worker that has the job")
+
+    def read(self, number: int, pixels: Any) -> bool:
+        """Take over what another worker has found in a piece; return False if it is not there."""
+        content = self._store.read(self._file(number))
+        found = None if content is None else _unpacked(content)
+        places = [array[..., pixels] for array in self._arrays]
+        if found is None or [(a.shape, a.dtype) for a in found] != [(a.shape, a.dtype) for a in places]:
+            return False
+        for array, values in zip(self._arrays, found, strict=True):
+            array[..., pixels] = values
+        return True
+
+    def claim(self, number: int) -> bool:
+        """Return whether this worker is to do a piece."""
+        if not self._leads:
+            self.agree()
+        return self._store.claim(f"{self._file(number)}.claim")
+
+    def write(self, number: int, pixels: Any) -> None:
+        """Give the others what this worker has found in a piece."""
+        self._store.write(self._file(number), _packed([array[..., pixels] for array in self._arrays]))
+
+    def _file(self, number: int) -> str:
+        return f"{self._folder}/{number:05d}"
+
+
+def kind_of_worker(device: str) -> str:
+    """Return what workers have in common that find the same to the last bit: the kind of device, and all versions."""
+    return digest((devices.kind(device), versions()))
+
+
+def digest(value: object) -> str:
+    """Return the SHA-256, hexadecimal, of numbers, strings, arrays and of tuples, lists and dataclasses of these.
+
+    Raises:
+        TypeError: a value is of another kind, whose content is not known.
+    """
+    hasher = hashlib.sha256()
+    _add(value, hasher.update)
+    return hasher.hexdigest()
+
+
+def _add(value: object, add: Callable[[bytes], None]) -> None:
+    if isinstance(value, wp.array):
+        value = value.numpy()
+    if isinstance(value, np.ndarray):
+        add(f"{value.dtype}{value.shape}".encode())
+        add(np.ascontiguousarray(value).tobytes())
+    elif value is None or isinstance(value, bool | int | float | str | np.generic):
+        add(f"{type(value).__name__} {value!r};".encode())
+    elif isinstance(value, tuple | list):
+        add(f"{type(value).__name__} {len(value)}:".encode())
+        for part in value:
+            _add(part, add)
+    elif isinstance(value, dict):
+        _add(list(value.items()), add)
+    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+        _add([(field.name, getattr(value, field.name)) for field in dataclasses.fields(value)], add)
+    else:
+        raise TypeError(f"the content of a {type(value).__name__} is not known")
+
+
+def _packed(arrays: Sequence[np.ndarray]) -> bytes:
+    """Return arrays as bytes, with their SHA-256 before them."""
+    buffer = io.BytesIO()
+    np.savez(buffer, *arrays, allow_pickle=False)
+    content = buffer.getvalue()
+    return hashlib.sha256(content).digest() + content
+
+
+def _unpacked(content: bytes) -> list[np.ndarray] | None:
+    """Return the arrays of `_packed`, or None if the bytes are not what was written."""
+    if hashlib.sha256(content[DIGEST_BYTES:]).digest() != content[:DIGEST_BYTES]:
+        return None
+    with np.load(io.BytesIO(content[DIGEST_BYTES:]), allow_pickle=False) as found:
+        return [found[name] for name in found.files]
