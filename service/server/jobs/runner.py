@@ -97,16 +97,7 @@ class JobRunner:
         try:
             row = jobs.find(self._context.database, claim.job)
             if row is not None and row["attempt"] == claim.attempt and row["worker"] != self._worker:
-                log.info("help begins")
-                job = Job.of(dict(row))
-                progress = HelpProgress(self._context, job, alive=lambda: self._sign(claim), ending=self._draining.is_set)
-                with places_named():
-                    help_with(job, self._context, progress)
-            log.info("help done")
-        except Stopped:
-            log.info("help stopped")
-        except DivergedError as error:
-            log.warning("help diverged", error=str(error))
+                self._help(Job.of(dict(row)), claim)
         except Exception as error:
             log.warning("help failed", error=repr(error), trace=traceback.format_exc())
         finally:
@@ -115,6 +106,20 @@ class JobRunner:
                 del self._signs[claim]
                 self._alive(min(self._signs.values(), default=0.0))
                 self._changed.notify_all()
+
+    def _help(self, job: Job, claim: Claim) -> None:
+        log = logger.bind(job=job.id, attempt=job.attempt, worker=self._worker)
+        log.info("help begins")
+        progress = HelpProgress(self._context, job, alive=lambda: self._sign(claim), ending=self._draining.is_set)
+        try:
+            with places_named():
+                help_with(job, self._context, progress)
+            log.info("help done")
+        except Stopped:
+            log.info("help stopped")
+            self._clear_if_deleted(job)
+        except DivergedError as error:
+            log.warning("help diverged", error=str(error))
 
     def drain(self, within_s: float) -> bool:
         """Start no further step and wait for the running ones; return whether they ended in time."""
