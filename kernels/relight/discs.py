@@ -49,12 +49,13 @@ def integrate_discs(middles: np.ndarray, angles_degrees: np.ndarray, directions:
     return energy
 
 
-def disc_samples(middle: np.ndarray, angle_degrees: float) -> np.ndarray:
+def disc_samples(middle: np.ndarray, angle_degrees: float, count: int | None = None) -> np.ndarray:
     """Return directions spread evenly over a disc on the sphere, each standing for the same solid angle.
 
     Args:
         middle: [3] unit vector.
         angle_degrees: diameter, 0…180.
+        count: of samples; None: MIN_SAMPLES, and more where they would be farther apart than SAMPLE_PITCH_DEGREES.
 
     Returns:
         [samples, 3] float64 unit vectors.
@@ -62,7 +63,8 @@ def disc_samples(middle: np.ndarray, angle_degrees: float) -> np.ndarray:
     Source: Vogel, "A better way to construct the sunflower head", Mathematical Biosciences 44, 1979, with even steps of the cosine.
     """
     low = 2 * math.sin(math.radians(angle_degrees / 4)) ** 2  # 1 - cosine of the rim: without the rounding near 1
-    count = max(MIN_SAMPLES, math.ceil(2 * math.pi * low / math.radians(SAMPLE_PITCH_DEGREES) ** 2))
+    if count is None:
+        count = max(MIN_SAMPLES, math.ceil(2 * math.pi * low / math.radians(SAMPLE_PITCH_DEGREES) ** 2))
     place = np.arange(count) + 0.5
     fall = place / count * low
     across = np.sqrt(fall * (2 - fall))

@@ -25,6 +25,9 @@ MOST_RATIO = 1.25
 """Largest ratio of image to model that the gloss is scaled by; what is brighter stays a difference. On the flank of a lobe that is
 too wide, the ratio says little of the peak: unbounded, it makes sharp highlights half as bright again as they are."""
 
+LEAST_GLOSS = 1.0e-9
+"""Radiance of a specular part below which there is none, and the ratio is 1."""
+
 
 class ShownModel(NamedTuple):
     """The model under the captured lights, summed for one frame, with its gloss as bright as the images show it."""
@@ -43,7 +46,12 @@ def gloss_ratio(reading: float, matt: float, gloss: float) -> float:
 @wp.func
 def mean_ratio(shown: float, gloss: float) -> float:
     """Return the mean of ratios from sums of the scaled specular part and of the specular part."""
-    return wp.where(gloss > 1.0e-9, shown / wp.max(gloss, 1.0e-9), 1.0)
+    return wp.where(gloss > LEAST_GLOSS, shown / wp.max(gloss, LEAST_GLOSS), 1.0)
+
+
+def ratio_of_sums(shown: np.ndarray, gloss: np.ndarray) -> np.ndarray:
+    """Return the mean of ratios from sums of the scaled specular part and of the specular part, both […], as mean_ratio does."""
+    return np.divide(shown, gloss, out=np.ones_like(shown), where=gloss > LEAST_GLOSS)
 
 
 def sum_shown(band: Band, surface: Surface, visible: wp.array, direction: np.ndarray, irradiance: np.ndarray, scale: np.ndarray,

@@ -46,20 +46,56 @@ def combine_batch(band: Band, weights: np.ndarray) -> wp.array:
         frames = wp.empty((len(weights), 3, band.packs * pack), dtype=wp.float32, device=device)
         _product(band, weights, frames.numpy(), pack)
         return frames
-    groups = -(-len(weights) // REGISTER_FRAMES)
-    padded = np.zeros((groups * REGISTER_FRAMES, 3, band.frame_count), dtype=np.float32)
-    padded[: len(weights)] = weights
-    frames = wp.empty((groups * REGISTER_FRAMES, 3, band.packs * pack), dtype=wp.float32, device=device)
-    devices.launch(register_kernel(pack), groups * 3 * band.packs,
-                   [band.values, wp.array(padded, dtype=wp.float32, device=device)], [as_packs(frames, device)], device=device)
+    return _register_sums(band.values, weights, pack, device)
+
+
+def combine_rows(rows: wp.array, weights: np.ndarray) -> wp.array:
+    """Return weighted sums of float32 rows, with the same guarantee: a frame at the same position does not depend on the others.
+
+    Args:
+        rows: [channels · n, P] float32 packs, contiguous; all rows of the first channel come first.
+        weights: [frames, channels, n] float32.
+
+    Returns:
+        [frames, channels, pixels padded] float32 on the device; not synchronised on CUDA.
+
+    Raises:
+        ArrayError: weights do not match the rows, or are not finite.
+    """
+    count, channels, terms = weights.shape
+    check_weights(weights, (count, channels, rows.shape[0] // channels))
+    device = rows.device.alias
+    pack = devices.pack_width(device)
+    if device != "cpu":
+        return _register_sums(rows, weights, pack, device)
+    frames = wp.empty((count, channels, rows.shape[1] * pack), dtype=wp.float32, device=device)
+    planes, sums = rows.numpy().reshape(channels, terms, -1), frames.numpy()
+    padded = _padded(weights, GROUP)
+    for channel in range(channels):
+        for first in range(0, count, GROUP):
+            last = min(first + GROUP, count)
+            sums[first:last, channel] = np.matmul(padded[first : first + GROUP, channel], planes[channel])[: last - first]
+    return frames
+
+
+def _padded(weights: np.ndarray, multiple: int) -> np.ndarray:
+    """Return weights with zero frames after them, so that their number is a multiple."""
+    return np.pad(weights, ((0, -len(weights) % multiple), (0, 0), (0, 0)))
+
+
+def _register_sums(values: wp.array, weights: np.ndarray, pack: int, device: str) -> wp.array:
+    """Return the sums of half or float32 rows on CUDA."""
+    padded = _padded(weights, REGISTER_FRAMES)
+    frames = wp.empty((len(padded), weights.shape[1], values.shape[1] * pack), dtype=wp.float32, device=device)
+    kernel = register_kernel(pack, values.dtype._wp_scalar_type_ == wp.float16)
+    devices.launch(kernel, len(padded) // REGISTER_FRAMES * weights.shape[1] * values.shape[1],
+                   [values, wp.array(padded, dtype=wp.float32, device=device)], [as_packs(frames, device)], device=device)
     return frames[: len(weights)]
 
 
 def _product(band: Band, weights: np.ndarray, frames: np.ndarray, pack: int) -> None:
     """Compute frames[f, c] = weights[f, c] @ stack[c], block by block and GROUP frames at a time."""
-    groups = -(-len(weights) // GROUP)
-    padded = np.zeros((groups * GROUP, *weights.shape[1:]), dtype=np.float32)
-    padded[: len(weights)] = weights
+    padded = _padded(weights, GROUP)
     step = max(1, BLOCK_BYTES // (4 * pack * band.frame_count))
     block = wp.empty((band.frame_count, step), dtype=pack_type(pack, wp.float32), device="cpu")
     widened = block.numpy().reshape(band.frame_count, step * pack)
@@ -101,22 +137,22 @@ def _widen_kernel(pack: int) -> Any:
 
 
 @cache
-def register_kernel(pack: int) -> Any:
-    """Return the CUDA kernel: one thread for a pack and eight frames, their sums in registers."""
-    half_pack, float_pack = pack_type(pack, wp.float16), pack_type(pack, wp.float32)
+def register_kernel(pack: int, half: bool = True) -> Any:
+    """Return the CUDA kernel for half or float32 rows: one thread for a pack and eight frames, their sums in registers."""
+    row_pack, float_pack = pack_type(pack, wp.float16 if half else wp.float32), pack_type(pack, wp.float32)
     sums = wp.types.matrix(shape=(REGISTER_FRAMES, pack), dtype=wp.float32)
 
     @wp.kernel(enable_backward=False, module="unique")
     def batch_register(first: int,
-                       values: wp.array2d(dtype=half_pack),  # [3 · L, P] stored radiance
-                       weights: wp.array3d(dtype=float),  # [F, 3, L]; F a multiple of 8
+                       values: wp.array2d(dtype=row_pack),  # [C · L, P]
+                       weights: wp.array3d(dtype=float),  # [F, C, L]; F a multiple of 8
                        # outputs
-                       frames: wp.array3d(dtype=float_pack)):  # [F, 3, P]
+                       frames: wp.array3d(dtype=float_pack)):  # [F, C, P]
         thread = first + wp.tid()
         packs = values.shape[1]
         p = thread % packs
-        channel = (thread / packs) % 3
-        f = thread / packs / 3 * REGISTER_FRAMES
+        channel = (thread / packs) % weights.shape[1]
+        f = thread / packs / weights.shape[1] * REGISTER_FRAMES
         total = sums()
         for light in range(weights.shape[2]):
             value = values[channel * weights.shape[2] + light, p]

@@ -110,18 +110,26 @@ def shade(surface: Surface, sources: Sources, visible: wp.array | None = None) -
     Raises:
         ArrayError: samples that ask for rows of visibility that are not there, or visibility of other pixels.
     """
-    rows = 0 if visible is None else visible.shape[0]
-    if sources.count and sources.occluder.max() >= rows:
-        raise ArrayError(f"sources ask for row {sources.occluder.max()} of visibility, there are {rows}")
-    if visible is not None and visible.shape[1] != surface.packs:
-        raise ArrayError(f"visibility has {visible.shape[1]} packs, the surface {surface.packs}: give the same pixels")
     pack = devices.pack_width(surface.device)
     if visible is None:
         visible = wp.empty((0, surface.packs), dtype=pack_type(pack, wp.uint8), device=surface.device)
+    require_rows(surface, sources, visible)
     out = wp.empty((6, surface.packs * pack), dtype=wp.float32, device=surface.device)
     devices.launch(_shade_kernel(pack), surface.packs, [surface.values, *upload_sources(sources, surface.device), visible],
                    [as_packs(out, surface.device)], device=surface.device)
     return out
+
+
+def require_rows(surface: Surface, sources: Sources, visible: wp.array) -> None:
+    """Refuse visibility of other pixels than a surface has, or without rows that samples of light ask for.
+
+    Raises:
+        ArrayError: naming what was got.
+    """
+    if sources.count and sources.occluder.max() >= visible.shape[0]:
+        raise ArrayError(f"sources ask for row {sources.occluder.max()} of visibility, there are {visible.shape[0]}")
+    if visible.shape[1] != surface.packs:
+        raise ArrayError(f"visibility has {visible.shape[1]} packs, the surface {surface.packs}: give the same pixels")
 
 
 def require_same(band: Band, surface: Surface, visible: wp.array, count: int) -> None:
@@ -274,9 +282,32 @@ def modelled(lit: float, albedo: float, facing: float, gloss: float) -> float:
 
 
 @cache
+def visibility(pack: int) -> Any:
+    """Return the Warp function that interpolates the visibility of a sample between the occluders around it."""
+    lane_type, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.uint8)
+
+    @wp.func
+    def seen(visible: wp.array2d(dtype=byte_pack), p: int, rows: wp.vec3i, parts: wp.vec3):
+        """Return the share of a sample, 0 to 1, that each pixel of a pack sees."""
+        whole = lane_type()
+        for corner in range(3):
+            if rows[corner] >= 0:
+                v = visible[rows[corner], p]
+                part = parts[corner] * wp.static(1.0 / 255.0)
+                for k in range(pack):
+                    whole[k] += part * float(v[k])
+            else:
+                for k in range(pack):
+                    whole[k] += parts[corner]
+        return whole
+
+    return seen
+
+
+@cache
 def _shade_kernel(pack: int) -> Any:
     lane_type, byte_pack, channels = pack_type(pack, wp.float32), pack_type(pack, wp.uint8), channels_type(pack)
-    evaluate = lobes(pack)
+    evaluate, seen = lobes(pack), visibility(pack)
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
     def shade_kernel(first: int,
@@ -295,17 +326,7 @@ def _shade_kernel(pack: int) -> Any:
             facing, gloss, lit, _ = evaluate(values, p, place[n], axis[n])
             rows = occluder[n]
             if rows[0] >= 0 or rows[1] >= 0 or rows[2] >= 0:
-                parts = share[n]
-                whole = lane_type()
-                for corner in range(3):
-                    if rows[corner] >= 0:
-                        v = visible[rows[corner], p]
-                        part = parts[corner] * wp.static(1.0 / 255.0)
-                        for k in range(pack):
-                            whole[k] += part * float(v[k])
-                    else:
-                        for k in range(pack):
-                            whole[k] += parts[corner]
+                whole = seen(visible, p, rows, share[n])
                 for k in range(pack):
                     lit[k] = lit[k] * whole[k]
             for c in range(3):

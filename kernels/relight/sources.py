@@ -5,6 +5,7 @@ Area lights become patches of equal area, each shining by the cosine to its norm
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -116,9 +117,16 @@ def rectangle(centre: np.ndarray, edge_u: np.ndarray, edge_v: np.ndarray, radian
     return _patches(places, np.tile(normal / np.linalg.norm(normal), (len(places), 1)), np.asarray(radiance, dtype=np.float64) * area)
 
 
-def join(parts: list[Sources]) -> Sources:
+def join(parts: Sequence[Sources]) -> Sources:
     """Return all samples of some sources, in order."""
     return Sources(*(np.concatenate(planes) for planes in zip(*parts, strict=True)))
+
+
+def own_rows(sources: Sources, first: int = 0) -> Sources:
+    """Return samples of which each is hidden as the row of visibility of its own says, from row `first` on."""
+    rows = np.full((sources.count, 3), NEVER, np.int32)
+    rows[:, 0] = first + np.arange(sources.count)
+    return sources._replace(occluder=rows, share=np.tile(np.float32([1, 0, 0]), (sources.count, 1)))
 
 
 def _patches(places: np.ndarray, normal: np.ndarray, intensity: np.ndarray) -> Sources:

@@ -8,11 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from kernels.relight.environment_sources import EnvironmentSamples, sample_environment
+from kernels.relight.environment_sources import EnvironmentParts, EnvironmentSamples, sample_environment, split_environment
 from service.errors import RequestError
 from service.requests.frame_range import numbered
 from stage import fingerprint
 from stage.environment_maps import check_environment, read_environment
+
+SHARP_RADIUS_DEGREES = 2.0
+"""Largest angular radius of a map's sample that casts shadows of its own: small samples lie where the map is bright. The visibility of
+other samples is interpolated from the captured lights around them."""
 
 
 class EnvironmentMap:
@@ -26,6 +30,11 @@ class EnvironmentMap:
     def samples(self) -> EnvironmentSamples:
         """The samples of the environment map, for a model of a surface."""
         return sample_environment(self.radiance)
+
+    @cached_property
+    def parts(self) -> EnvironmentParts:
+        """The small bright places of the environment map, and the rest."""
+        return split_environment(self.radiance, np.radians(SHARP_RADIUS_DEGREES))
 
 
 class Environments:

@@ -27,7 +27,12 @@ from kernels.relight.near_sum import sum_near
 from kernels.relight.shading import shade
 from kernels.relight.sources import Sources
 from service.light.clipping import Clipping, clipped_channels
-from service.light.lighting import ModelLight, NearLights, captured_lights
+from service.light.far_light import captured_lights
+from service.light.lit_model import LitBeyond, LitModel, correction
+from service.light.model_light import ModelLight
+from service.light.model_range import ModelRange
+from service.light.near_light import NearLights
+from service.light.range_light import RangeLight
 from service.light.surface_model import ModelBatch, SurfaceModel
 from service.reporting.progress import Timings
 from stage.errors import ResultError
@@ -137,7 +142,7 @@ class Guide:
         return ReplacedStack.of(stack, np.concatenate(pixel), np.concatenate(light), np.concatenate(radiance, axis=1))
 
     def correct(self, frames: np.ndarray, lights: Sequence[ModelLight], *, specular: bool) -> np.ndarray | None:
-        """Add to plain frames what the model says they miss.
+        """Add to plain frames what the model says they miss, one frame after another.
 
         Args:
             frames: [frames, 3, pixels] float32, changed in place; never below 0 where they were not.
@@ -151,36 +156,64 @@ class Guide:
         done = 0
         for batch in self._model.batches():
             part = slice(done, done + len(batch.pixels))
+            done = part.stop
             band = packs.upload(*self.stack.pick(batch.pixels), device=self._model.device)
             for index, light in enumerate(lights):
-                visible = self._visible(batch, light.marched)
-                plain = frames[index][:, batch.pixels]
-                correction, mirror = self._correction(batch, band, part, light, visible, plain)
-                guided = np.maximum(plain + correction, np.minimum(plain, 0))
-                frames[index][:, batch.pixels] = guided
-                if mirrored is not None:
-                    mirrored[index][:, batch.pixels] = np.clip(mirror, 0, np.maximum(guided, 0))
-            done = part.stop
+                frame, mirror = frames[index : index + 1], None if mirrored is None else mirrored[index : index + 1]
+                self._add(frame, mirror, batch.pixels, part, self._lit(batch, band, light))
         return mirrored
 
-    def _correction(self, batch: ModelBatch, band: packs.Band, part: slice, light: ModelLight, visible: wp.array,
-                    plain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return what is added to a plain frame [3, n], and the model's specular part of the frame's light [3, n]."""
+    def correct_range(self, frames: np.ndarray, lights: Sequence[RangeLight], places: Sequence[int], *,
+                      specular: bool) -> np.ndarray | None:
+        """Add to the plain frames of a chunk what the model says they miss; what they have in common is computed once.
+
+        Args:
+            frames: [frames, 3, pixels] float32, changed in place; never below 0 where they were not.
+            lights: the light of each frame.
+            places: position of each frame in the full chunk, also when only some of its frames are made.
+            specular: whether the specular part is wanted too.
+
+        Returns:
+            [frames, 3, pixels] float32 of that part, between 0 and the frame, or None.
+        """
+        mirrored = np.zeros(frames.shape, dtype=np.float32) if specular else None
+        chunk = self._range.chunk(lights, places)
+        done = 0
+        for batch in self._model.batches():
+            band = packs.upload(*self.stack.pick(batch.pixels), device=self._model.device)
+            for at, lit in self._range.light(batch, band, self.stack.scale, self._visible(batch), chunk):
+                self._add(frames, mirrored, batch.pixels[at], slice(done + at.start, done + at.stop), lit)
+            done += len(batch.pixels)
+        return mirrored
+
+    def _add(self, frames: np.ndarray, mirrored: np.ndarray | None, pixels: np.ndarray, part: slice, lit: LitModel) -> None:
+        """Add the correction of some pixels to frames [frames, 3, pixels], and keep its specular part."""
+        plain = frames[:, :, pixels]
+        change, mirror = correction(lit, plain, self.trust[part], None if lit.beyond is None else self.trust_beyond[part])
+        guided = np.maximum(plain + change, np.minimum(plain, 0))
+        frames[:, :, pixels] = guided
+        if mirrored is not None:
+            mirrored[:, :, pixels] = np.clip(mirror, 0, np.maximum(guided, 0))
+
+    def _lit(self, batch: ModelBatch, band: packs.Band, light: ModelLight) -> LitModel:
+        """Return the model of a batch under the light of one frame."""
+        visible = self._visible(batch, light.marched)
+
         def lit(sources: Sources) -> np.ndarray:
             return shade(batch.surface, sources, visible).numpy()[:, : len(batch.pixels)].reshape(2, 3, -1)
 
         wanted = lit(light.wanted)
-        given = sum_shown(band, batch.surface, visible, self._lights.direction, self._lights.irradiance, self.stack.scale,
-                          light.captured.energy)
-        matt, mirror = wanted[0], wanted[1] * given.ratio
-        correction = self.trust[part] * (matt + mirror - given.whole)
-        added = np.zeros_like(wanted) if light.added is None else lit(light.added)
+        given = sum_shown(band, batch.surface, visible, self._lights.direction, self._lights.irradiance, self.stack.scale, light.captured)
+        beyond = None
         if light.beyond is not None:
-            outside, stands_in = lit(light.beyond.wanted), lit(light.beyond.captured)
-            whole = (stands_in + added).sum(axis=0) + np.maximum(given.whole, 0)
-            correction += self.trust_beyond[part] * followed((outside - stands_in).sum(axis=0), plain, whole)
-            mirror = mirror + outside[1]
-        return correction, mirror + added[1]
+            outside = lit(light.beyond.wanted)
+            beyond = LitBeyond(outside.sum(axis=0), outside[1], lit(light.beyond.captured).sum(axis=0))
+        return LitModel(wanted[0], wanted[1], given.whole, given.ratio, None if light.added is None else lit(light.added), beyond)
+
+    @cached_property
+    def _range(self) -> ModelRange:
+        """The model for many frames."""
+        return ModelRange(self._model, self._lights)
 
     def add_near(self, frame: np.ndarray, specular: np.ndarray, near: NearLights) -> None:
         """Add near lights to a frame: every pixel's own sum of the captured images, and what the model says that misses.

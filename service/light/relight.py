@@ -20,7 +20,7 @@ from service.light.findings import FrameFindings, MatteFindings
 from service.light.groups import add_up, in_groups
 from service.light.guide import Guide
 from service.light.layers import frame_matte, read_maps, still_layers
-from service.light.lighting import CaptureLighting, FrameLight
+from service.light.lighting import CaptureLighting, FrameLight, ModelUse
 from service.light.outputs import REQUEST_ATTRIBUTE, frame_hashes, is_complete
 from service.light.plan import Plan, PlannedFrame, make_plan
 from service.light.sequence import OpenedCapture, open_capture
@@ -33,6 +33,9 @@ from service.requests.relight import RelightRequest
 from stage.brackets import merge_brackets
 from stage.files import write_text
 from stage.stack import Stack
+
+RANGE_FRAMES = 4
+"""Least number of frames of a chunk whose model is computed once for all of them; for fewer, each frame is shaded with its own samples."""
 
 
 class RelightResult(NamedTuple):
@@ -146,13 +149,14 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
     provenance = metadata(request, capture=opened.capture.name, inputs=stack.key, near_lights=opened.near_lights)
     if plan.keys is not None and plan.keys.frames_per_second is not None:
         provenance["relit:frames_per_second"] = f"{plan.keys.frames_per_second:g}"
+    size = max(1, chunk_frames(stack) // max(1, len(plan.groups)))
+    alone = plan.total == 1 or plan.is_sequence  # decided from the whole range, so that --only gives bit-identical frames
+    use = ModelUse.NONE if guide is None else ModelUse.FRAME if alone or size < RANGE_FRAMES else ModelUse.RANGE
     lighting = CaptureLighting(opened.lights, stack, plan.environments, opened.space, weighting=Weighting[request.weighting.name],
-                               device=device, with_model=guide is not None)
+                               device=device, model=use)
     lights = lighting.frames([frame.scheduled for frame, _ in todo])
     single = [in_groups(frame.scheduled, plan.keys) for frame, _ in todo] if len(plan.groups) > 1 else []
     single_lights = [lighting.frames(frames) for frames in zip(*single, strict=True)]
-    size = max(1, chunk_frames(stack) // max(1, len(plan.groups)))
-    alone = plan.total == 1 or plan.is_sequence  # decided from the whole range, so that --only gives bit-identical frames
     for _, members in groupby(todo, key=lambda item: item[0].position // size):
         chunk = list(members)
         with timings.part("weights"):
@@ -166,7 +170,7 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
         colours: dict[str, np.ndarray] = {}
         if guide is not None:
             with timings.part("guide"):
-                specular = guide.correct(frames, [each.model for each in light if each.model is not None], specular=bool(form.parts))
+                specular = _guide(guide, frames, light, places, specular=bool(form.parts))
             if specular is not None:
                 colours[Layer.SPECULAR] = specular
         if plan.groups:
@@ -180,6 +184,15 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
             writer.put(files, frames, form, colours)
 
 
+def _guide(guide: Guide, frames: np.ndarray, lights: Sequence[FrameLight], places: Sequence[int] | None, *,
+           specular: bool) -> np.ndarray | None:
+    """Add to plain frames what the model says they miss, and return its specular part where it is wanted."""
+    of_range = [each.spread for each in lights if each.spread is not None]
+    if of_range and places is not None:
+        return guide.correct_range(frames, of_range, places, specular=specular)
+    return guide.correct(frames, [each.model for each in lights if each.model is not None], specular=specular)
+
+
 def _lights_alone(names: Sequence[str], lights: Sequence[Sequence[FrameLight]], frames: np.ndarray, stack: Stack,
                   places: Sequence[int] | None, guide: Guide | None, device: str) -> dict[str, np.ndarray]:
     """Return the frames under each light alone, which add up to the frames [frames, 3, pixels], by the names of their layers."""
@@ -189,7 +202,7 @@ def _lights_alone(names: Sequence[str], lights: Sequence[Sequence[FrameLight]], 
     for name, light in zip(names, lights, strict=True):
         found[name] = linear_frames(stack, np.stack([each.weights for each in light]), places, device=device)
         if guide is not None:
-            guide.correct(found[name], [each.model for each in light if each.model is not None], specular=False)
+            _guide(guide, found[name], light, places, specular=False)
     if guide is not None and found:
         add_up(list(found.values()), frames)
     return found

@@ -17,10 +17,13 @@ from service.errors import RequestError
 from service.light.clipping import Clipping
 from service.light.combine import linear_frames
 from service.light.environments import Environments
+from service.light.far_light import far_light, far_samples
 from service.light.findings import FrameFindings
 from service.light.guide import Guide
 from service.light.layers import check_layers, frame_matte, hard_matte, read_maps, still_layers
-from service.light.lighting import CaptureLighting, NearLight, far_light, far_samples, light_samples, near_lights
+from service.light.lighting import CaptureLighting, ModelUse
+from service.light.model_light import light_samples
+from service.light.near_light import NearLight, near_lights
 from service.light.outputs import check_outputs
 from service.light.schedule import UPRIGHT, ScheduledFrame, TurnedEnvironment
 from service.light.sequence import capture_files
@@ -160,7 +163,7 @@ def _shade_capture(capture: Capture, request: ShadeRequest, maps: SurfaceMaps, p
     guide = Guide(maps, path, stack, lights, clipping, space=maps.color_space, device=device, progress=timings)
     timings.stage("shade", 2)
     captured = CaptureLighting(lights, guide.stack, environments, maps.color_space, weighting=Weighting.SMOOTH, device=device,
-                               with_model=True)
+                               model=ModelUse.FRAME)
     light, = captured.frames([lighting])
     frames = linear_frames(guide.stack, light.weights[None], None, device=device)
     findings = FrameFindings(guided=True)

@@ -4,12 +4,14 @@ The surface reflects by Relit's BRDF, Lambert and the GGX lobes of one material 
 """
 
 from collections.abc import Iterator
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import warp as wp
 
+from kernels.relight.horizon import HeightField, Horizons, azimuths_of, find_horizons, height_field
 from kernels.relight.occlusion import see_lights
 from kernels.relight.shading import SecondLobe, Surface, upload_surface
 from kernels.surface.shadows import extent_of
@@ -105,3 +107,21 @@ class SurfaceModel:
             pixels: [m] of a batch.
         """
         return see_lights(place, pixels, self._height, self._mask, self._projection, extent=self._extent, device=self.device)
+
+    def albedo(self, pixels: np.ndarray) -> np.ndarray:
+        """Return [3, m] float32 diffuse albedo of pixels [m]."""
+        assert self.maps.diffuse_albedo is not None
+        return np.ascontiguousarray(self.maps.diffuse_albedo.reshape(-1, 3)[pixels].T, dtype=np.float32)
+
+    def horizons(self, direction: np.ndarray, batch: ModelBatch) -> Horizons:
+        """Return the horizons of a batch, as far as they tell which pixels see far lights in directions [n, 3]."""
+        sight = np.zeros((1, 2))
+        if self._projection.perspective:
+            points = self.points[batch.pixels]
+            sight = points[:, :2] / points[:, 2:]
+        return find_horizons(azimuths_of(direction, sight), batch.pixels, batch.surface, self._field)
+
+    @cached_property
+    def _field(self) -> HeightField:
+        """The height on the device, for finding horizons."""
+        return height_field(self._height.numpy(), self._mask.numpy() != 0, self._projection, self.device)

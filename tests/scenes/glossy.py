@@ -81,12 +81,12 @@ def write_dome(folder: Path, surface: Dome, *, lights: int = 48, irradiance: flo
     return directions
 
 
-def write_maps(folder: Path, surface: Dome, **changes: np.ndarray | str | None) -> Path:
-    """Write the true maps, or changed ones."""
+def write_maps(folder: Path, surface: Dome, camera: Camera | None = None, **changes: np.ndarray | str | None) -> Path:
+    """Write the true maps, or changed ones, or those of another camera than the orthographic one of the capture."""
     folder.mkdir(parents=True)
     size = len(surface.mask)
     full = np.ones((size, size, 3), np.float32)
-    camera = Camera(projection="orthographic", resolution=(size, size), pixel_size_m=PIXEL_M)
+    camera = camera or Camera(projection="orthographic", resolution=(size, size), pixel_size_m=PIXEL_M)
     layers = {"normal": surface.normal.astype(np.float32), "diffuse_albedo": ALBEDO * full, "specular": F0 * full,
               "roughness": ROUGHNESS * full[..., 0], "height": surface.height.astype(np.float32), "confidence": full[..., 0], **changes}
     SurfaceMaps(camera=camera, mask=surface.mask, **layers).write(folder / MAPS_FILE)

@@ -66,6 +66,25 @@ def test_a_batch_of_several_blocks(device):
         assert close(single[:, :BLOCKS], stack, weights[f])
 
 
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("frames", FRAMES)
+def test_rows_are_summed_as_images_are(frames, channels, device):
+    """Float32 rows; and a frame is the same to the last bit if the others are none."""
+    rows = np.random.default_rng(2).normal(size=(channels, 50, 96)).astype(np.float32)
+    weights = drawn((frames, channels, 50))
+    packed = wp.array(rows.reshape(channels * 50, -1, devices.pack_width(device)), dtype=pack_type(devices.pack_width(device), wp.float32),
+                      device=device)
+    got = many_frames.combine_rows(packed, weights).numpy()
+    assert got.shape == (frames, channels, 96)
+    for f in range(frames):
+        assert close(got[f], rows, weights[f])
+    alone = np.zeros_like(weights)
+    alone[frames // 2] = weights[frames // 2]
+    assert np.array_equal(many_frames.combine_rows(packed, alone).numpy()[frames // 2], got[frames // 2])
+    with pytest.raises(ArrayError, match="expected"):
+        many_frames.combine_rows(packed, weights[:, :, :-1])
+
+
 def fours(stack):
     """[3 · light, pack] in packs of four, as on CUDA, on the CPU."""
     padded = np.pad(stack, ((0, 0), (0, 0), (0, -stack.shape[2] % 4)))

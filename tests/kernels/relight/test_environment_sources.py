@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kernels.relight import sources
-from kernels.relight.environment_sources import SAMPLES, sample_environment
+from kernels.relight.environment_sources import BROAD_SAMPLES, MOST_SMALL, SAMPLES, sample_environment, split_environment
 from tests.kernels.relight.lights import SUM, sun
 from tests.kernels.relight.surfaces import facing, radiance
 from tests.kernels.scenes import angle_degrees, cap
@@ -141,3 +141,31 @@ def test_turning_the_map_by_columns_turns_the_samples():
     # columns to the right are from +z towards -x: turned by -90 degrees about +y, (x, z) → (-z, x)
     quarter = np.array([[0, 0, -1.0], [0, 1, 0], [1, 0, 0]])
     np.testing.assert_allclose(moment(turned), np.einsum("ax,by,xyc->abc", quarter, quarter, moment(got)), rtol=1e-9, atol=1e-12)
+
+
+def test_small_bright_places_and_the_rest_are_the_whole_map():
+    environment = np.ones((64, 128, 3)) + sun(64, 128, 20, 50, 1e4) + sun(64, 128, 40, 90, 5e3)
+    small, broad = split_environment(environment, np.radians(2))
+    np.testing.assert_allclose(small.energy.sum(axis=0) + broad.energy.sum(axis=0), whole(environment), rtol=SUM)
+    assert len(small.energy) >= 2 and small.radius.max() < np.radians(2)
+    for row, col in ((20, 50), (40, 90)):
+        assert angle_degrees(small.direction, texel_directions(64, 128)[row, col]).min() < 1e-5
+        rest = angle_degrees(broad.direction, texel_directions(64, 128)[row, col]) < 1
+        assert broad.energy[rest].sum() < 0.01 * small.energy.sum()
+
+
+def test_of_very_many_small_places_the_brightest_stay_apart():
+    """A window of 45° by 45°, with most of the energy and so of the samples."""
+    environment = np.full((128, 256, 3), 0.01)
+    environment[40:72, 100:132] = 10 + noise(32, 32)
+    small, broad = split_environment(environment, np.radians(2))
+    every = sample_environment(environment)
+    assert (every.radius < np.radians(2)).sum() > MOST_SMALL == len(small.energy)
+    np.testing.assert_allclose(np.sort(small.energy.sum(axis=1)),
+                               np.sort(every.energy[every.radius < np.radians(2)].sum(axis=1))[-MOST_SMALL:], rtol=SUM)
+    np.testing.assert_allclose(small.energy.sum(axis=0) + broad.energy.sum(axis=0), whole(environment), rtol=SUM)
+
+
+def test_a_sky_without_a_sun_is_all_broad():
+    small, broad = split_environment(np.ones((64, 128, 3)), np.radians(2))
+    assert len(small.energy) == 0 and len(broad.energy) == BROAD_SAMPLES

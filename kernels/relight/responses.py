@@ -1,0 +1,137 @@
+"""The response of a surface to light of energy one from each of many directions: frames are weighted sums of it.
+
+A frame's own samples are shaded by kernels.relight.shading. Where many frames light the same surface, what depends on the surface is
+computed once here, and what depends on the frame is a matrix product (kernels.relight.many_frames).
+
+Source: precomputed light transport, Ng, Ramamoorthi and Hanrahan, "All-frequency shadows using non-linear wavelet lighting
+approximation", SIGGRAPH 2003, here without wavelets.
+"""
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from kernels.microfacet import INVERSE_PI
+from kernels.packs import Band, pack_type
+from kernels.relight.gloss_ratio import gloss_ratio
+from kernels.relight.shading import SourcesOnDevice, Surface, lobes, require_same, upload_captured, visibility
+
+
+class Responses(NamedTuple):
+    """Responses of a surface to some directions; on CUDA not synchronised."""
+
+    matt: wp.array  # [n, P] float32 packs: visibility · n·l / π; times albedo it is the diffuse part of the radiance
+    gloss: wp.array  # [3 n, P] float32 packs: the specular part, R of all directions, then G, then B
+
+
+def empty_responses(count: int, packs: int, device: str) -> Responses:
+    """Return memory for the responses of some packs to some directions."""
+    kind = pack_type(devices.pack_width(device), wp.float32)
+    return Responses(*(wp.empty((rows, packs), dtype=kind, device=device) for rows in (count, 3 * count)))
+
+
+def respond(surface: Surface, sources: SourcesOnDevice, visible: wp.array, responses: Responses) -> None:
+    """Compute the responses of a surface to samples of light, each of energy one.
+
+    Args:
+        surface: the pixels.
+        sources: far samples; their energy is not used.
+        visible: [rows, P] uint8 packs, 255 where a pixel sees the occluder of that row; it has the rows of all samples.
+        responses: where they are written, of as many packs as the surface has.
+    """
+    devices.launch(_respond_kernel(devices.pack_width(surface.device)), responses.matt.size,
+                   [surface.values, sources.place, sources.occluder, sources.share, visible], list(responses), device=surface.device)
+
+
+def shown_gloss(band: Band, surface: Surface, responses: Responses, direction: np.ndarray, irradiance: np.ndarray,
+                scale: np.ndarray) -> wp.array:
+    """Return the specular part under each captured light, as bright as the images show it (kernels.relight.gloss_ratio).
+
+    Args:
+        band: captured images of the same pixels as the surface.
+        surface: solved maps.
+        responses: of the surface to the captured lights.
+        direction: [lights, 3] unit vectors to the captured lights.
+        irradiance: [lights, 3] of each.
+        scale: [lights padded] radiance of a stored 1.0.
+
+    Returns:
+        [3 lights, P] float32 packs for lights of irradiance one; on CUDA not synchronised.
+
+    Raises:
+        ArrayError: shapes that do not fit.
+    """
+    count, device = len(direction), surface.device
+    require_same(band, surface, responses.matt, count)
+    _, factors = upload_captured(direction, irradiance, scale, device)
+    shown = wp.empty(responses.gloss.shape, dtype=responses.gloss.dtype, device=device)
+    devices.launch(_shown_kernel(devices.pack_width(device)), count * surface.packs,
+                   [band.values, band.frame_count, surface.values, responses.matt, responses.gloss, factors], [shown], device=device)
+    return shown
+
+
+@cache
+def _respond_kernel(pack: int) -> Any:
+    lane_type, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.uint8)
+    evaluate, seen = lobes(pack), visibility(pack)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
+    def respond_kernel(first: int,
+                       values: wp.array2d(dtype=lane_type),  # [24, P]
+                       place: wp.array(dtype=wp.vec4),  # [N]
+                       occluder: wp.array(dtype=wp.vec3i),  # [N]
+                       share: wp.array(dtype=wp.vec3),  # [N]
+                       visible: wp.array2d(dtype=byte_pack),  # [rows, P]
+                       # outputs
+                       matt: wp.array2d(dtype=lane_type),  # [N, P]
+                       gloss: wp.array2d(dtype=lane_type)):  # [3 N, P]
+        thread = first + wp.tid()
+        packs = values.shape[1]
+        n = thread / packs
+        p = thread % packs
+        facing, shine, _, _ = evaluate(values, p, place[n], wp.vec4())
+        lit = seen(visible, p, occluder[n], share[n])
+        for k in range(pack):
+            facing[k] = INVERSE_PI * lit[k] * facing[k]
+        matt[n, p] = facing
+        for c in range(3):
+            out = lane_type()
+            for k in range(pack):
+                out[k] = lit[k] * shine[c, k]
+            gloss[c * place.shape[0] + n, p] = out
+
+    return respond_kernel
+
+
+@cache
+def _shown_kernel(pack: int) -> Any:
+    lane_type, half_pack = pack_type(pack, wp.float32), pack_type(pack, wp.float16)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
+    def shown_kernel(first: int,
+                     captured: wp.array2d(dtype=half_pack),  # [3 · lights padded, P]
+                     padded: int,  # lights
+                     values: wp.array2d(dtype=lane_type),  # [24, P]
+                     matt: wp.array2d(dtype=lane_type),  # [lights, P]
+                     gloss: wp.array2d(dtype=lane_type),  # [3 lights, P]
+                     factors: wp.array(dtype=wp.vec3),  # [lights] stored → radiance / irradiance
+                     # outputs
+                     shown: wp.array2d(dtype=lane_type)):  # [3 lights, P]
+        thread = first + wp.tid()
+        packs = values.shape[1]
+        light = thread / packs
+        p = thread % packs
+        diffuse = matt[light, p]
+        for c in range(3):
+            reading = captured[c * padded + light, p]
+            albedo = values[3 + c, p]
+            shine = gloss[c * matt.shape[0] + light, p]
+            factor = factors[light][c]
+            for k in range(pack):
+                shine[k] = shine[k] * gloss_ratio(factor * float(reading[k]), albedo[k] * diffuse[k], shine[k])
+            shown[c * matt.shape[0] + light, p] = shine
+
+    return shown_kernel
