@@ -1,6 +1,8 @@
-"""relit keys: who may use the service."""
+"""relit keys and relit audit: who may use the service, and who did what."""
 
-from typing import Annotated, Any
+from collections.abc import Callable
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
@@ -8,6 +10,12 @@ from service.cli.printing import print_table
 from service.cli.request_commands import command
 from service.cli.server import ConfigOption, DataOption, settings_of
 from service.requests.keys import NewKey
+
+if TYPE_CHECKING:
+    from service.server.database.engine import Database
+
+T = TypeVar("T")
+ProjectOption = Annotated[str | None, typer.Option("--project", help="List only what belongs to this project.", show_default=False)]
 
 
 def register(app: typer.Typer) -> None:
@@ -17,41 +25,38 @@ def register(app: typer.Typer) -> None:
     group.command("list")(list_)
     group.command("revoke")(revoke)
     app.add_typer(group)
+    app.command("audit")(audit)
 
 
 def _create(wanted: NewKey, data: DataOption = None, config: ConfigOption = None) -> None:
     import sys
 
-    from service.server.database import keys
-    from service.server.database.engine import open_database
+    from service.server.database import audit, keys
+    from service.server.database.engine import connect, usable
     from service.server.database.schema import upgrade
-    from service.server.permissions import keep_private
 
-    def prepare(settings: Any, database: Any) -> None:
-        keep_private()
+    def work(connection: Any) -> str:
+        key = keys.insert(connection, wanted)
+        audit.record_operator(connection, wanted.project, "key.create", key.partition(".")[0])
+        return key
+
+    settings = settings_of(config, data=data)
+    with usable(settings):
         settings.data.mkdir(parents=True, exist_ok=True)
+        database = connect(settings.sqlalchemy_url)
         upgrade(database)
-
-    print(keys.create(open_database(settings_of(config, data=data), prepare), wanted))
+        print(database.transact(work))
     print("keep it: it is not shown again", file=sys.stderr)
 
 
-def list_(
-    project: Annotated[str | None, typer.Option("--project", help="List only the keys of this project.", show_default=False)] = None,
-    data: DataOption = None,
-    config: ConfigOption = None,
-) -> None:
+def list_(project: ProjectOption = None, data: DataOption = None, config: ConfigOption = None) -> None:
     """Show the keys that were made, without their secrets."""
-    from datetime import UTC, datetime
-
     from service.server.database import keys
 
-    def day(seconds: float) -> str:
-        return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M")
-
-    rows = [("KEY", "PROJECT", "SCOPE", "CREATED (UTC)", "REVOKED", "NAME")]
-    rows += [(row["id"], row["project"], row["scope"], day(row["created_at"]), "" if row["revoked_at"] is None else day(row["revoked_at"]),
-              row["name"]) for row in keys.listing(_open(settings_of(config, data=data)), project)]
+    rows = [("KEY", "PROJECT", "SCOPE", "CREATED (UTC)", "LAST USED", "EXPIRES", "REVOKED", "NAME")]
+    times = "created_at", "used_at", "expires_at", "revoked_at"
+    rows += [(row["id"], row["project"], row["scope"], *(_time(row[name]) for name in times), row["name"])
+             for row in _existing(settings_of(config, data=data), lambda database: keys.listing(database, project))]
     print_table(rows)
 
 
@@ -62,19 +67,49 @@ def revoke(
 ) -> None:
     """Revoke a key: requests with it are refused from now on."""
     from service.errors import RequestError
-    from service.server.database import keys
+    from service.server.database import audit, keys
 
-    if not keys.revoke(_open(settings_of(config, data=data)), key.partition(".")[0]):
-        raise RequestError(f"{key.partition('.')[0]}: there is no such key that is not revoked")
-    print(f"revoked  {key.partition('.')[0]}")
+    identifier = key.partition(".")[0]
+
+    def work(connection: Any) -> str | None:
+        project = keys.withdraw(connection, identifier)
+        if project is not None:
+            audit.record_operator(connection, project, "key.revoke", identifier)
+        return project
+
+    if _existing(settings_of(config, data=data), lambda database: database.transact(work)) is None:
+        raise RequestError(f"{identifier}: there is no such key that is not revoked")
+    print(f"revoked  {identifier}")
 
 
-def _open(settings: Any) -> Any:
-    """Open the database of an existing service; a wrong --data makes no new one."""
+def audit(
+    project: ProjectOption = None,
+    limit: Annotated[int, typer.Option("--limit", min=1, help="Lines at most.")] = 100,
+    data: DataOption = None,
+    config: ConfigOption = None,
+) -> None:
+    """Show who did what to which object, the newest first."""
+    from service.server.database import audit as log
+
+    rows = [("TIME (UTC)", "PROJECT", "WHO", "ACTION", "OBJECT", "REQUEST")]
+    rows += [(_time(row["at"]), row["project"], row["actor"], row["action"], row["object"], row["request"] or "")
+             for row in _existing(settings_of(config, data=data), lambda database: log.listing(database, project=project, limit=limit))]
+    print_table(rows)
+
+
+def _time(seconds: float | None) -> str:
+    return "" if seconds is None else datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M")
+
+
+def _existing(settings: Any, work: "Callable[[Database], T]") -> T:
+    """Do something with the database of an existing service; a wrong --data makes no new one."""
     from service.errors import RequestError
-    from service.server.database.engine import open_database
+    from service.server.database.engine import connect, usable
     from service.server.database.schema import require_current
 
     if settings.is_sqlite and not settings.sqlite_file.exists():
         raise RequestError(f"data {settings.data}: there is no service in this folder")
-    return open_database(settings, lambda _settings, database: require_current(database))
+    with usable(settings):
+        database = connect(settings.sqlalchemy_url)
+        require_current(database)
+        return work(database)

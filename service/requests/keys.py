@@ -2,7 +2,7 @@
 
 from typing import Annotated
 
-from pydantic import StringConstraints
+from pydantic import Field, StringConstraints
 
 from service.requests.base import Choice, Options
 from service.requests.identifiers import Project
@@ -25,3 +25,5 @@ class NewKey(Options):
     """Who holds the key: a person or a program."""
     scope: Scope
     """What the key allows."""
+    expires_days: Annotated[float | None, Field(gt=0, le=36_500)] = None
+    """Days after which requests with the key are refused; without it never."""

@@ -20,6 +20,7 @@ from pydantic_settings import BaseSettings, InitSettingsSource, NoDecode, Pydant
 from service.errors import RequestError
 from service.requests.identifiers import PROJECT_PATTERN
 from service.requests.jobs import DEFAULT_PORT
+from service.requests.keys import Scope
 from stage.model import Count, Positive
 
 PREFIX = "RELIT_"
@@ -54,6 +55,26 @@ class ProjectRoot(NamedTuple):
         return cls(project, _absolute(Path(folder)))
 
 
+class Grant(NamedTuple):
+    """What a token with a value of the claim may do."""
+
+    value: str
+    project: str
+    scope: Scope
+
+    @classmethod
+    def read(cls, given: object) -> object:
+        """Return what VALUE=PROJECT:SCOPE stands for."""
+        if not isinstance(given, str):
+            return given
+        value, _, granted = given.rpartition("=")
+        project, _, scope = granted.partition(":")
+        if not value or not re.fullmatch(PROJECT_PATTERN, project) or scope not in list(Scope):
+            raise ValueError(f"is {given}: give VALUE=PROJECT:SCOPE, with a scope of {', '.join(Scope)}")
+        return cls(value, project, Scope(scope))
+
+
+Granted = Annotated[Grant, BeforeValidator(Grant.read)]
 ProjectFolder = Annotated[ProjectRoot, BeforeValidator(ProjectRoot.read)]
 
 
@@ -80,6 +101,14 @@ class Settings(BaseSettings):
     """Port that the API listens on; 0 takes a free one."""
     anonymous: bool = False
     """Accept requests without a key, in the project `default`; only on loopback addresses."""
+    oidc_issuer: str | None = None
+    """https://idp.studio: its OpenID Connect tokens are accepted beside keys (needs the extra `oidc`); without it keys alone."""
+    oidc_audience: str = "relit"
+    """The audience (`aud`) that a token must have."""
+    oidc_claim: str = "groups"
+    """Claim of a token whose text or texts `oidc_grants` maps to projects."""
+    oidc_grants: Annotated[tuple[Granted, ...], NoDecode] = ()
+    """What a value of the claim allows: VALUE=PROJECT:SCOPE, separated by commas."""
     roots: Annotated[tuple[Folder, ...], NoDecode] = ()
     """Folders of the server whose captures and environments may be registered without an upload; in the environment separated by `:`."""
     project_roots: Annotated[tuple[ProjectFolder, ...], NoDecode] = ()
@@ -141,7 +170,8 @@ class Settings(BaseSettings):
     @model_validator(mode="before")
     @classmethod
     def _split(cls, given: dict[str, object]) -> dict[str, object]:
-        for name, mark in (("roots", os.pathsep), ("project_roots", os.pathsep), ("devices", ","), ("trusted_proxies", ",")):
+        for name, mark in (("roots", os.pathsep), ("project_roots", os.pathsep), ("devices", ","), ("trusted_proxies", ","),
+                           ("oidc_grants", ",")):
             if isinstance(value := given.get(name), str):
                 given[name] = tuple(part.strip() for part in value.split(mark) if part.strip())
         return given
@@ -163,6 +193,9 @@ class Settings(BaseSettings):
                 raise ValueError(f"trusted_proxies: {proxy} is no address and no network such as 10.0.0.0/8") from None
         if self.otel_endpoint is not None and not _is_http(self.otel_endpoint):
             raise ValueError(f"otel_endpoint: {self.otel_endpoint} is no address of the form http://host:4318")
+        if self.oidc_issuer is not None and not (_is_http(self.oidc_issuer) and (
+                self.oidc_issuer.startswith("https:") or is_loopback(urlsplit(self.oidc_issuer).hostname or ""))):
+            raise ValueError(f"oidc_issuer: {self.oidc_issuer} is no https:// address")
         return self
 
     @model_validator(mode="after")

@@ -11,6 +11,7 @@ from service.server.api import document, events, intakes, jobs, middleware, oper
 from service.server.api.access import RateLimiter
 from service.server.api.context import Service
 from service.server.api.metrics import Metrics
+from service.server.api.tokens import TokenReader
 from service.server.api.watch import MAX_STREAMS, StreamLimits, Watcher
 from service.server.database.engine import Database
 from service.server.jobs.queue import JobQueue
@@ -40,7 +41,7 @@ def create_app(settings: Settings, database: Database, tracing: TracerProvider |
     app.state.service = Service(
         settings, database, JobQueue(database), storage, open_upload_parts(settings, database, storage),
         RateLimiter(settings.requests_per_second, settings.request_burst), draining=threading.Event(), closing=closing,
-        watcher=Watcher(database, closing, streams))
+        watcher=Watcher(database, closing, streams), tokens=None if settings.oidc_issuer is None else TokenReader(settings))
     app.state.metrics, app.state.readiness = Metrics(settings, database), operations.Readiness()
     problems.install(app)
     document.install(app)

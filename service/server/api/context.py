@@ -13,6 +13,7 @@ from fastapi.security.utils import get_authorization_scheme_param
 from service.requests.keys import Scope
 from service.server.api.access import RateLimiter, require_local
 from service.server.api.problems import ApiError
+from service.server.api.tokens import PROJECT_HEADER, TokenReader
 from service.server.api.watch import Watcher
 from service.server.database import idempotency, keys
 from service.server.database.engine import Database
@@ -42,6 +43,8 @@ class Service(NamedTuple):
     closing: threading.Event
     """Set when the workers have ended: streams of events end, and then the service."""
     watcher: Watcher
+    tokens: TokenReader | None = None
+    """Reads the tokens of the identity provider; None: there is none."""
 
 
 async def service_of(request: Request) -> Service:  # async, as it waits for nothing: FastAPI calls it without a thread
@@ -67,7 +70,10 @@ def authenticate(request: Request) -> Caller:
     scheme, given = get_authorization_scheme_param(request.headers.get("Authorization"))
     caller = None
     if scheme.lower() == "bearer" and given:
-        caller = keys.find(service.database, given)
+        if service.tokens is not None and given.count(".") == 2:  # a JWT; keys have one dot
+            caller = service.tokens.caller(given, request.headers.get(PROJECT_HEADER))
+        else:
+            caller = keys.find(service.database, given)
     elif service.settings.anonymous:
         require_local(request)
         caller = ANONYMOUS

@@ -16,7 +16,7 @@ from service.server.api.json_body import JsonRoute
 from service.server.api.problems import ApiError, responses
 from service.server.api.submission import submit
 from service.server.api.views import intake_view
-from service.server.database import intakes, jobs, uploads
+from service.server.database import audit, intakes, jobs, uploads
 from service.server.database.keys import Caller
 from service.server.safe_names import shown
 from service.server.storage import layout
@@ -157,6 +157,7 @@ def _create(service: Service, caller: Caller, prefix: str, name: str, folder: Pa
                        folder=None if folder is None else str(folder))
         if folder is not None:
             submit(service, caller, CheckJob(kind="check", intake=identifier), connection, [identifier])
+        audit.record(connection, caller, "intake.create" if folder is None else "intake.register", identifier)
         return identifier
 
     identifier, _ = create_once(service, caller, token, [prefix, name, None if folder is None else str(folder)], make)
@@ -182,6 +183,7 @@ def _validate(service: Service, caller: Caller, identifier: str) -> IntakeView:
         if (file := uploads.unfinished(connection, identifier)) is not None:
             raise ApiError("conflict", f"{identifier}: {shown(file['path'])} is not complete: go on with {file['id']}, or delete it")
         submit(service, caller, CheckJob(kind="check", intake=identifier), connection, [identifier])
+        audit.record(connection, caller, "intake.validate", identifier)
         return True
 
     if not service.database.transact(work):
@@ -197,6 +199,7 @@ def _delete(service: Service, caller: Caller, identifier: str) -> None:
     def work(connection: sa.Connection) -> list[str] | None:
         if users := jobs.users_of(connection, identifier, active=True):
             raise ApiError("conflict", f"{identifier} is read by {users[0]}, which has not ended")
+        audit.record(connection, caller, "intake.delete", identifier)
         return intakes.remove(connection, identifier)
 
     parts = service.database.transact(work)

@@ -27,7 +27,7 @@ from service.server.api.json_body import JsonRoute
 from service.server.api.problems import ApiError, responses
 from service.server.api.submission import inputs_of, require_queue, spelled_out, submit
 from service.server.api.views import job_view
-from service.server.database import jobs
+from service.server.database import audit, jobs
 from service.server.database.keys import Caller
 from service.server.storage import layout
 from service.views import states
@@ -118,7 +118,7 @@ def get_job(service: ServiceDep, caller: Reader, job: JobName) -> JobView:
 def cancel_job(service: ServiceDep, caller: Writer, job: JobName) -> JobView:
     """Cancel a job: at once if it is queued, else at its next sign of progress. Its results stay."""
     before = view(service, caller, job)
-    if not service.database.transact(lambda connection: jobs.cancel(connection, job)):
+    if not service.database.transact(lambda connection: _told(connection, caller, "job.cancel", job, jobs.cancel(connection, job))):
         raise ApiError("conflict", f"{job} is {before.state}: it has ended")
     service.queue.cancel(job, before.attempt)
     return view(service, caller, job)
@@ -146,6 +146,7 @@ def change_priority(service: ServiceDep, caller: Writer, job: JobName,
         attempt = jobs.set_priority(connection, job, wanted.priority)
         if attempt is not None:
             service.queue.set_priority(connection, job, attempt, wanted.priority)
+            audit.record(connection, caller, "job.priority", job)
         return attempt is not None
 
     if not service.database.transact(work):
@@ -161,7 +162,7 @@ def delete_job(service: ServiceDep, caller: Writer, job: JobName) -> None:
     def work(connection: sa.Connection) -> bool:
         if users := jobs.users_of(connection, job, active=True):
             raise ApiError("conflict", f"{job} is read by {users[0]}, which has not ended")
-        return jobs.remove(connection, job)
+        return _told(connection, caller, "job.delete", job, jobs.remove(connection, job))
 
     if not service.database.transact(work):
         raise ApiError("conflict", f"{job} is {before.state}: cancel it first")
@@ -182,6 +183,13 @@ def view(service: Service, caller: Caller, job: str) -> JobView:
     return job_view(row)
 
 
+def _told(connection: sa.Connection, caller: Caller, action: str, job: str, done: bool) -> bool:
+    """Write a change that was made into the audit log, and return whether it was."""
+    if done:
+        audit.record(connection, caller, action, job)
+    return done
+
+
 def _again(service: Service, caller: Caller, job: str, state: str) -> JobView:
     require_space(service, FOR_WORK)
     before = view(service, caller, job)
@@ -194,6 +202,7 @@ def _again(service: Service, caller: Caller, job: str, state: str) -> JobView:
         if attempt is not None:
             service.queue.enqueue(connection, job, attempt, request, before.priority)
             require_queue(service, caller, connection)
+            audit.record(connection, caller, "job.again", job)
         return attempt is not None
 
     if not service.database.transact(work):

@@ -8,7 +8,7 @@ from service.requests.relight import RelightOptions
 from service.server import telemetry
 from service.server.api.context import Service
 from service.server.api.problems import ApiError
-from service.server.database import intakes, jobs
+from service.server.database import audit, intakes, jobs
 from service.server.database.keys import Caller
 from service.views import states
 
@@ -20,6 +20,7 @@ def submit(service: Service, caller: Caller, request: JobRequest, connection: sa
     job = service.queue.submit(connection, project=caller.project, key=caller.key, request=request, inputs=inputs,
                               chunk_frames=service.settings.chunk_frames, trace=telemetry.current())
     require_queue(service, caller, connection)
+    audit.record(connection, caller, "job.submit", job)
     return job
 
 

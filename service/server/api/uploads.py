@@ -28,7 +28,7 @@ from service.server.api.tus import (
 )
 from service.server.api.upload_body import BodyBroken, RunningHashes, TooLong, write_body
 from service.server.api.upload_patch import UploadPatch, being_written, received_of, settled
-from service.server.database import idempotency, intakes, uploads
+from service.server.database import audit, idempotency, intakes, uploads
 from service.server.database.keys import Caller
 from service.server.database.uploads import Row
 from service.server.safe_names import check_path, shown
@@ -132,6 +132,7 @@ def delete_upload(service: ServiceDep, caller: Writer, upload: UploadId) -> None
         def work(connection: sa.Connection) -> None:
             _hold(service, caller, connection, row["intake"])
             if uploads.remove(connection, upload):
+                audit.record(connection, caller, "upload.delete", upload)
                 service.storage.delete(layout.intake(row["project"], row["intake"]), row["path"])
 
         try:
@@ -195,6 +196,7 @@ def _create(service: Service, caller: Caller, intake: str, length: int, given: M
                            sha256=given.sha256)
         except uploads.PathTaken as error:
             raise ApiError("conflict", str(error)) from None
+        audit.record(connection, caller, "upload.create", identifier)
         return identifier
 
     asked = ["upload", intake, given.path, length, given.sha256]

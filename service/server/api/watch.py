@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import sqlalchemy as sa
 
-from service.requests.identifiers import JOB
+from service.requests.identifiers import JOB, KEY
 from service.server.api.problems import RETRY_S, ApiError
 from service.server.api.views import job_view
 from service.server.database import jobs, keys
@@ -168,13 +168,15 @@ class Watcher:
             listener.fresh = False
 
     async def _close_revoked(self, *, now: bool) -> None:
-        """End the streams of keys that were revoked; unless `now`, look at the keys every KEYS_S only."""
+        """End the streams of keys and tokens that were revoked or have expired; unless `now`, look at the keys every KEYS_S only."""
         if not now and time.monotonic() < self._keys_until:
             return
-        used = {listener.caller.key for listener in self._all() if listener.caller is not None and listener.caller.key is not None}
+        used = {listener.caller.key or "" for listener in self._all() if listener.caller is not None
+                and (listener.caller.key or "").startswith(f"{KEY}_")}
         valid = await asyncio.to_thread(keys.still_valid, self._database, used) if used else set[str]()
         for listener in self._all():
-            if listener.caller is not None and listener.caller.key in used - valid:
+            caller = listener.caller
+            if caller is not None and (caller.key in used - valid or (caller.until is not None and caller.until < time.time())):
                 listener.close()
         self._keys_until = time.monotonic() + KEYS_S
 

@@ -1,7 +1,8 @@
 """The database: SQLite in the data folder, or PostgreSQL. Transactions can wait while its server restarts."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, TypeVar
 
 import sqlalchemy as sa
@@ -118,9 +119,21 @@ def open_database(settings: Settings, prepare: Callable[[Settings, Database], No
     Raises:
         RequestError: the data folder or the database cannot be used.
     """
-    try:
+    with usable(settings):
         database = connect(settings.sqlalchemy_url)
         prepare(settings, database)
+    return database
+
+
+@contextmanager
+def usable(settings: Settings) -> Iterator[None]:
+    """Turn errors of the data folder and the database into one sentence for people, without SQL and without values.
+
+    Raises:
+        RequestError: the data folder or the database cannot be used.
+    """
+    try:
+        yield
     except DatabaseError as error:
         raise RequestError(str(error)) from error
     except OSError as error:
@@ -128,7 +141,6 @@ def open_database(settings: Settings, prepare: Callable[[Settings, Database], No
     except DBAPIError as error:
         what = f"data {settings.data}: the database in it" if settings.is_sqlite else "database_url: the database"
         raise RequestError(f"{what} cannot be used ({' '.join(str(error.orig).split())})") from None
-    return database
 
 
 def _sqlite(connection: Any, _record: Any) -> None:

@@ -19,6 +19,9 @@ SECRET_BYTES = 32
 DEFAULT_PROJECT = "default"
 """The project of whoever needs no key: requests from the machine of an anonymous service, and the sample of `relit demo --serve`."""
 ORDER = list(Scope)
+DAY_S = 86_400.0
+USED_S = 60.0
+"""Seconds to which the last use of a key is recorded, so that not every request writes."""
 
 
 class Caller(NamedTuple):
@@ -27,7 +30,9 @@ class Caller(NamedTuple):
     project: str
     scope: Scope
     key: str | None
-    """Identifier of the key; None: the request has no key."""
+    """Identifier of the key, or of the user of an identity provider; None: the request has neither."""
+    until: float | None = None
+    """When the key or the token expires, seconds since 1970; None: never."""
 
     def may(self, scope: Scope) -> bool:
         """Return whether the caller's scope includes this one."""
@@ -40,36 +45,59 @@ def create(database: Database, wanted: NewKey) -> str:
     Returns:
         The key as its user sends it; it cannot be shown again.
     """
-    identifier, secret = new_id(KEY), secrets.token_urlsafe(SECRET_BYTES)
-    database.transact(lambda connection: connection.execute(keys.insert().values(
-        id=identifier, **wanted.model_dump(), digest=_digest(secret), created_at=time.time())))
+    return database.transact(lambda connection: insert(connection, wanted))
+
+
+def insert(connection: sa.Connection, wanted: NewKey) -> str:
+    """Create a key in the caller's transaction, as `create` does."""
+    identifier, secret, now = new_id(KEY), secrets.token_urlsafe(SECRET_BYTES), time.time()
+    connection.execute(keys.insert().values(
+        id=identifier, project=wanted.project, name=wanted.name, scope=wanted.scope, digest=_digest(secret), created_at=now,
+        expires_at=None if wanted.expires_days is None else now + wanted.expires_days * DAY_S))
     return f"{identifier}.{secret}"
 
 
 def find(database: Database, presented: str) -> Caller | None:
-    """Return the caller to whom a key belongs; None: the key is unknown or was revoked."""
+    """Return the caller to whom a key belongs; None: the key is unknown, was revoked or has expired. Record that it was used."""
     identifier, _, secret = presented.partition(".")
-    row = database.row(sa.select(keys).where(keys.c.id == identifier, keys.c.revoked_at.is_(None)))
+    row = database.row(sa.select(keys).where(keys.c.id == identifier, _valid()))
     if row is None or not hmac.compare_digest(row["digest"], _digest(secret)):
         return None
-    return Caller(row["project"], Scope(row["scope"]), identifier)
+    now = time.time()
+    if row["used_at"] is None or abs(now - row["used_at"]) > USED_S:
+        database.transact(lambda connection: connection.execute(keys.update().where(keys.c.id == identifier).values(used_at=now)))
+    return Caller(row["project"], Scope(row["scope"]), identifier, row["expires_at"])
 
 
 def still_valid(database: Database, identifiers: Collection[str]) -> set[str]:
-    """Return those of the keys that have not been revoked."""
-    return {row["id"] for row in database.rows(sa.select(keys.c.id).where(keys.c.id.in_(identifiers), keys.c.revoked_at.is_(None)))}
+    """Return those of the keys that have neither been revoked nor expired."""
+    return {row["id"] for row in database.rows(sa.select(keys.c.id).where(keys.c.id.in_(identifiers), _valid()))}
 
 
 def revoke(database: Database, identifier: str) -> bool:
     """Revoke a key; return False if there is no such key or it was revoked before."""
-    return database.transact(lambda connection: connection.execute(keys.update().where(
-        keys.c.id == identifier, keys.c.revoked_at.is_(None)).values(revoked_at=time.time())).rowcount == 1)
+    return database.transact(lambda connection: withdraw(connection, identifier)) is not None
+
+
+def withdraw(connection: sa.Connection, identifier: str) -> str | None:
+    """Revoke a key in the caller's transaction.
+
+    Returns:
+        The project of the key; None: there is no such key, or it was revoked before.
+    """
+    return connection.execute(keys.update().where(keys.c.id == identifier, keys.c.revoked_at.is_(None)).values(
+        revoked_at=time.time()).returning(keys.c.project)).scalar()
 
 
 def listing(database: Database, project: str | None = None) -> list[sa.RowMapping]:
     """Return the keys of a project or of all, without their secrets, the oldest first."""
-    query = sa.select(keys.c.id, keys.c.project, keys.c.name, keys.c.scope, keys.c.created_at, keys.c.revoked_at)
+    query = sa.select(keys.c.id, keys.c.project, keys.c.name, keys.c.scope, keys.c.created_at, keys.c.revoked_at,
+                      keys.c.expires_at, keys.c.used_at)
     return database.rows((query if project is None else query.where(keys.c.project == project)).order_by(keys.c.created_at))
+
+
+def _valid() -> "sa.ColumnElement[bool]":
+    return keys.c.revoked_at.is_(None) & (keys.c.expires_at.is_(None) | (keys.c.expires_at > time.time()))
 
 
 def _digest(secret: str) -> str:

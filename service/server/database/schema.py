@@ -13,7 +13,7 @@ from alembic.config import Config
 from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
 
-from service.server.database import tables
+from service.server.database import audit, tables
 from service.server.database.engine import Database, DatabaseError
 
 REVISIONS = "relit_schema"
@@ -42,9 +42,11 @@ def upgrade(database: Database) -> None:
             ABOUT.create(connection)
             connection.execute(ABOUT.insert().values(version=SINCE_MIGRATIONS))
             command.stamp(config, "head")
+            audit.protect(connection)
         elif found != _newest():
             _require_known(found)
             command.upgrade(config, "head")
+            audit.protect(connection)
 
 
 def require_current(database: Database) -> None:

@@ -26,7 +26,18 @@ keys = sa.Table(
     sa.Column("scope", sa.String(8), nullable=False),
     sa.Column("digest", sa.String(64), nullable=False),  # SHA-256 of the secret, hexadecimal
     sa.Column("created_at", sa.Float, nullable=False),  # every time: seconds since 1970, UTC
-    sa.Column("revoked_at", sa.Float))
+    sa.Column("revoked_at", sa.Float),
+    sa.Column("expires_at", sa.Float),  # NULL: never
+    sa.Column("used_at", sa.Float))  # of the last request, to a minute
+
+audit = sa.Table(  # who did what to which object; triggers refuse every other statement than INSERT (service.server.database.audit)
+    "relit_audit", metadata, sa.Column("id", sa.BigInteger().with_variant(sa.Integer, "sqlite"), primary_key=True), _project(),
+    sa.Column("at", sa.Float, nullable=False),
+    sa.Column("actor", sa.String(200), nullable=False),  # a key, a user of an identity provider, anonymous, or an operator
+    sa.Column("action", sa.String(40), nullable=False),
+    sa.Column("object", sa.String(40), nullable=False),  # identifier
+    sa.Column("request", sa.String(32)),  # identifier of the HTTP request, which the log has too; NULL: the command line
+    sa.Index("relit_audit_of_project", "project", "id"))
 
 intakes = sa.Table(  # captures and environments
     "relit_intakes", metadata, _id(), _project(),

@@ -1,9 +1,13 @@
 """relit keys."""
 
+import getpass
+import sqlite3
+import time
+
 import pytest
 
 from service.requests.keys import Scope
-from service.server.database import keys
+from service.server.database import engine, keys, tables
 from service.server.database.engine import connect
 from service.server.settings import Settings
 
@@ -27,7 +31,7 @@ def made(relit, data):
 def test_a_key_is_printed_alone_and_opens_its_project(made, data):
     key = made()
     database = connect(Settings(data=data).sqlalchemy_url)
-    assert keys.find(database, key) == keys.Caller("larch", Scope.WRITE, key.partition(".")[0])
+    assert keys.find(database, key) == keys.Caller("larch", Scope.WRITE, key.partition(".")[0], None)
     database.close()
 
 
@@ -40,6 +44,52 @@ def test_keys_are_listed_without_their_secrets(relit, made, data):
     assert all(word in lines[2] for word in ("willow", "read", "render farm"))
     assert not any(key.partition(".")[2] in outcome.out for key in (first, second))
     assert len(relit("keys", "list", "--data", data, "--project", "willow").out.splitlines()) == 2
+
+
+def test_a_key_expires(relit, data):
+    key = relit("keys", "create", "--data", data, "--project", "larch", "--name", "x", "--scope", "read", "--expires-days", "2").out.strip()
+    database = connect(Settings(data=data).sqlalchemy_url)
+    until = keys.listing(database)[0]["expires_at"]
+    assert until == pytest.approx(time.time() + 2 * 86_400, abs=600)  # the time that this test takes
+    assert keys.find(database, key).until == until and keys.still_valid(database, [key.partition(".")[0]])
+    database.transact(lambda connection: connection.execute(tables.keys.update().values(expires_at=time.time() - 1)))
+    assert keys.find(database, key) is None and not keys.still_valid(database, [key.partition(".")[0]])
+    database.close()
+
+
+def test_the_last_use_of_a_key_is_recorded_to_a_minute(relit, made, data):
+    key = made()
+    database = connect(Settings(data=data).sqlalchemy_url)
+    assert keys.find(database, f"{key}x") is None
+    assert keys.listing(database)[0]["used_at"] is None
+    assert keys.find(database, key)
+    first = keys.listing(database)[0]["used_at"]
+    assert first == pytest.approx(time.time(), abs=600)
+    assert keys.find(database, key) and keys.listing(database)[0]["used_at"] == first
+    database.transact(lambda connection: connection.execute(tables.keys.update().values(used_at=first - 2 * keys.USED_S)))
+    assert keys.find(database, key) and keys.listing(database)[0]["used_at"] >= first
+    database.close()
+
+
+def test_making_and_revoking_keys_is_audited(relit, made, data):
+    identifier = made().partition(".")[0]
+    relit("keys", "revoke", identifier, "--data", data)
+    lines = relit("audit", "--data", data).out.splitlines()
+    assert [line.split()[3:] for line in lines[1:]] == [["operator", getpass.getuser(), "key.revoke", identifier],
+                                                       ["operator", getpass.getuser(), "key.create", identifier]]
+    assert len(relit("audit", "--data", data, "--project", "willow").out.splitlines()) == 1
+
+
+def test_a_database_that_cannot_be_written_is_one_sentence(relit, made, data, monkeypatch):
+    identifier = made().partition(".")[0]
+    monkeypatch.setattr(engine, "BUSY_MS", 1)
+    holder = sqlite3.connect(data / "relit.sqlite", isolation_level=None)
+    holder.execute("BEGIN IMMEDIATE")  # root may write a read-only file, so another keeps it from being written
+    for arguments in (["create", "--project", "larch", "--name", "x", "--scope", "read"], ["revoke", identifier]):
+        outcome = relit("keys", *arguments, "--data", data)
+        assert (outcome.code, outcome.out) == (2, "")
+        assert outcome.err == f"relit: data {data}: the database in it cannot be used (database is locked)\n"
+    holder.close()
 
 
 def test_a_key_is_revoked_once(relit, made, data):

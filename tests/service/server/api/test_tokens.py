@@ -1,0 +1,184 @@
+"""Tokens of an identity provider: a local one, which signs, changes its keys, and is away."""
+
+import base64
+import hmac
+import json
+import threading
+import time
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import pytest
+from joserfc import jwt
+from joserfc.jwk import KeySet, RSAKey
+
+from service.requests.keys import Scope
+from service.server.api import tokens
+from service.server.api.problems import ApiError
+from service.server.api.tokens import TokenReader
+from service.server.settings import Settings
+from tests.service.server_process import serving
+
+GRANTS = "artists=larch:write,td=larch:admin,guests=willow:read"
+
+
+class Issuer:
+    """An identity provider on loopback."""
+
+    def __init__(self) -> None:
+        self.keys = KeySet([RSAKey.generate_key(2048, {"kid": "one"})])
+        self.requests: list[str] = []
+        issuer = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                issuer.requests.append(self.path)
+                found = {"/.well-known/openid-configuration": {"issuer": issuer.url, "jwks_uri": f"{issuer.url}/keys"},
+                         "/keys": issuer.keys.as_dict(private=False)}[self.path]
+                body = json.dumps(found).encode()
+                self.send_response(200)
+                self.send_header("Content-Length", str(len(body)))
+                self.end_headers()
+                self.wfile.write(body)
+
+            def log_message(self, *_: object) -> None:
+                pass
+
+        self.server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self.url = f"http://127.0.0.1:{self.server.server_port}"
+        threading.Thread(target=self.server.serve_forever, daemon=True).start()
+
+    def token(self, *, key=None, algorithm: str = "RS256", **claims: object) -> str:
+        key = key or self.keys.keys[-1]
+        now = int(time.time())
+        values = {"iss": self.url, "aud": "relit", "sub": "ann", "exp": now + 600, "groups": ["artists"]} | claims
+        return jwt.encode({"alg": algorithm, "kid": key.kid}, {name: value for name, value in values.items() if value is not None}, key,
+                          algorithms=[algorithm])
+
+    def rotate(self) -> None:
+        self.keys = KeySet([RSAKey.generate_key(2048, {"kid": f"{len(self.requests)}"})])
+
+    def close(self) -> None:
+        self.server.shutdown()
+        self.server.server_close()
+
+
+@pytest.fixture
+def issuer() -> Iterator[Issuer]:
+    made = Issuer()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def reader(issuer, tmp_path) -> TokenReader:
+    return TokenReader(Settings(data=tmp_path, oidc_issuer=issuer.url, oidc_grants=GRANTS))
+
+
+def test_a_token_gives_the_project_and_the_scope_of_its_groups(issuer, reader):
+    caller = reader.caller(issuer.token(), None)
+    assert (caller.project, caller.scope, caller.key[:5]) == ("larch", Scope.WRITE, "oidc_")
+    assert caller.until == pytest.approx(time.time() + 600, abs=60)
+    assert reader.caller(issuer.token(groups=["td", "artists", "others"]), None).scope == Scope.ADMIN
+    assert reader.caller(issuer.token(groups="guests"), None)[:2] == ("willow", Scope.READ)
+    assert reader.caller(issuer.token(sub="bob"), None).key != caller.key == reader.caller(issuer.token(groups="td"), None).key
+    assert issuer.requests == ["/.well-known/openid-configuration", "/keys"]  # once for all
+
+
+def test_of_several_projects_the_request_names_one(issuer, reader):
+    token = issuer.token(groups=["artists", "guests"])
+    assert reader.caller(token, "willow")[:2] == ("willow", Scope.READ)
+    with pytest.raises(ApiError, match="the token allows larch, willow: name one in the header Relit-Project"):
+        reader.caller(token, None)
+    with pytest.raises(ApiError, match="the token does not allow oak"):
+        reader.caller(token, "oak")
+
+
+@pytest.mark.parametrize("groups", [[], ["others"], None, 7, {"artists": 1}, [7]])
+def test_a_token_without_a_group_that_counts_allows_nothing(issuer, reader, groups):
+    with pytest.raises(ApiError, match="the token allows no project"):
+        reader.caller(issuer.token(groups=groups), None)
+
+
+@pytest.mark.parametrize("claims", [{"aud": "another"}, {"aud": None}, {"iss": "http://127.0.0.1:1"}, {"exp": int(time.time()) - 3600},
+                                    {"exp": None}, {"sub": None}, {"nbf": int(time.time()) + 3600}])
+def test_claims_that_do_not_hold(issuer, reader, claims):
+    assert reader.caller(issuer.token(**claims), None) is None
+
+
+def test_signatures_that_do_not_hold(issuer, reader):
+    another = RSAKey.generate_key(2048, {"kid": "one"})
+    assert reader.caller(issuer.token(key=another), None) is None
+    # the public key, taken for a secret
+    head, body, _ = issuer.token().split(".")
+    forged = base64.urlsafe_b64encode(b'{"alg":"HS256","kid":"one"}').decode().rstrip("=") + f".{body}"
+    digest = hmac.digest(issuer.keys.keys[0].as_pem(private=False), forged.encode(), "sha256")
+    assert reader.caller(f"{forged}.{base64.urlsafe_b64encode(digest).decode().rstrip('=')}", None) is None
+    for text in (f"{head}.{body}.", f"eyJhbGciOiJub25lIn0.{body}.", "a.b.c", "..", f"{head}.{body}.{'A' * 342}"):
+        assert reader.caller(text, None) is None
+    assert reader.caller(issuer.token(), None) is not None
+
+
+def test_the_provider_may_change_its_keys(issuer, reader, monkeypatch):
+    old = issuer.token()
+    assert reader.caller(old, None)
+    issuer.rotate()
+    assert reader.caller(issuer.token(), None) is None  # it was asked a moment ago
+    monkeypatch.setattr(tokens, "AGAIN_S", 0.0)
+    assert reader.caller(issuer.token(), None)
+    assert reader.caller(old, None) is None
+
+
+def test_tokens_with_unknown_keys_do_not_flood_the_provider(issuer, reader):
+    assert reader.caller(issuer.token(), None)
+    for number in range(20):
+        assert reader.caller(issuer.token(key=RSAKey.generate_key(2048, {"kid": f"unknown {number}"})), None) is None
+    assert len(issuer.requests) == 2
+
+
+def test_a_provider_that_is_away(issuer, tmp_path, monkeypatch):
+    monkeypatch.setattr(tokens, "KEEP_S", 0.0)
+    monkeypatch.setattr(tokens, "AGAIN_S", 0.0)
+    settings = Settings(data=tmp_path, oidc_issuer=issuer.url, oidc_grants=GRANTS)
+    known, fresh = TokenReader(settings), TokenReader(settings)
+    token = issuer.token()
+    assert known.caller(token, None)
+    issuer.close()
+    assert known.caller(token, None)  # by the keys that it has
+    with pytest.raises(ApiError, match="the identity provider does not answer"):
+        fresh.caller(token, None)
+    monkeypatch.setattr(tokens, "STALE_S", 0.0)
+    with pytest.raises(ApiError, match="the identity provider does not answer"):
+        known.caller(token, None)
+
+
+@pytest.mark.parametrize(("settings", "words"), [
+    ({"oidc_issuer": "http://idp.studio"}, "is no https:// address"), ({"oidc_issuer": "idp.studio"}, "is no https:// address"),
+    ({"oidc_grants": "artists"}, "give VALUE=PROJECT:SCOPE"), ({"oidc_grants": "artists=larch:root"}, "give VALUE=PROJECT:SCOPE"),
+    ({"oidc_grants": "artists=../x:read"}, "give VALUE=PROJECT:SCOPE")])
+def test_settings_that_cannot_be(settings, words):
+    with pytest.raises(ValueError, match=words):
+        Settings(**settings)
+
+
+def test_a_service_takes_tokens_beside_keys_and_audits_both(issuer, tmp_path):
+    with serving(tmp_path, "--device", "none", oidc_issuer=issuer.url, oidc_grants=GRANTS, min_free_bytes="0") as server:
+        with server.client(issuer.token()) as client:
+            made = client.post("/v1/captures", json={"name": "owl"})
+            assert made.status_code == 201
+            assert client.get("/v1/captures").json()["items"][0]["id"] == made.json()["id"]
+            assert client.post("/v1/captures", json={"name": "owl", "folder": "/"}).status_code == 403  # needs admin
+        with server.client(issuer.token(groups=["guests"])) as other:
+            assert other.get("/v1/captures").json()["items"] == []
+            assert other.post("/v1/captures", json={"name": "owl"}).status_code == 403
+        with server.client(issuer.token(exp=1)) as late:
+            answer = late.get("/v1/captures")
+            assert (answer.status_code, answer.headers["WWW-Authenticate"]) == (401, "Bearer")
+        from service.server.database import audit
+        from service.server.database.engine import connect
+
+        database = connect(Settings(data=server.data).sqlalchemy_url)
+        line = audit.listing(database, limit=1)[0]
+        assert (line["project"], line["action"], line["object"]) == ("larch", "intake.create", made.json()["id"])
+        assert line["actor"].startswith("oidc_") and line["request"] == made.headers["X-Request-ID"]
+        database.close()
