@@ -25,11 +25,12 @@ class Running(NamedTuple):
 
 
 @contextmanager
-def running(folder: Path, **settings: str) -> Iterator[Running]:
+def running(folder: Path, *, descriptors: int | None = None, **settings: str) -> Iterator[Running]:
     """Start a service and end it.
 
     Args:
         folder: for its data and its log.
+        descriptors: files that it may have open at most; None: what the system allows.
         settings: without RELIT_, as text.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -38,8 +39,9 @@ def running(folder: Path, **settings: str) -> Iterator[Running]:
     chosen = {"roots": str(SAMPLES), "requests_per_second": "100000", "request_burst": "100000", "max_queued": "100000"} | settings
     environment |= {f"RELIT_{name.upper()}": value for name, value in chosen.items()}
     with open(folder / "log.txt", "w") as log:
-        process = subprocess.Popen([*RELIT, "serve", "--data", str(data), "--port", "0", "--device", "cpu"], stdout=subprocess.PIPE,
-                                   stderr=log, text=True, env=environment)
+        limited = [] if descriptors is None else ["prlimit", f"--nofile={descriptors}:{descriptors}"]
+        process = subprocess.Popen([*limited, *RELIT, "serve", "--data", str(data), "--port", "0", "--device", "cpu"],
+                                   stdout=subprocess.PIPE, stderr=log, text=True, env=environment)
         try:
             assert process.stdout is not None
             found = re.search(r"http://\S+:\d+", process.stdout.readline())

@@ -25,7 +25,10 @@ STALL_S = 60.0
 STALL_BYTES = 32_768
 OWN_DESCRIPTORS = 256
 """Descriptors that are kept for files, the database and the object store."""
-MAX_BACKLOG = 2048
+AT_ONCE = 32
+"""Connections accepted in one turn of the event loop: with the 2048 of uvicorn a flood of them keeps all others waiting for a second."""
+BACKLOG = 2048
+"""Connections that may wait to be accepted, in the system."""
 MAX_CONNECTIONS = 8192
 """Connections at most unless `max_connections` says otherwise: each takes about 20 KB."""
 REFUSAL = (b"HTTP/1.1 503 Service Unavailable\r\nContent-Type: text/plain\r\nRetry-After: 5\r\nConnection: close\r\n"
@@ -38,8 +41,6 @@ class ConnectionLimits(NamedTuple):
     connections: int
     of_address: int
     """Connections of one address at most."""
-    backlog: int
-    """Connections that may wait to be accepted; asyncio accepts as many at once, before any bound is looked at."""
 
 
 def raise_descriptors() -> int:
@@ -50,18 +51,17 @@ def raise_descriptors() -> int:
             resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
         except (ValueError, OSError):  # a system that allows less than it says
             return soft
-    return hard if hard != resource.RLIM_INFINITY else MAX_CONNECTIONS + MAX_BACKLOG + OWN_DESCRIPTORS
+    return hard if hard != resource.RLIM_INFINITY else MAX_CONNECTIONS + AT_ONCE + OWN_DESCRIPTORS
 
 
 def limits_of(settings: Settings, descriptors: int) -> ConnectionLimits:
     """Return the bounds of a process that may open this many descriptors; fewer connections than the settings ask for are logged."""
-    backlog = min(MAX_BACKLOG, max(16, descriptors // 8))
-    room = max(16, descriptors - backlog - OWN_DESCRIPTORS)
+    room = max(16, descriptors - AT_ONCE - OWN_DESCRIPTORS)  # asyncio accepts before any bound is looked at
     asked = settings.max_connections or MAX_CONNECTIONS
     if settings.max_connections is not None and settings.max_connections > room:
         logger.warning("fewer connections than max_connections: raise LimitNOFILE", connections=room, descriptors=descriptors)
     connections = min(asked, room)
-    return ConnectionLimits(connections, min(settings.max_address_connections or connections // 2, connections), backlog)
+    return ConnectionLimits(connections, min(settings.max_address_connections or connections // 2, connections))
 
 
 class Connections:

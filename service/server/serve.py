@@ -23,7 +23,7 @@ import uvicorn
 from service.errors import RequestError
 from service.server import log, telemetry
 from service.server.api.app import create_app
-from service.server.connections import ConnectionLimits, Connections, GuardedConnection, limits_of, raise_descriptors
+from service.server.connections import AT_ONCE, BACKLOG, ConnectionLimits, Connections, GuardedConnection, limits_of, raise_descriptors
 from service.server.database.engine import Database, open_database
 from service.server.housekeeping import Housekeeper
 from service.server.jobs.queue import JobQueue, prepare
@@ -57,7 +57,7 @@ def serve(settings: Settings, *, before_answering: Callable[[str, Database, JobQ
     keep_freed_blocks()
     _configure(settings)
     limits = limits_of(settings, raise_descriptors())
-    listening = _listen(settings, limits.backlog)
+    listening = _listen(settings)
     database = open_database(settings, prepare)
     supervisor = Supervisor(settings, _devices(settings))
     supervisors.append(supervisor)
@@ -112,6 +112,11 @@ def work(settings: Settings, device: str | None) -> None:
 class _Server(uvicorn.Server):
     """A server without signal handlers: those of uvicorn would end it at the first signal."""
 
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        await super().startup(sockets)
+        for listening in sockets or ():
+            listening.listen(BACKLOG)  # asyncio has made it AT_ONCE, which it uses for both
+
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
         yield
@@ -122,7 +127,7 @@ def http_server(app: Any, settings: Settings, limits: ConnectionLimits) -> uvico
     connection = partial(GuardedConnection, Connections(limits))
     return _Server(uvicorn.Config(
         app, http=cast(type[asyncio.Protocol], connection), ws="none", log_config=None, access_log=False, server_header=False,
-        timeout_graceful_shutdown=CLOSE_S, backlog=limits.backlog, proxy_headers=bool(settings.trusted_proxies),
+        timeout_graceful_shutdown=CLOSE_S, backlog=AT_ONCE, proxy_headers=bool(settings.trusted_proxies),
         forwarded_allow_ips=list(settings.trusted_proxies)))
 
 
@@ -156,10 +161,10 @@ def _configure(settings: Settings) -> None:
             logger.warning("a root is no folder", root=str(root))
 
 
-def _listen(settings: Settings, backlog: int) -> socket.socket:
+def _listen(settings: Settings) -> socket.socket:
     try:
         family, *_, address = socket.getaddrinfo(settings.host, settings.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
-        listening = socket.create_server((str(address[0]), settings.port), family=family, backlog=backlog)
+        listening = socket.create_server((str(address[0]), settings.port), family=family, backlog=BACKLOG)
         # connections inherit it: without it the body of an answer waits 40 ms for the client to acknowledge the headers
         listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         return listening

@@ -41,7 +41,7 @@ async def app(scope, receive, send) -> None:
 @contextmanager
 def running(limits: ConnectionLimits, **settings) -> Iterator[tuple[int, uvicorn.Server]]:
     """The server of `relit serve` around another app, in a thread; its port."""
-    listening = socket.create_server(("127.0.0.1", 0), backlog=limits.backlog)
+    listening = socket.create_server(("127.0.0.1", 0))
     server = http_server(app, Settings(**settings), limits)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]})
     thread.start()
@@ -72,7 +72,7 @@ def closed(connection: socket.socket) -> bool:
 
 
 def test_requests_that_are_never_whole_give_way_to_those_that_are():
-    with running(ConnectionLimits(20, 20, 64)) as (port, server):
+    with running(ConnectionLimits(20, 20)) as (port, server):
         half = [opened(port, HALF) for _ in range(60)]
         for _ in range(5):
             assert answered(port).startswith(b"HTTP/1.1 200")
@@ -86,7 +86,7 @@ def test_requests_that_are_never_whole_give_way_to_those_that_are():
 
 def test_a_header_has_to_come_in_time_however_slowly_its_bytes_come(monkeypatch):
     monkeypatch.setattr(connections, "HEADER_S", 0.5)
-    with running(ConnectionLimits(20, 20, 64)) as (port, _):
+    with running(ConnectionLimits(20, 20)) as (port, _):
         silent, kept, trickling = opened(port), opened(port, WHOLE), opened(port, WHOLE)
         for connection in (kept, trickling):
             assert connection.recv(4096).startswith(b"HTTP/1.1 200")
@@ -102,7 +102,7 @@ def test_a_header_has_to_come_in_time_however_slowly_its_bytes_come(monkeypatch)
 
 
 def test_an_address_that_takes_its_share_leaves_the_rest_to_others():
-    with running(ConnectionLimits(20, 5, 64)) as (port, server):
+    with running(ConnectionLimits(20, 5)) as (port, server):
         theirs = [opened(port, HALF, "127.0.0.2") for _ in range(30)]
         mine = opened(port, HALF, "127.0.0.1")
         assert answered(port, "127.0.0.2").startswith(b"HTTP/1.1 200")
@@ -116,7 +116,7 @@ def test_an_address_that_takes_its_share_leaves_the_rest_to_others():
 def test_who_takes_no_answer_is_closed_and_who_is_busy_is_not(monkeypatch):
     monkeypatch.setattr(connections, "STALL_S", 0.5)
     monkeypatch.setattr(connections, "HEADER_S", 0.5)
-    with running(ConnectionLimits(2, 2, 64)) as (port, server):
+    with running(ConnectionLimits(2, 2)) as (port, server):
         request = WHOLE.replace(b"/healthz", b"/large")
         stalled = [opened(port, request) for _ in range(2)]
         assert all(connection.recv(1) for connection in stalled)
@@ -138,9 +138,9 @@ def test_who_takes_no_answer_is_closed_and_who_is_busy_is_not(monkeypatch):
 
 def test_a_proxy_is_believed_where_it_is_named_and_nowhere_else():
     forged = b"X-Forwarded-For: 10.9.8.7\r\n"
-    with running(ConnectionLimits(20, 20, 64)) as (port, _):
+    with running(ConnectionLimits(20, 20)) as (port, _):
         assert answered(port, headers=forged).endswith(b"127.0.0.1")
-    with running(ConnectionLimits(20, 20, 64), trusted_proxies="127.0.0.0/24") as (port, _):
+    with running(ConnectionLimits(20, 20), trusted_proxies="127.0.0.0/24") as (port, _):
         assert answered(port, headers=forged).endswith(b"10.9.8.7")
 
 
@@ -149,8 +149,8 @@ def test_bounds_leave_descriptors_for_files(descriptors):
     limits = limits_of(Settings(), descriptors)
     assert limits.of_address <= limits.connections and limits.connections >= 16
     if descriptors > 512:
-        assert limits.connections + limits.backlog + connections.OWN_DESCRIPTORS <= descriptors
-    assert limits_of(Settings(max_connections=10, max_address_connections=3), 4096)[:2] == (10, 3)
+        assert limits.connections + connections.AT_ONCE + connections.OWN_DESCRIPTORS <= descriptors
+    assert limits_of(Settings(max_connections=10, max_address_connections=3), 4096) == (10, 3)
 
 
 def test_descriptors_are_raised_to_what_is_allowed():
