@@ -150,8 +150,9 @@ def row(name: str, url: str, pid: int, log: Path, other: str, attacks: list[Atta
     spans = [", ".join(f"{1e3 * np.percentile(times, part, method='higher'):.1f}" for part in (50, 99)) for times in found]
     pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
     busy, grown = (processor_s(pid) - worked) / spent, (log.stat().st_size - before) / 1024
-    cells = (name, " + ".join(str(wanted.count) for wanted in attacks) or 0, " + ".join(map(str, kept)) or 0, sum(map(len, found)), *spans,
-             lost, f"{opened / spent:.0f}", f"{grown:.0f}", most, f"{100 * busy:.0f} %", f"{pages * os.sysconf('SC_PAGE_SIZE') / 2**20:.0f}")
+    wanted_of, held_of = (" + ".join(map(str, numbers)) or 0 for numbers in ([wanted.count for wanted in attacks], kept))
+    cells = (name, wanted_of, held_of, sum(map(len, found)), *spans, lost, f"{opened / spent:.0f}", f"{grown:.0f}", most,
+             f"{100 * busy:.0f} %", f"{pages * os.sysconf('SC_PAGE_SIZE') / 2**20:.0f}")
     return f"| {' | '.join(map(str, cells))} |"
 
 

@@ -4,6 +4,7 @@ import math
 import threading
 import time
 from collections.abc import Callable
+from typing import NoReturn
 from urllib.parse import urlsplit
 
 from fastapi import Request
@@ -38,13 +39,28 @@ class RateLimiter:
         """
         now = self._clock()
         with self._lock:
-            tokens, counted = self._buckets.get(key, (float(self._burst), now))
-            tokens = min(float(self._burst), tokens + (now - counted) * self._per_second)
+            tokens = self._tokens(key, now)
             if tokens >= 1:
                 self._buckets[key] = (tokens - 1, now)
                 if len(self._buckets) > FORGET_ABOVE:
                     self._forget(now)
                 return
+        self._refuse(tokens)
+
+    def require(self, key: str | None) -> None:
+        """Take nothing from the bucket of a key, of which it need not be known whether it is right.
+
+        Raises:
+            ApiError: the bucket is empty.
+        """
+        if key in self._buckets and (tokens := self._tokens(key, self._clock())) < 1:
+            self._refuse(tokens)
+
+    def _tokens(self, key: str | None, now: float) -> float:
+        tokens, counted = self._buckets.get(key, (float(self._burst), now))
+        return min(float(self._burst), tokens + (now - counted) * self._per_second)
+
+    def _refuse(self, tokens: float) -> NoReturn:
         wait = math.ceil((1 - tokens) / self._per_second)
         raise ApiError("too-many", f"the key asks more than {self._per_second:g} times a second", headers={"Retry-After": str(wait)})
 

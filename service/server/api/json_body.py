@@ -10,7 +10,7 @@ from fastapi.routing import APIRoute
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 
-from service.server.api.context import authenticate
+from service.server.api.context import authenticated
 
 BODY_S = 30.0
 """Seconds that a body may take to arrive; it has at most middleware.MAX_BYTES."""
@@ -27,12 +27,12 @@ class JsonRoute(APIRoute):
         """Return the handler of requests."""
         handle = super().get_route_handler()
 
-        async def authenticated(request: Request) -> Response:
+        async def known(request: Request) -> Response:
             if self.body_field is not None:
-                await run_in_threadpool(authenticate, request)
+                await authenticated(request)
             return await handle(_JsonRequest(request.scope, request.receive))
 
-        return authenticated
+        return known
 
 
 class _JsonRequest(Request):

@@ -1,5 +1,6 @@
 """Limits, on a server where they are small: what is too much is refused by name, and the next who asks is served."""
 
+import asyncio
 from collections.abc import Iterator
 
 import httpx2
@@ -8,10 +9,12 @@ import pytest
 from service.requests.keys import NewKey, Scope
 from service.server.api import access
 from service.server.api.access import RateLimiter
+from service.server.api.app import create_app
 from service.server.api.problems import ApiError
 from service.server.database import intakes, jobs, keys
 from service.server.database.engine import Database, connect
 from service.server.settings import Settings
+from tests.service.server.api.asgi import Call
 from tests.service.server.api.conftest import SAMPLES
 from tests.service.server_process import Server, serving
 
@@ -72,6 +75,20 @@ def test_a_key_that_asks_too_often_waits_and_others_do_not(small, client):
     assert client.get("/healthz").status_code == 200
     with server.client(key(database)) as other:
         assert other.get("/v1/jobs").status_code == 200
+
+
+def test_a_key_that_asks_too_often_is_not_even_looked_up(small, client, monkeypatch):
+    """Whoever asks ten thousand times a second gets no thread and no query of the database for it."""
+    server, database = small
+    settings = Settings(data=server.data, requests_per_second=PER_SECOND, request_burst=2)
+    app, made = create_app(settings, database), key(database)
+    looked: list[str] = []
+    find = keys.find
+    monkeypatch.setattr(keys, "find", lambda database, given: looked.append(given) or find(database, given))
+    found = [asyncio.run(Call(app, "/v1/jobs", headers={"Authorization": f"Bearer {made}"}).run()).status for _ in range(5)]
+    assert found == [200, 200, 429, 429, 429] and len(looked) == 2
+    stranger = f"{made.partition('.')[0]}.guessed"  # learns that the key is busy, not whether the guess is right
+    assert asyncio.run(Call(app, "/v1/jobs", headers={"Authorization": f"Bearer {stranger}"}).run()).status == 429
 
 
 def test_tokens_come_back_with_time():
