@@ -32,6 +32,7 @@ from service.server.log import logger
 from service.server.malloc import keep_freed_blocks
 from service.server.permissions import keep_private
 from service.server.settings import NO_WORKER, Settings, unknown_variables
+from service.server.storage.folder import Storage
 from service.server.storage.open import open_storage
 
 T = TypeVar("T")
@@ -42,12 +43,12 @@ SAME_S = 1.0
 """Seconds within which signals count as one: terminals, `timeout` and supervisors signal a process and its group."""
 
 
-def serve(settings: Settings, *, before_answering: Callable[[str, Database, JobQueue], None] | None = None) -> None:
+def serve(settings: Settings, *, before_answering: Callable[[str, Database, JobQueue, Storage], None] | None = None) -> None:
     """Serve until SIGTERM or SIGINT; then let steps and requests end.
 
     Args:
         settings: of the service.
-        before_answering: called before the service answers, with its address, its database and its queue.
+        before_answering: called before the service answers, with its address, its database, its queue and its storage.
 
     Raises:
         RequestError: the address, the data folder or the database cannot be used, or a device is not on this machine.
@@ -69,7 +70,7 @@ def serve(settings: Settings, *, before_answering: Callable[[str, Database, JobQ
     print(f"relit    {address}/v1", flush=True)
     print(f"data     {settings.data}", flush=True)
     if before_answering is not None:
-        before_answering(address, database, app.state.service.queue)
+        before_answering(address, database, app.state.service.queue, app.state.service.storage)
 
     def end() -> None:
         asked.get()

@@ -49,7 +49,7 @@ class StageProgress(NamedTuple):
 
 
 def insert(connection: sa.Connection, *, project: str, key: str | None, request: JobRequest, chunk_frames: int,
-           inputs: Iterable[str], trace: str | None = None) -> str:
+           inputs: Iterable[str], trace: str | None = None, finished: str | None = None) -> str:
     """Insert a new job in the caller's transaction.
 
     Args:
@@ -59,15 +59,17 @@ def insert(connection: sa.Connection, *, project: str, key: str | None, request:
         chunk_frames: frames of one step.
         inputs: identifiers of the captures, environments and jobs that it reads.
         trace: traceparent of the HTTP request, so that the spans of the job's steps belong to its trace.
+        finished: identifier of a job whose results exist already: it is inserted as one that has succeeded; None: it is queued.
 
     Returns:
         The identifier of the job.
     """
-    identifier, now = new_id(JOB), time.time()
+    identifier, now = finished or new_id(JOB), time.time()
+    ended = {} if finished is None else {"started_at": now, "finished_at": now}
     connection.execute(jobs.insert().values(
         id=identifier, project=project, key=key, request=request.model_dump(mode="json", by_alias=True), trace=trace,
-        chunk_frames=chunk_frames, priority=request.priority, state=QUEUED, attempt=1, revision=1, created_at=now, updated_at=now, lost=0,
-        reached=0, finished_steps=[]))
+        chunk_frames=chunk_frames, priority=request.priority, state=QUEUED if finished is None else SUCCEEDED, attempt=1, revision=1,
+        created_at=now, updated_at=now, lost=0, reached=0, finished_steps=[], **ended))
     if rows := [{"job": identifier, "input": name} for name in dict.fromkeys(inputs)]:
         connection.execute(job_inputs.insert(), rows)
     return identifier

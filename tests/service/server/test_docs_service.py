@@ -20,6 +20,7 @@ from service.server.database.engine import connect
 from service.server.jobs.queue import JobQueue, prepare
 from service.server.sample import show_sample
 from service.server.settings import Settings
+from service.server.storage.open import open_storage
 
 HOME = Path(__file__).parents[3]
 TEXT = (HOME / "docs" / "service.md").read_text(encoding="utf-8")
@@ -67,7 +68,7 @@ def test_the_service_of_the_demo_says_what_to_try_and_that_works(tmp_path):
         process = subprocess.Popen([sys.executable, "-c", code, str(tmp_path / "data")], cwd=HOME, text=True, stdout=subprocess.PIPE,
                                    stderr=log, env=os.environ | {"RELIT_PORT": "0", "RELIT_DRAIN_S": "1", "RELIT_MIN_FREE_BYTES": "0"})
     try:
-        said = [process.stdout.readline() for _ in range(6)]
+        said = [process.stdout.readline() for _ in range(7)]
         urls = [re.search(r"http://\S+", line)[0] for line in (said[0], said[2], said[3])]
         body = json.loads(re.search(r"-d '(.*)'", said[4])[1])
         with httpx2.Client(timeout=60) as client:
@@ -87,7 +88,7 @@ def test_the_sample_is_registered_once(tmp_path, capsys):
     database = connect(settings.sqlalchemy_url)
     prepare(settings, database)
     for _ in range(2):
-        show_sample("http://x", database, JobQueue(database), sample_folder())
+        show_sample("http://x", database, JobQueue(database), open_storage(settings), sample_folder(), None)
     first, second = capsys.readouterr().out.split("capture ")[1:]
     assert first == second
     database.close()

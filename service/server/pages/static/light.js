@@ -24,6 +24,7 @@ function request() {
   const spin = Number(batch.spin.value);
   if (!Number.isInteger(frames) || frames < 1) throw new Error(`Frames: is ${batch.last.value}: give a whole number from 1`);
   if (!Number.isFinite(spin)) throw new Error(`Spin: is ${batch.spin.value}: give a number of degrees`);
+  if (light === null) throw new Error("There is no picture to render here: submit a job with light keys on the page of the capture");
   if (light.light === null && light.environment === null) throw new Error("Nothing lights the object: switch the light on, or choose an environment");
   if (light.environment !== null && light.environment.id === null) {
     throw new Error(`${light.environment.name} is a file of this machine: upload it on the page of captures, and choose it above`);

@@ -4,12 +4,12 @@ Chromium is Debian's. Without it these tests are skipped, unless RELIT_TEST_PAGE
 """
 
 import os
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from benchmarks.clients import installed
 from tests.service.server_process import Server, serving
 
 SAMPLES = Path(__file__).resolve().parents[4] / "samples"
@@ -17,6 +17,10 @@ REQUIRED = os.environ.get("RELIT_TEST_PAGES") == "required"
 ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking", "--disable-sync",
              "--disable-component-update", "--no-first-run", "--disable-quic"]
 """WebGL is rendered by the processor; without the others, Chromium asks servers of its maker."""
+CONTENT_MS = 60_000
+"""Time for the content of a page on a loaded machine."""
+MAX_SIGMA = 0.3
+"""Largest standard error in degrees of a normal that counts as solved here, so that the capture has unsure pixels too."""
 
 
 @pytest.fixture(scope="session")
@@ -28,9 +32,10 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 
 @pytest.fixture(scope="session")
 def browser():
-    path = shutil.which("chromium")
-    if path is None:
-        (pytest.fail if REQUIRED else pytest.skip)("chromium is not installed: apt-get install chromium")
+    try:
+        path = installed.browser()
+    except installed.MissingClientError as error:
+        (pytest.fail if REQUIRED else pytest.skip)(str(error))
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
@@ -49,3 +54,41 @@ def page(browser, server: Server):
     yield opened
     context.close()
     assert errors == []
+
+
+class Solved:
+    """A capture that is registered, solved and prepared, and its pages."""
+
+    def __init__(self, server: Server, capture: str, solve: str) -> None:
+        self.server, self.capture, self.solve = server, capture, solve
+        self.pages = {"capture": f"/captures/{capture}", "job": f"/jobs/{solve}", "light": f"/light/{capture}", "maps": f"/maps/{solve}"}
+
+    def wait_for_content(self, page, name: str) -> None:
+        """Wait until a page shows what it is for."""
+        content = {"captures": "#captures a", "jobs": "#jobs tbody tr", "capture": "#frames canvas", "job": "#stages tbody tr",
+                   "light": "canvas.picture[data-ready]", "maps": "canvas.map"}[name]
+        page.locator(content).first.wait_for(timeout=CONTENT_MS)
+
+    def result(self, job: str, name: str, folder: Path) -> Path:
+        """Download a result."""
+        with self.server.client() as client:
+            path = folder / name
+            path.write_bytes(client.get(f"/v1/jobs/{job}/results/{name}").raise_for_status().content)
+        return path
+
+
+@pytest.fixture(scope="session")
+def solved(server: Server) -> Solved:
+    with server.client() as client:
+        def done(request: dict) -> str:
+            job = client.post("/v1/jobs", json=request).raise_for_status().json()["id"]
+            found = server.wait(client, f"/v1/jobs/{job}", ("succeeded", "failed"))
+            assert found["state"] == "succeeded", found["error"]
+            return job
+
+        made = client.post("/v1/captures", json={"name": "lambert", "folder": str(SAMPLES / "lambert")}).raise_for_status().json()
+        server.wait(client, f"/v1/captures/{made['id']}", ("ready",))
+        solve = done({"kind": "solve", "capture": made["id"], "options": {"method": "lambert", "max_sigma": MAX_SIGMA}})
+        done({"kind": "view", "capture": made["id"]})
+        done({"kind": "view", "capture": made["id"], "maps": solve})
+        return Solved(server, made["id"], solve)

@@ -89,11 +89,16 @@ export class LightModel {
   addEnvironment(energy, profile, turnDegrees, gain) {
     const shift = (((-turnDegrees / 360) % 1) + 1) % 1;
     const { cols } = profile;
-    for (let row = 0; row < this.rows; row += 1) {
-      for (let col = 0; col < cols; col += 1) {
-        const cell = row * this.cols + (Math.floor(((col + 0.5) / cols + shift) * this.cols) % this.cols);
-        const at = 3 * (row * cols + col);
-        for (let channel = 0; channel < 3; channel += 1) energy[3 * cell + channel] += gain * profile.energy[at + channel];
+    for (let col = 0; col < cols; col += 1) {
+      const place = ((col + 0.5) / cols + shift) * this.cols - 0.5;
+      const left = Math.floor(place);
+      for (const [cell, part] of [[left, 1 - (place - left)], [left + 1, place - left]]) {
+        const column = ((cell % this.cols) + this.cols) % this.cols;
+        for (let row = 0; row < this.rows; row += 1) {
+          const from = 3 * (row * cols + col);
+          const to = 3 * (row * this.cols + column);
+          for (let channel = 0; channel < 3; channel += 1) energy[to + channel] += gain * part * profile.energy[from + channel];
+        }
       }
     }
   }
@@ -117,11 +122,11 @@ export class EnvironmentProfile {
     for (let row = 0; row < map.rows; row += 1) {
       const polar = (Math.PI * (row + 0.5)) / map.rows;
       const solidAngle = Math.sin(polar) * (Math.PI / map.rows) * ((2 * Math.PI) / map.cols);
-      const first = (row * rows) / map.rows; // a row of a coarse map covers several rows of the grid
-      const last = ((row + 1) * rows) / map.rows;
-      for (let to = Math.floor(first); to < Math.ceil(last); to += 1) {
-        const part = ((Math.min(last, to + 1) - Math.max(first, to)) / (last - first)) * solidAngle;
-        for (let at = 0; at < 3 * map.cols; at += 1) this.energy[3 * to * map.cols + at] += part * map.pixels[3 * row * map.cols + at];
+      const place = ((row + 0.5) / map.rows) * rows - 0.5; // shared by the two nearest rows of the grid
+      const top = Math.floor(place);
+      for (const [to, part] of [[top, 1 - (place - top)], [top + 1, place - top]]) {
+        const into = 3 * Math.max(0, Math.min(rows - 1, to)) * map.cols;
+        for (let at = 0; at < 3 * map.cols; at += 1) this.energy[into + at] += part * solidAngle * map.pixels[3 * row * map.cols + at];
       }
     }
   }

@@ -38,12 +38,12 @@ export async function mount(parent, view, { environments, load, onchange }) {
   const control = {
     lit: element("input", { type: "checkbox", checked: true }),
     brightness: range("Brightness of the light", -6, 6, 0.1, 0), colour: element("input", { type: "color", value: "#ffffff" }),
-    size: range("Size of the light in degrees", 0, 90, 0.5, 0.5), environment: element("select", {}, element("option", { value: "" }, "none"),
+    size: range("Size of the light in degrees", 0, 90, 0.5, 0.5), environment: element("select", { "aria-label": "Environment map" }, element("option", { value: "" }, "none"),
       ...environments.map(({ id, name }) => element("option", { value: id }, name))),
     file: element("input", { type: "file", accept: ".exr,.hdr", class: "visually-hidden" }),
     environmentStops: range("Brightness of the environment", -10, 10, 0.1, 0), turn: range("Turn of the environment in degrees", 0, 360, 1, 0),
     exposure: range("Exposure in stops", -10, 10, 0.1, 0),
-    compare: element("select", {}, element("option", { value: "" }, "nothing"),
+    compare: element("select", { "aria-label": "Photograph to compare with" }, element("option", { value: "" }, "nothing"),
       ...lights.map((frame, index) => element("option", { value: index }, frame.image))),
     wipe: range("Where the two pictures meet", 0, 100, 1, 50),
   };
@@ -202,6 +202,7 @@ export async function mount(parent, view, { environments, load, onchange }) {
   }));
   expose();
   change();
+  canvas.dataset.ready = "";
   return {
     destroy: () => spinning !== null && cancelAnimationFrame(spinning),
     state,

@@ -1,0 +1,158 @@
+"""Live relighting shows what `relit relight` makes, and sends exactly that to the batch."""
+
+import numpy as np
+import pytest
+
+from stage import exr
+from tests.service.server.pages.conftest import SAMPLES
+
+CAPTURED = 7
+"""A light of the sample, from whose direction its photograph is compared."""
+STEPS = 2 / 255
+"""Largest mean difference of the picture in the browser from the frame: that of the issue."""
+
+
+@pytest.fixture
+def opened(page, solved):
+    page.goto(solved.pages["light"])
+    solved.wait_for_content(page, "light")
+    return page
+
+
+def picture(page) -> np.ndarray:
+    """What is shown, [rows, cols, 3], 0 to 1."""
+    found = page.evaluate("() => Array.from(relit.pixels())")
+    return (np.array(found, dtype=np.uint8).reshape(128, 128, 4)[..., :3] / 255).astype(np.float64)
+
+
+def encoded(linear: np.ndarray) -> np.ndarray:
+    clipped = np.clip(linear, 0, 1)
+    return np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
+
+
+def rendered(page, solved, folder) -> tuple[np.ndarray, np.ndarray]:
+    """The first frame of the batch that the page submits, encoded as the page does, and its coverage."""
+    page.get_by_label("Frames", exact=True).last.fill("1")
+    page.get_by_role("button", name="Render").click()
+    page.wait_for_url("**/jobs/job_*")
+    page.locator(".state.succeeded").wait_for(timeout=120_000)
+    job = page.url.rpartition("/")[2]
+    channels, _ = exr.read(solved.result(job, "frame.0001.exr", folder))
+    return encoded(np.stack([channels[c] for c in "RGB"], axis=-1)), channels["A"]
+
+
+def assert_same(shown: np.ndarray, frame: np.ndarray, coverage: np.ndarray) -> None:
+    inside = coverage == 1
+    assert inside.sum() > 1000 and frame[inside].mean() > 0.1
+    assert np.abs(shown[inside] - frame[inside]).mean() <= STEPS
+
+
+def test_the_key_light_shows_what_the_batch_renders(opened, solved, tmp_path):
+    opened.get_by_label("Size of the light in degrees").fill("10")
+    shown = picture(opened)
+    assert_same(shown, *rendered(opened, solved, tmp_path))
+
+
+def test_dragging_on_the_picture_moves_the_light(opened):
+    box = opened.locator("canvas.picture").bounding_box()
+    opened.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    opened.mouse.down()
+    assert np.allclose(opened.evaluate("() => relit.state().light.direction"), [0, 0, 1], atol=0.02)
+    side = min(box["width"], box["height"])
+    opened.mouse.move(box["x"] + box["width"] / 2 - 0.3 * side, box["y"] + box["height"] / 2 - 0.2 * side)
+    opened.mouse.up()
+    assert np.allclose(opened.evaluate("() => relit.state().light.direction"), [-0.6, 0.4, np.sqrt(1 - 0.52)], atol=0.03)
+
+
+def test_arrow_keys_move_the_light(opened):
+    before = opened.evaluate("() => relit.state().light.direction")
+    opened.locator("canvas.dome").focus()
+    opened.keyboard.press("ArrowRight")
+    after = opened.evaluate("() => relit.state().light.direction")
+    assert np.degrees(np.arccos(np.dot(before, after))) == pytest.approx(5, abs=1.5) and after[0] > before[0]
+
+
+def test_a_photograph_is_compared(opened, solved, tmp_path):
+    """At the left end of the wipe, all of the picture is the photograph, as its coefficient images keep it."""
+    opened.get_by_label("Photograph to compare with").select_option(str(CAPTURED))
+    opened.get_by_label("Where the two pictures meet").fill("0")
+    shown = picture(opened)
+    exposure = opened.evaluate("() => relit.state().exposure")
+    with solved.server.client() as client:
+        jobs = client.get("/v1/jobs").json()["jobs"]
+        view = next(job for job in jobs if job["request"]["kind"] == "view" and job["request"]["maps"] is None)
+        frames = client.get(f"/v1/jobs/{view['id']}/results/view.json").json()["frames"]
+        image = [frame["image"] for frame in frames if frame["direction"] is not None][CAPTURED]
+        keys = {"schema": "relit.keys/1", "captured": [{"image": image, "keys": [{"frame": 1, "weight": 1}]}]}
+        job = client.post("/v1/jobs", json={"kind": "relight", "capture": solved.capture, "keys": keys,
+                                            "options": {"exposure": exposure}}).raise_for_status().json()["id"]
+        assert solved.server.wait(client, f"/v1/jobs/{job}", ("succeeded", "failed"))["state"] == "succeeded"
+    channels, _ = exr.read(solved.result(job, "frame.0001.exr", tmp_path))
+    assert_same(shown, encoded(np.stack([channels[c] for c in "RGB"], axis=-1)), channels["A"])
+
+
+def test_light_from_beyond_the_captured_is_said(opened):
+    """The lights of the sample are in front; light from behind is none of theirs."""
+    opened.evaluate("() => relit.set([0, 0, -1])")
+    opened.get_by_text("100 % of the light comes from beyond the captured lights").wait_for()
+    assert opened.locator("canvas.picture.hatched").is_visible()
+    assert "beyond the captured lights" in opened.locator("output", has_text="from the camera").inner_text()
+    opened.evaluate("() => relit.set([0, 0, 1])")
+    opened.locator("canvas.picture:not(.hatched)").wait_for()
+
+
+def test_without_webgl_it_is_said(browser, solved):
+    context = browser.new_context(base_url=solved.server.url)
+    context.add_init_script("HTMLCanvasElement.prototype.getContext = new Proxy(HTMLCanvasElement.prototype.getContext, "
+                            "{ apply: (target, self, given) => given[0] === 'webgl2' ? null : Reflect.apply(target, self, given) });")
+    page = context.new_page()
+    page.goto(solved.pages["light"])
+    page.get_by_text("This browser has no WebGL2").wait_for(timeout=60_000)
+    assert page.get_by_role("button", name="Render").is_visible()
+    context.close()
+
+
+@pytest.fixture(scope="module")
+def sky(server) -> str:
+    with server.client() as client:
+        file = str(SAMPLES / "owl" / "environment.exr")
+        made = client.post("/v1/environments", json={"name": "sky", "file": file}).raise_for_status().json()
+        return server.wait(client, f"/v1/environments/{made['id']}", ("ready", "refused"))["id"]
+
+
+@pytest.mark.parametrize("turn", ["0"])
+def test_an_environment_shows_what_the_batch_renders(page, solved, sky, tmp_path, turn):
+    page.goto(solved.pages["light"])
+    solved.wait_for_content(page, "light")
+    page.get_by_label("On", exact=True).uncheck()
+    page.get_by_label("Environment map").select_option(sky)
+    page.locator("canvas.preview").wait_for(timeout=60_000)
+    page.get_by_label("Turn of the environment in degrees").fill(turn)
+    page.get_by_role("button", name="Expose for this light").click()
+    shown = picture(page)
+    assert_same(shown, *rendered(page, solved, tmp_path))
+
+
+def test_a_local_environment_is_shown_and_not_sent(opened):
+    opened.set_input_files("input[accept='.exr,.hdr']", SAMPLES / "owl" / "environment.exr")
+    opened.locator("canvas.preview").wait_for(timeout=60_000)
+    opened.get_by_role("button", name="Render").click()
+    opened.get_by_text("environment.exr is a file of this machine: upload it").first.wait_for()
+    assert "/light/" in opened.url
+
+
+def test_a_file_that_is_no_environment_is_named(opened, tmp_path):
+    broken = tmp_path / "broken.exr"
+    broken.write_bytes(b"nothing")
+    opened.set_input_files("input[accept='.exr,.hdr']", broken)
+    opened.get_by_role("alert").get_by_text("broken.exr: cannot be read as an environment map").wait_for(timeout=60_000)
+
+
+def test_an_environment_spins(opened):
+    opened.set_input_files("input[accept='.exr,.hdr']", SAMPLES / "owl" / "environment.exr")
+    opened.locator("canvas.preview").wait_for(timeout=60_000)
+    before = picture(opened)
+    opened.get_by_role("button", name="Spin").click()
+    opened.wait_for_function("() => relit.state().environment.turn_degrees > 20")
+    opened.get_by_role("button", name="Spin").click()
+    assert np.abs(picture(opened) - before).mean() > 1 / 255

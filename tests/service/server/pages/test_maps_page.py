@@ -1,0 +1,105 @@
+"""The page of maps shows the values of the file, marks what is unsure, and plots the readings of a pixel."""
+
+import re
+
+import numpy as np
+import pytest
+
+from stage.maps import SurfaceMaps
+
+
+@pytest.fixture(scope="module")
+def maps(solved, tmp_path_factory) -> SurfaceMaps:
+    return SurfaceMaps.read(solved.result(solved.solve, "maps.exr", tmp_path_factory.mktemp("maps")))
+
+
+@pytest.fixture
+def opened(page, solved):
+    page.goto(solved.pages["maps"])
+    solved.wait_for_content(page, "maps")
+    return page
+
+
+def point_at(page, row: int, col: int, side: int) -> str:
+    """Point at a pixel of the map, which is shown as a whole; return what the page says of it."""
+    box = page.locator("canvas.map").bounding_box()
+    scale = min(box["width"], box["height"]) / side
+    x = box["x"] + box["width"] / 2 + (col + 0.5 - side / 2) * scale
+    y = box["y"] + box["height"] / 2 + (row + 0.5 - side / 2) * scale
+    page.mouse.move(x, y)
+    said = page.locator("output.value")
+    said.get_by_text(f"row {row}, column {col}:").wait_for()
+    return said.inner_text()
+
+
+def numbers(said: str, title: str) -> list[float]:
+    return [float(each) for each in re.search(rf"{title} ([^;a-z]+)", said)[1].replace("−", "-").split(",")]
+
+
+@pytest.mark.parametrize(("layer", "title"), [("normal", "Normals"), ("diffuse_albedo", "Diffuse albedo"), ("height", "Height")])
+def test_the_value_under_the_cursor_is_that_of_the_file(opened, maps, layer, title):
+    """Four significant digits are shown."""
+    opened.get_by_label("Layer", exact=True).first.select_option(layer)
+    rows, cols = np.nonzero(maps.mask)
+    for at in (0, len(rows) // 3, len(rows) // 2, len(rows) - 1):
+        said = point_at(opened, int(rows[at]), int(cols[at]), len(maps.mask))
+        expected = np.atleast_1d(getattr(maps, layer)[rows[at], cols[at]])
+        assert np.allclose(numbers(said, title), expected, rtol=5e-4, atol=1e-6)
+        assert "status: " in said
+
+
+def test_an_unsure_pixel_is_hatched_and_said(opened, maps):
+    unsure = (maps.status == 15) & (maps.mask == 0)
+    assert unsure.any(), "the capture was solved so that some pixels are unsure"
+    row, col = (int(each[len(each) // 2]) for each in np.nonzero(unsure))
+    assert "unsure" in point_at(opened, row, col, len(maps.mask))
+
+    def picture() -> bytes:
+        opened.wait_for_timeout(300)  # a frame, and the tiles
+        return opened.locator("canvas.map").screenshot()
+
+    with_hatching = picture()
+    opened.get_by_label("Hatch unsure pixels").uncheck()
+    without = picture()
+    assert with_hatching != without
+    opened.get_by_label("Hatch unsure pixels").check()
+    assert picture() == with_hatching
+
+
+def test_the_map_is_moved_by_keys(opened, maps):
+    canvas = opened.locator("canvas.map")
+    canvas.focus()
+    for _ in range(8):
+        opened.keyboard.press("+")
+    opened.keyboard.press("ArrowRight")
+    middle = opened.locator("output.value")
+    middle.get_by_text("row ").wait_for()
+    first = middle.inner_text()
+    opened.keyboard.press("ArrowDown")
+    opened.wait_for_function("first => document.querySelector('output.value').textContent !== first", arg=first)
+    row, col = (int(each) for each in re.findall(r"row (\d+), column (\d+)", middle.inner_text())[0])
+    assert row > len(maps.mask) // 2 and col > len(maps.mask) // 2
+    opened.keyboard.press("0")
+    assert "row" in point_at(opened, 64, 64, len(maps.mask))
+
+
+def test_two_layers_are_wiped(opened):
+    opened.get_by_label("Compare with", exact=True).first.select_option("height")
+    wipe = opened.get_by_label("Where the two layers meet")
+    pictures = set()
+    for value in ("0", "50", "100"):
+        wipe.fill(value)
+        opened.wait_for_timeout(300)
+        pictures.add(opened.locator("canvas.map").screenshot())
+    assert len(pictures) == 3
+    said = point_at(opened, 64, 64, 128)
+    assert "Normals" in said and "Height" in said
+
+
+def test_the_range_of_the_histogram_changes_the_picture(opened):
+    opened.get_by_label("Layer", exact=True).first.select_option("height")
+    opened.wait_for_timeout(500)
+    before = opened.locator("canvas.map").screenshot()
+    opened.get_by_label("Lowest value that is shown").fill("600")
+    opened.wait_for_timeout(500)
+    assert opened.locator("canvas.map").screenshot() != before
