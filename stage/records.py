@@ -12,6 +12,8 @@ from stage.errors import ManifestError
 Record = TypeVar("Record", bound=BaseModel)
 MAX_KEYS = 1000
 """The most keys of a JSON object: no schema has as many, and an error is collected for each unknown key."""
+MOST_SHOWN = 60
+"""The most characters of a value or a key that a sentence repeats."""
 
 
 def read_record(path: str | Path, model: type[Record], schema: str) -> Record:
@@ -42,7 +44,7 @@ def read_record(path: str | Path, model: type[Record], schema: str) -> Record:
     if "schema" not in data:
         raise ManifestError(f"{path}: schema: is missing: this program reads {schema}")
     if data["schema"] != schema:
-        raise ManifestError(f"{path}: schema: is {json.dumps(data['schema'])}, this program reads {schema}")
+        raise ManifestError(f"{path}: schema: is {_short(data['schema'])}, this program reads {schema}")
     try:
         return model.model_validate(data)
     except ValidationError as error:
@@ -63,7 +65,7 @@ def describe(error: ValidationError) -> str:
         case "value_error":
             text = str(fault["ctx"]["error"])
         case "union_tag_invalid":
-            text = f"{fault['ctx']['discriminator'].strip(chr(39))} is {json.dumps(fault['ctx']['tag'])}, " \
+            text = f"{fault['ctx']['discriminator'].strip(chr(39))} is {_short(fault['ctx']['tag'])}, " \
                    f"must be one of {fault['ctx']['expected_tags']}"
         case "too_short":
             text = f"has {fault['ctx']['actual_length']} entries, needs {fault['ctx']['min_length']} or more"
@@ -89,14 +91,14 @@ def _field(location: tuple[int | str, ...]) -> str:
         if isinstance(part, int):
             text += f"[{part}]"
         elif previous not in ("light", "pattern", "laser", "tof"):
-            text += f".{part}" if text else part
+            text += ("." if text else "") + (part if len(part) <= MOST_SHOWN else f"{part[:MOST_SHOWN]}...")
         previous = part
     return text
 
 
 def _short(value: Any) -> str:
     text = json.dumps(value, default=str)
-    return text if len(text) <= 60 else text[:57] + "..."
+    return text if len(text) <= MOST_SHOWN else text[: MOST_SHOWN - 3] + "..."
 
 
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -105,7 +107,7 @@ def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     result: dict[str, Any] = {}
     for key, value in pairs:
         if key in result:
-            raise ValueError(f"key {key} is given twice in one object")
+            raise ValueError(f"key {_short(key)[1:-1]} is given twice in one object")
         result[key] = value
     return result
 

@@ -136,7 +136,11 @@ class _Lines:
 
 
 def _write(line: dict[str, Any]) -> None:
-    os.write(sys.stdout.fileno(), json.dumps(line).encode() + b"\n")
+    os.write(_answers, json.dumps(line).encode() + b"\n")
+
+
+_answers = 1
+"""Descriptor of the pipe to the service."""
 
 
 def _limit() -> None:
@@ -154,6 +158,9 @@ def _end_with_parent() -> None:
 
 def main() -> None:
     """Do the check that the first line of the standard input names."""
+    global _answers
+    _answers = os.dup(sys.stdout.fileno())
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # libraries print there what they find wrong
     _limit()
     asked = json.loads(sys.stdin.buffer.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()

@@ -76,7 +76,7 @@ def _matrix(value: Any) -> np.ndarray | None:
         if isinstance(value, dict):
             return np.array(value["data"], dtype=np.float64).reshape(int(value["rows"]), int(value["cols"]))
         return np.atleast_1d(np.array(value, dtype=np.float64))
-    except (KeyError, ValueError, TypeError):
+    except (KeyError, ValueError, TypeError, OverflowError):
         return None
 
 

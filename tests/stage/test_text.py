@@ -12,6 +12,7 @@ import service.requests
 import stage
 from service.requests.base import Options, Role
 from service.requests.jobs import UserJob
+from stage.calibration.opencv_file import read_matrices
 from stage.errors import ManifestError
 from stage.importers import lp
 from stage.manifest import read_manifest
@@ -96,3 +97,18 @@ def test_every_text_of_a_manifest_or_a_request_is_checked():
     unchecked = {f"{model.__name__}.{name}" for model in known for name, field in model.model_fields.items()
                  if Role.OUTPUT not in field.metadata and bare_text(field.annotation, tuple(field.metadata))}
     assert unchecked == set()
+
+
+@pytest.mark.parametrize("content", [
+    '{"schema": "LONG"}', '{"schema": ["LONG"]}', '{"schema": "relit.capture/1", "LONG": 1}', '{"LONG": 1, "LONG": 2}',
+    '{"schema": "relit.capture/1", "name": "a", "frames": [{"image": "a", "light": {"type": "LONG"}}]}'])
+def test_a_sentence_does_not_repeat_a_long_value(tmp_path, content):
+    (tmp_path / "capture.json").write_text(content.replace("LONG", "x" * 100_000))
+    with pytest.raises(ManifestError) as error:
+        read_manifest(tmp_path / "capture.json")
+    assert len(str(error.value).removeprefix(str(tmp_path))) < 400
+
+
+def test_a_number_that_no_float_holds_is_no_matrix(tmp_path):
+    (tmp_path / "camera.json").write_text(f'{{"a": {10**400}, "b": [1, 2]}}')
+    assert set(read_matrices(tmp_path / "camera.json")) == {"b"}

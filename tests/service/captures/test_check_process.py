@@ -126,6 +126,22 @@ def test_a_process_that_takes_too_long_or_is_not_wanted_is_ended(monkeypatch, tm
         os.kill(int((tmp_path / "pid").read_text()), 0)
 
 
+def test_what_a_library_prints_is_no_answer(tmp_path):
+    """The decoders of damaged files print on the standard output."""
+    write_capture(tmp_path / "cap", make_scene(size=8, lights=5))
+    noise = f"import os, sys; sys.path[:0] = {sys.path!r}\nfrom stage import images\nbefore = images.read_header"
+    code = f"""{noise}
+def noisy(path):
+    os.write(1, b"libtiff: {{}}\\n")
+    return before(path)
+images.read_header = noisy
+from service.captures import check_process
+check_process.main()"""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(check_process, "COMMAND", (sys.executable, "-c", code))
+        assert check(tmp_path / "cap")["frames"] == 5
+
+
 def test_an_error_of_relit_itself_is_told_with_its_place(monkeypatch):
     running(monkeypatch, "print(json.dumps({'fault': 'Traceback: line 7'}))")
     with pytest.raises(RuntimeError, match="line 7"):
