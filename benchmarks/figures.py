@@ -7,6 +7,7 @@ import argparse
 import os
 import platform
 import re
+import subprocess
 import sys
 import tempfile
 import time
@@ -18,7 +19,7 @@ import numpy as np
 
 from benchmarks.ablation import ablation_table
 from benchmarks.accuracy import SolveError, compare, diligent_errors, read_truth, sample_errors
-from benchmarks.large import large_rows, measure
+from benchmarks.large import large_table
 from benchmarks.left_out import left_out_table
 from benchmarks.materials import material_table
 from benchmarks.relighting import relighting_table
@@ -147,19 +148,30 @@ def demo(_: argparse.Namespace) -> list[str]:
     """Measure the seconds of `relit demo`, with and without compiled kernels."""
     with tempfile.TemporaryDirectory() as folder:
         os.environ["WARP_CACHE_PATH"] = str(Path(folder) / "kernels")
-        cold, _ = measure("demo", "--out", str(Path(folder) / "cold"))
-        warm, peak = measure("demo", "--out", str(Path(folder) / "warm"))
+        cold, _ = _measure("demo", "--out", str(Path(folder) / "cold"))
+        warm, peak = _measure("demo", "--out", str(Path(folder) / "warm"))
         del os.environ["WARP_CACHE_PATH"]
     return [f"`relit demo` takes {cold:.0f} s the first time, when its kernels are compiled, and {warm:.0f} s afterwards; "
             f"peak memory {peak:.2f} GiB."]
 
 
+def _measure(*arguments: str) -> tuple[float, float]:
+    """Run relit in a child process.
+
+    Returns:
+        Seconds, and peak resident memory in GiB.
+    """
+    before = time.perf_counter()
+    code = "import resource, sys; from service.cli.main import main\n" \
+           "try:\n    main()\nfinally:\n    print('peak', resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
+    result = subprocess.run([sys.executable, "-c", code, *arguments], check=True, capture_output=True, text=True)
+    peak = int(result.stdout.split("peak")[-1])
+    return time.perf_counter() - before, peak / 2**20
+
+
 def memory(given: argparse.Namespace) -> list[str] | None:
-    """Measure the peak memory of a large capture."""
-    if given.large is None:
-        return None
-    return ["A synthetic capture of 4096 × 4096 pixels and 64 lights (6.4 GB as a stack), whole image unmasked:", "",
-            "| | seconds | peak resident memory, GiB |", "|---|---|---|", *large_rows(given.large)]
+    """Measure the stages and the peak memory of a large capture."""
+    return None if given.large is None else large_table(given.large)
 
 
 SECTIONS: dict[str, tuple[str, Section]] = {
@@ -196,7 +208,7 @@ def main() -> None:
     parser.add_argument("--relighting", type=Path, help="folder with glossy and owl of samples/make_relight_checks.py, and "
                                                            "two_parts and figure of samples/make_parts.py")
     parser.add_argument("--rig", type=Path, help="folder with the sets of samples/make_rig.py")
-    parser.add_argument("--large", type=Path, help="folder where some 12 GiB may be written and are removed again")
+    parser.add_argument("--large", type=Path, help="folder where about 60 GB may be written and are removed again")
     parser.add_argument("--only", nargs="+", choices=SECTIONS, help="sections to measure (default: all)")
     given = parser.parse_args()
     before = TARGET.read_text(encoding="utf-8") if TARGET.exists() else ""

@@ -5,8 +5,8 @@
     python -m benchmarks.gpu --no-tests     # without the kernel tests before it
     python -m benchmarks.gpu --write        # put the table into docs/figures.md
 
-Where torch is installed, its products of the same stack are timed in the same run. Bytes are those that the work must read or write once;
-`of copy` is their rate over that of a copy on the device.
+Where torch or the extra `gpu` (cuBLAS) is installed, its products of the same stack are timed in the same run. Bytes are those that the
+work must read or write once; `of copy` is their rate over that of a copy on the device.
 """
 
 import argparse
@@ -32,6 +32,7 @@ from kernels.photometric.readings import grey_factors, grey_readings, pad_lights
 from kernels.photometric.robust import solve_robust
 from kernels.photometric.samples import gather
 from kernels.photometric.svbrdf import solve_svbrdf
+from kernels.relight import cublas
 from kernels.relight.many_frames import combine_batch
 from kernels.relight.one_frame import combine
 from kernels.structured.frames import NoiseModel, upload
@@ -76,9 +77,10 @@ class Table:
         self.lines.append(f"| {name} | {first:.2f} | {speed} |")
         print(self.lines[-1], flush=True)
 
-    def absent(self, name: str) -> None:
-        """Add the row of a peer that is not installed."""
-        self.lines.append(f"| {name} | not installed | – | – | – | – |")
+    def absent(self, name: str, why: str = "not installed") -> None:
+        """Add the row of what cannot be measured here."""
+        self.lines.append(f"| {name} | {why} | – | – | – | – |")
+        print(self.lines[-1], flush=True)
 
 
 def scene(rng: np.random.Generator, pixels: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -106,7 +108,13 @@ def measure(device: str) -> list[str]:
     table.row("copy of the stack", lambda: wp.copy(target, band.values), pixels, 2 * stack)
     weights = rng.random((FRAMES, 3, LIGHTS), dtype=np.float32)
     table.row("relight, 1 frame", lambda: combine(band, weights[0]), pixels, stack + frame)
-    table.row(f"relight, {FRAMES} frames", lambda: combine_batch(band, weights), FRAMES * pixels, stack + FRAMES * frame)
+    many = FRAMES * pixels, stack + FRAMES * frame
+    table.row(f"relight, {FRAMES} frames", lambda: combine_batch(band, weights, with_cublas=False), *many)
+    name = f"relight, {FRAMES} frames, cuBLAS (extra `gpu`)"
+    if cublas.product_of(device) is None:
+        table.absent(name, "not on the CPU" if device == "cpu" else cublas.describe(device).partition(":")[0])
+    else:
+        table.row(name, lambda: combine_batch(band, weights), *many)
     _torch_rows(table, images, weights, pixels, stack, frame)
     table.row("`lambert`", lambda: solve_lambert(band, grey_readings(band, factors), lights.direction), pixels, stack)
     table.row("`robust`", lambda: solve_robust(band, grey_readings(band, factors), lights.direction), pixels, stack)

@@ -1,84 +1,189 @@
-"""Peak memory on a synthetic capture of 4096 x 4096 pixels and 64 lights: it must not grow with the capture."""
+"""A large capture end to end: seconds and peak memory of every stage of a solve, an export and relit frames.
+
+    python -m benchmarks.large FOLDER                    # 50 megapixels, 64 lights, 100 frames: about 60 GB in the folder, removed again
+    python -m benchmarks.large FOLDER --megapixels 4     # less of everything
+
+The capture is synthetic: a bumpy Lambertian surface that fills the frame, as half EXR files. Each command has a process of its own, whose
+peak memory is set back at the beginning of every stage (Linux: /proc/self/clear_refs), so that each stage shows its own peak.
+"""
 
 import argparse
+import json
+import math
+import os
+import re
 import resource
 import shutil
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from stage import exr
 from stage.manifest import SCHEMA, Manifest, write_manifest
 
+MEGAPIXELS, LIGHTS, FRAMES = 50.0, 64, 100
+ASPECT = 1.5
+"""Width over height, as of full-frame cameras."""
+ROWS = 256
+"""Rows of the synthetic images that are computed at one time."""
+COMMANDS = ("solve", "export", "relight")
 
-def make_capture(folder: Path, side: int, lights: int) -> None:
-    """Write a bumpy Lambertian capture, half EXR, without a mask."""
+
+class Stage(NamedTuple):
+    """What a stage of a command took."""
+
+    command: str
+    name: str
+    seconds: float
+    peak_gib: float
+
+
+class StagePeaks:
+    """A Progress that measures the seconds and the peak resident memory of each stage."""
+
+    def __init__(self, command: str) -> None:
+        self._command = command
+        self.stages: list[Stage] = []
+        self._begin("start")
+
+    def stage(self, name: str, total: int) -> None:
+        """End a stage and begin the next."""
+        self.close()
+        self._begin(name)
+
+    def advance(self, done: int) -> None:
+        """Take no note."""
+
+    def close(self) -> None:
+        """End the last stage; a stage that recurs is one."""
+        now = Stage(self._command, self._name, time.perf_counter() - self._began, peak_gib())
+        for place, before in enumerate(self.stages):
+            if before.name == now.name:
+                self.stages[place] = now._replace(seconds=before.seconds + now.seconds, peak_gib=max(before.peak_gib, now.peak_gib))
+                return
+        self.stages.append(now)
+
+    def _begin(self, name: str) -> None:
+        self._name, self._began = name, time.perf_counter()
+        with suppress(OSError):  # without it the peaks are those of the command so far
+            Path("/proc/self/clear_refs").write_text("5")  # the peak is that of the present from here
+
+
+def peak_gib() -> float:
+    """Return the peak resident memory since it was set back."""
+    try:
+        status = Path("/proc/self/status").read_text(encoding="ascii")
+        return int(re.search(r"VmHWM:\s+(\d+)", status).group(1)) / 2**20  # type: ignore[union-attr]
+    except OSError:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+
+
+def make_capture(folder: Path, width: int, height: int, lights: int) -> None:
+    """Write a bumpy Lambertian capture, half EXR, without a mask, and an environment."""
     folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(lights, 3))
     directions[:, 2] = np.abs(directions[:, 2]) + 0.5
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    v, u = np.mgrid[0:side, 0:side].astype(np.float32) * np.float32(2 * np.pi * 8 / side)
-    normal = np.stack([-0.4 * np.cos(u) * np.cos(v), -0.4 * np.sin(u) * np.sin(v), np.ones_like(u)], axis=-1)
-    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    albedo = np.array([0.6, 0.5, 0.4], dtype=np.float32)
+    u = np.arange(width, dtype=np.float32)[None] * np.float32(2 * np.pi * 8 / width)
+    albedo = np.array([0.6, 0.5, 0.4], dtype=np.float32) / np.float32(np.pi)
     frames = []
-    for index, direction in enumerate(directions):
+    for index, (x, y, z) in enumerate(directions.astype(np.float32)):
+        image = np.empty((3, height, width), dtype=np.float16)
+        for first in range(0, height, ROWS):
+            v = np.arange(first, min(first + ROWS, height), dtype=np.float32)[:, None] * np.float32(2 * np.pi * 8 / width)
+            slope_x, slope_y = np.float32(-0.4) * np.cos(u) * np.cos(v), np.float32(-0.4) * np.sin(u) * np.sin(v)
+            shading = np.maximum((x * slope_x + y * slope_y + z) / np.sqrt(slope_x**2 + slope_y**2 + 1), 0)
+            image[:, first : first + ROWS] = albedo[:, None, None] * shading
         name = f"{index:03d}.exr"
-        shading = np.maximum(normal @ direction.astype(np.float32), 0)[..., None] * albedo / np.float32(np.pi)
-        exr.write(folder / name, dict(zip("RGB", np.moveaxis(shading.astype(np.float16), -1, 0), strict=True)),
-                  color_space="lin_rec709_scene", metadata={})
-        frames.append({"image": name, "light": {"type": "distant", "direction": direction.tolist(), "irradiance": [1, 1, 1]}})
+        exr.write(folder / name, dict(zip("RGB", image, strict=True)), color_space="lin_rec709_scene", metadata={})
+        frames.append({"image": name, "light": {"type": "distant", "direction": [float(x), float(y), float(z)], "irradiance": [1, 1, 1]}})
     write_manifest(Manifest.model_validate({
-        "schema": SCHEMA, "name": "large", "camera": {"projection": "orthographic", "resolution": [side, side]},
+        "schema": SCHEMA, "name": "large", "camera": {"projection": "orthographic", "resolution": [width, height]},
         "frames": frames}), folder / "capture.json")
-    environment = np.ones((64, 128, 3), dtype=np.float16)
+    environment = rng.random((64, 128, 3)).astype(np.float16)
     exr.write(folder / "environment.exr", dict(zip("RGB", np.moveaxis(environment, -1, 0), strict=True)),
               color_space="lin_rec709_scene", metadata={})
 
 
-def measure(*arguments: str) -> tuple[float, float]:
-    """Run relit in a child process.
+def run_command(command: str, folder: Path, method: str, frames: int) -> list[Stage]:
+    """Run a command in this process, and return its stages."""
+    capture, out, peaks = folder / "capture", folder / "out", StagePeaks(command)
+    if command == "solve":
+        from service.requests.solve import Method, SolveRequest
+        from service.solve.solve import solve
 
-    Returns:
-        Seconds, and peak resident memory in GiB.
-    """
-    before = time.perf_counter()
-    code = "import resource, sys; from service.cli.main import main\n" \
-           "try:\n    main()\nfinally:\n    print('peak', resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
-    result = subprocess.run([sys.executable, "-c", code, *arguments], check=True, capture_output=True, text=True)
-    peak = int(result.stdout.split("peak")[-1])
-    return time.perf_counter() - before, peak / 2**20
+        solve(SolveRequest(capture=capture, out=out, method=Method(method)), peaks)
+    elif command == "export":
+        from service.export.export import export
+        from service.requests.export import ExportRequest
+
+        export(ExportRequest(maps=out, out=folder / "asset" / "asset.usdz"), peaks)
+    else:
+        from service.light.relight import relight
+        from service.requests.picture import FrameCompression
+        from service.requests.relight import RelightRequest
+
+        relight(RelightRequest(capture=capture, environment=capture / "environment.exr", out=str(folder / "frames" / "frame.####.exr"),
+                               frames=f"1-{frames}", spin_degrees=360, compression=FrameCompression.DWAA), peaks)
+    peaks.close()
+    return peaks.stages
 
 
-def large_rows(folder: Path, side: int = 4096, lights: int = 64) -> list[str]:
-    """Return the table rows: the command, its seconds, and its peak memory."""
-    capture, out = folder / "large", folder / "large-out"
-    make_capture(capture, side, lights)
-    rows = []
+def measure(command: str, folder: Path, method: str, frames: int) -> list[Stage]:
+    """Run a command in a process of its own."""
+    done = subprocess.run([sys.executable, "-m", "benchmarks.large", str(folder), "--command", command, "--method", method, "--frames",
+                           str(frames)], check=True, capture_output=True, text=True, env=os.environ)
+    return [Stage(*values) for values in json.loads(done.stdout.splitlines()[-1])]
+
+
+def large_table(folder: Path, megapixels: float = MEGAPIXELS, lights: int = LIGHTS, frames: int = FRAMES,
+                method: str = "robust") -> list[str]:
+    """Return the table as lines of Markdown; the folder is empty again afterwards."""
+    height = round(math.sqrt(1e6 * megapixels / ASPECT))
+    width = round(1e6 * megapixels / height)
+    lines = [f"{width} × {height} pixels ({width * height / 1e6:.1f} megapixels), {lights} lights, no mask, `{method}`, {frames} frames "
+             f"(DWAA), {os.cpu_count()} cores. The peak is the resident memory of the process, mapped files included.", "",
+             "| command | stage | seconds | peak, GiB |", "|---|---|---|---|"]
+    work = folder / "relit-large"
     try:
-        for what, arguments in (
-            ("ingest and solve, robust", ("solve", str(capture), "--out", str(out), "--method", "robust")),
-            ("solve again, from the cache", ("solve", str(capture), "--out", str(out), "--method", "robust")),
-            ("relight, 4 frames", ("relight", str(capture), "--environment", str(capture / "environment.exr"),
-                                   "--out", str(out / "frame.####.exr"), "--frames", "1-4")),
-        ):
-            seconds, peak = measure(*arguments)
-            rows.append(f"| {what} | {seconds:.0f} | {peak:.2f} |")
+        # in a process of its own: the peak memory of a process is never below that of the one that started it
+        subprocess.run([sys.executable, "-c", "import sys; from pathlib import Path; from benchmarks.large import make_capture\n"
+                        "make_capture(Path(sys.argv[1]), *map(int, sys.argv[2:]))", str(work / "capture"), str(width), str(height),
+                        str(lights)], check=True)
+        for command in COMMANDS:
+            stages = measure(command, work, method, frames)
+            for stage in stages:
+                lines.append(f"| `{command}` | {stage.name} | {stage.seconds:.1f} | {stage.peak_gib:.2f} |")
+                print(lines[-1], flush=True)
+            seconds, peak = sum(stage.seconds for stage in stages), max(stage.peak_gib for stage in stages)
+            lines.append(f"| `{command}` | **all** | **{seconds:.0f}** | **{peak:.2f}** |")
+            print(lines[-1], flush=True)
     finally:
-        shutil.rmtree(capture, ignore_errors=True)
-        shutil.rmtree(out, ignore_errors=True)
-    return rows
+        shutil.rmtree(work, ignore_errors=True)
+    return lines
+
+
+def main() -> None:
+    """Measure, or run one command of a measurement."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="where the capture and the results are written and removed again")
+    parser.add_argument("--megapixels", type=float, default=MEGAPIXELS)
+    parser.add_argument("--lights", type=int, default=LIGHTS)
+    parser.add_argument("--frames", type=int, default=FRAMES)
+    parser.add_argument("--method", default="robust")
+    parser.add_argument("--command", choices=COMMANDS, help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.command is not None:
+        print(json.dumps(run_command(given.command, given.folder, given.method, given.frames)))
+        return
+    large_table(given.folder, given.megapixels, given.lights, given.frames, given.method)
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path, help="where about 12 GiB may be written and are removed again")
-    parser.add_argument("--side", type=int, default=4096)
-    parser.add_argument("--lights", type=int, default=64)
-    given = parser.parse_args()
-    print("\n".join(large_rows(given.folder, given.side, given.lights)))
-    print(f"of making it: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GiB")
+    main()

@@ -1,7 +1,7 @@
 """Relighting many frames at once: a matrix product of frame weights and the stack, read once for all frames.
 
 On the CPU the product is NumPy's BLAS on blocks of the stack that a kernel has widened to float32; on CUDA a thread keeps eight
-frames of one pack in registers.
+frames of one pack in registers, or cuBLAS makes the product where it is installed (cublas.py).
 """
 
 from functools import cache
@@ -12,6 +12,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.packs import Band, as_packs, pack_type
+from kernels.relight import cublas
 from kernels.relight.one_frame import check_weights
 
 BLOCK_BYTES = 16 << 20
@@ -24,12 +25,13 @@ REGISTER_FRAMES = 8
 """Number of frames that one CUDA thread computes: 8 frames of 4 pixels are 32 sums, which fit into registers."""
 
 
-def combine_batch(band: Band, weights: np.ndarray) -> wp.array:
+def combine_batch(band: Band, weights: np.ndarray, *, with_cublas: bool = True) -> wp.array:
     """Relight many frames: a weighted sum of the stored images for each.
 
     Args:
         band: the stack on the device.
         weights: [frames, 3, lights] float32; 0 for padded lights.
+        with_cublas: whether cuBLAS makes them on CUDA where it is installed. The last bits differ.
 
     Returns:
         [frames, 3, pixels padded] float32 radiance on the device; not synchronised on CUDA.
@@ -46,6 +48,8 @@ def combine_batch(band: Band, weights: np.ndarray) -> wp.array:
         frames = wp.empty((len(weights), 3, band.packs * pack), dtype=wp.float32, device=device)
         _product(band, weights, frames.numpy(), pack)
         return frames
+    if with_cublas and (gemm := cublas.product_of(device)) is not None:
+        return cublas.combine_by(gemm, band, weights)
     return _register_sums(band.values, weights, pack, device)
 
 

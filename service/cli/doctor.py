@@ -44,12 +44,16 @@ def doctor(only: DoctorDevice = None, data: DataOption = None, config: ConfigOpt
         import numpy as np
 
         from kernels import device, packs
+        from kernels.relight import cublas
         from kernels.relight.one_frame import combine
 
         for name in [device.resolve(only)] if only else device.names():
             band = packs.upload(np.ones((3, 8, 64), dtype=np.float16), device=name)
             sound = bool((combine(band, np.full((3, 8), 0.25, dtype=np.float32)).numpy() == 2.0).all())
             print(f"{'device':<12} {device.describe(name)}: {'works' if sound else 'gives wrong sums'}")
+            if name != "cpu":
+                print(f"{'cuBLAS':<12} {name}: {cublas.describe(name)}")
+                faults += _wrong_products(name)
             if not sound:
                 faults.append(f"{name} gives wrong sums")
         with tempfile.TemporaryDirectory() as folder:
@@ -60,6 +64,24 @@ def doctor(only: DoctorDevice = None, data: DataOption = None, config: ConfigOpt
     print("sound" if not faults else f"{len(faults)} faults")
     if faults:
         raise typer.Exit(1)
+
+
+def _wrong_products(device: str) -> list[str]:
+    """Compare batches of frames by cuBLAS with those by the kernel of relit, where both are there; return what is wrong."""
+    import numpy as np
+
+    from kernels import packs
+    from kernels.relight import cublas
+    from kernels.relight.many_frames import combine_batch
+
+    if cublas.product_of(device) is None:
+        return []
+    rng = np.random.default_rng(0)
+    band = packs.upload(rng.random((3, 16, 256)).astype(np.float16), device=device)
+    weights = rng.random((40, 3, 16), dtype=np.float32)
+    theirs, ours = (combine_batch(band, weights, with_cublas=which).numpy() for which in (True, False))
+    agree = np.allclose(theirs, ours, rtol=cublas.TOLERANCE, atol=0)
+    return [] if agree else [f"{device}: cuBLAS gives wrong sums: uninstall nvmath-python"]
 
 
 def _service(data: Path | None, config: Path | None) -> list[str]:

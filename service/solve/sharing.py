@@ -17,6 +17,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.relight import cublas
 from service.errors import DivergedError
 from service.reporting.provenance import versions
 from service.solve.several_devices import deal
@@ -163,8 +164,8 @@ class _Pass:
 
 
 def kind_of_worker(device: str) -> str:
-    """Return what workers have in common that find the same to the last bit: the kind of device, and all versions."""
-    return digest((devices.kind(device), versions()))
+    """Return what workers have in common that find the same to the last bit: the kind of device, all versions, and cuBLAS."""
+    return digest((devices.kind(device), versions(), cublas.product_of(device) is not None))
 
 
 def digest(value: object) -> str:

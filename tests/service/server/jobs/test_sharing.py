@@ -25,8 +25,8 @@ comes before the first has done all."""
 
 
 @pytest.fixture
-def capture(tmp_path) -> Path:
-    return write_capture(tmp_path / "capture", make_scene(size=32, lights=9))
+def capture(tmp_path_factory) -> Path:
+    return write_capture(tmp_path_factory.mktemp("captures") / "capture", make_scene(size=32, lights=9))
 
 
 def maps_alone(capture: Path, method: str, out: Path, monkeypatch) -> bytes:
