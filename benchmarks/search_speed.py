@@ -6,8 +6,9 @@ import numpy as np
 
 from benchmarks.timing import run_seconds
 from kernels import packs
+from kernels.photometric.candidates import rings
 from kernels.photometric.descent import descend
-from kernels.photometric.hypotheses import Diffuse, rings, search_normals
+from kernels.photometric.hypotheses import Diffuse, search_normals
 from kernels.photometric.lambert import solve_lambert
 from kernels.photometric.readings import grey_factors, grey_readings, pad_lights
 from kernels.photometric.samples import gather

@@ -29,6 +29,12 @@ def masking_root(cosine: float, alpha: float) -> float:
 
 
 @wp.func
+def masking_slope(cosine: float, alpha: float, root: float) -> float:
+    """Return the derivative of masking_root by the cosine, where it is `root`."""
+    return cosine * (1.0 - alpha * alpha) / root
+
+
+@wp.func
 def ggx_seen(nl: float, nv: float, nh: float, alpha: float, view_root: float) -> float:
     """Return `ggx`; `view_root` is masking_root(nv, alpha), the same for all lights."""
     a2 = alpha * alpha
@@ -52,27 +58,30 @@ def diffuse(nl: float, nv: float, hv2: float, rough: float, slope: float) -> flo
 
 
 @wp.func
-def ggx_with_slopes(nl: float, nv: float, nh: float, alpha: float, view_root: float):
+def ggx_with_slopes(nl: float, nv: float, nh: float, alpha: float, view_root: float, view_slope: float):
     """Return `ggx` and its derivatives by nh, nl, nv and α²; all are 0 for a light below the horizon.
 
-    `view_root` is as for `ggx_seen`. One division serves them all.
+    `view_root` is as for `ggx_seen`, and `view_slope` masking_slope of it. One division serves all but the last.
     """
     a2 = alpha * alpha
     rest = 1.0 - a2
     bottom = wp.max(1.0 - rest * nh * nh, 1.0e-9)
     light_root = wp.sqrt(nl * nl * rest + a2)
     masking = wp.max(nl * view_root + nv * light_root, 1.0e-6)
-    roots = view_root * light_root
-    inverse = wp.where(nl > 0.0, 1.0, 0.0) / (bottom * bottom * masking * roots)
-    top = wp.static(0.5 * INVERSE_PI) * a2 * inverse * roots  # a² / (2 π bottom² masking)
+    both = bottom * masking
+    inverse = wp.where(nl > 0.0, 1.0, 0.0) / (both * light_root)
+    inverse_both = inverse * light_root
+    per_bottom = inverse_both * masking
+    per_masking = inverse_both * bottom
+    per_light_root = inverse * both
+    per_a2 = wp.static(0.5 * INVERSE_PI) * inverse_both * per_bottom  # 1 / (2 π bottom² masking)
+    top = per_a2 * a2
     value = top * nl
-    per_masking = inverse * bottom * bottom * roots
-    by_nh = value * 4.0 * rest * nh * inverse * bottom * masking * roots
-    by_nl = top * nv * a2 * per_masking * inverse * bottom * bottom * masking * view_root
-    by_nv = 0.0 - value * per_masking * light_root * (1.0 + nl * rest * nv * inverse * bottom * bottom * masking)
-    bend = nl * (1.0 - nv * nv) * light_root + nv * (1.0 - nl * nl) * view_root  # of the masking, over 1 / (2 · roots)
-    by_a2 = wp.static(0.5 * INVERSE_PI) * nl * inverse * roots - value * inverse * bottom * (
-        2.0 * nh * nh * masking * roots + 0.5 * bottom * bend)
+    by_nh = value * per_bottom * (4.0 * rest) * nh
+    by_nl = top * per_masking * (a2 * nv) * per_light_root
+    by_nv = 0.0 - value * per_masking * (light_root + nl * view_slope)
+    bend = nl * (1.0 - nv * nv) / view_root + nv * (1.0 - nl * nl) * per_light_root  # twice the derivative of the masking by α²
+    by_a2 = per_a2 * nl - value * (2.0 * nh * nh * per_bottom + 0.5 * bend * per_masking)
     return value, by_nh, by_nl, by_nv, by_a2
 
 

@@ -21,8 +21,8 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import once
 from kernels.packs import pack_type
+from kernels.photometric.candidates import candidate_at, rings
 from kernels.photometric.evidence import evidence
-from kernels.photometric.hypotheses import candidate_at, rings
 from kernels.photometric.normal_search import Found
 from kernels.photometric.samples import Samples, per_pixel, to_host
 from kernels.photometric.survey import Survey
@@ -105,7 +105,7 @@ def _masses(surveyed: Survey | None, normal: np.ndarray, judged: np.ndarray) -> 
 
 
 def ring_areas(offsets: np.ndarray) -> np.ndarray:
-    """Return the solid angle that each candidate of `hypotheses.rings` stands for, [candidates] in degrees².
+    """Return the solid angle that each candidate of `candidates.rings` stands for, [candidates] in degrees².
 
     A ring reaches half-way to its neighbours, the last one as far beyond as it does inside.
     """

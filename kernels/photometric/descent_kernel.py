@@ -6,10 +6,11 @@ import warp as wp
 
 from kernels.device import once
 from kernels.logarithm import log_of
-from kernels.microfacet import diffuse_with_slopes, ggx_with_slopes, masking_root, schlick
+from kernels.microfacet import diffuse_with_slopes, ggx_with_slopes, masking_root, masking_slope, schlick
 from kernels.packs import pack_type
-from kernels.photometric.hypotheses import LARGEST_SQUARE, LEAST_NZ, LOG_GROUP, SHADOW_TRUST, tangents
+from kernels.photometric.candidates import LEAST_NZ, tangents
 from kernels.photometric.lobes import LOBE_SCALE, LOBES, MIXTURE, MIXTURE_F0
+from kernels.photometric.robust_weights import LARGEST_SQUARE, LOG_GROUP, SHADOW_TRUST
 
 SWEEPS = 8
 """Coordinate sweeps of the non-negative solve in each turn, from the weights of the turn before."""
@@ -100,7 +101,7 @@ def descent_kernel(lanes: int) -> Any:
                 ox[k] = other[0]
                 oy[k] = other[1]
                 oz[k] = other[2]
-            view_root = mixture()
+            view_root, view_slope = mixture(), mixture()
             for k in range(lanes):
                 nv[k] = nx[k] * vx[k] + ny[k] * vy[k] + nz[k] * vz[k]
                 va[k] = ax[k] * vx[k] + ay[k] * vy[k] + az[k] * vz[k]
@@ -108,6 +109,7 @@ def descent_kernel(lanes: int) -> Any:
             for a in range(gloss):
                 for k in range(lanes):
                     view_root[a, k] = masking_root(nv[k], alphas[a])
+                    view_slope[a, k] = masking_slope(nv[k], alphas[a], view_root[a, k])
             for a in range(MIXTURE):
                 for k in range(lanes):
                     explained[k] = wp.max(explained[k], x[a, k])
@@ -142,7 +144,8 @@ def descent_kernel(lanes: int) -> Any:
                     by_v[k] = x[0, k] * on_v
                 for a in range(gloss):
                     for k in range(lanes):
-                        lobe, on_h, along_l, along_v, _ = ggx_with_slopes(nl[k], nv[k], nh[k], alphas[a], view_root[a, k])
+                        lobe, on_h, along_l, along_v, _ = ggx_with_slopes(nl[k], nv[k], nh[k], alphas[a], view_root[a, k],
+                                                                                     view_slope[a, k])
                         scaled = fresnel[k] * x[1 + a, k]
                         f[1 + a, k] = fresnel[k] * lobe
                         predicted[k] += scaled * lobe

@@ -8,9 +8,8 @@ import warp as wp
 from kernels.device import once
 from kernels.logarithm import log_of
 from kernels.packs import channels_type, pack_type
-from kernels.photometric.hypotheses import LOG_GROUP
 from kernels.photometric.lobes import Reflectance
-from kernels.photometric.robust_weights import WEIGHT_ROWS, plain_weights, weigh
+from kernels.photometric.robust_weights import LOG_GROUP, WEIGHT_ROWS, plain_weights, weigh
 
 ROUGHNESS_FIRST, ROUGHNESS_STEP, ROUGHNESS_COUNT = 0.1, 0.075, 13
 """First value, step and length of the grid of roughness, 0.1 to 1: a lobe below 0.1 is narrower than the spacing of the lights of any

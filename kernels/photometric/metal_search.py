@@ -12,7 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kernels.photometric.hypotheses import LEAST_NZ, Diffuse, SearchOptions, rings
+from kernels.photometric.candidates import LEAST_NZ, rings
+from kernels.photometric.hypotheses import Diffuse, SearchOptions
 from kernels.photometric.material import BRIGHTEST_DIELECTRIC, COST_FLOOR, Material, fit_given
 from kernels.photometric.samples import Samples, choose, to_host
 

@@ -8,10 +8,9 @@ import warp as wp
 from kernels.device import once
 from kernels.logarithm import log_of
 from kernels.packs import channels_type, pack_type
-from kernels.photometric.hypotheses import LOG_GROUP
 from kernels.photometric.lobes import Reflectance
 from kernels.photometric.material_kernel import COMMON_ROUNDS, REWEIGHTINGS
-from kernels.photometric.robust_weights import WEIGHT_ROWS, plain_weights, weigh
+from kernels.photometric.robust_weights import LOG_GROUP, WEIGHT_ROWS, plain_weights, weigh
 
 MIXED_ROWS = 6
 """Values that scratch memory holds for each light beside the reflectance and the weights: in each channel, what the lobe of the second

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kernels.photometric.hypotheses import rings
+from kernels.photometric.candidates import rings
 from kernels.photometric.posterior import Model, Posterior, tangents
 from kernels.photometric.samples import Samples
 from kernels.photometric.scores import score_normals
@@ -77,7 +77,7 @@ def find_modes(samples: Samples, model: Model, view: np.ndarray) -> np.ndarray:
 
 
 def candidates(centre: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """Return [n, 3] float32 the normal at an offset of `hypotheses.rings` from each centre, [n, 3] and [n, 4]."""
+    """Return [n, 3] float32 the normal at an offset of `candidates.rings` from each centre, [n, 3] and [n, 4]."""
     tangent, other = tangents(centre)
     moved = offsets[:, 1:2] * centre + offsets[:, :1] * (offsets[:, 2:3] * tangent + offsets[:, 3:] * other)
     return (moved / np.linalg.norm(moved, axis=1, keepdims=True)).astype(np.float32)

@@ -18,7 +18,7 @@ import numpy as np
 import warp as wp
 
 from kernels.device import once
-from kernels.photometric.hypotheses import LEAST_NZ
+from kernels.photometric.candidates import LEAST_NZ
 from kernels.photometric.response_table import nodes
 from kernels.photometric.samples import Samples, choose, evenly, readings_of, to_host
 from kernels.photometric.scores import score_normals
@@ -200,7 +200,7 @@ def _angles() -> tuple[float, ...]:
 
 @once
 def _offsets() -> np.ndarray:
-    """Return [candidates, 4] offsets as of `hypotheses.rings`: the centre, then MEMBERS on each ring, turned by half a step from ring to
+    """Return [candidates, 4] offsets as of `candidates.rings`: the centre, then MEMBERS on each ring, turned by half a step from ring to
     ring."""
     angle = np.repeat(np.radians(_angles()), MEMBERS)
     azimuth = 2 * np.pi * (np.arange(MEMBERS) + 0.5 * (np.arange(len(_angles()))[:, None] % 2)).reshape(-1) / MEMBERS
@@ -231,7 +231,7 @@ def _cells() -> np.ndarray:
 
 
 def tangents(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return two [n, 3] tangents of each normal, those of `hypotheses.tangents`."""
+    """Return two [n, 3] tangents of each normal, those of `candidates.tangents`."""
     up = np.where(np.abs(normal[:, 2:]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0])
     tangent = np.cross(up, normal)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)

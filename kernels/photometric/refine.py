@@ -17,10 +17,11 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import once
 from kernels.logarithm import log_of
-from kernels.microfacet import INVERSE_PI, diffuse_with_slopes, ggx_with_slopes, masking_root, schlick
+from kernels.microfacet import INVERSE_PI, diffuse_with_slopes, ggx_with_slopes, masking_root, masking_slope, schlick
 from kernels.packs import channels_type, pack_type
-from kernels.photometric.hypotheses import LEAST_NZ, LOG_GROUP, Diffuse, SearchOptions, criteria, tangents
-from kernels.photometric.robust_weights import WEIGHT_ROWS, plain_weights, weigh
+from kernels.photometric.candidates import LEAST_NZ, tangents
+from kernels.photometric.hypotheses import Diffuse, SearchOptions, criteria
+from kernels.photometric.robust_weights import LOG_GROUP, WEIGHT_ROWS, plain_weights, weigh
 from kernels.photometric.samples import Samples, per_pixel, scratch_memory, to_host
 
 LINEAR_TURNS = 2
@@ -152,7 +153,7 @@ def _refine_kernel(lanes: int) -> Any:
         rho, f0, best_rho, best_f0 = channels(), channels(), channels(), channels()
         for turn in range(wp.static(LINEAR_TURNS + STEPS + 1)):
             ax, ay, az, ox, oy, oz = lane_type(), lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
-            nv, va, vo, alpha, view_root = lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
+            nv, va, vo, alpha, view_root, view_slope = lane_type(), lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
             for k in range(lanes):
                 tangent, other = tangents(wp.vec3(nx[k], ny[k], nz[k]))
                 ax[k] = tangent[0]
@@ -167,6 +168,7 @@ def _refine_kernel(lanes: int) -> Any:
                 vo[k] = ox[k] * vx[k] + oy[k] * vy[k] + oz[k] * vz[k]
                 alpha[k] = rough[k] * rough[k]
                 view_root[k] = masking_root(nv[k], alpha[k])
+                view_slope[k] = masking_slope(nv[k], alpha[k], view_root[k])
             heeded = wp.where(turn == 0, 0.0, 1.0)  # at first nothing is known of the misfit
             cost, product = lane_type(), lane_type(1.0)
             dd, ds, ss = lane_type(), lane_type(), lane_type()
@@ -190,7 +192,8 @@ def _refine_kernel(lanes: int) -> Any:
                     la = ax[k] * lx[k] + ay[k] * ly[k] + az[k] * lz[k]
                     lo = ox[k] * lx[k] + oy[k] * ly[k] + oz[k] * lz[k]
                     nl = wp.max(cosine, 0.0)
-                    lobe, by_h, by_l, by_v, by_a2 = ggx_with_slopes(nl, nv[k], (cosine + nv[k]) * inverse, alpha[k], view_root[k])
+                    lobe, by_h, by_l, by_v, by_a2 = ggx_with_slopes(nl, nv[k], (cosine + nv[k]) * inverse, alpha[k], view_root[k],
+                                                                     view_slope[k])
                     value, on_l, on_v = diffuse_with_slopes(nl, nv[k], hv[k] * hv[k], form[0], form[1])
                     fd[k] = INVERSE_PI * value
                     d0[k] = INVERSE_PI * (on_l * la + on_v * va[k])

@@ -1,6 +1,7 @@
-"""Weights of the lights in the robust fits of reflectance: Cauchy weights of the colour readings, one a light, and the cost that follows.
+"""Weights of the lights in robust fits.
 
-What the readings alone decide is written to scratch memory once, so that the rounds of a fit divide once a light.
+Fits of reflectance weigh the colour readings of a light together, with one Cauchy weight. What the readings alone decide is written to
+scratch memory once, so that the rounds of a fit divide once a light.
 """
 
 from typing import Any
@@ -9,8 +10,12 @@ import warp as wp
 
 from kernels.device import once
 from kernels.packs import pack_type
-from kernels.photometric.hypotheses import LARGEST_SQUARE, SHADOW_TRUST
 
+SHADOW_TRUST = 0.1
+"""Weight in the fit of a reading that is zero or far below its prediction: such a reading bounds the radiance and hardly measures it."""
+LOG_GROUP, LARGEST_SQUARE = 6, 1e6
+"""Lights whose 1 + r²/σ² are multiplied before one logarithm is taken, a multiple of 3, and the largest r²/σ²: their product stays in
+range."""
 WEIGHT_ROWS = 4
 """Values that scratch memory holds for each light: the weight of a reading without misfit, and 1 / σ of each channel over √3."""
 ROOT_OF_THIRD = 3.0**-0.5

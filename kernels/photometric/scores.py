@@ -14,7 +14,7 @@ from kernels import device as devices
 from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.packs import pack_type
-from kernels.photometric.hypotheses import candidate_at
+from kernels.photometric.candidates import candidate_at
 from kernels.photometric.lobes import Lobes
 from kernels.photometric.samples import Samples, per_pixel, to_host
 from kernels.photometric.tabulated_lobes import tabulated_lobes
@@ -53,7 +53,7 @@ def score_normals(samples: Samples, centre: np.ndarray, offsets: np.ndarray, *, 
     Args:
         samples: their readings.
         centre: [n, 3] unit normals.
-        offsets: [candidates, 4] of `hypotheses.rings`; the first is the centre.
+        offsets: [candidates, 4] of `candidates.rings`; the first is the centre.
         noise: [n, 2] standard deviation of a reading: constant part and part of the reading, both relative to the pixel's level.
         table: [cells, lights, lobes] of response_table.search_table or a reference_table.
         bound: [lobes] largest weight of each lobe, in the units of the readings.

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from kernels.photometric.candidates import rings
 from kernels.photometric.certainty import ring_areas
-from kernels.photometric.hypotheses import Diffuse, rings
+from kernels.photometric.hypotheses import Diffuse
 from kernels.photometric.survey import CLOSE
 from kernels.photometric.svbrdf import solve_svbrdf
 from tests.kernels.photometric.test_svbrdf import COLOUR, degrees, render, sample, tilted

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from kernels.errors import ArrayError
-from kernels.microfacet import diffuse_with_slopes, ggx_with_slopes, masking_root
+from kernels.microfacet import diffuse_with_slopes, ggx_with_slopes, masking_root, masking_slope
 from kernels.photometric.descent import COLD, WARM, Schedule, descend
 from kernels.photometric.hypotheses import Diffuse, Prior, RingOptions, search_normals
 from kernels.photometric.normal_search import find_normals
@@ -33,7 +33,8 @@ def test_slopes_are_those_of_the_model(device):
     def evaluate(nl: wp.array(dtype=float), nv: wp.array(dtype=float), nh: wp.array(dtype=float), hv: wp.array(dtype=float),
                  a: wp.array(dtype=float), r: wp.array(dtype=float), s: wp.array(dtype=float), out: wp.array2d(dtype=float)):
         i = wp.tid()
-        value, by_h, by_l, by_v, by_a2 = ggx_with_slopes(nl[i], nv[i], nh[i], a[i], masking_root(nv[i], a[i]))
+        root = masking_root(nv[i], a[i])
+        value, by_h, by_l, by_v, by_a2 = ggx_with_slopes(nl[i], nv[i], nh[i], a[i], root, masking_slope(nv[i], a[i], root))
         out[0, i] = value
         out[1, i] = by_h
         out[2, i] = by_l

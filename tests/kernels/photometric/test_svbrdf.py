@@ -7,8 +7,9 @@ import warp as wp
 from kernels import packs
 from kernels.errors import ArrayError
 from kernels.microfacet import diffuse, ggx, schlick
+from kernels.photometric.candidates import rings
 from kernels.photometric.diffuse_shape import choose_diffuse
-from kernels.photometric.hypotheses import Diffuse, RingOptions, rings, search_normals
+from kernels.photometric.hypotheses import Diffuse, RingOptions, search_normals
 from kernels.photometric.material import fit_material
 from kernels.photometric.normal_search import find_normals
 from kernels.photometric.readings import grey_factors, pad_lights
