@@ -47,6 +47,11 @@ class CaptureImages(NamedTuple):
     """Which frames are measurements, and not ambient light, a tracking frame or a photograph under an environment."""
 
     @property
+    def usable(self) -> bool:
+        """Return whether all measurements can be read."""
+        return all(image is not None for image, measured in zip(self.images, self.measured, strict=True) if measured)
+
+    @property
     def white(self) -> float:
         """Return the radiance of white: a percentile of the brightest channel of the mean image; 0 where everything is dark."""
         shown = [image.preview for image, measured in zip(self.images, self.measured, strict=True) if image is not None and measured]

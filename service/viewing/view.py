@@ -11,6 +11,7 @@ import numpy as np
 from kernels import device as devices
 from kernels.errors import DeviceError, KernelError
 from service.captures.inspect import standing_faults
+from service.light.outputs import check_outputs
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import metadata
 from service.requests.view import ViewRequest
@@ -63,6 +64,7 @@ def view(request: ViewRequest, progress: Progress | None = None) -> ViewResult:
         progress: told of every stage.
 
     Raises:
+        RequestError: a file of the view would replace one of the capture.
         ResultError: the maps are missing, incomplete or of another camera than the capture.
         StageError: the capture cannot be opened; a frame that cannot be used is among the findings instead.
         StorageError: a file cannot be written; view.json is there only if everything is.
@@ -71,6 +73,7 @@ def view(request: ViewRequest, progress: Progress | None = None) -> ViewResult:
     device = devices.resolve(request.device)
     timings.stage("open", 1)
     capture = Capture.open(request.capture)
+    _check_outputs(request, capture)
     result = None if request.maps is None else ResultLayers(result_file(request.maps), capture)
     report = SolveReport([], {}, None) if result is None else read_report(result.path)
     mask = _mask(capture)
@@ -85,7 +88,7 @@ def view(request: ViewRequest, progress: Progress | None = None) -> ViewResult:
             sections["points"] = write_points(result, file)
         if result is not None:
             sections["layers"] = write_layers(result, file, timings)
-        readings = _attempt(findings, lambda: open_readings(capture, request, timings)) if capture.sources() else None
+        readings = _attempt(findings, lambda: open_readings(capture, request, timings)) if capture.sources() and images.usable else None
         if readings is not None:
             sections["relight"] = _attempt(findings, lambda: _relight(readings, request, file, device, timings))
             if result is not None and not result.of_depth:
@@ -132,6 +135,16 @@ def _relight(readings: Readings, request: ViewRequest, file: BlockFile, device: 
     timings.stage("matte", 1)
     return write_relighting(readings.stack, readings.lights, matte_of(readings.capture, readings.stack), file, most_terms=request.terms,
                             device=device, timings=timings)
+
+
+def _check_outputs(request: ViewRequest, capture: Capture) -> None:
+    """Refuse to write over an input, or into a folder that cannot be written to.
+
+    Raises:
+        RequestError, StorageError: as check_outputs.
+    """
+    outputs = [(f"--out {request.out}", request.out / name) for name in (VIEW_FILE, BLOCKS_FILE, THUMBNAILS_FILE)]
+    check_outputs(outputs, [capture.file(name) for _, name in capture.files()])
 
 
 def result_file(maps: Path) -> Path:
