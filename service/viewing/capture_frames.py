@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from service.reporting.progress import Timings
-from service.viewing.reduction import block_means, step_within
+from service.viewing.reduction import block_sums, step_within
 from stage.capture import Capture
 from stage.correction import Correction
 from stage.errors import ImageError, StageError, storage
@@ -74,7 +74,8 @@ def read_images(capture: Capture, mask: np.ndarray, timings: Timings) -> Capture
     measured = [not sources or frame.image in sources for frame in frames]
     timings.stage("frames", len(frames))
     step, weight = step_within(mask.size, PREVIEW_PIXELS), mask.astype(np.float32)
-    inside = block_means(np.ones((*mask.shape, 1), dtype=np.float32), step, weight)[..., 0] > 0
+    counted = block_sums(weight[..., None], step)
+    inside = counted[..., 0] > 0
     try:
         correction = Correction.of(capture, full_scale=True)
     except StageError as error:
@@ -85,8 +86,10 @@ def read_images(capture: Capture, mask: np.ndarray, timings: Timings) -> Capture
             pixels, saturated = _radiance(capture, correction, frame)
         except StageError as error:
             return str(error)
-        return FrameImage(block_means(pixels, step, weight), pixels[mask].mean(axis=0, dtype=np.float64),
-                          0.0 if saturated is None else float(saturated[mask].mean()))
+        sums = block_sums(pixels, step, weight)
+        return FrameImage(np.divide(sums, counted, out=np.zeros_like(sums), where=counted > 0),
+                          sums.sum(axis=(0, 1), dtype=np.float64) / mask.sum(),
+                          0.0 if saturated is None else float((saturated & mask).sum() / mask.sum()))
 
     images: list[FrameImage | None] = []
     faults = []

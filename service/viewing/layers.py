@@ -9,9 +9,8 @@ from kernels.status import ESTIMATED, Status
 from service.reporting.progress import Timings
 from service.viewing import pyramid
 from service.viewing.block_file import BlockFile
-from service.viewing.histograms import code_counts, histogram_of, range_of
+from service.viewing.histograms import code_counts, statistics_of
 from service.viewing.result_layers import CODES, MASK, VECTOR, ResultLayers
-from stage.light_basis import numbers
 
 MEANINGS = {
     Status.UNSOLVED: "Outside the object: nothing was to be solved here.",
@@ -78,8 +77,7 @@ def _write_layer(found: ResultLayers, name: str, classes: list[np.ndarray], file
         if name == "regime":
             facts["codes"] = {str(code): {"name": words} for code, words in REGIMES.items()}
     else:
-        facts["range"] = numbers(range_of(values, found.mask))
-        facts["histogram"] = histogram_of(values, found.mask)
+        facts |= statistics_of(values, found.mask)
     facts["levels"] = []
     for level in _levels(found, name, shown.kind, values, classes):
         rows, cols = level.shape[1:]

@@ -15,7 +15,7 @@ from kernels.relight.many_frames import combine_batch
 from kernels.relight.residual import squared_residual
 from service.reporting.progress import Timings
 from service.viewing.block_file import BlockFile
-from service.viewing.reduction import block_sums, step_within
+from service.viewing.reduction import plane_means, step_within
 from service.viewing.row_bands import row_bands
 from service.viewing.transfer import COLS, FULL, ROWS, transfer_of
 from stage.ingest import TOP_EXPONENT
@@ -70,7 +70,7 @@ def write_relighting(stack: Stack, lights: DistantLights, matte: Matte, file: Bl
     transfer = transfer_of(basis, lights, scale)
     step = step_within(matte.factor.size, MOST_VALUES // basis.matrix.shape[1])
     found = _coefficients(stack, basis, matte, covered, step, scale, device, timings)
-    coverage = block_sums(matte.coverage, step) / block_sums(np.ones_like(matte.coverage), step)
+    coverage = plane_means(matte.coverage, step)
     captured = np.moveaxis(basis.matrix, 0, -1).swapaxes(0, 1) * scale  # [lights, terms, 3]
     return {
         "terms": len(found.images), "rows": coverage.shape[0], "cols": coverage.shape[1], "step": step,
@@ -123,8 +123,7 @@ def _coefficients(stack: Stack, basis: Basis, matte: Matte, covered: np.ndarray,
             squares = squared_residual(values, gains, stored, functions).numpy()
             left += float(squares[:, inside].sum(dtype=np.float64))
             planes = stored[:, :, band.own].reshape(3 * terms, -1, cols) * matte.factor[band.rows]
-            counted = block_sums(np.ones(planes.shape[1:], dtype=np.float32), step)
             for index, plane in enumerate(planes):
-                images[index // 3, index % 3, band.reduced] = block_sums(plane, step) / counted
+                images[index // 3, index % 3, band.reduced] = plane_means(plane, step)
         timings.advance(done)
     return Coefficients(images, float(np.sqrt(left / whole)) if whole > 0 else 0.0)

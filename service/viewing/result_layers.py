@@ -1,5 +1,6 @@
 """The layers of maps.exr or depth.exr as they are stored, taken one at a time, and how each is shown."""
 
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -64,36 +65,63 @@ class ResultLayers:
     """A result file of a capture, open for its layers."""
 
     def __init__(self, path: Path, capture: Capture) -> None:
-        """Read a maps.exr or depth.exr.
+        """Read the header of a maps.exr or depth.exr; its layers are read when the first is asked for.
 
         Raises:
             ResultError: a layer is incomplete, the mask is missing, or the file is of another camera than the capture.
             ImageError: the file is not a readable EXR.
         """
         self.path = path
-        self._channels, metadata = exr.read(path)
-        self.of_depth = "depth.Z" in self._channels
+        header = exr.read_header(path)
+        self.of_depth = "depth.Z" in header.channels
         file_name = depth_maps.DEPTH_FILE if self.of_depth else maps.MAPS_FILE
-        self.camera, self.provenance = camera_and_provenance(metadata, path, file_name=file_name)
-        self.color_space = exr.color_space_of(metadata)
+        self.camera, self.provenance = camera_and_provenance(header.metadata, path, file_name=file_name)
         _check_camera(path, self.camera, capture.camera)
-        self._names = channels_of_layers(self.of_depth)
-        for name, channels in self._names.items():
-            lacking = [channel for channel in channels if channel not in self._channels]
+        self._names = {}
+        for name, channels in channels_of_layers(self.of_depth).items():
+            lacking = [channel for channel in channels if channel not in header.channels]
             if lacking and (len(lacking) < len(channels) or name == "mask"):
                 raise ResultError(f"{path}: has no channel {lacking[0]}")
-        self.mask: np.ndarray = self._channels["mask.Y"] > 0.5  # [rows, cols] bool
-        self.status = self._status()  # [rows, cols] uint8, or None
-        seen = self._channels["depth.Z"] != 0 if self.of_depth else np.logical_or.reduce(
-            [self._channels[channel] != 0 for channel in self._names["normal"] if channel in self._channels] or [self.mask])
-        self.estimated: np.ndarray = self.mask | seen
-        """[rows, cols] bool, where values are kept."""
-        self.on_object: np.ndarray = self.mask if self.status is None else self.mask | (self.status != Status.UNSOLVED)
-        """[rows, cols] bool, the pixels that were to be solved, as far as the status tells."""
+            if not lacking:
+                self._names[name] = channels
+
+    @cached_property
+    def _channels(self) -> dict[str, np.ndarray]:
+        return exr.read(self.path)[0]
+
+    @cached_property
+    def mask(self) -> np.ndarray:
+        """The pixels that count as solved, [rows, cols] bool."""
+        return np.asarray(self.plane("mask") > 0.5)
+
+    @cached_property
+    def status(self) -> np.ndarray | None:
+        """The status of each pixel, [rows, cols] uint8; None: the file has none.
+
+        Raises:
+            ResultError: a code is not known.
+        """
+        if "status" not in self._names:
+            return None
+        codes = self.plane("status")
+        if not np.isin(codes, list(Status)).all():
+            raise ResultError(f"{self.path}: layer status holds codes that this version does not know: solve again")
+        return codes.astype(np.uint8)
+
+    @cached_property
+    def estimated(self) -> np.ndarray:
+        """The pixels whose values are kept, [rows, cols] bool: those of the mask and the unsure ones."""
+        told = self._names.get("depth" if self.of_depth else "normal", [])
+        return np.logical_or.reduce([self.mask, *(self._channels[channel] != 0 for channel in told)])
+
+    @cached_property
+    def on_object(self) -> np.ndarray:
+        """The pixels that were to be solved, as far as the status tells, [rows, cols] bool."""
+        return self.mask if self.status is None else self.mask | (self.status != Status.UNSOLVED)
 
     def names(self) -> list[str]:
         """Return the layers of the file in the order in which they are shown."""
-        return [name for name in (DEPTH if self.of_depth else SURFACE) if self._names[name][0] in self._channels]
+        return [name for name in (DEPTH if self.of_depth else SURFACE) if name in self._names]
 
     def appearance(self, name: str) -> Appearance:
         """Return how a layer is shown."""
@@ -109,23 +137,16 @@ class ResultLayers:
         return self._channels[self._names[name][0]]
 
     def take(self, name: str) -> np.ndarray:
-        """Return a layer, [channels, rows, cols] in its stored type, which is read once and then forgotten.
+        """Return a layer, [channels, rows, cols] in its stored type, and forget it.
 
         Raises:
             ResultError: the layer holds values that are not finite.
         """
+        _ = self.estimated, self.on_object  # which are made of layers that may be the next to be forgotten
         values = np.stack([self._channels.pop(channel) for channel in self._names[name]])
         if bad := int((~np.isfinite(values)).sum()):
             raise ResultError(f"{self.path}: layer {name} has {bad} values that are not finite")
         return values
-
-    def _status(self) -> np.ndarray | None:
-        if "status.Y" not in self._channels:
-            return None
-        codes = self._channels["status.Y"]
-        if not np.isin(codes, list(Status)).all():
-            raise ResultError(f"{self.path}: layer status holds codes that this version does not know: solve again")
-        return codes.astype(np.uint8)
 
 
 def channels_of_layers(of_depth: bool) -> dict[str, list[str]]:
