@@ -29,7 +29,7 @@ import numpy as np
 
 from benchmarks.service_process import RELIT, running
 
-PER_SECOND = 1000
+PER_SECOND = 200
 """Connections that an attacker opens in a second at most."""
 AGAIN_S = 5.0
 """Seconds until an attacker opens a connection again that was closed."""

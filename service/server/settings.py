@@ -134,6 +134,8 @@ class Settings(BaseSettings):
     """Connections of clients at most; without it 8192, or as many as the open files that the system allows leave room for."""
     max_address_connections: Count | None = None
     """Connections of one address at most; without it half of all."""
+    max_requests: Count = 256
+    """Requests of one key that may be under way at one time, event streams among them, in each API process."""
     max_streams: Count = 128
     """Event streams of one key at most, in each API process."""
     max_project_streams: Count = 512

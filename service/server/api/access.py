@@ -3,13 +3,14 @@
 import math
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from typing import NoReturn
 from urllib.parse import urlsplit
 
 from fastapi import Request
 
-from service.server.api.problems import ApiError
+from service.server.api.problems import RETRY_S, ApiError
 from service.server.settings import is_loopback
 
 FORGET_ABOVE = 10_000
@@ -67,6 +68,34 @@ class RateLimiter:
     def _forget(self, now: float) -> None:
         self._buckets = {key: (tokens, counted) for key, (tokens, counted) in self._buckets.items()
                          if tokens + (now - counted) * self._per_second < self._burst}
+
+
+class RunningRequests:
+    """The requests of each key that are under way in this process. Everything runs in the event loop.
+
+    An upload or a download that its client draws out holds a connection and a file, and its connection gives way to no other.
+    """
+
+    def __init__(self, most: int) -> None:
+        """Args: most: requests of one key."""
+        self._most = most
+        self._running: Counter[str | None] = Counter()
+
+    def enter(self, key: str | None) -> None:
+        """Count a request, which `leave` must end.
+
+        Raises:
+            ApiError: as many of the key are under way.
+        """
+        if self._running[key] >= self._most:
+            raise ApiError("too-many", f"{self._most} requests of this key are under way", headers={"Retry-After": str(RETRY_S)})
+        self._running[key] += 1
+
+    def leave(self, key: str | None) -> None:
+        """End a request."""
+        self._running[key] -= 1
+        if not self._running[key]:
+            del self._running[key]
 
 
 def require_local(request: Request) -> None:

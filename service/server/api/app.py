@@ -8,7 +8,7 @@ from opentelemetry.trace import TracerProvider
 
 from service import __version__
 from service.server.api import document, environment_files, events, intakes, jobs, middleware, operations, problems, results, tus, uploads
-from service.server.api.access import RateLimiter
+from service.server.api.access import RateLimiter, RunningRequests
 from service.server.api.context import Service
 from service.server.api.metrics import Metrics
 from service.server.api.tokens import TokenReader
@@ -40,8 +40,9 @@ def create_app(settings: Settings, database: Database, tracing: TracerProvider |
     storage = open_storage(settings)
     app.state.service = Service(
         settings, database, JobQueue(database), storage, open_upload_parts(settings, database, storage),
-        RateLimiter(settings.requests_per_second, settings.request_burst), draining=threading.Event(), closing=closing,
-        watcher=Watcher(database, closing, streams), tokens=None if settings.oidc_issuer is None else TokenReader(settings))
+        RateLimiter(settings.requests_per_second, settings.request_burst), RunningRequests(settings.max_requests),
+        draining=threading.Event(), closing=closing, watcher=Watcher(database, closing, streams),
+        tokens=None if settings.oidc_issuer is None else TokenReader(settings))
     app.state.metrics, app.state.readiness = Metrics(settings, database), operations.Readiness()
     problems.install(app)
     document.install(app)

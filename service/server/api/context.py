@@ -12,7 +12,7 @@ from fastapi.security.utils import get_authorization_scheme_param
 from starlette.concurrency import run_in_threadpool
 
 from service.requests.keys import Scope
-from service.server.api.access import RateLimiter, require_local
+from service.server.api.access import RateLimiter, RunningRequests, require_local
 from service.server.api.problems import ApiError
 from service.server.api.tokens import PROJECT_HEADER, TokenReader
 from service.server.api.watch import Watcher
@@ -39,6 +39,7 @@ class Service(NamedTuple):
     storage: Storage
     parts: UploadParts
     limiter: RateLimiter
+    running: RunningRequests
     draining: threading.Event
     """Set when the service is asked to end: it still answers while its workers finish their steps, and says that it is not ready."""
     closing: threading.Event
@@ -90,7 +91,11 @@ async def authenticated(request: Request) -> Caller:
     scheme, given = get_authorization_scheme_param(request.headers.get("Authorization"))
     if getattr(request.state, "caller", None) is None and scheme.lower() == "bearer":
         request.app.state.service.limiter.require(given.partition(".")[0])
-    return await run_in_threadpool(authenticate, request)
+    caller = await run_in_threadpool(authenticate, request)
+    if not getattr(request.state, "running", False):
+        request.app.state.service.running.enter(caller.key)
+        request.state.running = True  # middleware.RequestLog ends it
+    return caller
 
 
 async def caller_of(request: Request, _given: Annotated[HTTPAuthorizationCredentials | None, Security(bearer)]) -> Caller:

@@ -66,6 +66,8 @@ class RequestLog:
             self._metrics.count(scope, status, waited, received)
             log = logger.debug if scope["path"] in QUIET else logger.info
             caller, problem = scope["state"].get("caller"), scope["state"].get("problem")
+            if scope["state"].get("running"):
+                scope["app"].state.service.running.leave(caller.key)
             log("request", method=scope["method"], path=scope["path"], status=status, ms=round(1e3 * (time.perf_counter() - began), 1),
                 client=scope["client"][0] if scope.get("client") else None, **({} if problem is None else {"problem": problem}),
                 **({} if caller is None else {"project": caller.project, "key": caller.key}))

@@ -91,6 +91,30 @@ def test_a_key_that_asks_too_often_is_not_even_looked_up(small, client, monkeypa
     assert asyncio.run(Call(app, "/v1/jobs", headers={"Authorization": f"Bearer {stranger}"}).run()).status == 429
 
 
+def test_a_key_has_so_many_requests_under_way_and_no_more(small):
+    """An upload or a download that is drawn out holds a connection and a file."""
+    server, database = small
+    app = create_app(Settings(data=server.data, max_requests=2), database)
+    ours, theirs = ({"Authorization": f"Bearer {key(database)}"} for _ in range(2))
+
+    async def follow() -> None:
+        drawn = [Call(app, "/v1/events", headers=ours) for _ in range(2)]
+        running = [asyncio.create_task(call.run()) for call in drawn]
+        while not all(call.status for call in drawn):
+            await asyncio.sleep(0.01)
+        assert [call.status for call in drawn] == [200, 200]
+        assert (await Call(app, "/v1/jobs", headers=ours).run()).status == 429
+        assert (await Call(app, "/v1/jobs", headers=theirs).run()).status == 200
+        drawn[0].leave()
+        await running[0]
+        for _ in range(3):
+            assert (await Call(app, "/v1/jobs", headers=ours).run()).status == 200
+        drawn[1].leave()
+        await running[1]
+
+    asyncio.run(asyncio.wait_for(follow(), 60))
+
+
 def test_tokens_come_back_with_time():
     now = 0.0
     limiter = RateLimiter(2.0, 3, clock=lambda: now)
