@@ -9,6 +9,8 @@ import numpy as np
 
 from kernels import device as devices
 from kernels.photometric.lambert import solve_lambert
+from kernels.photometric.near import NearField
+from kernels.photometric.readings import Lights
 from kernels.photometric.robust import solve_robust
 from kernels.status import ESTIMATED, SOLVED, Status
 from kernels.surface.integrate import Integration
@@ -20,12 +22,8 @@ from service.solve import integrability
 from service.solve.diagnosis import diagnose
 from service.solve.diffuse import solve_diffuse
 from service.solve.distant import solve_distant
-from service.solve.extended import solve_extended
-from service.solve.gradient import solve_gradients
-from service.solve.material import refine_material, solve_material
 from service.solve.near import MATERIAL_ROUNDS, Rounds, solve_near
 from service.solve.parts import numbered, place_solution
-from service.solve.reference import solve_by_reference
 from service.solve.sharing import SharedSolve
 from service.solve.solution import Solution, SolveInput, SuspectLight, mark_not_facing, refine_status
 from service.solve.surface import guessed_part, height_warnings, integrate
@@ -71,16 +69,49 @@ def _single_lights(*series: Rounds) -> dict[type, Solver]:
     return {DistantLights: partial(solve_distant, solver=series[-1].solver), PlacedLights: partial(solve_near, series=series)}
 
 
+# solvers that few captures need are imported, with their kernels, when they are called: all of them take a tenth of a second
+
+
+def _solve_material(given: SolveInput, lights: Lights, field: NearField | None = None) -> Solution:
+    from service.solve.material import solve_material
+
+    return solve_material(given, lights, field)
+
+
+def _refine_material(given: SolveInput, lights: Lights, field: NearField, before: Solution) -> Solution:
+    from service.solve.material import refine_material
+
+    return refine_material(given, lights, field, before)
+
+
+def _solve_extended(given: SolveInput, lights: ExtendedLights) -> Solution:
+    from service.solve.extended import solve_extended
+
+    return solve_extended(given, lights)
+
+
+def _solve_gradients(given: SolveInput, frames: GradientFrames) -> Solution:
+    from service.solve.gradient import solve_gradients
+
+    return solve_gradients(given, frames)
+
+
+def _solve_by_reference(given: SolveInput, ball: ReferenceBall) -> Solution:
+    from service.solve.reference import solve_by_reference
+
+    return solve_by_reference(given, ball)
+
+
 LAMBERT = Rounds(Method.LAMBERT, partial(solve_diffuse, fit_normals=solve_lambert))
 ROBUST = Rounds(Method.ROBUST, partial(solve_diffuse, fit_normals=solve_robust))
-MATERIAL = Rounds(Method.SVBRDF, solve_material, MATERIAL_ROUNDS, refine_material)
+MATERIAL = Rounds(Method.SVBRDF, _solve_material, MATERIAL_ROUNDS, _refine_material)
 
 METHODS: Mapping[Method, MethodEntry] = {
-    Method.GRADIENT: MethodEntry(gradient_frames, {GradientFrames: solve_gradients}, has_gradients),
-    Method.SVBRDF: MethodEntry(check_solvable, {**_single_lights(ROBUST, MATERIAL), ExtendedLights: solve_extended}, _suits_svbrdf),
+    Method.GRADIENT: MethodEntry(gradient_frames, {GradientFrames: _solve_gradients}, has_gradients),
+    Method.SVBRDF: MethodEntry(check_solvable, {**_single_lights(ROBUST, MATERIAL), ExtendedLights: _solve_extended}, _suits_svbrdf),
     Method.ROBUST: MethodEntry(check_solvable, _single_lights(ROBUST), is_default=lambda capture: True),
     Method.LAMBERT: MethodEntry(check_solvable, _single_lights(LAMBERT)),
-    Method.REFERENCE: MethodEntry(reference_ball, {ReferenceBall: solve_by_reference}),
+    Method.REFERENCE: MethodEntry(reference_ball, {ReferenceBall: _solve_by_reference}),
 }
 """Every method. The default for a capture is the first whose `is_default` says so."""
 
