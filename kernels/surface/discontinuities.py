@@ -21,8 +21,9 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.surface.conjugate import Convergence
+from kernels.surface.fragments import cut
 from kernels.surface.grid import EdgeWeights, Grid, Walk, end_cell, first_cell, run
-from kernels.surface.parts import assemble, connect, cut
+from kernels.surface.parts import assemble, connect
 from kernels.surface.slopes import Slopes
 
 wp.set_module_options({"enable_backward": False})
@@ -146,20 +147,23 @@ def integrate_broken(slopes: Slopes, normal: wp.array, x: wp.array, y: wp.array,
     """
     noise = loop_noise(slopes, grid=grid)
     lowered, height = distrust_loops(slopes, noise=noise, grid=grid), grid.zeros()
-    whole, left = (np.stack([w.right.numpy(), w.down.numpy()]) for w in (slopes.weights, lowered.weights))
-    slope = np.stack([slopes.right.numpy(), slopes.down.numpy()])
-    found = cut(normal.numpy(), np.stack([x.numpy(), y.numpy()]), slope, whole, left, grid=grid, perspective=perspective, spacing=spacing)
+    whole, left = ((w.right.numpy(), w.down.numpy()) for w in (slopes.weights, lowered.weights))
+    slope = slopes.right.numpy(), slopes.down.numpy()
+    found = cut(normal.numpy(), (x.numpy(), y.numpy()), slope, whole, left, grid=grid, perspective=perspective, spacing=spacing)
     if not len(found.first):
         return Broken(height, found.label, solve(lowered, height))
     edges = (found.way, found.first)
-    _set(lowered.weights, edges, np.where(found.turned, 0.0, left[edges]))
+    kept = np.where(found.way == 1, left[1][found.first], left[0][found.first])
+    _set(lowered.weights, edges, np.where(found.turned, 0.0, kept))
     solve(lowered, height)
     parts = connect(found, height.numpy(), noise=noise)
-    _set(lowered.weights, edges, np.where(parts.between, 0.0, left[edges]))
+    _set(lowered.weights, edges, np.where(parts.between, 0.0, kept))
     height.zero_()  # the tolerance is relative to the first residual
     convergence = solve(lowered, height)
     heights = height.numpy()
-    height.assign(heights + np.where(parts.label >= 0, assemble(found, parts, heights)[parts.label], 0).astype(np.float32))
+    added = np.append(assemble(found, parts, heights), 0.0).astype(np.float32)  # 0 for the label -1
+    heights += added[parts.label]
+    height.assign(heights)
     return Broken(height, parts.label, convergence)
 
 

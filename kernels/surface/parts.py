@@ -15,26 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kernels.surface.components import join
-from kernels.surface.grid import Grid
-from kernels.surface.slopes import STEEPEST
+from kernels.surface.fragments import LEAST_PART, Fragments
 
-LEAST_TURN = np.radians(8.0)
-"""Least angle between the normals of two neighbours that may be a break."""
-TURN_OF_MEDIAN = 4.0
-"""The same in medians of this angle over all neighbours: noise and curvature turn normals everywhere."""
-STEADY, REACH = 0.5, 2
-"""Part of its turn by which the edges beside an edge must turn alike where a surface is merely round, and how many of them are looked
-at: three in line, since the outline of a part may turn twice, at a pixel that shows both sides."""
-NECK = 1
-"""Pixels beside cut edges that are left out where necks are looked for: an outline is open where both sides happen to share a normal."""
-LEAST_TRUST = 0.1
-"""Part of its weight below which loops have found that an edge crosses a break."""
-LEAST_PART = 48
-"""Number of pixels below which a fragment is no part: outlines are lined with pixels that show both sides."""
-EDGE_ON = 0.4
-"""Cosine between normal and line of sight below which a surface is seen edge on, and does not tell whether it touches its neighbour: an
-outline where a smooth surface turns away from the viewer is one of a part. It is taken a pixel beyond the last pixel centre."""
 MEETING = 0.6
 """Part of the edge between two fragments along which they must meet to belong together."""
 PLAY_PIXELS, PLAY_JUMP, PLAY_NOISE = 0.1, 0.6, 3.0
@@ -50,152 +32,12 @@ ROUNDS = 8
 """Most rounds in which small fragments join their neighbours; each at least halves a chain of them."""
 
 
-class Fragments(NamedTuple):
-    """A surface that is cut at all abrupt turns; cells are positions in the flat layout of its grid."""
-
-    label: np.ndarray  # [size] int, the fragment of each cell; -1 outside
-    count: int
-    first: np.ndarray  # [E] int, left or upper cell of each cut edge
-    second: np.ndarray  # [E] int, right or lower cell
-    way: np.ndarray  # [E] 1 where the edge leads down, 0 where it leads right
-    slope: np.ndarray  # [E] in units of the spacing
-    weight: np.ndarray  # [E] that of the edge if it crosses no break
-    turn: np.ndarray  # [E] angle between the two normals, radians
-    turned: np.ndarray  # [E] bool, whether the normals turn abruptly; else only loops contradict themselves
-    jump: np.ndarray  # [E] difference between the slopes of the two normals
-    edge_on: np.ndarray  # [E] bool, whether one of the two sides is seen edge on where it ends
-
-
 class Parts(NamedTuple):
     """The parts, and the edges between them."""
 
     label: np.ndarray  # [size] int, the part of each cell; -1 outside
     count: int
     between: np.ndarray  # [E] bool, whether this cut edge of the fragments leads from part to part
-
-
-def cut(normal: np.ndarray, ray: np.ndarray, slope: np.ndarray, weight: np.ndarray, left: np.ndarray, *, grid: Grid,
-        perspective: bool, spacing: float) -> Fragments:
-    """Cut a surface wherever its normals turn abruptly or contradict each other around a loop.
-
-    Args:
-        normal: [3, rows, cols] camera frame.
-        ray: [2, rows, cols] x and y of the pixels in the plane of projection.
-        slope: [2, size] of the edges to the right and down, in units of the spacing.
-        weight: [2, size] of these edges before loops are looked at; 0 is no edge.
-        left: [2, size] weights that the loops leave.
-        grid: the layout of slope, weight and left.
-        perspective: whether slopes are those of -log depth.
-        spacing: distance of neighbouring pixels in the plane of x and y.
-    """
-    n = _cells(normal, grid)
-    n /= np.maximum(np.linalg.norm(n, axis=0), 1e-9)
-    there = weight > 0
-    turn = np.zeros(weight.shape, dtype=np.float32)
-    for way, step in enumerate((1, grid.pitch)):
-        turn[way, :-step] = np.arccos(np.clip((n[:, :-step] * n[:, step:]).sum(axis=0), -1.0, 1.0))
-    usual = float(np.median(turn[there])) if there.any() else 0.0
-    turned = there & (turn > max(LEAST_TURN, TURN_OF_MEDIAN * usual)) & ~_rounded(n, there, grid.pitch)
-    lost = turned | (there & (left < LEAST_TRUST * weight) & turned.any())
-    usable = there[0] | there[1]
-    usable[1:] |= there[0, :-1]
-    usable[grid.pitch :] |= there[1, : -grid.pitch]
-    label, count = _part_at_necks(*label_cells(usable, there & ~lost, grid.pitch), there & ~lost, lost, grid.pitch)
-    for way, step in enumerate((1, grid.pitch)):
-        lost[way, :-step] |= there[way, :-step] & (label[:-step] != label[step:])
-    way, first = np.nonzero(lost)
-    second = first + np.where(way == 1, grid.pitch, 1)
-    xy = _cells(ray, grid)
-    step = (xy[:, second] - xy[:, first]) / spacing
-    sides = n[:, first], n[:, second]
-    facing = n[2] - (n[0] * xy[0] + n[1] * xy[1]) * perspective
-    alone = [-(side[:2] * step).sum(axis=0) / np.maximum(facing[cell], STEEPEST) for side, cell in zip(sides, (first, second), strict=True)]
-    inward = np.where(way == 1, grid.pitch, 1)
-    ends = np.minimum(*(_squared_end(facing, label, cell, cell + inner) for cell, inner in ((first, -inward), (second, inward))))
-    return Fragments(label, count, first, second, way, slope[way, first], weight[way, first], turn[way, first],
-                     turned[way, first], np.abs(alone[0] - alone[1]), ends < EDGE_ON**2)
-
-
-def _rounded(n: np.ndarray, there: np.ndarray, pitch: int) -> np.ndarray:
-    """Return which edges, [2, size], turn outwards as steadily as their neighbours in line: there a thin rod or ring is round."""
-    out = np.zeros(there.shape, dtype=bool)
-    for way, step in enumerate((1, pitch)):
-        change = np.where(there[way, :-step], n[:, step:] - n[:, :-step], 0)
-        least = STEADY * (change**2).sum(axis=0)
-        alike = [np.zeros(least.shape, dtype=bool) for _ in range(2 * REACH + 1)]  # of the edges that lie -REACH to REACH farther on
-        for k in range(1, REACH + 1):
-            near, far = slice(None, -k * step), slice(k * step, None)
-            along = (change[:, near] * change[:, far]).sum(axis=0)
-            alike[REACH + k][near], alike[REACH - k][far] = along > least[near], along > least[far]
-        two_before, before, _, after, two_after = alike
-        outwards = change[0] > 0 if way == 0 else change[1] < 0
-        out[way, :-step] = outwards & ((before & two_before) | (before & after) | (after & two_after))
-    return out
-
-
-def _squared_end(facing: np.ndarray, label: np.ndarray, cell: np.ndarray, inner: np.ndarray) -> np.ndarray:
-    """Return the squared cosine to the viewer a pixel beyond the last cell of a fragment; on a sphere it falls steadily to 0."""
-    here = np.maximum(facing[cell], 0) ** 2
-    return here - np.where(label[inner] == label[cell], np.maximum(np.maximum(facing[inner], 0) ** 2 - here, 0), 0)
-
-
-def _part_at_necks(label: np.ndarray, count: int, open_edges: np.ndarray, lost: np.ndarray, pitch: int) -> tuple[np.ndarray, int]:
-    """Return the fragments, [size] int with -1 outside, parted where only a neck of few pixels connects them, and their number.
-
-    What is left without the pixels beside lost edges falls apart at necks. Pieces of at least LEAST_PART pixels grow back until they meet.
-    """
-    if count == 0:
-        return label, 0
-    near = lost[0] | lost[1]
-    near[1:] |= lost[0, :-1]
-    near[pitch:] |= lost[1, :-pitch]
-    for _ in range(NECK):
-        for step in (1, pitch):
-            wide = near.copy()
-            wide[step:] |= near[:-step]
-            wide[:-step] |= near[step:]
-            near = wide
-    inner = (label >= 0) & ~near
-    within = open_edges & inner
-    within[0, :-1] &= inner[1:]
-    within[1, :-pitch] &= inner[pitch:]
-    core, cores = label_cells(inner, within, pitch)
-    large = np.bincount(core[core >= 0], minlength=cores) >= LEAST_PART
-    seed = np.where((core >= 0) & large[np.maximum(core, 0)], core + count, -1) if cores else core
-    seeded = np.zeros(count, dtype=bool)
-    seeded[label[seed >= 0]] = True
-    grown = np.where((label >= 0) & ~seeded[np.maximum(label, 0)], label, seed)
-    front = np.flatnonzero(seed >= 0)
-    while len(front):
-        reached = []
-        for step, ways, back in ((1, 0, 0), (pitch, 1, 0), (1, 0, 1), (pitch, 1, 1)):
-            into = front - step if back else front + step
-            passed = open_edges[ways, into if back else front] & (grown[into] < 0)
-            grown[into[passed]] = grown[front[passed]]
-            reached.append(into[passed])
-        front = np.unique(np.concatenate(reached))
-    kept, number = np.unique(grown[grown >= 0], return_inverse=True)
-    out = np.full(label.shape, -1)
-    out[grown >= 0] = number
-    return out, len(kept)
-
-
-def label_cells(usable: np.ndarray, open_edges: np.ndarray, pitch: int) -> tuple[np.ndarray, int]:
-    """Return the connected parts of a surface, [size] int with -1 outside, and their number.
-
-    Args:
-        usable: [size] bool.
-        open_edges: [2, size] bool, whether the edges to the right and down connect.
-        pitch: cells a row.
-    """
-    begins = usable.copy()
-    begins[1:] &= ~open_edges[0, :-1]
-    run = np.cumsum(begins) - 1  # runs of cells that are open to the right
-    count = int(run[-1]) + 1 if len(run) else 0
-    upper = np.flatnonzero(open_edges[1])
-    pairs = np.unique(run[upper].astype(np.int64) * max(count, 1) + run[upper + pitch])
-    kept, of_run = np.unique(join(count, pairs // max(count, 1), pairs % max(count, 1)), return_inverse=True)
-    return np.where(usable, of_run[np.maximum(run, 0)] if count else -1, -1), len(kept)
 
 
 def connect(found: Fragments, height: np.ndarray, *, noise: float) -> Parts:
@@ -217,7 +59,9 @@ def connect(found: Fragments, height: np.ndarray, *, noise: float) -> Parts:
             _join_meeting(seam, low, high, play)
     first, second = seam.sides()
     kept, number = np.unique(seam.group, return_inverse=True)
-    return Parts(np.where(found.label >= 0, number[np.maximum(found.label, 0)], -1), len(kept), first != second)
+    label = number.astype(np.int32)[np.maximum(found.label, 0)]
+    label[found.label < 0] = -1
+    return Parts(label, len(kept), first != second)
 
 
 def assemble(found: Fragments, parts: Parts, height: np.ndarray) -> np.ndarray:
@@ -322,11 +166,3 @@ def _join_meeting(seam: _Seam, low: int, high: int, play: np.ndarray) -> None:
         into, added = np.arange(len(seam.size)), np.zeros(len(seam.size))
         into[low], added[low] = high, 0.5 * (bounds[order[most]] + bounds[order[most + 1]])
         seam.move(into, added)
-
-
-def _cells(planes: np.ndarray, grid: Grid) -> np.ndarray:
-    """Return [k, rows, cols] planes in the flat layout of a grid, [k, size] float32."""
-    out = np.zeros((len(planes), grid.rows + 3, grid.pitch), dtype=np.float32)
-    out[:, 1 : grid.rows + 1, 1 : grid.cols + 1] = np.nan_to_num(planes)
-    return out.reshape(len(planes), -1)
-

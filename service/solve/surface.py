@@ -44,8 +44,8 @@ def integrate(given: SolveInput, normal: np.ndarray, solved: np.ndarray, *, sigm
         told = max(told, round(100 * part))  # the residual of conjugate gradients also grows for a few iterations
         given.timings.advance(told)
 
-    x, y = camera.plane_coordinates()
-    return integrate_normals(normal.reshape(3, *solved.shape), solved, x.astype(np.float32), y.astype(np.float32),
+    x, y = (plane.astype(np.float32) for plane in camera.plane_coordinates())
+    return integrate_normals(normal.reshape(3, *solved.shape), solved, x, y,
                              perspective=camera.projection == "perspective", mean_z=mean_height(camera),
                              sigma=None if sigma is None else np.radians(sigma, dtype=np.float32).reshape(solved.shape), options=OPTIONS,
                              device=given.device, progress=tell)
