@@ -65,12 +65,14 @@ def read_header(path: str | Path) -> Header:
         StorageError: the file cannot be opened.
     """
     with inputs.opened(path) as source:
-        return _header(source)
+        return header_of(source)
 
 
-def _header(source: inputs.Source) -> Header:
+def header_of(source: inputs.Source) -> Header:
+    """Read the header of an EXR file that is open; errors are those of `read_header`."""
     path, stream = source.path, source.file
     with storage("read", path):
+        stream.seek(0)
         start = stream.read(8)
     if start[:4] != b"\x76\x2f\x31\x01":
         raise ImageError(f"{path}: is not an OpenEXR file")
@@ -108,13 +110,18 @@ def read(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         StorageError: the file cannot be opened.
     """
     with inputs.opened(path) as source:
-        header = _header(source)
-        source.check_pixels(header.width, header.height)
-        try:
-            with source.reopened() as same, OpenEXR.File(same, separate_channels=True) as file:
-                channels = {name: channel.pixels for index in range(len(file.parts)) for name, channel in file.channels(index).items()}
-        except (RuntimeError, ValueError) as error:
-            raise ImageError(f"{path}: cannot be decoded: its data is damaged") from error
+        return read_open(source)
+
+
+def read_open(source: inputs.Source) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Read an EXR file that is open, as `read` does."""
+    path, header = source.path, header_of(source)
+    source.check_pixels(header.width, header.height)
+    try:
+        with source.reopened() as same, OpenEXR.File(same, separate_channels=True) as file:
+            channels = {name: channel.pixels for index in range(len(file.parts)) for name, channel in file.channels(index).items()}
+    except (RuntimeError, ValueError) as error:
+        raise ImageError(f"{path}: cannot be decoded: its data is damaged") from error
     if len(channels) < len(header.channels):  # the library leaves out a part that it cannot decode
         raise ImageError(f"{path}: cannot be decoded: its data is damaged")
     return channels, header.metadata

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import OpenImageIO as oiio
@@ -29,6 +29,29 @@ class ImageHeader(NamedTuple):
     integer: bool  # integers, whose largest value a camera writes for everything brighter too
 
 
+class Decoder(Protocol):
+    """Reads images in place of the functions here."""
+
+    def header(self, path: Path) -> ImageHeader:
+        """Return what `read_header` returns."""
+
+    def recorded(self, path: Path) -> np.ndarray:
+        """Return what `read_recorded` returns."""
+
+
+_elsewhere: list[Decoder] = []
+
+
+@contextmanager
+def decoded_by(decoder: Decoder) -> Iterator[None]:
+    """Let another decoder read all images, in all threads of this process, until the block ends; of several, the latest."""
+    _elsewhere.append(decoder)
+    try:
+        yield
+    finally:
+        _elsewhere.remove(decoder)
+
+
 def read_header(path: str | Path) -> ImageHeader:
     """Read the size and the channels of an image.
 
@@ -36,21 +59,27 @@ def read_header(path: str | Path) -> ImageHeader:
         ImageError: relit does not read such files, the file is truncated (EXR and PNG), or it has no grey or RGB channels.
         StorageError: the file cannot be opened.
     """
-    suffix = Path(path).suffix.lower()
-    if suffix == ".exr":
-        header = exr.read_header(path)
-        return ImageHeader(header.width, header.height, len(_colour_channels(path, header.channels)), len(header.channels), False)
-    if suffix not in OIIO_SUFFIXES:
-        raise ImageError(f"{path}: has an unknown suffix: relit reads {', '.join(sorted(SUFFIXES))}")
+    if _elsewhere:
+        return _elsewhere[-1].header(Path(path))
+    _check_suffix(path)
     with inputs.opened(path) as source:
-        if suffix == ".png":
-            integrity.check_png(path, source.file, contents=False)
-        elif suffix == ".jxl":
-            source.check_pixels(*jxl.resolution_of(path, source.file))
-        with _decoder(source) as decoder:
-            spec = decoder.spec()
-            return ImageHeader(spec.width, spec.height, 1 if spec.nchannels < 3 else 3, spec.nchannels,
-                               spec.format.basetype not in FLOATING)
+        return header_of(source)
+
+
+def header_of(source: inputs.Source) -> ImageHeader:
+    """Read the size and the channels of an image that is open; errors are those of `read_header`."""
+    path, suffix = source.path, source.path.suffix.lower()
+    if suffix == ".exr":
+        header = exr.header_of(source)
+        return ImageHeader(header.width, header.height, len(_colour_channels(path, header.channels)), len(header.channels), False)
+    _check_suffix(path)
+    if suffix == ".png":
+        integrity.check_png(path, source.file, contents=False)
+    elif suffix == ".jxl":
+        source.check_pixels(*jxl.resolution_of(path, source.file))
+    with _decoder(source) as decoder:
+        spec = decoder.spec()
+        return ImageHeader(spec.width, spec.height, 1 if spec.nchannels < 3 else 3, spec.nchannels, spec.format.basetype not in FLOATING)
 
 
 def read_pixels(path: str | Path) -> np.ndarray:
@@ -89,16 +118,23 @@ def read_recorded(path: str | Path) -> np.ndarray:
         ImageError: the file is damaged, or relit does not read such files.
         StorageError: the file cannot be opened.
     """
-    suffix = Path(path).suffix.lower()
+    if _elsewhere:
+        return _elsewhere[-1].recorded(Path(path))
+    with inputs.opened(path) as source:
+        return recorded_of(source)
+
+
+def recorded_of(source: inputs.Source) -> np.ndarray:
+    """Read the recorded values of an image that is open, as `read_recorded` does."""
+    path, suffix = source.path, source.path.suffix.lower()
     if suffix == ".exr":
-        channels, _ = exr.read(path)
+        channels, _ = exr.read_open(source)
         planes = [channels[name] for name in _colour_channels(path, tuple(channels))]
         if any(plane.dtype == np.uint32 for plane in planes):
             raise ImageError(f"{path}: holds integer identifiers, not radiance")
         pixels = np.stack(planes, axis=-1)
     else:
-        with inputs.opened(path) as source:
-            pixels = _decoded(source, suffix)
+        pixels = _decoded(source, suffix)
     return np.repeat(pixels, 3, axis=-1) if pixels.shape[-1] == 1 else pixels
 
 
@@ -225,6 +261,11 @@ def _decoder(source: inputs.Source) -> Iterator[oiio.ImageInput]:
             yield decoder
         finally:
             decoder.close()
+
+
+def _check_suffix(path: str | Path) -> None:
+    if Path(path).suffix.lower() not in SUFFIXES:
+        raise ImageError(f"{path}: has an unknown suffix: relit reads {', '.join(sorted(SUFFIXES))}")
 
 
 def _colour_channels(path: str | Path, names: tuple[str, ...]) -> tuple[str, ...]:

@@ -9,11 +9,11 @@ and at last {"facts": …}, {"error": sentence} or {"fault": traceback}.
 
 import json
 import os
-import resource
 import selectors
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 import traceback
@@ -21,6 +21,7 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
+from service.captures.processes import bare_environment, limit
 from service.errors import USER_ERRORS, RequestError, sentence
 from service.reporting.progress import Progress
 
@@ -37,10 +38,10 @@ ANSWER_BYTES = 1 << 20
 LOOK_S = 0.5
 """Seconds between two signs of life to the job."""
 COMMAND = (sys.executable, "-P", "-m", __name__)
+PYTHON_FAILED = 1
+"""Exit code of Python after an exception that nobody caught."""
 END_S = 5.0
 """Seconds that a process which has closed its output may take to end."""
-KEPT = ("PATH", "LANG", "LC_ALL", "LC_CTYPE", "TMPDIR", "LD_LIBRARY_PATH")
-"""Variables of the environment that the process inherits."""
 
 
 def check_in_process(folder: Path, *, environment: bool, root: Path | None, max_pixels: int, progress: Progress) -> dict[str, Any]:
@@ -60,14 +61,12 @@ def check_in_process(folder: Path, *, environment: bool, root: Path | None, max_
         RequestError: the files cannot be used; the sentence names them below the folder.
         RuntimeError: an error of relit itself; the message is its traceback.
     """
-    kept = {name: os.environ[name] for name in KEPT if name in os.environ}
-    path = os.pathsep.join(os.path.abspath(entry) for entry in sys.path)
     asked = {"folder": str(folder), "environment": environment, "root": None if root is None else str(root), "max_pixels": max_pixels}
-    process = subprocess.Popen(
-        COMMAND, env=kept | {"PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1", "OPENBLAS_NUM_THREADS": "1"}, cwd=os.sep,
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, start_new_session=True)
-    assert process.stdin is not None and process.stdout is not None
-    with process, ExitStack() as ended:
+    with ExitStack() as ended:
+        errors = ended.enter_context(tempfile.TemporaryFile())
+        process = ended.enter_context(subprocess.Popen(COMMAND, env=bare_environment(), cwd=os.sep, stdin=subprocess.PIPE,
+                                                       stdout=subprocess.PIPE, stderr=errors, start_new_session=True))
+        assert process.stdin is not None and process.stdout is not None
         ended.callback(process.kill)
         try:
             process.stdin.write(json.dumps(asked).encode() + b"\n")
@@ -78,6 +77,9 @@ def check_in_process(folder: Path, *, environment: bool, root: Path | None, max_
         if answer is None:
             with suppress(subprocess.TimeoutExpired):
                 process.wait(END_S)
+            if process.returncode == PYTHON_FAILED:
+                errors.seek(0)
+                raise RuntimeError(errors.read(ANSWER_BYTES).decode(errors="replace")[-4000:])
             raise RequestError(_end(process.returncode))
     if "error" in answer:
         raise RequestError(str(answer["error"]))
@@ -143,17 +145,9 @@ _answers = 1
 """Descriptor of the pipe to the service."""
 
 
-def _limit() -> None:
-    for kind, most in ((resource.RLIMIT_DATA, MEMORY_BYTES), (resource.RLIMIT_CPU, CPU_S), (resource.RLIMIT_CORE, 0),
-                       (resource.RLIMIT_FSIZE, FILE_BYTES)):
-        _, hard = resource.getrlimit(kind)
-        allowed = most if hard == resource.RLIM_INFINITY else min(most, hard)
-        resource.setrlimit(kind, (allowed, allowed))
-
-
 def _end_with_parent() -> None:
     sys.stdin.buffer.read()  # until its end: the worker is gone
-    os._exit(1)
+    os._exit(3)
 
 
 def main() -> None:
@@ -161,7 +155,7 @@ def main() -> None:
     global _answers
     _answers = os.dup(sys.stdout.fileno())
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # libraries print there what they find wrong
-    _limit()
+    limit(DATA=MEMORY_BYTES, CPU=CPU_S, FSIZE=FILE_BYTES)
     asked = json.loads(sys.stdin.buffer.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()
     folder = Path(asked["folder"])

@@ -38,11 +38,18 @@ class JobStep(NamedTuple):
 
 def steps_of(job: Job, context: WorkerContext) -> list[JobStep]:
     """Return the steps of a job, which are always the same for the same job."""
+    from service.captures.decoders import Decoders
+    from stage import images
+
     held = ExitStack()
 
     def closing(run: Callable[[Progress], None]) -> Callable[[Progress], None]:
         def step(progress: Progress) -> None:
             with held:
+                if not isinstance(job.request, CheckJob):  # which does not decode, and may run beside another step
+                    decoders = Decoders(context.max_pixels)
+                    held.callback(decoders.close)
+                    held.enter_context(images.decoded_by(decoders))
                 run(progress)
 
         return step

@@ -96,7 +96,7 @@ def test_its_memory_and_its_files_are_bounded(monkeypatch, tmp_path):
     running(monkeypatch, f"""
 sys.path.insert(0, {str(Path(__file__).parents[3])!r})
 from service.captures import check_process
-check_process._limit()
+check_process.limit(DATA=check_process.MEMORY_BYTES, FSIZE=check_process.FILE_BYTES)
 found = []
 for size in (1 << 30, 2 << 30):
     try:

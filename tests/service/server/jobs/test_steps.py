@@ -51,14 +51,24 @@ def test_a_file_that_becomes_a_link_after_it_was_checked_is_not_read(idle_harnes
     else:
         (outside / name).write_bytes((capture / name).read_bytes())
 
-    def swapped(request, progress):
+    def swapped(request, progress, **others):
         (capture / name).unlink()
         (capture / name).symlink_to(outside / name)
-        solve(request, progress)
+        solve(request, progress, **others)
 
     monkeypatch.setattr(product, "solve", swapped)
     with pytest.raises(StageError, match=f"{name}: leads out of the folder"):
         step_of(idle_harness, capture, (capture.parent,)).run(Silent())
+
+
+def test_the_worker_decodes_no_image_of_a_capture(idle_harness, capture, monkeypatch):
+    from stage import images
+
+    step = step_of(idle_harness, capture, (capture.parent,))
+    for name in ("recorded_of", "header_of"):
+        monkeypatch.setattr(images, name, lambda source: pytest.fail(f"{source.path} is read here"))
+    step.run(Silent())
+    assert (idle_harness.results("job_0123456789abcdefghjk") / "maps.exr").exists()
 
 
 def test_the_folder_is_closed_when_the_step_ends(idle_harness, capture):
