@@ -29,6 +29,8 @@ BASE_BYTES, PIXEL_BYTES = 2 << 30, 24
 """Bytes of data that a process may have, besides so many for each pixel that an image may have."""
 CPU_S, WALL_S = 120, 600.0
 """Seconds of processor time, and seconds, that one image may take."""
+MOST_PROCESSES, HEADER_PROCESSES = 8, 2
+"""Processes that decode at one time, and of these that read headers: a header takes less than a thousandth of the start of a process."""
 MESSAGE_BYTES = 1 << 16
 COMMAND = (sys.executable, "-P", "-m", __name__)
 SHRINK = 2
@@ -74,13 +76,15 @@ class Decoders:
     def __init__(self, max_pixels: int) -> None:
         """Args: max_pixels: most pixels of an image."""
         self._max_pixels = max_pixels
-        self._places = threading.BoundedSemaphore(os.cpu_count() or 1)
+        self._places = threading.BoundedSemaphore(min(os.cpu_count() or 1, MOST_PROCESSES))
+        self._headers = threading.BoundedSemaphore(HEADER_PROCESSES)
         self._idle: list[_Process] = []
         self._lock = threading.Lock()
 
     def header(self, path: Path) -> ImageHeader:
         """Return the header of an image; errors are those of `stage.images.read_header`."""
-        answer, _ = self._ask("header", path)
+        with self._headers:
+            answer, _ = self._ask("header", path)
         return ImageHeader(*answer["header"])
 
     def recorded(self, path: Path) -> np.ndarray:
