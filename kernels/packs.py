@@ -20,6 +20,8 @@ from kernels.errors import ArrayError
 
 STRIDE_LIMIT = 1 << 31
 """Bytes: strides of Warp arrays stay below."""
+LINE_BYTES = 64
+"""Bytes of a cache line, at which arrays begin, so that no SIMD store crosses one."""
 MAX_PIXELS = STRIDE_LIMIT // 12 // PACK_CPU * PACK_CPU - PACK_CPU
 """Pixels of one band, 178 million: a relit float32 RGB frame of them stays below the limit."""
 
@@ -129,14 +131,29 @@ def padded_count(pixels: int, device: str) -> int:
 def zeros(pixels: int, dtype: Any, device: str, *, rows: int | None = None) -> wp.array:
     """Return an output array of zeros, [pixels padded] or [rows, pixels padded], so that a kernel may leave pixels unwritten."""
     whole = padded_count(pixels, device)
-    return wp.zeros(whole if rows is None else (rows, whole), dtype=dtype, device=device)
+    return new_array(whole if rows is None else (rows, whole), dtype, device, cleared=True)
 
 
 def unwritten(pixels: int, dtype: Any, device: str, *, rows: int | None = None) -> wp.array:
     """Return an output array as `zeros` does, but with arbitrary values, for a kernel that writes every pixel: clearing it first would
     take as long as writing it."""
     whole = padded_count(pixels, device)
-    return wp.empty(whole if rows is None else (rows, whole), dtype=dtype, device=device)
+    return new_array(whole if rows is None else (rows, whole), dtype, device, cleared=False)
+
+
+def new_array(shape: int | tuple[int, ...], dtype: Any, device: str, *, cleared: bool) -> wp.array:
+    """Return a new array of scalars, of zeros or of arbitrary values.
+
+    On the CPU its memory is NumPy's, which asks the system for huge pages: touching 75 MB for the first time takes 7 ms with them and 36 ms
+    without, as much as a kernel may take to compute the values.
+    """
+    if device != "cpu":
+        return (wp.zeros if cleared else wp.empty)(shape, dtype=dtype, device=device)
+    kind = np.dtype(wp.dtype_to_numpy(dtype))
+    size = int(np.prod(shape)) * kind.itemsize
+    memory = (np.zeros if cleared else np.empty)(size + LINE_BYTES, dtype=np.uint8)
+    begin = -memory.ctypes.data % LINE_BYTES
+    return wp.array(memory[begin : begin + size].view(kind).reshape(shape), dtype=dtype, device="cpu", copy=False)
 
 
 def as_packs(array: wp.array, device: str) -> wp.array:

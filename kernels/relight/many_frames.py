@@ -1,7 +1,9 @@
-"""Relighting many frames at once: a matrix product of frame weights and the stack, read once for all frames.
+"""Relighting many frames at once: a matrix product of frame weights and the stack.
 
-On the CPU the product is NumPy's BLAS on blocks of the stack that a kernel has widened to float32; on CUDA a thread keeps eight
-frames of one pack in registers, or cuBLAS makes the product where it is installed (cublas.py).
+A thread keeps eight frames of one pack in registers. On the CPU it takes a chunk of packs, which eight frames after eight read again from
+the cache, so that the stack is read from memory once and never widened to float32 there; on CUDA it takes one pack, or cuBLAS makes the
+product where it is installed (cublas.py). The sum of a frame in registers adds its lights one after another, and is the same to the last
+bit whichever other frames are made.
 """
 
 from functools import cache
@@ -11,18 +13,17 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
-from kernels.packs import Band, as_packs, pack_type
+from kernels.packs import Band, as_packs, new_array, pack_type
 from kernels.relight import cublas
 from kernels.relight.one_frame import check_weights
 
-BLOCK_BYTES = 16 << 20
-"""Bytes of float32 that one BLAS call reads: they bound the scratch memory, and are so many that the start of the BLAS threads costs
-nothing."""
+CHUNK = 8
+"""Packs that one CPU thread takes: 256 pixels of 64 lights are 32 KiB, which the first-level cache holds."""
 GROUP = 32
-"""Number of frames in every BLAS call; missing ones are padded with zero frames. BLAS may sum in another order when the number changes, and
-a frame at the same position must be identical to the last bit whichever other frames are made."""
+"""Number of frames in every BLAS call of combine_rows; missing ones are padded with zero frames. BLAS may sum in another order when the
+number changes, and a frame at the same position must be identical to the last bit whichever other frames are made."""
 REGISTER_FRAMES = 8
-"""Number of frames that one CUDA thread computes: 8 frames of 4 pixels are 32 sums, which fit into registers."""
+"""Number of frames that one thread computes: their sums, 8 frames of 32 pixels on the CPU and of 4 on CUDA, fit into registers."""
 
 
 def combine_batch(band: Band, weights: np.ndarray, *, with_cublas: bool = True) -> wp.array:
@@ -44,17 +45,25 @@ def combine_batch(band: Band, weights: np.ndarray, *, with_cublas: bool = True) 
     device = band.device
     pack = devices.pack_width(device)
     weights = np.ascontiguousarray(weights, dtype=np.float32)
-    if device == "cpu":
-        frames = wp.empty((len(weights), 3, band.packs * pack), dtype=wp.float32, device=device)
-        _product(band, weights, frames.numpy(), pack)
-        return frames
-    if with_cublas and (gemm := cublas.product_of(device)) is not None:
-        return cublas.combine_by(gemm, band, weights)
-    return _register_sums(band.values, weights, pack, device)
+    if not len(weights):
+        return wp.empty((0, 3, band.packs * pack), dtype=wp.float32, device=device)
+    if device != "cpu":
+        if with_cublas and (gemm := cublas.product_of(device)) is not None:
+            return cublas.combine_by(gemm, band, weights)
+        return _register_sums(band.values, weights, pack, device)
+    padded = _padded(weights, REGISTER_FRAMES)
+    groups = np.ascontiguousarray(padded.reshape(-1, REGISTER_FRAMES, 3, band.frame_count).transpose(0, 2, 3, 1))
+    frames = new_array((len(padded), 3, band.packs * pack), wp.float32, device, cleared=False)
+    chunks = -(-band.packs // CHUNK)
+    devices.launch(chunk_kernel(pack), 3 * chunks, [band.values, wp.array(groups, dtype=wp.float32, device=device), chunks],
+                   [as_packs(frames, device)], device=device)
+    return frames[: len(weights)]
 
 
 def combine_rows(rows: wp.array, weights: np.ndarray) -> wp.array:
-    """Return weighted sums of float32 rows, with the same guarantee: a frame at the same position does not depend on the others.
+    """Return weighted sums of many float32 rows; a frame at the same position does not depend on the others, to the last bit.
+
+    On the CPU the product is NumPy's BLAS, which is faster where rows are thousands.
 
     Args:
         rows: [channels · n, P] float32 packs, contiguous; all rows of the first channel come first.
@@ -97,47 +106,40 @@ def _register_sums(values: wp.array, weights: np.ndarray, pack: int, device: str
     return frames[: len(weights)]
 
 
-def _product(band: Band, weights: np.ndarray, frames: np.ndarray, pack: int) -> None:
-    """Compute frames[f, c] = weights[f, c] @ stack[c], block by block and GROUP frames at a time."""
-    padded = _padded(weights, GROUP)
-    step = max(1, BLOCK_BYTES // (4 * pack * band.frame_count))
-    block = wp.empty((band.frame_count, step), dtype=pack_type(pack, wp.float32), device="cpu")
-    widened = block.numpy().reshape(band.frame_count, step * pack)
-    group = np.empty((GROUP, step * pack), dtype=np.float32)
-    for channel in range(3):
-        per_frame = np.ascontiguousarray(padded[:, channel])
-        for begin in range(0, band.packs, step):
-            count = min(step, band.packs - begin)
-            devices.launch(_widen_kernel(pack), band.frame_count, [band.values, channel * band.frame_count, begin, count],
-                           [block], device="cpu")
-            pixels = slice(begin * pack, (begin + count) * pack)
-            for first in range(0, len(weights), GROUP):
-                last = min(first + GROUP, len(weights))
-                np.matmul(per_frame[first : first + GROUP], widened[:, : count * pack], out=group[:, : count * pack])
-                frames[first:last, channel, pixels] = group[: last - first, : count * pack]
-
-
 @cache
-def _widen_kernel(pack: int) -> Any:
+def chunk_kernel(pack: int) -> Any:
+    """Return the CPU kernel: one thread for a chunk of packs, eight frames of one pack at a time, their sums in registers."""
     half_pack, float_pack = pack_type(pack, wp.float16), pack_type(pack, wp.float32)
+    sums = wp.types.matrix(shape=(REGISTER_FRAMES, pack), dtype=wp.float32)
 
-    @wp.kernel(enable_backward=False, module="unique")
-    def widen_kernel(first: int,
-                     values: wp.array2d(dtype=half_pack),  # [3 · L, P] stored radiance
-                     row: int,  # of the channel's first light
-                     begin: int,
-                     count: int,
-                     # outputs
-                     block: wp.array2d(dtype=float_pack)):  # [L, count or more]
-        light = first + wp.tid()
-        for p in range(count):
-            half = values[row + light, begin + p]
-            wide = float_pack()
-            for k in range(pack):
-                wide[k] = float(half[k])
-            block[light, p] = wide
+    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
+    def batch_chunk(first: int,
+                    values: wp.array2d(dtype=half_pack),  # [3 · L, P] stored radiance
+                    weights: wp.array4d(dtype=float),  # [F / 8, 3, L, 8]
+                    chunks: int,  # of one channel
+                    # outputs
+                    frames: wp.array3d(dtype=float_pack)):  # [F, 3, P]
+        thread = first + wp.tid()
+        channel = thread / chunks
+        begin = (thread % chunks) * CHUNK
+        end = wp.min(begin + CHUNK, values.shape[1])
+        row = channel * weights.shape[2]
+        for group in range(weights.shape[0]):
+            for p in range(begin, end):
+                total = sums()
+                for light in range(weights.shape[2]):
+                    value = values[row + light, p]
+                    for g in range(REGISTER_FRAMES):
+                        w = weights[group, channel, light, g]
+                        for k in range(pack):
+                            total[g, k] += float(value[k]) * w
+                for g in range(REGISTER_FRAMES):
+                    out = float_pack()
+                    for k in range(pack):
+                        out[k] = total[g, k]
+                    frames[group * REGISTER_FRAMES + g, channel, p] = out
 
-    return widen_kernel
+    return batch_chunk
 
 
 @cache
