@@ -18,6 +18,9 @@ from kernels.status import OK
 SHADOW_FRACTION = 0.1
 """Fraction of the brightest reading below which a reading may be in shadow, and b·l need not predict it."""
 
+PRODUCTS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+"""Entries of a symmetric matrix, in the order of the sums of add_reading."""
+
 
 class NormalFit(NamedTuple):
     """Normals of a band, and what their uncertainty follows from; the last axis is pixels, padded to whole packs. Only pixels with
@@ -50,11 +53,15 @@ def solve_lambert(band: Band, readings: Readings, directions: np.ndarray, near_l
     Source:
         Woodham, "Photometric method for determining surface orientation from multiple images", Optical Engineering 1980.
     """
-    return run_normal_kernel(_lambert_kernel, band, readings, directions, near_lights)
+    exact = directions.astype(np.float64)
+    products = np.array([(exact[:, i] * exact[:, j]).sum() for i, j in PRODUCTS])
+    return run_normal_kernel(_lambert_kernel, band, readings, directions, near_lights,
+                             wp.array(products, dtype=wp.float32, device=band.device), int(directions.any(axis=1).sum()))
 
 
-def run_normal_kernel(make: Any, band: Band, readings: Readings, directions: np.ndarray, near_lights: NearLights | None) -> NormalFit:
-    """Launch a kernel that turns readings into normals; shared by the solvers that differ in the kernel alone."""
+def run_normal_kernel(make: Any, band: Band, readings: Readings, directions: np.ndarray, near_lights: NearLights | None,
+                      *more: Any) -> NormalFit:
+    """Launch a kernel that turns readings into normals; shared by solvers that differ in the kernel alone, and in what more it takes."""
     if directions.shape != (band.frame_count, 3):
         raise ArrayError(f"directions are {directions.shape}, the band has {band.frame_count} lights: give a row for each")
     def floats() -> wp.array:
@@ -64,7 +71,7 @@ def run_normal_kernel(make: Any, band: Band, readings: Readings, directions: np.
                     floats(), floats(), floats(), floats())
     lights = wp.array(directions, dtype=wp.vec3, device=band.device)
     devices.launch(make(devices.pack_width(band.device), near_lights is not None), band.packs,
-                   [lights, toward_or_none(near_lights, band.device), readings.pack_stride, readings.light_stride],
+                   [lights, toward_or_none(near_lights, band.device), readings.pack_stride, readings.light_stride, *more],
                    [readings.values, _as_struct(fit)], device=band.device)
     return fit
 
@@ -118,6 +125,8 @@ def _lambert_kernel(pack: int, near: bool = False) -> Any:
                        toward: wp.array2d(dtype=float_pack),  # [3, P · L] in place of lights, if near
                        pack_stride: int,
                        light_stride: int,
+                       products: wp.array(dtype=float),  # [6] Σ l lᵀ over all lights
+                       light_count: int,  # without padding
                        # outputs
                        readings: wp.array(dtype=float_pack),  # in: readings, out: weights
                        fit: NormalArrays):
@@ -129,18 +138,43 @@ def _lambert_kernel(pack: int, near: bool = False) -> Any:
             y = readings[p * pack_stride + light * light_stride]
             for k in range(pack):
                 top[k] = wp.max(top[k], y[k])
-        for light in range(lights.shape[0]):
-            at = p * pack_stride + light * light_stride
-            y = readings[at]
-            lx, ly, lz = directions_of(lights, toward, light, at)
-            weight = float_pack()
+                count[k] += wp.where(y[k] > 0.0, 1.0, 0.0)
+        fewest = float(lights.shape[0])
+        for k in range(pack):
+            fewest = wp.min(fewest, count[k])
+        if not near and fewest >= float(light_count):  # each pixel has every reading, and Σ l lᵀ is the same for all
             for k in range(pack):
-                weight[k] = wp.where(y[k] > 0.0, 1.0, 0.0)
-                count[k] += weight[k]
-                bright[k] += wp.where(y[k] > SHADOW_FRACTION * top[k], 1.0, 0.0)
-                add_reading(y[k], weight[k], lx[step * k], ly[step * k], lz[step * k], xx[k], xy[k], xz[k], yy[k], yz[k], zz[k],
-                            rx[k], ry[k], rz[k], squares[k])
-            readings[at] = weight
+                xx[k] = products[0]
+                xy[k] = products[1]
+                xz[k] = products[2]
+                yy[k] = products[3]
+                yz[k] = products[4]
+                zz[k] = products[5]
+            for light in range(lights.shape[0]):
+                at = p * pack_stride + light * light_stride
+                y = readings[at]
+                direction = lights[light]
+                weight = float_pack()
+                for k in range(pack):
+                    weight[k] = wp.where(y[k] > 0.0, 1.0, 0.0)
+                    bright[k] += wp.where(y[k] > SHADOW_FRACTION * top[k], 1.0, 0.0)
+                    rx[k] += y[k] * direction[0]
+                    ry[k] += y[k] * direction[1]
+                    rz[k] += y[k] * direction[2]
+                    squares[k] += y[k] * y[k]
+                readings[at] = weight
+        else:
+            for light in range(lights.shape[0]):
+                at = p * pack_stride + light * light_stride
+                y = readings[at]
+                lx, ly, lz = directions_of(lights, toward, light, at)
+                weight = float_pack()
+                for k in range(pack):
+                    weight[k] = wp.where(y[k] > 0.0, 1.0, 0.0)
+                    bright[k] += wp.where(y[k] > SHADOW_FRACTION * top[k], 1.0, 0.0)
+                    add_reading(y[k], weight[k], lx[step * k], ly[step * k], lz[step * k], xx[k], xy[k], xz[k], yy[k], yz[k], zz[k],
+                                rx[k], ry[k], rz[k], squares[k])
+                readings[at] = weight
         for k in range(pack):
             found = fit_pixel(symmetric(xx[k], xy[k], xz[k], yy[k], yz[k], zz[k]), wp.vec3(rx[k], ry[k], rz[k]),
                               squares[k], int(count[k]))

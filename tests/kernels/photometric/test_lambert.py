@@ -71,6 +71,24 @@ def test_values_are_those_of_the_twin_on_noisy_data(device):
     np.testing.assert_allclose(solved.albedo, expected, atol=1e-4)
 
 
+def test_pixels_with_every_reading_are_solved_alike_beside_one_that_lacks_some(device):
+    """The products of the lights are summed once for packs whose pixels have every reading. To float32 sums, and their difference."""
+    normal, albedo, direction, irradiance = cap(320, 30), colours(320), cap(19, 40), 3 * colours(19, seed=1)
+    radiance = shade(normal, albedo, direction, irradiance)
+    radiance *= np.random.default_rng(2).normal(1, 0.03, radiance.shape)
+    whole = solve(solve_lambert, radiance, direction, irradiance, device)
+    assert (whole.weights[:19] == 1).all() and (whole.status == Status.OK).all()
+    lacking = np.arange(0, 320, 4)  # one in every pack
+    radiance[:, 5, lacking] = 0
+    part = solve(solve_lambert, radiance, direction, irradiance, device)
+    kept = np.setdiff1d(np.arange(320), lacking)
+    assert (part.weights[5, lacking] == 0).all() and (part.weights[:19, kept] == 1).all()
+    np.testing.assert_allclose(part.normal[kept], whole.normal[kept], atol=2e-6)
+    np.testing.assert_allclose(part.squares[kept], whole.squares[kept], rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(part.across[kept], whole.across[kept], rtol=1e-5)
+    assert np.abs(part.normal[lacking] - whole.normal[lacking]).max() > 1e-3
+
+
 @pytest.mark.parametrize("lit, status", list(enumerate([Status.DARK, Status.TOO_FEW_LIGHTS, Status.TOO_FEW_LIGHTS, Status.OK])))
 def test_status_by_the_number_of_readings(lit, status, device):
     direction = cap(5, 30)
