@@ -14,9 +14,10 @@ MOST_TERMS = 256
 class ViewOptions(StackOptions):
     """How a capture is shown."""
 
-    terms: Annotated[int, Field(ge=1, le=MOST_TERMS)] = 32
+    terms: Annotated[int, Field(ge=1, le=MOST_TERMS)] | None = None
     """Most coefficient images that the object is relit with in the browser; fewer where fewer show the captured images as well. Objects
-    with sharp highlights and shadows need about as many as there are lights."""
+    with sharp highlights and shadows need about as many as there are lights. None: as many as a browser holds at the resolution of the
+    capture, and 32 at least."""
 
 
 class ViewRequest(ViewOptions, Request):

@@ -14,6 +14,7 @@ from kernels.relight.beyond import reach
 from kernels.relight.many_frames import combine_batch
 from kernels.relight.residual import squared_residual
 from service.reporting.progress import Timings
+from service.requests.view import MOST_TERMS
 from service.viewing.block_file import BlockFile
 from service.viewing.reduction import plane_means, step_within
 from service.viewing.row_bands import row_bands
@@ -26,6 +27,8 @@ from stage.stack import Stack
 
 LEAST_LIGHTS = 4
 """With fewer lights there is nothing to relight with: they do not surround any direction."""
+LEAST_TERMS = 32
+"""Most coefficient images of a large capture, unless the request says otherwise: it is rather reduced than shown with fewer."""
 RELATIVE_RMS = 0.005
 """Error of the captured images, relative to them, that needs no further coefficient image: half a step of an 8-bit display."""
 MOST_VALUES = 64_000_000
@@ -43,7 +46,7 @@ class Coefficients(NamedTuple):
     """Root mean square of what the stored coefficients leave of the captured images, relative to these."""
 
 
-def write_relighting(stack: Stack, lights: DistantLights, matte: Matte, file: BlockFile, *, most_terms: int,
+def write_relighting(stack: Stack, lights: DistantLights, matte: Matte, file: BlockFile, *, most_terms: int | None,
                      device: str, timings: Timings) -> dict[str, Any]:
     """Write basis, matte, transfer and coefficients of the captured images, and return what view.json says of them.
 
@@ -52,7 +55,7 @@ def write_relighting(stack: Stack, lights: DistantLights, matte: Matte, file: Bl
         lights: of the images, near ones as the object's centre sees them.
         matte: of the object; the coefficient images are premultiplied by its coverage.
         file: for the blocks.
-        most_terms: most coefficient images.
+        most_terms: most coefficient images; None: as many as fit without reducing the images, and LEAST_TERMS at least.
         device: where.
         timings: told of every stage.
 
@@ -63,7 +66,8 @@ def write_relighting(stack: Stack, lights: DistantLights, matte: Matte, file: Bl
     count = stack.light_count
     covered = np.zeros(stack.shape[2], dtype=bool)
     covered[: stack.pixel_count] = (matte.factor > 0).reshape(-1)
-    basis = _basis(stack, covered, most_terms, device, timings)
+    most = most_terms or max(LEAST_TERMS, min(MOST_TERMS, MOST_VALUES // matte.factor.size))
+    basis = _basis(stack, covered, most, device, timings)
     largest = float(np.linalg.norm(2.0**TOP_EXPONENT * stack.scale))  # no pixel's radiance over all lights, nor any coefficient, is larger
     scale = 2.0 ** math.ceil(math.log2(largest / HALF_BOUND))
     timings.stage("directions", 1)
