@@ -94,7 +94,7 @@ def share_kernel(samples: np.ndarray, energy: np.ndarray, directions: np.ndarray
             energy = energy * (1 - beyond)[:, None]
         except ArrayError:  # no triangles
             pass
-    solved = _solve(towards.tobytes())
+    solved = quadrature_of(towards)
     moments = np.zeros((len(kept) + 1, energy.shape[1]))
     size = max(1, CHUNK_VALUES // len(kept))
     for begin in range(0, len(samples), size):
@@ -110,23 +110,32 @@ def share_kernel(samples: np.ndarray, energy: np.ndarray, directions: np.ndarray
     return given
 
 
-class _Solved(NamedTuple):
-    """What all samples have in common."""
+class Quadrature(NamedTuple):
+    """What the lights need for every integral: the weights of least expected error are inverse[:-1] @ moments."""
 
     range: float
     """ρ, as a distance between unit vectors."""
     inverse: np.ndarray  # [lights + 1, lights + 1] of the covariance between the lights, bordered by ones for the sum of the weights
 
 
+def quadrature_of(directions: np.ndarray) -> Quadrature:
+    """Return the quadrature of lights.
+
+    Args:
+        directions: [lights, 3] unit vectors, all in different places.
+    """
+    return _solve(np.ascontiguousarray(directions, dtype=np.float64).tobytes())
+
+
 @lru_cache(maxsize=REMEMBERED)
-def _solve(directions_bytes: bytes) -> _Solved:
+def _solve(directions_bytes: bytes) -> Quadrature:
     """Return what lights [lights, 3] float64 need; the result is kept, because every frame asks for the same one."""
     directions = np.frombuffer(directions_bytes).reshape(-1, 3)
     count = len(directions)
     distance = np.sort(_distance(directions, directions), axis=1)[:, 1 : 1 + NEIGHBOURS]
     length = RANGE * float(np.median(distance.mean(axis=1))) if count > 1 else RANGE
     covariance = _covariance(directions, directions, length)
-    return _Solved(length, np.linalg.inv(np.block([[covariance, np.ones((count, 1))], [np.ones((1, count)), np.zeros((1, 1))]])))
+    return Quadrature(length, np.linalg.inv(np.block([[covariance, np.ones((count, 1))], [np.ones((1, count)), np.zeros((1, 1))]])))
 
 
 def _distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ from kernels.relight.residual import squared_residual
 from service.reporting.progress import Timings
 from service.requests.view import MOST_TERMS
 from service.viewing.block_file import BlockFile
+from service.viewing.quadrature import write_quadrature
 from service.viewing.reduction import plane_means, step_within
 from service.viewing.row_bands import row_bands
 from service.viewing.transfer import COLS, FULL, ROWS, transfer_of
@@ -83,6 +84,7 @@ def write_relighting(stack: Stack, lights: DistantLights, matte: Matte, file: Bl
         "directions": [COLS, ROWS],
         "transfer": file.append(transfer.coefficients),
         "beyond": file.append(transfer.beyond),
+        "quadrature": write_quadrature(lights, file),
         "captured": file.append(captured[:count].astype(np.float32)),
         "relative_rms": numbers(found.relative_rms),
         "beyond_degrees": numbers(float(np.degrees(2 * reach(lights.direction)))),

@@ -120,7 +120,7 @@ def sky(server) -> str:
         return server.wait(client, f"/v1/environments/{made['id']}", ("ready", "refused"))["id"]
 
 
-@pytest.mark.parametrize("turn", ["0"])
+@pytest.mark.parametrize("turn", ["0", "130"])
 def test_an_environment_shows_what_the_batch_renders(page, solved, sky, tmp_path, turn):
     page.goto(solved.pages["light"])
     solved.wait_for_content(page, "light")

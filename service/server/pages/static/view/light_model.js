@@ -1,25 +1,41 @@
 /**
- * From light to the coefficients of a reduced basis (docs/view.md): a frame is the sum of the coefficient images, each times its coefficient,
- * which is the sum over directions of energy times the table `transfer`.
+ * From light to the coefficients of a reduced basis (docs/view.md): light is shared out over the captured lights as `relit relight` does, and
+ * the coefficients are those of the captured images, each times the energy of its light.
  *
  * Directions are those of environment maps: +y at the top, +z in the middle, +x a quarter from the left edge.
  */
 
+import { covariance, quadratureWeights } from "./kernel_quadrature.js";
+
 const MIN_SAMPLES = 64;
+const WHOLE = 1 - 1e-6; // but for rounding
 const GOLDEN = Math.PI * (3 - Math.sqrt(5));
 
-/** Table from directions to coefficients, and which directions lie beyond the captured lights. */
+/** Light as sums over its directions, in three channels. */
+class LightSum {
+  constructor(lights) {
+    this.moments = [0, 1, 2].map(() => new Float64Array(lights + 1));
+    this.outside = [0, 1, 2].map(() => new Float64Array(lights));
+    this.energy = 0;
+    this.energyBeyond = 0;
+  }
+}
+
+/** The captured lights, and how other light is shared out over them. */
 export class LightModel {
   /**
-   * @param {{terms: number, directions: [number, number]}} relight Of view.json.
-   * @param {Float32Array} transfer [rows, cols, terms, 3]
-   * @param {Uint8Array} beyond [rows, cols], 255 beyond the captured lights
+   * @param {any} relight Of view.json.
+   * @param {{inverse: Float64Array, beyond: Float32Array, outside: Float32Array, captured: Float32Array}} tables Blocks of that name.
+   * @param {{direction: number[], irradiance: number[]}[]} lights All captured lights, in the order of `captured`.
    */
-  constructor(relight, transfer, beyond) {
+  constructor(relight, tables, lights) {
     this.terms = relight.terms;
     [this.cols, this.rows] = relight.directions;
-    this.transfer = transfer;
-    this.beyond = beyond;
+    this.range = relight.quadrature.range;
+    this.kept = relight.quadrature.kept;
+    this.tables = tables;
+    this.lights = lights;
+    this.covariances = null; // of every cell of the grid with every light
   }
 
   /** Return the number of cells of the grid of directions. */
@@ -27,66 +43,55 @@ export class LightModel {
     return this.rows * this.cols;
   }
 
-  /** Return the coefficients [terms, 3] of an energy [cells, 3]. */
-  coefficients(energy) {
+  /**
+   * Sum up light.
+   * @param {{direction: number[], irradiance: number[], angle_degrees: number}|null} disc As in light keys.
+   * @param {Float64Array|null} energy [cells, 3] of an environment.
+   * @returns {LightSum}
+   */
+  sum(disc, energy) {
+    const sum = new LightSum(this.kept.length);
+    if (disc !== null) this.#addDisc(sum, disc);
+    if (energy !== null) this.#addCells(sum, energy);
+    return sum;
+  }
+
+  /** Return the coefficients [terms, 3] of light. */
+  coefficients(sum) {
     const found = new Float32Array(3 * this.terms);
-    for (let cell = 0; cell < this.cells; cell += 1) {
-      const [r, g, b] = [energy[3 * cell], energy[3 * cell + 1], energy[3 * cell + 2]];
-      if (r === 0 && g === 0 && b === 0) continue;
-      for (let k = 0, at = 3 * this.terms * cell; k < 3 * this.terms; k += 3, at += 3) {
-        found[k] += r * this.transfer[at];
-        found[k + 1] += g * this.transfer[at + 1];
-        found[k + 2] += b * this.transfer[at + 2];
+    for (let channel = 0; channel < 3; channel += 1) {
+      const energies = sum.outside[channel].slice();
+      const whole = sum.moments[channel].at(-1);
+      if (whole > 0) {
+        const weights = quadratureWeights(this.tables.inverse, this.kept.length, sum.moments[channel].map((moment) => moment / whole));
+        weights.forEach((weight, index) => { energies[index] += whole * weight; });
       }
+      this.kept.forEach((light, index) => {
+        const weight = energies[index] / this.lights[light].irradiance[channel];
+        if (weight === 0) return;
+        for (let k = 0; k < this.terms; k += 1) found[3 * k + channel] += weight * this.tables.captured[3 * (light * this.terms + k) + channel];
+      });
     }
     return found;
   }
 
-  /** Return the share of an energy [cells, 3] that comes from beyond the captured lights, 0 to 1. */
-  shareBeyond(energy) {
-    let [outside, all] = [0, 0];
-    for (let cell = 0; cell < this.cells; cell += 1) {
-      const here = energy[3 * cell] + energy[3 * cell + 1] + energy[3 * cell + 2];
-      all += here;
-      if (this.beyond[cell] === 255) outside += here;
-    }
-    return all > 0 ? outside / all : 0;
+  /** Return the share of light that comes from wholly beyond the captured lights, 0 to 1. */
+  shareBeyond(sum) {
+    return sum.energy > 0 ? sum.energyBeyond / sum.energy : 0;
   }
 
-  /** Return whether a direction lies beyond the captured lights. */
+  /** Return whether a direction lies wholly beyond the captured lights. */
   isBeyond(direction) {
     const [col, row] = this.#cellOf(direction);
-    return this.beyond[Math.min(this.rows - 1, Math.floor(row)) * this.cols + (Math.floor(col) % this.cols)] === 255;
+    return this.tables.beyond[Math.min(this.rows - 1, Math.floor(row)) * this.cols + (Math.floor(col) % this.cols)] >= WHOLE;
   }
 
   /**
-   * Add a disc of even radiance to an energy [cells, 3]; each sample is shared by the four cells around it.
-   * @param {Float64Array} energy
-   * @param {{direction: number[], irradiance: number[], angle_degrees: number}} light As in light keys.
-   */
-  addDisc(energy, { direction, irradiance, angle_degrees: angle }) {
-    const samples = discSamples(direction, angle);
-    const whole = 2 / (1 + Math.cos((angle * Math.PI) / 360)) / samples.length; // so that a facing surface gets the irradiance
-    for (const sample of samples) {
-      const [col, row] = this.#cellOf(sample).map((place) => place - 0.5);
-      const [left, top] = [Math.floor(col), Math.floor(row)];
-      for (const [r, down] of [[top, 1 - (row - top)], [top + 1, row - top]]) {
-        for (const [c, across] of [[left, 1 - (col - left)], [left + 1, col - left]]) {
-          const cell = Math.max(0, Math.min(this.rows - 1, r)) * this.cols + ((c % this.cols) + this.cols) % this.cols;
-          for (let channel = 0; channel < 3; channel += 1) energy[3 * cell + channel] += whole * down * across * irradiance[channel];
-        }
-      }
-    }
-  }
-
-  /**
-   * Add an environment map to an energy [cells, 3].
-   * @param {Float64Array} energy
+   * Return the energy [cells, 3] of an environment that is turned about +y, from +z towards +x.
    * @param {EnvironmentProfile} profile
-   * @param {number} turnDegrees About +y, from +z towards +x.
-   * @param {number} gain
    */
-  addEnvironment(energy, profile, turnDegrees, gain) {
+  turned(profile, turnDegrees, gain) {
+    const energy = new Float64Array(3 * this.cells);
     const shift = (((-turnDegrees / 360) % 1) + 1) % 1;
     const { cols } = profile;
     for (let col = 0; col < cols; col += 1) {
@@ -101,6 +106,79 @@ export class LightModel {
         }
       }
     }
+    return energy;
+  }
+
+  /** Add a disc of even radiance. */
+  #addDisc(sum, { direction, irradiance, angle_degrees: angle }) {
+    const samples = discSamples(direction, angle);
+    const whole = 2 / (1 + Math.cos((angle * Math.PI) / 360)) / samples.length; // so that a facing surface gets the irradiance
+    const energy = irradiance.map((each) => whole * each);
+    for (const sample of samples) {
+      const around = this.#cellsAround(sample);
+      const beyond = around.reduce((total, [cell, part]) => total + part * this.tables.beyond[cell], 0);
+      this.#count(sum, energy, beyond);
+      this.kept.forEach((light, index) => {
+        const kernel = beyond < 1 ? (1 - beyond) * covariance(dot(sample, this.lights[light].direction), this.range) : 0;
+        const share = beyond > 0 ? around.reduce((total, [cell, part]) => total + part * this.tables.outside[cell * this.kept.length + index], 0) : 0;
+        for (let channel = 0; channel < 3; channel += 1) {
+          sum.moments[channel][index] += energy[channel] * kernel;
+          sum.outside[channel][index] += energy[channel] * share;
+        }
+      });
+    }
+  }
+
+  #addCells(sum, energy) {
+    const count = this.kept.length;
+    this.covariances ??= this.#cellCovariances();
+    for (let cell = 0; cell < this.cells; cell += 1) {
+      const here = energy.subarray(3 * cell, 3 * cell + 3);
+      if (here[0] === 0 && here[1] === 0 && here[2] === 0) continue;
+      const beyond = this.tables.beyond[cell];
+      this.#count(sum, here, beyond);
+      for (let channel = 0; channel < 3; channel += 1) {
+        const [moments, outside] = [sum.moments[channel], sum.outside[channel]];
+        const inside = here[channel] * (1 - beyond);
+        for (let index = 0, at = cell * count; index < count; index += 1, at += 1) {
+          moments[index] += inside * this.covariances[at];
+          outside[index] += here[channel] * this.tables.outside[at];
+        }
+      }
+    }
+  }
+
+  #count(sum, energy, beyond) {
+    const all = energy[0] + energy[1] + energy[2];
+    sum.energy += all;
+    if (beyond >= WHOLE) sum.energyBeyond += all;
+    for (let channel = 0; channel < 3; channel += 1) sum.moments[channel][this.kept.length] += energy[channel] * (1 - beyond);
+  }
+
+  #cellCovariances() {
+    const found = new Float32Array(this.cells * this.kept.length);
+    for (let cell = 0, at = 0; cell < this.cells; cell += 1) {
+      const [polar, azimuth] = [(Math.PI * (Math.floor(cell / this.cols) + 0.5)) / this.rows, (2 * Math.PI * ((cell % this.cols) + 0.5)) / this.cols];
+      const direction = [Math.sin(azimuth) * Math.sin(polar), Math.cos(polar), -Math.cos(azimuth) * Math.sin(polar)];
+      for (const light of this.kept) {
+        found[at] = covariance(dot(direction, this.lights[light].direction), this.range);
+        at += 1;
+      }
+    }
+    return found;
+  }
+
+  /** Return the four cells around a direction, with the part of each. */
+  #cellsAround(direction) {
+    const [col, row] = this.#cellOf(direction).map((place) => place - 0.5);
+    const [left, top] = [Math.floor(col), Math.floor(row)];
+    const found = [];
+    for (const [r, down] of [[top, 1 - (row - top)], [top + 1, row - top]]) {
+      for (const [c, across] of [[left, 1 - (col - left)], [left + 1, col - left]]) {
+        found.push([Math.max(0, Math.min(this.rows - 1, r)) * this.cols + ((c % this.cols) + this.cols) % this.cols, down * across]);
+      }
+    }
+    return found;
   }
 
   #cellOf([x, y, z]) {
@@ -153,6 +231,10 @@ export function discSamples(direction, angleDegrees) {
 export function unit(vector) {
   const length = Math.hypot(...vector);
   return vector.map((each) => each / length);
+}
+
+function dot(a, b) {
+  return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 }
 
 function cross(a, b) {

@@ -62,9 +62,10 @@ export async function mount(parent, view, { environments, load, onchange }) {
         isKnownSpace(view.info.color_space) ? "" : ` The space ${view.info.color_space} is shown as if it were linear Rec.709.`)));
   parent.replaceChildren(element("div", { class: "viewer" }, element("div", { class: "stage" }, canvas, warning), panel));
 
-  const [transfer, beyond, captured] = await Promise.all([relight.transfer, relight.beyond, relight.captured].map((block) => view.block(block)));
-  const model = new LightModel(relight, new Float32Array(transfer), new Uint8Array(beyond));
+  const { quadrature } = relight;
+  const [inverse, beyond, outside, captured] = await Promise.all([quadrature.inverse, quadrature.beyond, quadrature.outside, relight.captured].map((block) => view.block(block)));
   const photographs = new Float32Array(captured);
+  const model = new LightModel(relight, { inverse: new Float64Array(inverse), beyond: new Float32Array(beyond), outside: new Float32Array(outside), captured: photographs }, lights);
   const renderer = new BasisRenderer(canvas, relight, view.info.color_space);
   const matte = new Uint8Array(await view.block(relight.matte));
   renderer.setMatte(matte);
@@ -105,13 +106,13 @@ export async function mount(parent, view, { environments, load, onchange }) {
 
   function draw() {
     const now = state();
-    const energy = energyOf(now);
-    const shown = model.coefficients(energy);
+    const sum = sumOf(now);
+    const shown = model.coefficients(sum);
     const chosen = control.compare.value;
     const compared = chosen === "" ? shown : photographs.subarray(3 * relight.terms * Number(chosen), 3 * relight.terms * (Number(chosen) + 1));
     const dark = globalThis.matchMedia("(prefers-color-scheme: dark)").matches;
     renderer.draw({ shown, compared, border: chosen === "" ? 1 : Number(control.wipe.value) / 100, gain: 2 ** now.exposure, backdrop: dark ? [0.09, 0.09, 0.1] : [0.2, 0.2, 0.2] });
-    const share = model.shareBeyond(energy);
+    const share = model.shareBeyond(sum);
     warning.hidden = share < BEYOND_SHARE;
     canvas.classList.toggle("hatched", share >= BEYOND_SHARE);
     warning.textContent = warning.hidden ? "" : `${Math.round(100 * share)} % of the light comes from beyond the captured lights (more than ${relight.beyond_degrees.toFixed(0)}° from each): the nearest of them stand in for it, with their own shading and shadows.`;
@@ -119,17 +120,14 @@ export async function mount(parent, view, { environments, load, onchange }) {
 
   /** Set the exposure at which all but the brightest pixels of the picture are below white. */
   function expose() {
-    const coefficients = model.coefficients(energyOf(state()));
+    const coefficients = model.coefficients(sumOf(state()));
     const levels = covered.map((_, index) => Math.max(...[0, 1, 2].map((c) => terms.reduce((sum, term, k) => sum + coefficients[3 * k + c] * term[3 * index + c], 0))));
     const white = levels.sort((a, b) => a - b)[Math.floor(WHITE_PERCENTILE * (levels.length - 1))];
     if (white > 0) control.exposure.value = String(Math.round(-10 * Math.log2(white)) / 10);
   }
 
-  function energyOf(now) {
-    const energy = new Float64Array(3 * model.cells);
-    if (now.light !== null) model.addDisc(energy, now.light);
-    if (map !== null) model.addEnvironment(energy, map.profile, now.environment.turn_degrees, 2 ** now.environment.exposure);
-    return energy;
+  function sumOf(now) {
+    return model.sum(now.light, map === null ? null : model.turned(map.profile, now.environment.turn_degrees, 2 ** now.environment.exposure));
   }
 
   async function useEnvironment(id, name, data) {
