@@ -54,10 +54,10 @@ async function look() {
 }
 
 function figure(frame, index, atlas) {
-  const [x, y, width, height] = frame.thumbnail;
+  const [x, y, width, height] = frame.thumbnail ?? [0, 0, 96, 96];
   const canvas = element("canvas", { width, height, role: "img", "aria-label": `Frame ${index + 1}: ${frame.image}` });
-  canvas.getContext("2d").drawImage(atlas, x, y, width, height, 0, 0, width, height);
-  const clipped = frame.saturated > 0.0005 ? `${(100 * frame.saturated).toFixed(1)} % clipped` : null;
+  if (frame.thumbnail !== null) canvas.getContext("2d").drawImage(atlas, x, y, width, height, 0, 0, width, height);
+  const clipped = frame.saturated === null ? "cannot be read" : frame.saturated > 0.0005 ? `${(100 * frame.saturated).toFixed(1)} % clipped` : null;
   return element("figure", { class: frame.suspect === null ? "" : "suspect" }, canvas,
     element("figcaption", {}, frame.image, element("small", {}, [frame.label, clipped, frame.suspect].filter(Boolean).join(" · "))));
 }

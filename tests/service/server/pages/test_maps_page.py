@@ -5,7 +5,10 @@ import re
 import numpy as np
 import pytest
 
+from stage.capture import Capture
+from stage.correction import Correction
 from stage.maps import SurfaceMaps
+from tests.service.server.pages.conftest import SAMPLES
 
 
 @pytest.fixture(scope="module")
@@ -103,3 +106,22 @@ def test_the_range_of_the_histogram_changes_the_picture(opened):
     opened.get_by_label("Lowest value that is shown").fill("600")
     opened.wait_for_timeout(500)
     assert opened.locator("canvas.map").screenshot() != before
+
+
+def test_the_readings_of_a_pixel_are_plotted(opened, solved, maps):
+    """A click plots a point for each light and channel; the table has the numbers, which are those of the photographs."""
+    row, col = 64, 64
+    point_at(opened, row, col, len(maps.mask))
+    opened.mouse.down()
+    opened.mouse.up()
+    opened.get_by_role("heading", name=f"Row {row}, column {col}").wait_for()
+    capture = Capture.open(SAMPLES / "lambert")
+    frames = capture.manifest.frames
+    assert opened.locator("svg.plot circle.measured").count() == 3 * len(frames)
+    assert opened.locator("svg.plot polyline.model").count() == 3
+    opened.locator("summary", has_text="The numbers").click()
+    rows = [each.split("\t") for each in opened.locator("section table tbody tr").all_inner_texts()]
+    assert [each[0] for each in rows] == [frame.image for frame in frames]
+    readings = np.array([[float(value) for value in each[2].split(",")] for each in rows])
+    expected = np.stack([Correction.of(capture).apply(frame).pixels[row, col] for frame in frames])
+    assert np.allclose(readings, expected, rtol=2e-3, atol=1e-5)  # half floats, four digits

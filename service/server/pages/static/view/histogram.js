@@ -19,7 +19,7 @@ const STEPS = 1000;
  */
 export function mountHistogram(parent, layer, codes, look, changed) {
   if (layer.kind === "codes") {
-    const names = layer.name === "status" ? (code) => codeWords(codes, code) : (code) => String(code);
+    const names = layer.name === "status" ? (code) => codeWords(codes, code) : (code) => layer.codes?.[code]?.name ?? `${layer.title} ${code}`;
     parent.replaceChildren(element("ul", { class: "plain legend" }, ...layer.range.filter((code) => code !== 0).map((code) => legend(codeColour(layer, code), names(code)))));
     return;
   }

@@ -21,7 +21,7 @@ export function mount(parent, view) {
     parent.replaceChildren(element("p", { class: "help" }, "There are no readings to plot: the maps were not solved from lights."));
     return null;
   }
-  const frames = view.info.frames.filter((frame) => frame.kind === "light");
+  const frames = view.info.frames.filter((frame) => frame.direction !== null);
   const order = element("select", {}, element("option", { value: "light" }, "number of the light"), element("option", { value: "angle" }, "angle to the normal"));
   const place = element("div", {}, element("p", { class: "help" }, "Choose a pixel of the map: click it, or press Enter."));
   parent.replaceChildren(element("label", {}, "Order by ", order), place);
@@ -34,7 +34,8 @@ export function mount(parent, view) {
     const read = async (offset, bytes) => (offset === null ? null : view.raw(offset + at * bytes, bytes));
     const [measured, model, used, normal] = await Promise.all([read(samples.measured, size), read(samples.model, size),
       read(samples.used ?? null, samples.lights), view.layer("normal") === undefined ? null : view.pixel(view.layer("normal"), row, col)]);
-    shown = { row, col, measured: floats(measured, "float16"), model: model === null ? null : floats(model, "float16"),
+    const radiance = (block) => floats(block, "float16").map((value) => samples.scale * value);
+    shown = { row, col, measured: radiance(measured), model: model === null ? null : radiance(model),
       used: used === null ? null : new Uint8Array(used), normal };
     present(shown);
   }
@@ -71,7 +72,7 @@ export function mount(parent, view) {
       element("td", {}, triple(measured, light)), element("td", {}, model === null ? "–" : triple(model, light)), element("td", {}, words(used, light))));
     const heads = ["Light", "Angle to the normal", "Measured", "Model", "Remark"].map((name) => element("th", { scope: "col" }, name));
     place.replaceChildren(element("h3", {}, `Row ${row}, column ${col}`), svg,
-      element("p", { class: "help" }, "Dots: measured radiance. Lines: the fitted model. Hollow dots: readings that are not used.",
+      element("p", { class: "help" }, "Dots: measured radiance. Lines: the fitted model. Hollow dots: readings that are clipped, in shadow or lit from behind.",
         samples.step > 1 ? ` Readings of every ${samples.step}th pixel are kept; this is the nearest.` : ""),
       element("details", {}, element("summary", {}, "The numbers"), element("table", {}, element("thead", {}, element("tr", {}, ...heads)), element("tbody", {}, ...rows))));
   }
