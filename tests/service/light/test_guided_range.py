@@ -116,3 +116,13 @@ def test_it_is_as_near_to_the_truth_as_a_frame_alone(relit, scene, tmp_path):
     together = relight(relit, scene, tmp_path / "a", "--frames", f"1-{FRAMES}")
     alone = relight(relit, scene, tmp_path / "b", "--frames", "1")
     assert off(together[1], truth) < 1.02 * off(alone[1], truth)
+
+
+def test_pixels_are_lit_alike_in_whatever_portions(relit, scene, tmp_path, monkeypatch):
+    """Batches of 128 pixels in portions of 32: to half and the order of float32 sums."""
+    whole = relight(relit, scene, tmp_path / "a", "--frames", f"1-{FRAMES}")
+    monkeypatch.setattr("service.light.surface_model.BATCH_PIXELS", 128)
+    monkeypatch.setattr("service.light.model_range.RESPONSE_BYTES", 1)
+    parts = relight(relit, scene, tmp_path / "b", "--frames", f"1-{FRAMES}")
+    for number in (1, FRAMES):
+        np.testing.assert_allclose(parts[number], whole[number], rtol=2 * HALF, atol=1e-5)
