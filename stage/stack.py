@@ -27,8 +27,9 @@ PIXEL_PAD = 64
 """The count of pixels is padded to this multiple, so that a band divides into whole packs (32 pixels on the CPU, 4 on CUDA)."""
 BAND_BYTES = 256 << 20
 """The bytes of the stack in one band, which bound the memory of every solver."""
-PAGE_BYTES, PICK_BYTES = 4096, 64 << 20
-"""What a scattered read brings into memory, and how much of it a pick keeps there at one time."""
+PAGE_BYTES, PICK_BYTES = 64 << 10, 64 << 20
+"""What a scattered read brings into memory, since Linux maps the 16 pages around it where they are cached, and how much of it a pick keeps
+there at one time."""
 
 
 def padded(count: int, multiple: int) -> int:

@@ -16,6 +16,9 @@ import numpy as np
 THREADS = 4
 """The threads that compare checksums: memory and disks are not faster with more."""
 
+PIECE_BYTES = 4 << 20
+"""The bytes of a file that one thread holds at one time."""
+
 _sound: dict[Path, tuple[int, ...]] = {}
 """The files that were compared in this process, with their state then."""
 _sound_lock = threading.Lock()
@@ -49,15 +52,27 @@ def is_sound(path: Path, shape: tuple[int, ...], kind: type[np.generic], checksu
         values = np.load(path, mmap_mode="r", allow_pickle=False)
         if values.shape != shape or values.dtype != np.dtype(kind) or not values.flags.c_contiguous or not expected:
             return False
-        planes = np.asarray(values).reshape(len(expected), -1)
+        start, size = values.offset, values.nbytes // len(expected)
+        del values
         with ThreadPoolExecutor(THREADS, thread_name_prefix="relit-checksums") as pool:
-            if not all(pool.map(lambda plane, checksum: zlib.crc32(plane) == checksum, planes, expected)):
+            if not all(pool.map(lambda number, checksum: _of_bytes(path, start + number * size, size) == checksum,
+                                range(len(expected)), expected)):
                 return False
     except (OSError, ValueError, EOFError, SyntaxError, MemoryError):  # gone, truncated, or the header is damaged
         return False
     with _sound_lock:
         _sound[path] = state
     return True
+
+
+def _of_bytes(path: Path, start: int, size: int) -> int:
+    """Return the checksum of a part of a file, which is read: mapped pages would stay in the process."""
+    checksum = 0
+    with open(path, "rb", buffering=0) as file:
+        file.seek(start)
+        while size > 0 and (content := file.read(min(size, PIECE_BYTES))):
+            checksum, size = zlib.crc32(content, checksum), size - len(content)
+    return checksum
 
 
 def _state(path: Path) -> tuple[int, ...]:

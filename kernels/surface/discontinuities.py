@@ -21,7 +21,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.surface.conjugate import Convergence
-from kernels.surface.fragments import cut
+from kernels.surface.fragments import Fragments, cut
 from kernels.surface.grid import EdgeWeights, Grid, Walk, end_cell, first_cell, run
 from kernels.surface.parts import assemble, connect
 from kernels.surface.slopes import Slopes
@@ -40,6 +40,15 @@ MAD_TO_SIGMA = 1.4826
 """Ratio of the standard deviation of Gaussian values to the median of their magnitudes."""
 
 _TRUST = wp.constant(wp.float32(LEAST_TRUST))
+
+
+class Breaks(NamedTuple):
+    """Where a surface may break."""
+
+    lowered: Slopes  # with lower weights for edges across contradictions
+    noise: float  # of loop_noise
+    found: Fragments
+    kept: np.ndarray  # [E] the lowered weights of the cut edges
 
 
 class Broken(NamedTuple):
@@ -128,9 +137,8 @@ def distrust_loops(slopes: Slopes, *, noise: float, grid: Grid) -> Slopes:
     return lowered
 
 
-def integrate_broken(slopes: Slopes, normal: wp.array, x: wp.array, y: wp.array, *, grid: Grid, perspective: bool, spacing: float,
-                     solve: Callable[[Slopes, wp.array], Convergence]) -> Broken:
-    """Integrate slopes, with breaks where the normals say so.
+def find_breaks(slopes: Slopes, normal: wp.array, x: wp.array, y: wp.array, *, grid: Grid, perspective: bool, spacing: float) -> Breaks:
+    """Cut a surface where its normals turn abruptly or contradict each other.
 
     Args:
         slopes: of all pairs of neighbours.
@@ -140,20 +148,34 @@ def integrate_broken(slopes: Slopes, normal: wp.array, x: wp.array, y: wp.array,
         grid: the layout of the slopes.
         perspective: whether the slopes are those of -log depth.
         spacing: distance of neighbouring pixels in the plane of x and y.
-        solve: integrates slopes, improving the heights that it is given.
 
     Convention:
-        Reads slopes, weights and normals back to the host, and heights where the normals turn abruptly anywhere.
+        Reads slopes, weights and normals back to the host.
     """
     noise = loop_noise(slopes, grid=grid)
-    lowered, height = distrust_loops(slopes, noise=noise, grid=grid), grid.zeros()
+    lowered = distrust_loops(slopes, noise=noise, grid=grid)
     whole, left = ((w.right.numpy(), w.down.numpy()) for w in (slopes.weights, lowered.weights))
     slope = slopes.right.numpy(), slopes.down.numpy()
     found = cut(normal.numpy(), (x.numpy(), y.numpy()), slope, whole, left, grid=grid, perspective=perspective, spacing=spacing)
+    return Breaks(lowered, noise, found, np.where(found.way == 1, left[1][found.first], left[0][found.first]))
+
+
+def integrate_broken(breaks: Breaks, *, grid: Grid, solve: Callable[[Slopes, wp.array], Convergence]) -> Broken:
+    """Integrate slopes, with breaks where the normals say so.
+
+    Args:
+        breaks: of find_breaks.
+        grid: the layout of the slopes.
+        solve: integrates slopes, improving the heights that it is given.
+
+    Convention:
+        Reads heights back to the host where the normals turn abruptly anywhere.
+    """
+    lowered, noise, found, kept = breaks
+    height = grid.zeros()
     if not len(found.first):
         return Broken(height, found.label, solve(lowered, height))
     edges = (found.way, found.first)
-    kept = np.where(found.way == 1, left[1][found.first], left[0][found.first])
     _set(lowered.weights, edges, np.where(found.turned, 0.0, kept))
     solve(lowered, height)
     parts = connect(found, height.numpy(), noise=noise)

@@ -75,6 +75,7 @@ def cut(normal: np.ndarray, ray: Planes, slope: Planes, weight: Planes, left: Pl
     for way, step in enumerate((1, grid.pitch)):
         abrupt = np.flatnonzero(turned[way])
         turned[way, abrupt[_rounded(n, there[way], abrupt, way, step)]] = False
+    del n, turn  # what follows needs them along the cut alone
     lost = turned.copy()
     if turned.any():
         for edges, held, whole, kept in zip(lost, there, weight, left, strict=True):
@@ -88,11 +89,11 @@ def cut(normal: np.ndarray, ray: Planes, slope: Planes, weight: Planes, left: Pl
     way, first = np.nonzero(lost)
     second = first + np.where(way == 1, grid.pitch, 1)
     step = (_at(ray, second, grid) - _at(ray, first, grid)) / spacing
-    sides = n[:, first], n[:, second]
+    sides = _unit_at(normal, first, grid), _unit_at(normal, second, grid)
 
     def facing(cell: np.ndarray) -> np.ndarray:
-        x, y = _at(ray, cell, grid)
-        return n[2, cell] - (n[0, cell] * x + n[1, cell] * y) * perspective
+        (x, y), n = _at(ray, cell, grid), _unit_at(normal, cell, grid)
+        return n[2] - (n[0] * x + n[1] * y) * perspective
 
     alone = [-(side[:2] * step).sum(axis=0) / np.maximum(facing(cell), STEEPEST) for side, cell in zip(sides, (first, second), strict=True)]
     inward = np.where(way == 1, grid.pitch, 1)
@@ -102,7 +103,8 @@ def cut(normal: np.ndarray, ray: Planes, slope: Planes, weight: Planes, left: Pl
     def of_edges(planes: Planes) -> np.ndarray:
         return np.where(way == 1, planes[1][first], planes[0][first])
 
-    return Fragments(label, count, first, second, way, of_edges(slope), of_edges(weight), of_edges(turn), turned[way, first],
+    return Fragments(label, count, first, second, way, of_edges(slope), of_edges(weight),
+                     np.arccos(np.clip((sides[0] * sides[1]).sum(axis=0), -1.0, 1.0)), turned[way, first],
                      np.abs(alone[0] - alone[1]), ends < EDGE_ON**2)
 
 
@@ -221,7 +223,13 @@ def _unit_cells(normal: np.ndarray, grid: Grid) -> np.ndarray:
     return out
 
 
-def _at(planes: Planes, cell: np.ndarray, grid: Grid) -> np.ndarray:
+def _unit_at(normal: np.ndarray, cell: np.ndarray, grid: Grid) -> np.ndarray:
+    """Return [3, n] float32 unit normals at some cells of a grid; 0 in its padding."""
+    n = _at(normal, cell, grid)
+    return n / np.maximum(np.linalg.norm(n, axis=0), 1e-9)
+
+
+def _at(planes: Planes | np.ndarray, cell: np.ndarray, grid: Grid) -> np.ndarray:
     """Return [k, n] float32 planes [rows, cols] at some cells of a grid; 0 in its padding."""
     row, col = cell // grid.pitch - 1, cell % grid.pitch - 1
     inside = (row >= 0) & (row < grid.rows) & (col >= 0) & (col < grid.cols)

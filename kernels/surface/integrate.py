@@ -10,7 +10,7 @@ import warp as wp
 from kernels.errors import ArrayError
 from kernels.surface.components import label_runs, place
 from kernels.surface.conjugate import Convergence, Solver
-from kernels.surface.discontinuities import integrate_broken
+from kernels.surface.discontinuities import find_breaks, integrate_broken
 from kernels.surface.grid import make_grid
 from kernels.surface.slopes import Slopes, pair_slopes, usable_pixels
 from kernels.surface.support import supported_normals
@@ -80,7 +80,7 @@ def integrate_normals(
     Convention:
         Waits for the device: the mask of usable pixels and one number per mask run are read back, and the residual
         every few iterations. Needs eleven float32 per pixel beyond the inputs (15 with discontinuities,
-        and thirty on the host).
+        and before them nine on the host).
     """
     options = options or IntegrationOptions()
     _check(normal, mask, x, y, sigma, perspective=perspective, mean_z=mean_z)
@@ -104,7 +104,10 @@ def integrate_normals(
         return Solver(grid, slopes, max_iterations=options.max_iterations).solve(h, tolerance=options.tolerance, progress=progress)
 
     if options.discontinuities:
-        h, part, done = integrate_broken(slopes, *inputs, grid=grid, perspective=perspective, spacing=spacing, solve=improve)
+        breaks = find_breaks(slopes, *inputs, grid=grid, perspective=perspective, spacing=spacing)
+        del inputs, normal, trust, usable, slopes  # the solver needs the memory
+        h, part, done = integrate_broken(breaks, grid=grid, solve=improve)
+        del breaks
     else:
         h, part = grid.zeros(), None
         done = improve(slopes, h)
