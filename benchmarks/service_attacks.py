@@ -42,8 +42,8 @@ NICE = 15
 """Attackers have a processor of their own; here they get what the service and its readers leave."""
 HALF = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\nX-Slow: "
 HEAD = ("| attack | asked for | open in the end | reads | `/healthz` p50, p99, ms | reads of another project p50, p99, ms | not answered | "
-        "connections a second | log, KiB | files open at most | processor of the API | its memory, MiB |\n"
-        "|---|---|---|---|---|---|---|---|---|---|---|---|")
+        "connections a second | log, KiB | files open at most | processor of the API | it waited for one | "
+        "its memory, MiB |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|")
 
 
 class Attack(NamedTuple):
@@ -122,7 +122,7 @@ def row(name: str, url: str, pid: int, log: Path, other: str, attacks: list[Atta
     """Attack for some seconds and measure meanwhile."""
     port, before = urlsplit(url).port or 0, log.stat().st_size
     ended, held = multiprocessing.Event(), multiprocessing.Queue()
-    began, worked = time.monotonic(), processor_s(pid)
+    began, worked, delayed = time.monotonic(), processor_s(pid), delay_s(pid)
     attackers = [multiprocessing.Process(target=attack, args=(port, wanted, ended, held)) for wanted in attacks]
     for process in attackers:
         process.start()
@@ -152,7 +152,7 @@ def row(name: str, url: str, pid: int, log: Path, other: str, attacks: list[Atta
     busy, grown = (processor_s(pid) - worked) / spent, (log.stat().st_size - before) / 1024
     wanted_of, held_of = (" + ".join(map(str, numbers)) or 0 for numbers in ([wanted.count for wanted in attacks], kept))
     cells = (name, wanted_of, held_of, sum(map(len, found)), *spans, lost, f"{opened / spent:.0f}", f"{grown:.0f}", most,
-             f"{100 * busy:.0f} %", f"{pages * os.sysconf('SC_PAGE_SIZE') / 2**20:.0f}")
+             f"{100 * busy:.0f} %", f"{100 * (delay_s(pid) - delayed) / spent:.0f} %", f"{pages * os.sysconf('SC_PAGE_SIZE') / 2**20:.0f}")
     return f"| {' | '.join(map(str, cells))} |"
 
 
@@ -160,6 +160,11 @@ def processor_s(pid: int) -> float:
     """Seconds of processor that a process has used."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def delay_s(pid: int) -> float:
+    """Seconds for which the main thread of a process, that of its event loop, could run and waited for a processor."""
+    return int(Path(f"/proc/{pid}/schedstat").read_text().split()[1]) / 1e9
 
 
 def key_of(data: Path, project: str) -> str:
