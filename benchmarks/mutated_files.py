@@ -168,7 +168,8 @@ def kinds(folder: Path) -> list[Kind]:
     made.append(Kind("capture.json of the sample rig", sample, read_manifest, True))
     quantization = Quantization(np.ones(6, dtype=np.float32), np.zeros(6, dtype=int))
     ptm.write(folder / "a.ptm", ptm.Ptm(rng.integers(0, 256, (3, 4, 4, 6), dtype=np.uint8), quantization, None))
-    hsh.write(folder / "a.rti", hsh.Hsh(rng.integers(0, 256, (3, 4, 4, 6), dtype=np.uint8), quantization))
+    of_four = Quantization(np.ones(4, dtype=np.float32), np.zeros(4, dtype=int))
+    hsh.write(folder / "a.rti", hsh.Hsh(rng.integers(0, 256, (3, 4, 4, 4), dtype=np.uint8), of_four))
     made += [Kind("PTM", folder / "a.ptm", ptm.read), Kind("HSH", folder / "a.rti", hsh.read)]
     for suffix in (".yml", ".xml", ".json"):
         storage = cv2.FileStorage(str(folder / f"camera{suffix}"), cv2.FILE_STORAGE_WRITE)
@@ -181,4 +182,6 @@ def kinds(folder: Path) -> list[Kind]:
     toml = folder / "relit.toml"
     toml.write_text('port = 8470\nroots = ["/captures"]\nlog_level = "info"\nmax_pixels = 4096\n')
     made.append(Kind("settings", toml, lambda path: Settings(config=path, data=folder / "data"), True))
+    for kind in made:
+        kind.read(kind.path)  # or its cases would prove nothing
     return made
