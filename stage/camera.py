@@ -141,7 +141,22 @@ class Camera(Strict):
         Returns:
             [rows, cols, 3] float32, in the unit of `height`.
         """
-        x, y = self.plane_coordinates()
+        return self._raised(*self.plane_coordinates(), height)
+
+    def points_at(self, pixels: np.ndarray, height: np.ndarray) -> np.ndarray:
+        """Return the camera-frame points of single pixels, as `points` does.
+
+        Args:
+            pixels: [n] row-major positions in the image.
+            height: [n] camera-frame z.
+
+        Returns:
+            [n, 3] float32, in the unit of `height`.
+        """
+        row, col = np.divmod(pixels, self.width)
+        return self._raised(*self.plane_at(col + 0.5, row + 0.5), height)
+
+    def _raised(self, x: np.ndarray, y: np.ndarray, height: np.ndarray) -> np.ndarray:
         if self.projection == "perspective":
             x, y = -x * height, -y * height
         return np.stack([x, y, height], axis=-1).astype(np.float32)

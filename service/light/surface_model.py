@@ -60,9 +60,7 @@ class SurfaceModel:
         """[n] Row-major positions of the solved pixels that will be lit."""
         if not len(self.pixels):
             raise ResultError(f"{where}: no pixel is solved")
-        self.points = maps.camera.points(maps.height).reshape(-1, 3)
-        """[rows · cols, 3] Place of every pixel, camera frame."""
-        self.middle = self.points[self.pixels].mean(axis=0)
+        self.middle = self.places(self.pixels).mean(axis=0)
         """[3] Mean place of these pixels."""
         self._view = view_directions(maps.camera)
         inside = whole.reshape(maps.mask.shape)
@@ -81,7 +79,7 @@ class SurfaceModel:
             pixels = self.pixels[start : start + BATCH_PIXELS]
 
             def rows(values: np.ndarray, pixels: np.ndarray = pixels) -> np.ndarray:
-                return values.reshape(maps.mask.size, -1)[pixels]
+                return values.reshape(maps.mask.size, -1)[pixels].astype(np.float32, copy=False)
 
             specular, roughness = np.zeros((len(pixels), 3), np.float32), np.zeros((len(pixels), 1), np.float32)
             if maps.specular is not None and maps.roughness is not None:
@@ -95,9 +93,14 @@ class SurfaceModel:
                 roughness = np.where(abundance > 0, first_roughness, roughness)
                 second = SecondLobe(*other, np.where(abundance > 0, 1 - abundance, 0))
             yield ModelBatch(pixels, upload_surface(rows(maps.normal), rows(maps.diffuse_albedo), specular, roughness, self._view(pixels),
-                                                    self.points[pixels], second=second,
+                                                    self.places(pixels), second=second,
                                                     profile=None if self.profile is None else self.profile[start : start + BATCH_PIXELS],
                                                     device=self.device))
+
+    def places(self, pixels: np.ndarray) -> np.ndarray:
+        """Return the places of pixels [n], row-major positions: [n, 3] float32, camera frame."""
+        assert self.maps.height is not None
+        return self.maps.camera.points_at(pixels, self.maps.height.reshape(-1)[pixels])
 
     def see(self, place: np.ndarray, pixels: np.ndarray) -> wp.array:
         """Return which pixels see which lights, as [n, P] uint8 packs of 255 or 0.
@@ -117,7 +120,7 @@ class SurfaceModel:
         """Return the horizons of a batch, as far as they tell which pixels see far lights in directions [n, 3]."""
         sight = np.zeros((1, 2))
         if self._projection.perspective:
-            points = self.points[batch.pixels]
+            points = self.places(batch.pixels)
             sight = points[:, :2] / points[:, 2:]
         return find_horizons(azimuths_of(direction, sight), batch.pixels, batch.surface, self._field)
 

@@ -89,6 +89,10 @@ class ResultLayers:
     def _channels(self) -> dict[str, np.ndarray]:
         return exr.read(self.path)[0]
 
+    def forget(self) -> None:
+        """Forget all layers; the next one that is asked for is read from the file again."""
+        self.__dict__.pop("_channels", None)
+
     @cached_property
     def mask(self) -> np.ndarray:
         """The pixels that count as solved, [rows, cols] bool."""

@@ -4,7 +4,6 @@ The model is Relit's BRDF under the lights of the capture, with the shadows that
 throws on itself: what `relit shade` and guided frames are made with (service.light.surface_model).
 """
 
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -112,13 +111,19 @@ def _write_measured(stack: Stack, shape: tuple[int, int], grid: PixelGrid, scale
 
 def _surface(found: ResultLayers, grid: PixelGrid, device: str) -> SurfaceModel | None:
     """Return the surface at the pixels of the grid; None where the maps lack what a model needs, or none of the pixels is estimated."""
-    maps = SurfaceMaps.read(found.path, unsure=True, layers=MODEL_LAYERS)
-    estimated = maps.mask if maps.estimated is None else maps.estimated
-    chosen = np.zeros(estimated.shape, dtype=bool)
-    chosen[:: grid.step, :: grid.step] = estimated[:: grid.step, :: grid.step]
-    if any(getattr(maps, name) is None for name in ("normal", "diffuse_albedo", "height")) or not chosen.any():
+    names = found.names()
+    chosen = np.zeros(found.estimated.shape, dtype=bool)
+    chosen[:: grid.step, :: grid.step] = found.estimated[:: grid.step, :: grid.step]
+    if not {"normal", "diffuse_albedo", "height"} <= set(names) or not chosen.any():
         return None
-    return SurfaceModel(replace(maps, mask=estimated), found.path, device, chosen=chosen)
+    layers: dict[str, Any] = {}
+    found.forget()
+    for name in MODEL_LAYERS:  # half values stay half: SurfaceMaps.read would take twice the memory
+        if name in names:
+            values = found.take(name)
+            layers[name] = values[0] if len(values) == 1 else np.ascontiguousarray(np.moveaxis(values, 0, -1))
+    found.forget()
+    return SurfaceModel(SurfaceMaps(camera=found.camera, mask=found.estimated, **layers), found.path, device, chosen=chosen)
 
 
 def _write_model(model: SurfaceModel, lights: DistantLights | PlacedLights, grid: PixelGrid, scale: float, file: BlockFile, offset: int,
@@ -149,7 +154,7 @@ def _lit(model: SurfaceModel, batch: ModelBatch, sources: Sources, scale: float)
         values[:, light] = np.minimum((lit[:3] + lit[3:]) / scale, np.finfo(np.float16).max).T
     seen = visible.numpy().reshape(count, -1)[:, :pixels].T != 0
     assert model.maps.normal is not None
-    normal, point = model.maps.normal.reshape(-1, 3)[batch.pixels], model.points[batch.pixels]
+    normal, point = model.maps.normal.reshape(-1, 3)[batch.pixels], model.places(batch.pixels)
     place, is_near = sources.place[:, :3], sources.place[:, 3]
     facing = normal @ place.T - is_near * np.einsum("nx,nx->n", normal, point)[:, None]
     return values, np.where(seen, 0, HIDDEN).astype(np.uint8) | np.where(facing > 0, 0, BACKLIT).astype(np.uint8)

@@ -94,3 +94,14 @@ def test_principal_point_defaults_to_the_image_centre():
 def test_contradictions_are_refused(changes, words):
     with pytest.raises(ValidationError, match=words):
         perspective(**changes)
+
+
+@pytest.mark.parametrize("camera", [
+    Camera(projection="orthographic", resolution=(7, 5), pixel_size_m=0.01),
+    Camera(projection="perspective", resolution=(7, 5), focal_px=(9.0, 9.5), principal_px=(3.0, 2.0),
+           distortion=Distortion(model="brown_conrady", k=(0.1, 0.01, 0.0), p=(0.001, 0.002))),
+], ids=["orthographic", "perspective"])
+def test_points_of_single_pixels_are_those_of_the_image(camera):
+    height = -1.0 - np.arange(35, dtype=np.float32).reshape(5, 7) / 50
+    pixels = np.array([0, 6, 12, 34])
+    assert np.array_equal(camera.points_at(pixels, height.reshape(-1)[pixels]), camera.points(height).reshape(-1, 3)[pixels])
