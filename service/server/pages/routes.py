@@ -97,6 +97,12 @@ async def maps(job: JobId) -> Response:
     return _page("maps.html", identifier=job)
 
 
+@router.get("/asset/{job}")
+async def asset(job: JobId) -> Response:
+    """Show the asset that a job has exported."""
+    return _page("asset.html", identifier=job)
+
+
 @router.get("/favicon.ico")
 async def icon(request: Request) -> Response:
     """Return the icon, which browsers ask for at this place."""

@@ -1,7 +1,8 @@
 /** The page that lights a capture live, and sends what it shows to the batch. */
 
-import { attempt, listing, post, send } from "./api.js";
+import { attempt, post } from "./api.js";
 import { byId, element } from "./element.js";
+import { loadEnvironment, readyEnvironments } from "./environments.js";
 import { commandOf, curlOf } from "./form.js";
 import { mount } from "./view/relight_viewer.js";
 import { ViewFile } from "./view/view_file.js";
@@ -75,21 +76,14 @@ function batchForm() {
         element("p", {}, "With curl:"), batch.curl)));
 }
 
-async function load(id) {
-  const answer = await send(`/v1/environments/${id}/file`);
-  const name = /filename="([^"]+)"/.exec(answer.headers.get("Content-Disposition") ?? "")?.[1] ?? id;
-  return { name, data: await answer.arrayBuffer() };
-}
-
 await attempt(async () => {
   const { files } = await openView(identifier, null);
   const view = await ViewFile.open(files);
   byId("name").textContent = view.info.name;
   document.title = `${view.info.name} · Relit`;
   if (view.info.relight === null) throw new Error("this capture has too few lights to relight it: four or more are needed");
-  const environments = [];
-  for await (const item of listing("/v1/environments", "items")) if (item.state === "ready") environments.push(item);
+  const environments = await readyEnvironments();
   const stage = element("div");
   byId("view").replaceChildren(stage, batchForm());
-  globalThis.relit = await mount(stage, view, { environments, load, onchange: (now) => { light = now; present(); } });
+  globalThis.relit = await mount(stage, view, { environments, load: loadEnvironment, onchange: (now) => { light = now; present(); } });
 });

@@ -1,0 +1,126 @@
+/** What an asset is lit with: a neutral room, an environment map, or one light of the rig. */
+
+import { DataTexture, DirectionalLight, EquirectangularReflectionMapping, FloatType, LinearFilter, LinearSRGBColorSpace, MathUtils, PMREMGenerator, RGBAFormat } from "three";
+
+const LARGEST_COLS = 1024; // of a map: three.js makes cubes of a quarter of it
+const QUARTER = 4; // three.js has +x in the middle of a map, Relit +z: a quarter of the width
+const ROOM = { cols: 64, rows: 32, sky: 1.35, floor: 0.45, lamp: 5, lampAt: [0.45, 0.6, 0.66], lampCosine: 0.94 };
+
+/** Return a neutral room as an environment map: light from above, and a lamp before the object, above and to the right. */
+export function neutralRoom() {
+  const { rows, cols } = ROOM;
+  const pixels = new Float32Array(3 * rows * cols);
+  for (let row = 0; row < rows; row += 1) {
+    const polar = (Math.PI * (row + 0.5)) / rows;
+    for (let col = 0; col < cols; col += 1) {
+      const azimuth = (2 * Math.PI * (col + 0.5)) / cols;
+      const direction = [Math.sin(azimuth) * Math.sin(polar), Math.cos(polar), -Math.cos(azimuth) * Math.sin(polar)];
+      const lamp = direction.reduce((sum, value, axis) => sum + value * ROOM.lampAt[axis], 0) > ROOM.lampCosine ? ROOM.lamp : 0;
+      pixels.fill(ROOM.floor + ((ROOM.sky - ROOM.floor) * (1 + direction[1])) / 2 + lamp, 3 * (row * cols + col), 3 * (row * cols + col) + 3);
+    }
+  }
+  return { rows, cols, pixels };
+}
+
+/**
+ * Return the exposure in stops that shows a white surface as white: one that faces a light of this irradiance, or as much light from all around.
+ * @param {number} irradiance The largest of its channels.
+ */
+export function stopsFor(irradiance) {
+  return irradiance > 0 ? Math.log2(Math.PI / irradiance) : 0;
+}
+
+/** Return π times the mean radiance of a map over the sphere, the largest of the channels. */
+export function meanIrradiance({ rows, cols, pixels }) {
+  const sums = [0, 0, 0];
+  for (let row = 0; row < rows; row += 1) {
+    const weight = Math.sin((Math.PI * (row + 0.5)) / rows) * (Math.PI / rows / 2 / cols);
+    for (let at = 3 * row * cols; at < 3 * (row + 1) * cols; at += 1) sums[at % 3] += weight * pixels[at];
+  }
+  return Math.PI * Math.max(...sums);
+}
+
+/**
+ * Return a map as a texture of three.js: the bottom row first, and +x in the middle.
+ * @param {{rows: number, cols: number, pixels: Float32Array}} map Radiance [rows, cols, 3], from the top, +z in the middle.
+ */
+export function latLongTexture(map) {
+  const factor = Math.max(1, Math.ceil(map.cols / LARGEST_COLS));
+  const [rows, cols] = [Math.floor(map.rows / factor), Math.floor(map.cols / factor)];
+  const values = new Float32Array(4 * rows * cols).fill(1);
+  for (let row = 0; row < rows; row += 1) {
+    for (let col = 0; col < cols; col += 1) {
+      const to = 4 * ((rows - 1 - row) * cols + ((col + Math.floor(cols / QUARTER)) % cols));
+      for (let c = 0; c < 3; c += 1) {
+        let sum = 0;
+        for (let down = 0; down < factor; down += 1) {
+          for (let across = 0; across < factor; across += 1) sum += map.pixels[3 * ((row * factor + down) * map.cols + col * factor + across) + c];
+        }
+        values[to + c] = sum / factor ** 2;
+      }
+    }
+  }
+  const texture = new DataTexture(values, cols, rows, RGBAFormat, FloatType);
+  texture.mapping = EquirectangularReflectionMapping;
+  texture.colorSpace = LinearSRGBColorSpace;
+  texture.minFilter = texture.magFilter = LinearFilter;
+  texture.needsUpdate = true;
+  return texture;
+}
+
+/** Lights a scene in one way at a time. */
+export class Lighting {
+  #scene;
+  #renderer;
+  #filtered = null; // the environment, for all roughnesses
+  #light = new DirectionalLight();
+
+  /** @param {import("three").Scene} scene @param {import("three").WebGLRenderer} renderer */
+  constructor(scene, renderer) {
+    this.#scene = scene;
+    this.#renderer = renderer;
+  }
+
+  /** Light by an environment map, as `latLongTexture` takes it. */
+  byMap(map) {
+    this.#clear();
+    const texture = latLongTexture(map);
+    const generator = new PMREMGenerator(this.#renderer);
+    this.#filtered = generator.fromEquirectangular(texture);
+    generator.dispose();
+    texture.dispose();
+    this.#scene.environment = this.#filtered.texture;
+  }
+
+  /** Turn the environment about +y: what shines from +z then shines from +x after 90 degrees. */
+  turn(degrees) {
+    this.#scene.environmentRotation.set(0, MathUtils.degToRad(degrees), 0);
+  }
+
+  /**
+   * Light by one distant light.
+   * @param {number[]} direction From the object to the light.
+   * @param {number[]} irradiance Red, green and blue, on a surface that faces it.
+   */
+  byLight(direction, irradiance) {
+    this.#clear();
+    const largest = Math.max(...irradiance, Number.MIN_VALUE);
+    this.#light.color.setRGB(...irradiance.map((value) => value / largest), LinearSRGBColorSpace);
+    this.#light.intensity = largest;
+    this.#light.position.set(...direction);
+    this.#scene.add(this.#light);
+  }
+
+  /** Give everything back. */
+  destroy() {
+    this.#clear();
+    this.#light.dispose();
+  }
+
+  #clear() {
+    this.#filtered?.dispose();
+    this.#filtered = null;
+    this.#scene.environment = null;
+    this.#light.removeFromParent();
+  }
+}

@@ -1,0 +1,151 @@
+/** Shows an asset as programs that open it do: in 3D, lit by a room, an environment map or one light of the rig, with the rig's lights around it. */
+
+import { Group, LinearToneMapping, Matrix4 } from "three";
+import { element, tell } from "../element.js";
+import { openAsset } from "./asset_file.js";
+import { Lighting, meanIrradiance, neutralRoom, stopsFor } from "./asset_lighting.js";
+import { VIEW_TRANSFORM } from "./display.js";
+import { previewOf, readEnvironment } from "./environment_map.js";
+import { OrbitScene } from "./orbit_scene.js";
+import { RigLights } from "./rig_lights.js";
+
+const ROOM = "room";
+const MAP = "map";
+const MOST_STOPS = 10;
+
+/**
+ * Show an asset.
+ * @param {HTMLElement} parent Takes it.
+ * @param {{name: string, data: ArrayBuffer}} file The asset, .usdz or .glb.
+ * @param {{rig?: any, environments?: {id: string, name: string}[], load?: function(string): Promise<{name: string, data: ArrayBuffer}>}} [options]
+ *     `rig` is the content of view.json of the capture, null if it is not known: then no lights are shown. Environments of the server, and how their files are read.
+ * @returns {Promise<{destroy: function(): void, state: function(): any, picture: function(): {rows: number, cols: number, pixels: Uint8Array}}>}
+ * @throws {Error} The asset cannot be opened; a sentence.
+ */
+export async function mount(parent, file, { rig = null, environments = [], load = undefined } = {}) {
+  const asset = await openAsset(file.data, file.name);
+  const lights = (rig?.frames ?? []).map((frame, index) => ({ frame, index })).filter(({ frame }) => frame.kind === "light" && frame.direction !== null);
+  const stage = element("div", { class: "stage" });
+  const fault = element("p", { class: "fault", role: "status" });
+  const preview = element("div");
+  const control = {
+    lit: element("select", {}, element("option", { value: ROOM }, "A neutral room"), element("option", { value: MAP, disabled: true }, "An environment map"),
+      ...lights.map(({ frame, index }) => element("option", { value: index }, `${frame.image}: ${frame.label}`))),
+    environment: element("select", {}, element("option", { value: "" }, "none"), ...environments.map(({ id, name }) => element("option", { value: id }, name))),
+    file: element("input", { type: "file", accept: ".exr,.hdr", class: "visually-hidden" }),
+    turn: element("input", { type: "range", min: 0, max: 360, step: 1, value: 0 }),
+    exposure: element("input", { type: "range", min: -MOST_STOPS, max: MOST_STOPS, step: 0.1, value: 0 }),
+    markers: element("input", { type: "checkbox", checked: true }),
+  };
+  const stopsText = element("output", {});
+  const row = (text, ...each) => element("label", {}, `${text} `, ...each);
+  const turnRow = row("Turn (degrees)", control.turn);
+  const panel = element("div", { class: "panel" },
+    row("Lit by", control.lit),
+    element("fieldset", {}, element("legend", {}, "Environment"), environments.length > 0 ? row("Map", control.environment) : null,
+      element("label", { class: "button quiet" }, "Open a file", control.file), preview, turnRow),
+    row("Exposure (stops)", control.exposure, stopsText),
+    lights.length > 0 ? row("Lights of the rig", control.markers) : null,
+    element("p", { class: "actions" }, element("button", { type: "button", class: "quiet", onclick: () => view.reset() }, "As it was captured")),
+    element("p", { class: "help" }, words(asset, lights)),
+    ...asset.problems.map((problem) => element("p", { class: "fault" }, problem)));
+  parent.replaceChildren(element("div", { class: "viewer" }, stage, panel));
+  stage.append(fault);
+
+  let map = null; // { name, ...pixels }
+  const view = new OrbitScene(stage, `The asset ${file.name} in 3D`, { onclick: pick, onfault: (sentence) => { fault.textContent = sentence; } });
+  const { scene, renderer } = view;
+  renderer.toneMapping = LinearToneMapping;
+  const lighting = new Lighting(scene, renderer);
+  const inCameraFrame = new Group(); // as all of Relit's pictures are, wherever the capture says that the camera stood
+  if (rig?.camera.world_from_camera) inCameraFrame.applyMatrix4(new Matrix4().set(...rig.camera.world_from_camera.flat()).invert());
+  inCameraFrame.add(asset.object);
+  scene.add(inCameraFrame);
+  view.frame(inCameraFrame);
+  const style = getComputedStyle(parent);
+  const markers = new RigLights(lights, view.center, view.radius, { light: style.getPropertyValue("--accent"), suspect: style.getPropertyValue("--warn") });
+  scene.add(markers.object);
+
+  /** Light the asset as chosen, and expose for it. */
+  function light() {
+    const chosen = control.lit.value;
+    let irradiance;
+    if (chosen === ROOM || chosen === MAP) {
+      const shown = chosen === ROOM ? neutralRoom() : map;
+      lighting.byMap(shown);
+      irradiance = meanIrradiance(shown);
+    } else {
+      const { frame } = lights.find(({ index }) => index === Number(chosen));
+      lighting.byLight(frame.direction, frame.irradiance ?? [1, 1, 1]);
+      irradiance = Math.max(...(frame.irradiance ?? [1]));
+    }
+    markers.choose(chosen === ROOM || chosen === MAP ? null : Number(chosen));
+    turnRow.hidden = chosen !== MAP;
+    control.exposure.value = String(Math.max(-MOST_STOPS, Math.min(MOST_STOPS, stopsFor(irradiance))));
+    change();
+  }
+
+  function change() {
+    lighting.turn(control.lit.value === MAP ? Number(control.turn.value) : 0);
+    renderer.toneMappingExposure = 2 ** Number(control.exposure.value);
+    stopsText.textContent = Number(control.exposure.value).toFixed(1);
+    markers.object.visible = control.markers.checked;
+    view.changed();
+  }
+
+  function pick(place) {
+    const index = markers.at(place, view.camera);
+    if (index === null) return;
+    control.lit.value = String(index);
+    light();
+  }
+
+  async function use(read) {
+    try {
+      const { name, data } = await read();
+      map = { name, ...(await readEnvironment(data, name)) };
+    } catch (error) {
+      tell(error.message);
+      return;
+    }
+    preview.replaceChildren(previewOf(map));
+    control.lit.options[1].disabled = false;
+    control.lit.options[1].textContent = `The environment map ${map.name}`;
+    control.lit.value = MAP;
+    light();
+  }
+
+  control.lit.addEventListener("change", light);
+  for (const each of [control.turn, control.exposure, control.markers]) each.addEventListener("input", change);
+  control.environment.addEventListener("change", () => {
+    const id = control.environment.value;
+    if (id !== "") return use(() => load(id));
+    if (control.lit.value === MAP) control.lit.value = ROOM;
+    return light();
+  });
+  control.file.addEventListener("change", () => {
+    const [given] = control.file.files;
+    control.environment.value = "";
+    if (given !== undefined) use(async () => ({ name: given.name, data: await given.arrayBuffer() }));
+  });
+  light();
+
+  return {
+    destroy() {
+      lighting.destroy();
+      view.destroy();
+      parent.replaceChildren();
+    },
+    state: () => ({ lit: control.lit.value, environment: map?.name ?? null, turn_degrees: Number(control.turn.value), exposure: Number(control.exposure.value),
+      triangles: asset.triangles, points: asset.points, textures: asset.textures, problems: asset.problems }),
+    picture: () => view.picture(),
+  };
+}
+
+function words({ triangles, points, textures }, lights) {
+  const count = (number, name) => `${number.toLocaleString()} ${name}${number === 1 ? "" : "s"}`;
+  const has = points > 0 ? count(points, "point") : `${count(triangles, "triangle")}, ${count(textures, "texture")}`;
+  const near = lights.filter(({ frame }) => frame.near).length;
+  const around = lights.length === 0 ? "" : ` Around it are the ${count(lights.length, "light")} of the rig${near === 0 ? "" : `, ${near} of them near: they are shown by their direction`}; choose one to see the asset under it.`;
+  return `${has}.${around} Shown by three.js, without cast shadows, through ${VIEW_TRANSFORM}. White is a white surface that faces the light.`;
+}
