@@ -19,4 +19,10 @@ await attempt(async () => {
   byId("view").replaceChildren(maps, plot);
   const readings = mountPlot(plot, view);
   mountMaps(maps, view, { onpick: (row, col) => attempt(() => readings?.show(row, col)) });
+  if (view.info.points !== null) {
+    const points = element("div");
+    byId("view").append(element("section", { "aria-labelledby": "points-title" }, element("h2", { id: "points-title" }, "Points"), points));
+    const { mount } = await import("./view/cloud_viewer.js"); // three.js is large: only a depth needs it here
+    globalThis.cloud = await mount(points, view);
+  }
 });

@@ -1,0 +1,182 @@
+"""Exported assets are shown in 3D under the light that is chosen, and what cannot be shown is said."""
+
+import zipfile
+
+import numpy as np
+import OpenEXR
+import OpenImageIO as oiio
+import pytest
+
+from tests.service.server.pages.axe import violations
+
+LOADED_MS = 120_000
+"""Time for an asset to load and to be lit on a loaded machine, where the processor renders WebGL."""
+SHIFT = 0.05
+"""Least shift of the brightness from the middle of the object, in its widths. A
+patch of light on one side of a ball gives a tenth or more."""
+PICTURE = """() => { const { rows, cols, pixels } = globalThis.asset.picture(); return { rows, cols, pixels: Array.from(pixels) }; }"""
+
+
+@pytest.fixture(scope="module")
+def exported(server, solved) -> dict[str, str]:
+    """The jobs that exported the solved capture, by format."""
+    with server.client() as client:
+        jobs = {form: client.post("/v1/jobs", json={"kind": "export", "maps": solved.solve, "format": form}).raise_for_status().json()["id"]
+                for form in ("usdz", "glb", "usda")}
+        for job in jobs.values():
+            found = server.wait(client, f"/v1/jobs/{job}", ("succeeded", "failed"))
+            assert found["state"] == "succeeded", found["error"]
+    return jobs
+
+
+def open_asset(page, job: str) -> dict:
+    """Open the page of an asset, and hide the lights of the rig, which are no part of it."""
+    page.goto(f"/asset/{job}")
+    page.wait_for_function("() => globalThis.asset !== undefined", timeout=LOADED_MS)
+    page.get_by_label("Lights of the rig").uncheck()
+    return page.evaluate("() => globalThis.asset.state()")
+
+
+def shift_of_light(page) -> np.ndarray:
+    """How far to the right and up the brightness lies from the middle of the object, in its widths."""
+    found = page.evaluate(PICTURE)
+    picture = np.array(found["pixels"], dtype=float).reshape(found["rows"], found["cols"], 4)
+    row, col = np.indices(picture.shape[:2])
+    inside = picture[..., 3] > 0
+    weight = picture[..., :3].sum(axis=2) * inside
+    width = np.ptp(col[inside])
+    right = (col * weight).sum() / weight.sum() - col[inside].mean()
+    down = (row * weight).sum() / weight.sum() - row[inside].mean()
+    return np.array([right, -down]) / width
+
+
+def patch(path, direction: tuple[float, float, float]):
+    """Write a lat-long map that is bright around a direction: +y is up, +z in the middle, +x a quarter from the left."""
+    v, u = (np.indices((32, 64)) + 0.5) / np.array([32, 64])[:, None, None]
+    azimuth, polar = 2 * np.pi * u, np.pi * v
+    towards = np.stack([np.sin(azimuth) * np.sin(polar), np.cos(polar), -np.cos(azimuth) * np.sin(polar)], axis=-1)
+    values = np.where((towards @ np.array(direction) > 0.9)[..., None], 10.0, 0.05).astype(np.float32).repeat(3, axis=2)
+    if path.suffix == ".exr":
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        OpenEXR.File(header, {"RGB": values}).write(str(path))
+    else:
+        image = oiio.ImageBuf(values)
+        assert image.write(str(path), "float"), image.geterror()
+    return path
+
+
+def light_by(page, path) -> None:
+    page.set_input_files("input[type=file]", path)
+    page.wait_for_function("(name) => globalThis.asset.state().environment === name", arg=path.name, timeout=LOADED_MS)
+
+
+@pytest.mark.parametrize("form", ["usdz", "glb"])
+def test_an_asset_is_shown(page, exported, form):
+    state = open_asset(page, exported[form])
+    assert state["triangles"] > 1000 and state["textures"] >= 2 and state["problems"] == []
+    found = page.evaluate(PICTURE)
+    picture = np.array(found["pixels"]).reshape(found["rows"], found["cols"], 4)
+    covered = picture[..., 3] > 0
+    # the object fills the height of the picture but for the margin, and is lit
+    assert 0.6 < np.ptp(np.flatnonzero(covered.any(axis=1))) / found["rows"] < 1
+    assert picture[..., :3][covered].mean() > 60
+
+
+@pytest.mark.parametrize(("direction", "axis", "sign"), [((1, 0, 0), 0, 1), ((-1, 0, 0), 0, -1), ((0, 1, 0), 1, 1), ((0, -1, 0), 1, -1)])
+@pytest.mark.parametrize("suffix", [".exr", ".hdr"])
+def test_an_environment_lights_from_where_it_is_bright(page, exported, tmp_path, direction, axis, sign, suffix):
+    open_asset(page, exported["glb"])
+    light_by(page, patch(tmp_path / f"patch{suffix}", direction))
+    assert sign * shift_of_light(page)[axis] > SHIFT
+
+
+def test_an_environment_turns_as_in_relit_relight(page, exported, tmp_path):
+    """Turned by 90 degrees, what shone from the camera (+z) shines from the right (+x)."""
+    open_asset(page, exported["usdz"])
+    light_by(page, patch(tmp_path / "front.exr", (0, 0, 1)))
+    assert abs(shift_of_light(page)[0]) < SHIFT
+    page.get_by_label("Turn (degrees)").fill("90")
+    assert shift_of_light(page)[0] > SHIFT
+
+
+def test_the_lights_of_the_rig_are_shown_and_light_the_asset(page, exported, solved):
+    open_asset(page, exported["usdz"])
+    with solved.server.client() as client:
+        view = next(job["id"] for job in client.get("/v1/jobs").json()["jobs"]
+                    if job["request"]["kind"] == "view" and job["request"]["capture"] == solved.capture)
+        frames = client.get(f"/v1/jobs/{view}/results/view.json").json()["frames"]
+    lights = [index for index, frame in enumerate(frames) if frame["kind"] == "light" and frame["direction"] is not None]
+    assert page.locator("select").first.locator("option").count() == 2 + len(lights) > 2
+    hidden = np.array(page.evaluate(PICTURE)["pixels"])
+    page.get_by_label("Lights of the rig").check()
+    assert not np.array_equal(hidden, np.array(page.evaluate(PICTURE)["pixels"]))
+    page.get_by_label("Lights of the rig").uncheck()
+    for axis in (0, 1):
+        for most in (max, min):
+            index = most(lights, key=lambda at: frames[at]["direction"][axis])
+            page.get_by_label("Lit by").select_option(str(index))
+            assert np.sign(frames[index]["direction"][axis]) * shift_of_light(page)[axis] > SHIFT
+
+
+def test_the_keyboard_turns_it(page, exported):
+    open_asset(page, exported["glb"])
+    first = np.array(page.evaluate(PICTURE)["pixels"])
+    page.locator("canvas.scene").focus()
+    for _ in range(4):
+        page.keyboard.press("ArrowRight")
+    assert not np.array_equal(first, np.array(page.evaluate(PICTURE)["pixels"]))
+    page.keyboard.press("0")
+    assert np.array_equal(first, np.array(page.evaluate(PICTURE)["pixels"]))
+
+
+def test_a_job_without_an_asset_that_can_be_shown_is_said(page, exported):
+    page.goto(f"/asset/{exported['usda']}")
+    page.get_by_text("this job has no asset.usdz or asset.glb").wait_for()
+
+
+@pytest.mark.parametrize("form", ["usdz", "glb"])
+def test_a_damaged_asset_is_named(page, exported, form):
+    page.route(f"**/results/asset.{form}", lambda route: route.fulfill(body=b"PK" + bytes(500)))
+    page.goto(f"/asset/{exported[form]}")
+    page.get_by_text(f"asset.{form} cannot be opened").wait_for(timeout=LOADED_MS)
+
+
+def test_a_map_that_is_none_is_named(page, exported, tmp_path):
+    open_asset(page, exported["glb"])
+    bad = tmp_path / "bad.exr"
+    bad.write_bytes(b"nothing")
+    page.set_input_files("input[type=file]", bad)
+    page.get_by_text("bad.exr: cannot be read as an environment map").wait_for()
+    assert page.evaluate("() => globalThis.asset.state()")["lit"] == "room"
+
+
+def test_textures_that_are_not_in_the_file_are_named(page, exported, solved, tmp_path):
+    """The package without its textures; nothing is asked of the server for them."""
+    whole = solved.result(exported["usdz"], "asset.usdz", tmp_path)
+    with zipfile.ZipFile(whole) as package, zipfile.ZipFile(tmp_path / "bare.usdz", "w", zipfile.ZIP_STORED) as bare:
+        for name in package.namelist():
+            if not name.endswith(".png"):
+                bare.writestr(name, package.read(name))
+    asked = []
+    page.on("request", lambda request: asked.append(request.url) if request.url.endswith(".png") else None)
+    page.route("**/results/asset.usdz", lambda route: route.fulfill(body=(tmp_path / "bare.usdz").read_bytes()))
+    state = open_asset(page, exported["usdz"])
+    assert state["problems"] and all("is not in the file" in problem for problem in state["problems"])
+    page.locator(".fault", has_text="is not in the file").first.wait_for()
+    assert asked == []
+
+
+def test_without_webgl_the_file_is_still_offered(page, exported):
+    page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
+    page.goto(f"/asset/{exported['glb']}")
+    page.get_by_text("This browser has no WebGL2").wait_for()
+    assert page.get_by_role("link", name="Its job").get_attribute("href") == f"/jobs/{exported['glb']}"
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_no_serious_violation(browser, server, exported, scheme):
+    page = browser.new_page(base_url=server.url, color_scheme=scheme, bypass_csp=True, viewport={"width": 390, "height": 844})
+    open_asset(page, exported["glb"])
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    assert violations(page) == []
+    page.close()

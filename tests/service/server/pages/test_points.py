@@ -1,0 +1,100 @@
+"""The points of a depth on the page of its maps: where they lie, how they are coloured, and which are unsure."""
+
+import re
+
+import numpy as np
+import pytest
+
+from stage import exr
+from tests.service.server.pages.axe import violations
+from tests.service.server.pages.conftest import SAMPLES
+
+LOADED_MS = 120_000
+"""Time for the points to be drawn on a loaded machine, where the processor renders WebGL."""
+DIGITS = 2e-3
+"""Relative error of numbers with four significant digits, and what it makes of a difference between two of them."""
+PICTURE = "() => Array.from(globalThis.cloud.picture().pixels)"
+
+
+@pytest.fixture(scope="module")
+def depth(server) -> tuple[str, str]:
+    """The job of a depth, and that of its view."""
+    with server.client() as client:
+        made = client.post("/v1/captures", json={"name": "rig", "folder": str(SAMPLES / "rig")}).raise_for_status().json()
+        server.wait(client, f"/v1/captures/{made['id']}", ("ready",))
+        jobs = []
+        for request in ({"kind": "depth"}, {"kind": "view"}):
+            maps = {"maps": jobs[0]} if jobs else {}
+            jobs.append(client.post("/v1/jobs", json={"capture": made["id"]} | request | maps).raise_for_status().json()["id"])
+            found = server.wait(client, f"/v1/jobs/{jobs[-1]}", ("succeeded", "failed"))
+            assert found["state"] == "succeeded", found["error"]
+    return jobs[0], jobs[1]
+
+
+@pytest.fixture
+def cloud(page, depth):
+    page.goto(f"/maps/{depth[0]}")
+    page.wait_for_function("() => globalThis.cloud !== undefined", timeout=LOADED_MS)
+    return page
+
+
+def picture(page) -> np.ndarray:
+    return np.array(page.evaluate(PICTURE)).reshape(-1, 4)
+
+
+def test_each_colouring_is_another_picture_of_the_same_points(cloud):
+    pictures = []
+    for name in ("depth", "confidence", "photograph"):
+        cloud.get_by_label("Colour by").select_option(name)
+        assert cloud.evaluate("() => globalThis.cloud.state()")["by"] == name
+        pictures.append(picture(cloud))
+    assert (pictures[0][:, 3] > 0).mean() > 0.1
+    for other in pictures[1:]:
+        assert np.array_equal(pictures[0][:, 3] > 0, other[:, 3] > 0)
+        assert not np.array_equal(pictures[0], other)
+
+
+def test_unsure_points_can_be_hidden(cloud, server, depth):
+    with server.client() as client:
+        points = client.get(f"/v1/jobs/{depth[1]}/results/view.json").json()["points"]
+    assert points["unsure"] > 0
+    assert cloud.evaluate("() => globalThis.cloud.state()")["shown"] == points["count"] + points["unsure"]
+    cloud.get_by_label("Show unsure points").uncheck()
+    assert cloud.evaluate("() => globalThis.cloud.state()")["shown"] == points["count"]
+
+
+def test_a_chosen_point_is_one_of_the_depth(cloud, server, depth, tmp_path):
+    """The point in the middle, read by the keyboard, lies where depth.exr has it."""
+    cloud.locator("canvas.scene").focus()
+    cloud.keyboard.press("Enter")
+    text = cloud.locator("output", has_text="camera frame").inner_text().replace("−", "-")
+    x, y, z, away = (float(value) for value in re.search(r"x (\S+), y (\S+), z (\S+) m .*?depth (\S+) m", text).groups())
+    assert away == -z
+    with server.client() as client:
+        path = tmp_path / "depth.exr"
+        path.write_bytes(client.get(f"/v1/jobs/{depth[0]}/results/depth.exr").raise_for_status().content)
+        camera = client.get(f"/v1/jobs/{depth[1]}/results/view.json").json()["camera"]
+    channels, _ = exr.read(path)
+    u = camera["principal_px"][0] + camera["focal_px"][0] * x / away
+    v = camera["principal_px"][1] - camera["focal_px"][1] * y / away
+    near = channels["depth.Z"][int(v) - 1 : int(v) + 2, int(u) - 1 : int(u) + 2]
+    assert np.abs(near / away - 1).min() < DIGITS
+
+
+def test_without_webgl_the_maps_remain(page, depth):
+    page.add_init_script("""const real = HTMLCanvasElement.prototype.getContext;
+        HTMLCanvasElement.prototype.getContext = function (kind, ...more) {
+            return kind === "webgl2" ? null : real.call(this, kind, ...more);
+        };""")
+    page.goto(f"/maps/{depth[0]}")
+    page.get_by_text("This browser has no WebGL2, which the points need").wait_for(timeout=LOADED_MS)
+    assert page.locator("canvas.map").is_visible()
+
+
+def test_no_serious_violation(browser, server, depth):
+    page = browser.new_page(base_url=server.url, bypass_csp=True, viewport={"width": 390, "height": 844})
+    page.goto(f"/maps/{depth[0]}")
+    page.wait_for_function("() => globalThis.cloud !== undefined", timeout=LOADED_MS)
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    assert violations(page) == []
+    page.close()
