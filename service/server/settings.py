@@ -74,6 +74,29 @@ class Grant(NamedTuple):
         return cls(value, project, Scope(scope))
 
 
+QUOTAS = ("max_project_bytes", "max_project_captures", "max_project_jobs", "max_project_pixels")
+
+
+class ProjectQuota(NamedTuple):
+    """A quota of one project in place of that of all."""
+
+    project: str
+    quota: str
+    limit: int
+
+    @classmethod
+    def read(cls, given: object) -> object:
+        """Return what PROJECT:QUOTA=NUMBER stands for."""
+        if not isinstance(given, str):
+            return given
+        project, _, rest = given.partition(":")
+        quota, _, limit = rest.partition("=")
+        if not re.fullmatch(PROJECT_PATTERN, project) or quota not in QUOTAS or not re.fullmatch(r"[0-9]{1,18}", limit):
+            raise ValueError(f"is {given}: give PROJECT:QUOTA=NUMBER, with a quota of {', '.join(QUOTAS)}")
+        return cls(project, quota, int(limit))
+
+
+Quoted = Annotated[ProjectQuota, BeforeValidator(ProjectQuota.read)]
 Granted = Annotated[Grant, BeforeValidator(Grant.read)]
 ProjectFolder = Annotated[ProjectRoot, BeforeValidator(ProjectRoot.read)]
 
@@ -126,6 +149,16 @@ class Settings(BaseSettings):
     """Frames of one relight at most."""
     max_queued: Count = 200
     """Queued jobs of one key at most."""
+    max_project_bytes: Count | None = None
+    """Bytes of the uploaded files and the results of one project at most; without it no limit but the disk."""
+    max_project_captures: Count | None = None
+    """Captures and environments of one project at most; without it any number."""
+    max_project_jobs: Count | None = None
+    """Jobs of one project that have not ended at most; without it any number."""
+    max_project_pixels: Count | None = None
+    """Pixels of all images of the captures and environments of one project at most; without it any number."""
+    project_quotas: Annotated[tuple[Quoted, ...], NoDecode] = ()
+    """Other quotas for some projects, separated by commas: `larch:max_project_jobs=500`."""
     requests_per_second: Positive = 50.0
     """Requests of one key a second, on average, in each API process."""
     request_burst: Count = 200
@@ -173,7 +206,7 @@ class Settings(BaseSettings):
     @classmethod
     def _split(cls, given: dict[str, object]) -> dict[str, object]:
         for name, mark in (("roots", os.pathsep), ("project_roots", os.pathsep), ("devices", ","), ("trusted_proxies", ","),
-                           ("oidc_grants", ",")):
+                           ("oidc_grants", ","), ("project_quotas", ",")):
             if isinstance(value := given.get(name), str):
                 given[name] = tuple(part.strip() for part in value.split(mark) if part.strip())
         return given
@@ -215,6 +248,11 @@ class Settings(BaseSettings):
     def roots_of(self, project: str) -> tuple[Path, ...]:
         """Return the folders below which a project may register captures and environments."""
         return (*self.roots, *(root.folder for root in self.project_roots if root.project == project))
+
+    def quota_of(self, project: str, quota: str) -> int | None:
+        """Return the limit of one of QUOTAS for a project; None: there is none."""
+        own = [each.limit for each in self.project_quotas if (each.project, each.quota) == (project, quota)]
+        return own[-1] if own else getattr(self, quota)
 
     @cached_property
     def loopback(self) -> bool:

@@ -16,7 +16,7 @@ from service.server.api.access import RateLimiter, RunningRequests, require_loca
 from service.server.api.problems import ApiError
 from service.server.api.tokens import PROJECT_HEADER, TokenReader
 from service.server.api.watch import Watcher
-from service.server.database import idempotency, keys
+from service.server.database import idempotency, keys, quotas
 from service.server.database.engine import Database
 from service.server.database.keys import DEFAULT_PROJECT, Caller
 from service.server.jobs.queue import JobQueue
@@ -25,7 +25,7 @@ from service.server.storage.folder import Storage
 from service.server.storage.upload_parts import UploadParts
 
 ANONYMOUS = Caller(DEFAULT_PROJECT, Scope.ADMIN, None)
-SPACE_RETRY_S = 600
+SPACE_RETRY_S = QUOTA_RETRY_S = 600
 FOR_WORK, FOR_UPLOAD = "new work", "this upload"
 """Purposes of space, as the sentence names them."""
 
@@ -157,3 +157,17 @@ def require_space(service: Service, purpose: str, length: int = 0) -> None:
     """
     if not has_space(service.settings, length):
         raise ApiError("full", f"the service has no space left for {purpose}", headers={"Retry-After": str(SPACE_RETRY_S)})
+
+
+def require_quota(service: Service, connection: sa.Connection, quota: str, project: str, more: int) -> None:
+    """Refuse, and so roll back the transaction, if a project would have more than it may; the arguments are those of `quotas.require`.
+
+    Raises:
+        ApiError: the quota is exceeded: too-large for bytes, else too-many.
+    """
+    try:
+        quotas.require(connection, service.settings, quota, project, more)
+    except quotas.QuotaExceeded as error:
+        if quota == quotas.BYTES:
+            raise ApiError("too-large", str(error)) from None
+        raise ApiError("too-many", str(error), headers={"Retry-After": str(QUOTA_RETRY_S)}) from None

@@ -21,13 +21,14 @@ from service.server.api.context import (
     Writer,
     create_once,
     created_before,
+    require_quota,
     require_space,
 )
 from service.server.api.json_body import JsonRoute
 from service.server.api.problems import ApiError, responses
 from service.server.api.submission import inputs_of, require_queue, spelled_out, submit
 from service.server.api.views import job_view
-from service.server.database import audit, jobs
+from service.server.database import audit, jobs, quotas
 from service.server.database.keys import Caller
 from service.server.storage import layout
 from service.views import states
@@ -200,8 +201,9 @@ def _again(service: Service, caller: Caller, job: str, state: str) -> JobView:
     def work(connection: sa.Connection) -> bool:
         attempt = jobs.queue_again(connection, job, state)
         if attempt is not None:
-            service.queue.enqueue(connection, job, attempt, request, before.priority)
+            service.queue.enqueue(connection, job, attempt, request, before.priority, caller.project)
             require_queue(service, caller, connection)
+            require_quota(service, connection, quotas.JOBS, caller.project, 0)
             audit.record(connection, caller, "job.again", job)
         return attempt is not None
 

@@ -3,12 +3,12 @@
 import sqlalchemy as sa
 
 from service.requests.frame_range import frame_numbers
-from service.requests.jobs import ExportJob, JobRequest, PipelineJob, RelightJob, ShadeJob, ViewJob
+from service.requests.jobs import CheckJob, ExportJob, JobRequest, PipelineJob, RelightJob, ShadeJob, ViewJob
 from service.requests.relight import RelightOptions
 from service.server import telemetry
-from service.server.api.context import Service
+from service.server.api.context import Service, require_quota
 from service.server.api.problems import ApiError
-from service.server.database import audit, intakes, jobs
+from service.server.database import audit, intakes, jobs, quotas
 from service.server.database.keys import Caller
 from service.views import states
 
@@ -20,6 +20,9 @@ def submit(service: Service, caller: Caller, request: JobRequest, connection: sa
     job = service.queue.submit(connection, project=caller.project, key=caller.key, request=request, inputs=inputs,
                               chunk_frames=service.settings.chunk_frames, trace=telemetry.current())
     require_queue(service, caller, connection)
+    if not isinstance(request, CheckJob):  # of which there is one for each capture
+        require_quota(service, connection, quotas.JOBS, caller.project, 0)  # it is counted already
+        require_quota(service, connection, quotas.BYTES, caller.project, 0)
     audit.record(connection, caller, "job.submit", job)
     return job
 

@@ -9,7 +9,17 @@ import sqlalchemy as sa
 from fastapi import APIRouter, Header, Query, Request, Response
 
 from service.requests.identifiers import ENVIRONMENT, UPLOAD, CaptureId, EnvironmentId, UploadId, new_id
-from service.server.api.context import FOR_UPLOAD, IdempotencyKey, Reader, Service, ServiceDep, Writer, create_once, require_space
+from service.server.api.context import (
+    FOR_UPLOAD,
+    IdempotencyKey,
+    Reader,
+    Service,
+    ServiceDep,
+    Writer,
+    create_once,
+    require_quota,
+    require_space,
+)
 from service.server.api.intakes import row_of
 from service.server.api.problems import ApiError, responses
 from service.server.api.tus import (
@@ -28,7 +38,7 @@ from service.server.api.tus import (
 )
 from service.server.api.upload_body import BodyBroken, RunningHashes, TooLong, write_body
 from service.server.api.upload_patch import UploadPatch, being_written, received_of, settled
-from service.server.database import audit, idempotency, intakes, uploads
+from service.server.database import audit, idempotency, intakes, quotas, uploads
 from service.server.database.keys import Caller
 from service.server.database.uploads import Row
 from service.server.safe_names import check_path, shown
@@ -190,6 +200,7 @@ def _create(service: Service, caller: Caller, intake: str, length: int, given: M
         elif before is not None:
             raise ApiError("conflict", f"path {shown(given.path)}: is being uploaded as {before['id']}: go on with it, or delete it")
         _require_room(service, connection, intake)
+        require_quota(service, connection, quotas.BYTES, caller.project, length)
         identifier = new_id(UPLOAD)
         try:
             uploads.insert(connection, identifier=identifier, project=caller.project, intake=intake, path=given.path, length=length,

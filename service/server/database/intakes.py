@@ -4,7 +4,7 @@ receiving (an upload) → checking → ready | refused. The files of an intake d
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import sqlalchemy as sa
@@ -59,14 +59,21 @@ def begin_check(connection: sa.Connection, identifier: str) -> bool:
         state=CHECKING, problem=None)).rowcount == 1
 
 
-def accept(database: Database, identifier: str, facts: dict[str, Any]) -> None:
-    """Record that the check found nothing wrong, and the facts that it found."""
-    _judge(database, identifier, state=READY, facts=facts, problem=None)
+def accept(database: Database, identifier: str, facts: dict[str, Any], allow: Callable[[sa.Connection], None] | None = None) -> None:
+    """Record that the check found nothing wrong, and the facts that it found.
+
+    Args:
+        database: of the service.
+        identifier: of the intake.
+        facts: of the check.
+        allow: called in the transaction; raises if the project may not have it. None: it may.
+    """
+    _judge(database, identifier, allow, state=READY, facts=facts, problem=None)
 
 
 def refuse(database: Database, identifier: str, problem: str) -> None:
     """Record the problem that the check found; the files of an upload may then be replaced and checked again."""
-    _judge(database, identifier, state=REFUSED, problem=storable(problem))
+    _judge(database, identifier, None, state=REFUSED, problem=storable(problem))
 
 
 def remove(connection: sa.Connection, identifier: str) -> list[str] | None:
@@ -82,6 +89,10 @@ def remove(connection: sa.Connection, identifier: str) -> list[str] | None:
     return parts if connection.execute(intakes.delete().where(intakes.c.id == identifier)).rowcount == 1 else None
 
 
-def _judge(database: Database, identifier: str, **values: Any) -> None:
-    database.transact(lambda connection: connection.execute(intakes.update().where(
-        intakes.c.id == identifier, intakes.c.state == CHECKING).values(**values)), patience_s=PATIENCE_S)
+def _judge(database: Database, identifier: str, allow: Callable[[sa.Connection], None] | None, **values: Any) -> None:
+    def work(connection: sa.Connection) -> None:
+        if allow is not None:
+            allow(connection)
+        connection.execute(intakes.update().where(intakes.c.id == identifier, intakes.c.state == CHECKING).values(**values))
+
+    database.transact(work, patience_s=PATIENCE_S)

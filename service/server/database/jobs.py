@@ -191,9 +191,14 @@ def advance(database: Database, claim: Claim, progress: StageProgress, *, repeat
     return _change(database, claim, patience_s=0.0, **values)
 
 
-def finish_step(database: Database, claim: Claim, steps: Sequence[str]) -> bool:
-    """Record the names of all finished steps; return False if the worker no longer has the job."""
-    return _change(database, claim, finished_steps=list(steps), **NOTHING_LOST)
+def finish_step(database: Database, claim: Claim, steps: Sequence[str], result_bytes: int | None = None) -> bool:
+    """Record the names of all finished steps, and the size of all results unless it is None.
+
+    Returns:
+        False if the worker no longer has the job.
+    """
+    size: dict[str, Any] = {} if result_bytes is None else {"result_bytes": result_bytes}
+    return _change(database, claim, finished_steps=list(steps), **size, **NOTHING_LOST)
 
 
 def end(database: Database, claim: Claim, state: str, error: str | None = None) -> bool:

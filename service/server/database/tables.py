@@ -109,6 +109,7 @@ jobs = sa.Table(
     sa.Column("total", sa.Integer),
     sa.Column("rate", sa.Float),  # per second
     sa.Column("error", sa.Text),  # one sentence
+    sa.Column("result_bytes", sa.BigInteger, nullable=False, server_default="0"),  # of its results, after the last finished step
     sa.Index("relit_jobs_of_project", "project", "created_at"),
     sa.Index("relit_jobs_of_state", "state", "updated_at"))
 

@@ -1,13 +1,16 @@
 """What the steps of a job are given: the worker that does them, and the job."""
 
+import shutil
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import NamedTuple
 
+from service.errors import RequestError
 from service.requests.jobs import ANY_JOB, JobRequest
 from service.server.database.engine import Database
 from service.server.jobs.queue import JobQueue
+from service.server.settings import Settings
 from service.server.storage.folder import Storage
 
 
@@ -28,6 +31,18 @@ class WorkerContext(NamedTuple):
     """Name of the worker."""
     queue: JobQueue | None = None
     """Where other workers are asked to help; None: nobody is asked."""
+
+    settings: Settings | None = None
+    """Of the service, for quotas and `min_free_bytes`; None: neither is looked at."""
+
+    def require_space(self) -> None:
+        """Check that `min_free_bytes` are left in the data folder.
+
+        Raises:
+            RequestError: less is left.
+        """
+        if self.settings is not None and shutil.disk_usage(self.settings.data).free < self.settings.min_free_bytes:
+            raise RequestError("the service has no space left for this job (min_free_bytes): retry it when there is")
 
     def without_folder(self, sentence: str) -> str:
         """Return a sentence for users, in which files are named below the data folder, whose place is not theirs to know."""

@@ -69,7 +69,7 @@ class JobPieces:
         """Ask workers that have no other work to help with the job, no more than there are pieces beside that of this worker."""
         queue, missing = self._context.queue, self._missing(pieces)
         if queue is not None and missing > 0:
-            queue.ask_for_help(self._job.id, self._job.attempt, self._job.request.priority, missing)
+            queue.ask_for_help(self._job.id, self._job.attempt, self._job.request.priority, missing, self._job.project)
             self._invited += missing
 
     def invite_to_steps(self, steps: int) -> None:

@@ -50,6 +50,8 @@ class JobProgress:
         self._opening = self._stopped = False
         self._begun, self._new_stage, self._repeating = list(begun), False, bool(begun)
         self._reached = reached
+        self.guard: Callable[[], None] = _nothing
+        """Called before each record of the progress; what it raises ends the step."""
 
     def begin(self, kind: str) -> None:
         """Begin the step, which is shown as a stage of this name; no product has begun."""
@@ -91,6 +93,7 @@ class JobProgress:
             further = self._stage == FRAMES and self._reached is not None and self._offset + self._counted > self._reached
             if now < self._record_at and not further:
                 return
+            self.guard()
             spent = now - self._began
             counted = self._counted
             rate = counted / spent if counted and spent > 0 else None
@@ -109,3 +112,7 @@ class JobProgress:
                 self._record_at = time.monotonic() + UNANSWERED_S
             if self._stopped:
                 raise Stopped
+
+
+def _nothing() -> None:
+    pass

@@ -12,7 +12,7 @@ from dbos._schemas import SCHEMA_PLACEHOLDER
 from dbos._schemas.system_database import SystemSchema
 
 from service.requests.jobs import CheckJob, JobRequest
-from service.server.database import jobs
+from service.server.database import jobs, tables
 from service.server.database.engine import Database
 from service.server.database.jobs import Claim
 from service.server.database.schema import upgrade
@@ -41,6 +41,24 @@ def prepare(settings: Settings, database: Database) -> None:
     settings.data.mkdir(parents=True, exist_ok=True)
     upgrade(database)
     DBOS.migrate(settings.sqlalchemy_url)
+    _assign_projects(database)
+
+
+def _assign_projects(database: Database) -> None:
+    """Give workflows their project that were queued before projects took turns; no worker takes them without."""
+    workflows = SystemSchema.workflow_status
+
+    def work(connection: sa.Connection) -> None:
+        schema = {SCHEMA_PLACEHOLDER: None if database.is_sqlite else POSTGRES_SCHEMA}
+        without = connection.execute(sa.select(workflows.c.workflow_uuid).where(
+            workflows.c.queue_name.in_((WORK, CHECKS)), workflows.c.queue_partition_key.is_(None)), execution_options={
+                "schema_translate_map": schema}).scalars().all()
+        for workflow in without:
+            project = connection.execute(sa.select(tables.jobs.c.project).where(tables.jobs.c.id == workflow.partition(".")[0])).scalar()
+            connection.execute(workflows.update().where(workflows.c.workflow_uuid == workflow).values(queue_partition_key=project),
+                               execution_options={"schema_translate_map": schema})
+
+    database.transact(work)
 
 
 def workflow_id(job: str, attempt: int) -> str:
@@ -73,14 +91,14 @@ class JobQueue:
         """Record a new job and queue it in the caller's transaction; the arguments are those of `jobs.insert`."""
         job = jobs.insert(connection, project=project, key=key, request=request, chunk_frames=chunk_frames, inputs=inputs,
                           trace=trace)
-        self.enqueue(connection, job, 1, request, request.priority)
+        self.enqueue(connection, job, 1, request, request.priority, project)
         return job
 
-    def enqueue(self, connection: sa.Connection, job: str, attempt: int, request: JobRequest, priority: int) -> None:
-        """Queue an attempt of a job in the caller's transaction."""
+    def enqueue(self, connection: sa.Connection, job: str, attempt: int, request: JobRequest, priority: int, project: str) -> None:
+        """Queue an attempt of a job in the caller's transaction: behind the project's jobs of higher priority, and not behind others'."""
         self._client.enqueue_in_transaction(connection, {
             "workflow_name": WORKFLOW, "queue_name": _queue(isinstance(request, CheckJob)), "workflow_id": workflow_id(job, attempt),
-            "app_version": VERSION, "priority": HIGHEST - priority}, job, attempt)
+            "app_version": VERSION, "priority": HIGHEST - priority, "queue_partition_key": project}, job, attempt)
 
     def set_priority(self, connection: sa.Connection, job: str, attempt: int, priority: int) -> None:
         """Change the priority of a queued attempt in the caller's transaction; its place among equal priorities stays.
@@ -96,14 +114,14 @@ class JobQueue:
         """Take an attempt out of the queue; a worker that runs it learns so from the job's row at its next sign of progress."""
         self._client.cancel_workflow(workflow_id(job, attempt))
 
-    def ask_for_help(self, job: str, attempt: int, priority: int, workers: int) -> None:
+    def ask_for_help(self, job: str, attempt: int, priority: int, workers: int, project: str) -> None:
         """Queue work for workers that have no other: to help with a job that another worker does."""
         def enqueue(connection: sa.Connection) -> None:
             for _ in range(workers):
                 workflow = f"{workflow_id(job, attempt)}.{secrets.token_hex(4)}"
                 self._client.enqueue_in_transaction(connection, {
                     "workflow_name": HELP, "queue_name": WORK, "workflow_id": workflow, "app_version": VERSION,
-                    "priority": HIGHEST - priority}, workflow)
+                    "priority": HIGHEST - priority, "queue_partition_key": project}, workflow)
 
         self._database.transact(enqueue)
 

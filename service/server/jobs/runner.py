@@ -194,6 +194,9 @@ class JobRunner:
             if step.frames and (outcome := self._leave_to_others(claim, step, steps, row["finished_steps"])) is not None:
                 return outcome
             log.info("step begins")
+            size = None
+            if not isinstance(job.request, CheckJob):
+                progress.guard = self._context.require_space
             progress.begin(name.partition(" ")[0])
             with telemetry.span(step.name, row["trace"], job=job.id, attempt=claim.attempt, worker=self._worker), places_named():
                 step.run(progress)
@@ -201,6 +204,7 @@ class JobRunner:
                 raise Stopped
             if not isinstance(job.request, CheckJob):
                 self._publish(claim, job, step, progress)
+                size = sum(file.size for file in self._context.storage.files(layout.results(job.project, job.id)))
         except Stopped:
             log.info("step stopped")
             self._clear_if_deleted(job)
@@ -212,7 +216,7 @@ class JobRunner:
         except Exception as error:
             log.error("step failed", error=repr(error), trace=traceback.format_exc())
             return self._fail(claim, f"{name}: an error of relit itself ({type(error).__name__}): its log has more", job)
-        if not jobs.finish_step(database, claim, [*row["finished_steps"], name]):
+        if not jobs.finish_step(database, claim, [*row["finished_steps"], name], size):
             self._clear_if_deleted(job)
             return STOPPED
         log.info("step done")

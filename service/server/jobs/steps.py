@@ -11,7 +11,7 @@ from service.reporting.provenance import name_place
 from service.requests.frame_range import frame_numbers
 from service.requests.identifiers import CAPTURE
 from service.requests.jobs import CheckJob, DepthJob, ExportJob, PipelineJob, RelightJob, ShadeJob, SolveJob, ViewJob
-from service.server.database import intakes
+from service.server.database import intakes, quotas
 from service.server.jobs.context import Job, WorkerContext
 from service.server.jobs.pieces import JobPieces
 from service.server.storage import layout
@@ -111,7 +111,9 @@ def _check(job: Job, request: CheckJob, context: WorkerContext, progress: Progre
     folder, root = _place(job, request.intake, context, progress)
     facts = check_in_process(folder, environment=not request.intake.startswith(CAPTURE), root=root, max_pixels=context.max_pixels,
                              progress=progress)
-    intakes.accept(context.database, request.intake, facts)
+    settings, more = context.settings, quotas.pixels_of(facts)
+    intakes.accept(context.database, request.intake, facts, None if settings is None else lambda connection: quotas.require(
+        connection, settings, quotas.PIXELS, job.project, more))
 
 
 def _solve(job: Job, request: SolveJob, context: WorkerContext, progress: Progress) -> None:

@@ -57,7 +57,7 @@ def run_worker(settings: Settings, device: str, heartbeat: Heartbeat) -> None:
         raise RuntimeError(f"another process holds the lock of {name}")  # its name is random
     queue = JobQueue(database)
     context = WorkerContext(database, open_storage(settings), cache_folder(settings), device, settings.max_pixels, settings.roots_of,
-                            worker=name, queue=queue)
+                            worker=name, queue=queue, settings=settings)
     runner = JobRunner(context, name, alive=heartbeat.step)
     config: DBOSConfig = {
         "name": APPLICATION, "system_database_url": settings.sqlalchemy_url, "system_database_engine": database.engine,
@@ -72,7 +72,8 @@ def run_worker(settings: Settings, device: str, heartbeat: Heartbeat) -> None:
                         running=lambda: runner.running, beat=heartbeat.beat, lock_lost=_end_without_lock)
     DBOS.launch()
     for waiting in (WORK, CHECKS):
-        DBOS.register_queue(waiting, worker_concurrency=1, polling_interval_sec=POLL_S)
+        # a limit for each partition makes the queue one of partitions, which are the projects: DBOS draws the next one by lot
+        DBOS.register_queue(waiting, worker_concurrency=1, partition_worker_concurrency=1, polling_interval_sec=POLL_S)
     workers.insert(database, name, host=host, pid=os.getpid(), device=device)
     takeover.start()
     heartbeat.ready()

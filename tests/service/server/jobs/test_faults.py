@@ -10,7 +10,7 @@ import pytest
 
 from service.requests.identifiers import CAPTURE, ENVIRONMENT
 from service.server.database import jobs, workers
-from tests.service.server.jobs.harness import digests, harness
+from tests.service.server.jobs.harness import PROJECT, digests, harness
 
 HERE = Path(__file__).resolve().parent
 SABOTAGE = os.pathsep.join([str(HERE / "sabotage"), str(HERE.parents[3])])
@@ -160,7 +160,7 @@ def test_a_job_on_a_full_disk_fails_with_a_sentence_and_goes_on_when_there_is_sp
         attempt = made.database.transact(lambda connection: jobs.queue_again(connection, job, jobs.FAILED))
         assert attempt == 2
         request = made.request(job)
-        made.database.transact(lambda connection: made.queue.enqueue(connection, job, attempt, request, request.priority))
+        made.database.transact(lambda connection: made.queue.enqueue(connection, job, attempt, request, request.priority, PROJECT))
         row = made.ended(job)
         assert (row["state"], row["error"]) == (jobs.SUCCEEDED, None)
         assert digests(made.results(job)) == undisturbed.digests

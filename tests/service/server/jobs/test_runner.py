@@ -123,3 +123,13 @@ def test_what_a_step_wrote_after_its_job_was_deleted_is_removed(idle_harness, ru
     do_nothing(monkeypatch, run)
     assert made.run(claim) in (STOPPED, jobs.FAILED)
     assert not folder.exists()
+
+
+def test_a_step_that_would_fill_the_disk_fails_with_a_sentence(runner, idle_harness, monkeypatch):
+    """At its beginning, and while it goes on."""
+    made, claim = runner
+    settings = idle_harness.settings.model_copy(update={"min_free_bytes": 1 << 60})
+    made._context = made._context._replace(settings=settings)
+    do_nothing(monkeypatch, lambda progress: pytest.fail("there is no space"))
+    assert made.run(claim) == "failed"
+    assert "no space left for this job (min_free_bytes)" in idle_harness.row(claim.job)["error"]

@@ -9,10 +9,10 @@ from service.requests.identifiers import CAPTURE, ENVIRONMENT, new_id
 from service.server.database import jobs
 from service.server.database.jobs import Claim, StageProgress
 from service.server.jobs.progress import JobProgress
-from service.server.jobs.queue import job_and_attempt, workflow_id
+from service.server.jobs.queue import job_and_attempt, prepare, workflow_id
 from service.server.jobs.takeover import FORGOTTEN_ROUNDS, GRACE_ROUNDS, Takeover
 from service.server.jobs.worker_lock import LockState, open_worker_lock
-from tests.service.server.jobs.harness import harness
+from tests.service.server.jobs.harness import PROJECT, harness
 
 MAX_LOST = 3
 
@@ -134,6 +134,17 @@ def test_a_changed_priority_is_that_of_the_queue(idle_harness):
     idle_harness.take(second, "one")
     jobs.begin(idle_harness.database, Claim(second, 1, "one"))
     assert idle_harness.database.transact(lambda connection: jobs.set_priority(connection, second, 1)) is None  # it runs
+
+
+def test_workflows_of_before_projects_took_turns_get_their_project(idle_harness):
+    """Workers take only workflows that name their project."""
+    job = idle_harness.relight(new_id(CAPTURE), new_id(ENVIRONMENT), 10, chunk_frames=5)
+    table = "workflow_status" if idle_harness.database.is_sqlite else "dbos.workflow_status"
+    idle_harness.database.transact(lambda connection: connection.execute(sa.text(f"UPDATE {table} SET queue_partition_key = NULL")))
+    prepare(idle_harness.settings, idle_harness.database)
+    row = idle_harness.database.row(sa.select(sa.text("queue_partition_key")).select_from(sa.text(table)))
+    assert row["queue_partition_key"] == PROJECT
+    assert idle_harness.in_queue(job)[0] == "ENQUEUED"
 
 
 def test_a_worker_is_lost_once_whoever_finds_it_and_however_often(idle_harness, job):

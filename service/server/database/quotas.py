@@ -1,0 +1,84 @@
+"""Quotas: what one project may have, whichever API process is asked.
+
+What a project has is counted in the transaction that adds to it, under a lock of the project, so that two requests at once cannot both take
+the last place.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import sqlalchemy as sa
+
+from service.errors import RequestError
+from service.server.database.tables import intakes, jobs, uploads
+from service.server.settings import Settings
+from service.views.states import ACTIVE, READY
+
+BYTES, CAPTURES, JOBS, PIXELS = "max_project_bytes", "max_project_captures", "max_project_jobs", "max_project_pixels"
+LOCK_SPACE = 11
+"""Seed of the hash of projects, so that these advisory locks do not coincide with those of workers."""
+
+
+class QuotaExceeded(RequestError):
+    """The project has as much as it may; the message names the quota."""
+
+    def __init__(self, quota: str, project: str, limit: int, used: int, more: int) -> None:
+        """Args: quota: name of the setting. limit, used, more: allowed, present, and asked for."""
+        super().__init__(f"quota {quota}: the project {project} has {used} of {limit} {UNITS[quota]}, and this needs {more} more")
+        self.quota = quota
+
+
+def require(connection: sa.Connection, settings: Settings, quota: str, project: str, more: int) -> None:
+    """Check a quota before something is added in the caller's transaction; other requests of the project wait for its end.
+
+    Args:
+        connection: of the transaction.
+        settings: of the service.
+        quota: BYTES, CAPTURES, JOBS or PIXELS.
+        project: that is to have more.
+        more: what will be added, in the unit of the quota.
+
+    Raises:
+        QuotaExceeded: the project would have more than it may.
+    """
+    limit = settings.quota_of(project, quota)
+    if limit is None:
+        return
+    if connection.dialect.name == "postgresql":  # SQLite has one writer at a time
+        connection.execute(sa.text("SELECT pg_advisory_xact_lock(hashtextextended(:name, :space))"), {"name": project, "space": LOCK_SPACE})
+    used = USED[quota](connection, project)
+    if used + more > limit:
+        raise QuotaExceeded(quota, project, limit, used, more)
+
+
+def pixels_of(facts: dict[str, Any] | None) -> int:
+    """Return the pixels of all images of a capture or environment, from the facts that its check found."""
+    if not facts or "resolution" not in facts:
+        return 0
+    width, height = facts["resolution"]
+    return int(width) * int(height) * int(facts.get("frames", 1))
+
+
+def _bytes(connection: sa.Connection, project: str) -> int:
+    """Count files that are uploaded or announced, and results."""
+    files = sa.select(sa.func.coalesce(sa.func.sum(uploads.c.length), 0)).where(uploads.c.project == project)
+    results = sa.select(sa.func.coalesce(sa.func.sum(jobs.c.result_bytes), 0)).where(jobs.c.project == project)
+    return int(connection.execute(files).scalar_one()) + int(connection.execute(results).scalar_one())
+
+
+def _captures(connection: sa.Connection, project: str) -> int:
+    return int(connection.execute(sa.select(sa.func.count()).where(intakes.c.project == project)).scalar_one())
+
+
+def _jobs(connection: sa.Connection, project: str) -> int:
+    return int(connection.execute(sa.select(sa.func.count()).where(
+        jobs.c.project == project, jobs.c.state.in_(ACTIVE), jobs.c.request["kind"].as_string() != "check")).scalar_one())
+
+
+def _pixels(connection: sa.Connection, project: str) -> int:
+    rows = connection.execute(sa.select(intakes.c.facts).where(intakes.c.project == project, intakes.c.state == READY)).scalars()
+    return sum(pixels_of(facts) for facts in rows)
+
+
+USED: dict[str, Callable[[sa.Connection, str], int]] = {BYTES: _bytes, CAPTURES: _captures, JOBS: _jobs, PIXELS: _pixels}
+UNITS = {BYTES: "bytes", CAPTURES: "captures and environments", JOBS: "jobs", PIXELS: "pixels"}

@@ -1,0 +1,120 @@
+"""Quotas of projects, and that two requests at once do not both take the last place."""
+
+import threading
+
+import pytest
+
+from service.errors import RequestError
+from service.requests.identifiers import CAPTURE, UPLOAD, new_id
+from service.requests.jobs import CheckJob, SolveJob
+from service.server.database import intakes, jobs, quotas, tables, uploads
+from service.server.database.engine import Database, connect
+from service.server.database.schema import upgrade
+from service.server.settings import Settings
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def database(request, tmp_path) -> Database:
+    url = None if request.param == "sqlite" else request.getfixturevalue("server_postgres").new_database()
+    made = connect(Settings(data=tmp_path, database_url=url).sqlalchemy_url)
+    upgrade(made)
+    yield made
+    made.close()
+
+
+def capture(connection, project: str) -> str:
+    made = new_id(CAPTURE)
+    intakes.insert(connection, identifier=made, project=project, kind=CAPTURE, name="x", folder=None)
+    return made
+
+
+def allowed(database: Database, quota: str, project: str, more: int, **settings: object) -> bool:
+    try:
+        database.transact(lambda connection: quotas.require(connection, Settings(**settings), quota, project, more))
+    except quotas.QuotaExceeded:
+        return False
+    return True
+
+
+def test_bytes_are_those_of_uploads_and_results(database):
+    def work(connection):
+        place = capture(connection, "larch")
+        uploads.insert(connection, identifier=new_id(UPLOAD), project="larch", intake=place, path="a", length=60, sha256=None)
+        job = jobs.insert(connection, project="larch", key=None, request=SolveJob(kind="solve", capture=place), chunk_frames=1, inputs=[])
+        connection.execute(tables.jobs.update().where(tables.jobs.c.id == job).values(result_bytes=30))
+
+    database.transact(work)
+    assert allowed(database, quotas.BYTES, "larch", 10, max_project_bytes=100)
+    assert not allowed(database, quotas.BYTES, "larch", 11, max_project_bytes=100)
+    assert allowed(database, quotas.BYTES, "larch", 11)
+    assert allowed(database, quotas.BYTES, "willow", 100, max_project_bytes=100)
+
+
+def test_checks_and_ended_jobs_do_not_count(database):
+    def work(connection):
+        for request in (SolveJob(kind="solve", capture=new_id(CAPTURE)), CheckJob(kind="check", intake=new_id(CAPTURE))):
+            jobs.insert(connection, project="larch", key=None, request=request, chunk_frames=1, inputs=[])
+        ended = jobs.insert(connection, project="larch", key=None, request=SolveJob(kind="solve", capture=new_id(CAPTURE)), chunk_frames=1,
+                            inputs=[])
+        jobs.cancel(connection, ended)
+
+    database.transact(work)
+    assert allowed(database, quotas.JOBS, "larch", 1, max_project_jobs=2)
+    assert not allowed(database, quotas.JOBS, "larch", 2, max_project_jobs=2)
+
+
+def test_pixels_are_those_of_all_images_and_a_check_refuses_more(database):
+    first, second = (database.transact(lambda connection: capture(connection, "larch")) for _ in range(2))
+    for name in (first, second):
+        database.transact(lambda connection, name=name: intakes.begin_check(connection, name))
+    facts, settings = {"resolution": [10, 20], "frames": 3, "captures": 1}, Settings(max_project_pixels=1000)
+
+    def allow(connection):
+        quotas.require(connection, settings, quotas.PIXELS, "larch", quotas.pixels_of(facts))
+
+    intakes.accept(database, first, facts, allow)
+    with pytest.raises(RequestError, match="quota max_project_pixels: the project larch has 600 of 1000 pixels, and this needs 600 more"):
+        intakes.accept(database, second, facts, allow)
+    assert intakes.find(database, second, "larch")["state"] == "checking"
+
+
+def test_a_project_may_have_a_quota_of_its_own(database):
+    database.transact(lambda connection: [capture(connection, project) for project in ("larch", "willow")])
+    own = {"max_project_captures": 1, "project_quotas": "larch:max_project_captures=2,willow:max_project_bytes=1"}
+    assert allowed(database, quotas.CAPTURES, "larch", 1, **own)
+    assert not allowed(database, quotas.CAPTURES, "willow", 1, **own)
+
+
+def test_two_at_once_do_not_both_take_the_last_place(database):
+    """As two API processes do: each counts what the other has not yet written."""
+    settings, outcomes = Settings(max_project_captures=1), []
+    together = threading.Barrier(8)
+
+    def work(connection):
+        quotas.require(connection, settings, quotas.CAPTURES, "larch", 1)
+        return capture(connection, "larch")
+
+    def run():
+        together.wait()
+        try:
+            outcomes.append(database.transact(lambda connection: (_begin(connection), work(connection))[1]))
+        except quotas.QuotaExceeded:
+            outcomes.append(None)
+
+    def _begin(connection):
+        if database.is_sqlite:  # every route writes something before, as the idempotency token
+            connection.exec_driver_sql("BEGIN IMMEDIATE")
+
+    threads = [threading.Thread(target=run) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len([made for made in outcomes if made]) == 1
+
+
+@pytest.mark.parametrize("given", ["larch", "larch:max_project_jobs", "larch:max_frames=1", "larch:max_project_jobs=-1",
+                                   "../x:max_project_jobs=1"])
+def test_quotas_that_cannot_be(given):
+    with pytest.raises(ValueError, match="give PROJECT:QUOTA=NUMBER"):
+        Settings(project_quotas=given)
