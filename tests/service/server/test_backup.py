@@ -1,0 +1,100 @@
+"""Backups that are made while a job runs, and services that are made from them."""
+
+import json
+import shutil
+
+import pytest
+
+from service.requests.identifiers import CAPTURE, ENVIRONMENT
+from service.server.backup import CONTENTS, backup, restore
+from service.server.database import jobs
+from service.server.settings import Settings
+from tests.service.server.jobs.conftest import database_url, undisturbed  # noqa: F401  (fixtures)
+from tests.service.server.jobs.harness import digests, harness
+from tests.service.server.jobs.test_faults import SABOTAGE
+
+
+@pytest.mark.parametrize("database_url", ["sqlite", "postgresql"], indirect=True)
+def test_a_job_that_ran_is_finished_by_the_restored_service(tmp_path, database_url, undisturbed, request):  # noqa: F811
+    if database_url is not None and shutil.which("pg_dump") is None:
+        pytest.skip("the client programs of PostgreSQL are not on the path")
+    roots = str(undisturbed.capture.parent)
+    with harness(tmp_path / "first", database_url, roots=roots) as made:
+        made.start(PYTHONPATH=SABOTAGE, SABOTAGE="slow")
+        job = made.relight(made.register(undisturbed.capture, CAPTURE), made.register(undisturbed.environment, ENVIRONMENT),
+                           undisturbed.frames, chunk_frames=6)
+        made.until(lambda: made.frames_there(job) >= 8, "8 frames")
+        saved = backup(made.settings, tmp_path / "saved")
+        assert made.row(job)["state"] == jobs.RUNNING
+        contents = json.loads((tmp_path / "saved" / CONTENTS).read_text())["files"]
+        frames = [name for name in contents if name.endswith(".exr")]
+        assert saved.files == len(contents) and 8 <= len(frames) < undisturbed.frames
+        assert made.ended(job)["state"] == jobs.SUCCEEDED  # the backup did not disturb it
+        assert digests(made.results(job)) == undisturbed.digests
+    second = None if database_url is None else request.getfixturevalue("server_postgres").new_database()
+    restore(Settings(data=tmp_path / "second" / "data", database_url=second), tmp_path / "saved")
+    with harness(tmp_path / "second", second, takeover_s=0.5, roots=roots) as again:
+        row = again.row(job)
+        assert row["state"] == jobs.RUNNING and row["finished_steps"][:1] == ["frames 1-6"]
+        kept = {path.name: path.stat().st_mtime_ns for path in again.results(job).iterdir()}
+        assert len(kept) == len(frames)
+        again.start()
+        row = again.ended(job)
+        assert (row["state"], row["error"]) == (jobs.SUCCEEDED, None)
+        assert digests(again.results(job)) == undisturbed.digests
+        assert {name: (again.results(job) / name).stat().st_mtime_ns for name in kept} == kept  # frames that were there stay
+
+
+@pytest.fixture
+def saved(tmp_path):
+    """A backup of a service with one result."""
+    with harness(tmp_path / "first") as made:
+        folder = made.settings.data / "projects" / "larch" / "jobs" / "job_x"
+        folder.mkdir(parents=True)
+        (folder / "maps.exr").write_bytes(b"maps")
+        (folder / ".maps.exr.part").write_bytes(b"ma")
+        backup(made.settings, tmp_path / "saved")
+    return tmp_path / "saved"
+
+
+def test_files_that_are_being_written_are_left_out(saved):
+    assert sorted(path.name for path in saved.rglob("*") if path.is_file()) == ["backup.json", "maps.exr", "relit.sqlite"]
+
+
+@pytest.mark.parametrize("damage", ["flip", "cut", "remove", "no contents", "contents"])
+def test_a_damaged_backup_is_refused_and_nothing_is_made(relit, saved, tmp_path, damage):
+    file = saved / "projects/larch/jobs/job_x/maps.exr"
+    if damage == "flip":
+        file.unlink()
+        file.write_bytes(b"mops")
+    elif damage == "cut":
+        file.unlink()
+        file.write_bytes(b"map")
+    elif damage == "remove":
+        file.unlink()
+    elif damage == "no contents":
+        (saved / CONTENTS).unlink()
+    else:
+        (saved / CONTENTS).write_text('{"schema": "relit.backup/1", "files": {"../x": {}}}')
+    outcome = relit("restore", saved, "--data", tmp_path / "second")
+    assert (outcome.code, outcome.out) == (2, "") and outcome.err.count("\n") == 1
+    words = {"no contents": "is no whole backup", "contents": "../x leads out of the backup"}
+    assert words.get(damage, "maps.exr: is missing or differs from its checksum") in outcome.err
+    assert not (tmp_path / "second").exists()
+
+
+def test_a_service_is_neither_overwritten_nor_saved_into_itself(relit, saved, tmp_path):
+    data = tmp_path / "first" / "data"
+    assert "there is a service in this folder already" in relit("restore", saved, "--data", data).err
+    assert "is not empty: give a new folder" in relit("backup", "--out", saved, "--data", data).err
+    assert "lies in the data folder" in relit("backup", "--out", data / "saved", "--data", data).err
+    assert "there is no service in this folder" in relit("backup", "--out", tmp_path / "x", "--data", tmp_path / "nowhere").err
+    assert not (tmp_path / "x").exists() and not (tmp_path / "nowhere").exists()
+
+
+def test_the_commands_say_what_they_did(relit, saved, tmp_path):
+    outcome = relit("restore", saved, "--data", tmp_path / "second")
+    assert outcome.code == 0 and outcome.out.splitlines()[0] == f"data     {tmp_path / 'second'}"
+    assert (tmp_path / "second/projects/larch/jobs/job_x/maps.exr").read_bytes() == b"maps"
+    outcome = relit("backup", "--data", tmp_path / "second", "--out", tmp_path / "again")
+    assert outcome.code == 0 and outcome.out.splitlines()[0] == f"backup   {tmp_path / 'again'}"
