@@ -12,6 +12,8 @@ from stage.environment_maps import SUFFIXES
 from stage.errors import ImageError, ManifestError, storage
 from stage.files import resolved
 from stage.manifest import FILE_NAME, Manifest, read_manifest
+from stage.tof.scan import FILE_NAME as SCAN_FILE
+from stage.tof.scan import read_scan
 
 MAX_MANIFEST_BYTES = 16 << 20
 """Largest capture.json: 20 000 frames have a quarter of it. Read, it takes up to 40 times as much memory."""
@@ -20,7 +22,7 @@ MAX_CHANNELS = 4
 
 
 def admit_capture(folder: Path, *, max_pixels: int, progress: Progress | None = None) -> dict[str, Any]:
-    """Check the manifest of a capture, or of a sequence of captures, and the header of every file that it names.
+    """Check the manifest of a capture, or of a sequence of captures, and the header of every file that it names; or the shots of a scan.
 
     Args:
         folder: folder of the capture or of the sequence.
@@ -28,13 +30,16 @@ def admit_capture(folder: Path, *, max_pixels: int, progress: Progress | None = 
         progress: told of every capture.
 
     Returns:
-        A description: number of captures and frames, resolution, colour space, name.
+        A description: number of captures and frames, resolution, colour space, name; of a scan its number of shots and name.
 
     Raises:
         ManifestError: the manifest is wrong, or a file lies outside the folder; names the field.
         ImageError: a file is not an image, is cut short, or has more pixels than are allowed; names the file.
         StorageError: a file cannot be read.
     """
+    if (folder / SCAN_FILE).is_file() and not (folder / FILE_NAME).exists():
+        shots = read_scan(folder)
+        return {"captures": 0, "frames": 0, "shots": len(shots.time_s), "name": shots.scan.name}
     timings = Timings(progress)
     frames, manifest = 0, None
     _check_manifest_files(folder)

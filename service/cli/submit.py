@@ -15,11 +15,18 @@ from service.requests.frame_range import frame_numbers
 from service.requests.identifiers import ALPHABET, CAPTURE, ENVIRONMENT, LENGTH, pattern
 from service.requests.jobs import (
     DEFAULT_SERVER,
+    BasisJob,
     DepthJob,
     ExportJob,
+    GreyBallJob,
+    IntensityJob,
     JobRequest,
+    LightPositionsJob,
+    MirrorBallJob,
+    PatternsJob,
     PipelineJob,
     RelightJob,
+    ScanJob,
     ShadeJob,
     SolveJob,
     ViewJob,
@@ -31,7 +38,9 @@ if TYPE_CHECKING:
     from service.client import Client
 
 JOBS: dict[str, type[JobRequest]] = {"solve": SolveJob, "depth": DepthJob, "relight": RelightJob, "shade": ShadeJob, "export": ExportJob,
-                                     "view": ViewJob, "pipeline": PipelineJob}
+                                     "view": ViewJob, "pipeline": PipelineJob, "basis": BasisJob, "scan": ScanJob, "patterns": PatternsJob,
+                                     "calibrate-mirror-ball": MirrorBallJob, "calibrate-light-positions": LightPositionsJob,
+                                     "calibrate-grey-ball": GreyBallJob, "calibrate-intensity": IntensityJob}
 REGISTERED = "server:"
 SOURCES = "Give a path of this machine, which is uploaded; an identifier, {prefix}_…; or server:/path, which is registered."
 

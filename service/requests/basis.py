@@ -17,7 +17,22 @@ class BasisKind(Choice):
     HSH = "hsh", "hemispherical harmonics (.rti)"
 
 
-class BasisRequest(StackOptions, Request):
+class BasisCount(StackOptions):
+    """How many coefficients are kept."""
+
+    count: int | None = Field(default=None, ge=1)
+    """Coefficients in each channel. svd: 1 to the number of lights; hsh: 4, 9 or 16; both kinds of ptm: always 6. None: svd: 16, or the
+    number of lights if that is smaller; hsh: 9 with 18 lights or more, else 4."""
+
+
+class BasisOptions(BasisCount):
+    """What a job of the service reduces a capture to."""
+
+    basis: BasisKind = BasisKind.SVD
+    """What the capture is reduced to."""
+
+
+class BasisRequest(BasisCount, Request):
     """A capture as a few coefficient images, for a browser or for RTI viewers."""
 
     capture: Annotated[Path, Role.INPUT, CAPTURE]
@@ -26,6 +41,3 @@ class BasisRequest(StackOptions, Request):
     """The file: .exr, .ptm or .rti; a .json that describes it is written beside it."""
     kind: BasisKind | None = None
     """What the capture is reduced to; None: the first kind with the suffix of `out`."""
-    count: int | None = Field(default=None, ge=1)
-    """Coefficients in each channel. svd: 1 to the number of lights; hsh: 4, 9 or 16; both kinds of ptm: always 6. None: svd: 16, or the
-    number of lights if that is smaller; hsh: 9 with 18 lights or more, else 4."""

@@ -63,37 +63,29 @@ def _levels(given: Any) -> Any:
     return given
 
 
-class LightsRequest(Options):
-    """Base of the kinds that measure lights."""
+class LightsOptions(Options):
+    """Base of what is chosen to measure lights."""
 
-    capture: Annotated[Path, Role.INPUT, CAPTURE]
-    """Folder of the capture with the calibration images; its distant and point lights may be placeholders."""
-    apply_to: Annotated[Path | None, Role.INPUT, Spelling(metavar="CAPTURE")] = None
-    """Another capture under the same lights in the same order, whose manifest is written; None: the capture itself."""
-    out: Annotated[Path | None, Role.OUTPUT] = None
-    """Manifest to write; None: the target's own capture.json."""
     drop_failed: bool = False
     """Leave out frames whose light cannot be measured, in place of refusing the capture."""
 
 
-class BallRequest(LightsRequest):
-    """Base of the kinds that look at balls: circles first, then masks."""
+class BallOptions(LightsOptions):
+    """Base of what is chosen to look at balls."""
 
     circles: Annotated[tuple[Annotated[Circle, BeforeValidator(_circle)], ...], Role.INPUT, Spelling(flag="--ball", metavar="U,V,R")] = ()
     """Outline of a ball: centre and radius in pixels. Give one for each ball."""
-    masks: Annotated[tuple[Path, ...], Role.INPUT, Spelling(flag="--ball-mask")] = ()
-    """Mask image of a ball, in place of `ball`; better for a perspective camera. Give one for each ball."""
 
 
-class MirrorBallRequest(BallRequest):
-    """Directions of far lights from one mirror ball."""
+class MirrorBallOptions(BallOptions):
+    """How the highlight on a mirror ball is found."""
 
     level: Annotated[float, Field(gt=0, lt=1)] = 0.1
     """The highlight on the ball is what is brighter than this fraction of its peak."""
 
 
-class LightPositionsRequest(MirrorBallRequest):
-    """Positions of near lights from two or more mirror balls."""
+class LightPositionsOptions(MirrorBallOptions):
+    """What is known of the mirror balls."""
 
     ball_radius_m: tuple[Positive, ...] = ()
     """Radius in metres, one for all balls or one for each; an orthographic camera with pixel_size_m needs none."""
@@ -101,8 +93,8 @@ class LightPositionsRequest(MirrorBallRequest):
     """Camera-frame z of the centres in metres, for an orthographic camera; without it surface_z_m of the manifest, or 0."""
 
 
-class GreyBallRequest(BallRequest):
-    """Brightness of each light from one grey ball."""
+class GreyBallOptions(BallOptions):
+    """What is known of the grey ball."""
 
     albedo: Annotated[tuple[Positive, Positive, Positive] | None, BeforeValidator(_albedo), Spelling(metavar="R,G,B")] = None
     """Albedo of the ball, one number or three; None: only ratios of irradiance are measured, and their mean is set to 1."""
@@ -115,11 +107,45 @@ class GreyBallRequest(BallRequest):
     manifest, or 0."""
 
 
-class IntensityRequest(LightsRequest):
-    """Brightness of lights of known direction from images of the object itself."""
+class IntensityOptions(LightsOptions):
+    """How many pixels of the object are looked at."""
 
     pixels: Annotated[int, Field(ge=100, le=100_000)] = 2000
     """Number of pixels of the mask, drawn at random, that are used: 100 to 100000."""
+
+
+class LightsRequest(LightsOptions):
+    """Base of the kinds that measure lights."""
+
+    capture: Annotated[Path, Role.INPUT, CAPTURE]
+    """Folder of the capture with the calibration images; its distant and point lights may be placeholders."""
+    apply_to: Annotated[Path | None, Role.INPUT, Spelling(metavar="CAPTURE")] = None
+    """Another capture under the same lights in the same order, whose manifest is written; None: the capture itself."""
+    out: Annotated[Path | None, Role.OUTPUT] = None
+    """Manifest to write; None: the target's own capture.json."""
+
+
+class BallRequest(BallOptions, LightsRequest):
+    """Base of the kinds that look at balls: circles first, then masks."""
+
+    masks: Annotated[tuple[Path, ...], Role.INPUT, Spelling(flag="--ball-mask")] = ()
+    """Mask image of a ball, in place of `ball`; better for a perspective camera. Give one for each ball."""
+
+
+class MirrorBallRequest(MirrorBallOptions, BallRequest):
+    """Directions of far lights from one mirror ball."""
+
+
+class LightPositionsRequest(LightPositionsOptions, BallRequest):
+    """Positions of near lights from two or more mirror balls."""
+
+
+class GreyBallRequest(GreyBallOptions, BallRequest):
+    """Brightness of each light from one grey ball."""
+
+
+class IntensityRequest(IntensityOptions, LightsRequest):
+    """Brightness of lights of known direction from images of the object itself."""
 
 
 class FramesRequest(Options):

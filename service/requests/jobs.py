@@ -5,11 +5,15 @@ from typing import Annotated, Literal
 from pydantic import Field, TypeAdapter
 
 from service.requests.base import CAPTURE, Options, Role, Spelling
+from service.requests.basis import BasisOptions
+from service.requests.calibrate import GreyBallOptions, IntensityOptions, LightPositionsOptions, MirrorBallOptions
 from service.requests.depth import DepthOptions
 from service.requests.export import AssetFormat, ExportOptions
 from service.requests.identifiers import CaptureId, EnvironmentId, JobId
 from service.requests.light_keys import LightKeys
+from service.requests.patterns import PatternsOptions
 from service.requests.relight import RelightOptions
+from service.requests.scan import ScanOptions
 from service.requests.shade import ShadeOptions
 from service.requests.solve import SolveOptions
 from service.requests.view import ViewOptions
@@ -135,7 +139,78 @@ class PipelineJob(JobRequest):
     relight: RelightOptions = RelightOptions()
 
 
-UserJob = Annotated[SolveJob | DepthJob | RelightJob | ShadeJob | ExportJob | ViewJob | PipelineJob, Field(discriminator="kind")]
+class BasisJob(JobRequest):
+    """A capture as a few coefficient images: basis.exr, basis.ptm or basis.rti, and basis.json."""
+
+    kind: Literal["basis"]
+    capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
+    """The capture."""
+    options: BasisOptions = BasisOptions()
+
+
+class ScanJob(JobRequest):
+    """Shots of a scanning laser as one point cloud: points.ply, points.usdc, report.json."""
+
+    kind: Literal["scan"]
+    capture: Annotated[CaptureId, Role.INPUT, Spelling(argument=True, metavar="SCAN")]
+    """An uploaded folder with a scan.json."""
+    options: ScanOptions = ScanOptions()
+
+
+class PatternsJob(JobRequest):
+    """Images to project and their manifest entries: PNG files and patterns.json."""
+
+    kind: Literal["patterns"]
+    options: PatternsOptions
+
+
+class CalibrationJob(JobRequest):
+    """Base of the jobs that measure lights: capture.json with the lights, calibration.json."""
+
+    capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
+    """The capture with the calibration images; its distant and point lights may be placeholders."""
+    apply_to: Annotated[CaptureId | None, Role.INPUT, Spelling(metavar="CAPTURE")] = None
+    """Another capture under the same lights in the same order, whose manifest is written; None: the capture itself."""
+
+
+class BallJob(CalibrationJob):
+    """Base of the jobs that look at balls."""
+
+    masks: Annotated[tuple[str, ...], Role.INPUT, Spelling(flag="--ball-mask", metavar="NAME")] = ()
+    """Name of a mask image of a ball in the capture's folder, in place of `ball`. Give one for each ball."""
+
+
+class MirrorBallJob(BallJob):
+    """Directions of far lights from one mirror ball: capture.json, calibration.json."""
+
+    kind: Literal["calibrate-mirror-ball"]
+    options: MirrorBallOptions = MirrorBallOptions()
+
+
+class LightPositionsJob(BallJob):
+    """Positions of near lights from two or more mirror balls: capture.json, calibration.json."""
+
+    kind: Literal["calibrate-light-positions"]
+    options: LightPositionsOptions = LightPositionsOptions()
+
+
+class GreyBallJob(BallJob):
+    """Brightness of each light from one grey ball: capture.json, calibration.json."""
+
+    kind: Literal["calibrate-grey-ball"]
+    options: GreyBallOptions = GreyBallOptions()
+
+
+class IntensityJob(CalibrationJob):
+    """Brightness of lights of known direction from images of the object itself: capture.json, calibration.json."""
+
+    kind: Literal["calibrate-intensity"]
+    options: IntensityOptions = IntensityOptions()
+
+
+OneJob = (SolveJob | DepthJob | RelightJob | ShadeJob | ExportJob | ViewJob | PipelineJob | BasisJob | ScanJob | PatternsJob | MirrorBallJob
+          | LightPositionsJob | GreyBallJob | IntensityJob)
+UserJob = Annotated[OneJob, Field(discriminator="kind")]
 """Every kind of job that the API accepts."""
-AnyJob = Annotated[CheckJob | SolveJob | DepthJob | RelightJob | ShadeJob | ExportJob | ViewJob | PipelineJob, Field(discriminator="kind")]
-ANY_JOB: TypeAdapter[CheckJob | SolveJob | DepthJob | RelightJob | ShadeJob | ExportJob | ViewJob | PipelineJob] = TypeAdapter(AnyJob)
+AnyJob = Annotated[CheckJob | OneJob, Field(discriminator="kind")]
+ANY_JOB: TypeAdapter[CheckJob | OneJob] = TypeAdapter(AnyJob)

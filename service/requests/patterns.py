@@ -55,13 +55,11 @@ class CodeOptions(Options):
     """micro: number of periods."""
 
 
-class PatternsRequest(CodeOptions):
-    """Images to project and their manifest entries; each option belongs to the codes that its line names."""
+class PatternsOptions(CodeOptions):
+    """What is drawn; each option belongs to the codes that its line names."""
 
     code: Annotated[PatternCode, Spelling(argument=True, metavar="CODE")]
     """What to project; not needed with --plan."""
-    out: Annotated[Path, Role.OUTPUT]
-    """Folder for the images and patterns.json."""
     bits: int = Field(default=8, ge=8, le=16, multiple_of=8)
     """Bits of a channel in the PNG files, 8 or 16."""
     gamma: Positive = 1.0
@@ -78,6 +76,13 @@ class PatternsRequest(CodeOptions):
     """micro: mean of the periods, in pixels."""
     carrier: Positive = 8.0
     """modulated: period of the carrier, in pixels."""
+
+
+class PatternsRequest(PatternsOptions):
+    """Images to project and their manifest entries; each option belongs to the codes that its line names."""
+
+    out: Annotated[Path, Role.OUTPUT]
+    """Folder for the images and patterns.json."""
 
 
 class PlanRequest(CodeOptions):

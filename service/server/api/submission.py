@@ -45,7 +45,7 @@ def inputs_of(service: Service, project: str, request: JobRequest) -> list[str]:
         ApiError: one of them does not exist or is not ready.
     """
     read = []
-    for field in ("capture", "environment", "reference_ball", "rig"):
+    for field in ("capture", "environment", "reference_ball", "rig", "apply_to"):
         identifier = getattr(request, field, None)
         if identifier is not None:
             _require_ready(service, project, field, identifier)

@@ -12,6 +12,7 @@ from service.requests.frame_range import frame_numbers
 from service.requests.identifiers import CAPTURE
 from service.requests.jobs import CheckJob, DepthJob, ExportJob, PipelineJob, RelightJob, ShadeJob, SolveJob, ViewJob
 from service.server.database import intakes, quotas
+from service.server.jobs import measuring
 from service.server.jobs.context import Job, WorkerContext
 from service.server.jobs.pieces import JobPieces
 from service.server.storage import layout
@@ -72,6 +73,10 @@ def _steps_of(job: Job, context: WorkerContext) -> list[JobStep]:
         return [JobStep("export", lambda progress: _export(job, request, context, progress))]
     if isinstance(request, ViewJob):
         return [JobStep("view", lambda progress: _view(job, request, context, progress))]
+    if measuring.can_run(request):
+        return [JobStep("measure", lambda progress: measuring.run(
+            request, _out(job, context), lambda capture: _intake(job, capture, context, progress), device=context.device,
+            cache=context.cache, progress=progress))]
     if isinstance(request, RelightJob):
         return _frames(job, request, context)
     assert isinstance(request, PipelineJob), request
@@ -111,6 +116,8 @@ def _check(job: Job, request: CheckJob, context: WorkerContext, progress: Progre
     folder, root = _place(job, request.intake, context, progress)
     facts = check_in_process(folder, environment=not request.intake.startswith(CAPTURE), root=root, max_pixels=context.max_pixels,
                              progress=progress)
+    if "shots" in facts and root is not None:
+        raise RequestError("a scan is not registered: upload its folder")
     settings, more = context.settings, quotas.pixels_of(facts)
     intakes.accept(context.database, request.intake, facts, None if settings is None else lambda connection: quotas.require(
         connection, settings, quotas.PIXELS, job.project, more))

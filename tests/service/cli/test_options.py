@@ -47,6 +47,9 @@ COMMANDS: dict[str, list[type[Options]]] = {
     "calibrate tof": [calibrate.TofCalibrationRequest],
     "submit solve": [jobs.SolveJob], "submit depth": [jobs.DepthJob], "submit relight": [jobs.RelightJob], "submit shade": [jobs.ShadeJob],
     "submit export": [jobs.ExportJob], "submit view": [jobs.ViewJob], "submit pipeline": [jobs.PipelineJob],
+    "submit basis": [jobs.BasisJob], "submit scan": [jobs.ScanJob], "submit patterns": [jobs.PatternsJob],
+    "submit calibrate-mirror-ball": [jobs.MirrorBallJob], "submit calibrate-light-positions": [jobs.LightPositionsJob],
+    "submit calibrate-grey-ball": [jobs.GreyBallJob], "submit calibrate-intensity": [jobs.IntensityJob],
     "farm template relight": [relight.RelightRequest], "farm template shade": [shade.ShadeRequest],
 }
 OWN = {

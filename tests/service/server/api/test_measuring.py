@@ -1,0 +1,105 @@
+"""Jobs that make no maps: bases, scans, patterns to project, and calibrations of lights."""
+
+import base64
+import io
+import json
+
+import numpy as np
+import pytest
+
+from service.depth.projection import make_patterns
+from service.requests.patterns import PatternsRequest
+from tests.service.server.api.test_jobs import finish, made_by, refused, submit
+
+TUS = {"Tus-Resumable": "1.0.0"}
+
+
+def upload(server, client, files: dict[str, bytes], state: str = "ready") -> dict:
+    """A capture of these files, checked."""
+    capture = client.post("/v1/captures", json={"name": "x"}).raise_for_status().json()["id"]
+    for name, content in files.items():
+        place = client.post(f"/v1/captures/{capture}/files", headers={
+            **TUS, "Upload-Length": str(len(content)), "Upload-Metadata": f"path {base64.b64encode(name.encode()).decode()}"})
+        client.patch(place.raise_for_status().headers["Location"], content=content, headers={
+            **TUS, "Upload-Offset": "0", "Content-Type": "application/offset+octet-stream"}).raise_for_status()
+    client.post(f"/v1/captures/{capture}/validate").raise_for_status()
+    found = server.wait(client, f"/v1/captures/{capture}", ("ready", "refused"))
+    assert found["state"] == state, found
+    return found
+
+
+def scan_files(shots: int = 90) -> dict[str, bytes]:
+    azimuth = np.linspace(-np.pi, np.pi, shots, endpoint=False)
+    file = io.BytesIO()
+    np.save(file, np.stack([np.linspace(0, 1, shots), azimuth, np.zeros(shots), np.full(shots, 5.0), np.ones(shots)], axis=1))
+    return {"scan.json": json.dumps({"schema": "relit.scan/1", "name": "yard", "shots": "shots.npy"}).encode(),
+            "shots.npy": file.getvalue()}
+
+
+@pytest.mark.parametrize(("options", "file"), [({}, "basis.exr"), ({"basis": "hsh", "count": 4}, "basis.rti")])
+def test_a_basis(server, client, dome, options, file):
+    job = submit(client, kind="basis", capture=dome, options=options)
+    finish(server, client, job)
+    assert made_by(client, job) == {file, "basis.json"}
+
+
+def test_a_scan(server, client):
+    capture = upload(server, client, scan_files())
+    assert capture["facts"]["shots"] == 90
+    job = submit(client, kind="scan", capture=capture["id"], options={"near_m": 1})
+    finish(server, client, job)
+    assert made_by(client, job) >= {"points.ply", "points.usdc", "report.json"}
+    assert client.get(f"/v1/jobs/{job['id']}/results/report.json").json()["shots"]["points"] == 90
+    solve = submit(client, kind="solve", capture=capture["id"])
+    assert "capture.json" in finish(server, client, solve, "failed")["error"]
+
+
+def test_scans_that_cannot_be(server, client, registered):
+    files = scan_files()
+    cut = upload(server, client, files | {"shots.npy": files["shots.npy"][:-8]}, "refused")
+    assert "shots.npy" in cut["problem"] and str(server.data) not in cut["problem"]
+    away = upload(server, client, files | {"scan.json": files["scan.json"].replace(b"shots.npy", b"../x.npy")}, "refused")
+    assert "leads out of the scan's folder" in away["problem"]
+    folder = registered / "scan"
+    folder.mkdir()
+    for name, content in files.items():
+        (folder / name).write_bytes(content)
+    made = client.post("/v1/captures", json={"name": "scan", "folder": str(folder)}).raise_for_status().json()
+    found = server.wait(client, f"/v1/captures/{made['id']}", ("ready", "refused"))
+    assert found["problem"] == "a scan is not registered: upload its folder"
+
+
+def test_patterns_are_those_of_the_command(server, client, tmp_path):
+    job = submit(client, kind="patterns", options={"code": "gray", "projector": [64, 40], "inverses": False})
+    finish(server, client, job)
+    make_patterns(PatternsRequest(code="gray", projector=(64, 40), inverses=False, out=tmp_path))
+    assert made_by(client, job) == {path.name for path in tmp_path.iterdir()}
+    for path in tmp_path.glob("*.png"):
+        assert client.get(f"/v1/jobs/{job['id']}/results/{path.name}").content == path.read_bytes()
+
+
+def test_an_option_of_another_code_is_refused(server, client):
+    job = submit(client, kind="patterns", options={"code": "gray", "projector": [64, 40], "micro_periods": 4})
+    assert "micro_periods" in finish(server, client, job, "failed")["error"].replace(" ", "_")
+
+
+def test_the_brightness_of_lights(server, client, dome):
+    job = submit(client, kind="calibrate-intensity", capture=dome, options={"pixels": 100})
+    finish(server, client, job)
+    assert made_by(client, job) == {"capture.json", "calibration.json"}
+    measured = client.get(f"/v1/jobs/{job['id']}/results/calibration.json").json()["intensity"]
+    assert len(measured["lights"]) == len(client.get(f"/v1/jobs/{job['id']}/results/capture.json").json()["frames"])
+    assert str(server.data) not in json.dumps(measured)
+
+
+def test_a_ball_that_is_not_given(server, client, dome):
+    job = submit(client, kind="calibrate-mirror-ball", capture=dome)
+    assert "ball" in finish(server, client, job, "failed")["error"]
+    job = submit(client, kind="calibrate-grey-ball", capture=dome, masks=["../../x.png"])
+    assert "is no file of the capture" in finish(server, client, job, "failed")["error"]
+
+
+@pytest.mark.parametrize("request_", [{"kind": "patterns"}, {"kind": "patterns", "options": {"code": "gray", "projector": [0, 4]}},
+                                      {"kind": "scan"}, {"kind": "basis", "options": {"basis": "jpeg"}}, {"kind": "calibrate"}])
+def test_what_cannot_be_is_refused(client, request_):
+    refused(client.post("/v1/jobs", json=request_), 422, "")
