@@ -24,9 +24,9 @@ def _split_commas(given: Any) -> Any:
 
 
 def _sides(given: Any) -> Any:
-    """Return the two numbers of a text such as 1280x800."""
+    """Return the two numbers of a text such as 1280x800, and a list as a tuple, which strict validation of JSON asks for."""
     if not isinstance(given, str):
-        return given
+        return tuple(given) if isinstance(given, list) else given
     sides = given.lower().replace("×", "x").split("x")
     if len(sides) != 2 or not all(side.strip().isdigit() for side in sides):
         raise ValueError(f"is {given}: give width x height in pixels, as in 1280x800")

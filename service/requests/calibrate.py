@@ -41,7 +41,7 @@ def _circle(given: Any) -> Any:
 
 def _albedo(given: Any) -> Any:
     if not isinstance(given, str):
-        return given
+        return tuple(given) if isinstance(given, list) else given
     values = _numbers(given)
     if len(values) not in (1, 3):
         raise RequestError(f"--albedo {given}: give one number or three, such as 0.18")

@@ -140,7 +140,7 @@ class PipelineJob(JobRequest):
 
 
 class BasisJob(JobRequest):
-    """A capture as a few coefficient images: basis.exr, basis.ptm or basis.rti, and basis.json."""
+    """A capture as a few coefficient images: basis.exr, basis.ptm or basis.rti, and a .json beside it."""
 
     kind: Literal["basis"]
     capture: Annotated[CaptureId, Role.INPUT, CAPTURE]

@@ -40,7 +40,7 @@ def scan_files(shots: int = 90) -> dict[str, bytes]:
 def test_a_basis(server, client, dome, options, file):
     job = submit(client, kind="basis", capture=dome, options=options)
     finish(server, client, job)
-    assert made_by(client, job) == {file, "basis.json"}
+    assert made_by(client, job) == {file, f"{file}.json"}
 
 
 def test_a_scan(server, client):

@@ -70,7 +70,7 @@ def both_at_work(made, job: str) -> tuple[str, str]:
 @pytest.mark.parametrize("method", ["lambert", "svbrdf"])
 def test_two_workers_make_the_same_maps_as_one(tmp_path, database_url, capture, monkeypatch, method):
     alone = maps_alone(capture, method, tmp_path / "alone", monkeypatch)
-    with harness(tmp_path, database_url, log_level="debug") as made:
+    with harness(tmp_path / "service", database_url, log_level="debug") as made:
         start(made, method)
         job = begin(made, capture, method)
         row = made.ended(job)
@@ -89,7 +89,7 @@ def test_two_workers_make_the_same_maps_as_one(tmp_path, database_url, capture, 
 @pytest.mark.parametrize("whom", ["who helps", "who has the job"])
 def test_the_pieces_of_a_killed_worker_are_done_by_another(tmp_path, capture, monkeypatch, whom):
     alone = maps_alone(capture, "svbrdf", tmp_path / "alone", monkeypatch)
-    with harness(tmp_path, log_level="debug", takeover_s=0.5) as made:
+    with harness(tmp_path / "service", log_level="debug", takeover_s=0.5) as made:
         start(made, "svbrdf")
         job = begin(made, capture, "svbrdf")
         holder, helper = both_at_work(made, job)
@@ -107,7 +107,7 @@ def test_the_pieces_of_a_killed_worker_are_done_by_another(tmp_path, capture, mo
 
 @pytest.mark.long
 def test_a_cancelled_solve_ends_at_both_workers_and_leaves_nothing(tmp_path, capture):
-    with harness(tmp_path, log_level="debug") as made:
+    with harness(tmp_path / "service", log_level="debug") as made:
         start(made, "svbrdf")
         job = begin(made, capture, "svbrdf")
         both_at_work(made, job)
@@ -123,7 +123,7 @@ def test_a_cancelled_solve_ends_at_both_workers_and_leaves_nothing(tmp_path, cap
 
 def test_a_small_solve_is_not_shared(tmp_path, capture):
     """It has one piece a pass."""
-    with harness(tmp_path, log_level="debug") as made:
+    with harness(tmp_path / "service", log_level="debug") as made:
         for _ in range(WORKERS):
             made.start()
         made.ready(WORKERS)
@@ -133,7 +133,7 @@ def test_a_small_solve_is_not_shared(tmp_path, capture):
 
 
 def test_frames_are_made_by_both_workers(tmp_path, undisturbed):
-    with harness(tmp_path, log_level="debug") as made:
+    with harness(tmp_path / "service", log_level="debug") as made:
         for _ in range(WORKERS):
             made.start(PYTHONPATH=SABOTAGE, SABOTAGE="slow")
         made.ready(WORKERS)
