@@ -133,7 +133,7 @@ def test_a_small_solve_is_not_shared(tmp_path, capture):
 
 
 def test_frames_are_made_by_both_workers(tmp_path, undisturbed):
-    with harness(tmp_path / "service", log_level="debug") as made:
+    with harness(tmp_path, log_level="debug") as made:
         for _ in range(WORKERS):
             made.start(PYTHONPATH=SABOTAGE, SABOTAGE="slow")
         made.ready(WORKERS)
