@@ -1,7 +1,8 @@
 """What the service loses when its processes are killed, hang or are without their database: the table of docs/service_faults.md.
 
-python -m benchmarks.service_faults [--seed N] [--sqlite | --write docs/service_faults.md]; some minutes. Without --sqlite it needs the
-server programs of PostgreSQL, and repeats the kills on SQLite; with it everything is on SQLite, without the restarts of PostgreSQL.
+python -m benchmarks.service_faults [--seed N] [--kills] [--sqlite | --write docs/service_faults.md]; some minutes. Without --sqlite it
+needs the server programs of PostgreSQL, and repeats the kills on SQLite; with it everything is on SQLite, without the restarts of
+PostgreSQL. With --kills there are only the kills, and --write replaces their section of the document.
 """
 
 import argparse
@@ -37,6 +38,8 @@ KILLS = {AT_WORK: 15, WITH_SUPERVISOR: 8, SUPERVISOR: 3, IDLE: 4}
 """30, in random order."""
 
 
+TOGETHER = "**these together, in one job, in random order"
+KILLS_BEGIN, KILLS_END = "<!-- kills: made by benchmarks.service_faults -->", "<!-- end of kills -->"
 NewDatabase = Callable[[], str | None]
 """Returns the URL of an empty database; None: SQLite in the data folder."""
 
@@ -151,7 +154,8 @@ def kills(folder: Path, new_database: NewDatabase, scene: Scene, chance: random.
         wanted, identical, lost = settle(made, scene, job)
     rows = [Fault(kind, times, 0, 0, takeovers[kind], 0) for kind, times in KILLS.items()]
     dead = [each for kind in KILLS if kind != SUPERVISOR for each in takeovers[kind]]
-    return [*rows, Fault(f"**these together, in one job, in random order, on {where}**", len(order), wanted, identical, dead, lost)]
+    assert lost == 0 and identical == wanted, f"{lost} jobs lost, {identical} of {wanted} frames are identical"
+    return [*rows, Fault(f"{TOGETHER}, on {where}**", len(order), wanted, identical, dead, lost)]
 
 
 def disturbed(folder: Path, new_database: NewDatabase, scene: Scene, kind: str, times: int,
@@ -251,10 +255,27 @@ the furthest stage of the step counts a tenth.
 """
 
 
+def kills_section(faults: list[Fault], seed: int, load: float) -> str:
+    return f"""{KILLS_BEGIN}
+## Kills with the default settings
+
+Measured on {datetime.now(UTC):%Y-%m-%d} on {os.cpu_count()} cores ({processor()}; load average before it began {load:.1f}), seed {seed}, by
+
+    python -m benchmarks.service_faults --kills --write docs/service_faults.md
+
+{chr(10).join(table(faults))}
+
+Every setting has its default (`max_lost` 3). A job fails that loses four workers without progress between them: without a new frame, a
+finished step, or a stage that the step had not come to. A worker that dies before the furthest stage of the step counts a tenth.
+{KILLS_END}
+"""
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=random.randrange(2**32))
     parser.add_argument("--write", type=Path, help="the document that the table goes into")
+    parser.add_argument("--kills", action="store_true", help="only the kills")
     parser.add_argument("--sqlite", action="store_true", help="without PostgreSQL")
     chosen = parser.parse_args(arguments)
     programs = binaries()
@@ -269,24 +290,28 @@ def main(arguments: Sequence[str] | None = None) -> None:
         scene = make_scene_files(folder / "scene")
         faults = kills(folder / "kills", new_database, scene, random.Random(chosen.seed), "SQLite" if server is None else "PostgreSQL")
         if server is not None:
-            faults.append(kills(folder / "sqlite", lambda: None, scene, random.Random(chosen.seed + 1), "SQLite")[-1])
+            faults += kills(folder / "sqlite", lambda: None, scene, random.Random(chosen.seed + 1), "SQLite")
         rows: list[tuple[str, int, Callable[[Harness, str], float | None], dict[str, float]]] = [
             ("SIGKILL of all workers at once", 3, kill_all, {}),
             ("SIGSTOP of the worker at work", 2, stop_one, {"stall_s": STALL_S}),
             ("SIGTERM to the `relit worker` at work", 3, ask_one_to_end, {})]
-        if server is not None:
+        if chosen.kills:
+            rows = []
+        elif server is not None:
             rows += [("PostgreSQL restarted (fast)", 3, restarted(server, "fast", 0.0), {}),
                      ("PostgreSQL restarted (immediate)", 3, restarted(server, "immediate", 0.0), {}),
                      ("PostgreSQL away for 10 s", 2, restarted(server, "fast", 10.0), {})]
         for number, (kind, times, disturb, settings) in enumerate(rows):
             faults.append(disturbed(folder / str(number), new_database, scene, kind, times, disturb, **settings))
-    text = document(faults, chosen.seed, time.monotonic() - began, load)
+    section = kills_section([fault for fault in faults if fault.kind in KILLS or fault.kind.startswith(TOGETHER)], chosen.seed, load)
+    text = section if chosen.kills else document(faults, chosen.seed, time.monotonic() - began, load) + "\n" + section
     print(text)
     dead = [each for fault in faults if "SIGKILL of the worker" in fault.kind or "all workers" in fault.kind for each in fault.takeovers_s]
     assert all(fault.identical == fault.frames and fault.lost == 0 for fault in faults), "frames or jobs are lost"
     assert max(dead) < TAKEOVER_LIMIT_S, f"a takeover took {max(dead):.1f} s"
     if chosen.write is not None and not chosen.sqlite:
-        chosen.write.write_text(text)
+        before = chosen.write.read_text() if chosen.kills else ""
+        chosen.write.write_text(before.partition(KILLS_BEGIN)[0].rstrip("\n") + "\n\n" + text if chosen.kills else text)
 
 
 if __name__ == "__main__":

@@ -1,13 +1,19 @@
 """What `relit calibrate` takes: one frozen model for each kind."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 from pydantic import BeforeValidator, Field
 
-from service.errors import RequestError
 from service.requests.base import CAPTURE, Commas, DeviceRequest, Options, Request, Role, Spelling, WidthHeight
 from stage.model import Count, Finite, Positive
+
+
+def _refuse(sentence: str) -> NoReturn:
+    from service.errors import RequestError  # which knows the errors of the kernels: not for a client, which imports this
+
+    raise RequestError(sentence)
+
 
 Corners = Annotated[int, Field(ge=3)]
 IMAGES = Spelling(argument=True, metavar="IMAGE...")
@@ -35,7 +41,7 @@ def _circle(given: Any) -> Any:
         return given
     values = _numbers(given)
     if len(values) != 3:
-        raise RequestError(f"--ball {given}: give centre and radius in pixels, such as 812.5,604,230")
+        _refuse(f"--ball {given}: give centre and radius in pixels, such as 812.5,604,230")
     return dict(zip(Circle.model_fields, values, strict=True))
 
 
@@ -44,7 +50,7 @@ def _albedo(given: Any) -> Any:
         return tuple(given) if isinstance(given, list) else given
     values = _numbers(given)
     if len(values) not in (1, 3):
-        raise RequestError(f"--albedo {given}: give one number or three, such as 0.18")
+        _refuse(f"--albedo {given}: give one number or three, such as 0.18")
     return tuple(values * 3 if len(values) == 1 else values)
 
 
@@ -53,13 +59,13 @@ def _board(given: Any) -> Any:
         return given
     parts = given.lower().split("x")
     if len(parts) != 2 or not all(part.isdecimal() for part in parts):
-        raise RequestError(f"--board {given}: give two whole numbers with an x between, as 9x6")
+        _refuse(f"--board {given}: give two whole numbers with an x between, as 9x6")
     return tuple(map(int, parts))
 
 
 def _levels(given: Any) -> Any:
     if isinstance(given, tuple) and given and not _numbers(text := ",".join(map(str, given))):
-        raise RequestError(f"--levels {text}: give numbers from 0 to 1 with commas between")
+        _refuse(f"--levels {text}: give numbers from 0 to 1 with commas between")
     return given
 
 

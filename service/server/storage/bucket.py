@@ -22,7 +22,7 @@ PARTS_AT_ONCE = 2
 """Parts of one file that are sent at one time; several files are sent at one time."""
 DELETED_AT_ONCE = 1000
 CONNECT_S, REQUEST_S = 10, 120
-RETRIES, RETRY_S = 8, 120
+RETRIES, RETRY_S = 100, 120
 """Retries, and their time in all, after errors of the network and of the store (5xx), with growing pauses; then the step fails."""
 PROBE_RETRIES, PROBE_S = 1, 5
 """Retries and time of a check whether the store answers, for which somebody waits."""
