@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PYTEST := $(BIN)/python -m pytest -q -n auto --maxprocesses 4 --dist loadfile
 
-.PHONY: demo serve test test-all clients lint bench gpu-bench figures samples lock vendor clean
+.PHONY: demo serve test test-all clients lint bench gpu-bench figures samples screenshots lock vendor clean
 demo: $(VENV)/installed
 	$(BIN)/relit demo
 
@@ -42,6 +42,10 @@ samples: $(VENV)/installed-dev
 	$(BIN)/python samples/make_owl.py
 	$(BIN)/python samples/make_lambert.py
 	$(BIN)/python samples/make_rig.py --sample
+
+# the pictures of the pages in docs/, by the tests that make them (needs Chromium)
+screenshots: $(VENV)/installed-dev
+	RELIT_TEST_SCREENSHOTS=$(CURDIR)/docs $(BIN)/python -m pytest -q tests/service/server/pages/test_screenshots.py
 
 # the lock records versions and hashes, and no download address
 lock:
