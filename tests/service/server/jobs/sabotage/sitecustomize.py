@@ -2,7 +2,8 @@
 
 kill  end the process by SIGKILL, as want of memory would      hang  stand still      slow  take a tenth of a second for each frame
 
-With PIECES the bands and batches of solves are small, and each takes that many seconds more.
+With PIECES the bands and batches of solves are small, and each takes that many seconds more. The first waits until a second worker has
+begun one: TOGETHER is the folder in which each leaves a file.
 """
 
 import os
@@ -43,8 +44,25 @@ if "SABOTAGE" in os.environ:
     steps._relight = {"kill": kill, "hang": hang, "slow": slow}[os.environ["SABOTAGE"]]
 
 if "PIECES" in os.environ:
+    from pathlib import Path
+
     import service.solve.batches as batches
     import stage.stack as stack
+    from service.server.jobs.pieces import JobPieces
+
+    claim, together = JobPieces.claim, Path(os.environ["TOGETHER"])
+
+    def claim_together(self, name):
+        taken = claim(self, name)
+        if taken:
+            together.mkdir(exist_ok=True)
+            (together / self._context.worker).touch()
+            deadline = time.monotonic() + 60
+            while len(list(together.iterdir())) < 2 and time.monotonic() < deadline:
+                time.sleep(0.05)
+        return taken
+
+    JobPieces.claim = claim_together
 
     stack.BAND_BYTES, batches.BATCH_BYTES = 1 << 14, 1 << 15
     upload = batches.packs.upload
