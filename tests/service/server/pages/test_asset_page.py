@@ -77,8 +77,8 @@ def test_an_asset_is_shown(page, exported, form):
     found = page.evaluate(PICTURE)
     picture = np.array(found["pixels"]).reshape(found["rows"], found["cols"], 4)
     covered = picture[..., 3] > 0
-    # the object fills the height of the picture but for the margin, and is lit
-    assert 0.6 < np.ptp(np.flatnonzero(covered.any(axis=1))) / found["rows"] < 1
+    # the sphere around the object's box, half as wide again as the object, fills the height of the picture but for the margin
+    assert 0.4 < np.ptp(np.flatnonzero(covered.any(axis=1))) / found["rows"] < 1
     assert picture[..., :3][covered].mean() > 60
 
 
