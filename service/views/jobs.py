@@ -38,6 +38,20 @@ class JobView(View):
     """Why it failed, in one sentence."""
 
 
+class LogEntry(View):
+    """Something that happened to a job."""
+
+    at: Time
+    attempt: int
+    text: str
+
+
+class JobLog(View):
+    """What happened to a job, the oldest first; of a long log, the first thousand entries."""
+
+    entries: list[LogEntry]
+
+
 class JobPage(View):
     """Jobs, the newest first."""
 

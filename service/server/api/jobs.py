@@ -27,12 +27,12 @@ from service.server.api.context import (
 from service.server.api.json_body import JsonRoute
 from service.server.api.problems import ApiError, responses
 from service.server.api.submission import inputs_of, require_queue, spelled_out, submit
-from service.server.api.views import job_view
-from service.server.database import audit, jobs, quotas
+from service.server.api.views import job_view, log_view
+from service.server.database import audit, job_log, jobs, quotas
 from service.server.database.keys import Caller
 from service.server.storage import layout
 from service.views import states
-from service.views.jobs import JobPage, JobView
+from service.views.jobs import JobLog, JobPage, JobView
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"], responses=responses(401, 403, 422, 429, 503), route_class=JsonRoute)
 
@@ -113,6 +113,13 @@ def list_jobs(service: ServiceDep, caller: Reader, state: States = (),
 def get_job(service: ServiceDep, caller: Reader, job: JobName) -> JobView:
     """Return state, progress and error of a job."""
     return view(service, caller, job)
+
+
+@router.get("/{job}/log", responses=responses(404), summary="Look at the log of a job")
+def get_log(service: ServiceDep, caller: Reader, job: JobName) -> JobLog:
+    """Return what happened to a job and when: its stages, workers that it lost, and how it ended."""
+    view(service, caller, job)
+    return log_view(job_log.read(service.database, job))
 
 
 @router.post("/{job}/cancel", status_code=202, responses=responses(404, 409), summary="Cancel a job")

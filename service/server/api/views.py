@@ -1,5 +1,6 @@
 """Views made from rows of the database and files of the storage; service.views declares their fields."""
 
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from urllib.parse import quote
 
@@ -7,7 +8,7 @@ import sqlalchemy as sa
 
 from service.server.storage.folder import StoredFile
 from service.views.intakes import IntakeView
-from service.views.jobs import JobView, ProgressView, ResultView
+from service.views.jobs import JobLog, JobView, LogEntry, ProgressView, ResultView
 
 
 def job_view(row: sa.RowMapping) -> JobView:
@@ -20,6 +21,11 @@ def job_view(row: sa.RowMapping) -> JobView:
     return JobView(id=row["id"], state=row["state"], attempt=row["attempt"], revision=row["revision"], priority=row["priority"],
                    request=row["request"], created_at=_time(row["created_at"]), started_at=_time_or_none(row["started_at"]),
                    finished_at=_time_or_none(row["finished_at"]), progress=progress, error=row["error"])
+
+
+def log_view(rows: Sequence[sa.RowMapping]) -> JobLog:
+    """Return the view of rows of `job_log`."""
+    return JobLog(entries=[LogEntry(at=_time(row["at"]), attempt=row["attempt"], text=row["text"]) for row in rows])
 
 
 def intake_view(row: sa.RowMapping) -> IntakeView:

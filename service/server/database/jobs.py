@@ -12,6 +12,7 @@ import sqlalchemy as sa
 
 from service.requests.identifiers import JOB, new_id
 from service.requests.jobs import JobRequest
+from service.server.database import job_log
 from service.server.database.engine import Database, storable
 from service.server.database.tables import intakes, job_inputs, jobs, newest_first
 from service.views.states import ACTIVE, CANCELLED, CHECKING, ENDED, FAILED, QUEUED, REFUSED, RUNNING, SUCCEEDED
@@ -153,7 +154,7 @@ def users_of(connection: sa.Connection, input_id: str, *, active: bool) -> list[
 def begin(database: Database, claim: Claim) -> bool:
     """Let a worker begin a job; return False if the job was cancelled or another worker has it."""
     free = sa.or_(jobs.c.worker.is_(None), jobs.c.worker == claim.worker)
-    return _change(database, claim, free, state=RUNNING, worker=claim.worker,
+    return _change(database, claim, free, entry="begun by a worker", state=RUNNING, worker=claim.worker,
                    started_at=sa.func.coalesce(jobs.c.started_at, time.time()))
 
 
@@ -163,7 +164,7 @@ def is_claimed(database: Database, claim: Claim) -> bool:
 
 
 def advance(database: Database, claim: Claim, progress: StageProgress, *, repeating: bool | None = None,
-            begun: Sequence[str] | None = None) -> bool:
+            begun: Sequence[str] | None = None, entered: bool = False) -> bool:
     """Record the progress of a running job; return False if the worker no longer has it.
 
     More frames than the attempt ever had, and a stage that the step never came to, set `lost` to 0, as a finished step does: a job that
@@ -175,6 +176,7 @@ def advance(database: Database, claim: Claim, progress: StageProgress, *, repeat
         progress: of the stage under way.
         repeating: whether an earlier worker went on from this stage to a further one; None: as recorded.
         begun: names of the stages that the step has come to, where one is new; None: as recorded.
+        entered: whether the log gets an entry for the stage.
 
     Raises:
         DBAPIError: the database does not answer; it is not asked again.
@@ -188,7 +190,7 @@ def advance(database: Database, claim: Claim, progress: StageProgress, *, repeat
         values["repeating"] = repeating
     if begun is not None:
         values |= {"stages_begun": list(begun), "lost": 0, "lost_repeating": 0}
-    return _change(database, claim, patience_s=0.0, **values)
+    return _change(database, claim, entry=f"{progress.stage}, {progress.total} to do" if entered else None, patience_s=0.0, **values)
 
 
 def finish_step(database: Database, claim: Claim, steps: Sequence[str], result_bytes: int | None = None) -> bool:
@@ -204,7 +206,8 @@ def finish_step(database: Database, claim: Claim, steps: Sequence[str], result_b
 def end(database: Database, claim: Claim, state: str, error: str | None = None) -> bool:
     """End a job; return False if the worker no longer has it."""
     done: dict[str, Any] = {"done": jobs.c.total} if state == SUCCEEDED else {}  # the last recorded progress may be half a second old
-    return _change(database, claim, state=state, error=None if error is None else storable(error), finished_at=time.time(), **done)
+    return _change(database, claim, entry=state if error is None else f"{state}: {error}", state=state,
+                   error=None if error is None else storable(error), finished_at=time.time(), **done)
 
 
 def record_lost_worker(connection: sa.Connection, claim: Claim, limit: int) -> str | None:
@@ -233,6 +236,7 @@ def record_lost_worker(connection: sa.Connection, claim: Claim, limit: int) -> s
         state=state, lost=lost, lost_repeating=repeating, repeating=bool(row.stages_begun), worker=None, updated_at=now,
         revision=jobs.c.revision + 1,
         **({"error": sentence, "finished_at": now} if state == FAILED else {})))
+    job_log.write(connection, claim.job, f"failed: {sentence}" if state == FAILED else "lost its worker, queued again")
     if state == FAILED:
         _end_check(connection, claim.job, sentence)
     return state if done.rowcount == 1 else None
@@ -241,9 +245,12 @@ def record_lost_worker(connection: sa.Connection, claim: Claim, limit: int) -> s
 def release(connection: sa.Connection, claim: Claim) -> bool:
     """Queue a job again that the worker had taken; return False if it was cancelled or another worker has it."""
     mine = sa.or_(jobs.c.worker.is_(None), jobs.c.worker == claim.worker)
-    return connection.execute(jobs.update().where(
+    done = connection.execute(jobs.update().where(
         jobs.c.id == claim.job, jobs.c.attempt == claim.attempt, jobs.c.state.in_(ACTIVE), mine).values(
         state=QUEUED, worker=None, updated_at=time.time(), revision=jobs.c.revision + 1)).rowcount == 1
+    if done:
+        job_log.write(connection, claim.job, "given back by its worker, queued again")
+    return done
 
 
 def cancel(connection: sa.Connection, job: str) -> bool:
@@ -252,6 +259,7 @@ def cancel(connection: sa.Connection, job: str) -> bool:
     done = connection.execute(jobs.update().where(jobs.c.id == job, jobs.c.state.in_(ACTIVE)).values(
         state=CANCELLED, finished_at=now, updated_at=now, revision=jobs.c.revision + 1))
     if done.rowcount == 1:
+        job_log.write(connection, job, CANCELLED)
         _end_check(connection, job, "its check was cancelled: validate it again")
     return done.rowcount == 1
 
@@ -267,6 +275,7 @@ def queue_again(connection: sa.Connection, job: str, state: str) -> int | None:
         error=None, reached=0, **NOTHING_LOST, worker=None, stage=None, done=None, total=None, rate=None))
     if done.rowcount != 1:
         return None
+    job_log.write(connection, job, "queued again")
     return int(connection.execute(sa.select(jobs.c.attempt).where(jobs.c.id == job)).scalar_one())
 
 
@@ -283,6 +292,7 @@ def set_priority(connection: sa.Connection, job: str, priority: int) -> int | No
 def remove(connection: sa.Connection, job: str) -> bool:
     """Delete a job; return False if it has not ended."""
     connection.execute(job_inputs.delete().where(job_inputs.c.job == job))
+    job_log.remove(connection, job)
     return connection.execute(jobs.delete().where(jobs.c.id == job, jobs.c.state.in_(ENDED))).rowcount == 1
 
 
@@ -302,9 +312,16 @@ def _end_check(connection: sa.Connection, job: str, problem: str) -> None:
         state=REFUSED, problem=problem))
 
 
-def _change(database: Database, claim: Claim, free: sa.ColumnElement[bool] | None = None, *, patience_s: float = PATIENCE_S,
-            **values: Any) -> bool:
-    """Change a job that the worker has or, with the condition `free`, may take."""
+def _change(database: Database, claim: Claim, free: sa.ColumnElement[bool] | None = None, *, entry: str | None = None,
+            patience_s: float = PATIENCE_S, **values: Any) -> bool:
+    """Change a job that the worker has or, with the condition `free`, may take; `entry` is added to its log."""
     found = _held(claim) if free is None else [jobs.c.id == claim.job, jobs.c.attempt == claim.attempt, jobs.c.state.in_(ACTIVE), free]
     statement = jobs.update().where(*found).values(updated_at=time.time(), revision=jobs.c.revision + 1, **values)
-    return database.transact(lambda connection: connection.execute(statement).rowcount == 1, patience_s=patience_s)
+
+    def work(connection: sa.Connection) -> bool:
+        changed = connection.execute(statement).rowcount == 1
+        if changed and entry is not None:
+            job_log.write(connection, claim.job, entry)
+        return changed
+
+    return database.transact(work, patience_s=patience_s)

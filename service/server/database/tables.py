@@ -118,6 +118,14 @@ job_inputs = sa.Table(  # the captures, environments and jobs that a job reads
     sa.Column("job", sa.String(32), sa.ForeignKey("relit_jobs.id", ondelete="CASCADE"), primary_key=True),
     sa.Column("input", sa.String(32), primary_key=True, index=True))
 
+job_log = sa.Table(  # what happened to each job, for its page
+    "relit_job_log", metadata,
+    sa.Column("number", sa.Integer, primary_key=True, autoincrement=True),
+    sa.Column("job", sa.String(32), sa.ForeignKey("relit_jobs.id", ondelete="CASCADE"), nullable=False, index=True),
+    sa.Column("at", sa.Float, nullable=False),
+    sa.Column("attempt", sa.Integer, nullable=False),
+    sa.Column("text", sa.Text, nullable=False))
+
 idempotency = sa.Table(
     "relit_idempotency", metadata, _project(),
     sa.Column("token", sa.String(255), nullable=False),

@@ -50,6 +50,7 @@ class JobProgress:
         self._opening = self._stopped = False
         self._begun, self._new_stage, self._repeating = list(begun), False, bool(begun)
         self._reached = reached
+        self._logged: str | None = None
         self.guard: Callable[[], None] = _nothing
         """Called before each record of the progress; what it raises ends the step."""
 
@@ -103,7 +104,9 @@ class JobProgress:
             progress = jobs.StageProgress(self._stage, shown, self._total, rate)
             try:
                 self._stopped = not jobs.advance(self._database, self._claim, progress, repeating=self._repeating,
-                                                 begun=self._begun if self._new_stage else None)
+                                                 begun=self._begun if self._new_stage else None,
+                                                 entered=self._stage != self._logged)
+                self._logged = self._stage
                 self._record_at = time.monotonic() + EVERY_S
                 self._new_stage = False
                 self._reached = None if further else self._reached

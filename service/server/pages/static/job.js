@@ -1,7 +1,7 @@
 /** The page of one job: progress, stages, log and results, and what can be done with it. */
 
 import { attempt, listing, post, read, remove, resultsOf, send } from "./api.js";
-import { byId, bytes, duration, element, factText, show, words } from "./element.js";
+import { byId, bytes, duration, element, factText, show, time, words } from "./element.js";
 import { watch } from "./events.js";
 import { enableForms } from "./form.js";
 import { titleOf } from "./jobs_table.js";
@@ -9,7 +9,6 @@ import { titleOf } from "./jobs_table.js";
 const identifier = byId("main").dataset.identifier;
 const ENDED = ["succeeded", "failed", "cancelled"];
 const MAPS = ["maps.exr", "depth.exr"];
-const LOG_LINES = 1000;
 let logged = "";
 
 function present(job) {
@@ -34,7 +33,9 @@ function present(job) {
   show(byId("retry"), job.state === "failed" && job.request.kind !== "check");
   show(byId("resume"), job.state === "cancelled" && job.request.kind !== "check");
   show(byId("delete"), ended);
-  log(job);
+  const happened = `${job.attempt} ${job.state} ${job.progress?.stage}`;
+  if (happened !== logged) attempt(log);
+  logged = happened;
 }
 
 function presentRequest(job) {
@@ -54,13 +55,9 @@ function link(name, value) {
   return factText(name, value);
 }
 
-function log(job) {
-  const said = job.state === "running" && job.progress !== null ? `${job.progress.stage} ${job.progress.done} of ${job.progress.total}` : job.error ?? job.state;
-  if (said === logged) return;
-  logged = said;
-  const list = byId("log");
-  list.append(element("li", {}, element("time", {}, new Date().toLocaleTimeString()), " ", said));
-  while (list.childElementCount > LOG_LINES) list.firstElementChild.remove();
+async function log() {
+  const { entries } = await read(`/v1/jobs/${identifier}/log`);
+  byId("log").replaceChildren(...entries.map((entry) => element("li", {}, time(entry.at), ` attempt ${entry.attempt}: ${entry.text}`)));
 }
 
 async function presentResults(job) {

@@ -349,3 +349,32 @@ def test_a_job_that_is_cancelled_and_deleted_while_it_runs_is_no_error_in_the_lo
     lines = [json.loads(line) for line in server.log.read_text().splitlines()]
     assert any(line["event"] == "step stopped" and line["job"] == job for line in lines)
     assert [line for line in lines if line["level"] == "error" and line.get("logger") == "dbos"] == []
+
+
+def texts(client: httpx2.Client, job: dict) -> list[str]:
+    entries = client.get(f"/v1/jobs/{job['id']}/log").raise_for_status().json()["entries"]
+    assert [entry["at"] for entry in entries] == sorted(entry["at"] for entry in entries)
+    return [f"{entry['attempt']} {entry['text']}" for entry in entries]
+
+
+def test_the_log_says_what_happened(server, client, dome, long):
+    solved = finish(server, client, submit(client, kind="solve", capture=dome, options={"method": "lambert"}))
+    found = texts(client, solved)
+    assert found[0] == "1 begun by a worker" and found[-1] == "1 succeeded"
+    assert any(each.startswith("1 ingest, ") for each in found) and any(each.startswith("1 normals, ") for each in found)
+    job = submit(client, **long)
+    has_made(client, job, 1)
+    client.post(f"/v1/jobs/{job['id']}/cancel").raise_for_status()
+    client.post(f"/v1/jobs/{job['id']}/resume").raise_for_status()
+    client.post(f"/v1/jobs/{job['id']}/cancel").raise_for_status()
+    found = texts(client, job)
+    assert found.index("1 cancelled") < found.index("2 queued again") < found.index("2 cancelled")
+    failing = finish(server, client, submit(client, kind="solve", capture=dome, options={"align_to": "nothing.png"}), "failed")
+    assert texts(client, failing)[-1] == f"1 failed: {failing['error']}"
+
+
+def test_the_log_goes_with_its_job(server, client, dome):
+    job = finish(server, client, submit(client, kind="solve", capture=dome, options={"method": "lambert"}))
+    client.delete(f"/v1/jobs/{job['id']}").raise_for_status()
+    refused(client.get(f"/v1/jobs/{job['id']}/log"), 404, "there is no")
+    refused(client.get(f"/v1/jobs/{NOBODY}/log"), 404, "there is no")

@@ -68,6 +68,8 @@ def test_a_form_submits_a_job_that_is_followed_to_its_results(server, page, capt
         report = client.get(f"/v1/jobs/{job}/results/report.json").json()
     shown = page.locator("#stages tbody tr").all_inner_texts()
     assert [row.split()[0] for row in shown] == list(report["timings_s"])
+    page.locator("summary", has_text="Log").click()
+    page.locator("#log li", has_text="attempt 1: succeeded").wait_for()
     with page.expect_download() as download:
         page.locator("#results").get_by_text("report.json").click()
     assert json.loads(download.value.path().read_text()) == report
