@@ -176,7 +176,7 @@ class CalibrationJob(JobRequest):
 class BallJob(CalibrationJob):
     """Base of the jobs that look at balls."""
 
-    masks: Annotated[tuple[str, ...], Role.INPUT, Spelling(flag="--ball-mask", metavar="NAME")] = ()
+    masks: Annotated[tuple[Line, ...], Role.INPUT, Spelling(flag="--ball-mask", metavar="NAME")] = ()
     """Name of a mask image of a ball in the capture's folder, in place of `ball`. Give one for each ball."""
 
 

@@ -95,7 +95,7 @@ KERNELS = discovered()
 
 
 def test_kernels_are_discovered():
-    assert {"photometric.lambert._lambert_kernel", "photometric.search_kernel._search_kernel", "structured.stripe._stripe_kernel",
+    assert {"photometric.lambert._lambert_kernel", "photometric.search_kernel.search_kernel", "structured.stripe._stripe_kernel",
             "surface.multigrid._smooth_from_zero", "tof.flying._flying_kernel"} <= KERNELS.keys()
     for module in modules():
         source = inspect.getsource(module)
