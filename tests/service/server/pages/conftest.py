@@ -77,18 +77,40 @@ class Solved:
         return path
 
 
+def done(server: Server, client, request: dict) -> str:
+    """Submit a job, and return its identifier when it has succeeded."""
+    job = client.post("/v1/jobs", json=request).raise_for_status().json()["id"]
+    found = server.wait(client, f"/v1/jobs/{job}", ("succeeded", "failed"), timeout_s=300)
+    assert found["state"] == "succeeded", found["error"]
+    return job
+
+
+def prepared(server: Server, name: str, options: dict) -> Solved:
+    """A sample, registered, solved, and prepared for the pages."""
+    with server.client() as client:
+        capture = client.post("/v1/captures", json={"name": name, "folder": str(SAMPLES / name)}).raise_for_status().json()["id"]
+        server.wait(client, f"/v1/captures/{capture}", ("ready",))
+        solve = done(server, client, {"kind": "solve", "capture": capture, "options": options})
+        done(server, client, {"kind": "view", "capture": capture})
+        done(server, client, {"kind": "view", "capture": capture, "maps": solve})
+        return Solved(server, capture, solve)
+
+
 @pytest.fixture(scope="session")
 def solved(server: Server) -> Solved:
-    with server.client() as client:
-        def done(request: dict) -> str:
-            job = client.post("/v1/jobs", json=request).raise_for_status().json()["id"]
-            found = server.wait(client, f"/v1/jobs/{job}", ("succeeded", "failed"))
-            assert found["state"] == "succeeded", found["error"]
-            return job
+    return prepared(server, "lambert", {"method": "lambert", "max_sigma": MAX_SIGMA})
 
-        made = client.post("/v1/captures", json={"name": "lambert", "folder": str(SAMPLES / "lambert")}).raise_for_status().json()
-        server.wait(client, f"/v1/captures/{made['id']}", ("ready",))
-        solve = done({"kind": "solve", "capture": made["id"], "options": {"method": "lambert", "max_sigma": MAX_SIGMA}})
-        done({"kind": "view", "capture": made["id"]})
-        done({"kind": "view", "capture": made["id"], "maps": solve})
-        return Solved(server, made["id"], solve)
+
+@pytest.fixture(scope="session")
+def owl(server: Server) -> Solved:
+    """The sample that `make serve` opens on."""
+    return prepared(server, "owl", {})
+
+
+@pytest.fixture(scope="session")
+def sky(server: Server) -> str:
+    """An environment, registered and ready."""
+    with server.client() as client:
+        file = str(SAMPLES / "owl" / "environment.exr")
+        made = client.post("/v1/environments", json={"name": "sky", "file": file}).raise_for_status().json()
+        return server.wait(client, f"/v1/environments/{made['id']}", ("ready", "refused"))["id"]

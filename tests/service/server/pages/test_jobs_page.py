@@ -24,14 +24,6 @@ def capture(server) -> str:
     return made["id"]
 
 
-@pytest.fixture(scope="session")
-def sky(server) -> str:
-    with server.client() as client:
-        file = str(SAMPLES / "owl" / "environment.exr")
-        made = client.post("/v1/environments", json={"name": "sky", "file": file}).raise_for_status().json()
-        return server.wait(client, f"/v1/environments/{made['id']}", ("ready", "refused"))["id"]
-
-
 def opened_form(page, title: str, options: bool = True):
     """Open the form of a job, its options and what shows it as a command."""
     page.locator("summary", has_text=title).first.click()

@@ -125,3 +125,19 @@ def test_the_readings_of_a_pixel_are_plotted(opened, solved, maps):
     readings = np.array([[float(value) for value in each[2].split(",")] for each in rows])
     expected = np.stack([Correction.of(capture).apply(frame).pixels[row, col] for frame in frames])
     assert np.allclose(readings, expected, rtol=2e-3, atol=1e-5)  # half floats, four digits
+
+
+def test_every_map_of_the_capture_is_shown(opened):
+    """Each layer has tiles, a histogram or a legend, and a value under the cursor."""
+    layers = opened.get_by_label("Layer", exact=True).first
+    names = layers.locator("option").evaluate_all("all => all.map(each => each.value)")
+    assert {"normal", "diffuse_albedo", "height", "confidence", "status", "mask"} <= set(names)
+    pictures = set()
+    for name in names:
+        layers.select_option(name)
+        opened.wait_for_timeout(400)
+        assert opened.locator(".histogram canvas, .histogram li").first.is_visible()
+        assert "row 64, column 64" in point_at(opened, 64, 64, 128)
+        opened.mouse.move(5, 5)
+        pictures.add(opened.locator("canvas.map").screenshot())
+    assert len(pictures) == len(names)

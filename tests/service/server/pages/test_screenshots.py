@@ -5,40 +5,18 @@ from pathlib import Path
 
 import pytest
 
-from tests.service.server.pages.conftest import SAMPLES, Solved
-
 FOLDER = os.environ.get("RELIT_TEST_SCREENSHOTS")
 """Where the pictures go; without it they are made and dropped."""
 
 
-@pytest.fixture(scope="module")
-def owl(server) -> Solved:
-    """The shipped sample, solved and prepared, and the sky that it is lit by."""
-    with server.client() as client:
-        def done(request: dict) -> str:
-            job = client.post("/v1/jobs", json=request).raise_for_status().json()["id"]
-            found = server.wait(client, f"/v1/jobs/{job}", ("succeeded", "failed"), timeout_s=300)
-            assert found["state"] == "succeeded", found["error"]
-            return job
-
-        capture = client.post("/v1/captures", json={"name": "owl", "folder": str(SAMPLES / "owl")}).raise_for_status().json()["id"]
-        sky = client.post("/v1/environments", json={"name": "sky", "file": str(SAMPLES / "owl" / "environment.exr")}).json()["id"]
-        server.wait(client, f"/v1/captures/{capture}", ("ready",))
-        server.wait(client, f"/v1/environments/{sky}", ("ready",))
-        solve = done({"kind": "solve", "capture": capture})
-        done({"kind": "view", "capture": capture})
-        done({"kind": "view", "capture": capture, "maps": solve})
-        return Solved(server, capture, solve)
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["light", "maps", "capture"])
-def test_a_page_shows_the_sample(browser, owl, tmp_path, name):
+def test_a_page_shows_the_sample(browser, owl, sky, tmp_path, name):
     page = browser.new_page(base_url=owl.server.url, viewport={"width": 1280, "height": 860}, color_scheme="dark")
     page.goto(owl.pages[name])
     owl.wait_for_content(page, name)
     if name == "light":
-        page.get_by_label("Environment map").select_option(label="sky")
+        page.get_by_label("Environment map").select_option(sky)
         page.locator("canvas.preview").wait_for(timeout=60_000)
         page.get_by_label("Brightness of the environment").fill("-3")
         page.get_by_role("button", name="Expose for this light").click()
