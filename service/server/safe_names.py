@@ -65,6 +65,8 @@ def folders_of(path: str) -> list[str]:
 def _fault(path: str) -> str | None:
     if not path:
         return "is empty: a file has a name"
+    if len(path.encode(errors="surrogatepass")) > MAX_PATH_BYTES:
+        return f"is longer than {MAX_PATH_BYTES} bytes"
     if fault := name_fault(path):
         return fault
     for character in path:
@@ -77,8 +79,6 @@ def _fault(path: str) -> str | None:
             return f"has {character}, which cannot be in a name everywhere: folders have / between"
     if unicodedata.normalize("NFC", path) != path:
         return "is not in the Unicode form NFC: other systems would write the same name in other bytes"
-    if len(path.encode()) > MAX_PATH_BYTES:
-        return f"is longer than {MAX_PATH_BYTES} bytes"
     parts = path.split("/")
     if len(parts) > MAX_DEPTH:
         return f"is {len(parts)} names deep, {MAX_DEPTH} are allowed"
