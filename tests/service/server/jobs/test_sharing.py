@@ -24,8 +24,9 @@ PIECE_S = {"lambert": 0.1, "svbrdf": 0.05}
 
 
 @pytest.fixture
-def capture(tmp_path_factory) -> Path:
-    return write_capture(tmp_path_factory.mktemp("captures") / "capture", make_scene(size=32, lights=9))
+def capture(tmp_path) -> Path:
+    """A capture beside the folder of the service, as no root of captures may hold that."""
+    return write_capture(tmp_path / "capture", make_scene(size=32, lights=9))
 
 
 def maps_alone(capture: Path, method: str, out: Path, monkeypatch) -> bytes:
