@@ -1,6 +1,7 @@
 """One job by several workers: the same files as those of one, whoever is killed, and nothing left behind."""
 
 import os
+import shutil
 import signal
 from pathlib import Path
 
@@ -116,6 +117,7 @@ def test_a_cancelled_solve_ends_at_both_workers_and_leaves_nothing(tmp_path, cap
         made.until(lambda: {"step stopped", "help stopped"} <= {event["event"] for event in made.events()}, "stopped")
         made.until(lambda: not pieces_folder(made, job).exists(), "removed")
         assert made.row(job)["state"] == jobs.CANCELLED
+        shutil.rmtree(made.folder / "together")  # the first piece waits for both once more
         other = begin(made, capture, "lambert")  # both are free again
         assert made.ended(other)["state"] == jobs.SUCCEEDED
         made.until(lambda: len(begun(made, other)) == WORKERS, "shared")

@@ -30,8 +30,9 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
         yield running
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser():
+    """Headless Chromium. It ends with its module: Playwright keeps an event loop in this thread, beside which no other can run."""
     try:
         path = installed.browser()
     except installed.MissingClientError as error:
