@@ -25,6 +25,8 @@ from service.server.settings import Settings
 from service.server.storage import layout
 
 PROJECT = "tests"
+CAPTURES = ("capture", "registered", "undisturbed")
+"""How the names of folders with captures begin."""
 WAIT_S = 120.0
 """Far beyond what anything takes here, so that a slow machine fails no test."""
 
@@ -34,8 +36,8 @@ class Harness:
 
     def __init__(self, folder: Path, database_url: str | None, **settings: Any) -> None:
         self.folder = folder
-        beside = [str(path) for path in folder.parent.iterdir() if path.is_dir() and path.resolve() != folder.resolve()]
-        settings = {"roots": os.pathsep.join(beside)} | settings  # captures may lie anywhere beside, as no root may hold the data folder
+        beside = [str(path) for path in folder.parent.iterdir() if path.is_dir() and path.name.startswith(CAPTURES)]
+        settings = {"roots": os.pathsep.join(beside)} | settings  # captures lie beside, as no root may hold the data folder
         self.settings = Settings(data=folder / "data", database_url=database_url, **settings)
         self.database = connect(self.settings.sqlalchemy_url)
         prepare(self.settings, self.database)
