@@ -107,8 +107,11 @@ async function follow() {
   let job = await read(`/v1/jobs/${identifier}`);
   presentRequest(job);
   present(job);
-  await presentResults(job);
-  if (ENDED.includes(job.state)) return;
+  const results = attempt(() => presentResults(job)); // the job is followed whether or not they can be had now
+  if (ENDED.includes(job.state)) {
+    await results;
+    return;
+  }
   await watch(`/v1/jobs/${identifier}/events`, { job: (now) => { job = now; present(now); } });
   job = await read(`/v1/jobs/${identifier}`);
   present(job);
