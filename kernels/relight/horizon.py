@@ -59,7 +59,7 @@ class HeightField(NamedTuple):
     greatest: wp.array  # [rows / BLOCK, cols / BLOCK] float32: of each block and the pixels right of it and below
     projection: Projection
     box: wp.vec4i
-    """Of shadows.Extent."""
+    """First row and column of the mask, and the last of each, as in kernels.surface.shadows.Extent."""
 
 
 class Horizons(NamedTuple):

@@ -79,7 +79,7 @@ class Portion(NamedTuple):
     """Neighbouring packs of a batch."""
 
     pixels: slice
-    """Of the batch."""
+    """The pixels of the batch that the portion covers."""
     surface: Surface
     band: Band
     visible: wp.array  # [lights, P] of the captured lights

@@ -23,7 +23,7 @@ SEVERITY = (Status.UNSOLVED, *SOLVED, Status.UNSURE, Status.UNDECIDED, Status.MU
 
 
 class Tile(NamedTuple):
-    """Where a tile lies in its level."""
+    """The rows and columns of its level that a tile covers."""
 
     rows: slice
     cols: slice

@@ -33,7 +33,7 @@ class WorkerContext(NamedTuple):
     """Where other workers are asked to help; None: nobody is asked."""
 
     settings: Settings | None = None
-    """Of the service, for quotas and `min_free_bytes`; None: neither is looked at."""
+    """The settings of the service, for its quotas and `min_free_bytes`; None: neither is looked at."""
 
     def require_space(self) -> None:
         """Check that `min_free_bytes` are left in the data folder.

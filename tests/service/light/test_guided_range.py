@@ -107,7 +107,7 @@ def test_a_turn_is_a_picture_that_is_moved(relit, scene, tmp_path):
 
 
 def test_it_is_as_near_to_the_truth_as_a_frame_alone(relit, scene, tmp_path):
-    """Of the pictures by parallel lines of sight; with perspective, both are as far from it."""
+    """The pictures are those of an orthographic camera. With a perspective camera, both ways are equally far from the truth."""
     directions, solid_angle = lat_long(ROWS)
     sky = rgb(scene / "sky.exr")
     truth = np.zeros((*SURFACE.mask.shape, 3))

@@ -10,7 +10,7 @@ from service.server import log
 
 @pytest.fixture(autouse=True)
 def own_log(monkeypatch):
-    """As it was, afterwards."""
+    """The test configures the log; what was configured before is put back afterwards."""
     root = logging.getLogger()
     before = root.handlers[:]
     yield

@@ -162,7 +162,7 @@ def test_a_worker_that_begins_again_does_only_what_is_left(tmp_path, small_piece
 
 
 def test_a_piece_of_a_worker_that_is_gone_is_done_by_another():
-    """It is waited for as long as its worker lives."""
+    """A claimed piece is waited for while the worker that claimed it is alive."""
     store, found, waited = Store(), np.zeros(4), []
     store.claims = {}
     one = SharedSolve(store.of("one"), leads=True)
