@@ -72,6 +72,11 @@ export async function post(path, body = undefined, headers = {}) {
   return answer.status === 204 ? null : answer.json();
 }
 
+/** Return an Idempotency-Key: a request that is sent again with it creates nothing again. */
+export function newToken() {
+  return crypto.getRandomValues(new Uint32Array(4)).join("-");
+}
+
 /** Delete what is at a path. */
 export async function remove(path) {
   await send(path, { method: "DELETE" });

@@ -1,6 +1,6 @@
 /** The page that lights a capture live, and sends what it shows to the batch. */
 
-import { attempt, post } from "./api.js";
+import { attempt, newToken, post } from "./api.js";
 import { byId, element } from "./element.js";
 import { loadEnvironment, readyEnvironments } from "./environments.js";
 import { commandOf, curlOf } from "./form.js";
@@ -62,7 +62,7 @@ async function submit(event) {
   event.preventDefault();
   present();
   if (!batch.fault.hidden) return;
-  const job = await post("/v1/jobs", request(), { "Idempotency-Key": crypto.getRandomValues(new Uint32Array(4)).join("-") });
+  const job = await post("/v1/jobs", request(), { "Idempotency-Key": newToken() });
   location.assign(`/jobs/${job.id}`);
 }
 

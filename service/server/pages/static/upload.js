@@ -1,6 +1,6 @@
 /** Uploads of captures and environments by tus 1.0 (https://tus.io/protocols/resumable-upload), continued after an interruption. */
 
-import { listing, post, read, Refusal, send } from "./api.js";
+import { listing, newToken, post, read, Refusal, send } from "./api.js";
 
 const PIECE_BYTES = 8 << 20;
 const PARALLEL = 4;
@@ -86,7 +86,7 @@ async function uploadFile(place, { path, file }, known, progress, signal) {
 async function create(place, path, size, digest, signal) {
   const metadata = [`path ${base64(new TextEncoder().encode(path))}`];
   if (digest !== null) metadata.push(`sha256 ${base64(new TextEncoder().encode(hex(digest)))}`);
-  const token = crypto.getRandomValues(new Uint32Array(4)).join("-");
+  const token = newToken();
   const made = await persist(() => send(place, { method: "POST", headers: {
     ...TUS, "Upload-Length": String(size), "Upload-Metadata": metadata.join(","), "Idempotency-Key": token } }), signal);
   await made.json(); // a body that is not read counts as a broken request
