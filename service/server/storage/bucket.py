@@ -4,16 +4,18 @@ The credentials, region and endpoint of S3 come from the usual variables (AWS_AC
 """
 
 import os
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import timedelta
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 from urllib.parse import unquote, urlsplit
 
 from service.errors import RequestError
 from stage.errors import StorageError, storage
 
+T = TypeVar("T")
 PIECE_BYTES = PART_BYTES = 16 << 20
 """Bytes of one request: few enough for a slow line to send them within REQUEST_S, enough for the number of requests not to matter."""
 MOST_PARTS = 9_000
@@ -24,6 +26,9 @@ DELETED_AT_ONCE = 1000
 CONNECT_S, REQUEST_S = 10, 120
 RETRIES, RETRY_S = 100, 120
 """Retries, and their time in all, after errors of the network and of the store (5xx), with growing pauses; then the step fails."""
+BROKEN, AGAIN_S = "HTTP error:", 0.5
+"""What errors of the connection are called by obstore, which gives up at once after some of them (a damaged answer, a request cut while it
+is sent), and the pause before another try."""
 PROBE_RETRIES, PROBE_S = 1, 5
 """Retries and time of a check whether the store answers, for which somebody waits."""
 
@@ -59,7 +64,7 @@ class Bucket:
         import obstore
 
         with self._told("list", prefix):
-            return [_object(meta) for batch in obstore.list(self._store, prefix=f"{prefix}/") for meta in batch]
+            return _persist(lambda: [_object(meta) for batch in obstore.list(self._store, prefix=f"{prefix}/") for meta in batch])
 
     def find(self, path: str) -> Object | None:
         """Return one object; None: there is none."""
@@ -68,7 +73,7 @@ class Bucket:
 
         with self._told("look at", path):
             try:
-                return _object(obstore.head(self._store, path))
+                return _object(_persist(lambda: obstore.head(self._store, path)))
             except FileNotFoundError:
                 return None
             except GenericError as error:
@@ -92,8 +97,9 @@ class Bucket:
         with storage("write", target), open(target, "wb") as file:
             for begin in range(0, found.size, PIECE_BYTES):
                 end = min(begin + PIECE_BYTES, found.size)
+                options: Any = {"if_match": found.version, "range": (begin, end)}
                 with self._told("fetch", found.path):
-                    got = obstore.get(self._store, found.path, options={"if_match": found.version, "range": (begin, end)}).bytes()
+                    got = _persist(lambda wanted=options: obstore.get(self._store, found.path, options=wanted).bytes())
                 if len(got) != end - begin:
                     raise StorageError(f"cannot fetch {self.url}/{found.path}: {len(got)} bytes came instead of {end - begin}")
                 file.write(got)
@@ -106,12 +112,17 @@ class Bucket:
         with storage("read", file), open(file, "rb") as source:
             size = os.fstat(source.fileno()).st_size
             part = max(PART_BYTES, -(-size // MOST_PARTS))
-            with self._told("send", path):
+
+            def put() -> None:
+                source.seek(0)
                 if size <= part:
                     obstore.put(self._store, path, source.read(), use_multipart=False)
                     moved()
                 else:
                     obstore.put(self._store, path, _parts(source, part, moved), chunk_size=part, max_concurrency=PARTS_AT_ONCE)
+
+            with self._told("send", path):
+                _persist(put)
         sent = self.find(path)
         if sent is None or sent.size != size:
             raise StorageError(f"cannot send {self.url}/{path}: it is not there as it was sent")
@@ -122,19 +133,14 @@ class Bucket:
         import obstore
 
         with self._told("write", path):
-            obstore.put(self._store, path, b"", use_multipart=False)
+            _persist(lambda: obstore.put(self._store, path, b"", use_multipart=False))
 
     def delete(self, paths: list[str]) -> None:
         """Delete objects; some may be gone already."""
-        import obstore
 
         for begin in range(0, len(paths), DELETED_AT_ONCE):
             with self._told("delete", paths[begin]):
-                try:
-                    obstore.delete(self._store, paths[begin : begin + DELETED_AT_ONCE])
-                except FileNotFoundError:  # of a store of files, which stops at a missing one: one at a time then
-                    for path in paths[begin : begin + DELETED_AT_ONCE]:
-                        _delete(self._store, path)
+                _persist(lambda some=paths[begin : begin + DELETED_AT_ONCE]: _delete_all(self._store, some))
 
     def check(self, path: str) -> None:
         """Write and delete an object, with few retries.
@@ -197,6 +203,30 @@ def _parts(source: Any, size: int, moved: Callable[[], None]) -> Iterator[bytes]
     while part := source.read(size):
         yield part
         moved()
+
+
+def _persist(action: Callable[[], T]) -> T:
+    """Call obstore, and again after errors of the connection that it does not retry; within the time that it retries others."""
+    from obstore.exceptions import GenericError
+
+    until = time.monotonic() + RETRY_S
+    while True:
+        try:
+            return action()
+        except GenericError as error:
+            if BROKEN not in str(error) or time.monotonic() > until:
+                raise
+        time.sleep(AGAIN_S)
+
+
+def _delete_all(store: Any, paths: list[str]) -> None:
+    import obstore
+
+    try:
+        obstore.delete(store, paths)
+    except FileNotFoundError:  # of a store of files, which stops at a missing one: one at a time then
+        for path in paths:
+            _delete(store, path)
 
 
 def _delete(store: Any, path: str) -> None:

@@ -18,6 +18,7 @@ class TcpProxy:
         self._open: set[socket.socket] = set()
         self._budget: int | None = None
         self._away_until = 0.0
+        self._damaged = 0
         self.cuts = 0
         """How often connections that were open have been cut."""
         threading.Thread(target=self._accept, daemon=True).start()
@@ -38,6 +39,11 @@ class TcpProxy:
                 each.shutdown(socket.SHUT_RDWR)
             each.close()
 
+    def damage(self, count: int) -> None:
+        """Answer the next connections with bytes that belong to no protocol."""
+        with self._lock:
+            self._damaged = count
+
     def close(self) -> None:
         self._listening.close()
         self.cut()
@@ -49,6 +55,12 @@ class TcpProxy:
             except OSError:
                 return
             if time.monotonic() < self._away_until:
+                client.close()
+                continue
+            if self._damaged:
+                self._damaged -= 1
+                client.recv(1)
+                client.sendall(b"\0nonsense\r\n\r\n")
                 client.close()
                 continue
             try:

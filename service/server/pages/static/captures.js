@@ -30,7 +30,7 @@ async function begin(what, name, files) {
   const status = element("span", {}, "beginning");
   const bar = element("progress", { "aria-label": `Upload of ${name}` });
   const button = element("button", { type: "button", class: "quiet", onclick: () => stop.abort() }, "Stop");
-  const line = element("li", {}, element("strong", {}, name), " ", bar, " ", status, " ", button);
+  const line = element("li", {}, element("strong", {}, name), " ", bar, " ", button, " ", status); // a text that grows moves no button
   byId("uploads").append(line);
   const leaving = (event) => event.preventDefault();
   addEventListener("beforeunload", leaving);

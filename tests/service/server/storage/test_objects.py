@@ -16,6 +16,7 @@ from service.server.storage.objects import ObjectStorage
 from service.server.storage.open import open_storage
 from service.server.storage.scratch import IN_USE_S, Scratch
 from stage.errors import StorageError
+from tests.service.server.tcp_proxy import tcp_proxy
 
 RESULTS = "projects/film/jobs/job_0123456789abcdefghjk"
 CAPTURE = "projects/film/captures/cap_0123456789abcdefghjk"
@@ -283,3 +284,20 @@ def test_the_settings_choose(tmp_path):
     assert isinstance(open_storage(Settings(data=tmp_path, storage_url=(tmp_path / "store").as_uri())), ObjectStorage)
     with pytest.raises(RequestError, match="storage_url"):
         open_storage(Settings(data=tmp_path, storage_url="ftp://store"))
+
+
+def test_a_damaged_answer_is_asked_for_again(s3, tmp_path, monkeypatch):
+    """obstore takes an answer that is no HTTP for final, whatever its number of retries."""
+    with tcp_proxy(int(os.environ["AWS_ENDPOINT_URL"].rpartition(":")[2])) as damaged:
+        monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{damaged.port}")
+        bucket = Bucket(s3)
+        (tmp_path / "here").write_bytes(b"pixels")
+        for action in (lambda: bucket.send(tmp_path / "here", "one", lambda: None), lambda: bucket.mark("two"),
+                       lambda: bucket.fetch(bucket.find("one"), tmp_path / "there", lambda: None), lambda: bucket.delete(["two"])):
+            damaged.cut()  # of connections that are kept open
+            damaged.damage(2)
+            action()
+        assert (tmp_path / "there").read_bytes() == b"pixels"
+        damaged.cut()
+        damaged.damage(2)
+        assert bucket.below("none") == []
