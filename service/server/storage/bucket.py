@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import timedelta
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 from urllib.parse import unquote, urlsplit
@@ -92,18 +93,21 @@ class Bucket:
         Raises:
             StorageError: the object cannot be read, or was replaced meanwhile.
         """
-        import obstore
 
         with storage("write", target), open(target, "wb") as file:
             for begin in range(0, found.size, PIECE_BYTES):
                 end = min(begin + PIECE_BYTES, found.size)
-                options: Any = {"if_match": found.version, "range": (begin, end)}
                 with self._told("fetch", found.path):
-                    got = _persist(lambda wanted=options: obstore.get(self._store, found.path, options=wanted).bytes())
+                    got = _persist(partial(self._piece, found, begin, end))
                 if len(got) != end - begin:
                     raise StorageError(f"cannot fetch {self.url}/{found.path}: {len(got)} bytes came instead of {end - begin}")
                 file.write(got)
                 moved()
+
+    def _piece(self, found: Object, begin: int, end: int) -> Any:
+        import obstore
+
+        return obstore.get(self._store, found.path, options={"if_match": found.version, "range": (begin, end)}).bytes()
 
     def send(self, file: Path, path: str, moved: Callable[[], None]) -> Object:
         """Copy a file into an object, which appears complete or not at all; `moved` is that of `fetch`."""
@@ -140,7 +144,7 @@ class Bucket:
 
         for begin in range(0, len(paths), DELETED_AT_ONCE):
             with self._told("delete", paths[begin]):
-                _persist(lambda some=paths[begin : begin + DELETED_AT_ONCE]: _delete_all(self._store, some))
+                _persist(partial(_delete_all, self._store, paths[begin : begin + DELETED_AT_ONCE]))
 
     def check(self, path: str) -> None:
         """Write and delete an object, with few retries.
