@@ -1,4 +1,4 @@
-"""relit import and relit info: make a capture of data laid out another way, and look at one."""
+"""relit info: look at a capture."""
 
 from pathlib import Path
 from typing import Annotated
@@ -6,29 +6,14 @@ from typing import Annotated
 import typer
 
 from service.cli.progress import ProgressBar
-from service.cli.request_commands import HostOption, local_command
-from service.requests.captures import ImportFormat, ImportRequest
+from service.cli.request_commands import HostOption
 
 CaptureArgument = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder with a capture.json.", show_default=False)]
 
 
 def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    local_command(app, "import", _import)
+    """Add the command."""
     app.command("info")(info)
-
-
-def _import(request: ImportRequest) -> None:
-    from stage.importers import diligent, lp, opencv_gray
-
-    source, destination = request.source, request.destination
-    if request.projector is not None:
-        path = opencv_gray.import_folder(source, destination, projector=request.projector, calibration=request.calibration,
-                                         unit_m=request.unit_m)
-    else:
-        module = {ImportFormat.DILIGENT: diligent, ImportFormat.LP: lp}[request.format]
-        path = module.import_folder(source, destination)
-    print(f"capture  {path}")
 
 
 def info(capture: CaptureArgument, device: HostOption = None) -> None:

@@ -9,11 +9,28 @@ from typing import Annotated
 import typer
 from typer.exceptions import TyperException
 
-from service.cli import backup, calibrate, captures, demo, depth, doctor, farm, inspect, jobs, keys, light, server, solve, submit, view
+from service.cli import (
+    backup,
+    calibrate,
+    captures,
+    demo,
+    depth,
+    doctor,
+    farm,
+    imports,
+    inspect,
+    jobs,
+    keys,
+    light,
+    server,
+    solve,
+    submit,
+    view,
+)
 
 app = typer.Typer(name="relit", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
                   help="Active-illumination captures to normals, materials, depth, USD assets and relit frames.")
-for module in (demo, captures, calibrate, solve, inspect, depth, light, view, doctor, server, submit, jobs, keys, backup, farm):
+for module in (demo, imports, captures, calibrate, solve, inspect, depth, light, view, doctor, server, submit, jobs, keys, backup, farm):
     module.register(app)
 
 BAD_INPUT, INTERRUPTED = 2, 130

@@ -1,45 +1,133 @@
-"""What `relit import` takes."""
+"""What `relit import` takes: one frozen model for each layout of files."""
 
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated
 
-from pydantic import model_validator
+from pydantic import AfterValidator
 
-from service.errors import RequestError
-from service.requests.base import Choice, Options, Role, Spelling, WidthHeight
-from stage.model import Positive, Resolution
-
-
-class ImportFormat(Choice):
-    """Layouts that relit reads."""
-
-    DILIGENT = "diligent", "an object's folder of the DiLiGenT benchmark"
-    LP = "lp", "an RTI light list with its images"
-    OPENCV_GRAY = "opencv-gray", "images of a Gray code in OpenCV's order"
+from service.requests.base import Choice, Commas, Options, Role, Spelling, WidthHeight
+from stage.colour_spaces import ColorSpaceName
+from stage.model import Finite, Positive, Resolution
 
 
 class ImportRequest(Options):
-    """Write a capture.json for data laid out another way."""
+    """Base of every layout: where the files are, and where the capture comes to be."""
 
-    format: Annotated[ImportFormat, Spelling(argument=True, metavar="FORMAT")]
-    """How the data is laid out."""
     source: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="SRC")]
-    """Folder of the data, or the .lp file."""
-    destination: Annotated[Path, Role.OUTPUT, Spelling(argument=True, metavar="DST")]
-    """Folder for the capture; may be SRC."""
-    projector: Annotated[Resolution | None, WidthHeight, Spelling(metavar="1280x800")] = None
-    """opencv-gray: width and height of the projector in pixels."""
-    calibration: Annotated[Path | None, Role.INPUT] = None
-    """opencv-gray: OpenCV file (.yml, .xml, .json) with the intrinsics of camera and projector, R and T; relit calibrate procam
-    measures them without such a file."""
-    unit_m: Positive = 1.0
-    """opencv-gray: metres in one unit of T, such as 0.001 for millimetres."""
+    """Folder of the data."""
+    destination: Annotated[Path | None, Role.OUTPUT, Spelling(argument=True, metavar="DST")] = None
+    """Folder for the capture, which gets links to the files; None: SRC, where nothing but capture.json is written."""
 
-    @model_validator(mode="after")
-    def _options_of_the_format(self) -> Self:
-        if self.format is ImportFormat.OPENCV_GRAY:
-            if self.projector is None:
-                raise RequestError("--projector is missing: opencv-gray needs the projector's pixels to know how many bits there are")
-        elif self.projector is not None or self.calibration is not None or self.unit_m != 1.0:
-            raise RequestError(f"--projector, --calibration and --unit-m are for opencv-gray, the format is {self.format}")
-        return self
+    @property
+    def folder(self) -> Path:
+        """The folder for the capture."""
+        return self.destination or (self.source.parent if self.source.is_file() else self.source)
+
+
+class DiligentImport(ImportRequest):
+    """An object's folder of the DiLiGenT benchmark."""
+
+
+class LpImport(ImportRequest):
+    """An RTI light list (.lp) with its images; SRC may be the .lp file."""
+
+
+class OpencvGrayImport(ImportRequest):
+    """Images of a Gray code in the order of OpenCV's GrayCodePattern: columns and rows, each with its inverse, then white and black."""
+
+    projector: Annotated[Resolution, WidthHeight, Spelling(metavar="1280x800")]
+    """Width and height of the projector in pixels, which say how many bits there are."""
+    calibration: Annotated[Path | None, Role.INPUT] = None
+    """OpenCV file (.yml, .xml, .json) with the intrinsics of camera and projector, R and T; relit calibrate procam measures them without
+    such a file."""
+    unit_m: Positive = 1.0
+    """Metres in one unit of T, such as 0.001 for millimetres."""
+
+
+def _one_or_two(values: tuple[float, ...]) -> tuple[float, ...]:
+    if len(values) not in (1, 2):
+        raise ValueError("give one focal length, or two with a comma between")
+    return values
+
+
+def _four_or_five(values: tuple[float, ...]) -> tuple[float, ...]:
+    if len(values) not in (4, 5):
+        raise ValueError("give k1,k2,p1,p2 or k1,k2,p1,p2,k3")
+    return values
+
+
+class CameraOptions(Options):
+    """What is known of the camera; without a focal length it is taken to be orthographic."""
+
+    focal_px: Annotated[tuple[Positive, ...] | None, Commas, AfterValidator(lambda v: v and _one_or_two(v)),
+                        Spelling(metavar="F[,F]")] = None
+    """Focal length in pixels, one or that of columns and rows; None: the camera is orthographic."""
+    principal_px: Annotated[tuple[Finite, Finite] | None, Commas, Spelling(metavar="U,V")] = None
+    """Principal point in pixels, where the centre of the first pixel is 0.5,0.5 (add 0.5 to OpenCV's); None: the centre of the image."""
+    distortion: Annotated[tuple[Finite, ...] | None, Commas, AfterValidator(lambda v: v and _four_or_five(v)),
+                          Spelling(metavar="K1,K2,P1,P2[,K3]")] = None
+    """Lens distortion as OpenCV has it."""
+    pixel_size_m: Positive | None = None
+    """Orthographic camera: side of a pixel on the object, metres; None: heights are in pixels."""
+    surface_z_m: Finite | None = None
+    """Mean z of the object in the camera frame, metres: negative before a perspective camera. Near lights need it."""
+
+
+class ImageOptions(Options):
+    """Which images of the folder are frames, and how they are encoded."""
+
+    images: Annotated[str | None, Spelling(metavar="GLOB")] = None
+    """Names of the frames, such as 'img_*.png'; None: every image but the mask and the one of ambient light."""
+    mask: Annotated[str | None, Spelling(metavar="NAME")] = None
+    """Image of the mask; None: the one with the word mask in its name, if there is one."""
+    ambient: Annotated[str | None, Spelling(metavar="NAME")] = None
+    """Image without any of the lights, which is subtracted; None: the one with the word ambient in its name, if there is one."""
+    color_space: ColorSpaceName | None = None
+    """Colour space of the images; None: sRGB for 8-bit images, scene-linear for others."""
+
+
+class Sense(Choice):
+    """Where the vectors of a table point."""
+
+    TO_LIGHT = "to-light", "directions to the light, or its position seen from the object"
+    FROM_LIGHT = "from-light", "along the rays, away from the light"
+
+
+class Run(Choice):
+    """What a light is in a table of numbers."""
+
+    ROWS = "rows"
+    COLUMNS = "columns"
+
+
+class AxisWay(Choice):
+    """Where an axis points, as seen by the camera."""
+
+    RIGHT = "right"
+    LEFT = "left"
+    UP = "up"
+    DOWN = "down"
+    TOWARDS = "towards"
+    AWAY = "away"
+
+
+Axes = Annotated[tuple[AxisWay, AxisWay, AxisWay], Commas, Spelling(metavar="X,Y,Z")]
+
+
+class OlatImport(CameraOptions, ImageOptions, ImportRequest):
+    """Images under one far light each, with a table of the lights: .csv, .txt, .json, .mat or .npy."""
+
+    axes: Axes
+    """Where x, y and z of the table point as seen by the camera: right or left, up or down, towards the camera or away from it. relit and
+    OpenGL have right,up,towards, OpenCV has right,down,away."""
+    sense: Annotated[Sense, Spelling(flag="--vectors")]
+    """What the vectors of the table are."""
+    lights: Annotated[Path | None, Role.INPUT] = None
+    """Table of the lights: rows of an image name or none, three numbers, and one or three of the strength or none; None: the only table in
+    SRC."""
+    variable: str | None = None
+    """Variable of a .mat table, or key of a .json; None: the only one that can be meant."""
+    lights_in: Run | None = None
+    """What a light is in a table of numbers; None: as its shape says."""
+    strengths: Annotated[Path | None, Role.INPUT] = None
+    """File with the strength of each light, one or three numbers; None: that in the table, else equal."""

@@ -1,19 +1,49 @@
-"""The common parts of the importers: reading tables of numbers, placing images, and writing the manifest."""
+"""The common parts of the importers: reading tables of numbers, placing images and arrays, and writing the manifest."""
 
+import io
 import os
+import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import OpenImageIO as oiio
 from pydantic import ValidationError
 
-from stage import images
+from stage import images, inputs
+from stage.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError, storage
 from stage.files import replacing
 from stage.manifest import FILE_NAME, Manifest, write_manifest
 from stage.records import describe
+
+
+class Imported(NamedTuple):
+    """What an importer wrote, and how it understood the folder."""
+
+    path: Path
+    """The manifest."""
+    facts: tuple[tuple[str, str], ...]
+    """Names and sentences of what was understood, for the person who asked: nothing is guessed without being shown."""
+
+
+def natural_order(names: Iterable[str]) -> list[str]:
+    """Return names in the order in which people count: 2 before 10."""
+    return sorted(names, key=lambda name: [(0, int(part), "") if part.isdecimal() else (1, 0, part.lower())
+                                           for part in re.split(r"(\d+)", name)])
+
+
+def image_names(folder: Path) -> list[str]:
+    """Return the names of the images in a folder, in natural order; hidden files are left out.
+
+    Raises:
+        StorageError: the folder cannot be read.
+    """
+    with storage("read", folder):
+        return natural_order(path.name for path in folder.iterdir()
+                             if path.suffix.lower() in images.SUFFIXES and not path.name.startswith("."))
 
 
 def read_table(path: Path, columns: int) -> np.ndarray:
@@ -48,6 +78,22 @@ def image_resolution(path: Path) -> tuple[int, int]:
     return header.width, header.height
 
 
+def color_space_of(path: Path) -> ColorSpaceName:
+    """Return sRGB for an image of 8-bit integers, and scene-linear for any other.
+
+    Raises:
+        ManifestError: the file is no image.
+    """
+    if path.suffix.lower() == ".exr":
+        return "lin_rec709_scene"
+    source = oiio.ImageInput.open(str(path))
+    if source is None:
+        raise ManifestError(f"{path}: cannot be read as an image")
+    eight_bit = source.spec().format == oiio.UINT8
+    source.close()
+    return "srgb_texture" if eight_bit else "lin_rec709_scene"
+
+
 def place_images(source: Path, destination: Path, names: Sequence[str]) -> None:
     """Put files of `source` into `destination` as hard links when the file system allows it, otherwise as copies.
 
@@ -79,13 +125,16 @@ def place_images(source: Path, destination: Path, names: Sequence[str]) -> None:
                     shutil.copy2(origin, temporary)
 
 
-def write_capture(data: dict[str, Any], table: Path, destination: Path) -> Path:
+def write_capture(data: dict[str, Any], table: Path, destination: Path, *, folder: Path | None = None,
+                  arrays: Mapping[str, np.ndarray] | None = None) -> Path:
     """Check a manifest, place its images, and write it last, so that a capture.json never names files that do not exist.
 
     Args:
         data: the manifest as plain data.
-        table: the file that the manifest was made from, which lies beside the images; errors name it.
+        table: the file that the manifest was made from; errors name it.
         destination: the folder of the capture.
+        folder: the folder of the images; None: that of `table`.
+        arrays: what the .npy files of these names hold, which are written; the other files are placed.
 
     Returns:
         The path of the manifest.
@@ -98,11 +147,26 @@ def write_capture(data: dict[str, Any], table: Path, destination: Path) -> Path:
         manifest = Manifest.model_validate(data)
     except ValidationError as error:
         raise ManifestError(f"{table}: {describe(error)}") from error
-    names = [frame.image for frame in manifest.frames]
-    place_images(table.parent, destination, [*names, *([manifest.mask] if manifest.mask else [])])
+    made = {name: _npy(array) for name, array in (arrays or {}).items()}
+    for name, content in made.items():
+        target = destination / name
+        if target.exists() and inputs.read_bytes(target) != content:
+            raise ManifestError(f"{target}: is there already and is another array: choose another folder")
+    names = [frame.image for frame in manifest.frames if frame.image not in made]
+    place_images(folder or table.parent, destination, [*names, *([manifest.mask] if manifest.mask else [])])
+    for name, content in made.items():
+        with replacing(destination / name) as temporary:
+            temporary.write_bytes(content)
     path = destination / FILE_NAME
     write_manifest(manifest, path)
     return path
+
+
+def _npy(array: np.ndarray) -> bytes:
+    """Return the content of a .npy file."""
+    buffer = io.BytesIO()
+    np.save(buffer, np.ascontiguousarray(array))
+    return buffer.getvalue()
 
 
 def _alike(a: Path, b: Path) -> bool:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from stage.errors import ManifestError, storage
-from stage.importers.layout import image_resolution, write_capture
+from stage.importers.layout import color_space_of, image_resolution, write_capture
 from stage.manifest import SCHEMA
 from stage.text import name_fault
 
@@ -48,7 +48,7 @@ def import_folder(source: Path, destination: Path) -> Path:
     return write_capture({
         "schema": SCHEMA,
         "name": path.stem,
-        "color_space": "srgb_texture" if _display_encoded(first) else "lin_rec709_scene",
+        "color_space": color_space_of(first),
         "camera": {"projection": "orthographic", "resolution": resolution},
         "mask": mask,
         "irradiance_scale": "relative",
@@ -83,16 +83,3 @@ def _frame(path: Path, folder: Path, number: int, row: str) -> dict[str, Any]:
     with storage("read", folder / name):  # a name that is too long is an error of the file system
         relative = name if not name.startswith("/") and ":" not in name and (folder / name).is_file() else name.rsplit("/", 1)[-1]
     return {"image": relative, "light": {"type": "distant", "direction": direction, "irradiance": [1.0, 1.0, 1.0]}}
-
-
-def _display_encoded(path: Path) -> bool:
-    import OpenImageIO as oiio
-
-    if path.suffix.lower() == ".exr":
-        return False
-    source = oiio.ImageInput.open(str(path))
-    if source is None:
-        raise ManifestError(f"{path}: cannot be read as an image")
-    eight_bit = source.spec().format == oiio.UINT8
-    source.close()
-    return bool(eight_bit)

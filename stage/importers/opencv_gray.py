@@ -5,15 +5,13 @@ An OpenCV calibration has pixel centres at whole numbers, so cx and cy become 0.
 and R, T take points from the camera to the projector (stereoCalibrate with the camera first).
 """
 
-import re
 from pathlib import Path
 from typing import Any
 
 from stage.calibration.opencv_file import camera_from_projector, lens, pick, read_matrices
 from stage.camera import Distortion
-from stage.errors import ManifestError, storage
-from stage.images import SUFFIXES
-from stage.importers.layout import image_resolution, write_capture
+from stage.errors import ManifestError
+from stage.importers.layout import image_names, image_resolution, write_capture
 from stage.manifest import SCHEMA
 
 CAMERA_MATRIX = ("cam_K", "cam_int", "camera_matrix", "cameraMatrix1", "M1", "K1", "mtx1")
@@ -43,7 +41,7 @@ def import_folder(source: Path, destination: Path, *, projector: tuple[int, int]
     Raises:
         ManifestError: the count of images does not fit the projector, or the calibration file lacks a matrix.
     """
-    names = _images(source)
+    names = image_names(source)
     patterns = gray_order(*projector)
     if len(names) != len(patterns):
         raise ManifestError(f"{source}: holds {len(names)} images, a projector of {projector[0]}x{projector[1]} px takes {len(patterns)}: "
@@ -90,9 +88,3 @@ def camera_and_projector(path: Path, resolution: tuple[int, int], projector: tup
                          "principal_px": [k[0, 2] + PIXEL_CENTRE, k[1, 2] + PIXEL_CENTRE], "distortion": glass.model_dump()}
     return {"camera": {"projection": "perspective", **entries["camera"]},
             "projector": {**entries["projector"], "camera_from_projector": pose.tolist()}}
-
-
-def _images(source: Path) -> list[str]:
-    with storage("read", source):
-        names = [path.name for path in source.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")]
-    return sorted(names, key=lambda name: [int(part) if part.isdecimal() else part.lower() for part in re.split(r"(\d+)", name)])

@@ -1,0 +1,279 @@
+"""Tables of lights: rows of CSV and text files, arrays of .mat and .npy files, and lists of JSON files."""
+
+import json
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from stage import inputs
+from stage.errors import ManifestError
+from stage.mat_file import read_mat
+from stage.text import name_fault
+
+SUFFIXES = (".csv", ".txt", ".tsv", ".mat", ".npy", ".json", ".lp", ".dat")
+NAME_KEYS = ("image", "file", "filename", "name", "img")
+VECTOR_KEYS = ("direction", "position", "vector", "light", "dir", "pos", "xyz", "l")
+STRENGTH_KEYS = ("intensity", "irradiance", "strength", "rgb", "colour", "color")
+"""Keys and headings of a light, in small letters, in order of preference."""
+LIST_KEYS = ("lights", "directions", "positions", "light_directions", "light_positions")
+COMMENTS = ("#", "%", "//")
+
+Run = str
+"""Whether lights are the `rows` or the `columns` of a table of numbers."""
+
+
+class LightTable(NamedTuple):
+    """The lights of a table, in its own axes."""
+
+    names: tuple[str, ...] | None
+    """The image of each light; None where the table names none."""
+    vectors: np.ndarray  # [lights, 3] float64
+    strengths: np.ndarray | None  # [lights, 3] float64, red, green and blue
+    run: Run
+    what: str
+    """The file, and the variable in it where it has several, for messages."""
+
+
+def read_light_table(path: Path, *, variable: str | None = None, run: Run | None = None) -> LightTable:
+    """Read a table of lights.
+
+    Args:
+        path: a .csv, .txt, .tsv, .lp or .dat file with a light in each row: an image name or none, three numbers, and one or three
+            numbers of its strength or none, with a line of headings or none; a .mat or .npy file with an array of three numbers for
+            each light; or a .json file with a list of lights or an object of lights by image name.
+        variable: the variable of a .mat file, or the key of a JSON object; None: the only one that can be meant.
+        run: whether lights are rows or columns of a table of numbers; None: as its shape says.
+
+    Raises:
+        ManifestError: the file holds no table of lights, or its shape leaves open where the lights are; the message names file and line.
+        StorageError: the file cannot be read.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".mat":
+        name, values = _variable(path, {name: value for name, value in read_mat(path).items() if isinstance(value, np.ndarray)}, variable)
+        return _numbers(path, values, run, f"{path}: {name}")
+    if suffix == ".npy":
+        try:
+            values = np.load(path, allow_pickle=False)
+        except (ValueError, EOFError) as error:
+            raise ManifestError(f"{path}: is no .npy file of numbers") from error
+        return _numbers(path, values, run, str(path))
+    if suffix == ".json":
+        return _from_json(path, variable, run)
+    if suffix not in SUFFIXES:
+        raise ManifestError(f"{path}: is no table of lights: its suffix must be one of {', '.join(SUFFIXES)}")
+    return _from_text(path, run)
+
+
+def read_strengths(path: Path, *, variable: str | None = None) -> np.ndarray:
+    """Read the strength of each light from a file of its own: rows of one or three numbers.
+
+    Returns:
+        [lights, 3] float64.
+
+    Raises:
+        ManifestError: the file holds something else.
+        StorageError: the file cannot be read.
+    """
+    if path.suffix.lower() == ".mat":
+        name, values = _variable(path, {name: value for name, value in read_mat(path).items() if isinstance(value, np.ndarray)}, variable,
+                                 sides=(1, 3))
+        return _strengths(np.asarray(values, dtype=np.float64), f"{path}: {name}")
+    _, rows, _ = _rows(path)
+    try:
+        values = np.array([[float(part) for part in row] for _, row in rows], dtype=np.float64)
+    except ValueError as error:
+        raise ManifestError(f"{path}: must hold one or three numbers for each light") from error
+    return _strengths(values, str(path))
+
+
+def _strengths(values: np.ndarray, what: str) -> np.ndarray:
+    values = values.reshape(-1, 1) if values.ndim == 2 and 1 in values.shape else values
+    if values.ndim != 2 or values.shape[1] not in (1, 3) or not np.isfinite(values).all():
+        raise ManifestError(f"{what}: must hold one or three finite numbers for each light")
+    return np.broadcast_to(values, (len(values), 3)).copy()
+
+
+def _variable(path: Path, arrays: Mapping[str, np.ndarray], wanted: str | None, sides: tuple[int, ...] = (3,)) -> tuple[str, np.ndarray]:
+    """Return the array that is meant: the one that was named, or the only one that has a side of three."""
+    if wanted is not None:
+        if wanted not in arrays:
+            raise ManifestError(f"{path}: holds no array {wanted}, but {', '.join(arrays) or 'none at all'}")
+        return wanted, arrays[wanted]
+    fitting = {name: values for name, values in arrays.items() if values.ndim == 2 and set(values.shape) & set(sides)}
+    if len(fitting) != 1:
+        raise ManifestError(f"{path}: holds {', '.join(arrays) or 'no array'}: " + ("name that of the lights with --variable" if arrays else
+                                                                                     "give a table of lights"))
+    return next(iter(fitting.items()))
+
+
+def _numbers(path: Path, values: np.ndarray, run: Run | None, what: str) -> LightTable:
+    """Return the lights of an array of numbers without names."""
+    if values.ndim != 2 or values.dtype.kind not in "fiu" or 3 not in values.shape:
+        raise ManifestError(f"{what}: is {' x '.join(map(str, values.shape))}: give three numbers for each light")
+    if run is None:
+        if values.shape == (3, 3):
+            raise ManifestError(f"{what}: is 3 x 3: say with --lights-in whether its rows or its columns are the lights")
+        run = "rows" if values.shape[1] == 3 else "columns"
+    vectors = np.asarray(values if run == "rows" else values.T, dtype=np.float64)
+    if vectors.shape[1] != 3:
+        raise ManifestError(f"{what}: is {' x '.join(map(str, values.shape))}: its {run} do not have three numbers each")
+    return _checked(LightTable(None, vectors, None, run, what), lambda index: f"{what}: light {index + 1}")
+
+
+def _checked(table: LightTable, place: Callable[[int], str]) -> LightTable:
+    """Refuse a light without a direction, which `place` names."""
+    for index, vector in enumerate(table.vectors):
+        if not np.isfinite(vector).all() or not vector.any():
+            raise ManifestError(f"{place(index)}: {' '.join(f'{value:g}' for value in vector)} is no direction and no position")
+    for name in table.names or ():
+        if (fault := name_fault(name)) is not None:
+            raise ManifestError(f"{table.what}: the image name {ascii(name)[1:-1][:60]} {fault}")
+    if table.names is not None and len(set(table.names)) < len(table.names):
+        twice = next(name for index, name in enumerate(table.names) if name in table.names[:index])
+        raise ManifestError(f"{table.what}: names {twice} twice")
+    return table
+
+
+def _rows(path: Path) -> tuple[list[str] | None, list[tuple[int, list[str]]], int | None]:
+    """Return the headings of a text file in small letters, the number and the parts of each line, and the count in its first line."""
+    text = inputs.read_bytes(path).decode("utf-8-sig", "replace")
+    lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), start=1)]
+    lines = [(number, line) for number, line in lines if line and not line.startswith(COMMENTS)]
+    separator = next((mark for mark in (";", ",", "\t") if any(mark in line for _, line in lines)), None)
+
+    def split(line: str) -> list[str]:
+        parts = line.split(separator) if separator else line.split()
+        return [part.strip().strip('"').strip("'") for part in parts]
+
+    rows = [(number, split(line)) for number, line in lines]
+    count = None
+    if len(rows) > 1 and len([part for part in rows[0][1] if part]) == 1 and rows[0][1][0].isdecimal() and len(rows[1][1]) > 1:
+        count, rows = int(rows[0][1][0]), rows[1:]
+    headings = None
+    if rows and len(rows[0][1]) > 1 and not any(_number(part) is not None for part in rows[0][1]):
+        headings, rows = [part.lower() for part in rows[0][1]], rows[1:]
+    return headings, rows, count
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text)
+    except ValueError:
+        return None
+
+
+def _from_text(path: Path, run: Run | None) -> LightTable:
+    headings, rows, count = _rows(path)
+    if not rows:
+        raise ManifestError(f"{path}: holds no light")
+    table = _without_headings(path, rows, run) if headings is None else _with_headings(path, headings, rows)
+    if count is not None and count != len(table.vectors):
+        raise ManifestError(f"{path}: says {count} lights, holds {len(table.vectors)}")
+    return _checked(table, (lambda index: f"{path}: line {rows[index][0]}") if table.run == "rows" else
+                    (lambda index: f"{path}: column {index + 1}"))
+
+
+def _with_headings(path: Path, headings: list[str], rows: list[tuple[int, list[str]]]) -> LightTable:
+    def column(pattern: str) -> int | None:
+        return next((index for index, heading in enumerate(headings) if re.fullmatch(pattern, heading)), None)
+
+    vector = [column(rf"(l|d|p|n|light|dir|direction|pos|position)?[ _.]?{axis}([ _]?\(?\[?(mm|cm|m)?\)?\]?)?") for axis in "xyz"]
+    name = next((index for index, heading in enumerate(headings) if heading in NAME_KEYS), None)
+    strength = [column(rf"({letter}|{word}|(intensity|irradiance|i)[ _.]?({letter}|{word}))")
+                for letter, word in (("r", "red"), ("g", "green"), ("b", "blue"))]
+    single = column("|".join((*STRENGTH_KEYS, "i")))
+    if None in vector:
+        raise ManifestError(f"{path}: has the headings {', '.join(headings)}: there must be x, y and z of each light")
+    if None in strength:
+        strength = [single] * 3
+    vectors, strengths, names = [], [], []
+    for number, parts in rows:
+        wanted = [*vector, *(strength if single is not None or strength[0] is not None else [])]
+        values = [_number(parts[index]) if index is not None and index < len(parts) else None for index in wanted]
+        if any(value is None for value in values) or (name is not None and (name >= len(parts) or not parts[name])):
+            raise ManifestError(f"{path}: line {number}: {' '.join(parts)[:60]!r} lacks a value of {', '.join(headings)}")
+        vectors.append(values[:3])
+        strengths.append(values[3:])
+        names.append(parts[name] if name is not None else "")
+    return LightTable(tuple(names) if name is not None else None, np.array(vectors, dtype=np.float64),
+                      np.array(strengths, dtype=np.float64) if strengths[0] else None, "rows", str(path))
+
+
+def _without_headings(path: Path, rows: list[tuple[int, list[str]]], run: Run | None) -> LightTable:
+    named = _number(rows[0][1][0]) is None
+    parsed = []
+    for number, parts in rows:
+        read = [_number(part) for part in (parts[1:] if named else parts) if part]
+        row = [value for value in read if value is not None]
+        if len(row) < len(read) or not row:
+            raise ManifestError(f"{path}: line {number}: {' '.join(parts)[:60]!r} is not "
+                                f"{'an image name and ' if named else ''}three numbers")
+        parsed.append(row)
+    width = len(parsed[0])
+    uneven = next((number for (number, _), row in zip(rows, parsed, strict=True) if len(row) != width), None)
+    if uneven is not None:
+        raise ManifestError(f"{path}: line {uneven}: has another count of numbers than the first line, {width}")
+    values = np.array(parsed, dtype=np.float64)
+    if not named and len(values) == 3 and run != "rows":
+        if run is None and width in (3, 4, 6):
+            raise ManifestError(f"{path}: is 3 x {width}: say with --lights-in whether its rows or its columns are the lights")
+        return LightTable(None, values.T, None, "columns", str(path))
+    if run == "columns" or width not in (3, 4, 6):
+        raise ManifestError(f"{path}: has {len(values)} rows of {width} numbers: a light has three, and one or three of its strength")
+    strengths = values[:, 3:] if width > 3 else None
+    return LightTable(tuple(parts[0] for _, parts in rows) if named else None, values[:, :3],
+                      None if strengths is None else np.broadcast_to(strengths, (len(values), 3)).copy(), "rows", str(path))
+
+
+def _from_json(path: Path, variable: str | None, run: Run | None) -> LightTable:
+    try:
+        data = json.loads(inputs.read_bytes(path).decode("utf-8-sig"))
+    except (ValueError, RecursionError) as error:
+        raise ManifestError(f"{path}: is not JSON") from error
+    if isinstance(data, dict):
+        key = variable or next((key for key in LIST_KEYS if key in data), None)
+        if variable is not None and variable not in data:
+            raise ManifestError(f"{path}: has no key {variable}, but {', '.join(map(str, data))[:200]}")
+        if key is not None:
+            data = data[key]
+    entries = list(data.items()) if isinstance(data, dict) else [(None, entry) for entry in data] if isinstance(data, list) else []
+    if not entries:
+        raise ManifestError(f"{path}: holds no list of lights" + ("" if variable else ": name its key with --variable"))
+    if isinstance(data, list) and all(isinstance(entry, list) and all(isinstance(value, int | float) for value in entry) for entry in data):
+        if len({len(entry) for _, entry in entries}) > 1:
+            raise ManifestError(f"{path}: its lights have different counts of numbers")
+        return _numbers(path, np.array([entry for _, entry in entries], dtype=np.float64), run, str(path))
+    lights = [_light(path, index, key, entry) for index, (key, entry) in enumerate(entries)]
+    names = [name for name, _, _ in lights]
+    strengths = [strength for _, _, strength in lights if strength is not None]
+    if (any(names) and not all(names)) or len(strengths) not in (0, len(lights)):
+        raise ManifestError(f"{path}: some lights have an image or a strength and others have none: give all, or none")
+    return _checked(LightTable(tuple(map(str, names)) if all(names) else None, np.array([vector for _, vector, _ in lights]),
+                               np.array(strengths) if strengths else None, "rows", str(path)),
+                    lambda index: f"{path}: light {index + 1}")
+
+
+def _light(path: Path, index: int, key: str | None, entry: Any) -> tuple[str | None, list[float], list[float] | None]:
+    """Return the image, the vector and the strength of an entry of a JSON list."""
+    if isinstance(entry, list):
+        entry = {"vector": entry}
+    if not isinstance(entry, dict):
+        raise ManifestError(f"{path}: light {index + 1} is {str(entry)[:60]}: give a list of three numbers, or an object")
+    small = {str(name).lower(): value for name, value in entry.items()}
+    vector = next((small[name] for name in VECTOR_KEYS if name in small), None)
+    if vector is None:
+        vector = [small.get(axis) for axis in "xyz"]
+    if isinstance(vector, dict):
+        vector = [vector.get(axis) for axis in "xyz"]
+    strength = next((small[name] for name in STRENGTH_KEYS if name in small), None)
+    strength = [strength] * 3 if isinstance(strength, int | float) else strength
+    for what, values in (("direction or position", vector), ("strength", strength)):
+        if values is not None and not (isinstance(values, list) and len(values) == 3
+                                       and all(isinstance(value, int | float) and np.isfinite(value) for value in values)):
+            raise ManifestError(f"{path}: light {index + 1}: its {what} is {str(values)[:60]}: give three numbers")
+    name = key or next((small[name] for name in NAME_KEYS if name in small), None)
+    return (None if name is None else str(name)), [float(value) for value in vector], strength

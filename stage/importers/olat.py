@@ -1,0 +1,106 @@
+"""Import of images under one light each (OLAT) with a table of far lights, whose axes and sense are told and never guessed."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stage.colour_spaces import ColorSpaceName
+from stage.errors import ManifestError, storage
+from stage.importers.axes import Axes, camera_from_table, describe
+from stage.importers.layout import Imported, color_space_of, image_resolution, natural_order, write_capture
+from stage.importers.light_table import SUFFIXES, LightTable, Run, read_light_table, read_strengths
+from stage.importers.view import Selected, Selection, View, select
+from stage.manifest import FILE_NAME, SCHEMA
+
+
+def import_folder(source: Path, destination: Path, *, axes: Axes, to_light: bool, lights: Path | None = None, variable: str | None = None,
+                  run: Run | None = None, strengths: Path | None = None, selection: Selection | None = None, view: View | None = None,
+                  color_space: ColorSpaceName | None = None) -> Imported:
+    """Write a capture.json for images under one far light each.
+
+    Args:
+        source: the folder of the images.
+        destination: the folder of the capture; another folder than the source gets links to, or copies of, the images.
+        axes: where x, y and z of the table point, as seen by the camera.
+        to_light: whether the vectors point to the light, as directions and positions seen from the object do; False: along its rays.
+        lights: the table; None: the only one in the folder.
+        variable: of a .mat or JSON table, as `read_light_table` takes it.
+        run: whether lights are rows or columns, as `read_light_table` takes it.
+        strengths: a file with the strength of each light; None: that in the table, else equal.
+        selection: which images are frames; None: all but mask and ambient light.
+        view: the camera; None: orthographic, of unknown scale.
+        color_space: of the images; None: sRGB of 8-bit images, scene-linear of others.
+
+    Raises:
+        ManifestError: there is no table or more than one, images and lights do not fit, or a value is wrong; the message names the file.
+        StorageError: a file cannot be read or written.
+    """
+    path = lights or find_table(source)
+    table = read_light_table(path, variable=variable, run=run)
+    chosen = select(source, selection or Selection())
+    names, matched = match(path, table, chosen)
+    strength = table.strengths if strengths is None else read_strengths(strengths)
+    if strength is not None and len(strength) != len(names):
+        raise ManifestError(f"{strengths or path}: has {len(strength)} strengths, the table {len(names)} lights")
+    directions = table.vectors @ camera_from_table(axes).T * (1 if to_light else -1)
+    irradiance = np.ones((len(names), 3)) if strength is None else strength
+    space = color_space or color_space_of(source / names[0])
+    view = view or View()
+    frames: list[dict[str, Any]] = [
+        {"image": name, "light": {"type": "distant", "direction": list(direction), "irradiance": list(power)}}
+        for name, direction, power in zip(names, directions.tolist(), irradiance.tolist(), strict=True)]
+    frames += [{"image": chosen.ambient, "light": {"type": "off"}}] if chosen.ambient else []
+    written = write_capture({
+        "schema": SCHEMA, "name": source.resolve().name, "color_space": space, "camera": view.entry(image_resolution(source / names[0])),
+        "mask": chosen.mask, "irradiance_scale": "relative", "frames": frames,
+    }, path, destination, folder=source)
+    behind = int((directions[:, 2] < 0).sum())
+    return Imported(written, (
+        ("lights", f"{len(names)} from {table.what}, {matched}"),
+        ("axes", f"{describe(axes)}; vectors {'point to the light' if to_light else 'point along the rays, from the light'}"),
+        ("side", f"{len(names) - behind} lights stand on the camera's side of the object, {behind} behind it"
+                 + (": if they should not, --axes or --vectors is another" if behind else "")),
+        ("strength", "equal: relit calibrate intensity measures it" if strength is None else "as the table says, with an unknown factor"),
+        ("colour", space + ("" if color_space else ", by the depth of the images: --color-space says another")),
+        ("camera", view.describe()), *chosen.facts()))
+
+
+def find_table(source: Path) -> Path:
+    """Return the only table of lights in a folder.
+
+    Raises:
+        ManifestError: there is none, or more than one.
+        StorageError: the folder cannot be read.
+    """
+    with storage("read", source):
+        found = natural_order(path.name for path in source.iterdir() if path.suffix.lower() in SUFFIXES and path.name != FILE_NAME
+                              and not path.name.startswith("."))
+    if len(found) != 1:
+        raise ManifestError(f"{source}: holds {', '.join(found) or 'no table of lights'}: name that of the lights with --lights")
+    return source / found[0]
+
+
+def match(path: Path, table: LightTable, chosen: Selected) -> tuple[list[str], str]:
+    """Return the image of each light, by its name in the table or by order, and words that say which.
+
+    Raises:
+        ManifestError: a name of the table is no image, or the counts differ where no names tell.
+    """
+    if table.names is None:
+        if len(chosen.frames) != len(table.vectors):
+            raise ManifestError(f"{path}: has {len(table.vectors)} lights, the folder {len(chosen.frames)} images "
+                                f"({chosen.frames[0]} to {chosen.frames[-1]}): choose as many with --images")
+        return list(chosen.frames), f"in the order of the images, {chosen.frames[0]} to {chosen.frames[-1]}"
+    known = {name: name for name in chosen.frames}
+    known |= {Path(name).stem.lower(): name for name in chosen.frames if sum(Path(n).stem.lower() == Path(name).stem.lower()
+                                                                            for n in chosen.frames) == 1}
+    names = []
+    for given in table.names:
+        last = given.replace("\\", "/").rsplit("/", 1)[-1]
+        found = known.get(last) or known.get(Path(last).stem.lower()) or known.get(last.lower())
+        if found is None:
+            raise ManifestError(f"{path}: names {given}, which is no image in the folder")
+        names.append(found)
+    left = len(chosen.frames) - len(set(names))
+    return names, "by the names in it" + (f"; {left} images without a light are left out" if left else "")

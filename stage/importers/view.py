@@ -1,0 +1,112 @@
+"""What an importer is told of the camera and of the images, and the entries of the manifest that follow from it."""
+
+from dataclasses import dataclass
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from stage.errors import ManifestError
+from stage.importers.layout import image_names
+from stage.text import name_fault
+
+MASK_WORDS, AMBIENT_WORDS = frozenset({"mask"}), frozenset({"ambient"})
+"""Words in the name of an image by which it is the mask, or an image of ambient light alone."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """The camera, as far as it is known; without a focal length it is orthographic."""
+
+    focal_px: tuple[float, ...] | None = None
+    """fx and fy in pixels, or one for both."""
+    principal_px: tuple[float, float] | None = None
+    """The image coordinates of the principal point; the centre of the first pixel is 0.5, 0.5."""
+    distortion: tuple[float, ...] | None = None
+    """OpenCV's k1 k2 p1 p2 and, if any, k3."""
+    pixel_size_m: float | None = None
+    surface_z_m: float | None = None
+
+    def entry(self, resolution: tuple[int, int]) -> dict[str, Any]:
+        """Return the entry `camera` of the manifest."""
+        entry: dict[str, Any] = {"projection": "orthographic" if self.focal_px is None else "perspective", "resolution": list(resolution)}
+        if self.focal_px is not None:
+            entry["focal_px"] = [self.focal_px[0], self.focal_px[-1]]
+        if self.distortion is not None:
+            k1, k2, p1, p2, k3 = (*self.distortion, 0.0)[:5]
+            entry["distortion"] = {"model": "brown_conrady", "k": [k1, k2, k3], "p": [p1, p2]}
+        for name in ("principal_px", "pixel_size_m", "surface_z_m"):
+            if (value := getattr(self, name)) is not None:
+                entry[name] = value
+        return entry
+
+    def describe(self) -> str:
+        """Return the camera in a few words."""
+        if self.focal_px is None:
+            size = f", {1000 * self.pixel_size_m:g} mm a pixel" if self.pixel_size_m is not None else ", of unknown scale"
+            return f"orthographic{size}: give --focal-px for a perspective camera"
+        centre = "the centre of the image" if self.principal_px is None else "{:g}, {:g}".format(*self.principal_px)
+        return f"perspective, focal length {' x '.join(f'{value:g}' for value in self.focal_px)} px, principal point {centre}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Selection:
+    """Which images of a folder are frames."""
+
+    images: str | None = None
+    """The names of the frames, as the shell matches them; None: every image that is neither mask nor ambient light."""
+    mask: str | None = None
+    """The name of the mask; None: the one image with the word mask in its name."""
+    ambient: str | None = None
+    """The name of the image of ambient light alone; None: the one image with the word ambient in its name."""
+
+
+class Selected(NamedTuple):
+    """The images of a folder by what they are."""
+
+    frames: tuple[str, ...]
+    """In natural order: 2 before 10."""
+    mask: str | None
+    ambient: str | None
+
+    def facts(self) -> list[tuple[str, str]]:
+        """Return what was understood, as `Imported.facts` has it."""
+        found = [("mask", self.mask or "none: every pixel is taken")]
+        return found if self.ambient is None else [*found, ("ambient", f"{self.ambient} is subtracted from the others")]
+
+
+def select(folder: Path, selection: Selection) -> Selected:
+    """Return the images of a folder by what they are.
+
+    Raises:
+        ManifestError: there is no image, an image that was named does not exist, or more than one could be the mask.
+        StorageError: the folder cannot be read.
+    """
+    names = image_names(folder)
+    mask = _named(folder, names, selection.mask, MASK_WORDS, "mask")
+    ambient = _named(folder, names, selection.ambient, AMBIENT_WORDS, "ambient")
+    wanted = [name for name in names if name not in (mask, ambient)
+              and (not words_of(name) & (MASK_WORDS | AMBIENT_WORDS) if selection.images is None else fnmatch(name, selection.images))]
+    for name in wanted:
+        if (fault := name_fault(name)) is not None:
+            raise ManifestError(f"{folder}: the name {ascii(name)[1:-1]} {fault}")
+    if not wanted:
+        raise ManifestError(f"{folder}: holds no image" + (f" that {selection.images} names" if selection.images else "")
+                            + (": give --images" if names else ""))
+    return Selected(tuple(wanted), mask, ambient)
+
+
+def words_of(name: str) -> frozenset[str]:
+    """Return the words of a file's name in small letters, without its suffix: those of `cat.mask_raw.png` are cat, mask and raw."""
+    text = "".join(letter if letter.isalpha() else " " for letter in Path(name).stem)
+    return frozenset(text.lower().split())
+
+
+def _named(folder: Path, names: list[str], given: str | None, words: frozenset[str], what: str) -> str | None:
+    if given is not None:
+        if given not in names:
+            raise ManifestError(f"{folder}: --{what} {given}: there is no such image in the folder")
+        return given
+    found = [name for name in names if words_of(name) & words]
+    if len(found) > 1:
+        raise ManifestError(f"{folder}: {found[0]} and {found[1]} both look like the {what}: name it with --{what}")
+    return found[0] if found else None

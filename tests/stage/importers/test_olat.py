@@ -1,0 +1,179 @@
+"""Images under one far light each with a table of the lights: every kind of table, and every convention of its axes."""
+
+import json
+from itertools import product
+
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+from stage.capture import Capture
+from stage.errors import ManifestError
+from stage.importers.axes import WAYS
+from stage.importers.olat import import_folder
+from stage.importers.view import Selection
+from tests.scenes.captures import files_in, write_image
+
+DIRECTIONS = np.array([(0, 0, 1), (0.6, 0, 0.8), (0, 0.6, 0.8), (-0.48, -0.36, 0.8)])
+STRENGTHS = np.array([(1, 1, 1), (2, 1, 0.5), (0.5, 1, 2), (1.5, 1.5, 1.5)])
+NAMES = [f"IMG_{number}.JPG" for number in (2, 9, 10, 11)]  # as cameras write them; text order would be 10, 11, 2, 9
+OURS = ("right", "up", "towards")
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for number, name in enumerate(NAMES):
+        write_image(tmp_path / "coin" / name, np.full((4, 5, 3), 40 * (number + 1), np.uint8))
+    return tmp_path / "coin"
+
+
+def lights_of(folder, path, **choices):
+    """What a manifest says of the lights: names, directions and irradiances."""
+    import_folder(folder, folder, lights=path, **{"axes": OURS, "to_light": True, **choices})
+    frames = Capture.open(folder).manifest.frames
+    return ([frame.image for frame in frames], np.array([frame.light.direction for frame in frames]),
+            np.array([frame.light.irradiance for frame in frames]))
+
+
+def rows(*columns, separator=" "):
+    return "".join(separator.join(f"{value:g}" if isinstance(value, float) else value for value in row) + "\n"
+                   for row in zip(*columns, strict=True))
+
+
+X, Y, Z = (list(map(float, column)) for column in DIRECTIONS.T)
+R, G, B = (list(map(float, column)) for column in STRENGTHS.T)
+TEXTS = {
+    "lights.txt": "4\n" + rows(X, Y, Z),  # the University of Washington's data: a count, then the directions
+    "commas.csv": "# dome of 2019\n" + rows(X, Y, Z, separator=","),
+    "semicolons.csv": "x;y;z\n" + rows(X, Y, Z, separator=";"),
+    "named.csv": "Image,X,Y,Z\n" + rows(NAMES, X, Y, Z, separator=","),
+    "other_order.csv": "\ufeffz,image,lx,ly\n" + rows(Z, [f"C:\\dome\\{name}" for name in NAMES], X, Y, separator=","),
+    "millimetres.csv": "file,x_mm,y_mm,z_mm\n" + rows(NAMES, *([1000 * value for value in column] for column in (X, Y, Z)), separator=","),
+    "dome.lp": "4\n" + rows([name.replace(".JPG", ".tif") for name in NAMES], X, Y, Z),  # stems: the images were converted since
+}
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_a_table_of_text(folder, name):
+    path = folder / name
+    path.write_text(TEXTS[name], encoding="utf-8")
+    images, directions, irradiance = lights_of(folder, path)
+    assert images == NAMES
+    assert np.allclose(directions, DIRECTIONS) and np.all(irradiance == 1)
+    assert Capture.open(folder).manifest.irradiance_scale == "relative"
+
+
+def test_lights_in_columns(folder):
+    """What MATLAB's save -ascii makes of a 3 x n matrix; 3 x 4 might be three lights with strengths too, and is asked for."""
+    path = folder / "L.txt"
+    path.write_text("".join(" ".join(f"{value:.7e}" for value in row) + "\n" for row in DIRECTIONS.T))
+    with pytest.raises(ManifestError, match="is 3 x 4: say with --lights-in"):
+        lights_of(folder, path)
+    assert np.allclose(lights_of(folder, path, run="columns")[1], DIRECTIONS)
+
+
+@pytest.mark.parametrize("text", [rows(X, Y, Z, R, G, B), "image,x,y,z,r,g,b\n" + rows(NAMES, X, Y, Z, R, G, B, separator=","),
+                                  "x\ty\tz\tintensity_r\tintensity_g\tintensity_b\n" + rows(X, Y, Z, R, G, B, separator="\t")])
+def test_a_table_with_strengths(folder, text):
+    path = folder / "table.txt"
+    path.write_text(text)
+    _, directions, irradiance = lights_of(folder, path)
+    assert np.allclose(directions, DIRECTIONS) and np.allclose(irradiance, STRENGTHS)
+
+
+@pytest.mark.parametrize("content", [
+    DIRECTIONS.tolist(),
+    {"light_directions": DIRECTIONS.tolist()},
+    {"lights": [{"image": name, "direction": list(row)} for name, row in zip(NAMES[::-1], DIRECTIONS[::-1].tolist(), strict=True)]},
+    [{"x": x, "y": y, "z": z} for x, y, z in DIRECTIONS.tolist()],
+    dict(zip(NAMES, DIRECTIONS.tolist(), strict=True)),
+])
+def test_json(folder, content):
+    path = folder / "lights.json"
+    path.write_text(json.dumps(content))
+    images, directions, _ = lights_of(folder, path)
+    assert sorted(images) == sorted(NAMES)
+    for name, direction in zip(images, directions, strict=True):
+        assert np.allclose(direction, DIRECTIONS[NAMES.index(name)])
+
+
+@pytest.mark.parametrize(("variables", "choices"), [
+    ({"L": DIRECTIONS}, {}), ({"L": DIRECTIONS.T}, {}), ({"L": DIRECTIONS, "mask": np.ones((9, 9))}, {}),
+    ({"L": DIRECTIONS, "E": STRENGTHS}, {"variable": "L"}), ({"rig": {"light": DIRECTIONS.T}}, {"variable": "rig.light"}),
+])
+def test_matlab(folder, variables, choices):
+    savemat(folder / "light.mat", variables)
+    assert np.allclose(lights_of(folder, None, **choices)[1], DIRECTIONS)  # the only table in the folder
+
+
+def test_strengths_of_a_file_of_their_own(folder):
+    path, strengths = folder / "dirs.txt", folder / "strengths.txt"
+    path.write_text(rows(X, Y, Z))
+    strengths.write_text(rows(R))
+    assert np.allclose(lights_of(folder, path, strengths=strengths)[2], STRENGTHS[:, :1])
+
+
+@pytest.mark.parametrize("to_light", [True, False])
+@pytest.mark.parametrize("axes", [axes for axes in product(WAYS, repeat=3)
+                                  if sorted(np.abs([WAYS[way] for way in axes]).argmax(axis=1)) == [0, 1, 2]][::5], ids=",".join)
+def test_every_convention_of_the_axes_comes_out_in_the_camera_frame(folder, axes, to_light):
+    path = folder / "dirs.txt"
+    there = np.array([[np.dot(direction, WAYS[way]) for way in axes] for direction in DIRECTIONS]) * (1 if to_light else -1)
+    path.write_text(rows(*map(list, there.astype(float).T)))
+    assert np.allclose(lights_of(folder, path, axes=axes, to_light=to_light)[1], DIRECTIONS)
+
+
+def test_what_was_understood_is_told(folder):
+    (folder / "dirs.txt").write_text(rows(X, Y, Z))
+    write_image(folder / "coin_mask.png", np.full((4, 5), 255, np.uint8))
+    write_image(folder / "ambient.JPG", np.zeros((4, 5, 3), np.uint8))
+    imported = import_folder(folder, folder, axes=("right", "down", "away"), to_light=False)
+    facts = dict(imported.facts)
+    assert facts["axes"] == "x right, y down, z away from the camera (right-handed); vectors point along the rays, from the light"
+    assert facts["side"].startswith("4 lights stand on the camera's side") and facts["mask"] == "coin_mask.png"
+    assert "in the order of the images, IMG_2.JPG to IMG_11.JPG" in facts["lights"] and "srgb_texture" in facts["colour"]
+    frames = Capture.open(folder).manifest.frames
+    assert (frames[-1].image, frames[-1].light.type) == ("ambient.JPG", "off") and len(frames) == 5
+    assert "mirrors" not in facts["axes"] and dict(import_folder(folder, folder, axes=("right", "down", "towards"), to_light=True).facts)[
+        "axes"].startswith("x right, y down, z towards the camera (left-handed)")
+
+
+@pytest.mark.parametrize(("text", "choices", "words"), [
+    ("0 0 1\n0 up 1\n", {}, r"dirs\.txt: line 2: '0 up 1' is not three numbers"),
+    ("0 0 1\n0 1\n", {}, r"dirs\.txt: line 2: has another count of numbers than the first line, 3"),
+    ("0 0 1\n0 0 1\n0 0 0\n0 0 1\n", {"run": "rows"}, r"dirs\.txt: line 3: 0 0 0 is no direction"),
+    ("0 0 1\n0 1 0\n1 0 0\n", {}, "is 3 x 3: say with --lights-in"),
+    ("5\n" + rows(X, Y, Z), {}, r"dirs\.txt: says 5 lights, holds 4"),
+    ("1 2\n3 4\n", {}, "has 2 rows of 2 numbers: a light has three"),
+    ("azimuth,elevation\n1,2\n", {}, "has the headings azimuth, elevation: there must be x, y and z"),
+    ("image,x,y,z\na.jpg,1,2\n", {}, r"line 2: 'a\.jpg 1 2' lacks a value"),
+    (rows(X[:2], Y[:2], Z[:2]), {}, r"dirs\.txt: has 2 lights, the folder 4 images \(IMG_2\.JPG to IMG_11\.JPG\): choose as many with"),
+    ("image,x,y,z\nno.jpg,0,0,1\n", {}, r"dirs\.txt: names no\.jpg, which is no image in the folder"),
+    ("image,x,y,z\nIMG_2.JPG,0,0,1\nIMG_2.JPG,0,1,1\n", {}, r"names IMG_2\.JPG twice"),
+    ("", {}, r"dirs\.txt: holds no light"),
+    (rows(X, Y, Z), {"axes": ("right", "left", "up")}, "two of them lie on one line"),
+])
+def test_faults_are_named_and_nothing_is_written(folder, text, choices, words):
+    (folder / "dirs.txt").write_text(text)
+    before = files_in(folder)
+    with pytest.raises(ManifestError, match=words) as caught:
+        lights_of(folder, folder / "dirs.txt", **choices)
+    assert "\n" not in str(caught.value) and files_in(folder) == before
+
+
+def test_no_table_or_several(folder):
+    with pytest.raises(ManifestError, match="holds no table of lights: name that of the lights with --lights"):
+        lights_of(folder, None)
+    for name in ("a.txt", "b.csv"):
+        (folder / name).write_text(rows(X, Y, Z))
+    with pytest.raises(ManifestError, match=r"holds a\.txt, b\.csv: name that of the lights with --lights"):
+        lights_of(folder, None)
+
+
+def test_images_chosen_by_name(folder):
+    (folder / "dirs.txt").write_text(rows(X[:2], Y[:2], Z[:2]))
+    assert lights_of(folder, folder / "dirs.txt", selection=Selection(images="IMG_1*"))[0] == NAMES[2:]
+    with pytest.raises(ManifestError, match="holds no image that IMG_3"):
+        lights_of(folder, folder / "dirs.txt", selection=Selection(images="IMG_3*"))
+    with pytest.raises(ManifestError, match=r"--mask m\.png: there is no such image"):
+        lights_of(folder, folder / "dirs.txt", selection=Selection(mask="m.png"))
