@@ -6,7 +6,17 @@ from typing import TYPE_CHECKING
 import typer
 
 from service.cli.request_commands import local_command
-from service.requests.captures import CameraOptions, DiligentImport, ImageOptions, LpImport, OlatImport, OpencvGrayImport, Sense
+from service.requests.captures import (
+    CameraOptions,
+    DiligentImport,
+    ImageOptions,
+    LpImport,
+    NearLightsImport,
+    OlatImport,
+    OpencvGrayImport,
+    RelightlabImport,
+    Sense,
+)
 
 if TYPE_CHECKING:
     from stage.importers.layout import Imported
@@ -17,7 +27,8 @@ def register(app: typer.Typer) -> None:
     """Add the commands."""
     layouts = typer.Typer(name="import", no_args_is_help=True,
                           help="Write a capture.json for files that are laid out another way; docs/captures.md shows each layout.")
-    for name, function in (("diligent", _diligent), ("lp", _lp), ("olat", _olat), ("opencv-gray", _opencv_gray)):
+    for name, function in (("diligent", _diligent), ("lp", _lp), ("relightlab", _relightlab), ("olat", _olat),
+                           ("near-lights", _near_lights), ("opencv-gray", _opencv_gray)):
         local_command(layouts, name, function)
     app.add_typer(layouts)
 
@@ -48,6 +59,20 @@ def _olat(request: OlatImport) -> None:
         request.source, request.folder, axes=request.axes, to_light=request.sense is Sense.TO_LIGHT, lights=request.lights,
         variable=request.variable, run=request.lights_in, strengths=request.strengths, selection=_selection(request), view=_view(request),
         color_space=request.color_space))
+
+
+def _near_lights(request: NearLightsImport) -> None:
+    from stage.importers import near_lights
+
+    _print(near_lights.import_folder(
+        request.source, request.folder, axes=request.axes, unit_m=request.unit_m, lights=request.lights, camera=request.camera,
+        selection=_selection(request), view=_view(request), color_space=request.color_space))
+
+
+def _relightlab(request: RelightlabImport) -> None:
+    from stage.importers import relightlab
+
+    _print(relightlab.import_folder(request.source, request.destination))
 
 
 def _view(request: CameraOptions) -> "View":

@@ -131,3 +131,21 @@ class OlatImport(CameraOptions, ImageOptions, ImportRequest):
     """What a light is in a table of numbers; None: as its shape says."""
     strengths: Annotated[Path | None, Role.INPUT] = None
     """File with the strength of each light, one or three numbers; None: that in the table, else equal."""
+
+
+class NearLightsImport(CameraOptions, ImageOptions, ImportRequest):
+    """Images under one near light each (LEDs), with a .mat or .json file of the rig as near_ps has it: S, Dir, Phi and mu."""
+
+    axes: Axes
+    """Where x, y and z of the rig point as seen by the camera, whose centre is their origin: right or left, up or down, towards the camera
+    or away from it. near_ps and OpenCV have right,down,away."""
+    unit_m: Positive
+    """Metres in one unit of the positions: near_ps has millimetres, 0.001."""
+    lights: Annotated[Path | None, Role.INPUT] = None
+    """File of the rig: positions and, if they are known, directions, intensities and mu (anisotropy); None: the only table in SRC."""
+    camera: Annotated[Path | None, Role.INPUT] = None
+    """File with the matrix of the camera: K of a .mat file, or an OpenCV file (.yml, .xml, .json); None: as the other options say."""
+
+
+class RelightlabImport(ImportRequest):
+    """A project of RelightLab (.relight), or its dome (.dome) beside the images; SRC may be the file."""

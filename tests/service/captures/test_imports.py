@@ -1,9 +1,14 @@
 """From files in the layouts of other programs to a result in two commands, with the truth known."""
 
+import json
+
 import numpy as np
 import pytest
+from scipy.io import savemat
 
+from stage.capture import Capture
 from stage.maps import SurfaceMaps
+from tests.scenes import near_lights
 from tests.scenes.captures import make_scene, write_exr, write_image
 
 
@@ -35,3 +40,70 @@ def test_axes_are_asked_for_and_never_guessed(relit, tmp_path):
     assert outcome.code == 2 and "--axes" in outcome.err and outcome.err.count("\n") == 1
     outcome = relit("import", "olat", tmp_path, "--vectors", "to-light", "--axes", "right,up,forward")
     assert outcome.code == 2 and "axes" in outcome.err and outcome.err.count("\n") == 1
+
+
+NEAR_PS = np.diag([1.0, -1.0, -1.0])
+"""The axes of near_ps from those of relit, and back."""
+
+
+def write_near_ps(folder, dome, lights, ambient=0.02):
+    """The layout of Quéau's near_ps: raw 16-bit PNG of the object, a mask, an ambient image, and both .mat files in the folder above."""
+    images = [near_lights.render(dome, lamp) * dome.mask[..., None] for lamp in lights]
+    scale = 0.9 / (max(image.max() for image in images) + ambient)
+    for number, image in enumerate([*images, sum(images) / len(images)], start=1):
+        name = f"photometric_sample_raw_{number:04d}.png" if number <= len(lights) else "photometric_sample_all_raw.png"
+        write_image(folder / name, np.round((image + ambient) * scale * 65535).astype(np.uint16))
+    write_image(folder / "photometric_sample_raw_ambient.png", np.full((*dome.mask.shape, 3), round(ambient * scale * 65535), np.uint16))
+    write_image(folder / "photometric_sample_mask_raw.png", dome.mask.astype(np.uint8) * 255)
+    savemat(folder.parent / "light.mat", {
+        "S": 1000 * np.array([lamp.position for lamp in lights]) @ NEAR_PS, "Dir": np.array([lamp.axis for lamp in lights]) @ NEAR_PS,
+        "Phi": np.array([lamp.strength for lamp in lights]) * 3e6, "mu": np.full((len(lights), 1), lights[0].exponent)})
+    width, height = dome.camera["resolution"]
+    focal = dome.camera["focal_px"][0]
+    k = np.array([[focal, 0, width / 2 + 0.5], [0, focal, height / 2 + 0.5], [0, 0, 1]])
+    savemat(folder.parent / "camera.mat", {"K": k.T})  # as MATLAB's toolbox writes it, transposed
+
+
+def test_leds_in_the_layout_of_near_ps_give_the_true_height(relit, tmp_path):
+    dome = near_lights.dome(perspective=True)
+    folder = tmp_path / "Datasets" / "Statuette"
+    write_near_ps(folder, dome, near_lights.lamps(dome, 8, 3.0, widest=50, exponent=1.4))
+    outcome = relit("import", "near-lights", folder, tmp_path / "capture", "--lights", tmp_path / "Datasets" / "light.mat",
+                    "--camera", tmp_path / "Datasets" / "camera.mat", "--axes", "right,down,away", "--unit-m", "0.001",
+                    "--images", "*raw_0*", "--surface-z-m", dome.camera["surface_z_m"])
+    assert outcome.code == 0, outcome.err
+    assert "8 near lights" in outcome.out and "(MATLAB)" in outcome.out and "raw_ambient.png is subtracted" in outcome.out
+    camera = Capture.open(tmp_path / "capture").camera
+    assert np.allclose(camera.principal_px, np.array(camera.resolution) / 2) and np.allclose(camera.focal_px, dome.camera["focal_px"])
+    assert relit("solve", tmp_path / "capture", "--out", tmp_path / "maps", "--method", "robust").code == 0
+    maps = SurfaceMaps.read(tmp_path / "maps" / "maps.exr")
+    solved = maps.mask & dome.mask
+    assert solved.sum() > 0.95 * dome.mask.sum()
+    assert np.abs(maps.height - dome.points[..., 2])[solved].max() < 0.01 * dome.relief  # as the capture in relit's own layout is held to
+    assert degrees_between(maps.normal, dome.normal)[solved].max() < 0.5  # 16-bit readings minus ambient light
+
+
+def test_a_project_of_relightlab_gives_the_true_normals(relit, tmp_path):
+    scene = make_scene(24, 8)
+    images = [{"filename": f"DSC_{number:04d}.png", "skip": number == 3, "direction": dict.fromkeys("xyz", 0.0)} for number in range(9)]
+    lit = iter(range(8))
+    for entry in images:
+        pixels = scene.images[next(lit)] if not entry["skip"] else np.ones_like(scene.images[0])
+        write_image(tmp_path / "photos" / entry["filename"], np.round(pixels * 0.9 / scene.images.max() * 65535).astype(np.uint16))
+    directions = [dict(zip("xyz", row, strict=True)) for row in scene.directions.tolist()]
+    adjust = [dict(zip("rgb", row, strict=True)) for row in (1 / scene.irradiance).tolist()]
+    (tmp_path / "lab").mkdir()
+    (tmp_path / "lab" / "coin.relight").write_text(json.dumps({
+        "application": "RelightLab", "version": "2025.02", "name": "coin", "width": 24, "height": 24, "folder": "../photos", "images": images,
+        "lens": {"focalLength": 0}, "spheres": [], "crop": {"left": 2, "top": 2, "width": 20, "height": 20}, "dome": {
+            "label": "", "imageWidth": 48.0, "domeDiameter": 600.0, "verticalOffset": 0.0, "lightConfiguration": "directional",
+            "directions": directions, "positionsSphere": [], "positions3d": [], "ledAdjust": adjust}}))
+    outcome = relit("import", "relightlab", tmp_path / "lab")
+    assert outcome.code == 0, outcome.err
+    assert "8 far lights" in outcome.out and "1 images are skipped" in outcome.out and "crops the images" in outcome.out
+    capture = Capture.open(tmp_path / "photos")
+    assert np.isclose(capture.camera.pixel_size_m, 0.002) and len(capture.manifest.frames) == 8
+    assert relit("solve", tmp_path / "photos", "--out", tmp_path / "maps", "--method", "robust").code == 0
+    maps = SurfaceMaps.read(tmp_path / "maps" / "maps.exr")
+    assert degrees_between(maps.normal, scene.normal)[scene.mask & maps.mask].max() < 0.1
+    assert maps.mask.sum() > 0.9 * scene.mask.sum()
