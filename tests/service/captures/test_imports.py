@@ -94,7 +94,8 @@ def test_a_project_of_relightlab_gives_the_true_normals(relit, tmp_path):
     adjust = [dict(zip("rgb", row, strict=True)) for row in (1 / scene.irradiance).tolist()]
     (tmp_path / "lab").mkdir()
     (tmp_path / "lab" / "coin.relight").write_text(json.dumps({
-        "application": "RelightLab", "version": "2025.02", "name": "coin", "width": 24, "height": 24, "folder": "../photos", "images": images,
+        "application": "RelightLab", "version": "2025.02", "name": "coin", "width": 24, "height": 24,
+        "folder": "../photos", "images": images,
         "lens": {"focalLength": 0}, "spheres": [], "crop": {"left": 2, "top": 2, "width": 20, "height": 20}, "dome": {
             "label": "", "imageWidth": 48.0, "domeDiameter": 600.0, "verticalOffset": 0.0, "lightConfiguration": "directional",
             "directions": directions, "positionsSphere": [], "positions3d": [], "ledAdjust": adjust}}))
