@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import OpenEXR
 
-from stage import inputs
+from stage import exr_checksum, inputs
 from stage.errors import ImageError, StorageError, storage
 from stage.exr_chunks import missing_bytes
 from stage.exr_scan import scan_header
@@ -143,17 +143,20 @@ def write(path: str | Path, channels: Mapping[str, np.ndarray], *, color_space: 
     write_parts(path, [Part("", channels, color_space, compression)], metadata=metadata)
 
 
-def write_parts(path: str | Path, parts: Sequence[Part], *, metadata: Mapping[str, Any]) -> None:
+def write_parts(path: str | Path, parts: Sequence[Part], *, metadata: Mapping[str, Any], checksum: bool = False) -> None:
     """Write an EXR file whole or not at all: of several parts, or, where there is one part, a file without parts.
 
     Args:
         path: the file.
         parts: with names that differ, and channels that differ and have one size.
         metadata: further attributes of the first part; `pixelAspectRatio` and `framesPerSecond` are written to every part.
+        checksum: True to write a checksum of the file too, by which `stage.exr_checksum` finds every change of it.
 
     Raises:
         StorageError: the file cannot be written; nothing is left behind.
     """
+    if checksum:
+        metadata = {**metadata, exr_checksum.ATTRIBUTE: exr_checksum.UNSET}
     written: list[tuple[dict[str, Any], dict[str, np.ndarray], str]] = []
     for part in parts:
         header: dict[str, Any] = {"compression": part.compression, "type": OpenEXR.scanlineimage, "colorInteropID": part.color_space}
@@ -176,6 +179,8 @@ def write_parts(path: str | Path, parts: Sequence[Part], *, metadata: Mapping[st
             read_header(temporary)
         except ImageError as error:
             raise StorageError(f"cannot write {path}: the disk took only part of it") from error
+        if checksum:
+            exr_checksum.write_checksum(temporary)
 
 
 SHARED = ("pixelAspectRatio", "framesPerSecond")

@@ -19,7 +19,7 @@ from service.reporting.provenance import choices
 from service.requests.frame_range import numbered
 from service.requests.picture import FrameMatte, Layer
 from service.requests.relight import RelightRequest
-from stage import exr, fingerprint
+from stage import exr, exr_checksum, fingerprint
 from stage.errors import StageError, StorageError
 
 ARITHMETIC = 3
@@ -119,11 +119,11 @@ def _has_mask(request: RelightRequest) -> bool:
 
 
 def is_complete(path: Path, request_hash: str) -> bool:
-    """Return whether the file is a whole frame that was made by a request of this hash."""
+    """Return whether the file is a frame that was made by a request of this hash, with every byte as it was written."""
     if not path.is_file():
         return False
     try:
-        return bool(exr.read_header(path).metadata.get(REQUEST_ATTRIBUTE) == request_hash)
+        return bool(exr.read_header(path).metadata.get(REQUEST_ATTRIBUTE) == request_hash) and exr_checksum.is_intact(path)
     except StageError:  # not an EXR, truncated or unreadable: the frame is made again
         return False
 

@@ -152,7 +152,7 @@ class FrameWriter:
         halved = time.perf_counter()
         if not form.in_parts:
             parts = [parts[0]._replace(channels={name: plane for part in parts for name, plane in part.channels.items()})]
-        exr.write_parts(file.path, parts, metadata={**form.attributes, **file.metadata})
+        exr.write_parts(file.path, parts, metadata={**form.attributes, **file.metadata}, checksum=True)
         ended = time.perf_counter()
         with self._lock:
             before = self.written

@@ -60,6 +60,23 @@ def test_whole_frames_are_kept_and_others_made(made, tmp_path):
     assert made("--overwrite", "") == FRAMES
 
 
+def test_a_frame_with_one_changed_byte_is_made_again(made, tmp_path):
+    made()
+    path = tmp_path / "f" / "a.2.exr"
+    whole = path.read_bytes()
+    places = {"first byte": 0, "an attribute": whole.index(b"relit:request"), "the checksum": whole.index(b"relit:checksum") + 30,
+              "pixels": len(whole) - 20, "last byte": len(whole) - 1}
+    for place in places.values():
+        damaged = bytearray(whole)
+        damaged[place] ^= 1
+        path.write_bytes(damaged)
+        assert made() == {"a.2.exr"}
+        assert path.read_bytes() == whole
+    path.write_bytes(whole + b"\0")
+    assert made() == {"a.2.exr"}
+    assert made() == set()
+
+
 @pytest.mark.parametrize("options", [
     ("--exposure", "1"), ("--compression", "piz"), ("--color-space", "lin_ap1_scene"), ("--aov", "mask"), ("--weights", "smooth"),
 ])
