@@ -54,6 +54,8 @@ class MethodEntry(NamedTuple):
     raises a StageError that says what they lack."""
     solvers: Mapping[type, Solver]
     """One function for each kind of lights; a kind that is not here is refused."""
+    residual: str
+    """What the residual of a pixel is, as the report says it."""
     is_default: Callable[[Capture], bool] = lambda capture: False
     """Whether a capture is solved by this method when the request names none."""
 
@@ -106,12 +108,22 @@ LAMBERT = Rounds(Method.LAMBERT, partial(solve_diffuse, fit_normals=solve_lamber
 ROBUST = Rounds(Method.ROBUST, partial(solve_diffuse, fit_normals=solve_robust))
 MATERIAL = Rounds(Method.SVBRDF, _solve_material, MATERIAL_ROUNDS, _refine_material)
 
+OF_THE_LARGEST = ("of grey readings over irradiance less b·l, relative to the length of b, which is the reading under a light along "
+                  "the normal")
+IN_NOISE = ("square root of the mean over the lights of log(1 + r²/σ²), where r is reading less model and σ the noise that the search "
+            "assumes: 0.83 where r is σ everywhere; a shadow counts 1")
+
 METHODS: Mapping[Method, MethodEntry] = {
-    Method.GRADIENT: MethodEntry(gradient_frames, {GradientFrames: _solve_gradients}, has_gradients),
-    Method.SVBRDF: MethodEntry(check_solvable, {**_single_lights(ROBUST, MATERIAL), ExtendedLights: _solve_extended}, _suits_svbrdf),
-    Method.ROBUST: MethodEntry(check_solvable, _single_lights(ROBUST), is_default=lambda capture: True),
-    Method.LAMBERT: MethodEntry(check_solvable, _single_lights(LAMBERT)),
-    Method.REFERENCE: MethodEntry(reference_ball, {ReferenceBall: _solve_by_reference}),
+    Method.GRADIENT: MethodEntry(gradient_frames, {GradientFrames: _solve_gradients},
+                                 "root mean square of the grey readings less the fit, relative to the reading under the full frame",
+                                 has_gradients),
+    Method.SVBRDF: MethodEntry(check_solvable, {**_single_lights(ROBUST, MATERIAL), ExtendedLights: _solve_extended}, IN_NOISE,
+                               _suits_svbrdf),
+    Method.ROBUST: MethodEntry(check_solvable, _single_lights(ROBUST),
+                               f"root mean square, by the weights of the fit and without rejected readings, {OF_THE_LARGEST}",
+                               is_default=lambda capture: True),
+    Method.LAMBERT: MethodEntry(check_solvable, _single_lights(LAMBERT), f"root mean square {OF_THE_LARGEST}"),
+    Method.REFERENCE: MethodEntry(reference_ball, {ReferenceBall: _solve_by_reference}, IN_NOISE),
 }
 """Every method. The default for a capture is the first whose `is_default` says so."""
 
@@ -198,7 +210,7 @@ def solve(request: SolveRequest, progress: Progress | None = None, *, sharing: S
         device="; ".join(map(devices.describe, given.devices)),
         timings_s=timings.close(),
         pixels={"mask": int(mask.sum()), **counts},
-        residual=_residual_statistics(solution.residual.reshape(mask.shape)[solved]),
+        residual={**_residual_statistics(solution.residual.reshape(mask.shape)[solved]), "meaning": METHODS[method].residual},
         albedo_above_one=int((maps.diffuse_albedo[solved] > 1).any(axis=-1).sum()) if maps.diffuse_albedo is not None else 0,
         height=_height_report(solution.integration, guessed, capture),
         **({} if placed is None else {"parts": [part.facts() for part in placed.parts]}),
@@ -307,7 +319,7 @@ def _nothing_solved(counts: Mapping[str, int]) -> str:
 
 
 def _residual_statistics(residual: np.ndarray) -> dict[str, float]:
-    """Return the median and the 95th percentile of the relative residual of each solved pixel's lit readings."""
+    """Return the median and the 95th percentile of the residuals of the solved pixels, as the method defines them."""
     if residual.size == 0:
         return {}
     values = np.percentile(residual.astype(np.float32), [50, 95])

@@ -1,10 +1,14 @@
 """solve, export: the whole way from a capture with a known truth to its results."""
 
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from service.requests.solve import Method
+from service.solve.solve import METHODS
 from stage import exr
 from stage.maps import SurfaceMaps
 from tests.scenes.captures import angles_degrees, files_in, make_scene, write_capture
@@ -50,10 +54,17 @@ def test_the_report_and_the_maps_say_where_they_come_from(relit, tmp_path):
     assert set(report["timings_s"]) >= {"open", "ingest", "normals", "height"}
     assert {"relit", "warp-lang", "numpy", "OpenEXR"} <= set(report["versions"])
     assert report["residual"]["p95"] < 0.01
+    assert report["residual"]["meaning"] == METHODS[Method.LAMBERT].residual
     metadata = exr.read_header(tmp_path / "out" / "maps.exr").metadata
     assert metadata["relit:capture"] == "cap" and metadata["relit:inputs"] == report["inputs"]["content"]
     assert json.loads(metadata["relit:options"]) == {"method": "lambert"}
     assert metadata["colorInteropID"] == "lin_rec709_scene" and "chromaticities" in metadata
+
+
+def test_the_residual_of_every_method_is_documented():
+    text = (Path(__file__).parents[3] / "docs" / "capture.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(\w+)` \| (.+) \|$", text.split("| method | residual of a pixel |")[1].split("\n\n")[0], re.MULTILINE)
+    assert rows == [(str(method), entry.residual) for method, entry in METHODS.items()]
 
 
 def test_solve_twice_is_the_same_file_and_the_cache_may_lie_elsewhere(relit, tmp_path):
