@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from kernels.errors import KernelError
 from service.asset.errors import AssetError
 from stage.errors import StageError
-from stage.records import describe
+from stage.records import FieldName, describe, field_name
 
 
 class RequestError(ValueError):
@@ -25,14 +25,18 @@ USER_ERRORS: tuple[type[Exception], ...] = (RequestError, ValidationError, Stage
 """Errors whose text is a sentence for the person who asked: exit code 2 on the command line."""
 
 
-def sentence(error: BaseException) -> str:
+def sentence(error: BaseException, name: FieldName = field_name) -> str:
     """Return the line to show for an error.
 
     Names of files and fields stand in it as others wrote them, so characters that cannot be printed are escaped.
+
+    Args:
+        error: what was raised.
+        name: names the field of a request with an invalid value.
     """
     if isinstance(error, ValidationError):
         raised = (fault.get("ctx", {}).get("error") for fault in error.errors())
-        text = next((str(found) for found in raised if isinstance(found, RequestError)), None) or describe(error)
+        text = next((str(found) for found in raised if isinstance(found, RequestError)), None) or describe(error, name)
     else:
         text = " ".join(str(error).split())
     return "".join(character if character.isprintable() else ascii(character)[1:-1] for character in text)

@@ -1,6 +1,7 @@
 """Reading of JSON files by a schema, with one sentence about the first fault, which names the file and the field."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -10,6 +11,8 @@ from stage import inputs
 from stage.errors import ManifestError
 
 Record = TypeVar("Record", bound=BaseModel)
+FieldName = Callable[[tuple[int | str, ...]], str]
+"""Makes the name of a field, as a sentence has it, from its pydantic location."""
 MAX_KEYS = 1000
 """The most keys of a JSON object: no schema has as many, and an error is collected for each unknown key."""
 MOST_SHOWN = 60
@@ -51,12 +54,17 @@ def read_record(path: str | Path, model: type[Record], schema: str) -> Record:
         raise ManifestError(f"{path}: {describe(error)}") from error
 
 
-def describe(error: ValidationError) -> str:
-    """Return the first fault of a pydantic error as `field: what is wrong`, with the count of the other faults."""
+def describe(error: ValidationError, name: FieldName | None = None) -> str:
+    """Return the first fault of a pydantic error as `field: what is wrong`, with the count of the other faults.
+
+    Args:
+        error: with one fault or more.
+        name: names the field; None: as `field_name` does.
+    """
     places = {fault["loc"][:n] for fault in error.errors() for n in range(len(fault["loc"]))}
     faults = [fault for fault in error.errors() if fault["loc"] not in places]  # a fault of an entry replaces the fault of its list
     fault = faults[0]
-    where = _field(fault["loc"])
+    where = (name or field_name)(fault["loc"])
     match fault["type"]:
         case "extra_forbidden":
             text = "is not a known key"
@@ -83,7 +91,7 @@ def describe(error: ValidationError) -> str:
     return f"{where}: {text}{more}" if where else f"{text}{more}"
 
 
-def _field(location: tuple[int | str, ...]) -> str:
+def field_name(location: tuple[int | str, ...]) -> str:
     """Return a field such as `frames[3].light.direction` from a pydantic location, which also names union members after their key."""
     text = ""
     previous: int | str = ""

@@ -23,16 +23,18 @@ results by the role of the field.
 """
 
 import inspect
+import re
 from collections.abc import Callable, Mapping
 from enum import Enum
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Generic, Literal, get_args, get_origin
 
 import typer
-from pydantic import BaseModel, BeforeValidator
+from pydantic import BaseModel, BeforeValidator, ValidationError
 
 from service.requests.base import Options, Role
-from service.requests.options import Model, Option, build, help_text, options_of, typed
+from service.requests.options import Model, Option, build, help_text, options_of, typed, typed_name
 
 ORDER = (Role.INPUT, Role.OUTPUT, Role.CHOICE, Role.PART, Role.RUN, Role.MACHINE)
 """The order in which the help lists options."""
@@ -65,9 +67,14 @@ class Given(Generic[Model]):
         """Make the model, with some values in place of those that were typed.
 
         Raises:
-            ValidationError: a value cannot be used, or one is missing.
+            RequestError: a value cannot be used, or one is missing; the message names the option as it is typed.
         """
-        return build(self.model, {**self.values, **changes})
+        try:
+            return build(self.model, {**self.values, **changes})
+        except ValidationError as error:
+            from service.errors import RequestError, sentence  # which import what a request needs, and the start of the program does not
+
+            raise RequestError(sentence(error, partial(typed_name, self.model))) from error
 
 
 def local_command(group: typer.Typer, name: str, function: Callable[..., None]) -> None:
@@ -106,7 +113,7 @@ def command(group: typer.Typer, name: str, function: Callable[..., None], *, wit
         signature.append(inspect.Parameter("device", inspect.Parameter.KEYWORD_ONLY, annotation=HostOption, default=None))
     run.__signature__ = inspect.Signature(signature)  # type: ignore[attr-defined]
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in signature}
-    group.command(name, help=inspect.getdoc(function) or inspect.getdoc(next(iter(models.values()))))(run)
+    group.command(name, help=_literal(inspect.getdoc(function) or inspect.getdoc(next(iter(models.values()))) or ""))(run)
 
 
 def _model(annotation: Any) -> type[Options] | None:
@@ -137,7 +144,7 @@ def _parameter(option: Option, required: bool, about: str) -> inspect.Parameter:
     default = inspect.Parameter.empty if required else _default(option)
     kind = list[_typer_type(get_args(option.kind)[0])] if option.is_repeated else _typer_type(option.kind)  # type: ignore[misc]
     has_default = default not in (inspect.Parameter.empty, None)
-    shown: dict[str, Any] = {"help": about, "metavar": option.spelling.metavar, "show_default": has_default}
+    shown: dict[str, Any] = {"help": _literal(about), "metavar": option.spelling.metavar, "show_default": has_default}
     info: Any
     if option.spelling.argument:
         info = typer.Argument(**shown)
@@ -147,6 +154,11 @@ def _parameter(option: Option, required: bool, about: str) -> inspect.Parameter:
         info = typer.Option(option.flag, **shown)
     annotation = Annotated[kind if default is not None else kind | None, info]  # type: ignore[valid-type]
     return inspect.Parameter(option.name, inspect.Parameter.KEYWORD_ONLY, annotation=annotation, default=default)
+
+
+def _literal(words: str) -> str:
+    """Return words as Typer's markup shows them unchanged: `[las]` would be a style."""
+    return re.sub(r"(?=\[[a-z#/@])", r"\\", words)
 
 
 def _default(option: Option) -> Any:

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
-from pydantic import BeforeValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field
 
 from service.requests.base import CAPTURE, Commas, DeviceRequest, Options, Request, Role, Spelling, WidthHeight
 from stage.model import Count, Finite, Positive
@@ -16,6 +16,8 @@ def _refuse(sentence: str) -> NoReturn:
 
 
 Corners = Annotated[int, Field(ge=3)]
+LARGEST_SQUARE_M = 1.0
+"""The largest side of a square of a chessboard, metres: larger numbers are millimetres."""
 IMAGES = Spelling(argument=True, metavar="IMAGE...")
 
 
@@ -61,6 +63,13 @@ def _board(given: Any) -> Any:
     if len(parts) != 2 or not all(part.isdecimal() for part in parts):
         _refuse(f"--board {given}: give two whole numbers with an x between, as 9x6")
     return tuple(map(int, parts))
+
+
+def _square(side_m: float) -> float:
+    if side_m > LARGEST_SQUARE_M:
+        _refuse(f"--square-m {side_m:g}: is {side_m:g} m, more than a square of a chessboard has: give metres, such as "
+                f"{side_m / 1000:g} for {side_m:g} mm")
+    return side_m
 
 
 def _levels(given: Any) -> Any:
@@ -190,7 +199,7 @@ class ProcamRequest(Request):
     """Folders with a capture.json, one for each pose of the board."""
     board: Annotated[tuple[Corners, Corners], BeforeValidator(_board), Spelling(metavar="9x6")]
     """Inner corners of the chessboard, across and down."""
-    square_m: Positive
+    square_m: Annotated[Positive, AfterValidator(_square)]
     """Side of a square in metres."""
     projector: Annotated[tuple[Count, Count] | None, WidthHeight, Spelling(metavar="1280x800")] = None
     """Width and height of the projector in pixels; None: as in the manifests."""

@@ -81,17 +81,32 @@ def build(model: type[Model], given: Mapping[str, Any]) -> Model:
     Raises:
         ValidationError: a value cannot be used, or one is missing.
     """
+    return model.model_validate(_values(model, given))
+
+
+def _values(model: type[BaseModel], given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return options by name as the values of a model's fields, those of a model within it in a dictionary of their own."""
     values: dict[str, Any] = {}
     for name, field in _fields(model):
         inner = nested(field)
         if inner is not None:
             if any(option.name in given for option in options_of(inner)):
-                values[name] = build(inner, given)
+                values[name] = _values(inner, given)
         elif _is_constant(field):
             values[name], = get_args(field.annotation)
         elif (option := _option(name, field)).name in given:
             values[name] = given[option.name]
-    return model.model_validate(values)
+    return values
+
+
+def typed_name(model: type[BaseModel], location: tuple[int | str, ...]) -> str:
+    """Return how the value at a place of a request is named where it is typed, such as `--max-sigma`, or `--aov, value 2` of a list."""
+    for place, option in places_of(model):
+        if location[: len(place)] == place:
+            inside = [f"value {part + 1}" if isinstance(part, int) else part for part in location[len(place) :]]
+            shown = (option.spelling.metavar or option.name.upper()) if option.spelling.argument else option.flag
+            return ", ".join([shown, *inside])
+    return ".".join(map(str, location))
 
 
 def values_of(request: BaseModel) -> Iterator[tuple[Option, Any]]:

@@ -29,7 +29,7 @@ from service.requests import (
     view,
 )
 from service.requests.base import Choice, Options, Role
-from service.requests.options import build, options_of, typed, values_of
+from service.requests.options import build, help_text, options_of, typed, values_of
 
 COMMANDS: dict[str, list[type[Options]]] = {
     "solve": [solve.SolveRequest], "export": [export.ExportRequest], "inspect": [inspect.InspectRequest],
@@ -169,3 +169,24 @@ def test_every_choice_is_explained_once():
     for option in options_of(solve.SolveRequest):
         if isinstance(option.kind, type) and issubclass(option.kind, Choice):
             assert all(f"{value}: {value.words}" in shown("solve")[option.name].help for value in option.kind)
+
+
+def commands(group: Any, words: tuple[str, ...] = ()) -> Any:
+    for name, command in group.commands.items():
+        yield from commands(command, (*words, name)) if hasattr(command, "commands") else [((*words, name), command)]
+
+
+@pytest.mark.parametrize("words", [words for words, _ in commands(get_command(app))], ids=" ".join)
+def test_a_help_shows_every_word(relit, monkeypatch, words):
+    """Brackets too, which the markup of the help would take for a style."""
+    monkeypatch.setenv("COLUMNS", "4000")  # so that no cell is wrapped
+
+    def letters(text: str) -> str:
+        return re.sub(r"[\s│╭╮╰╯─*]", "", text)
+
+    said = letters(relit(*words, "--help").out)
+    models = {option.name: (option, model) for model in reversed(COMMANDS.get(" ".join(words), [])) for option in options_of(model)}
+    for name in parameters(" ".join(words)):
+        if name in models and words[0] != "submit":
+            assert letters(help_text(*models[name])) in said
+    assert " ".join(words) != "scan" or "'relit[las]'" in said
