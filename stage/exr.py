@@ -162,9 +162,8 @@ def write_parts(path: str | Path, parts: Sequence[Part], *, metadata: Mapping[st
         header: dict[str, Any] = {"compression": part.compression, "type": OpenEXR.scanlineimage, "colorInteropID": part.color_space}
         if part.compression == Compression.DWAA:
             header["dwaCompressionLevel"] = DWA_LEVEL
-        chromaticities = OpenEXR.colorInteropIDToChromaticities(part.color_space)
-        if chromaticities is not None:
-            header["chromaticities"] = chromaticities
+        if (declared := chromaticities(part.color_space)) is not None:
+            header["chromaticities"] = declared
         header |= {name: value for name, value in metadata.items() if not written or name in SHARED}
         written.append((header, {name: np.ascontiguousarray(plane) for name, plane in part.channels.items()}, part.name))
     with replacing(path) as temporary:
@@ -191,6 +190,11 @@ PRIMARIES_TOLERANCE = 2e-3
 """The largest difference of a chromaticity coordinate, because writers round the coordinates."""
 
 
+def chromaticities(space: str) -> Sequence[float] | None:
+    """Return x and y of red, green, blue and white of a colour space; None: the library does not know it."""
+    return OpenEXR.colorInteropIDToChromaticities(space)
+
+
 def color_space_of(metadata: Mapping[str, Any], default: str = "lin_rec709_scene") -> str:
     """Return the scene-linear colour space that a header declares by `colorInteropID` or by `chromaticities`, else `default`.
 
@@ -202,7 +206,7 @@ def color_space_of(metadata: Mapping[str, Any], default: str = "lin_rec709_scene
     if (given := metadata.get("chromaticities")) is None:
         return default
     for space in PRIMARIES:
-        if np.allclose(given, OpenEXR.colorInteropIDToChromaticities(space), atol=PRIMARIES_TOLERANCE):
+        if (known := chromaticities(space)) is not None and np.allclose(given, known, atol=PRIMARIES_TOLERANCE):
             return space
     raise ValueError("has chromaticities of no known colour space: convert it to Rec.709, Rec.2020, P3-D65, ACEScg or ACES2065-1")
 

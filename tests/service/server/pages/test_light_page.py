@@ -1,10 +1,16 @@
 """Live relighting shows what `relit relight` makes, and sends exactly that to the batch."""
 
+import shutil
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from service.client import Client
 from stage import exr
-from tests.service.server.pages.conftest import SAMPLES
+from stage.colour import rgb_matrix
+from tests.scenes.captures import edit_manifest
+from tests.service.server.pages.conftest import SAMPLES, Solved, done
 
 CAPTURED = 7
 """A light of the sample, from whose direction its photograph is compared."""
@@ -38,8 +44,9 @@ def rendered(page, solved, folder) -> tuple[np.ndarray, np.ndarray]:
     page.wait_for_url("**/jobs/job_*")
     page.locator(".state.succeeded").wait_for(timeout=120_000)
     job = page.url.rpartition("/")[2]
-    channels, _ = exr.read(solved.result(job, "frame.0001.exr", folder))
-    return encoded(np.stack([channels[c] for c in "RGB"], axis=-1)), channels["A"]
+    channels, metadata = exr.read(solved.result(job, "frame.0001.exr", folder))
+    to_screen = rgb_matrix(exr.color_space_of(metadata), "lin_rec709_scene")
+    return encoded(np.stack([channels[c] for c in "RGB"], axis=-1).astype(np.float32) @ to_screen.T), channels["A"]
 
 
 def assert_same(shown: np.ndarray, frame: np.ndarray, coverage: np.ndarray) -> None:
@@ -140,6 +147,65 @@ def test_an_environment_shows_what_the_batch_renders(page, solved, sky, tmp_path
     page.get_by_role("button", name="Expose for this light").click()
     shown = picture(page)
     assert_same(shown, *rendered(page, solved, tmp_path))
+
+
+@pytest.fixture(scope="module")
+def aces(server, tmp_path_factory) -> Solved:
+    """The sample as a capture whose colours are ACEScg."""
+    folder = shutil.copytree(SAMPLES / "lambert", tmp_path_factory.mktemp("aces") / "aces")
+    edit_manifest(folder, name="aces", color_space="lin_ap1_scene")
+    for image in folder.glob("*.exr"):
+        channels, _ = exr.read(image)
+        exr.write(image, channels, color_space="lin_ap1_scene", metadata={})
+    with Client(server.url) as uploading, server.client() as client:
+        capture = uploading.captures.upload(folder).id
+        done(server, client, {"kind": "view", "capture": capture})
+    return Solved(server, capture, "")
+
+
+@pytest.fixture(scope="module")
+def wide_sky(server, tmp_path_factory) -> str:
+    """The sample's environment, its colours made saturated, in ACEScg, which the file declares by chromaticities alone."""
+    path = tmp_path_factory.mktemp("wide") / "wide.exr"
+    channels, _ = exr.read(SAMPLES / "owl" / "environment.exr")
+    rgb = np.stack([channels[c] for c in "RGB"], axis=-1) * np.linspace((0.1, 1, 3), (3, 1, 0.1), channels["R"].shape[1])
+    planes = dict(zip("RGB", np.moveaxis((rgb @ rgb_matrix("lin_rec709_scene", "lin_ap1_scene").T).astype(np.float32), -1, 0), strict=True))
+    write_with_chromaticities(path, planes)
+    with Client(server.url) as client:
+        return client.environments.upload(path).id
+
+
+def write_with_chromaticities(path: Path, planes: dict[str, np.ndarray]) -> None:
+    import OpenEXR
+
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "chromaticities": exr.chromaticities("lin_ap1_scene")}
+    OpenEXR.File(header, {name: np.ascontiguousarray(plane) for name, plane in planes.items()}).write(str(path))
+
+
+@pytest.mark.parametrize("capture", ["solved", "aces"])
+def test_colours_are_converted_as_the_batch_converts_them(page, capture, wide_sky, tmp_path, request):
+    """A key light is chosen in the colours of the screen, and maps and captures have colour spaces of their own."""
+    shown_capture = request.getfixturevalue(capture)
+    page.goto(shown_capture.pages["light"])
+    shown_capture.wait_for_content(page, "light")
+    page.get_by_label("Size of the light in degrees").fill("10")
+    page.locator("input[type=color]").fill("#ff4020")
+    page.get_by_label("Environment map").select_option(wide_sky)
+    page.locator("canvas.preview").wait_for(timeout=60_000)
+    page.get_by_role("button", name="Expose for this light").click()
+    shown = picture(page)
+    assert_same(shown, *rendered(page, shown_capture, tmp_path))
+
+
+def test_an_unknown_colour_space_is_named(opened, tmp_path):
+    import OpenEXR
+
+    path = tmp_path / "odd.exr"
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage,
+              "chromaticities": (0.5, 0.3, 0.3, 0.5, 0.2, 0.1, 0.33, 0.33)}
+    OpenEXR.File(header, {name: np.ones((8, 16), dtype=np.float32) for name in "RGB"}).write(str(path))
+    opened.set_input_files("input[accept='.exr,.hdr']", path)
+    opened.get_by_role("alert").get_by_text("odd.exr: has chromaticities of no known colour space").wait_for(timeout=60_000)
 
 
 def test_a_local_environment_is_shown_and_not_sent(opened):

@@ -4,6 +4,7 @@ import { Group, LinearToneMapping, Matrix4 } from "three";
 import { element, tell } from "../element.js";
 import { openAsset } from "./asset_file.js";
 import { Lighting, meanIrradiance, neutralRoom, stopsFor } from "./asset_lighting.js";
+import { converted, DISPLAY_SPACE, matrixBetween } from "./colour_spaces.js";
 import { VIEW_TRANSFORM } from "./display.js";
 import { previewOf, readEnvironment } from "./environment_map.js";
 import { OrbitScene } from "./orbit_scene.js";
@@ -76,8 +77,9 @@ export async function mount(parent, file, { rig = null, environments = [], load 
       irradiance = meanIrradiance(shown);
     } else {
       const { frame } = lights.find(({ index }) => index === Number(chosen));
-      lighting.byLight(frame.direction, frame.irradiance ?? [1, 1, 1]);
-      irradiance = Math.max(...(frame.irradiance ?? [1]));
+      const shown = frame.irradiance === null ? [1, 1, 1] : converted(matrixBetween(rig.color_space, DISPLAY_SPACE), frame.irradiance);
+      lighting.byLight(frame.direction, shown);
+      irradiance = Math.max(...shown);
     }
     markers.choose(chosen === ROOM || chosen === MAP ? null : Number(chosen));
     turnRow.hidden = chosen !== MAP;
@@ -103,7 +105,7 @@ export async function mount(parent, file, { rig = null, environments = [], load 
   async function use(read) {
     try {
       const { name, data } = await read();
-      map = { name, ...(await readEnvironment(data, name)) };
+      map = { name, ...(await readEnvironment(data, name, DISPLAY_SPACE)) };
     } catch (error) {
       tell(error.message);
       return;

@@ -1,6 +1,6 @@
 /** Draws the sum of coefficient images in WebGL2: one half-float texture layer for each, the coefficients in a small texture. */
 
-import { displayMatrix } from "./display.js";
+import { DISPLAY_SPACE, matrixBetween } from "./colour_spaces.js";
 
 const VERTEX = `#version 300 es
 void main() {
@@ -60,7 +60,7 @@ export class BasisRenderer {
     gl.uniform1i(this.#places.matte, 1);
     gl.uniform1i(this.#places.coefficients, 2);
     gl.uniform1i(this.#places.terms, relight.terms);
-    gl.uniformMatrix3fv(this.#places.rec709, true, displayMatrix(space) ?? [1, 0, 0, 0, 1, 0, 0, 0, 1]);
+    gl.uniformMatrix3fv(this.#places.rec709, true, matrixBetween(space, DISPLAY_SPACE));
     gl.activeTexture(gl.TEXTURE0);
     gl.bindTexture(gl.TEXTURE_2D_ARRAY, gl.createTexture());
     gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, gl.RGBA16F, relight.cols, relight.rows, relight.terms);

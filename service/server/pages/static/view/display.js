@@ -1,5 +1,7 @@
 /** Values as colours of the screen: named colour maps for numbers, and a named view transform for scene-linear colours. */
 
+import { converted, DISPLAY_SPACE, matrixBetween } from "./colour_spaces.js";
+
 const ANCHORS = { // matplotlib's viridis at every sixteenth
   viridis: "440154 48186a 472d7b 424086 3b528b 33638d 2c728e 26828e 21918c 1fa088 28ae80 3fbc73 5ec962 84d44b addc30 d8e219 fde725",
   grey: "000000 ffffff",
@@ -12,11 +14,6 @@ export const COLOUR_MAPS = Object.keys(ANCHORS);
 export const VIEW_TRANSFORM = "sRGB (linear Rec.709, clipped, no tone mapping)";
 /** Colours of codes, which differ for people with any colour vision as far as nine colours can (Okabe and Ito 2008, and grey). */
 const CODE_COLOURS = ["009e73", "e69f00", "56b4e9", "f0e442", "0072b2", "d55e00", "cc79a7", "777777", "202020"].map(bytesOf);
-/** From each working space to linear Rec.709. */
-const TO_REC709 = {
-  lin_rec709_scene: null,
-  lin_ap1_scene: [1.70505, -0.62179, -0.08326, -0.13026, 1.1408, -0.01055, -0.024, -0.12897, 1.15297], // ACEScg, Bradford-adapted (ACES TB-2014-004)
-};
 
 function bytesOf(hex) {
   return [0, 2, 4].map((at) => parseInt(hex.slice(at, at + 2), 16));
@@ -54,16 +51,6 @@ const ENCODED = Uint8ClampedArray.from({ length: 4096 }, (_, index) => {
   return Math.round(255 * (value <= 0.0031308 ? 12.92 * value : 1.055 * value ** (1 / 2.4) - 0.055));
 });
 
-/** Return the matrix from a working space to linear Rec.709, row by row; null: it is that space. */
-export function displayMatrix(space) {
-  return TO_REC709[space] ?? null;
-}
-
-/** Return whether colours of a space can be shown as they are meant. */
-export function isKnownSpace(space) {
-  return space in TO_REC709;
-}
-
 /**
  * Paint a tile.
  * @param {any} layer Of view.json.
@@ -85,9 +72,9 @@ export function paint(layer, tile, look) {
     }
   } else if (layer.kind === "colour") {
     const gain = 2 ** look.stops;
-    const m = displayMatrix(look.space);
+    const m = matrixBetween(look.space, DISPLAY_SPACE);
     for (let at = 0, to = 0; at < count; at += 1, to += 4) {
-      const [r, g, b] = m === null ? [x[at], y[at], z[at]] : [0, 3, 6].map((row) => m[row] * x[at] + m[row + 1] * y[at] + m[row + 2] * z[at]);
+      const [r, g, b] = converted(m, [x[at], y[at], z[at]]);
       data[to] = srgbByte(gain * r);
       data[to + 1] = srgbByte(gain * g);
       data[to + 2] = srgbByte(gain * b);

@@ -1,7 +1,7 @@
 /** Layers of a view as an image that can be zoomed and compared, with the value under the cursor. */
 
 import { element, tell } from "../element.js";
-import { COLOUR_MAPS, isKnownSpace, VIEW_TRANSFORM } from "./display.js";
+import { COLOUR_MAPS, VIEW_TRANSFORM } from "./display.js";
 import { mountHistogram, short } from "./histogram.js";
 import { codeWords, OUTSIDE, REFUSED, stateOf, UNSURE } from "./pixel_states.js";
 import { TiledImage } from "./tiled_image.js";
@@ -40,8 +40,7 @@ export function mount(parent, view, { onpick = () => {} } = {}) {
   const panel = element("div", { class: "panel" }, named("Layer", layerSelect), named("Compare with", otherSelect), wipeRow,
     named("Hatch unsure pixels", hatched.unsure), named("Hatch refused pixels", hatched.refused), colourRow, stopsRow, histogram,
     element("p", { class: "actions" }, button("Zoom in", () => zoom(ZOOM)), button("Zoom out", () => zoom(1 / ZOOM)), button("Show all", fit)),
-    element("p", { class: "help" }, `Colours are shown through ${VIEW_TRANSFORM}.`,
-      isKnownSpace(view.info.color_space) ? "" : ` The space ${view.info.color_space} is shown as if it were linear Rec.709.`));
+    element("p", { class: "help" }, `Colours are shown through ${VIEW_TRANSFORM}.`));
   parent.replaceChildren(element("div", { class: "viewer" }, element("div", { class: "stage" }, canvas, value), panel));
 
   let place = { x: 0, y: 0, scale: 1 };

@@ -2,7 +2,8 @@
 
 import { element, tell } from "../element.js";
 import { BasisRenderer, canRender } from "./basis_renderer.js";
-import { isKnownSpace, VIEW_TRANSFORM } from "./display.js";
+import { converted, DISPLAY_SPACE, matrixBetween } from "./colour_spaces.js";
+import { VIEW_TRANSFORM } from "./display.js";
 import { mountDomeControl } from "./dome_control.js";
 import { previewOf, readEnvironment } from "./environment_map.js";
 import { EnvironmentProfile, LightModel, unit } from "./light_model.js";
@@ -58,8 +59,7 @@ export async function mount(parent, view, { environments, load, onchange }) {
       row("Turn (degrees)", control.turn), play),
     element("fieldset", {}, element("legend", {}, "Picture"), row("Exposure (stops)", control.exposure),
       element("button", { type: "button", class: "quiet", onclick: () => { expose(); change(); } }, "Expose for this light"), row("Compare with the photograph", control.compare), wipeRow,
-      element("p", { class: "help" }, `Shown through ${VIEW_TRANSFORM}, from ${relight.terms} coefficient images, which keep the captured images within ${(100 * relight.relative_rms).toPrecision(2)} % (RMS).`,
-        isKnownSpace(view.info.color_space) ? "" : ` The space ${view.info.color_space} is shown as if it were linear Rec.709.`)));
+      element("p", { class: "help" }, `Shown through ${VIEW_TRANSFORM}, from ${relight.terms} coefficient images, which keep the captured images within ${(100 * relight.relative_rms).toPrecision(2)} % (RMS).`)));
   parent.replaceChildren(element("div", { class: "viewer" }, element("div", { class: "stage" }, canvas, warning), panel));
 
   const { quadrature } = relight;
@@ -70,6 +70,7 @@ export async function mount(parent, view, { environments, load, onchange }) {
   const matte = new Uint8Array(await view.block(relight.matte));
   renderer.setMatte(matte);
   const unitIrradiance = Math.max(...(lights[0]?.irradiance ?? [1]));
+  const fromDisplay = matrixBetween(DISPLAY_SPACE, view.info.color_space);
   const light = { direction: unit(FIRST_LIGHT) };
   let map = null; // { id, name, profile }
   let asked = false;
@@ -127,11 +128,12 @@ export async function mount(parent, view, { environments, load, onchange }) {
   }
 
   function sumOf(now) {
-    return model.sum(now.light, map === null ? null : model.turned(map.profile, now.environment.turn_degrees, 2 ** now.environment.exposure));
+    const key = now.light === null ? null : { ...now.light, irradiance: converted(fromDisplay, now.light.irradiance) };
+    return model.sum(key, map === null ? null : model.turned(map.profile, now.environment.turn_degrees, 2 ** now.environment.exposure));
   }
 
   async function useEnvironment(id, name, data) {
-    const found = await readEnvironment(data, name);
+    const found = await readEnvironment(data, name, view.info.color_space);
     map = { id, name, profile: new EnvironmentProfile(found, model.rows) };
     preview.replaceChildren(previewOf(found));
     change();
