@@ -17,6 +17,10 @@ class DistantLight(Strict):
     """The irradiance at normal incidence in relative units, which are the same for all lights of a capture."""
 
 
+PLACEHOLDER = DistantLight(type="distant", direction=(0.0, 0.0, 1.0), irradiance=(1.0, 1.0, 1.0))
+"""The light that a manifest gives to frames whose light is yet to be measured, in place of each."""
+
+
 class PointLight(Strict):
     """A point light at a finite distance d, whose irradiance at normal incidence is intensity · cos^μ / d².
 

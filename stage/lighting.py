@@ -5,9 +5,12 @@ import numpy as np
 from stage.capture import SOURCES, Capture
 from stage.errors import ManifestError
 from stage.extended_lights import ExtendedLights, extended_lights, lie_in_one_plane
-from stage.light import DistantLight, ExtendedLight, GradientLight, PointLight
+from stage.light import PLACEHOLDER, DistantLight, ExtendedLight, GradientLight, PointLight
 from stage.manifest import FILE_NAME
 from stage.point_lights import DistantLights, PlacedLights, place_lights
+
+MEASURED_BY = "relit calibrate mirror-ball or light-positions measures where they are, grey-ball or intensity how strong"
+"""How placeholders are replaced."""
 
 
 def distant_lights(capture: Capture) -> DistantLights:
@@ -27,6 +30,12 @@ def distant_lights(capture: Capture) -> DistantLights:
     return DistantLights(np.array([light.direction for light in lights]), np.array([light.irradiance for light in lights]))
 
 
+def has_placeholders(capture: Capture) -> bool:
+    """Return whether the lights of a capture are yet to be measured: two frames or more are lit, all of them by the placeholder."""
+    lit = [frame.light for frame in capture.sources()]
+    return len(lit) > 1 and all(light == PLACEHOLDER for light in lit)
+
+
 def check_solvable(capture: Capture) -> DistantLights | PlacedLights | ExtendedLights:
     """Check that a normal can be solved from a capture, and return its lights.
 
@@ -35,9 +44,12 @@ def check_solvable(capture: Capture) -> DistantLights | PlacedLights | ExtendedL
 
     Raises:
         ManifestError: there are fewer than three lights, all lights lie in one plane through the centre of the object, a point
-            light stands at an impossible position, the image has one pixel, or a channel has no light.
+            light stands at an impossible position, the image has one pixel, a channel has no light, or the lights are placeholders.
     """
     where = capture.folder / FILE_NAME
+    if has_placeholders(capture):
+        raise ManifestError(f"{where}: frames[].light: all are the placeholder, direction [0, 0, 1] and irradiance [1, 1, 1]: "
+                            f"{MEASURED_BY}")
     if capture.lit_by(ExtendedLight):
         check_surface(capture)
         return extended_lights(capture)

@@ -15,11 +15,13 @@ from stage import images
 from stage.capture import Capture
 from stage.correction import Correction
 from stage.errors import StageError
+from stage.front_lights import front_lights
 from stage.gradients import gradient_frames, has_gradients
 from stage.light import DistantLight, PointLight
-from stage.lighting import check_solvable
+from stage.lighting import MEASURED_BY, check_solvable, has_placeholders, lights_from_centre
 from stage.manifest import Frame
 from stage.point_lights import PlacedLights, place_lights
+from stage.tof.frames import check_frames, read_frame
 
 
 class Inspection(NamedTuple):
@@ -32,9 +34,12 @@ class Inspection(NamedTuple):
 class _FrameLevel(NamedTuple):
     """The readings of one frame."""
 
+    lowest: float
     peak: float
     saturated: int
     fault: str | None
+    unread: int = 0
+    """Readings of a time-of-flight frame that are not finite."""
 
 
 def inspect(path: Path, progress: Progress | None = None) -> Inspection:
@@ -46,9 +51,8 @@ def inspect(path: Path, progress: Progress | None = None) -> Inspection:
     timings = Timings(progress)
     timings.stage("open", 1)
     capture = Capture.open(path)
-    frames = [frame for frame in capture.manifest.frames if Path(frame.image).suffix.lower() != ".npy"]
-    if frames:
-        timings.stage("frames", len(frames))
+    frames = capture.manifest.frames
+    timings.stage("frames", len(frames))
     levels = []
     with ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="relit-inspect") as pool:
         for level in pool.map(lambda frame: _level(capture, frame), frames):
@@ -58,8 +62,13 @@ def inspect(path: Path, progress: Progress | None = None) -> Inspection:
     faults = [level.fault for level in levels if level.fault is not None]
     faults += standing_faults(capture, readable=not faults)
     facts = list(_facts(capture))
-    if levels:
-        facts.append(("brightest", f"{max(level.peak for level in levels):.4g} recorded"))
+    read = [level for level in levels if level.fault is None]
+    if read:
+        lowest, peak = min(level.lowest for level in read), max(level.peak for level in read)
+        facts.append(("recorded", f"{lowest:.4g} to {peak:.4g}: correlation images have both signs") if lowest < 0 else
+                     ("brightest", f"{peak:.4g} recorded"))
+    if unread := sum(level.unread for level in read):
+        facts.append(("not finite", f"{unread} readings, which count as saturated"))
     if capture.manifest.saturation is not None:
         count = sum(level.saturated for level in levels)
         facts.append(("saturated", f"{count} readings at or above {capture.manifest.saturation:g}"))
@@ -80,14 +89,16 @@ def standing_faults(capture: Capture, *, readable: bool = True) -> list[str]:
         readable: whether all frames are; else dark and flat frames are not looked at, because they are read with the ambient frames.
     """
     faults = []
-    if capture.sources():
-        try:
+    try:
+        if any(frame.tof is not None for frame in capture.manifest.frames):
+            check_frames(capture)
+        if capture.sources() and not has_placeholders(capture):
             if has_gradients(capture):
                 gradient_frames(capture)
             else:
                 check_solvable(capture)
-        except StageError as error:
-            faults.append(str(error))
+    except StageError as error:
+        faults.append(str(error))
     try:
         capture.mask()
     except StageError as error:
@@ -114,11 +125,16 @@ def _facts(capture: Capture) -> Iterator[tuple[str, str]]:
         given.append("exposure_s")
     yield "given", ", ".join(given) or "nothing beside the frames"
     directions = np.array([light.direction for _, light in capture.lit_by(DistantLight)])
-    if len(directions):
+    if has_placeholders(capture):
+        yield "lights", f"{len(directions)} placeholders: {MEASURED_BY}"
+    elif len(directions):
         behind = int((directions[:, 2] < 0).sum())
         widest = np.degrees(np.arccos(np.clip(directions[:, 2].min(), -1, 1)))
         yield "lights", f"{len(directions)} distant, up to {widest:.0f} degrees from the view axis, {behind} behind the object"
         yield "irradiance", manifest.irradiance_scale
+    with suppress(StageError):
+        if not has_placeholders(capture) and (front := front_lights(lights_from_centre(capture).direction)) is not None:
+            yield "not seen", front.sentence()
 
 
 def _near_lights(lights: PlacedLights) -> str:
@@ -137,13 +153,20 @@ def _kind(frame: Frame) -> str:
 
 
 def _level(capture: Capture, frame: Frame) -> _FrameLevel:
-    """Return the brightest value and the saturated readings of one frame, or its fault."""
+    """Return the lowest and the brightest value and the saturated readings of one frame, or its fault."""
     path = capture.file(frame.image)
     try:
-        pixels = images.read_pixels(path)
-        images.check_radiance(path, pixels)
+        if frame.tof is not None:
+            pixels = read_frame(capture, frame)[..., None]
+        else:
+            pixels = images.read_pixels(path)
+            images.check_radiance(path, pixels)
     except StageError as error:
-        return _FrameLevel(0.0, 0, str(error))
+        return _FrameLevel(0.0, 0.0, 0, str(error))
     limit = capture.manifest.saturation
     saturated = 0 if limit is None else int((pixels >= limit).any(axis=-1).sum())
-    return _FrameLevel(float(pixels.max()), saturated, None)
+    finite = np.isfinite(pixels)
+    if not finite.any():
+        return _FrameLevel(0.0, 0.0, 0, f"{path}: no reading is finite")
+    lowest, peak = float(pixels.min(where=finite, initial=np.inf)), float(pixels.max(where=finite, initial=-np.inf))
+    return _FrameLevel(lowest, peak, saturated, None, int(finite.size - finite.sum()))

@@ -87,18 +87,10 @@ def read_histograms(capture: Capture) -> Histograms:
             file.
     """
     frames = _frames(capture, Pulsed)
-    manifest = capture.folder / FILE_NAME
     if not frames:
-        raise ManifestError(f"{manifest}: frames[].tof: none is pulsed")
+        raise ManifestError(f"{capture.folder / FILE_NAME}: frames[].tof: none is pulsed")
     first = frames[0][1]
-    for frame, tof in frames:
-        if (abs(tof.bin_s - first.bin_s) > SAME_TIME * first.bin_s or abs(tof.start_s - first.start_s) > SAME_TIME * first.bin_s
-                or tof.first_photon_only != first.first_photon_only or tof.count_scale != first.count_scale):
-            raise ManifestError(f"{manifest}: frames[].tof: the bins of {frame.image} are others than those of {frames[0][0].image}, or "
-                                "its counts have another scale: give one capture for each")
-        if tof.first_photon_only and tof.pulses is None:
-            raise ManifestError(f"{manifest}: frames[].tof.pulses: is missing for {frame.image}: pile-up of a detector that counts first "
-                                "photons only is corrected with it")
+    _check_bins(capture, frames)
     total: np.ndarray | None = None
     for frame, _ in frames:
         counts = _histogram(capture, frame)
@@ -109,6 +101,41 @@ def read_histograms(capture: Capture) -> Histograms:
     given = [tof.pulses for _, tof in frames if tof.pulses is not None]
     return Histograms(total, first.bin_s, first.start_s, sum(given) if len(given) == len(frames) else None, first.first_photon_only,
                       read_source(capture), first.count_scale)
+
+
+def check_frames(capture: Capture) -> None:
+    """Check that the time-of-flight frames of a capture go together: one kind, one place of the source, and the same bins.
+
+    Raises:
+        ManifestError: they do not; the message names the frames.
+    """
+    if is_pulsed(capture):
+        _check_bins(capture, _frames(capture, Pulsed))
+    read_source(capture)
+
+
+def read_frame(capture: Capture, frame: Frame) -> np.ndarray:
+    """Read the recorded values of one time-of-flight frame.
+
+    Returns:
+        [rows, cols] float32 of a correlation image, which may be negative or not finite; [rows · cols, bins] float32 counts of histograms.
+
+    Raises:
+        ImageError: the file is unreadable or has another size than the camera, or holds impossible counts; the message names the file.
+    """
+    return _histogram(capture, frame) if isinstance(frame.tof, Pulsed) else _plane(capture, frame)
+
+
+def _check_bins(capture: Capture, frames: list[tuple[Frame, Pulsed]]) -> None:
+    manifest, first = capture.folder / FILE_NAME, frames[0][1]
+    for frame, tof in frames:
+        if (abs(tof.bin_s - first.bin_s) > SAME_TIME * first.bin_s or abs(tof.start_s - first.start_s) > SAME_TIME * first.bin_s
+                or tof.first_photon_only != first.first_photon_only or tof.count_scale != first.count_scale):
+            raise ManifestError(f"{manifest}: frames[].tof: the bins of {frame.image} are others than those of {frames[0][0].image}, or "
+                                "its counts have another scale: give one capture for each")
+        if tof.first_photon_only and tof.pulses is None:
+            raise ManifestError(f"{manifest}: frames[].tof.pulses: is missing for {frame.image}: pile-up of a detector that counts first "
+                                "photons only is corrected with it")
 
 
 def read_source(capture: Capture) -> Vector | None:

@@ -1,8 +1,17 @@
 """relit info: the facts of a capture, and every fault of it at once."""
 
+import json
+import re
+from pathlib import Path
+
 import numpy as np
+import pytest
 
 from service.captures.inspect import inspect
+from stage import exr
+from stage.capture import Capture
+from stage.errors import ManifestError
+from stage.lighting import check_solvable
 from tests.scenes import near_lights
 from tests.scenes.captures import edit_frame, make_scene, write_capture, write_exr, write_image, write_manifest
 from tests.scenes.near_lights import lamps
@@ -53,7 +62,7 @@ def test_near_lights_have_a_distance(tmp_path):
     assert facts["near lights"].startswith("5, ") and facts["near lights"].endswith("m from the object's centre")
 
 
-def test_a_capture_of_arrays_alone_has_no_frames_to_decode(tmp_path):
+def test_a_capture_of_arrays_alone(tmp_path):
     np.save(tmp_path / "00.npy", np.ones((4, 6, 32), np.float32))
     write_manifest(tmp_path, {"schema": "relit.capture/1", "name": "room", "frames": [
         {"image": "00.npy", "tof": {"type": "pulsed", "bin_s": 1e-9, "start_s": 0.0}}],
@@ -61,6 +70,73 @@ def test_a_capture_of_arrays_alone_has_no_frames_to_decode(tmp_path):
     recording = Recording()
     found = inspect(tmp_path, recording)
     assert found.faults == [] and recording.faults == [] and dict(found.facts)["frames"] == "1 time of flight"
+
+
+def correlation_images(folder, values, **manifest):
+    """Write a capture of four correlation images, each [rows, cols] float32, as EXR files."""
+    frames = []
+    for index, plane in enumerate(values):
+        exr.write(folder / f"{index}.exr", {"Y": plane}, color_space="data", metadata={})
+        frames.append({"image": f"{index}.exr", "tof": {"type": "cw", "modulation_hz": 6e7, "reference_phase_rad": index * np.pi / 2}})
+    rows, cols = values[0].shape
+    write_manifest(folder, {"schema": "relit.capture/1", "name": "room", "frames": frames, **manifest,
+                            "camera": {"projection": "perspective", "resolution": [cols, rows], "focal_px": [5, 5]}})
+    return folder
+
+
+def test_correlation_images_have_both_signs(tmp_path):
+    phase = np.linspace(1, 2, 24, dtype=np.float32).reshape(4, 6)
+    images = [100 * np.cos(phase - index * np.pi / 2).astype(np.float32) for index in range(4)]
+    found = inspect(correlation_images(tmp_path, images, saturation=99.0))
+    facts, values = dict(found.facts), np.stack(images)
+    assert found.faults == []
+    assert facts["recorded"] == f"{values.min():.4g} to {values.max():.4g}: correlation images have both signs"
+    assert facts["saturated"] == f"{(values >= 99).sum()} readings at or above 99" and "brightest" not in facts
+    images[2][0, :3] = np.nan  # as the solver takes them
+    assert dict(inspect(correlation_images(tmp_path, images)).facts)["not finite"] == "3 readings, which count as saturated"
+    images[2][:] = np.nan
+    (fault,) = inspect(correlation_images(tmp_path, images)).faults
+    assert fault == f"{tmp_path}/2.exr: no reading is finite"
+
+
+def test_faults_of_time_of_flight_are_named(tmp_path):
+    """Arrays too are read."""
+    np.save(tmp_path / "00.npy", np.full((4, 6, 32), -1.0, np.float32))
+    np.save(tmp_path / "01.npy", np.ones((4, 5, 32), np.float32))
+    write_manifest(tmp_path, {"schema": "relit.capture/1", "name": "room", "frames": [
+        {"image": f"0{index}.npy", "tof": {"type": "pulsed", "bin_s": width, "start_s": 0.0}} for index, width in enumerate((1e-9, 2e-9))],
+        "camera": {"projection": "perspective", "resolution": [6, 4], "focal_px": [5, 5]}})
+    for fault, words in zip(inspect(tmp_path).faults, ("00.npy: holds counts that are negative", "01.npy: is (4, 5, 32)", "bins of 01.npy"),
+                            strict=True):
+        assert words in fault
+
+
+def test_placeholders_are_no_fault(tmp_path):
+    """The light that docs/calibration.md recommends for frames before they are measured."""
+    write_capture(tmp_path, SCENE)
+    text = (Path(__file__).parents[3] / "docs" / "calibration.md").read_text(encoding="utf-8")
+    recommended = json.loads(re.search(r"placeholder such as `({.*})`", text)[1])
+    for index in range(6):
+        edit_frame(tmp_path, index, light=recommended)
+    found = inspect(tmp_path)
+    assert found.faults == []
+    assert dict(found.facts)["lights"].startswith("6 placeholders: relit calibrate mirror-ball") and "not seen" not in dict(found.facts)
+    with pytest.raises(ManifestError, match="all are the placeholder"):
+        check_solvable(Capture.open(tmp_path))
+    edit_frame(tmp_path, 3, light={"type": "distant", "direction": [0, 1, 1], "irradiance": [1, 1, 1]})
+    assert any("lie in one plane" in fault for fault in inspect(tmp_path).faults)
+
+
+def test_a_rig_in_front_says_what_it_cannot_see(tmp_path):
+    write_capture(tmp_path, SCENE)
+    for index in range(6):
+        turn = np.radians(60 * index)
+        edit_frame(tmp_path, index, light={"type": "distant", "direction": [np.cos(turn), np.sin(turn), 0.9], "irradiance": [1, 1, 1]})
+    said = dict(inspect(tmp_path).facts)["not seen"]
+    assert "within 48 degrees" in said and "more than 24 degrees" in said  # atan(1 / 0.9), and half of it
+    assert "83 % of all directions" in said  # (1 + cos 48°) / 2
+    edit_frame(tmp_path, 2, light={"type": "distant", "direction": [0, 1, -0.1], "irradiance": [1, 1, 1]})
+    assert "not seen" not in dict(inspect(tmp_path).facts)
 
 
 def test_gradient_frames_that_lack_an_axis_are_a_fault(tmp_path):
