@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PYTEST := $(BIN)/python -m pytest -q -n auto --maxprocesses 4 --dist loadfile
 
-.PHONY: demo serve test test-all clients lint bench gpu-bench figures samples screenshots lock vendor clean
+.PHONY: demo serve test test-all clients lint bench gpu-bench figures samples screenshots lock vendor colour-table clean
 demo: $(VENV)/installed
 	$(BIN)/relit demo
 
@@ -67,6 +67,11 @@ vendor:
 	  install -D -m 644 "$(CURDIR)/.vendor/node_modules/three/$$from" "$$file" || exit 1; done
 	cd $(VENDORED) && sha256sum $$(awk '{print $$2}' SHA256SUMS) > SHA256SUMS.new && mv SHA256SUMS.new SHA256SUMS
 	rm -rf .vendor
+
+# the colour spaces that pages convert between, as the colour library has them
+colour-table: $(VENV)/installed
+	$(BIN)/python -m service.viewing.colour_table > service/server/pages/static/view/colour_table.js.new
+	mv service/server/pages/static/view/colour_table.js.new service/server/pages/static/view/colour_table.js
 
 clean:
 	rm -rf $(VENV) .clients relit-demo

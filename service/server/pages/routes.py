@@ -16,7 +16,6 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoes
 
 from service import __version__
 from service.requests.identifiers import CaptureId, JobId
-from service.server.pages.colour_spaces import colour_spaces
 from service.server.pages.forms import CAPTURE_JOBS, MAPS_JOBS, form_of
 
 HOME = Path(str(files("service.server.pages")))
@@ -37,7 +36,7 @@ HEADERS = {
 router = APIRouter(include_in_schema=False)
 templates = Environment(loader=FileSystemLoader(HOME / "templates"), autoescape=select_autoescape(), undefined=StrictUndefined,
                         trim_blocks=True, lstrip_blocks=True)
-templates.globals.update(version=__version__, static=STATIC, import_map=IMPORT_MAP, colour_spaces=colour_spaces)
+templates.globals.update(version=__version__, static=STATIC, import_map=IMPORT_MAP)
 
 
 class StaticModules(StaticFiles):
@@ -52,7 +51,6 @@ class StaticModules(StaticFiles):
 
 def install(app: FastAPI) -> None:
     """Add the pages and their files to the app."""
-    colour_spaces()  # loads the colour library, for which no visitor should wait
     app.include_router(router)
     app.mount(STATIC, StaticModules(directory=HOME / "static"), name="static")
 

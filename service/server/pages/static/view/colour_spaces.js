@@ -1,8 +1,7 @@
-/** Scene-linear colour spaces: what a file declares, and conversion between them, with the numbers of the server. */
+/** Scene-linear colour spaces: what a file declares, and conversion between them. */
 
-import { byId } from "../element.js";
+import { spaces, tolerance } from "./colour_table.js";
 
-const { spaces, tolerance } = JSON.parse(byId("colour-spaces").textContent);
 const UNITY = [1, 0, 0, 0, 1, 0, 0, 0, 1];
 
 /** The space of the screen. */
@@ -40,7 +39,7 @@ export function declaredSpace(header) {
 
 function matrixOf(space) {
   if (!(space in spaces)) throw new Error(`${space} is not a scene-linear colour space that these pages know`);
-  return spaces[space].to_rec709;
+  return spaces[space].toRec709;
 }
 
 function product(a, b) {

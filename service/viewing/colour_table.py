@@ -1,0 +1,31 @@
+"""The colour spaces that pages convert between, as the module that they load: `make colour-table` writes it, and a test compares it."""
+
+import json
+from typing import get_args
+
+from stage import exr
+from stage.colour import rgb_matrix
+from stage.colour_spaces import ColorSpaceName, is_linear, linear_space
+
+DIGITS = 6
+"""Decimals of the numbers: those that float32 surely has."""
+
+
+def colour_table() -> str:
+    """Return a JavaScript module with the matrix [9] of each scene-linear space to linear Rec.709, row by row, and its chromaticities [8].
+
+    The chromaticities are those by which EXR files declare the space: red, green, blue and white, x before y; null: files declare it by
+    its name alone.
+    """
+    spaces = {}
+    for space in filter(is_linear, get_args(ColorSpaceName)):
+        chromaticities = exr.chromaticities(space) if space in exr.PRIMARIES else None
+        spaces[space] = {"toRec709": [round(float(value), DIGITS) for value in rgb_matrix(space, linear_space("srgb_texture")).ravel()],
+                         "chromaticities": None if chromaticities is None else [round(float(value), DIGITS) for value in chromaticities]}
+    lines = ",\n".join(f"  {name}: {json.dumps(numbers)}" for name, numbers in spaces.items())
+    return ("/** Colour spaces by name, and how far declared chromaticities may differ: written by `make colour-table`. */\n"
+            f"export const spaces = {{\n{lines},\n}};\nexport const tolerance = {exr.PRIMARIES_TOLERANCE};\n")
+
+
+if __name__ == "__main__":
+    print(colour_table(), end="")
