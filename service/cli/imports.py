@@ -9,17 +9,25 @@ from service.cli.request_commands import local_command
 from service.requests.captures import (
     CameraOptions,
     DiligentImport,
+    GrayImport,
     ImageOptions,
     LpImport,
     NearLightsImport,
     OlatImport,
     OpencvGrayImport,
+    PhaseImport,
+    PhaseShift,
     RelightlabImport,
+    RigOptions,
+    ScannerImport,
     Sense,
+    StackOptions,
 )
+from service.requests.patterns import PatternAxis
 
 if TYPE_CHECKING:
     from stage.importers.layout import Imported
+    from stage.importers.patterns import Stack
     from stage.importers.view import Selection, View
 
 
@@ -28,7 +36,8 @@ def register(app: typer.Typer) -> None:
     layouts = typer.Typer(name="import", no_args_is_help=True,
                           help="Write a capture.json for files that are laid out another way; docs/captures.md shows each layout.")
     for name, function in (("diligent", _diligent), ("lp", _lp), ("relightlab", _relightlab), ("olat", _olat),
-                           ("near-lights", _near_lights), ("opencv-gray", _opencv_gray)):
+                           ("near-lights", _near_lights), ("opencv-gray", _opencv_gray), ("gray", _gray), ("phase", _phase),
+                           ("scanner", _scanner)):
         local_command(layouts, name, function)
     app.add_typer(layouts)
 
@@ -73,6 +82,44 @@ def _relightlab(request: RelightlabImport) -> None:
     from stage.importers import relightlab
 
     _print(relightlab.import_folder(request.source, request.destination))
+
+
+def _gray(request: GrayImport) -> None:
+    from stage.importers.patterns import import_gray
+    from stage.importers.sequences import GrayStack
+
+    gray = GrayStack(sequence=request.sequence, inverses=request.inverses, fine_first=request.fine_first, column_bits=request.column_bits,
+                     row_bits=request.row_bits)
+    _print(import_gray(request.source, request.folder, stack=_stack(request, request), gray=gray))
+
+
+def _phase(request: PhaseImport) -> None:
+    from stage.importers.patterns import import_phase
+    from stage.importers.sequences import GrayStack, PhaseStack
+
+    phase = PhaseStack(axes=_axes(request.axis), periods_px=request.periods, row_periods_px=request.row_periods, steps=request.steps,
+                       order=request.order, advancing=request.shift is PhaseShift.MINUS, offset_deg=request.offset_deg)
+    _print(import_phase(request.source, request.folder, stack=_stack(request, request), phase=phase, gray_images=request.gray_images,
+                        gray_stripe_px=request.gray_stripe, gray=GrayStack(inverses=request.gray_inverses,
+                                                                           fine_first=request.gray_fine_first)))
+
+
+def _scanner(request: ScannerImport) -> None:
+    from stage.importers.patterns import import_scanner
+
+    _print(import_scanner(request.source, request.folder, calibration=request.calibration, codec=request.codec, axes=_axes(request.axis),
+                          unit_m=request.unit_m, projector=request.projector, images=request.images))
+
+
+def _axes(axis: PatternAxis) -> tuple[str, ...]:
+    return ("column", "row") if axis is PatternAxis.BOTH else (axis.value,)
+
+
+def _stack(images: StackOptions, rig: RigOptions) -> "Stack":
+    from stage.importers.patterns import Stack
+
+    return Stack(projector=rig.projector, images=images.images, mask=images.mask, white=images.white, black=images.black,
+                 calibration=rig.calibration, unit_m=rig.unit_m, color_space=images.color_space)
 
 
 def _view(request: CameraOptions) -> "View":

@@ -1,13 +1,14 @@
 """What `relit import` takes: one frozen model for each layout of files."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Self
 
-from pydantic import AfterValidator
+from pydantic import AfterValidator, Field, model_validator
 
 from service.requests.base import Choice, Commas, Options, Role, Spelling, WidthHeight
+from service.requests.patterns import PatternAxis
 from stage.colour_spaces import ColorSpaceName
-from stage.model import Finite, Positive, Resolution
+from stage.model import Count, Finite, Positive, Resolution
 
 
 class ImportRequest(Options):
@@ -149,3 +150,120 @@ class NearLightsImport(CameraOptions, ImageOptions, ImportRequest):
 
 class RelightlabImport(ImportRequest):
     """A project of RelightLab (.relight), or its dome (.dome) beside the images; SRC may be the file."""
+
+
+class RigOptions(Options):
+    """The projector and the calibration of a rig."""
+
+    projector: Annotated[Resolution, WidthHeight, Spelling(metavar="1280x800")]
+    """Width and height of the projector in pixels."""
+    calibration: Annotated[Path | None, Role.INPUT] = None
+    """OpenCV file (.yml, .xml, .json) or that of SLStudio with the intrinsics of camera and projector and the pose of both; None: relit
+    calibrate procam measures them."""
+    unit_m: Positive = 1.0
+    """Metres in one unit of the translation in `calibration`, such as 0.001 for millimetres."""
+
+
+class StackOptions(Options):
+    """Which images of the folder are frames of patterns."""
+
+    images: Annotated[str | None, Spelling(metavar="GLOB")] = None
+    """Names of the frames, such as 'phase_*.png', taken in natural order; None: every image that is not named otherwise."""
+    mask: Annotated[str | None, Spelling(metavar="NAME")] = None
+    """Image of the mask; None: the one with the word mask in its name, if there is one."""
+    white: Annotated[str | None, Spelling(metavar="NAME")] = None
+    """Image under a white projection; None: the one with the word white in its name, if there is one."""
+    black: Annotated[str | None, Spelling(metavar="NAME")] = None
+    """Image under a black projection; None: the one with the word black in its name, if there is one."""
+    color_space: ColorSpaceName = "lin_rec709_scene"
+    """Colour space of the images: those of most scanners are linear."""
+
+
+class Inverses(Choice):
+    """Where the inverse images of a Gray code are."""
+
+    PAIRS = "pairs", "each image is followed by its inverse"
+    BLOCKS = "blocks", "all images of an axis, then their inverses"
+    NONE = "none", "there are none"
+
+
+class GrayImport(StackOptions, RigOptions, ImportRequest):
+    """Images of a Gray code in any order."""
+
+    sequence: Annotated[tuple[str, ...], Commas, Spelling(metavar="PART,PART,…")] = ("columns", "rows", "white", "black")
+    """What follows what in the images: columns, rows, white and black, each once or not at all."""
+    inverses: Inverses = Inverses.PAIRS
+    """Where the inverse images are."""
+    fine_first: bool = False
+    """The finest stripes come first; else the coarsest."""
+    column_bits: Count | None = None
+    """Number of images that code the columns, the finest left out where they are fewer; None: all bits of the projector."""
+    row_bits: Count | None = None
+    """Number of images that code the rows; None: all bits of the projector."""
+
+
+class PhaseShift(Choice):
+    """How the waves move from step to step."""
+
+    MINUS = "minus", "cos(2πu/P − 2πi/N), to larger columns, as relit and SLStudio do"
+    PLUS = "plus", "cos(2πu/P + 2πi/N)"
+
+
+class PhaseImport(StackOptions, RigOptions, ImportRequest):
+    """Images of phase shifts in any order, with a Gray code that numbers the periods or without."""
+
+    periods: Annotated[tuple[Positive, ...], Commas, Spelling(metavar="P,P,…")]
+    """Periods in projector pixels, in the order of the images."""
+    steps: Annotated[int, Field(ge=3)]
+    """Number of images for each period."""
+    axis: PatternAxis = PatternAxis.COLUMN
+    """The projector coordinate that is coded; both: columns first."""
+    row_periods: Annotated[tuple[Positive, ...] | None, Commas, Spelling(metavar="P,P,…")] = None
+    """Periods along the rows; None: as `periods`."""
+    order: Annotated[tuple[str, ...], Commas, Spelling(metavar="WORD,WORD,WORD")] = ("axis", "period", "step")
+    """What changes from image to image, slowest first: axis, period and step."""
+    shift: PhaseShift = PhaseShift.MINUS
+    """Direction in which the waves move from step to step."""
+    offset_deg: Finite = 0.0
+    """Phase at column 0 in the first step, degrees: a whole number of steps. Waves that are sines have -90."""
+    gray_images: Annotated[str | None, Spelling(metavar="GLOB")] = None
+    """Names of the images of a Gray code that numbers the periods."""
+    gray_stripe: Positive | None = None
+    """Width of the finest stripe of the Gray code in projector pixels: half a period, or less."""
+    gray_inverses: Inverses = Inverses.NONE
+    """Where the inverse images of the Gray code are."""
+    gray_fine_first: bool = False
+    """The finest stripes of the Gray code come first."""
+
+    @model_validator(mode="after")
+    def _stripe_of_the_code(self) -> Self:
+        if (self.gray_images is None) != (self.gray_stripe is None):
+            raise ValueError("--gray-images and --gray-stripe belong together: give both, or none")
+        return self
+
+
+class Codec(Choice):
+    """What a scanning program projects, and in which order."""
+
+    OPENCV_GRAY = "opencv-gray", "GrayCodePattern: columns and rows with inverses, white, black"
+    SLSTUDIO_GRAY = "slstudio-gray", "white, black, ten bits of columns, six of rows"
+    SLSTUDIO_PHASE_2X3 = "slstudio-phase-2x3", "three steps of 16 periods, three of one"
+    SLSTUDIO_PHASE_3 = "slstudio-phase-3", "three steps of one period"
+    SLSTUDIO_PHASE_4 = "slstudio-phase-4", "four steps of one period"
+
+
+class ScannerImport(ImportRequest):
+    """Images of a scanning program (SLStudio, or any in OpenCV's order) with its calibration file."""
+
+    calibration: Annotated[Path, Role.INPUT]
+    """Calibration of camera and projector: SLStudio's calibration.xml, or an OpenCV file (.yml, .xml, .json)."""
+    codec: Codec
+    """What was projected."""
+    unit_m: Positive
+    """Metres in one unit of the translation: SLStudio has millimetres, 0.001."""
+    axis: PatternAxis = PatternAxis.COLUMN
+    """The projector coordinate that is coded."""
+    projector: Annotated[Resolution | None, WidthHeight, Spelling(metavar="1280x800")] = None
+    """Width and height of the projector in pixels; None: as the calibration says."""
+    images: Annotated[str | None, Spelling(metavar="GLOB")] = None
+    """Names of the frames, taken in natural order; None: every image but the mask."""

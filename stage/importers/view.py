@@ -82,8 +82,8 @@ def select(folder: Path, selection: Selection) -> Selected:
         StorageError: the folder cannot be read.
     """
     names = image_names(folder)
-    mask = _named(folder, names, selection.mask, MASK_WORDS, "mask")
-    ambient = _named(folder, names, selection.ambient, AMBIENT_WORDS, "ambient")
+    mask = only_image(folder, names, selection.mask, MASK_WORDS, "mask")
+    ambient = only_image(folder, names, selection.ambient, AMBIENT_WORDS, "ambient")
     wanted = [name for name in names if name not in (mask, ambient)
               and (not words_of(name) & (MASK_WORDS | AMBIENT_WORDS) if selection.images is None else fnmatch(name, selection.images))]
     for name in wanted:
@@ -101,7 +101,12 @@ def words_of(name: str) -> frozenset[str]:
     return frozenset(text.lower().split())
 
 
-def _named(folder: Path, names: list[str], given: str | None, words: frozenset[str], what: str) -> str | None:
+def only_image(folder: Path, names: list[str], given: str | None, words: frozenset[str], what: str) -> str | None:
+    """Return the image that was named, or else the only one with one of the words in its name, or None.
+
+    Raises:
+        ManifestError: the image that was named does not exist, or several have the words.
+    """
     if given is not None:
         if given not in names:
             raise ManifestError(f"{folder}: --{what} {given}: there is no such image in the folder")

@@ -1,0 +1,176 @@
+"""Import of stacks of projected patterns: Gray codes and phase shifts in the order that options say, and the codecs of SLStudio."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any
+
+from stage.colour_spaces import ColorSpaceName
+from stage.errors import ManifestError
+from stage.importers.layout import Imported, image_names, image_resolution, write_capture
+from stage.importers.procam_file import camera_and_projector, projector_size
+from stage.importers.sequences import Entry, GrayStack, PhaseStack, describe, gray_entries
+from stage.importers.view import MASK_WORDS, only_image
+from stage.manifest import SCHEMA
+
+LINEAR: ColorSpaceName = "lin_rec709_scene"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stack:
+    """Which images of a folder are the frames of a stack, and the rig that took them."""
+
+    projector: tuple[int, int]
+    images: str | None = None
+    """The names of the frames, as the shell matches them; None: every image but mask, white and black."""
+    mask: str | None = None
+    white: str | None = None
+    black: str | None = None
+    """The images of the mask and of even light; None: the one with that word in its name, if there is one."""
+    calibration: Path | None = None
+    """OpenCV file of camera and projector; None leaves them to `relit calibrate procam`."""
+    unit_m: float = 1.0
+    """The metres in one unit of the translation in `calibration`."""
+    color_space: ColorSpaceName = LINEAR
+
+
+def import_gray(source: Path, destination: Path, *, stack: Stack, gray: GrayStack) -> Imported:
+    """Write a capture.json for a Gray code.
+
+    Raises:
+        ManifestError: images and patterns do not fit, or the calibration cannot be read; the message names the file.
+        StorageError: a file cannot be read or written.
+    """
+    return _write(source, destination, stack, gray.entries(stack.projector), ())
+
+
+def import_phase(source: Path, destination: Path, *, stack: Stack, phase: PhaseStack, gray_images: str | None = None,
+                 gray_stripe_px: float | None = None, gray: GrayStack | None = None) -> Imported:
+    """Write a capture.json for phase shifts, with a Gray code that numbers their periods or without.
+
+    Args:
+        source: the folder of the images.
+        destination: the folder of the capture; another folder than `source` gets links to, or copies of, the images.
+        stack: the frames of the phases, and the rig.
+        phase: how they were taken.
+        gray_images: the names of the images of a Gray code, as the shell matches them; None: there is none.
+        gray_stripe_px: the width of its finest stripe in projector pixels.
+        gray: how it was taken; its sequence and bits follow from the axes and the images.
+
+    Raises:
+        ManifestError: images and patterns do not fit, or the calibration cannot be read; the message names the file.
+        StorageError: a file cannot be read or written.
+    """
+    extra: list[tuple[str, Entry]] = []
+    if gray_images is not None:
+        names = [name for name in image_names(source) if fnmatch(name, gray_images)]
+        each, rest = divmod(len(names), len(phase.axes) * (1 if gray is None or gray.inverses == "none" else 2))
+        if rest or not each:
+            raise ManifestError(f"{source}: --gray-images {gray_images} names {len(names)} images, which is not equally many for each axis"
+                                + (" and inverse" if gray is None or gray.inverses != "none" else ""))
+        entries: list[Entry] = []
+        for axis in phase.axes:
+            inverses, fine_first = ("none", False) if gray is None else (gray.inverses, gray.fine_first)
+            of_axis = gray_entries(axis, 2**each, None, inverses=inverses, fine_first=fine_first)
+            entries += [{**entry, "stripe_px": gray_stripe_px} for entry in of_axis]
+        extra = list(zip(names, entries, strict=True))
+    return _write(source, destination, stack, phase.entries(), extra)
+
+
+def import_scanner(source: Path, destination: Path, *, calibration: Path, codec: str, axes: tuple[str, ...], unit_m: float,
+                   projector: tuple[int, int] | None = None, images: str | None = None) -> Imported:
+    """Write a capture.json for the images of a scanning program, with the calibration that it wrote.
+
+    Args:
+        source: the folder of the images.
+        destination: the folder of the capture; another folder than `source` gets links to, or copies of, the images.
+        calibration: its calibration file.
+        codec: one of CODECS.
+        axes: column, row or both: what was coded.
+        unit_m: the metres in one unit of the translation.
+        projector: the width and height of the projector; None: as the calibration says.
+        images: the names of the frames, as the shell matches them; None: every image but mask, white and black.
+
+    Raises:
+        ManifestError: images and patterns do not fit, or the calibration cannot be read; the message names the file.
+        StorageError: a file cannot be read or written.
+    """
+    size = projector or projector_size(calibration)
+    if size is None:
+        raise ManifestError(f"{calibration}: does not say how many pixels the projector has: give --projector")
+    stack = Stack(projector=size, images=images, calibration=calibration, unit_m=unit_m)
+    return _write(source, destination, stack, CODECS[codec](size, axes), (), shifted=codec in HALF_PIXEL)
+
+
+def _slstudio_gray(projector: tuple[int, int], axes: tuple[str, ...]) -> list[Entry]:
+    """SLStudio's CodecGrayCode: white, black, the coarsest ten bits of the columns, the coarsest six of the rows; no inverses."""
+    parts = tuple(f"{axis}s" for axis in axes)
+    bits = {"column": min(10, (projector[0] - 1).bit_length()), "row": min(6, (projector[1] - 1).bit_length())}
+    return GrayStack(sequence=("white", "black", *parts), inverses="none", column_bits=bits["column"],
+                     row_bits=bits["row"]).entries(projector)
+
+
+def _slstudio_phase(projector: tuple[int, int], axes: tuple[str, ...], parts: tuple[int, ...], steps: int) -> list[Entry]:
+    """Phases whose periods are the projector divided by whole numbers, those of an axis together."""
+    entries: list[Entry] = []
+    for axis in axes:
+        size = projector[0] if axis == "column" else projector[1]
+        entries += PhaseStack(axes=(axis,), periods_px=tuple(size / part for part in parts), steps=steps).entries()
+    return entries
+
+
+def _opencv_gray(projector: tuple[int, int], axes: tuple[str, ...]) -> list[Entry]:
+    """OpenCV's GrayCodePattern, and the programs after it: pairs of the columns, pairs of the rows, white, black."""
+    return GrayStack(sequence=(*(f"{axis}s" for axis in axes), "white", "black")).entries(projector)
+
+
+CODECS: dict[str, Callable[[tuple[int, int], tuple[str, ...]], list[Entry]]] = {
+    "opencv-gray": _opencv_gray,
+    "slstudio-gray": _slstudio_gray,
+    "slstudio-phase-2x3": lambda projector, axes: _slstudio_phase(projector, axes, (16, 1), 3),
+    "slstudio-phase-3": lambda projector, axes: _slstudio_phase(projector, axes, (1,), 3),
+    "slstudio-phase-4": lambda projector, axes: _slstudio_phase(projector, axes, (1,), 4),
+}
+"""The orders of scanning programs: of the projector's size and the axes, the patterns in the order of the images."""
+HALF_PIXEL = ("slstudio-phase-2x3", "slstudio-phase-3", "slstudio-phase-4")
+"""Codecs whose waves have their phase 0 at the centre of the first pixel: their coordinates are 0.5 smaller than those of the manifest, as
+those of their calibration are, whose principal point then stays as it is."""
+
+
+def _write(source: Path, destination: Path, stack: Stack, entries: list[Entry], extra: Sequence[tuple[str, Entry]], *,
+           shifted: bool = False) -> Imported:
+    """Write the capture of the images that the options name and of those of `extra`, which are paired with their patterns already."""
+    names = image_names(source)
+    mask = only_image(source, names, stack.mask, MASK_WORDS, "mask")
+    even: dict[str, str] = {}
+    for code, given in (("white", stack.white), ("black", stack.black)):
+        if not any(entry["code"] == code for entry in entries):
+            name = only_image(source, names, given, frozenset({code}), code)
+            even |= {} if name is None else {code: name}
+        elif given is not None:
+            raise ManifestError(f"--{code} {given}: {code} is in --sequence already: give one of both")
+    taken = {mask, *even.values(), *(name for name, _ in extra)}
+    frames = [name for name in names if name not in taken and (stack.images is None or fnmatch(name, stack.images))]
+    if len(frames) != len(entries):
+        shown = f" ({frames[0]} to {frames[-1]})" if frames else ""
+        raise ManifestError(f"{source}: has {len(frames)} images{shown} where these options have {len(entries)} patterns: "
+                            f"{describe(entries)}")
+    resolution = image_resolution(source / frames[0])
+    data: dict[str, Any] = {"schema": SCHEMA, "name": source.resolve().name, "color_space": stack.color_space, "mask": mask,
+                            "camera": {"projection": "orthographic", "resolution": list(resolution)}}
+    if stack.calibration is not None:
+        data |= camera_and_projector(stack.calibration, resolution, stack.projector, stack.unit_m)
+        if shifted:
+            data["projector"]["principal_px"] = [value - 0.5 for value in data["projector"]["principal_px"]]
+    pairs = [*zip(frames, entries, strict=True), *extra, *((name, {"code": code}) for code, name in even.items())]
+    data["frames"] = [{"image": name, "pattern": pattern} for name, pattern in pairs]
+    written = write_capture(data, stack.calibration or source, destination, folder=source)
+    facts = [("frames", f"{len(frames)} images in their order, {frames[0]} to {frames[-1]}"), ("patterns", describe(entries))]
+    if extra:
+        facts.append(("Gray", f"{len(extra)} images in their order, {extra[0][0]} to {extra[-1][0]}: {describe([e for _, e in extra])}"))
+    facts += [(code, name) for code, name in even.items()]
+    facts += [("colour", f"{stack.color_space}: --color-space says another"), ("mask", mask or "none: every pixel is taken"),
+              ("rig", f"from {stack.calibration}, in units of {stack.unit_m:g} m" if stack.calibration else
+                      "not calibrated: relit calibrate procam measures it, or give --calibration")]
+    return Imported(written, tuple(facts))

@@ -1,0 +1,179 @@
+"""Stacks of projected patterns in the orders and with the calibrations of other programs: from files to true depth in two commands."""
+
+import cv2
+import numpy as np
+import pytest
+
+from stage.capture import Capture
+from stage.depth_maps import DepthMaps
+from tests.reference.projector import FLIP
+from tests.scenes.captures import files_in, write_image
+from tests.scenes.depth import AMBIENT, CAMERA, POSE, PROJECTOR, make_scene
+
+SCENE = make_scene()
+LIT = (SCENE.uv > 0).all(axis=-1) & (SCENE.uv < (PROJECTOR.width, PROJECTOR.height)).all(axis=-1) & ~SCENE.shaded
+U, V = SCENE.uv[..., 0], SCENE.uv[..., 1]
+WHITE, BLACK = np.ones(U.shape), np.zeros(U.shape)
+SIZE = f"{PROJECTOR.width}x{PROJECTOR.height}"
+
+
+def gray(at, bit, stripe=1, inverse=False):
+    """The level of a bit of the Gray code of the stripe at a place of the projector."""
+    number = np.floor(at / stripe).astype(int)
+    return (((number ^ number >> 1) >> bit & 1) ^ inverse).astype(float)
+
+
+def wave(at, period, turns):
+    return (1 + np.cos(2 * np.pi * (at / period + turns))) / 2
+
+
+def write_stack(folder, levels, name="frame_{}.png", first=0):
+    """16-bit images of a scene under these levels, numbered without zeros in front, as many programs do."""
+    for number, level in enumerate(levels, start=first):
+        image = SCENE.albedo * (0.8 * level * ~SCENE.shaded + AMBIENT)[..., None]
+        write_image(folder / name.format(number), np.rint(image * 65535).astype(np.uint16))
+
+
+def write_calibration(path, names, unit_m=0.001, **sizes):
+    """What cv2.stereoCalibrate gives for this rig, with the camera first, by the names of a program; translations in millimetres."""
+    rotation = FLIP @ POSE[:3, :3].T @ FLIP
+    values = [part for device in (CAMERA, PROJECTOR) for part in (
+        np.array([[device.focal, 0, device.principal[0] - 0.5], [0, device.focal, device.principal[1] - 0.5], [0, 0, 1]]),
+        np.array([[*device.k[:2], *device.p, device.k[2]]]))]
+    values += [rotation, (-rotation @ FLIP @ POSE[:3, 3] / unit_m)[:, None]]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    for name, value in zip(names, values, strict=True):
+        file.write(name, value)
+    for name, value in sizes.items():
+        file.write(name, value)
+    file.release()
+    return path
+
+
+OPENCV, SLSTUDIO = ("M1", "D1", "M2", "D2", "R", "T"), ("Kc", "kc", "Kp", "kp", "Rp", "Tp")
+SIZES = {"frameWidth": CAMERA.width, "frameHeight": CAMERA.height, "screenResX": PROJECTOR.width, "screenResY": PROJECTOR.height}
+
+
+def depth_of(relit, folder, *words):
+    """Import a folder, solve it, and return the result and what was printed."""
+    imported = relit("import", words[0], folder, *words[1:])
+    assert (imported.code, imported.err) == (0, "")
+    outcome = relit("depth", folder, "--out", folder / "out")
+    assert (outcome.code, outcome.err) == (0, ""), outcome.err
+    return DepthMaps.read(folder / "out" / "depth.exr"), imported.out
+
+
+def error(maps):
+    return np.abs(maps.depth - SCENE.depth)[maps.mask]
+
+
+COLUMN_M = 0.065
+"""Metres of depth that a projector column is worth here, at most."""
+
+
+@pytest.mark.parametrize("layout", ["references first, no inverses", "inverses in blocks, fine first", "OpenCV's, as a scanner"])
+def test_gray_codes(relit, tmp_path, layout):
+    calibration = write_calibration(tmp_path / "rig.yml", OPENCV)
+    rig = ("--calibration", calibration, "--unit-m", "0.001", "--projector", SIZE)
+    columns, rows = range(6, -1, -1), range(6, -1, -1)
+    if layout == "references first, no inverses":
+        write_stack(tmp_path, [WHITE, BLACK, *(gray(U, bit) for bit in columns), *(gray(V, bit) for bit in rows)])
+        maps, out = depth_of(relit, tmp_path, "gray", "--sequence", "white,black,columns,rows", "--inverses", "none", *rig)
+        assert "white, black, Gray code of columns, 7 bits, Gray code of rows, 7 bits" in out
+    elif layout == "inverses in blocks, fine first":
+        write_stack(tmp_path, [gray(U, bit, inverse=turned) for turned in (False, True) for bit in reversed(columns)], "IMG_{}.png", 8)
+        maps, _ = depth_of(relit, tmp_path, "gray", "--sequence", "columns", "--inverses", "blocks", "--fine-first", *rig)
+    else:
+        write_stack(tmp_path, [*(gray(at, bit, inverse=turned) for at, bits in ((U, columns), (V, rows)) for bit in bits
+                                 for turned in (False, True)), WHITE, BLACK])
+        maps, _ = depth_of(relit, tmp_path, "scanner", "--codec", "opencv-gray", "--axis", "both", *rig)
+    assert maps.mask[LIT].mean() > 0.9 and error(maps).max() < 1.5 * COLUMN_M  # one where a bit is in doubt; rows may disagree by half of one
+
+
+def test_fewer_bits_than_the_projector_has(relit, tmp_path):
+    rig = ("--calibration", write_calibration(tmp_path / "rig.yml", OPENCV), "--unit-m", "0.001")
+    write_stack(tmp_path, [gray(U, bit, 4, turned) for bit in range(4, -1, -1) for turned in (False, True)])
+    maps, _ = depth_of(relit, tmp_path, "gray", "--projector", SIZE, "--sequence", "columns", "--column-bits", "5", *rig)
+    assert maps.mask[LIT].mean() > 0.9 and np.median(error(maps)) < COLUMN_M
+
+
+PERIODS = (16.0, 18.0, 21.0)
+
+
+@pytest.mark.parametrize("layout", ["as relit's", "sines that move back, steps slowest", "rows too"])
+def test_phases(relit, tmp_path, layout):
+    rig = ("--calibration", write_calibration(tmp_path / "rig.yml", OPENCV), "--unit-m", "0.001", "--projector", SIZE)
+    stack = ("--periods", "16,18,21", "--steps", "4")
+    if layout == "as relit's":
+        write_stack(tmp_path, [wave(U, period, -step / 4) for period in PERIODS for step in range(4)])
+        maps, out = depth_of(relit, tmp_path, "phase", *stack, *rig)
+        assert "12 images in their order, frame_0.png to frame_11.png" in out and "phase of columns, 4 steps" in out
+    elif layout == "sines that move back, steps slowest":
+        write_stack(tmp_path, [wave(U, period, -0.25 + step / 4) for step in range(4) for period in PERIODS])
+        maps, _ = depth_of(relit, tmp_path, "phase", *stack, "--shift", "plus", "--offset-deg", "-90", "--order", "axis,step,period", *rig)
+    else:
+        write_stack(tmp_path, [wave(at, period, -step / 4) for at in (U, V) for period in PERIODS for step in range(4)])
+        write_stack(tmp_path, [WHITE, BLACK], "{}.png")
+        (tmp_path / "0.png").rename(tmp_path / "white.png")
+        (tmp_path / "1.png").rename(tmp_path / "black.png")
+        maps, out = depth_of(relit, tmp_path, "phase", *stack, "--axis", "both", *rig)
+        assert "white    white.png" in out and "black    black.png" in out
+    assert maps.mask[LIT].mean() > 0.97 and np.median(error(maps)) < 0.01 * COLUMN_M and error(maps).max() < 0.2 * COLUMN_M  # 16 bits
+
+
+def test_a_phase_with_a_gray_code(relit, tmp_path):
+    rig = ("--calibration", write_calibration(tmp_path / "rig.xml", OPENCV), "--unit-m", "0.001", "--projector", SIZE)
+    write_stack(tmp_path, [wave(U, 16, -step / 4) for step in range(4)], "phase_{}.png")
+    write_stack(tmp_path, [gray(U, bit, 8) for bit in range(3, -1, -1)], "gray_{}.png")
+    write_stack(tmp_path, [WHITE, BLACK], "even_{}.png")
+    maps, _ = depth_of(relit, tmp_path, "phase", "--periods", "16", "--steps", "4", "--images", "phase_*", "--gray-images", "gray_*",
+                       "--gray-stripe", "8", "--white", "even_0.png", "--black", "even_1.png", *rig)
+    assert maps.mask[LIT].mean() > 0.97 and error(maps).max() < 0.2 * COLUMN_M
+
+
+@pytest.mark.parametrize("codec", ["slstudio-gray", "slstudio-phase-2x3"])
+def test_slstudio(relit, tmp_path, codec):
+    """frameSeq_0 … as its scan worker numbers them, with its calibration.xml; waves begin at the centre of the first column."""
+    calibration = write_calibration(tmp_path / "calibration.xml", SLSTUDIO, **SIZES)
+    if codec == "slstudio-gray":
+        levels = [WHITE, BLACK, *(gray(U, bit) for bit in range(6, -1, -1))]
+    else:
+        levels = [wave(U - 0.5, PROJECTOR.width / parts, -step / 3) for parts in (16, 1) for step in range(3)]
+    write_stack(tmp_path, levels, "frameSeq_{}.png")
+    maps, _ = depth_of(relit, tmp_path, "scanner", "--calibration", calibration, "--codec", codec, "--unit-m", "0.001")
+    assert maps.mask[LIT].mean() > 0.9
+    assert np.median(error(maps)) < (0.01 if "phase" in codec else 0.5) * COLUMN_M  # half a column of the waves would be 0.5
+
+
+@pytest.mark.parametrize(("words", "message"), [
+    (("gray", "--projector", SIZE), "has 5 images (frame_0.png to frame_4.png) where these options have 30 patterns: Gray code of columns, "
+                                    "7 bits, Gray code of rows, 7 bits, white, black"),
+    (("gray", "--projector", SIZE, "--sequence", "columns,lines"), "--sequence columns,lines: give some of columns, rows, white, black"),
+    (("gray", "--projector", SIZE, "--column-bits", "9"), "--column-bits 9: a projector of 128 columns has 1 to 7 bits"),
+    (("gray", "--projector", SIZE, "--white", "frame_0.png"), "white is in --sequence already: give one of both"),
+    (("phase", "--projector", SIZE, "--periods", "16", "--steps", "4", "--offset-deg", "45"), "must be a whole number of steps of 90"),
+    (("phase", "--projector", SIZE, "--periods", "16", "--steps", "4", "--order", "step,axis"), "--order step,axis: give axis, period, step"),
+    (("phase", "--projector", SIZE, "--periods", "16", "--steps", "4", "--row-periods", "1,2"), "--row-periods: has 2 periods, --periods"),
+    (("phase", "--projector", SIZE, "--periods", "16", "--steps", "4", "--gray-images", "x*"), "belong together: give both, or none"),
+    (("phase", "--projector", SIZE, "--periods", "16", "--steps", "4", "--gray-images", "x*", "--gray-stripe", "8"), "names 0 images"),
+    (("phase", "--projector", SIZE, "--periods", "16", "--steps", "5", "--calibration", "RIG"),
+     "is of a camera of 96x72 px, this one has 9x8"),
+    (("scanner", "--codec", "slstudio-gray", "--unit-m", "1", "--calibration", "NOSIZE"), "does not say how many pixels the projector has"),
+])
+def test_faults_are_named_and_nothing_is_written(relit, tmp_path, words, message):
+    for number in range(5):
+        write_image(tmp_path / "scan" / f"frame_{number}.png", np.zeros((8, 9), np.uint8))
+    files = {"RIG": write_calibration(tmp_path / "calibration.xml", SLSTUDIO, **SIZES),
+             "NOSIZE": write_calibration(tmp_path / "b.yml", OPENCV)}
+    before = files_in(tmp_path)
+    outcome = relit("import", words[0], tmp_path / "scan", *(files.get(word, word) for word in words[1:]))
+    assert outcome.code == 2 and message in outcome.err and outcome.err.count("\n") == 1, outcome.err
+    assert files_in(tmp_path) == before
+
+
+def test_without_a_calibration_the_frames_are_declared_all_the_same(relit, tmp_path):
+    write_stack(tmp_path, [wave(U, 16, -step / 4) for step in range(4)])
+    outcome = relit("import", "phase", tmp_path, "--projector", SIZE, "--periods", "16", "--steps", "4")
+    assert outcome.code == 0 and "relit calibrate procam measures it" in outcome.out
+    assert [frame.pattern.step for frame in Capture.open(tmp_path).manifest.frames] == [0, 1, 2, 3]
