@@ -13,7 +13,7 @@ from stage.files import write_text
 from stage.light import Light
 from stage.model import FirstFault, Positive, Strict, Text
 from stage.patterns.codes import Pattern
-from stage.projector import Projector
+from stage.projector import AnyProjector
 from stage.ranging import Laser, TimeOfFlight
 from stage.records import read_record
 
@@ -50,7 +50,7 @@ class Manifest(Strict):
     name: Text
     color_space: ColorSpaceName = "lin_rec709_scene"
     camera: Camera
-    projector: Projector | None = None
+    projector: AnyProjector | None = None
     mask: FileName | None = None
     dark: FileName | None = None
     flat: FileName | None = None

@@ -1,23 +1,20 @@
 """The projector of a manifest, and the projection of camera-frame points into its image."""
 
-from typing import Annotated, Self
+from collections.abc import Mapping
+from typing import Annotated, Any, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Discriminator, Field, Tag, model_validator
 
 from stage.camera import Distortion
 from stage.frames import OPENCV_FROM_CAMERA, Transform
 from stage.model import FirstFault, NotNegative, Positive, Resolution, Rgb, Strict
 
 
-class Projector(Strict):
-    """A projector, with the intrinsics and conventions of a perspective camera; its column and row are the continuous u and v."""
+class UncalibratedProjector(Strict):
+    """A projector whose lens and place nobody has measured yet: how many pixels it has, and what its light does."""
 
     resolution: Resolution
-    focal_px: tuple[Positive, Positive]
-    principal_px: tuple[float, float] | None = None
-    distortion: Distortion | None = None
-    camera_from_projector: Transform
     response: Annotated[tuple[NotNegative, ...], Field(min_length=2), FirstFault] | None = None
     """The light of the projector at even levels from 0 to 1, rising, as `relit calibrate response` writes it; None means linear."""
     crosstalk: tuple[Rgb, Rgb, Rgb] | None = None
@@ -28,6 +25,15 @@ class Projector(Strict):
         if self.response is not None and any(b <= a for a, b in zip(self.response, self.response[1:], strict=False)):
             raise ValueError("response must rise: each value above the one before")
         return self
+
+
+class Projector(UncalibratedProjector):
+    """A projector, with the intrinsics and conventions of a perspective camera; its column and row are the continuous u and v."""
+
+    focal_px: tuple[Positive, Positive]
+    principal_px: tuple[float, float] | None = None
+    distortion: Distortion | None = None
+    camera_from_projector: Transform
 
     def projector_from_camera(self) -> np.ndarray:
         """Return the transform from the camera frame to the frame of the projector with OpenCV's axes, x right, y down, z forward.
@@ -57,3 +63,17 @@ class Projector(Strict):
             x, y = self.distortion.apply(x, y)
         cu, cv = self.principal_px or (self.resolution[0] / 2, self.resolution[1] / 2)
         return np.stack([cu + self.focal_px[0] * x, cv + self.focal_px[1] * y], axis=-1), ahead
+
+
+def _calibration(given: Any) -> str:
+    """Return which of the two projectors a value is meant to be: without a field of its lens or place it is not calibrated."""
+    if isinstance(given, Mapping):
+        calibrated = any(given.get(name) is not None for name in Projector.model_fields.keys() - UncalibratedProjector.model_fields.keys())
+    else:
+        calibrated = not isinstance(given, UncalibratedProjector) or isinstance(given, Projector)
+    return "calibrated" if calibrated else "uncalibrated"
+
+
+AnyProjector = Annotated[Annotated[Projector, Tag("calibrated")] | Annotated[UncalibratedProjector, Tag("uncalibrated")],
+                         Discriminator(_calibration)]
+"""A projector of a manifest, with lens and place or without both."""

@@ -98,7 +98,7 @@ def field_name(location: tuple[int | str, ...]) -> str:
     for part in location:
         if isinstance(part, int):
             text += f"[{part}]"
-        elif previous not in ("light", "pattern", "laser", "tof"):
+        elif previous not in ("light", "pattern", "laser", "tof", "projector"):
             text += ("." if text else "") + (part if len(part) <= MOST_SHOWN else f"{part[:MOST_SHOWN]}...")
         previous = part
     return text

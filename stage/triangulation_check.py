@@ -28,13 +28,16 @@ def check_projector(capture: Capture) -> Projector:
     """Check that camera and projector can measure depth, and return the projector.
 
     Raises:
-        ManifestError: there is no projector, it stands at the camera or implausibly far away, or it lights nothing that the
-            camera sees.
+        ManifestError: there is no projector, it is not calibrated, it stands at the camera or implausibly far away, or it lights
+            nothing that the camera sees.
     """
     where = f"{capture.folder / FILE_NAME}: projector"
     projector = capture.manifest.projector
     if projector is None:
         raise ManifestError(f"{where}: is missing: depth from patterns needs its lens and pose; see relit calibrate procam")
+    if not isinstance(projector, Projector):
+        raise ManifestError(f"{where}: has no focal_px and no camera_from_projector: depth from patterns needs its lens and pose; "
+                            "relit calibrate procam measures them")
     check_perspective(capture)
     baseline = float(np.linalg.norm(np.array(projector.camera_from_projector)[:3, 3]))
     if baseline < LEAST_BASELINE_M:

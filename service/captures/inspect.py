@@ -21,6 +21,7 @@ from stage.light import DistantLight, PointLight
 from stage.lighting import MEASURED_BY, check_solvable, has_placeholders, lights_from_centre
 from stage.manifest import Frame
 from stage.point_lights import PlacedLights, place_lights
+from stage.projector import Projector
 from stage.tof.frames import check_frames, read_frame
 
 
@@ -124,6 +125,9 @@ def _facts(capture: Capture) -> Iterator[tuple[str, str]]:
     if manifest.frames[0].exposure_s is not None:
         given.append("exposure_s")
     yield "given", ", ".join(given) or "nothing beside the frames"
+    if manifest.projector is not None:
+        calibration = "calibrated" if isinstance(manifest.projector, Projector) else "not calibrated: see relit calibrate procam"
+        yield "projector", "{}x{}, {}".format(*manifest.projector.resolution, calibration)
     directions = np.array([light.direction for _, light in capture.lit_by(DistantLight)])
     if has_placeholders(capture):
         yield "lights", f"{len(directions)} placeholders: {MEASURED_BY}"

@@ -21,7 +21,8 @@ def import_folder(source: Path, destination: Path, *, projector: tuple[int, int]
         source: the folder of the images, which are taken in the natural order of their names: 2 before 10.
         destination: the folder of the capture; another folder than `source` gets links to, or copies of, the images.
         projector: the width and height of the projector in pixels, which determine the count of bits.
-        calibration: an OpenCV file with the intrinsics of camera and projector, R and T; None leaves them to `relit calibrate procam`.
+        calibration: an OpenCV file with the intrinsics of camera and projector, R and T; None leaves them to `relit calibrate procam`, and
+            the manifest has the size of the projector alone.
         unit_m: the metres in one unit of T.
 
     Returns:
@@ -40,6 +41,7 @@ def import_folder(source: Path, destination: Path, *, projector: tuple[int, int]
         "schema": SCHEMA, "name": source.resolve().name,
         "color_space": "lin_rec709_scene",
         "camera": {"projection": "orthographic", "resolution": resolution},
+        "projector": {"resolution": projector},
     }
     if calibration is not None:
         data |= camera_and_projector(calibration, resolution, projector, unit_m)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,7 @@ def phase(axis, period):
 PATTERNS = [*phase("column", 24), *phase("column", 25), *phase("row", 24), *phase("row", 25), *BLACK_WHITE]
 
 
-def write_view(folder, pose, *, devices=False):
+def write_view(folder, pose, **manifest):
     """One pose of the board under phases of both axes: with Gray codes it would be 34 images."""
     radiance = boards.board_image(pose)
     rays = reference.pixel_rays(CAMERA)
@@ -43,7 +44,7 @@ def write_view(folder, pose, *, devices=False):
             light = np.full(radiance.shape, float(pattern["code"] == "white"))
         write_image(folder / f"{number}.png", np.rint(65535 * radiance * (0.02 + 0.9 * light)).astype(np.uint16))
         frames.append({"image": f"{number}.png", "pattern": pattern})
-    write_manifest(folder, {"schema": "relit.capture/1", "name": folder.name, "frames": frames,
+    write_manifest(folder, {"schema": "relit.capture/1", "name": folder.name, "frames": frames, **manifest,
                             "camera": {"projection": "orthographic", "resolution": [CAMERA.width, CAMERA.height]}})
     return points
 
@@ -98,6 +99,23 @@ def test_what_is_wrong_is_said(relit, rig, tmp_path):
     assert "no row code" in refused(tmp_path / "one", *given, "9x6", "--projector", "256x192")
 
 
+def test_the_size_of_the_projector_may_stand_in_the_manifests(relit, rig, tmp_path):
+    """As relit import opencv-gray writes it; with a response of its light, which stays."""
+    folders, _ = rig
+    copies = [shutil.copytree(folder, tmp_path / folder.name) for folder in folders]
+    for folder in copies:
+        edit_manifest(folder, projector={"resolution": [256, 192], "response": [0, 0.5, 1]}, camera={
+            "projection": "orthographic", "resolution": [CAMERA.width, CAMERA.height]})
+    assert "projector    256x192, not calibrated: see relit calibrate procam" in relit("info", copies[0]).out
+    outcome = relit("depth", copies[0], "--out", tmp_path / "out")
+    assert outcome.code == 2 and "projector: has no focal_px and no camera_from_projector" in outcome.err
+    outcome = relit("calibrate", "procam", *copies, "--board", "9x6", "--square-m", 0.03)
+    assert (outcome.code, outcome.err) == (0, "")
+    projector = Capture.open(copies[0]).manifest.projector
+    assert projector.resolution == (256, 192) and projector.response == (0, 0.5, 1)
+    assert np.abs(np.array(projector.focal_px) / PROJECTOR.focal - 1).max() < 0.01
+
+
 def test_response_is_written_into_the_projector(relit, tmp_path):
     levels = np.linspace(0, 1, 6)
     rng = np.random.default_rng(0)
@@ -141,11 +159,11 @@ def test_a_real_scan_is_imported_and_decoded(relit, tmp_path):
         off = np.linalg.norm(there[:, :2] / there[:, 2:] - corners, axis=1)
         assert np.sqrt((off**2).mean()) < limit
     outcome = relit("depth", tmp_path, "--out", tmp_path / "out")
-    assert outcome.code == 2 and "projector: is missing" in outcome.err and "calibrate procam" in outcome.err
+    assert outcome.code == 2 and "projector: has no focal_px" in outcome.err and "calibrate procam" in outcome.err
 
 
 def test_import_options_are_for_their_format(relit, tmp_path):
     outcome = relit("import", "lp", tmp_path, tmp_path, "--projector", "16x6")
-    assert outcome.code == 2 and "are for opencv-gray" in outcome.err
+    assert outcome.code == 2 and "no such option: --projector" in outcome.err
     outcome = relit("import", "opencv-gray", tmp_path, tmp_path)
-    assert outcome.code == 2 and "--projector is missing" in outcome.err
+    assert outcome.code == 2 and "missing option '--projector'" in outcome.err

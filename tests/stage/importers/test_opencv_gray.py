@@ -9,6 +9,7 @@ import pytest
 from stage.capture import Capture
 from stage.errors import ManifestError
 from stage.importers.opencv_gray import gray_order, import_folder
+from stage.projector import UncalibratedProjector
 from tests.scenes.captures import write_image
 
 K1, D1 = np.array([[800.0, 0, 319.5], [0, 810, 239.5], [0, 0, 1]]), np.array([-0.1, 0.02, 0.001, -0.002, 0.003])
@@ -44,7 +45,7 @@ def test_the_order_is_opencvs(scan, tmp_path):
     assert (first.axis, first.bit, first.bits, first.inverse) == ("column", 3, 4, False)
     assert (last.axis, last.bit, last.bits, last.inverse) == ("row", 0, 3, True)
     assert [pattern.code for _, pattern in frames[-2:]] == ["white", "black"]
-    assert capture.manifest.projector is None
+    assert capture.manifest.projector == UncalibratedProjector(resolution=(16, 6))  # for relit calibrate procam
 
 
 @pytest.mark.parametrize("suffix", [".yml", ".xml", ".json"])
