@@ -97,20 +97,31 @@ def _factors(samples: Samples, start: np.ndarray, directions: np.ndarray, shape:
         change = np.array([np.nanmedian(column) if told else 0.0
                            for column, told in zip(ratio.T, lit.sum(axis=0) >= LEAST_PIXELS, strict=True)])
         logarithm += (STRIDE if step else 1.0) * change
-        logarithm -= _untold(logarithm, directions)
+        logarithm -= untold(logarithm, directions, falling=True)
     return np.exp(logarithm)
 
 
-def _untold(logarithm: np.ndarray, directions: np.ndarray) -> np.ndarray:
+def untold(logarithm: np.ndarray, directions: np.ndarray, *, falling: bool) -> np.ndarray:
     """Return the part of the logarithms of the factors that the object cannot tell, or that independent errors of lights do not have.
 
-    A factor that is linear in the direction across the view turns all normals, which lobes tell only weakly; it is kept as far as
+    A factor that is linear in the direction across the view turns all normals, which shading tells only weakly; it is kept as far as
     errors of the size of the others would give it.
+
+    Args:
+        logarithm: [lights] of the factors.
+        directions: [lights, 3] unit, in the camera frame.
+        falling: whether a part that falls with the angle to the viewer cannot be told at all, because the shape of the diffuse lobe is
+            free; else it is kept like those across the view.
     """
     design = np.stack([np.ones(len(directions)), directions[:, 2], directions[:, 0], directions[:, 1]], axis=1)
     found, spread = _robust_fit(design, logarithm)
-    most = LARGEST_LINEAR * spread / np.sqrt((design[:, 2:] ** 2).sum(axis=0))
-    return design @ np.concatenate([found[:2], found[2:] - np.clip(found[2:], -most, most)])
+    centred = design - design.mean(axis=0)
+    kept = np.zeros(4)
+    for column in range(2 if falling else 1, 4):
+        extent = (design if column > 1 else centred)[:, column]
+        most = LARGEST_LINEAR * spread / max(float(np.linalg.norm(extent)), 1e-9)
+        kept[column] = np.clip(found[column], -most, most)
+    return design @ (found - kept)
 
 
 def _robust_fit(design: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, float]:

@@ -27,12 +27,21 @@ class Method(Choice):
     SVBRDF = "svbrdf", "normal, diffuse albedo, specular and roughness"
 
 
+class Intensities(Choice):
+    """Which intensities of distant lights a solve uses."""
+
+    CHOSEN = "chosen", "those that the images ask for where they explain left-out pixels much better than those of the manifest"
+    DECLARED = "declared", "those of the manifest"
+
+
 class SolveOptions(StackOptions):
     """How normals, albedo and height are solved."""
 
     method: Method | None = Field(default=None, description=(
         "How normals are solved; None: gradient where there are gradient frames; else svbrdf where there are extended lights, or "
         f"{SVBRDF_LIGHTS} lights or more; else robust."))
+    intensities: Intensities = Intensities.CHOSEN
+    """Which intensities of distant lights are used; the report says what was found."""
     max_sigma: Positive | None = Field(default=None, description=(
         "Largest standard error, in degrees, of a normal that counts as solved; less certain ones are kept outside the mask, with the "
         f"status unsure. None: {MAX_SIGMA:g}; 180 refuses none."))

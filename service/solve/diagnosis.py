@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from kernels.photometric.readings import pad_lights
 from kernels.photometric.samples import evenly
 from kernels.status import ESTIMATED
 from service.solve.orientation import LightAxes, find_axes, find_inversion
-from service.solve.solution import PIXELS_AT_ONCE, Solution, SolveInput
+from service.solve.solution import PIXELS_AT_ONCE, Solution, SolveInput, suspect_lights
 from stage.capture import Capture
 from stage.consistency.explanations import Cause, Explanation, Sample, better_explanation, fit_manifest
 from stage.extended_lights import ExtendedLights
@@ -22,31 +23,40 @@ PIXELS = 600
 """Number of pixels, spread over the object, on which explanations are compared: three times as many change no misfit by a tenth."""
 UNORDERED = (Cause.REVERSED, Cause.SHIFTED, Cause.DIRECTIONS)
 """Causes after which the normals say nothing about the axes."""
+REPAIRED = "; the solve has used the brightness that the images ask for (found.light_intensities)"
 FIELDS = {DistantLights: "frames[].light.direction", PlacedLights: "frames[].light.position_m",
           ExtendedLights: "frames[].light.directions", GradientFrames: "frames[].light.axis and sign"}
 """The field that holds the axes of each kind of lights; else they come from the reference ball."""
 
 
-def diagnose(given: SolveInput, capture: Capture, lights: Any, solution: Solution) -> None:
+def diagnose(given: SolveInput, capture: Capture, lights: Any, declared: Any, solution: Solution) -> None:
     """Add a warning for everything that is wrong with the lights or the encoding, and make the normals less sure by it.
 
     Args:
         given: the images.
         capture: the manifest.
         lights: the lights with which the normals were solved; readings are examined under distant ones.
-        solution: its warnings, standard errors and confidence are changed.
+        declared: the lights of the manifest, which may have other intensities.
+        solution: its warnings, standard errors, confidence and suspect lights are changed.
     """
     field = FIELDS.get(type(lights), "the capture of the reference ball")
     fit = None
     if isinstance(lights, DistantLights):
-        sample = _sample(given, capture, lights)
+        assert isinstance(declared, DistantLights)
+        solution.suspects = suspect_lights(solution, given.stack, pad_lights(declared.direction, declared.irradiance, given.stack.scale))
+        sample = _sample(given, capture, declared)
         fit = fit_manifest(sample)
         found = better_explanation(sample, fit)
+        estimated = lights is not declared
         if found is not None:
-            solution.warnings.append(_sentence(found, sample))
-            _raise_error(solution, found.degrees)
+            repaired = estimated and found.cause in (Cause.IRRADIANCE, Cause.NORMALISED)
+            solution.warnings.append(_sentence(found, sample) + (REPAIRED if repaired else ""))
+            if not repaired:
+                _raise_error(solution, found.degrees)
             if found.cause in UNORDERED:
                 return
+        if estimated:
+            fit = fit_manifest(sample._replace(irradiance=lights.irradiance))
     axes = find_axes(given, solution, lights if isinstance(lights, DistantLights) else None, fit)
     if axes is None:
         axes = find_inversion(given, solution, lights if isinstance(lights, DistantLights) else None)

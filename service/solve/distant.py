@@ -4,7 +4,7 @@ from typing import Protocol
 
 from kernels.photometric.near import NearField
 from kernels.photometric.readings import Lights, pad_lights
-from service.solve.solution import Solution, SolveInput, suspect_lights
+from service.solve.solution import Solution, SolveInput
 from stage.point_lights import DistantLights
 
 
@@ -22,14 +22,11 @@ class NormalSolver(Protocol):
 
 
 def solve_distant(given: SolveInput, lights: DistantLights, *, solver: NormalSolver) -> Solution:
-    """Solve every pixel of the mask under distant lights, and name the lights that disagree with the others.
+    """Solve every pixel of the mask under distant lights.
 
     Args:
         given: the images.
         lights: lights of the stack.
         solver: finds the normals.
     """
-    padded = pad_lights(lights.direction, lights.irradiance, given.stack.scale)
-    solution = solver(given, padded)
-    solution.suspects = suspect_lights(solution, given.stack, padded)
-    return solution
+    return solver(given, pad_lights(lights.direction, lights.irradiance, given.stack.scale))

@@ -211,7 +211,8 @@ class _Walk:
 
     def refine_intensities(self, light: DirectLight | None) -> DirectLight | None:
         """Replace the intensities of the lights where the object shows that others explain it better; returns the direct light of them."""
-        told = self._supported and not self._few and self._field is None and self._options.intensities
+        told = (self._supported and not self._few and self._field is None and self._options.intensities
+                and self._given.refine_intensities)
         if light is None or not told:
             return light
         samples, count = self._pick(self._spread), self._given.stack.light_count

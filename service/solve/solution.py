@@ -51,6 +51,8 @@ class SolveInput:
     """Folder for stack caches; None: `.relit` in the folder of each capture."""
     relative: bool = False
     """Whether the irradiance of all lights lacks one common factor, so that the scale of albedo is unknown."""
+    refine_intensities: bool = True
+    """Whether a solver may replace the intensities of the lights by those that the object asks for."""
     sharing: SharedSolve | None = None
     """The part of this worker in a solve that several share; None: it is alone."""
 

@@ -17,11 +17,12 @@ from kernels.surface.integrate import Integration
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, metadata, report
-from service.requests.solve import MAX_SIGMA, SVBRDF_LIGHTS, Method, SolveRequest
+from service.requests.solve import MAX_SIGMA, SVBRDF_LIGHTS, Intensities, Method, SolveRequest
 from service.solve import integrability
 from service.solve.diagnosis import diagnose
 from service.solve.diffuse import solve_diffuse
 from service.solve.distant import solve_distant
+from service.solve.intensities import choose_intensities
 from service.solve.near import MATERIAL_ROUNDS, Rounds, solve_near
 from service.solve.parts import numbered, place_solution
 from service.solve.sharing import SharedSolve
@@ -148,8 +149,13 @@ class _Opened(NamedTuple):
     capture: Capture
     method: Method
     lights: Any
+    """With the intensities that the solve uses."""
+    declared: Any
+    """As the manifest has them."""
     solver: Solver
     given: SolveInput
+    facts: dict[str, Any]
+    """What the report says of the lights."""
 
 
 def solve(request: SolveRequest, progress: Progress | None = None, *, sharing: SharedSolve | None = None) -> SolveResult:
@@ -165,12 +171,13 @@ def solve(request: SolveRequest, progress: Progress | None = None, *, sharing: S
         StorageError: the results cannot be written; nothing is left half-written.
     """
     timings = Timings(progress)
-    capture, method, lights, solver, given = _open(request, timings, sharing)
+    capture, method, lights, declared, solver, given, facts = _open(request, timings, sharing)
     stack, mask = given.stack, given.mask
     solution = solver(given, lights)
+    solution.facts = facts | solution.facts
     mark_not_facing(capture.camera, solution)
     timings.stage("diagnosis", 1)
-    diagnose(given, capture, lights, solution)
+    diagnose(given, capture, lights, declared, solution)
     estimated = np.isin(solution.status, ESTIMATED).reshape(mask.shape)
     sigma = solution.standard_error()
     if solution.integration is None:  # near lights have found the height with the normals
@@ -231,8 +238,8 @@ def help_solve(request: SolveRequest, progress: Progress, sharing: SharedSolve) 
         StageError, KernelError: the input is wrong.
         DivergedError: this process finds something else than the other.
     """
-    *_, lights, solver, given = _open(request, Timings(progress), sharing)
-    solver(given, lights)
+    opened = _open(request, Timings(progress), sharing)
+    opened.solver(opened.given, opened.lights)
 
 
 def _open(request: SolveRequest, timings: Timings, sharing: SharedSolve | None) -> _Opened:
@@ -257,9 +264,15 @@ def _open(request: SolveRequest, timings: Timings, sharing: SharedSolve | None) 
         stack, lights = one_frame_a_light(merge_brackets(stack, capture.sources(), lights), lights)
     if sharing is not None:
         sharing.identify(chosen[0], str(method), stack.key, mask, stack.scale, capture.manifest.model_dump_json())
-    return _Opened(capture, method, lights, solver, SolveInput(
-        stack, capture.camera, mask, chosen, timings, request.cache, relative=capture.manifest.irradiance_scale == "relative",
-        sharing=sharing))
+    given = SolveInput(stack, capture.camera, mask, chosen, timings, request.cache, sharing=sharing,
+                       relative=capture.manifest.irradiance_scale == "relative",
+                       refine_intensities=request.intensities is Intensities.CHOSEN)
+    used: Any = lights
+    facts: dict[str, Any] = {}
+    if isinstance(lights, DistantLights) and given.refine_intensities:
+        timings.stage("intensities", 1)
+        used, facts = choose_intensities(given, lights)
+    return _Opened(capture, method, used, lights, solver, given, facts)
 
 
 def _maps(solution: Solution, solved: np.ndarray, estimated: np.ndarray, method: Method, capture: Capture,

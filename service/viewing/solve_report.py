@@ -23,9 +23,16 @@ class _Factors(BaseModel):
     factors: list[float] = []
 
 
+class _Estimated(BaseModel):
+    model_config = ConfigDict(extra="ignore")
+
+    factors: list[float] | None = None
+
+
 class _Found(BaseModel):
     model_config = ConfigDict(extra="ignore")
 
+    light_intensities: _Estimated = _Estimated()
     light_factors: _Factors | None = None
 
 
@@ -64,8 +71,15 @@ def read_report(maps: Path) -> SolveReport:
         found = _Report.model_validate(json.loads(text))
     except (ValueError, ValidationError) as error:
         raise ResultError(f"{path}: is not a report of relit: solve again, or take it away") from error
-    light_factors = found.found.light_factors
     suspects = {suspect.image: f"disagrees with the other lights by {100 * suspect.misfit:.0f} %: check its direction and irradiance"
                 for suspect in found.suspect_lights}
-    factors = None if light_factors is None or not light_factors.believed else np.array(light_factors.factors)
-    return SolveReport(found.warnings, suspects, factors)
+    return SolveReport(found.warnings, suspects, _factors(found.found))
+
+
+def _factors(found: _Found) -> np.ndarray | None:
+    """Return the factors that a solve estimated before it began, times those that it refined, or None where it did neither."""
+    refined = found.light_factors
+    factors = [np.array(values) for values in (found.light_intensities.factors,
+                                               refined.factors if refined is not None and refined.believed else None)
+               if values is not None]
+    return np.prod(factors, axis=0) if factors else None

@@ -8,6 +8,7 @@ Source: Cho, Matsushita, Tai and Kweon, "Photometric stereo under non-uniform li
     "Semi-calibrated photometric stereo", TPAMI 42(1), 2020: the linear joint estimation and the alternating one.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -64,20 +65,46 @@ def fit_intensities(readings: np.ndarray, usable: np.ndarray, directions: np.nda
     Raises:
         CalibrationError: there are too few lights or pixels, or the directions do not determine the brightness.
     """
+    result = [np.full((len(directions), 3), np.nan) for _ in range(3)]
+    told, fits = _fit_channels(readings, usable, directions, "RGB")
+    for part, values in enumerate(result):
+        values[told] = np.stack([fit[part] for fit in fits], axis=-1)
+    return Intensities(result[0], result[1], result[2], min(fit[3] for fit in fits))
+
+
+def fit_grey_intensities(readings: np.ndarray, usable: np.ndarray, directions: np.ndarray, *, rounds: int = ROUNDS) -> np.ndarray:
+    """Measure one brightness of every light, up to one factor; quicker than three channels.
+
+    Args:
+        readings: [lights, pixels] scene-linear grey readings of pixels of the object.
+        usable: [lights, pixels] bool, True for unsaturated readings.
+        directions: [lights, 3] unit.
+        rounds: the most rounds, more than LINEAR_ROUNDS.stop.
+
+    Returns:
+        [lights] float64, mean 1 over the measured lights; NaN for a light that too few pixels show.
+
+    Raises:
+        CalibrationError: there are too few lights or pixels, or the directions do not determine the brightness.
+    """
+    told, (fit,) = _fit_channels(readings[..., None], usable, directions, ("grey",), rounds)
+    result = np.full(len(directions), np.nan)
+    result[told] = fit[0]
+    return result
+
+
+def _fit_channels(readings: np.ndarray, usable: np.ndarray, directions: np.ndarray,
+                  names: Sequence[str], rounds: int = ROUNDS) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray, np.ndarray, int]]]:
+    """Return the lights that enough pixels show, and the fit of each channel to them."""
     check_directions(directions)
     told = np.arange(len(directions))
     while True:
         try:
-            fits = [_fit_channel(readings[told, :, channel].astype(np.float64), usable[told], directions[told], "RGB"[channel])
-                    for channel in range(3)]
-            break
+            return told, [_fit_channel(readings[told, :, channel].astype(np.float64), usable[told], directions[told], name, rounds)
+                          for channel, name in enumerate(names)]
         except _UnlitError as unlit:
             told = np.delete(told, unlit.lights)
             check_directions(directions[told])
-    result = [np.full((len(directions), 3), np.nan) for _ in range(3)]
-    for part, values in enumerate(result):
-        values[told] = np.stack([fit[part] for fit in fits], axis=-1)
-    return Intensities(result[0], result[1], result[2], min(fit[3] for fit in fits))
 
 
 def check_directions(directions: np.ndarray) -> None:
@@ -101,7 +128,7 @@ def check_directions(directions: np.ndarray) -> None:
 
 
 def _fit_channel(reading: np.ndarray, usable: np.ndarray, directions: np.ndarray,
-                 name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+                 name: str, rounds: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
     """Return the irradiance [lights] of one channel, its residual, its uncertainty, and the count of pixels.
 
     Each channel is fitted alone: under lights of different colours the grey of a coloured surface is no product of light and albedo.
@@ -115,7 +142,7 @@ def _fit_channel(reading: np.ndarray, usable: np.ndarray, directions: np.ndarray
     reading, lit = reading[:, enough], lit[:, enough]
     reading = reading / np.where(lit, reading, 0).max(axis=0)  # so that pixels of dark albedo have the same weight
     e, weight = np.ones(len(directions)), lit.astype(np.float64)
-    for step in range(ROUNDS):
+    for step in range(rounds):
         weight = _weights(reading, lit, e, directions, weight)
         unlit = (weight > 0).sum(axis=1) < MIN_PIXELS
         if unlit.any():

@@ -17,9 +17,9 @@ UNSURE = 0.2
 """What a wrong capture's median pixel stays below."""
 
 
-def solved(tmp_path, scene, method=Method.ROBUST, **changes):
+def solved(tmp_path, scene, method=Method.ROBUST, intensities="chosen", **changes):
     folder = write_capture(tmp_path / "capture", scene, **changes)
-    return solve(SolveRequest(capture=folder, out=tmp_path / "out", method=method, device="cpu"))
+    return solve(SolveRequest(capture=folder, out=tmp_path / "out", method=method, intensities=intensities, device="cpu"))
 
 
 def confidence(result) -> float:
@@ -100,9 +100,17 @@ def test_the_standard_error_of_mirrored_normals_is_the_error_that_they_have(tmp_
      "frames[].light.direction: images and directions do not belong together"),
 ], ids=["missing", "divided", "encoded", "linear", "reversed", "shifted", "shuffled"])
 def test_wrong_brightness_encoding_and_order_are_named_and_doubted(tmp_path, scene, changes, words):
-    result = solved(tmp_path, scene, Method.LAMBERT, **changes)
+    result = solved(tmp_path, scene, Method.LAMBERT, intensities="declared", **changes)
     assert words in alarms(result)[0]
     assert confidence(result) < UNSURE
+
+
+def test_wrong_brightness_that_the_solve_replaces_is_named_and_not_doubted(tmp_path):
+    result = solved(tmp_path, SCENE._replace(irradiance=np.ones_like(SCENE.irradiance)), Method.LAMBERT)
+    assert "every light is declared alike" in alarms(result)[0] and "the solve has used the brightness" in alarms(result)[0]
+    assert confidence(result) > UNSURE
+    mask = result.maps.estimated
+    assert np.median(angles_degrees(result.maps.normal[mask], SCENE.normal[mask])) < 3  # the noise of the images and a highlight
 
 
 def test_an_outline_that_points_inwards_is_said_where_nothing_decides(tmp_path):
