@@ -24,21 +24,29 @@ def check_perspective(capture: Capture) -> None:
         raise ManifestError(f"{capture.folder / FILE_NAME}: camera.projection: is orthographic: triangulation needs a perspective camera")
 
 
+def missing_calibration(capture: Capture) -> str | None:
+    """Return what the manifest lacks for triangulation under projected patterns, as a sentence; None if it lacks nothing."""
+    where = f"{capture.folder / FILE_NAME}"
+    projector = capture.manifest.projector
+    if not isinstance(projector, Projector):
+        fault = "is missing" if projector is None else "has no focal_px and no camera_from_projector"
+        return f"{where}: projector: {fault}: depth needs its lens and pose; relit calibrate procam measures them"
+    if capture.camera.projection != "perspective":
+        return f"{where}: camera.projection: is orthographic: triangulation needs a perspective camera"
+    return None
+
+
 def check_projector(capture: Capture) -> Projector:
-    """Check that camera and projector can measure depth, and return the projector.
+    """Check that a calibrated camera and projector can measure depth, and return the projector.
 
     Raises:
-        ManifestError: there is no projector, it is not calibrated, it stands at the camera or implausibly far away, or it lights
-            nothing that the camera sees.
+        ManifestError: the calibration is missing, the projector stands at the camera or implausibly far away, or it lights nothing
+            that the camera sees.
     """
     where = f"{capture.folder / FILE_NAME}: projector"
-    projector = capture.manifest.projector
-    if projector is None:
-        raise ManifestError(f"{where}: is missing: depth from patterns needs its lens and pose; see relit calibrate procam")
-    if not isinstance(projector, Projector):
-        raise ManifestError(f"{where}: has no focal_px and no camera_from_projector: depth from patterns needs its lens and pose; "
-                            "relit calibrate procam measures them")
-    check_perspective(capture)
+    projector, missing = capture.manifest.projector, missing_calibration(capture)
+    if missing is not None or not isinstance(projector, Projector):
+        raise ManifestError(missing or where)
     baseline = float(np.linalg.norm(np.array(projector.camera_from_projector)[:3, 3]))
     if baseline < LEAST_BASELINE_M:
         raise ManifestError(f"{where}.camera_from_projector: the projector stands {baseline:.2g} m from the camera: "

@@ -34,10 +34,15 @@ def _depth(request: DepthRequest) -> None:
 
     with ProgressBar() as bar:
         result = depth(request, bar)
-    print(f"depth    {result.depth_path}")
-    print(f"points   {result.points_path}")
-    print(f"report   {result.report_path}")
-    print(f"method   {result.method}, {result.points} points")
+    if result.points_path is None:
+        print(f"decoded  {result.depth_path} (projector coordinates, no depth)")
+        print(f"report   {result.report_path}")
+        print(f"method   {result.method}")
+    else:
+        print(f"depth    {result.depth_path}")
+        print(f"points   {result.points_path}")
+        print(f"report   {result.report_path}")
+        print(f"method   {result.method}, {result.points} points")
     print(f"pixels   {counted(result.counts)}")
     print_warnings(result.warnings)
     if not result.maps.mask.any():

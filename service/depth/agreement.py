@@ -4,6 +4,7 @@ import numpy as np
 
 from kernels.status import SOLVED, Status
 from kernels.structured.surface import check_surface
+from service.depth.coordinates import DecodedSolution, stands_alone
 from service.depth.solution import DepthSolution
 from service.requests.depth import DepthRequest
 from stage.camera import Camera
@@ -74,10 +75,32 @@ def doubt_pixels(solution: DepthSolution, residual_px: np.ndarray | None, camera
     if residual_px is not None and solved.sum() >= ENOUGH:
         usual = max(float(np.median(residual_px[solved])), LEAST_RESIDUAL_PX / RESIDUAL_TIMES)
         right[solved & (residual_px > RESIDUAL_TIMES * usual)] = DOUBTED
+    return _doubt_around(right, solution.status)
+
+
+def doubt_coordinates(solution: DecodedSolution) -> np.ndarray:
+    """Return the probability of each pixel's projector coordinates to be right, from its decoder and its neighbours alone.
+
+    Returns:
+        [rows, cols] float32, 0…1; 0 where there is no coordinate.
+    """
+    right = np.zeros(solution.status.shape, np.float32)
+    right[solution.solved] = 1
+    for status, likely in CONFIDENT.items():
+        right[(solution.status == status) & solution.estimated] = likely
+    alone = np.logical_or.reduce([stands_alone(axis) for axis in solution.coordinates.axes]) & solution.solved
+    right[alone] = DOUBTED
+    solution.facts["doubted"] = {"alone": int(alone.sum())}
+    return _doubt_around(right, solution.status)
+
+
+def _doubt_around(right: np.ndarray, status: np.ndarray) -> np.ndarray:
+    """Return the probabilities with those of pixels lowered around which many are doubted or refused."""
+    solved = np.isin(status, SOLVED)
     trust = (right >= LIKELY).astype(np.float32)
     known = solved.astype(np.float32)
-    for status, weight in DISTRUSTED.items():
-        known[solution.status == status] = weight
+    for code, weight in DISTRUSTED.items():
+        known[status == code] = weight
     share = _mean_around(trust * known, known)
     return np.where(solved & (share < TRUSTED_PART), np.minimum(right, DOUBTED + share * (LIKELY - DOUBTED)), right).astype(np.float32)
 
@@ -93,12 +116,13 @@ def _mean_around(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
     return np.asarray(np.where(sums[1] > 1e-6, sums[0] / np.maximum(sums[1], 1e-6), 1.0))
 
 
-def conclude(solution: DepthSolution, right: np.ndarray, mask: np.ndarray, request: DepthRequest, warnings: list[str]) -> None:
+def conclude(solution: DepthSolution | DecodedSolution, right: np.ndarray, mask: np.ndarray, request: DepthRequest,
+             warnings: list[str]) -> None:
     """Say what does not fit on the whole scene, and let confidence and status follow.
 
     Args:
         solution: its warnings, confidence and status are changed.
-        right: of `doubt_pixels`.
+        right: of `doubt_pixels` or `doubt_coordinates`.
         mask: [rows, cols] bool.
         request: near and far, the residual, and the least confidence; where it names one, it alone decides what counts as solved.
         warnings: what a sample has shown of the frames; where frames are declared wrongly, no depth is believed.
@@ -114,8 +138,9 @@ def conclude(solution: DepthSolution, right: np.ndarray, mask: np.ndarray, reque
     elif lit.sum() >= ENOUGH and share < SURE_SHARE:
         refused = np.where(lit & ~sure & np.isin(solution.status, SOLVED), int(Status.UNSURE), solution.status)[lit & ~sure]
         most = Status(int(np.bincount(refused).argmax()))
-        warnings = [*warnings, f"frames: {100 * share:.2g} % of the {int(lit.sum())} lit pixels have a depth that can be trusted; most of "
-                               f"the others are {most.name.lower().replace('_', ' ')}: {ADVICE[most]}"]
+        what = "depth" if isinstance(solution, DepthSolution) else "place in the projector"
+        warnings = [*warnings, f"frames: {100 * share:.2g} % of the {int(lit.sum())} lit pixels have a {what} that can be trusted; "
+                               f"most of the others are {most.name.lower().replace('_', ' ')}: {ADVICE[most]}"]
     confidence = solution.confidence_map()
     assert confidence is not None  # it follows from sigma
     solution.confidence = (right * min(1.0, share / SURE_SHARE) * confidence).astype(np.float32)

@@ -1,18 +1,20 @@
 """Measure the depth of a capture and write depth.exr, points.ply and report.json.
 
 The way of the data: the kind of the capture's frames chooses a row of `KINDS`, whose `solve` makes a DepthSolution of them: patterns.py
-(with codes.py and decoders.py), laser.py or tof.py. points.py makes the cloud of it, and the files are written here.
+(with codes.py and decoders.py), laser.py or tof.py; or a DecodedSolution, where patterns cannot be triangulated. points.py makes the cloud
+of a depth, and the files are written here.
 """
 
 import hashlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from kernels import device as devices
 from kernels.status import Status, refuse_unsure
+from service.depth.coordinates import DecodedSolution
 from service.depth.laser import solve_laser
 from service.depth.patterns import solve_patterns
 from service.depth.points import point_cloud
@@ -23,8 +25,8 @@ from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, metadata, report
 from service.requests.depth import DepthRequest, Ranging
 from stage.capture import Capture
-from stage.depth_maps import DEPTH_FILE, DepthMaps
-from stage.errors import ManifestError
+from stage.depth_maps import DEPTH_FILE, CoordinateMaps, DepthMaps
+from stage.errors import ManifestError, storage
 from stage.files import write_text
 from stage.fingerprint import Fingerprints, digest
 from stage.ingest import CACHE_FOLDER
@@ -41,7 +43,7 @@ class Kind(NamedTuple):
 
     holds: Callable[[Frame], bool]
     """Tells whether a frame is of this kind. Black and white frames go with any kind."""
-    solve: Callable[[Capture, np.ndarray, DepthRequest, str, Timings], DepthSolution]
+    solve: Callable[[Capture, np.ndarray, DepthRequest, str, Timings], DepthSolution | DecodedSolution]
     """Measures the depth of a capture, from its mask, the request, the device and the timings to tell of."""
     lengths: str | None
     """The field of the manifest whose unit is wrong if the depths are not plausible; None if depths of any size are plausible."""
@@ -62,9 +64,11 @@ KINDS: dict[Ranging, Kind] = {
 class DepthResult(NamedTuple):
     """The files and numbers of a depth that was written."""
 
-    maps: DepthMaps
+    maps: DepthMaps | CoordinateMaps
+    """CoordinateMaps where the patterns were decoded and could not be triangulated."""
     depth_path: Path
-    points_path: Path
+    points_path: Path | None
+    """None where there is no depth."""
     report_path: Path
     method: str
     points: int
@@ -95,22 +99,35 @@ def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResul
     mask = capture.mask()
     solution = KINDS[using].solve(capture, mask, request, device, timings)
     least = solution.least_confidence if request.least_confidence is None else request.least_confidence
-    refuse_unsure(solution.status, solution.sigma, solution.confidence_map(), max_sigma=request.max_sigma, least_confidence=least)
-    _check_plausible(solution, capture, using)
-    timings.stage("points", 1)
-    cloud = point_cloud(solution, capture.camera, color_space=capture.manifest.color_space, normals=request.normals)
-    timings.stage("write", 1)
     content = content_of(capture)
     calibration = request.tof.calibration
     sources = metadata(request, capture=capture.name, inputs=content, method=solution.method,
                        contents={} if calibration is None else {"tof_calibration": digest(calibration)})
-    maps = DepthMaps(
-        camera=capture.camera, mask=solution.solved, estimated=solution.estimated, depth=solution.depth, range=solution.range_m,
-        projector_u=solution.projector_u, projector_v=solution.projector_v, amplitude=solution.amplitude, sigma=solution.sigma,
-        confidence=solution.confidence_map(), status=solution.status, provenance=sources)
     depth_path, points_path, report_path = (request.out / name for name in (DEPTH_FILE, POINTS_FILE, REPORT_FILE))
-    maps.write(depth_path)
-    write_ply(cloud, points_path, comments=tuple(f"{key} {value}" for key, value in sources.items()))
+    maps: DepthMaps | CoordinateMaps
+    if isinstance(solution, DecodedSolution):
+        if not solution.estimated.any():
+            raise ManifestError(f"{capture.folder}: no pixel is decoded ({_reasons(solution)}): "
+                                f"{_advice(solution.counts(mask), using)}")
+        refuse_unsure(solution.status, None, solution.confidence_map(), max_sigma=None, least_confidence=least)
+        timings.stage("write", 1)
+        maps = solution.maps(capture.camera, sources)
+        maps.write(depth_path)
+        with storage("remove", points_path):
+            points_path.unlink(missing_ok=True)  # of an earlier run: there are no points beside this file
+        cloud = None
+        measured = solution.statistics()
+    else:
+        refuse_unsure(solution.status, solution.sigma, solution.confidence_map(), max_sigma=request.max_sigma, least_confidence=least)
+        _check_plausible(solution, capture, using)
+        timings.stage("points", 1)
+        cloud = point_cloud(solution, capture.camera, color_space=capture.manifest.color_space, normals=request.normals)
+        timings.stage("write", 1)
+        maps = solution.maps(capture.camera, sources)
+        maps.write(depth_path)
+        write_ply(cloud, points_path, comments=tuple(f"{key} {value}" for key, value in sources.items()))
+        measured = solution.statistics()
+    points = 0 if cloud is None else len(cloud.points)
     counts = solution.counts(mask)
     write_text(report_path, report(
         request,
@@ -122,11 +139,10 @@ def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResul
         device=devices.describe(device),
         timings_s=timings.close(),
         pixels={"mask": int(mask.sum()), **counts},
-        points=len(cloud.points),
-        depth_m=statistics(solution.depth[solution.solved]),
-        sigma_m=statistics(solution.sigma[solution.solved]) if solution.sigma is not None else {},
+        points=points,
+        **measured,
     ))
-    return DepthResult(maps, depth_path, points_path, report_path, solution.method, len(cloud.points), counts,
+    return DepthResult(maps, depth_path, None if cloud is None else points_path, report_path, solution.method, points, counts,
                        tuple(solution.warnings))
 
 
@@ -155,11 +171,10 @@ def _check_plausible(solution: DepthSolution, capture: Capture, using: Ranging) 
     """
     estimated = solution.estimated
     if not solution.solved.any():
-        reasons = {name: count for name, count in solution.counts(np.ones_like(estimated)).items() if count and name != "unsolved"}
-        text = ", ".join(f"{count} {name}" for name, count in reasons.items()) or "nothing is inside the mask"
+        text = _reasons(solution)
         if not estimated.any():
             raise ManifestError(f"{capture.folder}: no pixel has a depth ({text}): "
-                                f"{'; '.join(solution.warnings) or _advice(reasons, using)}")
+                                f"{'; '.join(solution.warnings) or _advice(solution.counts(np.ones_like(estimated)), using)}")
         solution.warnings.append(f"no depth is sure enough to count as solved ({text}): depth.exr keeps the values outside the mask; "
                                  "--least-confidence 0 counts unsure ones as solved")
     middle, field = float(np.median(solution.depth[estimated])), KINDS[using].lengths
@@ -167,9 +182,15 @@ def _check_plausible(solution: DepthSolution, capture: Capture, using: Ranging) 
         raise ManifestError(f"{capture.folder / FILE_NAME}: {field}: the median depth comes out as {middle:.3g} m: give lengths in metres")
 
 
-def _advice(reasons: dict[str, int], using: Ranging) -> str:
+def _reasons(solution: DepthSolution | DecodedSolution) -> str:
+    """Return how many pixels have each status."""
+    counts = solution.counts(np.ones_like(solution.estimated))
+    return ", ".join(f"{count} {name}" for name, count in counts.items() if count and name != "unsolved") or "nothing is inside the mask"
+
+
+def _advice(counts: dict[str, int], using: Ranging) -> str:
     """Return what most often is the cause of the commonest status."""
-    most = max(reasons, key=lambda name: reasons[name], default="")
+    most = max((name for name in counts if name != "unsolved"), key=lambda name: counts[name])
     if most == Status.ILL_POSED.name.lower():
         return "the projected coordinate does not change with depth: project columns from beside the camera, rows from above it"
     if most == Status.OUT_OF_RANGE.name.lower():
@@ -187,11 +208,3 @@ def content_of(capture: Capture) -> str:
     for name in names:
         combined.update(f"{name}\0{hashes[name]}\0".encode())
     return combined.hexdigest()
-
-
-def statistics(values: np.ndarray) -> dict[str, Any]:
-    """Return the median and the 5th and 95th percentile of what was measured, for the report."""
-    if values.size == 0:
-        return {}
-    low, middle, high = np.percentile(values.astype(np.float64), [5, 50, 95])
-    return {"p05": float(f"{low:.6g}"), "median": float(f"{middle:.6g}"), "p95": float(f"{high:.6g}")}

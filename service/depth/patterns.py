@@ -1,6 +1,7 @@
-"""Depth from frames under projected patterns: decode each axis band by band, then triangulate."""
+"""Depth from frames under projected patterns: decode each axis band by band, then triangulate, where the capture is calibrated."""
 
 from collections.abc import Iterator, Sequence
+from math import ceil
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,11 +12,13 @@ from kernels.structured.decoded import Decoded
 from kernels.structured.frames import NoiseModel, saturated_bits, upload
 from kernels.structured.join import cropped
 from kernels.structured.triangulate import ProjectorModel, triangulate
-from service.depth.agreement import conclude, doubt_pixels
+from service.depth.agreement import ADVICE, conclude, doubt_coordinates, doubt_pixels
 from service.depth.codes import choose_decoder
+from service.depth.coordinates import Coordinates, DecodedSolution
 from service.depth.decoders import AxisDecoder, PatternProjector, Readings
 from service.depth.pattern_checks import check_declaration, find_exponent, response_sentence, sample_of
 from service.depth.solution import DepthSolution
+from service.errors import RequestError
 from service.reporting.progress import Timings
 from service.requests.depth import DepthRequest
 from stage.capture import Capture
@@ -26,9 +29,10 @@ from stage.errors import ManifestError
 from stage.manifest import FILE_NAME, Frame
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected, collect
+from stage.patterns.kary import KaryCode
 from stage.planes import Planes, frame_planes
 from stage.projector import Projector
-from stage.triangulation_check import check_projector
+from stage.triangulation_check import check_projector, missing_calibration
 
 SCALE_PERCENTILE = 99.9
 """Percentile of the brightest frame that is taken for full scale, for images in floating point without a given saturation."""
@@ -48,51 +52,119 @@ class PatternCodes(NamedTuple):
     """Codes that no decoder reads."""
 
     @property
+    def method(self) -> str:
+        """Return the names of the decoders."""
+        return ", ".join(sorted({decoder.name for decoder in (self.columns, self.rows) if decoder is not None}))
+
+    @property
     def colour(self) -> bool:
         """Return whether a decoder needs colour frames."""
         return any(decoder is not None and decoder.colour for decoder in (self.columns, self.rows))
 
 
-def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, device: str, timings: Timings) -> DepthSolution:
-    """Decode the projector's columns, rows or both, and intersect them with the lines of sight.
+def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, device: str,
+                   timings: Timings) -> DepthSolution | DecodedSolution:
+    """Decode the projector's columns, rows or both, and intersect them with the lines of sight where the capture is calibrated.
 
     Args:
-        capture: with a projector and pattern frames.
+        capture: with pattern frames.
         mask: [rows, cols] bool.
         request: its noise, residual and span of depths; depths outside are OUT_OF_RANGE.
         device: where to run.
         timings: told of every stage.
 
+    Returns:
+        Depth; or the decoded coordinates alone, where the capture is not calibrated or where no decoded pixel has a depth.
+
     Raises:
-        StageError: no projector, an incomplete code, an unreadable frame.
+        StageError: a calibration that cannot be, an incomplete code, an unreadable frame.
+        RequestError: options about depth for a capture that is not calibrated.
     """
-    projector = check_projector(capture)
+    missing = missing_calibration(capture)
+    projector = check_projector(capture) if missing is None else None
+    if missing is not None:
+        _refuse_depth_options(request, missing)
     frames = [frame for frame in capture.manifest.frames if frame.pattern is not None]
-    shown = PatternProjector(projector.resolution, projector.response, projector.crosstalk)
+    shown = pattern_projector(capture, frames)
     codes = read_codes(capture, frames, shown, refine=request.refine)
     timings.stage("frames", len(frames))
     with frame_planes(capture, frames, colour=codes.colour, cache=request.cache, progress=timings.advance) as planes:
         full = full_scale(planes, capture, frames)
         noise = NoiseModel(request.read_noise * full, request.photon_gain * full)
         warnings, codes = _checked(planes, mask, codes, shown, projector, capture, frames, noise, device, request)
-        solution, right = _bands(planes, mask, codes, projector, capture, noise, device, request, timings)
-    conclude(solution, right, mask, request, warnings)
-    solution.colour = scene_colour(capture, frames, codes.collected)
-    solution.facts |= {"full_scale": float(f"{full:.6g}"), "frames": len(frames),
-                       "codes": {decoder.axis: decoder.name for decoder in (codes.columns, codes.rows) if decoder is not None},
-                       "unused": list(codes.unused)}
-    return solution
+        coordinates = Coordinates.empty(mask.shape, columns=codes.columns is not None, rows=codes.rows is not None)
+        if projector is None:
+            timings.stage("decode", mask.shape[0])
+            for band, decoded in decoded_bands(planes, (codes.columns, codes.rows), noise, device):
+                coordinates.put(band, mask[band], decoded)
+                timings.advance(band.stop)
+        else:
+            solution, right = _bands(planes, mask, codes, coordinates, projector, capture, noise, device, request, timings)
+    facts = {"full_scale": float(f"{full:.6g}"), "frames": len(frames),
+             "codes": {decoder.axis: decoder.name for decoder in (codes.columns, codes.rows) if decoder is not None},
+             "unused": list(codes.unused)}
+    spanned = request.near_m is not None or request.far_m is not None  # which may be what refuses all depths
+    if projector is not None and (spanned or solution.estimated.any() or not np.isin(coordinates.status(), SOLVED).any()):
+        conclude(solution, right, mask, request, warnings)
+        solution.colour = scene_colour(capture, frames, codes.collected)
+        solution.facts |= facts
+        return solution
+    reason = missing or f"no decoded pixel has a depth ({_refused(solution, mask)}"
+    decoded_only = DecodedSolution(method=codes.method, coordinates=coordinates, extents=shown.resolution, status=coordinates.status())
+    conclude(decoded_only, doubt_coordinates(decoded_only), mask, request, warnings)
+    decoded_only.warnings.insert(0, f"decoded only, without depth: {reason}")
+    decoded_only.facts |= facts | {"decoded_only": reason}
+    return decoded_only
 
 
-def _checked(planes: Planes, mask: np.ndarray, codes: PatternCodes, shown: PatternProjector, projector: Projector, capture: Capture,
-             frames: list[Frame], noise: NoiseModel, device: str, request: DepthRequest) -> tuple[list[str], PatternCodes]:
+def _refuse_depth_options(request: DepthRequest, missing: str) -> None:
+    """Refuse options that say something about depths where there will be none.
+
+    Raises:
+        RequestError: names the option.
+    """
+    for option in ("near_m", "far_m", "max_sigma", "normals"):
+        if getattr(request, option) not in (None, False):
+            raise RequestError(f"--{option.replace('_', '-')}: is about depths, and the patterns are decoded without depth: {missing}")
+
+
+def _refused(solution: DepthSolution, mask: np.ndarray) -> str:
+    """Return how many pixels have each status, and what most often is the cause of the commonest that triangulation gives."""
+    counts = {Status[name.upper()]: count for name, count in solution.counts(mask).items() if count}
+    most = max((Status.OUT_OF_RANGE, Status.ILL_POSED), key=lambda status: counts.get(status, 0))
+    listed = ", ".join(f"{count} {status.name.lower()}" for status, count in counts.items() if status != Status.UNSOLVED)
+    return f"{listed}): {ADVICE[most]}"
+
+
+def pattern_projector(capture: Capture, frames: Sequence[Frame]) -> PatternProjector:
+    """Return what decoding needs of the projector; where the manifest has none, stripes that are counted by bits or digits tell its size.
+
+    Raises:
+        ManifestError: the projector is missing, and the codes do not tell how many pixels it has.
+    """
+    projector = capture.manifest.projector
+    if projector is not None:
+        return PatternProjector(projector.resolution, projector.response, projector.crosstalk)
+    size = {"column": 1, "row": 1}
+    for code in collect([frame.pattern for frame in frames]).codes:
+        if not isinstance(code, BinaryCode | KaryCode):
+            raise ManifestError(f"{capture.folder / FILE_NAME}: projector: is missing, and a {code.name} code does not tell how many "
+                                'pixels it has: give its size at least, as "projector": {"resolution": [1280, 800]}')
+        size[code.axis] = max(size[code.axis], ceil(code.stripe_count * code.stripe_px))
+    return PatternProjector((size["column"], size["row"]))
+
+
+def _checked(planes: Planes, mask: np.ndarray, codes: PatternCodes, shown: PatternProjector, projector: Projector | None,
+             capture: Capture, frames: list[Frame], noise: NoiseModel, device: str,
+             request: DepthRequest) -> tuple[list[str], PatternCodes]:
     """Return what a sample of the frames says about all of them, and the decoders that heed it."""
     sample = sample_of(planes, capture.camera, mask)
     patterns = [frame.pattern for frame in frames if frame.pattern is not None]
-    wrong = check_declaration(sample, patterns, shown, projector_model(projector), noise, device)
-    if wrong is not None:
-        return [wrong], codes
-    if projector.response is None:
+    if projector is not None:
+        wrong = check_declaration(sample, patterns, shown, projector_model(projector), noise, device)
+        if wrong is not None:
+            return [wrong], codes
+    if shown.response is None:
         exponent = find_exponent(sample, codes.collected, shown, noise, device)
         if exponent != 1.0:
             names = [f"{decoder.axis}s" for decoder in (codes.columns, codes.rows) if decoder is not None]
@@ -117,54 +189,45 @@ def read_codes(capture: Capture, frames: list[Frame], projector: PatternProjecto
         raise ManifestError(f"{capture.folder / FILE_NAME}: frames: {error}") from error
 
 
-def _bands(planes: Planes, mask: np.ndarray, codes: PatternCodes, projector: Projector, capture: Capture, noise: NoiseModel, device: str,
-           request: DepthRequest, timings: Timings) -> tuple[DepthSolution, np.ndarray]:
-    """Return the depth of each pixel and its probability to be right."""
+def _bands(planes: Planes, mask: np.ndarray, codes: PatternCodes, coordinates: Coordinates, projector: Projector, capture: Capture,
+           noise: NoiseModel, device: str, request: DepthRequest, timings: Timings) -> tuple[DepthSolution, np.ndarray]:
+    """Return the depth of each pixel and its probability to be right; fill the coordinates."""
     shape = mask.shape
     columns, rows = codes.columns, codes.rows
     model = projector_model(projector)
     x, y = capture.camera.plane_coordinates()
-    maps = {name: np.zeros(shape, np.float32) for name in ("depth", "sigma", "residual", "amplitude", "u", "v")}
+    maps = {name: np.zeros(shape, np.float32) for name in ("depth", "sigma", "residual")}
     status = np.zeros(shape, np.uint8)
-    guessed = {name: np.zeros(shape, dtype=bool) for name in "uv"}
     timings.stage("decode", shape[0])
     for band, decoded in decoded_bands(planes, (columns, rows), noise, device):
         found = triangulate(x[band].ravel().astype(np.float32), y[band].ravel().astype(np.float32), decoded[0], decoded[1], model,
                             near_m=request.near_m or 0.0, far_m=request.far_m or np.inf, max_residual_px=request.max_residual_px,
                             device=device)
         part = mask[band]
-
-        def place(name: str, values: np.ndarray, kept: np.ndarray, band: slice = band) -> None:
-            flat = values[:kept.size].reshape(kept.shape)
-            maps[name][band] = np.where(kept, flat, 0)
-
+        coordinates.put(band, part, decoded)
         code = found.status.numpy()[:part.size].reshape(part.shape)
         status[band] = np.where(part, code, int(Status.UNSOLVED))
         solved = np.isin(status[band], SOLVED)
         kept = solved | (np.isin(status[band], ESTIMATED) & (found.depth.numpy()[:part.size].reshape(part.shape) > 0))
-        for name in ("depth", "sigma", "residual"):
-            place(name, getattr(found, name).numpy(), kept)
-        place("amplitude", _amplitude(decoded), part)
-        for name, axis in zip("uv", decoded, strict=True):
-            if axis is not None:
-                place(name, axis.coordinate.numpy(), kept)
-                sure = np.isin(axis.status.numpy()[:part.size].reshape(part.shape), SOLVED)
-                guessed[name][band] = solved & ~sure
+        for name in maps:
+            maps[name][band] = np.where(kept, getattr(found, name).numpy()[:part.size].reshape(part.shape), 0)
         timings.advance(band.stop)
-    for index, (name, missing) in enumerate(guessed.items()):
-        if missing.any():  # solved from the other axis alone: where the point lies in the projector
-            points = capture.camera.points(-maps["depth"])[missing]
-            maps[name][missing] = projector.project(points)[0][:, index]
+    for index, axis in enumerate((coordinates.columns, coordinates.rows)):
+        if axis is not None:
+            missing = np.isin(status, SOLVED) & ~axis.solved  # solved from the other axis alone: where the point lies in the projector
+            axis.coordinate[missing] = projector.project(capture.camera.points(-maps["depth"])[missing])[0][:, index]
+            axis.sigma[missing] = 0
     solved = np.isin(status, SOLVED)
     facts: dict[str, Any] = {}
     both = columns is not None and rows is not None
     if both and solved.any():
         low, high = np.percentile(maps["residual"][solved], [50, 95])
         facts["residual_px"] = {"median": float(f"{low:.4g}"), "p95": float(f"{high:.4g}")}
-    names = sorted({decoder.name for decoder in (columns, rows) if decoder is not None})
-    solution = DepthSolution(method=", ".join(names), depth=maps["depth"], status=status, sigma=maps["sigma"],
-                             projector_u=maps["u"] if columns is not None else None, projector_v=maps["v"] if rows is not None else None,
-                             amplitude=maps["amplitude"], facts=facts)
+    u, v = coordinates.columns, coordinates.rows
+    solution = DepthSolution(method=codes.method, depth=maps["depth"], status=status, sigma=maps["sigma"],
+                             projector_u=None if u is None else u.coordinate, projector_v=None if v is None else v.coordinate,
+                             sigma_u=None if u is None else u.sigma, sigma_v=None if v is None else v.sigma,
+                             amplitude=coordinates.amplitude, facts=facts)
     right = doubt_pixels(solution, maps["residual"] if both else None, capture.camera, projector, device)
     return solution, right
 
@@ -190,11 +253,6 @@ def decoded_bands(planes: Planes, decoders: Sequence[AxisDecoder | None], noise:
             first, count = (band.start - around.start) * width, (band.stop - band.start) * width
             decoded = [None if axis is None else cropped(axis, first, count, device=device) for axis in decoded]
         yield band, decoded
-
-
-def _amplitude(decoded: list[Decoded | None]) -> np.ndarray:
-    """Return the amplitude of the weaker axis: a pixel is as good as its worse one."""
-    return np.minimum.reduce([axis.amplitude.numpy() for axis in decoded if axis is not None])
 
 
 def projector_model(projector: Projector) -> ProjectorModel:

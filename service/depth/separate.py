@@ -13,7 +13,8 @@ from kernels import device as devices
 from kernels.status import OK, Status
 from kernels.structured.frames import saturated_bits, upload
 from kernels.structured.separation import separate as separate_band
-from service.depth.depth import content_of, statistics
+from service.depth.depth import content_of
+from service.depth.solution import statistics
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, metadata, report

@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 
 from kernels.status import ESTIMATED, SOLVED, Status
+from stage.camera import Camera
+from stage.depth_maps import DepthMaps
 
 HALF_SURE = 1e-3
 """Standard deviation of the depth over the depth, at which confidence is one half."""
@@ -13,7 +15,10 @@ HALF_SURE = 1e-3
 
 @dataclass
 class DepthSolution:
-    """Depth at every pixel of the image; only pixels with a status of kernels.status.ESTIMATED have values."""
+    """Depth at every pixel of the image; only pixels with a status of kernels.status.ESTIMATED have a depth.
+
+    Projector coordinates are kept where they are decoded, also where triangulation fails.
+    """
 
     method: str
     """What was decoded, in words for the report."""
@@ -23,6 +28,8 @@ class DepthSolution:
     range_m: np.ndarray | None = None  # [rows, cols] float32 metres along the ray
     projector_u: np.ndarray | None = None  # [rows, cols] float32 projector pixels
     projector_v: np.ndarray | None = None  # [rows, cols] float32 projector pixels
+    sigma_u: np.ndarray | None = None  # [rows, cols] float32 projector pixels, standard deviation of the decoded column
+    sigma_v: np.ndarray | None = None  # [rows, cols] float32 projector pixels, of the decoded row
     amplitude: np.ndarray | None = None  # [rows, cols] float32, in the unit of the images
     confidence: np.ndarray | None = None  # [rows, cols] 0…1; None: from sigma
     colour: np.ndarray | None = None  # [rows, cols, 3] float32 linear, of the scene under even light; None: the amplitude's grey
@@ -54,5 +61,30 @@ class DepthSolution:
 
     def counts(self, mask: np.ndarray) -> dict[str, int]:
         """Return how many pixels of the mask have each status, by name."""
-        numbers = np.bincount(self.status[mask], minlength=max(Status) + 1)
-        return {status.name.lower(): int(numbers[status]) for status in Status}
+        return status_counts(self.status, mask)
+
+    def statistics(self) -> dict[str, dict[str, float]]:
+        """Return the spread of the depth and of its deviation over the solved pixels, for the report."""
+        return {"depth_m": statistics(self.depth[self.solved]),
+                "sigma_m": statistics(self.sigma[self.solved]) if self.sigma is not None else {}}
+
+    def maps(self, camera: Camera, provenance: dict[str, str]) -> DepthMaps:
+        """Return the layers of depth.exr."""
+        return DepthMaps(
+            camera=camera, mask=self.solved, estimated=self.estimated, depth=self.depth, range=self.range_m,
+            projector_u=self.projector_u, projector_v=self.projector_v, amplitude=self.amplitude, sigma=self.sigma,
+            sigma_u=self.sigma_u, sigma_v=self.sigma_v, confidence=self.confidence_map(), status=self.status, provenance=provenance)
+
+
+def status_counts(status: np.ndarray, mask: np.ndarray) -> dict[str, int]:
+    """Return how many pixels of the mask have each status, by name."""
+    numbers = np.bincount(status[mask], minlength=max(Status) + 1)
+    return {code.name.lower(): int(numbers[code]) for code in Status}
+
+
+def statistics(values: np.ndarray) -> dict[str, float]:
+    """Return the median and the 5th and 95th percentile of what was measured, for the report."""
+    if values.size == 0:
+        return {}
+    low, middle, high = np.percentile(values.astype(np.float64), [5, 50, 95])
+    return {"p05": float(f"{low:.6g}"), "median": float(f"{middle:.6g}"), "p95": float(f"{high:.6g}")}

@@ -51,6 +51,8 @@ DEPTH = {
     "sigma": Appearance("Standard deviation of the depth", SCALAR, "m"),
     "projector_u": Appearance("Projector column", SCALAR, "px"),
     "projector_v": Appearance("Projector row", SCALAR, "px"),
+    "sigma_u": Appearance("Standard deviation of the projector column", SCALAR, "px"),
+    "sigma_v": Appearance("Standard deviation of the projector row", SCALAR, "px"),
     "amplitude": Appearance("Amplitude", SCALAR),
     "confidence": Appearance("Confidence", SCALAR),
     "status": Appearance("Status", CODES),
@@ -73,7 +75,10 @@ class ResultLayers:
         """
         self.path = path
         header = exr.read_header(path)
-        self.of_depth = "depth.Z" in header.channels
+        told = [name for name, (channel, _) in depth_maps.LAYERS.items()
+                if name in ("depth", "projector_u", "projector_v") and channel in header.channels]
+        self.of_depth = bool(told)
+        self.has_depth = "depth" in told
         file_name = depth_maps.DEPTH_FILE if self.of_depth else maps.MAPS_FILE
         self.camera, self.provenance = camera_and_provenance(header.metadata, path, file_name=file_name)
         _check_camera(path, self.camera, capture.camera)
@@ -115,7 +120,8 @@ class ResultLayers:
     @cached_property
     def estimated(self) -> np.ndarray:
         """The pixels whose values are kept, [rows, cols] bool: those of the mask and the unsure ones."""
-        told = self._names.get("depth" if self.of_depth else "normal", [])
+        names = (["depth"] if self.has_depth else ["projector_u", "projector_v"]) if self.of_depth else ["normal"]
+        told = [channel for name in names for channel in self._names.get(name, [])]
         return np.logical_or.reduce([self.mask, *(self._channels[channel] != 0 for channel in told)])
 
     @cached_property

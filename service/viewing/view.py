@@ -83,7 +83,7 @@ def view(request: ViewRequest, progress: Progress | None = None) -> ViewResult:
     target = request.out / VIEW_FILE
     sections: dict[str, Any] = {"layers": [], "relight": None, "samples": None, "points": None}
     with storage("write", target), replacing(request.out / BLOCKS_FILE) as temporary, BlockFile(temporary) as file:
-        if result is not None and result.of_depth:
+        if result is not None and result.has_depth:
             timings.stage("points", 1)
             sections["points"] = write_points(result, file)
         if result is not None:

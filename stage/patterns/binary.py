@@ -90,6 +90,11 @@ class BinaryCode(NamedTuple):
     inverses: tuple[int, ...] | None
     """The frame of each inverse; None without them."""
 
+    @property
+    def stripe_count(self) -> int:
+        """Return how many stripes the code numbers: the projector shows as many or fewer."""
+        return 2**len(self.frames)
+
     @classmethod
     def collect(cls, frames: Mapping[BinaryPattern | XorPattern, int]) -> "BinaryCode":
         """Sort the frames of one code by bit.

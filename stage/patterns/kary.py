@@ -80,6 +80,11 @@ class KaryCode(NamedTuple):
         """Return the word of the manifest."""
         return "kary"
 
+    @property
+    def stripe_count(self) -> int:
+        """Return how many stripes the code numbers: the projector shows as many or fewer."""
+        return self.base**len(self.frames)
+
     @classmethod
     def collect(cls, frames: Mapping[KaryPattern, int]) -> "KaryCode":
         """Sort the frames of one code by digit.
