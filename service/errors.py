@@ -40,3 +40,10 @@ def sentence(error: BaseException, name: FieldName = field_name) -> str:
     else:
         text = " ".join(str(error).split())
     return "".join(character if character.isprintable() else ascii(character)[1:-1] for character in text)
+
+
+def sentences(error: BaseException) -> list[str]:
+    """Return the lines to show for an error, one for each fault that it lists."""
+    if isinstance(error, StageError) and len(error.args) > 1:
+        return [sentence(StageError(fault)) for fault in error.args]
+    return [sentence(error)]

@@ -10,7 +10,7 @@ import numpy as np
 
 from stage import images
 from stage.camera import Camera
-from stage.errors import ManifestError, StageError, storage
+from stage.errors import MOST_FAULTS, ImageError, ManifestError, StageError, listed, storage
 from stage.light import DistantLight, EnvironmentLight, ExtendedLight, FullLight, GradientLight, OffLight, PointLight
 from stage.manifest import FILE_NAME, Frame, Manifest, read_manifest
 
@@ -143,6 +143,9 @@ class Capture:
             return None
 
         with ThreadPoolExecutor(HEADER_THREADS) as pool:
-            for error in pool.map(fault, self.files()):
-                if error is not None:
-                    raise error
+            errors = [error for error in pool.map(fault, self.files()) if error is not None]
+        if len(errors) == 1:
+            raise errors[0]
+        if errors:
+            kind = ImageError if all(isinstance(error, ImageError) for error in errors) else ManifestError
+            raise kind(*listed(map(str, errors), f"{self.folder}: has {len(errors) - MOST_FAULTS} faults more"))

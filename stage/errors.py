@@ -8,13 +8,20 @@ StageError
 └── StorageError     the file system refuses for lack of space or permission; the message names path and reason
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from os import PathLike, strerror
 
+MOST_FAULTS = 20
+"""The most faults that one error lists."""
+
 
 class StageError(Exception):
-    """The base of all exceptions that stage/ raises; the message is one plain sentence."""
+    """The base of all exceptions that stage/ raises; the message is one plain sentence, and `args` has one for each fault."""
+
+    def __str__(self) -> str:
+        """Return the sentences of all faults."""
+        return "; ".join(map(str, self.args))
 
 
 class ManifestError(StageError, ValueError):
@@ -35,6 +42,16 @@ class ResultError(StageError, ValueError):
 
 class StorageError(StageError, OSError):
     """The file system refuses an operation; the message names the path and the reason."""
+
+
+def listed(sentences: Iterable[str], rest: str) -> list[str]:
+    """Return the first different sentences, MOST_FAULTS of them, and `rest` where there are more; no more than these are made."""
+    first: dict[str, None] = {}
+    for sentence in sentences:
+        if sentence not in first and len(first) == MOST_FAULTS:
+            return [*first, rest]
+        first[sentence] = None
+    return list(first)
 
 
 @contextmanager

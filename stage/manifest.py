@@ -2,10 +2,11 @@
 
 import json
 import posixpath
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from stage.camera import Camera
 from stage.colour_spaces import ColorSpaceName
@@ -15,7 +16,7 @@ from stage.model import FirstFault, Positive, Strict, Text
 from stage.patterns.codes import Pattern
 from stage.projector import AnyProjector
 from stage.ranging import Laser, TimeOfFlight
-from stage.records import read_record
+from stage.records import faults_of, read_record
 
 SCHEMA = "relit.capture/1"
 FILE_NAME = "capture.json"
@@ -61,15 +62,9 @@ class Manifest(Strict):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        first: dict[str, int] = {}
-        for index, frame in enumerate(self.frames):
-            name = posixpath.normpath(frame.image)
-            if name in first:
-                raise ValueError(f"frames[{index}].image: {frame.image} is already the image of frames[{first[name]}]")
-            first[name] = index
-        timed = [frame.exposure_s is not None for frame in self.frames]
-        if any(timed) and not all(timed):
-            raise ValueError(f"frames[{timed.index(False)}].exposure_s: is missing: give it for every frame or for none")
+        fault = next(_between_frames([frame.image for frame in self.frames], [frame.exposure_s is not None for frame in self.frames]), None)
+        if fault is not None:
+            raise ValueError(fault)
         return self
 
 
@@ -81,9 +76,9 @@ def read_manifest(path: str | Path) -> Manifest:
 
     Raises:
         StorageError: the file cannot be read.
-        ManifestError: the file is not JSON, or a field is wrong; the message names file and field.
+        ManifestError: the file is not JSON, or fields are wrong; a sentence for each names file and field.
     """
-    return read_record(path, Manifest, SCHEMA)
+    return read_record(path, Manifest, SCHEMA, _frame_faults)
 
 
 def write_manifest(manifest: Manifest, path: str | Path) -> None:
@@ -97,3 +92,37 @@ def write_manifest(manifest: Manifest, path: str | Path) -> None:
     first = {"schema": data.pop("schema"), "name": data.pop("name"), "color_space": manifest.color_space}
     body = json.dumps({**first, **data}, indent=2)
     write_text(path, body[:-2] + f',\n  "frames": [\n{frames}\n  ]\n}}\n')
+
+
+def _frame_faults(data: dict[str, Any]) -> Iterator[str]:
+    """Yield the faults of every frame of a capture.json whose content is wrong, as sentences without the file."""
+    frames = data.get("frames")
+    if not isinstance(frames, list):
+        return
+    for index, frame in enumerate(frames):
+        try:
+            Frame.model_validate(frame)
+        except ValidationError as error:
+            yield from faults_of(error, within=("frames", index))
+    given = [frame if isinstance(frame, dict) else {} for frame in frames]
+    yield from _between_frames([frame.get("image") for frame in given], [frame.get("exposure_s") is not None for frame in given])
+
+
+def _between_frames(names: Sequence[Any], timed: Sequence[bool]) -> Iterator[str]:
+    """Yield the faults that frames have together: an image of two frames, and an exposure that some lack.
+
+    Args:
+        names: the image of each frame; what is no text has a fault of its own.
+        timed: whether each frame has an exposure.
+    """
+    first: dict[str, int] = {}
+    for index, image in enumerate(names):
+        if not isinstance(image, str):
+            continue
+        name = posixpath.normpath(image)
+        if name in first:
+            yield f"frames[{index}].image: {image} is already the image of frames[{first[name]}]"
+        else:
+            first[name] = index
+    if any(timed) and not all(timed):
+        yield f"frames[{timed.index(False)}].exposure_s: is missing: give it for every frame or for none"

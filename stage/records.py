@@ -1,14 +1,15 @@
-"""Reading of JSON files by a schema, with one sentence about the first fault, which names the file and the field."""
+"""Reading of JSON files by a schema, with one sentence about each fault, which names the file and the field."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
 from stage import inputs
-from stage.errors import ManifestError
+from stage.errors import ManifestError, listed
 
 Record = TypeVar("Record", bound=BaseModel)
 FieldName = Callable[[tuple[int | str, ...]], str]
@@ -19,17 +20,20 @@ MOST_SHOWN = 60
 """The most characters of a value or a key that a sentence repeats."""
 
 
-def read_record(path: str | Path, model: type[Record], schema: str) -> Record:
+def read_record(path: str | Path, model: type[Record], schema: str, further: Callable[[dict[str, Any]], Iterator[str]] | None = None
+                ) -> Record:
     """Read a JSON file and check it against a model.
 
     Args:
         path: the file.
         model: the model of its content.
         schema: the value that its key `schema` must have.
+        further: finds faults of content that is wrong, as `field: what is wrong`, among them those that the model does not report
+            because it stops at the first fault of a long list.
 
     Raises:
         StorageError: the file cannot be read.
-        ManifestError: the file is not JSON, has another schema, or a field is wrong; the message names file and field.
+        ManifestError: the file is not JSON, has another schema, or fields are wrong; a sentence for each names file and field.
     """
     text = inputs.read_bytes(path)
     try:
@@ -51,7 +55,8 @@ def read_record(path: str | Path, model: type[Record], schema: str) -> Record:
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        raise ManifestError(f"{path}: {describe(error)}") from error
+        found = chain(faults_of(error), further(data) if further is not None else ())
+        raise ManifestError(*listed((f"{path}: {fault}" for fault in found), f"{path}: has further faults: mend these first")) from error
 
 
 def describe(error: ValidationError, name: FieldName | None = None) -> str:
@@ -61,34 +66,48 @@ def describe(error: ValidationError, name: FieldName | None = None) -> str:
         error: with one fault or more.
         name: names the field; None: as `field_name` does.
     """
+    faults = faults_of(error, name)
+    return faults[0] + (f" (and {len(faults) - 1} more)" if len(faults) > 1 else "")
+
+
+def faults_of(error: ValidationError, name: FieldName | None = None, within: tuple[int | str, ...] = ()) -> list[str]:
+    """Return the faults of a pydantic error, each as `field: what is wrong`.
+
+    Args:
+        error: with one fault or more.
+        name: names the fields; None: as `field_name` does.
+        within: the place of what was validated, in the content of the file.
+    """
     places = {fault["loc"][:n] for fault in error.errors() for n in range(len(fault["loc"]))}
-    faults = [fault for fault in error.errors() if fault["loc"] not in places]  # a fault of an entry replaces the fault of its list
-    fault = faults[0]
-    where = (name or field_name)(fault["loc"])
+    named = [(fault, (name or field_name)((*within, *fault["loc"]))) for fault in error.errors()
+             if fault["loc"] not in places]  # a fault of an entry replaces the fault of its list
+    return [f"{where}: {_said(fault)}" if where else _said(fault) for fault, where in named]
+
+
+def _said(fault: Any) -> str:
+    """Return what is wrong with the value of a field, from an entry of `ValidationError.errors`."""
     match fault["type"]:
         case "extra_forbidden":
-            text = "is not a known key"
+            return "is not a known key"
         case "missing":
-            text = "is missing"
+            return "is missing"
         case "value_error":
-            text = str(fault["ctx"]["error"])
+            return str(fault["ctx"]["error"])
         case "union_tag_invalid":
-            text = f"{fault['ctx']['discriminator'].strip(chr(39))} is {_short(fault['ctx']['tag'])}, " \
+            return f"{fault['ctx']['discriminator'].strip(chr(39))} is {_short(fault['ctx']['tag'])}, " \
                    f"must be one of {fault['ctx']['expected_tags']}"
         case "too_short":
-            text = f"has {fault['ctx']['actual_length']} entries, needs {fault['ctx']['min_length']} or more"
+            return f"has {fault['ctx']['actual_length']} entries, needs {fault['ctx']['min_length']} or more"
         case "too_long":
-            text = f"has {fault['ctx']['actual_length']} entries, must have {fault['ctx']['max_length']}"
+            return f"has {fault['ctx']['actual_length']} entries, must have {fault['ctx']['max_length']}"
         case "tuple_type":
-            text = f"is {_short(fault['input'])}: must be a list"
+            return f"is {_short(fault['input'])}: must be a list"
         case "model_type" | "model_attributes_type":
-            text = f"is {_short(fault['input'])}: must be an object"
+            return f"is {_short(fault['input'])}: must be an object"
         case "union_tag_not_found":
-            text = f"lacks the key {fault['ctx']['discriminator'].strip(chr(39))}"
+            return f"lacks the key {fault['ctx']['discriminator'].strip(chr(39))}"
         case _:
-            text = f"is {_short(fault['input'])}: {fault['msg'][0].lower()}{fault['msg'][1:]}"
-    more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
-    return f"{where}: {text}{more}" if where else f"{text}{more}"
+            return f"is {_short(fault['input'])}: {fault['msg'][0].lower()}{fault['msg'][1:]}"
 
 
 def field_name(location: tuple[int | str, ...]) -> str:

@@ -63,12 +63,13 @@ def main() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader of our output is gone
         sys.exit(1)
     except Exception as error:
-        from service.errors import USER_ERRORS, sentence
+        from service.errors import USER_ERRORS, sentences
 
         if isinstance(error, OSError) and error.filename is not None and error.strerror:  # of a path that was given: too long, no folder …
             print(f"relit: {ascii(str(error.filename))[1:-1]}: {error.strerror.lower()}", file=sys.stderr)
         elif isinstance(error, USER_ERRORS):
-            print(f"relit: {sentence(error)}", file=sys.stderr)
+            for line in sentences(error):
+                print(f"relit: {line}", file=sys.stderr)
         else:
             raise
         sys.exit(BAD_INPUT)

@@ -54,6 +54,15 @@ def test_it_finds_what_a_check_finds(registered):
     assert check(sky, environment=True, root=root) == admit_environment(sky, max_pixels=PIXELS)
 
 
+def test_faults_are_in_one_line_without_the_folder(tmp_path):
+    write_capture(tmp_path / "cap", make_scene(size=8, lights=5))
+    edit_manifest(tmp_path / "cap", mask=3, saturation=0)
+    with pytest.raises(RequestError) as error:
+        check(tmp_path / "cap")
+    assert str(error.value) == ("capture.json: mask: is 3: input should be a valid string; "
+                                "capture.json: saturation: is 0: input should be greater than 0")
+
+
 def test_a_fault_is_one_sentence_without_the_folder(tmp_path):
     write_capture(tmp_path / "cap", make_scene(size=8, lights=5))
     edit_manifest(tmp_path / "cap", mask="nothing.png")

@@ -119,6 +119,27 @@ def test_bad_captures(relit, tmp_path, command, fault):
     assert not out.exists()
 
 
+@pytest.mark.parametrize("command", ["solve", "info", "depth"])
+def test_all_faults_of_a_manifest_are_listed(relit, tmp_path, command):
+    write_capture(tmp_path / "cap", SCENE)
+    edit_manifest(tmp_path / "cap", saturation=-1, colour="red")
+    edit_frame(tmp_path / "cap", 2, exposure_s=0)
+    arguments = [] if command == "info" else ["--out", tmp_path / "out"]
+    outcome = relit(command, tmp_path / "cap", *arguments)
+    assert (outcome.code, outcome.out) == (2, "") and not (tmp_path / "out").exists()
+    assert outcome.err.splitlines() == [f"relit: {tmp_path}/cap/capture.json: {fault}" for fault in (
+        "saturation: is -1: input should be greater than 0", "frames[2].exposure_s: is 0: input should be greater than 0",
+        "colour: is not a known key", "frames[0].exposure_s: is missing: give it for every frame or for none")]
+    write_capture(tmp_path / "other", SCENE)
+    for name in ("001.exr", "003.exr"):
+        (tmp_path / "other" / name).unlink()
+    write_image(tmp_path / "other" / "mask.png", np.full((9, 9), 255, np.uint8))
+    outcome = relit(command, tmp_path / "other", *arguments)
+    assert outcome.err.splitlines() == [f"relit: {tmp_path}/other/{fault}" for fault in (
+        "mask.png: is 9x9, camera.resolution says 8x8", "capture.json: frames[1].image: 001.exr is not in the folder",
+        "capture.json: frames[3].image: 003.exr is not in the folder")]
+
+
 def test_info_faults_are_refused_even_where_a_later_step_would_find_them(relit, tmp_path):
     write_capture(tmp_path, SCENE)
     image_with(tmp_path / "004.exr", np.nan)
