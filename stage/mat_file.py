@@ -66,6 +66,11 @@ def read_mat(path: Path) -> dict[str, Value]:
     return found
 
 
+def read_mat_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Return the numeric variables of a .mat file, as `read_mat` does."""
+    return {name: value for name, value in read_mat(path).items() if isinstance(value, np.ndarray)}
+
+
 def _keep(found: dict[str, Value], name: str, value: object) -> None:
     if isinstance(value, dict):
         for field, inner in value.items():

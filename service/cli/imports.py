@@ -23,11 +23,13 @@ from service.requests.captures import (
     Sense,
     StackOptions,
 )
+from service.requests.imports_tof import ArrayOptions, HistogramImport, KinectImport, Signal, TofImport
 from service.requests.patterns import PatternAxis
 
 if TYPE_CHECKING:
     from stage.importers.layout import Imported
     from stage.importers.patterns import Stack
+    from stage.importers.raw_arrays import ArrayFiles
     from stage.importers.view import Selection, View
 
 
@@ -37,7 +39,7 @@ def register(app: typer.Typer) -> None:
                           help="Write a capture.json for files that are laid out another way; docs/captures.md shows each layout.")
     for name, function in (("diligent", _diligent), ("lp", _lp), ("relightlab", _relightlab), ("olat", _olat),
                            ("near-lights", _near_lights), ("opencv-gray", _opencv_gray), ("gray", _gray), ("phase", _phase),
-                           ("scanner", _scanner)):
+                           ("scanner", _scanner), ("tof", _tof), ("histogram", _histogram), ("kinect", _kinect)):
         local_command(layouts, name, function)
     app.add_typer(layouts)
 
@@ -109,6 +111,36 @@ def _scanner(request: ScannerImport) -> None:
 
     _print(import_scanner(request.source, request.folder, calibration=request.calibration, codec=request.codec, axes=_axes(request.axis),
                           unit_m=request.unit_m, projector=request.projector, images=request.images))
+
+
+def _tof(request: TofImport) -> None:
+    from stage.importers.tof import import_correlations
+
+    _print(import_correlations(
+        request.source, request.folder, frequencies_hz=request.frequencies_hz, phases_deg=request.phases_deg,
+        minus=request.signal is Signal.MINUS, order=request.order, arrays=_arrays(request), planes=request.planes,
+        source_m=request.source_m, view=_view(request)))
+
+
+def _histogram(request: HistogramImport) -> None:
+    from stage.importers.tof import import_histograms
+
+    _print(import_histograms(
+        request.source, request.folder, bin_s=request.bin_s, start_s=request.start_s, count_scale=request.count_scale,
+        pulses=request.pulses, first_photon_only=request.first_photon_only, bins=request.bins, arrays=_arrays(request),
+        source_m=request.source_m, view=_view(request)))
+
+
+def _kinect(request: KinectImport) -> None:
+    from stage.importers import kinect
+
+    _print(kinect.import_folder(request.source, request.folder, packet=request.packet, p0=request.p0, view=_view(request)))
+
+
+def _arrays(request: ArrayOptions) -> "ArrayFiles":
+    from stage.importers.raw_arrays import ArrayFiles
+
+    return ArrayFiles(files=request.arrays, variables=request.variable, dtype=request.dtype, size=request.size)
 
 
 def _axes(axis: PatternAxis) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from stage import inputs
 from stage.calibration.opencv_file import lens, read_matrices
 from stage.camera import Distortion
 from stage.errors import ManifestError
-from stage.mat_file import read_mat
+from stage.mat_file import read_mat_arrays
 
 POSITIONS = ("s", "positions", "position", "locations", "pos")
 AXES = ("dir", "directions", "direction", "orientations", "orientation", "axes", "axis", "ns")
@@ -86,8 +86,8 @@ def read_camera_matrix(path: Path) -> CameraMatrix:
         StorageError: the file cannot be read.
     """
     matlab = path.suffix.lower() == ".mat"
-    matrices: dict[str, Any] = read_mat(path) if matlab else read_matrices(path)  # type: ignore[assignment]
-    name = next((name for name in CAMERA_MATRIX if isinstance(matrices.get(name), np.ndarray)), None)
+    matrices = read_mat_arrays(path) if matlab else read_matrices(path)
+    name = next((name for name in CAMERA_MATRIX if name in matrices), None)
     if name is None or matrices[name].shape != (3, 3) or not np.isfinite(matrices[name]).all():
         raise ManifestError(f"{path}: holds {', '.join(matrices) or 'nothing'}: there must be the 3 x 3 matrix of the camera, as K or "
                             "camera_matrix")
@@ -96,14 +96,14 @@ def read_camera_matrix(path: Path) -> CameraMatrix:
     if k[0, 0] <= 0 or k[1, 1] <= 0:
         raise ManifestError(f"{path}: {name}: its focal lengths are {k[0, 0]:g} and {k[1, 1]:g}: they must be above 0")
     shift = MATLAB_CENTRE if matlab else OPENCV_CENTRE
-    coefficients = next((matrices[name] for name in CAMERA_LENS if isinstance(matrices.get(name), np.ndarray)), None)
+    coefficients = next((matrices[name] for name in CAMERA_LENS if name in matrices), None)
     glass = None if coefficients is None or not np.any(coefficients) else lens(coefficients, path, "camera")
     return CameraMatrix((float(k[0, 0]), float(k[1, 1])), (float(k[0, 2]) + shift, float(k[1, 2]) + shift), glass,
                         "1, 1 (MATLAB)" if matlab else "0, 0 (OpenCV)")
 
 
 def _from_mat(path: Path) -> dict[str, Any]:
-    return {name.rpartition(".")[2].lower(): value for name, value in read_mat(path).items() if isinstance(value, np.ndarray)}
+    return {name.rpartition(".")[2].lower(): value for name, value in read_mat_arrays(path).items()}
 
 
 def _from_json(path: Path) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from stage import inputs
 from stage.errors import ManifestError
-from stage.mat_file import read_mat
+from stage.mat_file import read_mat_arrays
 from stage.text import name_fault
 
 SUFFIXES = (".csv", ".txt", ".tsv", ".mat", ".npy", ".json", ".lp", ".dat")
@@ -53,7 +53,7 @@ def read_light_table(path: Path, *, variable: str | None = None, run: Run | None
     """
     suffix = path.suffix.lower()
     if suffix == ".mat":
-        name, values = _variable(path, {name: value for name, value in read_mat(path).items() if isinstance(value, np.ndarray)}, variable)
+        name, values = _variable(path, read_mat_arrays(path), variable)
         return _numbers(path, values, run, f"{path}: {name}")
     if suffix == ".npy":
         try:
@@ -79,7 +79,7 @@ def read_strengths(path: Path, *, variable: str | None = None) -> np.ndarray:
         StorageError: the file cannot be read.
     """
     if path.suffix.lower() == ".mat":
-        name, values = _variable(path, {name: value for name, value in read_mat(path).items() if isinstance(value, np.ndarray)}, variable,
+        name, values = _variable(path, read_mat_arrays(path), variable,
                                  sides=(1, 3))
         return _strengths(np.asarray(values, dtype=np.float64), f"{path}: {name}")
     _, rows, _ = _rows(path)

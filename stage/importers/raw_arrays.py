@@ -1,0 +1,138 @@
+"""Arrays as sensors and programs write them: .npy, .npz, .mat, .json and raw .bin files."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stage import inputs
+from stage.errors import ManifestError, storage
+from stage.importers.layout import natural_order
+from stage.mat_file import read_mat_arrays
+from stage.tof.frames import read_array
+
+SUFFIXES = (".npy", ".npz", ".mat", ".json", ".bin", ".raw", ".dat")
+RAW = (".bin", ".raw", ".dat")
+"""Suffixes of files that are numbers alone, whose shape and type are told."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArrayFiles:
+    """Which files of a folder hold arrays, and what the files do not say themselves."""
+
+    files: str | None = None
+    """The names of the files, as the shell matches them; None: every file with one of SUFFIXES but capture.json."""
+    variables: tuple[str, ...] = ()
+    """The variables of .mat and .npz files, and the places in .json files (keys and numbers with points between, as 0.hists); none: the
+    only array in the file."""
+    dtype: str | None = None
+    """The type of the numbers of raw files, as NumPy has it: uint16, float32, >i2."""
+    size: tuple[int, int] | None = None
+    """The width and height of an image of a raw file, or of the pixels of an array that has them in one row."""
+
+    def names(self, folder: Path) -> list[str]:
+        """Return the names of the files in natural order.
+
+        Raises:
+            ManifestError: there is none.
+            StorageError: the folder cannot be read.
+        """
+        with storage("read", folder):
+            found = natural_order(
+                path.name for path in folder.iterdir() if not path.name.startswith(".") and path.name != "capture.json" and path.is_file()
+                and (path.suffix.lower() in SUFFIXES if self.files is None else fnmatch(path.name, self.files)))
+        if not found:
+            what = f"that {self.files} names" if self.files else f"with one of the suffixes {', '.join(SUFFIXES)}"
+            raise ManifestError(f"{folder}: holds no file {what}: give --arrays")
+        return found
+
+    def read(self, path: Path) -> list[np.ndarray]:
+        """Return the arrays of a file, one for each of `variables`, or the only one.
+
+        Raises:
+            ManifestError: the file lacks a variable, holds several, or needs a type and a size; the message names the file.
+            ImageError: a .npy file is damaged.
+            StorageError: the file cannot be read.
+        """
+        suffix = path.suffix.lower()
+        if suffix == ".npy":
+            return [read_array(path)]
+        if suffix in RAW:
+            return [self._raw(path)]
+        if suffix == ".json":
+            data = _json(path)
+            return [_at(path, data, name) for name in self.variables or ("",)]
+        arrays = _npz(path) if suffix == ".npz" else read_mat_arrays(path)
+        return [arrays[name] for name in _chosen(path, arrays, self.variables)]
+
+    def _raw(self, path: Path) -> np.ndarray:
+        """Return the images of a raw file: [images, rows, cols]."""
+        if self.dtype is None or self.size is None:
+            raise ManifestError(f"{path}: is raw numbers: give their --dtype, such as uint16, and the --size of an image, such as 320x240")
+        try:
+            kind = np.dtype(self.dtype)
+        except TypeError as error:
+            raise ManifestError(f"--dtype {self.dtype}: is no type of numbers: give uint16, int16, float32 or such") from error
+        if kind.kind not in "iuf":
+            raise ManifestError(f"--dtype {self.dtype}: is no type of real numbers")
+        content = inputs.read_bytes(path)
+        width, height = self.size
+        one = width * height * kind.itemsize
+        if not content or len(content) % one:
+            raise ManifestError(f"{path}: has {len(content)} bytes, which is no whole number of images of {width}x{height} {kind} "
+                                f"({one} bytes)")
+        return np.frombuffer(content, kind).reshape(-1, height, width)
+
+
+def _chosen(path: Path, arrays: dict[str, np.ndarray], wanted: Sequence[str]) -> Sequence[str]:
+    if not wanted:
+        wanted = [name for name, value in arrays.items() if value.ndim >= 2 and min(value.shape) > 1]
+        if len(wanted) != 1:
+            raise ManifestError(f"{path}: holds {', '.join(arrays) or 'no array'}: name the arrays with --variable")
+    for name in wanted:
+        if name not in arrays:
+            raise ManifestError(f"{path}: holds no array {name}, but {', '.join(arrays) or 'none at all'}")
+    return wanted
+
+
+def _npz(path: Path) -> dict[str, np.ndarray]:
+    try:
+        with storage("read", path), np.load(path, allow_pickle=False) as found:
+            return {name: found[name] for name in found.files}
+    except (ValueError, KeyError, EOFError, OSError) as error:
+        if isinstance(error, OSError) and error.errno:
+            raise
+        raise ManifestError(f"{path}: is no whole .npz file of numbers") from error
+
+
+def _json(path: Path) -> Any:
+    try:
+        return json.loads(inputs.read_bytes(path).decode("utf-8-sig"))
+    except (ValueError, RecursionError) as error:
+        raise ManifestError(f"{path}: is not JSON") from error
+
+
+def _at(path: Path, data: Any, place: str) -> np.ndarray:
+    """Return the array at a place of a JSON file."""
+    for part in place.split(".") if place else ():
+        if isinstance(data, dict) and part in data:
+            data = data[part]
+        elif isinstance(data, list) and part.isdecimal() and int(part) < len(data):
+            data = data[int(part)]
+        else:
+            held = f"the keys {', '.join(map(str, data))[:200]}" if isinstance(data, dict) else (
+                f"a list of {len(data)}" if isinstance(data, list) else "a value")
+            raise ManifestError(f"{path}: --variable {place}: there is no {part} in {held}")
+    try:
+        found = np.array(data, dtype=np.float64)
+    except (ValueError, TypeError) as error:
+        held = f": the keys are {', '.join(map(str, data))[:200]}" if isinstance(data, dict) else ""
+        where = f" at {place}" if place else ""
+        raise ManifestError(f"{path}: holds no array of numbers{where}: say with --variable where it is{held}") from error
+    if np.all(found == np.rint(found)) and found.size and np.abs(found).max() < 2**31:
+        return found.astype(np.int32)
+    return found
