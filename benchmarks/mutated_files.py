@@ -23,6 +23,7 @@ from stage.importers import lp
 from stage.ingest import open_stack
 from stage.manifest import read_manifest
 from stage.maps import SurfaceMaps
+from stage.radiance import check_radiance
 from stage.rti import hsh, ptm
 from stage.rti.quantization import Quantization
 from stage.tof.calibration import read_calibration
@@ -53,7 +54,7 @@ def read_image(path: Path) -> None:
     """Read an image as a check and then as ingest do."""
     header = images.read_header(path)
     if header.width * header.height <= MAX_PIXELS and header.stored <= 64:
-        images.check_radiance(path, images.read_pixels(path).astype(np.float32))
+        check_radiance(path, images.read_pixels(path).astype(np.float32))
 
 
 def read_exr(path: Path) -> None:

@@ -2,13 +2,14 @@
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
 from stage import images
+from stage import radiance as radiances
 from stage.camera import Camera
 from stage.errors import MOST_FAULTS, ImageError, ManifestError, StageError, listed, storage
 from stage.light import DistantLight, EnvironmentLight, ExtendedLight, FullLight, GradientLight, OffLight, PointLight
@@ -29,13 +30,18 @@ class Capture:
 
     folder: Path
     manifest: Manifest
+    clip_negative: bool = False
+    """Whether values that are negative beyond the noise of their image are set to 0; else such an image is refused."""
+    clipped: dict[str, int] = field(default_factory=dict, compare=False)
+    """The number of pixels in which a value was set to 0, by the names of the images that were read so far."""
 
     @classmethod
-    def open(cls, path: str | Path) -> "Capture":
+    def open(cls, path: str | Path, *, clip_negative: bool = False) -> "Capture":
         """Open a capture, and check its manifest and the header of every file.
 
         Args:
             path: the folder, or the capture.json in it.
+            clip_negative: True to set values to 0 that are negative beyond the noise of their image, which is refused otherwise.
 
         Raises:
             ManifestError: the manifest is wrong; the message names the field.
@@ -49,7 +55,7 @@ class Capture:
                 raise ManifestError(f"{folder}: there is no such folder")
             if not (folder / FILE_NAME).exists():
                 raise ManifestError(f"{folder}: holds no {FILE_NAME}: see `relit import` for data laid out another way")
-        capture = cls(folder, read_manifest(folder / FILE_NAME))
+        capture = cls(folder, read_manifest(folder / FILE_NAME), clip_negative)
         capture._check_files()
         return capture
 
@@ -85,6 +91,29 @@ class Capture:
         kinds = (*SOURCES, FullLight) if self.lit_by(GradientLight) else SOURCES
         return [frame for frame in self.manifest.frames if isinstance(frame.light, kinds)]
 
+    def recorded(self, name: str) -> np.ndarray:
+        """Read the recorded values of an image that holds radiance.
+
+        Returns:
+            [rows, cols, 3] uint8 or uint16 as the file has them, or float32; values below 0 are noise.
+
+        Raises:
+            ImageError: the file is unreadable, or a value is NaN, infinite or, unless `clip_negative`, negative beyond the noise of the
+                image; the message names the file.
+        """
+        path = self.file(name)
+        pixels = images.read_recorded(path)
+        if pixels.dtype.kind == "u":
+            return pixels
+        if self.clip_negative:
+            radiances.check_finite(path, pixels)
+            pixels, count = radiances.clip_negative(pixels)
+            if count:
+                self.clipped[name] = count
+        else:
+            radiances.check_radiance(path, pixels, remedy=radiances.CLIP_NEGATIVE)
+        return pixels.astype(np.float32, copy=False)
+
     def mask(self) -> np.ndarray:
         """Read the mask of the object.
 
@@ -113,10 +142,10 @@ class Capture:
 
     def files(self) -> Iterator[tuple[str, str]]:
         """Yield the manifest field and the name of every file that the manifest names."""
-        for field in ("mask", "dark", "flat"):
-            name = getattr(self.manifest, field)
+        for key in ("mask", "dark", "flat"):
+            name = getattr(self.manifest, key)
             if name is not None:
-                yield field, name
+                yield key, name
         for index, frame in enumerate(self.manifest.frames):
             yield f"frames[{index}].image", frame.image
             if isinstance(frame.light, EnvironmentLight):

@@ -60,9 +60,9 @@ class Correction:
         space = manifest.color_space
         dark = flat = None
         if manifest.dark is not None:
-            dark = linearise(_recorded(capture, manifest.dark), space)
+            dark = linearise(capture.recorded(manifest.dark), space)
         if manifest.flat is not None:
-            flat = linearise(_recorded(capture, manifest.flat), space)
+            flat = linearise(capture.recorded(manifest.flat), space)
             flat = flat - dark if dark is not None else flat
             mask = capture.mask()
             unlit = int((flat[mask] <= 0).any(axis=-1).sum())
@@ -82,7 +82,7 @@ class Correction:
         """Read one frame and correct it.
 
         Raises:
-            ImageError: the file is unreadable, or a recorded value is NaN, infinite or negative; the message names the file.
+            ImageError: the file is unreadable, or a recorded value is NaN, infinite or negative beyond noise; the message names the file.
         """
         coded = self.coded(frame)
         if isinstance(coded, Radiance):
@@ -96,7 +96,7 @@ class Correction:
             ImageError: as `apply`.
         """
         manifest = self.capture.manifest
-        recorded = _recorded(self.capture, frame.image)
+        recorded = self.capture.recorded(frame.image)
         saturated: np.ndarray | None = None
         limit = manifest.saturation
         if limit is None and self.full_scale and images.read_header(self.capture.file(frame.image)).integer:
@@ -119,15 +119,6 @@ class Correction:
         if self.ambient is not None:
             pixels = pixels - self.ambient
         return pixels
-
-
-def _recorded(capture: Capture, name: str) -> np.ndarray:
-    path = capture.file(name)
-    pixels = images.read_recorded(path)
-    if pixels.dtype.kind == "u":
-        return pixels
-    images.check_radiance(path, pixels)
-    return pixels.astype(np.float32, copy=False)
 
 
 def _any_from(limit: float, recorded: np.ndarray) -> np.ndarray:

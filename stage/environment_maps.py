@@ -7,6 +7,7 @@ import numpy as np
 from stage import exr, images
 from stage.colour import convert
 from stage.errors import ImageError
+from stage.radiance import CLIP_NEGATIVE, check_finite, check_radiance, clip_negative
 
 SUFFIXES = {".exr", ".hdr"}
 
@@ -25,18 +26,30 @@ def check_environment(path: Path) -> None:
         raise ImageError(f"{path}: is {header.width}x{header.height}: a lat-long map is twice as wide as high")
 
 
-def read_environment(path: Path, space: str) -> np.ndarray:
+def read_environment(path: Path, space: str, *, clipped: dict[str, int] | None = None) -> np.ndarray:
     """Read an environment map in a colour space; HDR files are Rec.709, and so are EXR files that declare no other space.
 
+    Args:
+        path: lat-long .exr or .hdr.
+        space: the scene-linear colour space of the result.
+        clipped: is given the number of pixels with values that are negative beyond the noise of the map and set to 0, by its file name;
+            None refuses such maps.
+
     Returns:
-        [rows, cols, 3] float32, scene-linear, none of them negative: a colour outside the gamut of `space` has a channel that is 0.
+        [rows, cols, 3] float32, scene-linear, none of them negative: noise below zero is 0, and a colour outside the gamut of `space` has
+        a channel that is 0.
 
     Raises:
         ImageError: impossible values (counted), or a colour space that is not known.
         StorageError: the file cannot be opened.
     """
     pixels = images.read_pixels(path).astype(np.float32)
-    images.check_radiance(path, pixels)
+    if clipped is None:
+        check_radiance(path, pixels, remedy=CLIP_NEGATIVE)
+    else:
+        check_finite(path, pixels)
+        pixels, count = clip_negative(pixels)
+        clipped |= {path.name: count} if count else {}
     try:
         given = exr.color_space_of(exr.read_header(path).metadata) if path.suffix.lower() == ".exr" else "lin_rec709_scene"
         converted = convert(pixels, given, space)

@@ -231,23 +231,6 @@ def check_resolution(path: str | Path, resolution: tuple[int, int]) -> None:
         raise ImageError(f"{path}: is {header.width}x{header.height}, camera.resolution says {resolution[0]}x{resolution[1]}")
 
 
-def check_radiance(path: str | Path, pixels: np.ndarray) -> None:
-    """Check that no pixel is NaN, infinite or negative.
-
-    Raises:
-        ImageError: some pixels are; the message counts them and names the first.
-    """
-    finite = np.isfinite(pixels)
-    for name, bad in (("not finite (NaN or infinity)", ~finite), ("negative", finite & (pixels < 0))):
-        if bad.any():
-            where = bad.any(axis=-1)
-            row, column = np.argwhere(where)[0]
-            count = int(where.sum())
-            found = f"{count} pixel is" if count == 1 else f"{count} pixels are"
-            raise ImageError(f"{path}: {found} {name}, the first at row {row}, column {column}: "
-                             "mend the image, or clip it if this is noise around zero")
-
-
 @contextmanager
 def _decoder(source: inputs.Source) -> Iterator[oiio.ImageInput]:
     """Open the decoder of an image that is open."""

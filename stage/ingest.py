@@ -96,6 +96,7 @@ class Ingest:
         if found is not None:
             if progress is not None:
                 progress(len(self.frames), len(self.frames))
+            self.capture.clipped.update(found.clipped)
             return found
         alignment = None if self.tracking is None else Alignment(self.capture, self.tracking, self.frames)
         with storage(f"make the stack cache{self.hint} in", self.folder):
@@ -138,6 +139,8 @@ def _key(capture: Capture, frames: list[Frame], tracking: Tracking | None, finge
     }
     if manifest.saturation is None and any(Path(frame.image).suffix.lower() not in FLOATING for frame in frames):
         inputs["saturation"] = "largest integer"
+    if capture.clip_negative:
+        inputs["negative"] = "clipped"
     if tracking is not None:
         time_of = {frame.image: time for time, frame in enumerate(manifest.frames)}
         inputs["align"] = [VERSION, tracking.times, tracking.reference, [time_of[frame.image] for frame in frames]]
@@ -195,7 +198,7 @@ def _build(capture: Capture, frames: list[Frame], alignment: Alignment | None, f
                 raise
     names = tuple(frame.image for frame in frames)
     motion = None if alignment is None else alignment.statistics()
-    built = Stack(folder, key, names, scale, pixel_count, motion)
+    built = Stack(folder, key, names, scale, pixel_count, motion, clipped=dict(capture.clipped))
     try:
         if saturated.any():
             with replacing(stacks.saturated_path(folder, key)) as temporary:

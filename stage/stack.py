@@ -9,7 +9,7 @@ has no usable reading (it saturates, or alignment lost it), and the index `stack
 import json
 import zlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +49,8 @@ class Stack:
     pixel_count: int
     motion: dict[str, Any] | None = None
     """The statistics of an aligned stack for the report, or None."""
+    clipped: dict[str, int] = field(default_factory=dict, kw_only=True)
+    """The number of pixels in which values below the noise were set to 0, by the names of the images that had any."""
 
     @property
     def light_count(self) -> int:
@@ -175,7 +177,7 @@ def find(folder: Path, key: str) -> Stack | None:
         index = json.loads(index_path(folder, key).read_text(encoding="utf-8"))
         checksum = index.pop("checksum")
         found = Stack(folder, key, tuple(index["frames"]), np.array(index["scale"], dtype=np.float32), int(index["pixel_count"]),
-                      index.get("motion"))
+                      index.get("motion"), clipped=index.get("clipped", {}))
         saturated = index["checksums"]["saturated"]
         bits = saturated_path(folder, key)
         sound = (checksum == _checksum(index)
@@ -199,7 +201,7 @@ def write_index(stack: Stack, values: Sequence[int], saturated: int | None) -> N
         saturated: the checksum of the saturation bits, or None where there are none.
     """
     index = {"frames": stack.frames, "scale": [float(scale) for scale in stack.scale], "pixel_count": stack.pixel_count,
-             "motion": stack.motion, "checksums": {"values": list(values), "saturated": saturated}}
+             "motion": stack.motion, "clipped": stack.clipped, "checksums": {"values": list(values), "saturated": saturated}}
     write_text(index_path(stack.folder, stack.key), json.dumps(index | {"checksum": _checksum(index)}))
 
 

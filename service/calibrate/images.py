@@ -18,6 +18,7 @@ from stage.calibration.saturation import TopHistogram, capture_saturation
 from stage.capture import Capture
 from stage.errors import CalibrationError
 from stage.manifest import FILE_NAME
+from stage.radiance import check_radiance
 
 DARK_FILE, FLAT_FILE = "dark.exr", "flat.exr"
 
@@ -121,7 +122,7 @@ def saturation(request: SaturationRequest, progress: Progress | None = None) -> 
 
 def _recorded(path: Path) -> np.ndarray:
     pixels = images.read_pixels(path)
-    images.check_radiance(path, pixels)
+    check_radiance(path, pixels)
     return pixels
 
 

@@ -15,6 +15,7 @@ from stage.capture import Capture
 from stage.colour import GREY_WEIGHTS, linearise
 from stage.errors import CalibrationError, ManifestError
 from stage.manifest import FILE_NAME
+from stage.radiance import check_radiance
 
 
 class ResponseResult(NamedTuple):
@@ -50,7 +51,7 @@ def response(request: ResponseRequest, progress: Progress | None = None) -> Resp
     for number, path in enumerate(request.images):
         images.check_resolution(path, capture.camera.resolution)
         recorded = images.read_pixels(path).astype(np.float32, copy=False)
-        images.check_radiance(path, recorded)
+        check_radiance(path, recorded)
         flat = recorded.reshape(-1, 3)[inside]
         if manifest.saturation is not None:
             usable &= (flat < manifest.saturation).all(axis=-1)

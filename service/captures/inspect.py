@@ -5,12 +5,12 @@ from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from service.reporting.progress import Progress, Timings
+from service.requests.captures import InfoRequest
 from stage import images
 from stage.capture import Capture
 from stage.correction import Correction
@@ -22,6 +22,7 @@ from stage.lighting import MEASURED_BY, check_solvable, has_placeholders, lights
 from stage.manifest import Frame
 from stage.point_lights import PlacedLights, place_lights
 from stage.projector import Projector
+from stage.radiance import clipping_sentences
 from stage.tof.frames import check_frames, read_frame
 
 
@@ -43,15 +44,19 @@ class _FrameLevel(NamedTuple):
     """Readings of a time-of-flight frame that are not finite."""
 
 
-def inspect(path: Path, progress: Progress | None = None) -> Inspection:
+def inspect(request: InfoRequest, progress: Progress | None = None) -> Inspection:
     """Decode and check every frame of a capture.
+
+    Args:
+        request: the capture, and how its pixels are read.
+        progress: told of every frame.
 
     Raises:
         StageError: the capture cannot be opened.
     """
     timings = Timings(progress)
     timings.stage("open", 1)
-    capture = Capture.open(path)
+    capture = Capture.open(request.capture, clip_negative=request.clip_negative)
     frames = capture.manifest.frames
     timings.stage("frames", len(frames))
     levels = []
@@ -66,13 +71,14 @@ def inspect(path: Path, progress: Progress | None = None) -> Inspection:
     read = [level for level in levels if level.fault is None]
     if read:
         lowest, peak = min(level.lowest for level in read), max(level.peak for level in read)
-        facts.append(("recorded", f"{lowest:.4g} to {peak:.4g}: correlation images have both signs") if lowest < 0 else
+        facts.append(("recorded", f"{lowest:.4g} to {peak:.4g}: correlation images have both signs") if lowest < 0 and any(frame.tof is not None for frame in frames) else
                      ("brightest", f"{peak:.4g} recorded"))
     if unread := sum(level.unread for level in read):
         facts.append(("not finite", f"{unread} readings, which count as saturated"))
     if capture.manifest.saturation is not None:
         count = sum(level.saturated for level in levels)
         facts.append(("saturated", f"{count} readings at or above {capture.manifest.saturation:g}"))
+    facts += [("clipped", sentence) for sentence in clipping_sentences(capture.clipped)]
     with suppress(StageError):
         mask = capture.mask()
         facts.append(("mask", f"{int(mask.sum())} of {mask.size} pixels"))
@@ -163,8 +169,8 @@ def _level(capture: Capture, frame: Frame) -> _FrameLevel:
         if frame.tof is not None:
             pixels = read_frame(capture, frame)[..., None]
         else:
-            pixels = images.read_pixels(path)
-            images.check_radiance(path, pixels)
+            recorded = capture.recorded(frame.image)
+            pixels = np.take(images.fractions(recorded.dtype), recorded) if recorded.dtype.kind == "u" else recorded
     except StageError as error:
         return _FrameLevel(0.0, 0.0, 0, str(error))
     limit = capture.manifest.saturation

@@ -1,28 +1,23 @@
 """relit info: look at a capture."""
 
-from pathlib import Path
-from typing import Annotated
-
 import typer
 
 from service.cli.progress import ProgressBar
-from service.cli.request_commands import HostOption
-
-CaptureArgument = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder with a capture.json.", show_default=False)]
+from service.cli.request_commands import local_command
+from service.requests.captures import InfoRequest
 
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
-    app.command("info")(info)
+    local_command(app, "info", _info)
 
 
-def info(capture: CaptureArgument, device: HostOption = None) -> None:
-    """Say what a capture holds, and what is wrong with it."""
+def _info(request: InfoRequest) -> None:
     from service.captures.inspect import inspect
     from stage.errors import StageError
 
     with ProgressBar() as bar:
-        found = inspect(capture, bar)
+        found = inspect(request, bar)
     for name, value in found.facts:
         print(f"{name:<12} {value}")
     for fault in found.faults:

@@ -33,6 +33,7 @@ from stage.ingest import CACHE_FOLDER
 from stage.manifest import FILE_NAME, Frame
 from stage.patterns.base import UniformPattern
 from stage.ply import POINTS_FILE, write_ply
+from stage.radiance import clipping_sentences
 
 PLAUSIBLE_M = 0.005, 500.0
 """Median depths that are plausible for a projector or a laser; beyond them the units of the calibration are wrong."""
@@ -92,7 +93,7 @@ def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResul
     timings = Timings(progress)
     device = devices.resolve(request.device)
     timings.stage("open", 1)
-    capture = Capture.open(request.capture)
+    capture = Capture.open(request.capture, clip_negative=request.clip_negative)
     using = _ranging(capture, request.using)
     if request.normals and capture.camera.projection != "perspective":
         raise RequestError("--normals: needs a perspective camera, that of the capture is orthographic")
@@ -127,6 +128,7 @@ def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResul
         maps.write(depth_path)
         write_ply(cloud, points_path, comments=tuple(f"{key} {value}" for key, value in sources.items()))
         measured = solution.statistics()
+    solution.warnings += clipping_sentences(capture.clipped)
     points = 0 if cloud is None else len(cloud.points)
     counts = solution.counts(mask)
     write_text(report_path, report(

@@ -31,6 +31,7 @@ from stage.patterns.base import Axis
 from stage.patterns.codes import Collected, collect
 from stage.patterns.phase import FULL_STEPS, PhaseCode
 from stage.planes import frame_planes
+from stage.radiance import clipping_sentences
 from stage.result_metadata import result_metadata
 
 SEPARATION_FILE = "separation.exr"
@@ -92,7 +93,7 @@ def separate(request: SeparateRequest, progress: Progress | None = None) -> Sepa
     timings = Timings(progress)
     device = devices.resolve(request.device)
     timings.stage("open", 1)
-    capture = Capture.open(request.capture)
+    capture = Capture.open(request.capture, clip_negative=request.clip_negative)
     frames = capture.manifest.frames
     try:
         collected = collect([frame.pattern for frame in frames])
@@ -134,6 +135,7 @@ def separate(request: SeparateRequest, progress: Progress | None = None) -> Sepa
         timings_s=timings.close(),
         pixels={"mask": int(mask.sum()), **counts},
         global_share=share,
+        warnings=clipping_sentences(capture.clipped),
         global_below_0=int((light.indirect[solved] < 0).any(axis=-1).sum()),
     ))
     return SeparationResult(path, report_path, period_px, share, counts)

@@ -23,6 +23,7 @@ from stage.errors import ResultError
 from stage.fingerprint import digest
 from stage.maps import MAPS_FILE, SurfaceMaps
 from stage.ply import POINTS_FILE, PointCloud, read_ply
+from stage.radiance import clipping_sentences
 
 GLB = ".glb"
 
@@ -90,6 +91,7 @@ def export(request: ExportRequest, progress: Progress | None = None) -> Exported
             report = write_usd_asset(maps, request.out, name=name, version=request.version, textures=request.textures,
                                      levels=request.levels, surroundings=around)
             lights = report.lights
+            warnings += clipping_sentences({**(around.clipped or {}), **(around.rig.clipped if around.rig is not None else {})})
         sizes = report.sizes
         warnings += report.warnings
         if maps.diffuse_albedo is None:

@@ -34,7 +34,7 @@ def open_surroundings(request: ExportRequest, camera: Camera) -> Surroundings:
         RequestError: the capture has another camera.
         ManifestError, ImageError, AssetError, StorageError: what the capture, the environment or the frames lack.
     """
-    rig = None if request.rig is None else Capture.open(request.rig)
+    rig = None if request.rig is None else Capture.open(request.rig, clip_negative=request.clip_negative)
     if rig is not None and rig.camera != camera:
         differs = [name for name, value in rig.camera if value != getattr(camera, name)]
         raise RequestError(f"--rig {request.rig}: its camera differs from that of the maps in {', '.join(differs)}: "
@@ -42,7 +42,7 @@ def open_surroundings(request: ExportRequest, camera: Camera) -> Surroundings:
     if request.environment is not None:
         check_environment(request.environment)
     card = None if request.card is None else find_frames(request.card, camera)
-    return Surroundings(rig, request.environment, card)
+    return Surroundings(rig, request.environment, card, {} if request.clip_negative else None)
 
 
 def content_hashes(surroundings: Surroundings) -> dict[str, str]:

@@ -40,14 +40,20 @@ class EnvironmentMap:
 class Environments:
     """The environment maps of `--environment`: a file, or a sequence of files where the name has a run of #."""
 
-    def __init__(self, pattern: Path) -> None:
-        """Args: pattern: the path, as it was given.
+    def __init__(self, pattern: Path, *, clip_negative: bool = False) -> None:
+        """Keep the path of the maps.
+
+        Args:
+            pattern: the path, as it was given.
+            clip_negative: True to set values to 0 that are negative beyond the noise of their map, which is refused otherwise.
 
         Raises:
             RequestError: several runs of #, or one in the folder.
         """
         self._pattern = pattern
         self._sequence = "#" in str(pattern) and not pattern.is_file()
+        self.clipped: dict[str, int] | None = {} if clip_negative else None
+        """The number of pixels with a value that was set to 0, by the names of the maps that were read so far; None: such are refused."""
         self._digests: dict[Path, str] = {}
         self._last: tuple[Path, str, EnvironmentMap] | None = None
         if self._sequence and (len(re.findall("#+", pattern.name)) != 1 or "#" in str(pattern.parent)):
@@ -77,7 +83,7 @@ class Environments:
             ImageError: impossible values (counted), or a colour space that is not known.
         """
         if self._last is None or self._last[:2] != (path, space):
-            self._last = (path, space, EnvironmentMap(read_environment(path, space)))
+            self._last = (path, space, EnvironmentMap(read_environment(path, space, clipped=self.clipped)))
         return self._last[2]
 
     def content(self, path: Path) -> str:

@@ -7,6 +7,7 @@ import numpy as np
 
 from service.light.clipping import Clipping
 from stage.matte import Matte, MatteSource
+from stage.radiance import clipping_sentences
 
 LEAST_BEYOND = 0.05
 """Least share of a frame's energy from beyond the captured lights that is told: with less, what stands in for it changes the frame by less
@@ -45,6 +46,8 @@ class FrameFindings:
     clipped_frame: int | None = None
     clipped_pixels: float = 0.0
     """Share of the object's pixels that have clipped readings in that capture."""
+    negative: dict[str, int] = field(default_factory=dict)
+    """Pixels with a value that was set to 0 because it was negative beyond noise, by the names of the images that were read."""
 
     def add_beyond(self, numbers: Sequence[int | None], shares: Sequence[float], degrees: float) -> None:
         """Take in the shares of energy of frames that come from more than some degrees beyond the captured lights."""
@@ -72,7 +75,7 @@ class FrameFindings:
             found.append(f"{red} of the red, {green} of the green and {blue} of the blue of {_picture(self.clipped_frame)} is from "
                          "readings that are clipped in every frame of their light, at "
                          f"{_percent(self.clipped_pixels)} of the object's pixels: it is {known}")
-        return tuple(found)
+        return (*found, *clipping_sentences(self.negative))
 
 
 @dataclass

@@ -95,10 +95,13 @@ def relight(request: RelightRequest, progress: Progress | None = None) -> Religh
             captures.append({"name": opened.capture.name, "content": opened.ingest.key, "frames": len(opened.lights.direction)})
             if todo:
                 _relight_capture(opened, todo, request, plan, writer, findings, mattes, device, timings)
+                findings.negative |= opened.capture.clipped
         with timings.part("waiting for files"):
             writer.wait()
         if plan.is_sequence:
             timings.advance(skipped + writer.written.frames)
+    if plan.environments is not None:
+        findings.negative |= plan.environments.clipped or {}
     paths = tuple(frame.path for frame in plan.frames)
     if request.sheet is not None:
         timings.stage("sheet", 1)

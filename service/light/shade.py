@@ -41,6 +41,7 @@ from stage.ingest import open_stack
 from stage.lighting import lights_from_centre
 from stage.maps import MAPS_FILE, SurfaceMaps
 from stage.matte import Matte
+from stage.radiance import clipping_sentences
 
 SHADOW_DIRECTIONS = 64
 """Number of directions in which the shadows of broad light are marched where there are no captured lights; between them, visibility is
@@ -76,19 +77,19 @@ def shade(request: ShadeRequest, progress: Progress | None = None) -> ShadeResul
     near: tuple[NearLight, ...] = (*request.light, *request.sphere, *request.rectangle)
     timings.stage("open", 1)
     path = check(request)
-    environments = Environments(request.environment) if request.environment is not None else None
+    environments = None if request.environment is None else Environments(request.environment, clip_negative=request.clip_negative)
     environment = None
     if environments is not None:
         turn = request.turn_degrees
         environment = TurnedEnvironment(environments.path(1), turn, UPRIGHT, rotation_about_y(turn), 0.0)
     lighting = ScheduledFrame(1, environment, (), {}, request.exposure)
-    if request.capture is None:
+    capture = None if request.capture is None else Capture.open(request.capture, clip_negative=request.clip_negative)
+    if capture is None:
         maps = SurfaceMaps.read(path)
         frame, specular = _shade_maps(maps, path, lighting, environments, near, device, timings)
         matte = None if request.matte is FrameMatte.NONE else hard_matte(maps.mask)
         warnings: tuple[str, ...] = ()
     else:
-        capture = Capture.open(request.capture)
         maps = read_maps(path, capture)
         frame, specular, matte, warnings = _shade_capture(capture, request, maps, path, lighting, environments, near, device, timings)
     timings.stage("write", 1)
@@ -99,7 +100,8 @@ def shade(request: ShadeRequest, progress: Progress | None = None) -> ShadeResul
         writer.put([FrameFile(request.out, 2.0**request.exposure, facts)], frame[None], form,
                    {Layer.SPECULAR: specular[None]} if form.parts else {})
     timings.close()
-    return ShadeResult(request.out, maps.camera.metric, writer.written.clipped, warnings)
+    negative = {**({} if environments is None else environments.clipped or {}), **({} if capture is None else capture.clipped)}
+    return ShadeResult(request.out, maps.camera.metric, writer.written.clipped, (*warnings, *clipping_sentences(negative)))
 
 
 def check(request: ShadeRequest) -> Path:

@@ -121,7 +121,15 @@ class Request(DeviceRequest):
     """Folder for the image stack; None: .relit in the capture's folder."""
 
 
-class StackOptions(Options):
+class PixelOptions(Options):
+    """How the pixels of images are read."""
+
+    clip_negative: bool = False
+    """Set values to 0 that are negative beyond the noise of their image, and say how many; without it such images are refused. Noise around
+    zero, as dark-subtracted images have, is kept in either case."""
+
+
+class StackOptions(PixelOptions):
     """How the images of a capture are aligned."""
 
     align: bool = False

@@ -1,11 +1,11 @@
-"""What `relit import` takes: one frozen model for each layout of files."""
+"""What `relit info` and `relit import` take: one frozen model for each layout of files."""
 
 from pathlib import Path
 from typing import Annotated, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from service.requests.base import Choice, Commas, Options, Role, Spelling, WidthHeight
+from service.requests.base import CAPTURE, Choice, Commas, Options, PixelOptions, Role, Spelling, WidthHeight
 from service.requests.patterns import PatternAxis
 from stage.colour_spaces import ColorSpaceName
 from stage.model import Count, Finite, Positive, Resolution
@@ -267,3 +267,10 @@ class ScannerImport(ImportRequest):
     """Width and height of the projector in pixels; None: as the calibration says."""
     images: Annotated[str | None, Spelling(metavar="GLOB")] = None
     """Names of the frames, taken in natural order; None: every image but the mask."""
+
+
+class InfoRequest(PixelOptions):
+    """Say what a capture holds, and what is wrong with it."""
+
+    capture: Annotated[Path, Role.INPUT, CAPTURE]
+    """Folder with a capture.json."""

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator
 
-from service.requests.base import CAPTURE, Choice, Commas, Options, Request, Role, Spelling
+from service.requests.base import CAPTURE, Choice, Commas, Options, PixelOptions, Request, Role, Spelling
 from stage.model import Finite, Fraction, NotNegative, Positive
 
 
@@ -59,7 +59,7 @@ class TofOptions(TofChoices):
     the capture, and nothing else is corrected."""
 
 
-class DepthOptions(Options):
+class DepthOptions(PixelOptions):
     """How depth is decoded, and which depths are kept."""
 
     using: Ranging | None = None

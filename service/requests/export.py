@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from service.requests.base import Choice, Options, Role, Spelling
+from service.requests.base import Choice, PixelOptions, Role, Spelling
 from stage.model import Line
 
 AssetFormat = Literal["usdz", "usda", "usdc", "glb"]
@@ -33,7 +33,7 @@ class TextureFormat(Choice):
     EXR = "exr", "half floats in the capture's scene-linear colour space, for .usda and .usdc"
 
 
-class ExportOptions(Options):
+class ExportOptions(PixelOptions):
     """What an asset is called and made of."""
 
     name: Line | None = None

@@ -5,11 +5,11 @@ from typing import Annotated
 
 from pydantic import Field
 
-from service.requests.base import CAPTURE, Request, Role
+from service.requests.base import CAPTURE, PixelOptions, Request, Role
 from stage.model import Positive
 
 
-class SeparateRequest(Request):
+class SeparateRequest(PixelOptions, Request):
     """Direct and global light of a capture under fine, shifted phase patterns."""
 
     capture: Annotated[Path, Role.INPUT, CAPTURE]

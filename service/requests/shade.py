@@ -3,13 +3,13 @@
 from pathlib import Path
 from typing import Annotated
 
-from service.requests.base import Request, Role, Spelling
+from service.requests.base import PixelOptions, Request, Role, Spelling
 from service.requests.near_lights import POINT_FORM, RECTANGLE_FORM, SPHERE_FORM, GivenPoint, GivenRectangle, GivenSphere
 from service.requests.picture import PictureOptions
 from stage.model import Finite, FirstFault
 
 
-class ShadeOptions(PictureOptions):
+class ShadeOptions(PictureOptions, PixelOptions):
     """Lights near the surface, and how its environment is turned."""
 
     light: Annotated[tuple[GivenPoint, ...], FirstFault, Spelling(metavar=POINT_FORM)] = ()

@@ -42,6 +42,7 @@ from stage.manifest import FILE_NAME
 from stage.maps import MAPS_FILE, SurfaceMaps
 from stage.motion.tracking import tracking_frames
 from stage.point_lights import DistantLights, PlacedLights
+from stage.radiance import clipping_sentences
 from stage.reference_ball import ReferenceBall, reference_ball
 
 Solver = Callable[[SolveInput, Any], Solution]
@@ -200,6 +201,7 @@ def solve(request: SolveRequest, progress: Progress | None = None, *, sharing: S
         solution.warnings.append(_nothing_solved(counts))
     guessed = guessed_part(sigma, estimated)
     solution.warnings += height_warnings(guessed, method)
+    solution.warnings += clipping_sentences(capture.clipped)
     sources = metadata(request, method=method, capture=capture.name, inputs=stack.key, contents=solution.contents)
     maps = _maps(solution, solved, estimated, method, capture, sources)
     timings.stage("write", 1)
@@ -246,11 +248,11 @@ def _open(request: SolveRequest, timings: Timings, sharing: SharedSolve | None) 
     """Open the capture of a request and read its images into a stack."""
     chosen = devices.resolve_all(request.device)
     timings.stage("open", 1)
-    capture = Capture.open(request.capture)
+    capture = Capture.open(request.capture, clip_negative=request.clip_negative)
     method = request.method or next(method for method, entry in METHODS.items() if entry.is_default(capture))
     if (method is Method.REFERENCE) != (request.reference_ball is not None):
         raise RequestError("--method reference and --reference-ball CAPTURE go together: give both or neither")
-    balls = [] if request.reference_ball is None else [Capture.open(request.reference_ball)]
+    balls = [] if request.reference_ball is None else [Capture.open(request.reference_ball, clip_negative=request.clip_negative)]
     lights = METHODS[method].read_lights(capture, *balls)
     solver = METHODS[method].solvers.get(type(lights))
     if solver is None:  # only extended lights can be missing here: every method takes distant and near ones

@@ -17,18 +17,19 @@ LIGHT_SPACE = "lin_rec709_scene"
 """Colour space of the lights: their colours have no declaration that clients read, and all take them as this."""
 
 
-def write_dome_texture(environment: Path, texture: Path) -> None:
+def write_dome_texture(environment: Path, texture: Path, *, clipped: dict[str, int] | None = None) -> None:
     """Write an environment map as the texture of a dome light.
 
     Args:
         environment: lat-long .exr or .hdr.
+        clipped: as in stage.environment_maps.read_environment.
         texture: the .exr; half where half holds every value, else float32.
 
     Raises:
         ImageError: impossible values, or a colour space that is not known.
         StorageError: a file cannot be read or written.
     """
-    write_radiance(read_environment(environment, LIGHT_SPACE), texture)
+    write_radiance(read_environment(environment, LIGHT_SPACE, clipped=clipped), texture)
 
 
 def write_radiance(radiance: np.ndarray, texture: Path) -> None:

@@ -30,6 +30,8 @@ class Surroundings(NamedTuple):
     """Lat-long map, which becomes the variant `environment` of `light`."""
     card: Mapping[int, Path] | None = None
     """Relit frames by their numbers, which become the variant `card` of `geo`."""
+    clipped: dict[str, int] | None = None
+    """As in stage.environment_maps.read_environment, for lat-long maps."""
 
 
 class Written(NamedTuple):
@@ -67,7 +69,7 @@ def define_surroundings(layers: AssetLayers, surroundings: Surroundings, camera:
     if surroundings.environment is not None:
         with layers.lighting(ENVIRONMENT) as usd_stage:
             texture = layers.lights / f"{ENVIRONMENT}.exr"
-            write_dome_texture(surroundings.environment, texture)
+            write_dome_texture(surroundings.environment, texture, clipped=surroundings.clipped)
             define_dome(usd_stage, layers.root.AppendChild(ENVIRONMENT.capitalize()), f"./{texture.name}")
         lights.append(texture)
     return Written(images, [*layers.light_files, *lights], clipped_pixels)

@@ -34,6 +34,7 @@ from stage.fingerprint import digest
 from stage.light_basis import numbers
 from stage.maps import MAPS_FILE
 from stage.matte import matte_of
+from stage.radiance import clipping_sentences
 
 Made = TypeVar("Made")
 SCHEMA = "relit.view/1"
@@ -72,7 +73,7 @@ def view(request: ViewRequest, progress: Progress | None = None) -> ViewResult:
     timings = Timings(progress)
     device = devices.resolve(request.device)
     timings.stage("open", 1)
-    capture = Capture.open(request.capture)
+    capture = Capture.open(request.capture, clip_negative=request.clip_negative)
     _check_outputs(request, capture)
     result = None if request.maps is None else ResultLayers(result_file(request.maps), capture)
     report = SolveReport([], {}, None) if result is None else read_report(result.path)
@@ -96,6 +97,7 @@ def view(request: ViewRequest, progress: Progress | None = None) -> ViewResult:
                     readings.stack, mask.shape, result, readings.model_lights(report.factors), file, device=device, timings=timings))
         timings.stage("write", 1)
         target.unlink(missing_ok=True)  # it would describe other blocks
+    findings += clipping_sentences(capture.clipped)
     thumbnails = write_thumbnails(request.out / THUMBNAILS_FILE, images, space)
     findings = [*findings[:MOST_FINDINGS], *([f"and {len(findings) - MOST_FINDINGS} more"] if len(findings) > MOST_FINDINGS else [])]
     contents = {} if result is None else {"maps": digest(result.path)}

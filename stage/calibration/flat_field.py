@@ -15,6 +15,7 @@ from stage.capture import Capture
 from stage.colour import convert, linearise
 from stage.colour_spaces import linear_space
 from stage.errors import CalibrationError, ImageError
+from stage.radiance import check_radiance
 
 
 class MeanImage(NamedTuple):
@@ -50,7 +51,7 @@ def mean_image(paths: Sequence[Path], capture: Capture, *, refuse_saturated: boo
     for index, path in enumerate(paths):
         images.check_resolution(path, capture.camera.resolution)
         recorded = images.read_pixels(path).astype(np.float32, copy=False)
-        images.check_radiance(path, recorded)
+        check_radiance(path, recorded)
         if mask is not None and manifest.saturation is not None:
             count = int((np.any(recorded >= manifest.saturation, axis=-1) & mask).sum())
             if count:
@@ -84,7 +85,7 @@ def make_flat(white: MeanImage, white_dark: MeanImage | None, capture: Capture) 
     if capture.manifest.dark is not None:
         path = capture.file(capture.manifest.dark)
         recorded = images.read_pixels(path).astype(np.float32, copy=False)
-        images.check_radiance(path, recorded)
+        check_radiance(path, recorded)
         dark = linearise(recorded, capture.manifest.color_space).astype(np.float64)
     light = white.pixels - (dark if white_dark is None else white_dark.pixels)
     unlit = int((light[capture.mask()] <= 0).any(axis=-1).sum())

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from service.captures.inspect import inspect
+from service.requests.captures import InfoRequest
 from stage import exr
 from stage.capture import Capture
 from stage.errors import ManifestError
@@ -23,7 +24,7 @@ SCENE = make_scene(size=16, lights=6)
 def test_facts_of_a_good_capture(tmp_path):
     write_capture(tmp_path, SCENE, saturation=0.9)
     recording = Recording()
-    found = inspect(tmp_path, recording)
+    found = inspect(InfoRequest(capture=tmp_path), recording)
     facts = dict(found.facts)
     assert found.faults == [] and recording.faults == []
     assert facts["frames"] == "6 distant light" and facts["camera"].startswith("orthographic, 16x16")
@@ -42,7 +43,7 @@ def test_every_fault_is_named(tmp_path):
         write_exr(tmp_path / f"{index:03d}.exr", bad)
     for index in range(2, 6):
         edit_frame(tmp_path, index, light={"type": "off"})
-    found = inspect(tmp_path)
+    found = inspect(InfoRequest(capture=tmp_path))
     for fault, words in zip(found.faults, ("001.exr", "002.exr", "a normal needs three or more"), strict=True):
         assert words in fault
     assert dict(found.facts)["frames"] == "2 distant light, 4 off light"
@@ -52,13 +53,13 @@ def test_lights_that_cannot_be_solved_are_a_fault(tmp_path):
     write_capture(tmp_path, SCENE)
     for index in range(2, 6):
         edit_frame(tmp_path, index, light={"type": "off"})
-    (fault,) = inspect(tmp_path).faults
+    (fault,) = inspect(InfoRequest(capture=tmp_path)).faults
     assert "a normal needs three or more" in fault
 
 
 def test_near_lights_have_a_distance(tmp_path):
     dome = near_lights.dome(size=16)
-    facts = dict(inspect(near_lights.write(tmp_path, dome, lamps(dome, 5, 2.0))).facts)
+    facts = dict(inspect(InfoRequest(capture=near_lights.write(tmp_path, dome, lamps(dome, 5, 2.0)))).facts)
     assert facts["near lights"].startswith("5, ") and facts["near lights"].endswith("m from the object's centre")
 
 
@@ -68,7 +69,7 @@ def test_a_capture_of_arrays_alone(tmp_path):
         {"image": "00.npy", "tof": {"type": "pulsed", "bin_s": 1e-9, "start_s": 0.0}}],
         "camera": {"projection": "perspective", "resolution": [6, 4], "focal_px": [5, 5]}})
     recording = Recording()
-    found = inspect(tmp_path, recording)
+    found = inspect(InfoRequest(capture=tmp_path), recording)
     assert found.faults == [] and recording.faults == [] and dict(found.facts)["frames"] == "1 time of flight"
 
 
@@ -106,7 +107,7 @@ def test_faults_of_time_of_flight_are_named(tmp_path):
     write_manifest(tmp_path, {"schema": "relit.capture/1", "name": "room", "frames": [
         {"image": f"0{index}.npy", "tof": {"type": "pulsed", "bin_s": width, "start_s": 0.0}} for index, width in enumerate((1e-9, 2e-9))],
         "camera": {"projection": "perspective", "resolution": [6, 4], "focal_px": [5, 5]}})
-    for fault, words in zip(inspect(tmp_path).faults, ("00.npy: holds counts that are negative", "01.npy: is (4, 5, 32)", "bins of 01.npy"),
+    for fault, words in zip(inspect(InfoRequest(capture=tmp_path)).faults, ("00.npy: holds counts that are negative", "01.npy: is (4, 5, 32)", "bins of 01.npy"),
                             strict=True):
         assert words in fault
 
@@ -118,13 +119,13 @@ def test_placeholders_are_no_fault(tmp_path):
     recommended = json.loads(re.search(r"placeholder such as `({.*})`", text)[1])
     for index in range(6):
         edit_frame(tmp_path, index, light=recommended)
-    found = inspect(tmp_path)
+    found = inspect(InfoRequest(capture=tmp_path))
     assert found.faults == []
     assert dict(found.facts)["lights"].startswith("6 placeholders: relit calibrate mirror-ball") and "not seen" not in dict(found.facts)
     with pytest.raises(ManifestError, match="all are the placeholder"):
         check_solvable(Capture.open(tmp_path))
     edit_frame(tmp_path, 3, light={"type": "distant", "direction": [0, 1, 1], "irradiance": [1, 1, 1]})
-    assert any("lie in one plane" in fault for fault in inspect(tmp_path).faults)
+    assert any("lie in one plane" in fault for fault in inspect(InfoRequest(capture=tmp_path)).faults)
 
 
 def test_a_rig_in_front_says_what_it_cannot_see(tmp_path):
@@ -132,22 +133,33 @@ def test_a_rig_in_front_says_what_it_cannot_see(tmp_path):
     for index in range(6):
         turn = np.radians(60 * index)
         edit_frame(tmp_path, index, light={"type": "distant", "direction": [np.cos(turn), np.sin(turn), 0.9], "irradiance": [1, 1, 1]})
-    said = dict(inspect(tmp_path).facts)["not seen"]
+    said = dict(inspect(InfoRequest(capture=tmp_path)).facts)["not seen"]
     assert "within 48 degrees" in said and "more than 24 degrees" in said  # atan(1 / 0.9), and half of it
     assert "83 % of all directions" in said  # (1 + cos 48°) / 2
     edit_frame(tmp_path, 2, light={"type": "distant", "direction": [0, 1, -0.1], "irradiance": [1, 1, 1]})
-    assert "not seen" not in dict(inspect(tmp_path).facts)
+    assert "not seen" not in dict(inspect(InfoRequest(capture=tmp_path)).facts)
 
 
 def test_gradient_frames_that_lack_an_axis_are_a_fault(tmp_path):
     write_capture(tmp_path, SCENE)
     for index, axis in enumerate("xyxyxy"):
         edit_frame(tmp_path, index, light={"type": "gradient", "axis": axis, "sign": 1})
-    assert any("lacks axis z" in fault for fault in inspect(tmp_path).faults)
+    assert any("lacks axis z" in fault for fault in inspect(InfoRequest(capture=tmp_path)).faults)
 
 
 def test_an_empty_mask_is_a_fault(tmp_path):
     write_capture(tmp_path, SCENE)
     write_image(tmp_path / "mask.png", np.zeros((16, 16), np.uint8))
-    (fault,) = inspect(tmp_path).faults
+    (fault,) = inspect(InfoRequest(capture=tmp_path)).faults
     assert "mask" in fault
+
+
+def test_negative_values_that_are_clipped_are_counted(tmp_path):
+    write_capture(tmp_path, SCENE)
+    low = SCENE.images[1].copy()
+    low[3, 3:6] = -0.2
+    write_exr(tmp_path / "001.exr", low)
+    (fault,) = inspect(InfoRequest(capture=tmp_path)).faults
+    assert fault.endswith("--clip-negative sets such values to 0")
+    found = inspect(InfoRequest(capture=tmp_path, clip_negative=True))
+    assert found.faults == [] and "3 pixels of 1 image were" in dict(found.facts)["clipped"]

@@ -155,7 +155,7 @@ def test_a_defect_of_ours_keeps_its_traceback(monkeypatch, tmp_path):
     from service.captures import inspect
     from service.cli.main import main
 
-    def fail(*arguments):
+    def fail(*arguments, **options):
         raise ZeroDivisionError
 
     monkeypatch.setattr(inspect.Capture, "open", fail)
