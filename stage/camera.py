@@ -7,6 +7,7 @@ from pydantic import model_validator
 
 from stage.frames import Transform, pixel_centres
 from stage.model import Positive, Resolution, Strict
+from stage.pixels import Crop
 
 UNDISTORT_ITERATIONS = 20
 """The number of fixed-point iterations that invert the distortion; ordinary lenses converge to 1e-10 in about ten."""
@@ -84,6 +85,11 @@ class Camera(Strict):
     def metric(self) -> bool:
         """True when solved heights are in metres; otherwise they are in units of pixels."""
         return self.pixel_size_m is not None if self.projection == "orthographic" else self.surface_z_m is not None
+
+    def cropped(self, crop: Crop) -> "Camera":
+        """Return the camera whose image is a part of the image of this one: its principal point moves, its frame stays."""
+        cu, cv = self.principal_point
+        return self.model_copy(update={"resolution": (crop.width, crop.height), "principal_px": (cu - crop.x, cv - crop.y)})
 
     def plane_coordinates(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the point at which the line of sight of each pixel crosses the reference plane of the camera.

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -11,9 +11,10 @@ import numpy as np
 from stage import images
 from stage import radiance as radiances
 from stage.camera import Camera
-from stage.errors import MOST_FAULTS, ImageError, ManifestError, StageError, listed, storage
+from stage.errors import MOST_FAULTS, ImageError, ManifestError, ResultError, StageError, listed, storage
 from stage.light import DistantLight, EnvironmentLight, ExtendedLight, FullLight, GradientLight, OffLight, PointLight
 from stage.manifest import FILE_NAME, Frame, Manifest, read_manifest
+from stage.pixels import AS_RECORDED, Crop, PixelChoices
 
 SOURCES = (DistantLight, PointLight, ExtendedLight, GradientLight)
 """The types of light whose frames are measurements, from which surfaces are solved and images are relit."""
@@ -24,27 +25,48 @@ HEADER_THREADS = 8
 LightKind = TypeVar("LightKind", DistantLight, PointLight, ExtendedLight, GradientLight, EnvironmentLight, OffLight, FullLight)
 
 
+def check_same_pixels(path: Path, camera: Camera, capture: "Capture") -> None:
+    """Check that results have the pixels of a capture.
+
+    Args:
+        path: of the results, for the message.
+        camera: of the results.
+        capture: as it is read.
+
+    Raises:
+        ResultError: the results have another size, or are of another part of the images.
+    """
+    if camera.resolution != capture.camera.resolution:
+        theirs, ours = ("x".join(map(str, each.resolution)) for each in (camera, capture.camera))
+        raise ResultError(f"{path}: is {theirs}, the capture {ours}: these are not its maps (--crop gives the part of the images that was "
+                          "solved)")
+    if capture.whole is not None and camera.principal_point != capture.camera.principal_point:
+        raise ResultError(f"{path}: is of another part of the images than --crop {capture.pixels.crop}")
+
+
 @dataclass(frozen=True)
 class Capture:
     """A folder of images that one camera took from one position, with its manifest."""
 
     folder: Path
     manifest: Manifest
-    clip_negative: bool = False
-    """Whether values that are negative beyond the noise of their image are set to 0; else such an image is refused."""
+    pixels: PixelChoices = AS_RECORDED
+    """How the pixels of the images are read."""
+    whole: "Capture | None" = None
+    """The capture with its whole images, of which this one is a part; None: it is no part."""
     clipped: dict[str, int] = field(default_factory=dict, compare=False)
     """The number of pixels in which a value was set to 0, by the names of the images that were read so far."""
 
     @classmethod
-    def open(cls, path: str | Path, *, clip_negative: bool = False) -> "Capture":
+    def open(cls, path: str | Path, pixels: PixelChoices = AS_RECORDED) -> "Capture":
         """Open a capture, and check its manifest and the header of every file.
 
         Args:
             path: the folder, or the capture.json in it.
-            clip_negative: True to set values to 0 that are negative beyond the noise of their image, which is refused otherwise.
+            pixels: how the pixels of the images are read; with a crop, the camera and all images are those of the part.
 
         Raises:
-            ManifestError: the manifest is wrong; the message names the field.
+            ManifestError: the manifest is wrong, or the crop leads out of the images; the message names the field.
             ImageError: a file has the wrong size or is no image; the message names the file.
             StorageError: a file cannot be read.
         """
@@ -55,14 +77,19 @@ class Capture:
                 raise ManifestError(f"{folder}: there is no such folder")
             if not (folder / FILE_NAME).exists():
                 raise ManifestError(f"{folder}: holds no {FILE_NAME}: see `relit import` for data laid out another way")
-        capture = cls(folder, read_manifest(folder / FILE_NAME), clip_negative)
+        capture = cls(folder, read_manifest(folder / FILE_NAME), pixels)
         capture._check_files()
-        return capture
+        return capture if pixels.crop is None else capture._part(pixels.crop)
 
     @property
     def camera(self) -> Camera:
         """The camera of the manifest."""
         return self.manifest.camera
+
+    @property
+    def image_resolution(self) -> tuple[int, int]:
+        """The width and height of the image files, of which the camera may see a part."""
+        return (self.whole or self).camera.resolution
 
     @property
     def name(self) -> str:
@@ -98,21 +125,25 @@ class Capture:
             [rows, cols, 3] uint8 or uint16 as the file has them, or float32; values below 0 are noise.
 
         Raises:
-            ImageError: the file is unreadable, or a value is NaN, infinite or, unless `clip_negative`, negative beyond the noise of the
-                image; the message names the file.
+            ImageError: the file is unreadable, or a value is NaN, infinite or negative beyond the noise of the image and not to be
+                clipped; the message names the file.
         """
         path = self.file(name)
         pixels = images.read_recorded(path)
         if pixels.dtype.kind == "u":
-            return pixels
-        if self.clip_negative:
+            return self.part_of(pixels)
+        if self.pixels.clip_negative:
             radiances.check_finite(path, pixels)
             pixels, count = radiances.clip_negative(pixels)
             if count:
                 self.clipped[name] = count
         else:
             radiances.check_radiance(path, pixels, remedy=radiances.CLIP_NEGATIVE)
-        return pixels.astype(np.float32, copy=False)
+        return self.part_of(pixels).astype(np.float32, copy=False)
+
+    def part_of(self, image: np.ndarray) -> np.ndarray:
+        """Return the part of a whole image, [rows, cols, ...], that the capture is about."""
+        return image if self.pixels.crop is None else np.ascontiguousarray(self.pixels.crop.of(image))
 
     def mask(self) -> np.ndarray:
         """Read the mask of the object.
@@ -125,7 +156,7 @@ class Capture:
         """
         if self.manifest.mask is None:
             return np.ones((self.camera.height, self.camera.width), dtype=bool)
-        return images.read_mask(self.file(self.manifest.mask), self.camera.resolution)
+        return images.read_mask(self.file(self.manifest.mask), self.image_resolution, self.pixels.crop)
 
     def mask_values(self) -> np.ndarray:
         """Read the mask of the object with its partial values.
@@ -138,7 +169,7 @@ class Capture:
         """
         if self.manifest.mask is None:
             return np.ones((self.camera.height, self.camera.width), dtype=np.float32)
-        return images.read_mask_values(self.file(self.manifest.mask), self.camera.resolution)
+        return self.part_of(images.read_mask_values(self.file(self.manifest.mask), self.image_resolution))
 
     def files(self) -> Iterator[tuple[str, str]]:
         """Yield the manifest field and the name of every file that the manifest names."""
@@ -150,6 +181,15 @@ class Capture:
             yield f"frames[{index}].image", frame.image
             if isinstance(frame.light, EnvironmentLight):
                 yield f"frames[{index}].light.image", frame.light.image
+
+    def _part(self, crop: Crop) -> "Capture":
+        """Return the part of the capture inside a rectangle of its images."""
+        width, height = self.camera.resolution
+        if not crop.is_within((width, height)):
+            raise ManifestError(f"--crop {crop}: leads out of the images of {self.folder}, which are {width}x{height}: "
+                                "give the first column, the first row, the width and the height")
+        return replace(self, manifest=self.manifest.model_copy(update={"camera": self.camera.cropped(crop)}),
+                       whole=replace(self, pixels=self.pixels._replace(crop=None)))
 
     def _check_files(self) -> None:
         arrays = {f"frames[{index}].image" for index, frame in enumerate(self.manifest.frames) if frame.tof is not None}

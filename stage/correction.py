@@ -56,19 +56,20 @@ class Correction:
         Raises:
             ImageError: a frame is unreadable or holds impossible values, or the flat field is dark inside the mask.
         """
-        manifest = capture.manifest
+        manifest, whole = capture.manifest, capture.whole or capture
         space = manifest.color_space
         dark = flat = None
         if manifest.dark is not None:
-            dark = linearise(capture.recorded(manifest.dark), space)
+            dark = linearise(whole.recorded(manifest.dark), space)
         if manifest.flat is not None:
-            flat = linearise(capture.recorded(manifest.flat), space)
+            flat = linearise(whole.recorded(manifest.flat), space)
             flat = flat - dark if dark is not None else flat
-            mask = capture.mask()
+            mask = whole.mask()  # so that a part of the images has the brightness that it has in the whole
             unlit = int((flat[mask] <= 0).any(axis=-1).sum())
             if unlit:
                 raise ImageError(f"{capture.file(manifest.flat)}: flat is not above dark at {unlit} of the mask's pixels")
             flat = np.where(flat > 0, flat, 1) / flat[mask].mean(axis=0)
+        dark, flat = (None if image is None else capture.part_of(image) for image in (dark, flat))
         partial = cls(capture, dark, flat, None, full_scale)
         off = [frame for frame, _ in capture.lit_by(OffLight)]
         if not off:

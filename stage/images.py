@@ -11,6 +11,7 @@ import OpenImageIO as oiio
 
 from stage import exr, inputs, integrity, jxl
 from stage.errors import ImageError
+from stage.pixels import Crop
 
 OIIO_SUFFIXES = {".png", ".tif", ".tiff", ".hdr", ".jpg", ".jpeg", ".jxl", ".dpx"}
 SUFFIXES = {".exr", *OIIO_SUFFIXES}
@@ -156,12 +157,13 @@ def _decoded(source: inputs.Source, suffix: str) -> np.ndarray:
         return np.asarray(decoded)
 
 
-def read_mask(path: str | Path, resolution: tuple[int, int]) -> np.ndarray:
+def read_mask(path: str | Path, resolution: tuple[int, int], crop: Crop | None = None) -> np.ndarray:
     """Read a mask, which is True where the first channel of an image is above one half.
 
     Args:
         path: the image.
         resolution: the width and height that the mask must have.
+        crop: the part of the mask that is returned; None: all of it.
 
     Returns:
         [rows, cols] bool.
@@ -169,9 +171,10 @@ def read_mask(path: str | Path, resolution: tuple[int, int]) -> np.ndarray:
     Raises:
         ImageError: the mask has another size, is unreadable, or is True nowhere.
     """
-    mask = read_mask_values(path, resolution) > 0.5
+    values = read_mask_values(path, resolution)
+    mask = (values if crop is None else crop.of(values)) > 0.5
     if not mask.any():
-        raise ImageError(f"{path}: the mask is empty: no pixel is above one half")
+        raise ImageError(f"{path}: the mask is empty{'' if crop is None else f' in --crop {crop}'}: no pixel is above one half")
     return mask
 
 

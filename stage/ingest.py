@@ -139,8 +139,10 @@ def _key(capture: Capture, frames: list[Frame], tracking: Tracking | None, finge
     }
     if manifest.saturation is None and any(Path(frame.image).suffix.lower() not in FLOATING for frame in frames):
         inputs["saturation"] = "largest integer"
-    if capture.clip_negative:
+    if capture.pixels.clip_negative:
         inputs["negative"] = "clipped"
+    if capture.pixels.crop is not None:
+        inputs["crop"] = capture.pixels.crop
     if tracking is not None:
         time_of = {frame.image: time for time, frame in enumerate(manifest.frames)}
         inputs["align"] = [VERSION, tracking.times, tracking.reference, [time_of[frame.image] for frame in frames]]
@@ -187,7 +189,7 @@ def _build(capture: Capture, frames: list[Frame], alignment: Alignment | None, f
         if alignment is not None:
             batches = alignment.batches(correction)
         bytes_per_pixel = BYTES_PER_PIXEL if alignment is None else ALIGNED_BYTES_PER_PIXEL
-        workers = max(1, min(os.cpu_count() or 1, DECODE_BYTES // (bytes_per_pixel * pixel_count)))
+        workers = max(1, min(os.cpu_count() or 1, DECODE_BYTES // (bytes_per_pixel * math.prod(capture.image_resolution))))
         with ThreadPoolExecutor(workers, thread_name_prefix="relit-ingest") as pool:
             try:
                 for batch, warp in batches:

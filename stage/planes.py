@@ -4,6 +4,7 @@ A light capture keeps a stack on disk for many solves; depth is decoded once, so
 because the ratio of two ramps is a projector column, which half precision would round by a pixel.
 """
 
+import math
 import os
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -92,7 +93,7 @@ def frame_planes(capture: Capture, frames: Sequence[Frame], *, colour: bool, cac
             if saturated is not None:
                 saturated[index] = radiance.saturated
 
-        at_once = max(1, min(os.cpu_count() or 1, DECODE_BYTES // (BYTES_PER_PIXEL * width * height)))
+        at_once = max(1, min(os.cpu_count() or 1, DECODE_BYTES // (BYTES_PER_PIXEL * math.prod(capture.image_resolution))))
         with ThreadPoolExecutor(at_once, thread_name_prefix="relit-planes") as pool:
             for done, _ in enumerate(pool.map(read, range(len(frames))), start=1):
                 if progress is not None:

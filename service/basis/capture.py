@@ -81,7 +81,7 @@ def open_capture(request: BasisRequest, timings: Timings) -> BasisCapture:
         StageError: bad input; names file and field.
     """
     timings.stage("open", 1)
-    capture = Capture.open(request.capture, clip_negative=request.clip_negative)
+    capture = Capture.open(request.capture, request.pixels)
     lights = lights_from_centre(capture)
     mask = capture.mask()
     tracking = tracking_frames(capture, to=request.align_to) if request.aligned else None

@@ -56,7 +56,7 @@ def inspect(request: InfoRequest, progress: Progress | None = None) -> Inspectio
     """
     timings = Timings(progress)
     timings.stage("open", 1)
-    capture = Capture.open(request.capture, clip_negative=request.clip_negative)
+    capture = Capture.open(request.capture, request.pixels)
     frames = capture.manifest.frames
     timings.stage("frames", len(frames))
     levels = []
@@ -71,7 +71,8 @@ def inspect(request: InfoRequest, progress: Progress | None = None) -> Inspectio
     read = [level for level in levels if level.fault is None]
     if read:
         lowest, peak = min(level.lowest for level in read), max(level.peak for level in read)
-        facts.append(("recorded", f"{lowest:.4g} to {peak:.4g}: correlation images have both signs") if lowest < 0 and any(frame.tof is not None for frame in frames) else
+        of_both_signs = lowest < 0 and any(frame.tof is not None for frame in frames)
+        facts.append(("recorded", f"{lowest:.4g} to {peak:.4g}: correlation images have both signs") if of_both_signs else
                      ("brightest", f"{peak:.4g} recorded"))
     if unread := sum(level.unread for level in read):
         facts.append(("not finite", f"{unread} readings, which count as saturated"))

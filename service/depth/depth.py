@@ -93,7 +93,7 @@ def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResul
     timings = Timings(progress)
     device = devices.resolve(request.device)
     timings.stage("open", 1)
-    capture = Capture.open(request.capture, clip_negative=request.clip_negative)
+    capture = Capture.open(request.capture, request.pixels)
     using = _ranging(capture, request.using)
     if request.normals and capture.camera.projection != "perspective":
         raise RequestError("--normals: needs a perspective camera, that of the capture is orthographic")

@@ -93,7 +93,7 @@ def separate(request: SeparateRequest, progress: Progress | None = None) -> Sepa
     timings = Timings(progress)
     device = devices.resolve(request.device)
     timings.stage("open", 1)
-    capture = Capture.open(request.capture, clip_negative=request.clip_negative)
+    capture = Capture.open(request.capture, request.pixels)
     frames = capture.manifest.frames
     try:
         collected = collect([frame.pattern for frame in frames])

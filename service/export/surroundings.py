@@ -34,7 +34,7 @@ def open_surroundings(request: ExportRequest, camera: Camera) -> Surroundings:
         RequestError: the capture has another camera.
         ManifestError, ImageError, AssetError, StorageError: what the capture, the environment or the frames lack.
     """
-    rig = None if request.rig is None else Capture.open(request.rig, clip_negative=request.clip_negative)
+    rig = None if request.rig is None else Capture.open(request.rig, request.pixels)
     if rig is not None and rig.camera != camera:
         differs = [name for name, value in rig.camera if value != getattr(camera, name)]
         raise RequestError(f"--rig {request.rig}: its camera differs from that of the maps in {', '.join(differs)}: "

@@ -8,7 +8,7 @@ import numpy as np
 
 from service.errors import RequestError
 from service.requests.picture import FrameCompression, FrameMatte, FrameParts, Layer, PictureOptions
-from stage.capture import Capture
+from stage.capture import Capture, check_same_pixels
 from stage.colour import rgb_matrix
 from stage.errors import ResultError
 from stage.maps import MAPS_FILE, SurfaceMaps
@@ -108,9 +108,7 @@ def read_maps(path: Path, capture: Capture) -> SurfaceMaps:
         ImageError: it cannot be read.
     """
     maps = SurfaceMaps.read(path)
-    if maps.camera.resolution != capture.camera.resolution:
-        theirs, ours = ("x".join(map(str, camera.resolution)) for camera in (maps.camera, capture.camera))
-        raise ResultError(f"{path}: is {theirs}, the capture {ours}: these are not its maps")
+    check_same_pixels(path, maps.camera, capture)
     return maps
 
 

@@ -91,7 +91,7 @@ def open_capture(folder: Path, request: RelightRequest, captures: int, frames: S
         StageError: bad input; names file and field.
         RequestError: its maps are not there, or light keys name an image that it has not.
     """
-    capture = Capture.open(folder, clip_negative=request.clip_negative)
+    capture = Capture.open(folder, request.pixels)
     images = {frame.image for frame in capture.sources()}
     for image in {image: None for frame in frames for image in frame.captured}:
         if image not in images:

@@ -83,7 +83,7 @@ def shade(request: ShadeRequest, progress: Progress | None = None) -> ShadeResul
         turn = request.turn_degrees
         environment = TurnedEnvironment(environments.path(1), turn, UPRIGHT, rotation_about_y(turn), 0.0)
     lighting = ScheduledFrame(1, environment, (), {}, request.exposure)
-    capture = None if request.capture is None else Capture.open(request.capture, clip_negative=request.clip_negative)
+    capture = None if request.capture is None else Capture.open(request.capture, request.pixels)
     if capture is None:
         maps = SurfaceMaps.read(path)
         frame, specular = _shade_maps(maps, path, lighting, environments, near, device, timings)

@@ -13,7 +13,8 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, GetJsonSchemaHandle
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
-from stage.model import Line
+from stage.model import Count, Line, NotNegativeCount
+from stage.pixels import Crop, PixelChoices
 
 
 def _split_commas(given: Any) -> Any:
@@ -37,6 +38,10 @@ Commas = BeforeValidator(_split_commas)
 """Marks a tuple whose values may be given as one text with commas between."""
 WidthHeight = BeforeValidator(_sides)
 """Marks two numbers that may be given as one text with an x between."""
+
+
+CropBox = tuple[NotNegativeCount, NotNegativeCount, Count, Count]
+"""The first column, the first row, the width and the height of a rectangle of an image."""
 
 
 class Role(StrEnum):
@@ -127,6 +132,13 @@ class PixelOptions(Options):
     clip_negative: bool = False
     """Set values to 0 that are negative beyond the noise of their image, and say how many; without it such images are refused. Noise around
     zero, as dark-subtracted images have, is kept in either case."""
+    crop: Annotated[CropBox | None, Commas, Spelling(metavar="X,Y,W,H")] = None
+    """Use this part of every image alone: first column, first row, width and height in pixels. The camera and the mask follow."""
+
+    @property
+    def pixels(self) -> PixelChoices:
+        """Return how the pixels of the capture are read."""
+        return PixelChoices(self.clip_negative, None if self.crop is None else Crop(*self.crop))
 
 
 class StackOptions(PixelOptions):

@@ -248,11 +248,11 @@ def _open(request: SolveRequest, timings: Timings, sharing: SharedSolve | None) 
     """Open the capture of a request and read its images into a stack."""
     chosen = devices.resolve_all(request.device)
     timings.stage("open", 1)
-    capture = Capture.open(request.capture, clip_negative=request.clip_negative)
+    capture = Capture.open(request.capture, request.pixels)
     method = request.method or next(method for method, entry in METHODS.items() if entry.is_default(capture))
     if (method is Method.REFERENCE) != (request.reference_ball is not None):
         raise RequestError("--method reference and --reference-ball CAPTURE go together: give both or neither")
-    balls = [] if request.reference_ball is None else [Capture.open(request.reference_ball, clip_negative=request.clip_negative)]
+    balls = [] if request.reference_ball is None else [Capture.open(request.reference_ball, request.pixels._replace(crop=None))]
     lights = METHODS[method].read_lights(capture, *balls)
     solver = METHODS[method].solvers.get(type(lights))
     if solver is None:  # only extended lights can be missing here: every method takes distant and near ones

@@ -139,7 +139,7 @@ def _define_light(usd_stage: Usd.Stage, path: Sdf.Path, lit: RigLight, capture: 
         return _define_point(usd_stage, path, light, space), None
     texture = folder / f"{RIG}_{lit.frames[0]:04d}.exr"
     if isinstance(light, EnvironmentLight):
-        write_dome_texture(capture.file(light.image), texture, clipped=capture.clipped if capture.clip_negative else None)
+        write_dome_texture(capture.file(light.image), texture, clipped=capture.clipped if capture.pixels.clip_negative else None)
     elif light.axis == "full":
         return _Emission(define_dome(usd_stage, path, None), 1.0, (1.0, 1.0, 1.0)), None
     else:

@@ -1,5 +1,6 @@
 """What each captured frame shows: its light in words and numbers, how bright it is, and a small picture of it."""
 
+import math
 import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -93,7 +94,7 @@ def read_images(capture: Capture, mask: np.ndarray, timings: Timings) -> Capture
 
     images: list[FrameImage | None] = []
     faults = []
-    workers = max(1, min(os.cpu_count() or 1, DECODE_BYTES // (BYTES_PER_PIXEL * mask.size)))
+    workers = max(1, min(os.cpu_count() or 1, DECODE_BYTES // (BYTES_PER_PIXEL * math.prod(capture.image_resolution))))
     with ThreadPoolExecutor(workers, thread_name_prefix="relit-view") as pool:
         for image in pool.map(small, frames):
             faults += [image] if isinstance(image, str) else []
@@ -175,7 +176,7 @@ def _radiance(capture: Capture, correction: Correction, frame: Frame) -> tuple[n
     path = capture.file(frame.image)
     if path.suffix.lower() != ".npy":
         return correction.apply(frame)
-    shape = capture.camera.height, capture.camera.width
+    shape = capture.image_resolution[::-1]
     try:
         with storage("read", path):
             values = np.load(path, mmap_mode="r")
@@ -183,7 +184,7 @@ def _radiance(capture: Capture, correction: Correction, frame: Frame) -> tuple[n
         raise ImageError(f"{path}: is no array that NumPy reads") from error
     if values.shape[:2] != shape or values.ndim not in (2, 3) or values.dtype.kind not in "fiu":
         raise ImageError(f"{path}: has the shape {values.shape}: expected {shape} with or without bins")
-    plane = np.concatenate(list(_row_sums(values)))
+    plane = capture.part_of(np.concatenate(list(_row_sums(values))))
     if not np.isfinite(plane).all():
         raise ImageError(f"{path}: holds values that are not finite")
     return np.repeat(plane[..., None], 3, axis=-1), None

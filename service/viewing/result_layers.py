@@ -8,8 +8,7 @@ import numpy as np
 
 from kernels.status import Status
 from stage import depth_maps, exr, maps
-from stage.camera import Camera
-from stage.capture import Capture
+from stage.capture import Capture, check_same_pixels
 from stage.errors import ResultError
 from stage.result_metadata import camera_and_provenance
 
@@ -81,7 +80,7 @@ class ResultLayers:
         self.has_depth = "depth" in told
         file_name = depth_maps.DEPTH_FILE if self.of_depth else maps.MAPS_FILE
         self.camera, self.provenance = camera_and_provenance(header.metadata, path, file_name=file_name)
-        _check_camera(path, self.camera, capture.camera)
+        check_same_pixels(path, self.camera, capture)
         self._names = {}
         for name, channels in channels_of_layers(self.of_depth).items():
             lacking = [channel for channel in channels if channel not in header.channels]
@@ -164,9 +163,3 @@ def channels_of_layers(of_depth: bool) -> dict[str, list[str]]:
     if of_depth:
         return {name: [channel] for name, (channel, _) in depth_maps.LAYERS.items()}
     return {name: [f"{name}.{suffix}" for suffix in suffixes] for name, (suffixes, _) in maps.LAYERS.items()}
-
-
-def _check_camera(path: Path, theirs: Camera, ours: Camera) -> None:
-    if theirs.resolution != ours.resolution:
-        sizes = ("x".join(map(str, camera.resolution)) for camera in (theirs, ours))
-        raise ResultError("{}: is {}, the capture {}: these are not its maps".format(path, *sizes))

@@ -73,7 +73,7 @@ def view(request: ViewRequest, progress: Progress | None = None) -> ViewResult:
     timings = Timings(progress)
     device = devices.resolve(request.device)
     timings.stage("open", 1)
-    capture = Capture.open(request.capture, clip_negative=request.clip_negative)
+    capture = Capture.open(request.capture, request.pixels)
     _check_outputs(request, capture)
     result = None if request.maps is None else ResultLayers(result_file(request.maps), capture)
     report = SolveReport([], {}, None) if result is None else read_report(result.path)

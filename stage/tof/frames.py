@@ -160,13 +160,13 @@ def _plane(capture: Capture, frame: Frame) -> np.ndarray:
     """Read a correlation image as [rows, cols] float32 from a .npy, or from the first channel of an image."""
     path = capture.file(frame.image)
     if path.suffix.lower() != ".npy":
-        images.check_resolution(path, capture.camera.resolution)
-        return images.read_pixels(path)[..., 0].astype(np.float32)
+        images.check_resolution(path, capture.image_resolution)
+        return capture.part_of(images.read_pixels(path)[..., 0]).astype(np.float32)
     values = read_array(path)
-    expected = (capture.camera.height, capture.camera.width)
+    expected = capture.image_resolution[::-1]
     if values.shape != expected:
         raise ImageError(f"{path}: is {values.shape}, the camera's image is {expected} (rows, cols)")
-    return values.astype(np.float32)
+    return capture.part_of(values).astype(np.float32)
 
 
 def _histogram(capture: Capture, frame: Frame) -> np.ndarray:
@@ -175,12 +175,12 @@ def _histogram(capture: Capture, frame: Frame) -> np.ndarray:
     if path.suffix.lower() != ".npy":
         raise ImageError(f"{path}: is no histogram: give a .npy of (rows, cols, bins)")
     values = read_array(path)
-    expected = (capture.camera.height, capture.camera.width)
+    expected = capture.image_resolution[::-1]
     if values.ndim != 3 or values.shape[:2] != expected:
         raise ImageError(f"{path}: is {values.shape}, expected {expected} and bins (rows, cols, bins)")
     if values.shape[2] < 3:
         raise ImageError(f"{path}: has {values.shape[2]} bins: a return needs three or more")
-    counts = values.reshape(-1, values.shape[2]).astype(np.float32)
+    counts = capture.part_of(values).reshape(-1, values.shape[2]).astype(np.float32)
     if not np.isfinite(counts).all() or counts.min() < 0:
         raise ImageError(f"{path}: holds counts that are negative or not finite: give photons")
     if not counts.any():

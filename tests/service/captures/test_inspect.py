@@ -88,15 +88,16 @@ def correlation_images(folder, values, **manifest):
 def test_correlation_images_have_both_signs(tmp_path):
     phase = np.linspace(1, 2, 24, dtype=np.float32).reshape(4, 6)
     images = [100 * np.cos(phase - index * np.pi / 2).astype(np.float32) for index in range(4)]
-    found = inspect(correlation_images(tmp_path, images, saturation=99.0))
+    found = inspect(InfoRequest(capture=correlation_images(tmp_path, images, saturation=99.0)))
     facts, values = dict(found.facts), np.stack(images)
     assert found.faults == []
     assert facts["recorded"] == f"{values.min():.4g} to {values.max():.4g}: correlation images have both signs"
     assert facts["saturated"] == f"{(values >= 99).sum()} readings at or above 99" and "brightest" not in facts
     images[2][0, :3] = np.nan  # as the solver takes them
-    assert dict(inspect(correlation_images(tmp_path, images)).facts)["not finite"] == "3 readings, which count as saturated"
+    facts = dict(inspect(InfoRequest(capture=correlation_images(tmp_path, images))).facts)
+    assert facts["not finite"] == "3 readings, which count as saturated"
     images[2][:] = np.nan
-    (fault,) = inspect(correlation_images(tmp_path, images)).faults
+    (fault,) = inspect(InfoRequest(capture=correlation_images(tmp_path, images))).faults
     assert fault == f"{tmp_path}/2.exr: no reading is finite"
 
 
@@ -107,7 +108,8 @@ def test_faults_of_time_of_flight_are_named(tmp_path):
     write_manifest(tmp_path, {"schema": "relit.capture/1", "name": "room", "frames": [
         {"image": f"0{index}.npy", "tof": {"type": "pulsed", "bin_s": width, "start_s": 0.0}} for index, width in enumerate((1e-9, 2e-9))],
         "camera": {"projection": "perspective", "resolution": [6, 4], "focal_px": [5, 5]}})
-    for fault, words in zip(inspect(InfoRequest(capture=tmp_path)).faults, ("00.npy: holds counts that are negative", "01.npy: is (4, 5, 32)", "bins of 01.npy"),
+    faults = inspect(InfoRequest(capture=tmp_path)).faults
+    for fault, words in zip(faults, ("00.npy: holds counts that are negative", "01.npy: is (4, 5, 32)", "bins of 01.npy"),
                             strict=True):
         assert words in fault
 

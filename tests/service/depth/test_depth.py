@@ -278,3 +278,20 @@ def test_frames_of_another_kind(relit, tmp_path):
     fails(relit, tmp_path, "none has a laser, which --using asks for", "--using", "laser")
     edit_frame(tmp_path, 15, pattern=None, laser={"type": "ray", "origin_m": [0.2, 0, 0], "direction": [0, 0, -1]})
     fails(relit, tmp_path, "there are pattern and laser frames: --using says which")
+
+
+def test_a_part_of_the_images_has_the_depth_of_the_whole(relit, tmp_path):
+    write_patterns(tmp_path, SCENE, [*phase_patterns("column", 16), *gray_patterns("column", stripe=4), *BLACK_WHITE])
+    whole, _ = solve(relit, tmp_path)
+    rows, cols = whole.mask.shape
+    x, y, width, height = cols // 4, rows // 5, cols // 2, rows // 2
+    part, report = solve(relit, tmp_path, "--crop", f"{x},{y},{width},{height}")
+    inside = (slice(y, y + height), slice(x, x + width))
+    both = part.mask & whole.mask[inside]
+    assert both.sum() > 0.995 * whole.mask[inside].sum()  # pixels beside the border of the part are doubted without their neighbours
+    # full scale comes from the largest values of the part, and so the noise that carries are judged by; a depth moves by rounding alone
+    np.testing.assert_allclose(part.depth[both], whole.depth[inside][both], rtol=1e-5)
+    assert report["options"]["crop"] == [x, y, width, height]
+    points = read_ply(tmp_path / "out" / "points.ply").points
+    expected = part.camera.points(-part.depth)[part.mask]
+    np.testing.assert_allclose(points, expected, rtol=1e-5)

@@ -160,3 +160,15 @@ def test_relight_takes_near_lights_as_the_centre_sees_them_and_says_so(relit, tm
         assert said == (name == "near",) * 2
     for channel in "RGB":  # half rounding, twice; the mean of float32 points
         assert np.allclose(frames["near"][channel], frames["far"][channel], rtol=2e-3, atol=1e-5)
+
+
+@DOMES
+def test_a_part_of_the_images_is_solved_as_in_the_whole(relit, tmp_path, dome):
+    """Lights stay where they are in the camera frame: the rays of the part and its distance are those of the whole."""
+    near_lights.write(tmp_path, dome, lamps(dome, 12, 2.0))
+    x, y, width, height = 10, 8, 30, 32
+    inside = (slice(y, y + height), slice(x, x + width))
+    edit_manifest(tmp_path, camera={**dome.camera, "surface_z_m": float(dome.points[inside][dome.mask[inside]][:, 2].mean())})
+    maps, _ = solve(relit, tmp_path, "lambert", "--crop", f"{x},{y},{width},{height}")
+    part = dome._replace(points=dome.points[inside], normal=dome.normal[inside], albedo=dome.albedo[inside], mask=dome.mask[inside])
+    assert_solved(maps, part, angle=0.06, albedo=0.003)
