@@ -95,7 +95,8 @@ def view_of(capture: Capture, size: Resolution, request: ProcamRequest, device: 
                             "calibration needs columns and rows")
     scene = scene_colour(capture, frames, codes.collected)
     if scene is None:
-        raise ManifestError(f"{capture.folder / FILE_NAME}: frames: no white frame and no inverses: the board must be seen evenly lit")
+        raise ManifestError(f"{capture.folder / FILE_NAME}: frames: no white frame, no inverses and no phases: "
+                            "the board must be seen evenly lit")
     corners = find_corners(scene @ np.array(GREY_WEIGHTS, np.float32), request.board)
     if corners is None:
         return f"the board of {request.board[0]}x{request.board[1]} inner corners is not found"

@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kernels.packs import Band
 from kernels.structured.binary import decode_binary, decode_gray, decode_xor
 from kernels.structured.decoded import Decoded
 from kernels.structured.edges import REACH, refine_edges
@@ -22,7 +21,8 @@ from kernels.structured.modulated import decode_modulated
 from kernels.structured.phase import WrappedPhase, decode_phase, weights
 from kernels.structured.ramp import decode_ramp
 from kernels.structured.response import light_of, wave_error
-from kernels.structured.unwrap import unwrap_by_code, unwrap_jointly
+from kernels.structured.unwrap import unwrap_by_code, unwrap_jointly, unwrap_range
+from service.depth.readings import EvenLight, Readings, even_light
 from stage.model import Resolution, Rgb
 from stage.patterns.base import Axis
 from stage.patterns.binary import BinaryCode
@@ -50,16 +50,6 @@ class PatternProjector(NamedTuple):
         return wave_error(np.linspace(0, 1, 256)**self.exponent, weights(own, period_px), own)
 
 
-class Readings(NamedTuple):
-    """The frames of a band on the device."""
-
-    grey: Band
-    colour: Band | None
-    """The frames with three channels; None if no code has colours."""
-    columns: int
-    """Number of pixels of an image row; the band consists of whole rows."""
-
-
 @dataclass(frozen=True)
 class AxisDecoder:
     """How one axis is decoded."""
@@ -74,6 +64,8 @@ class AxisDecoder:
     """The codes that it reads."""
     halo: int = 0
     """Number of rows above and below a band that decoding reads too."""
+    made: EvenLight | None = None
+    """How white and black are made of phases, where it needs them and the capture has none."""
 
 
 @dataclass(frozen=True)
@@ -87,12 +79,21 @@ class AxisCodes:
     projector: PatternProjector
     refine: bool
     """Interpolate a Gray code with inverses between the edges of its stripes."""
+    made: EvenLight | None = None
+    """How white and black are made of phases; None where the capture has both, or no phases."""
 
     @classmethod
     def of(cls, collected: Collected, axis: Axis, projector: PatternProjector, *, refine: bool) -> "AxisCodes":
-        """Return the codes of the axis that lack no frame."""
-        ready = tuple(code for code in collected.codes if code.axis == axis and code.lacks(collected.white, collected.black) is None)
-        return cls(axis, ready, collected.white, collected.black, projector, refine)
+        """Return the codes of the axis that lack no frame; bits without references count if phases tell white and black."""
+        own = [code for code in collected.codes if code.axis == axis]
+        lacking = [code for code in own if code.lacks(collected.white, collected.black) is not None]
+        made = even_light(collected, projector.response) if any(isinstance(code, BinaryCode) for code in lacking) else None
+        ready = tuple(code for code in own if code not in lacking or (isinstance(code, BinaryCode) and made is not None))
+        return cls(axis, ready, collected.white, collected.black, projector, refine, made)
+
+    def made_for(self, code: Code) -> EvenLight | None:
+        """Return how white and black are made for a code; None if it does without."""
+        return self.made if code.lacks(self.white, self.black) is not None else None
 
     @property
     def extent(self) -> int:
@@ -104,6 +105,10 @@ class AxisCodes:
         """Return the codes that number stripes."""
         return [code for code in self.codes if isinstance(code, BinaryCode | KaryCode)]
 
+    def numbering(self, periods_px: Sequence[float]) -> BinaryCode | KaryCode | None:
+        """Return a code whose stripes are fine enough to number the periods of phases; None without one."""
+        return next((code for code in self.stripes if 2 * code.stripe_px <= min(periods_px)), None)
+
     @property
     def phase(self) -> PhaseCode | None:
         """Return the phases of the axis."""
@@ -113,13 +118,23 @@ class AxisCodes:
 def modulated_decoder(axis: AxisCodes) -> AxisDecoder | None:
     """Decode modulated phases, which hold direct light alone."""
     waves = [code for code in axis.codes if isinstance(code, ModulatedCode)]
+    if not waves:
+        return None
+    periods = tuple(wave.period_px for wave in waves)
+    plain = axis.phase if unwrap_range(periods, axis.extent) < axis.extent else None  # plain phases number periods that repeat
+    if plain is not None and (plain.micro or axis.numbering(periods) is not None):
+        plain = None
 
     def wrapped(readings: Readings, noise: NoiseModel) -> WrappedPhase:
         parts = [decode_modulated(readings.grey, wave.frames, period_px=wave.period_px, response=axis.projector.response, noise=noise)
                  for wave in waves]
+        if plain is not None:
+            parts.append(_wrapped_phase(plain, axis, readings, noise))
         return parts[0] if len(parts) == 1 else join_periods(parts)
 
-    return _unwrapped("modulated phase", axis, waves, [wave.period_px for wave in waves], wrapped) if waves else None
+    if plain is None:
+        return _unwrapped("modulated phase", axis, waves, periods, wrapped)
+    return _unwrapped("modulated phase with phase", axis, [*waves, plain], (*periods, *dict.fromkeys(plain.periods_px)), wrapped)
 
 
 def micro_decoder(axis: AxisCodes) -> AxisDecoder | None:
@@ -143,14 +158,8 @@ def phase_decoder(axis: AxisCodes) -> AxisDecoder | None:
     phase = axis.phase
     if phase is None:
         return None
-    errors = [axis.projector.wave_error([s for s, p in zip(phase.shifts, phase.periods_px, strict=True) if p == period], period)
-              for period in dict.fromkeys(phase.periods_px)]
-
-    def wrapped(readings: Readings, noise: NoiseModel) -> WrappedPhase:
-        return decode_phase(readings.grey, phase.frames, phase.periods_px, phase.shifts, black=axis.black,
-                            response=axis.projector.response, wave_errors=errors, noise=noise)
-
-    return _unwrapped("phase", axis, [phase], phase.periods_px, wrapped)
+    return _unwrapped("phase", axis, [phase], phase.periods_px,
+                      lambda readings, noise: _wrapped_phase(phase, axis, readings, noise))
 
 
 def stripe_decoder(axis: AxisCodes) -> AxisDecoder | None:
@@ -168,8 +177,10 @@ def stripe_decoder(axis: AxisCodes) -> AxisDecoder | None:
         return refine_edges(found, readings.grey, code.frames, inverses, columns=readings.columns, down=axis.axis == "row",
                             extent=axis.extent, stripe_px=code.stripe_px, noise=noise)
 
-    name = f"{code.name}{' with inverses' if inverses else ''}{', edges refined' if edges else ''}"
-    return AxisDecoder(axis.axis, name, _coloured(code), decode, (code,), halo=REACH if edges and axis.axis == "row" else 0)
+    made = axis.made_for(code)
+    name = (f"{code.name}{' with inverses' if inverses else ''}{', edges refined' if edges else ''}"
+            f"{', white and black from phases' if made else ''}")
+    return AxisDecoder(axis.axis, name, _coloured(code), decode, (code,), halo=REACH if edges and axis.axis == "row" else 0, made=made)
 
 
 def ramp_decoder(axis: AxisCodes) -> AxisDecoder | None:
@@ -186,10 +197,17 @@ def ramp_decoder(axis: AxisCodes) -> AxisDecoder | None:
     return AxisDecoder(axis.axis, "ramp", False, decode, (code,))
 
 
+def _wrapped_phase(phase: PhaseCode, axis: AxisCodes, readings: Readings, noise: NoiseModel) -> WrappedPhase:
+    errors = [axis.projector.wave_error([s for s, p in zip(phase.shifts, phase.periods_px, strict=True) if p == period], period)
+              for period in dict.fromkeys(phase.periods_px)]
+    return decode_phase(readings.grey, phase.frames, phase.periods_px, phase.shifts, black=axis.black,
+                        response=axis.projector.response, wave_errors=errors, noise=noise)
+
+
 def _unwrapped(name: str, axis: AxisCodes, waves: Sequence[PhaseCode | ModulatedCode], periods_px: Sequence[float],
                wrapped: Callable[[Readings, NoiseModel], WrappedPhase]) -> AxisDecoder:
     """Unwrap phases by a code whose stripes are fine enough to number the periods, else jointly."""
-    numbering = next((code for code in axis.stripes if 2 * code.stripe_px <= min(periods_px)), None)
+    numbering = axis.numbering(periods_px)
     if numbering is None:
         return AxisDecoder(axis.axis, name, False, lambda readings, noise: unwrap_jointly(wrapped(readings, noise), extent=axis.extent),
                            tuple(waves))
@@ -198,7 +216,8 @@ def _unwrapped(name: str, axis: AxisCodes, waves: Sequence[PhaseCode | Modulated
         return unwrap_by_code(wrapped(readings, noise), _decode_stripes(numbering, axis, readings, noise),
                               stripe_px=numbering.stripe_px, extent=axis.extent)
 
-    return AxisDecoder(axis.axis, f"{name} numbered by {numbering.name}", _coloured(numbering), decode, (*waves, numbering))
+    return AxisDecoder(axis.axis, f"{name} numbered by {numbering.name}", _coloured(numbering), decode, (*waves, numbering),
+                       made=axis.made_for(numbering))
 
 
 def _decode_stripes(code: BinaryCode | KaryCode, axis: AxisCodes, readings: Readings, noise: NoiseModel) -> Decoded:
@@ -210,11 +229,15 @@ def _decode_stripes(code: BinaryCode | KaryCode, axis: AxisCodes, readings: Read
                            levels=light_of(axis.projector.response, np.array(code.levels if code.levels is not None else code.colors)),
                            reflected=code.reflected,
                            extent=axis.extent, stripe_px=code.stripe_px, crosstalk=crosstalk, noise=noise)
+    white, black = axis.white, axis.black
+    if axis.made_for(code) is not None:
+        assert readings.made is not None  # as the decoder has asked
+        white, black = readings.made
     if code.name == "xor":
-        return decode_xor(readings.grey, code.frames, code.inverses, base_bit=code.base_bit, white=axis.white, black=axis.black,
+        return decode_xor(readings.grey, code.frames, code.inverses, base_bit=code.base_bit, white=white, black=black,
                           extent=axis.extent, stripe_px=code.stripe_px, noise=noise)
     run = decode_gray if code.name == "gray" else decode_binary
-    return run(readings.grey, code.frames, code.inverses, white=axis.white, black=axis.black, extent=axis.extent,
+    return run(readings.grey, code.frames, code.inverses, white=white, black=black, extent=axis.extent,
                stripe_px=code.stripe_px, noise=noise)
 
 

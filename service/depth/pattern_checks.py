@@ -8,11 +8,12 @@ import numpy as np
 from kernels.errors import KernelError
 from kernels.status import OK, Status
 from kernels.structured.decoded import Decoded
-from kernels.structured.frames import NoiseModel, saturated_bits, upload
+from kernels.structured.frames import NoiseModel
 from kernels.structured.response import bent_wave
 from kernels.structured.triangulate import ProjectorModel, triangulate
 from service.depth.codes import choose_decoder
-from service.depth.decoders import AxisDecoder, PatternProjector, Readings
+from service.depth.decoders import AxisDecoder, PatternProjector
+from service.depth.readings import Readings
 from stage.camera import Camera
 from stage.colour import GREY_WEIGHTS
 from stage.errors import StageError
@@ -128,10 +129,7 @@ def agreeing_share(sample: Sample, patterns: list[Pattern], projector: PatternPr
 
 def decode_sample(sample: Sample, decoder: AxisDecoder, noise: NoiseModel, device: str) -> Decoded:
     """Decode the rows of a sample."""
-    bits = None if sample.saturated is None else saturated_bits(sample.saturated)
-    colour = upload(sample.values, bits, device=device) if sample.values.shape[1] > 1 else None
-    grey = np.ascontiguousarray(sample.grey)
-    return decoder.decode(Readings(upload(grey, bits, device=device), colour, sample.mask.shape[1]), noise)
+    return decoder.decode(Readings.of(sample.values, sample.saturated, sample.mask.shape[1], decoder.made, device=device), noise)
 
 
 def _mirror(axis: Decoded, extent: float, device: str) -> Decoded:

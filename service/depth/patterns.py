@@ -9,20 +9,20 @@ import numpy as np
 
 from kernels.status import ESTIMATED, SOLVED, Status
 from kernels.structured.decoded import Decoded
-from kernels.structured.frames import NoiseModel, saturated_bits, upload
+from kernels.structured.frames import NoiseModel
 from kernels.structured.join import cropped
 from kernels.structured.triangulate import ProjectorModel, triangulate
 from service.depth.agreement import ADVICE, conclude, doubt_coordinates, doubt_pixels
 from service.depth.codes import choose_decoder
 from service.depth.coordinates import Coordinates, DecodedSolution
-from service.depth.decoders import AxisDecoder, PatternProjector, Readings
+from service.depth.decoders import AxisDecoder, PatternProjector
 from service.depth.pattern_checks import check_declaration, find_exponent, response_sentence, sample_of
+from service.depth.readings import Readings, even_light
 from service.depth.solution import DepthSolution
 from service.errors import RequestError
 from service.reporting.progress import Timings
 from service.requests.depth import DepthRequest
 from stage.capture import Capture
-from stage.colour import GREY_WEIGHTS
 from stage.colour_spaces import is_linear
 from stage.correction import Correction
 from stage.errors import ManifestError
@@ -30,6 +30,7 @@ from stage.manifest import FILE_NAME, Frame
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected, collect
 from stage.patterns.kary import KaryCode
+from stage.patterns.modulated import ModulatedCode
 from stage.planes import Planes, frame_planes
 from stage.projector import Projector
 from stage.triangulation_check import check_projector, missing_calibration
@@ -145,13 +146,16 @@ def pattern_projector(capture: Capture, frames: Sequence[Frame]) -> PatternProje
     projector = capture.manifest.projector
     if projector is not None:
         return PatternProjector(projector.resolution, projector.response, projector.crosstalk)
-    size = {"column": 1, "row": 1}
-    for code in collect([frame.pattern for frame in frames]).codes:
-        if not isinstance(code, BinaryCode | KaryCode):
+    codes = collect([frame.pattern for frame in frames]).codes
+    size = {"column": 0, "row": 0}
+    for code in codes:
+        if isinstance(code, BinaryCode | KaryCode):
+            size[code.axis] = max(size[code.axis], ceil(code.stripe_count * code.stripe_px))
+    for code in codes:
+        if not size[code.axis]:
             raise ManifestError(f"{capture.folder / FILE_NAME}: projector: is missing, and a {code.name} code does not tell how many "
                                 'pixels it has: give its size at least, as "projector": {"resolution": [1280, 800]}')
-        size[code.axis] = max(size[code.axis], ceil(code.stripe_count * code.stripe_px))
-    return PatternProjector((size["column"], size["row"]))
+    return PatternProjector((size["column"] or 1, size["row"] or 1))  # an axis without a code has no coordinate
 
 
 def _checked(planes: Planes, mask: np.ndarray, codes: PatternCodes, shown: PatternProjector, projector: Projector | None,
@@ -240,14 +244,13 @@ def decoded_bands(planes: Planes, decoders: Sequence[AxisDecoder | None], noise:
         A range of rows, and each axis decoded in it; None where an axis has no decoder.
     """
     _, height, _, width = planes.values.shape
+    made = next((decoder.made for decoder in decoders if decoder is not None and decoder.made is not None), None)
     halo = max((decoder.halo for decoder in decoders if decoder is not None), default=0)
     for band in planes.bands(DECODE_BYTES_PER_PIXEL):
         around = slice(max(band.start - halo, 0), min(band.stop + halo, height))
         values = planes.band(around)
-        bits = None if planes.saturated is None else saturated_bits(planes.saturated[:, around].reshape(len(values), -1))
-        grey = values[:, 0] if values.shape[1] == 1 else np.tensordot(values, np.array(GREY_WEIGHTS, np.float32), ([1], [0]))
-        readings = Readings(upload(np.ascontiguousarray(grey), bits, device=device),
-                            upload(values, bits, device=device) if values.shape[1] > 1 else None, width)
+        saturated = None if planes.saturated is None else planes.saturated[:, around].reshape(len(values), -1)
+        readings = Readings.of(values, saturated, width, made, device=device)
         decoded = [None if decoder is None else decoder.decode(readings, noise) for decoder in decoders]
         if around != band:
             first, count = (band.start - around.start) * width, (band.stop - band.start) * width
@@ -278,15 +281,22 @@ def full_scale(planes: Planes, capture: Capture, frames: list[Frame]) -> float:
 
 
 def scene_colour(capture: Capture, frames: list[Frame], collected: Collected) -> np.ndarray | None:
-    """Return what the scene looks like, [rows, cols, 3] linear: the white frame, else a bit and its inverse, which add up to even light.
+    """Return what the scene looks like, [rows, cols, 3] linear: the white frame, else a bit and its inverse, which add up to even light,
+    else the mean of a wave over its shifts.
 
-    None if the capture has neither.
+    None if the capture has none of them.
     """
-    numbers = [collected.white] if collected.white is not None else []
+    parts = {collected.white: 1.0} if collected.white is not None else {}
     for code in collected.codes:
-        if not numbers and isinstance(code, BinaryCode) and code.inverses is not None:
-            numbers = [code.frames[0], code.inverses[0]]
-    if not numbers:
+        if not parts and isinstance(code, BinaryCode) and code.inverses is not None:
+            parts = {code.frames[0]: 1.0, code.inverses[0]: 1.0}
+    waves = even_light(collected)
+    if not parts and waves is not None:
+        parts = dict(zip(waves.frames, waves.weights[:, 0], strict=True))
+    for code in collected.codes:
+        if not parts and isinstance(code, ModulatedCode):
+            parts = {number: 1.0 for step in code.frames for number in step}
+    if not parts:
         return None
     correction = Correction.of(capture)
-    return np.asarray(np.sum([correction.apply(frames[number]).pixels for number in numbers], axis=0))
+    return np.asarray(np.sum([weight * correction.apply(frames[number]).pixels for number, weight in parts.items()], axis=0))

@@ -119,7 +119,8 @@ class BinaryCode(NamedTuple):
         """Return what is missing to decode the code, as a sentence; None if nothing is."""
         if self.inverses is not None or (white is not None and black is not None):
             return None
-        return f"the {self.axis} {self.name} code has neither inverses nor a white and a black frame: give one of the two"
+        return (f"the {self.axis} {self.name} code has neither inverses nor a white and a black frame, and no phases tell what these show: "
+                "give one of the three")
 
 
 def gray_of(code: np.ndarray) -> np.ndarray:

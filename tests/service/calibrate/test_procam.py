@@ -108,12 +108,26 @@ def test_the_size_of_the_projector_may_stand_in_the_manifests(relit, rig, tmp_pa
             "projection": "orthographic", "resolution": [CAMERA.width, CAMERA.height]})
     assert "projector    256x192, not calibrated: see relit calibrate procam" in relit("info", copies[0]).out
     outcome = relit("depth", copies[0], "--out", tmp_path / "out")
-    assert outcome.code == 2 and "projector: has no focal_px and no camera_from_projector" in outcome.err
+    assert outcome.code == 0 and "without depth" in outcome.out  # tests/service/depth/test_decoded_only.py
     outcome = relit("calibrate", "procam", *copies, "--board", "9x6", "--square-m", 0.03)
     assert (outcome.code, outcome.err) == (0, "")
     projector = Capture.open(copies[0]).manifest.projector
     assert projector.resolution == (256, 192) and projector.response == (0, 0.5, 1)
     assert np.abs(np.array(projector.focal_px) / PROJECTOR.focal - 1).max() < 0.01
+
+
+def test_poses_with_phases_alone_calibrate(relit, rig, tmp_path):
+    """The mean of a wave over its shifts is the image under even light, in which the corners are found: no white frame is needed."""
+    folders, _ = rig
+    copies = [shutil.copytree(folder, tmp_path / folder.name) for folder in folders]
+    for folder in copies:
+        frames = json.loads((folder / "capture.json").read_text())["frames"]
+        edit_manifest(folder, frames=[frame for frame in frames if frame["pattern"]["code"] == "phase"])
+    outcome = relit("calibrate", "procam", *copies, "--board", "9x6", "--square-m", 0.03, "--projector", "256x192")
+    assert (outcome.code, outcome.err) == (0, "")
+    report = json.loads((copies[0] / "calibration.json").read_text())["procam"]
+    assert len(report["views"]) == 5 and report["rms_px"] < 0.3  # as with a white frame
+    assert np.abs(np.array(Capture.open(copies[0]).manifest.projector.focal_px) / PROJECTOR.focal - 1).max() < 0.01
 
 
 def test_response_is_written_into_the_projector(relit, tmp_path):

@@ -129,6 +129,33 @@ def test_the_projectors_response_is_taken_off_a_ramp(relit, tmp_path):
     assert np.median(np.abs(maps.projector_u - SCENE.uv[..., 0])[maps.mask]) < 0.02
 
 
+@pytest.mark.parametrize(("patterns", "name", "worst_px"), [
+    ([*phase_patterns("column", 16), *gray_patterns("column", stripe=4, inverse=False)], "phase numbered by gray", 0.02),
+    ([*phase_patterns("column", 16, 3), *gray_patterns("column", stripe=4, inverse=False)], "phase numbered by gray", 0.02),
+    ([*phase_patterns("row", 96), *gray_patterns("column", inverse=False)], "gray, white and black from phases", 1.0),
+    (modulated(128), "modulated phase", 0.05),
+    ([*modulated(16), *phase_patterns("column", 128)], "modulated phase with phase", 0.02),
+    ([*phase_patterns("column", 16), *phase_patterns("column", 128)], "phase", 0.02),
+])
+def test_captures_without_white_and_black(relit, tmp_path, patterns, name, worst_px):
+    """Phases tell what white and black frames would show; a period as long as the projector is wide numbers the others, or itself."""
+    write_patterns(tmp_path, SCENE, patterns)
+    maps, report = solve(relit, tmp_path)
+    assert report["found"]["codes"]["column"] == name
+    assert maps.mask[LIT].mean() > 0.93
+    assert np.abs(maps.projector_u - SCENE.uv[..., 0])[maps.mask].max() <= worst_px
+
+
+def test_a_bent_wave_still_tells_white_and_black(relit, tmp_path):
+    """Light = level^2.2: the mean of the wave lies at .36 of white, and the threshold of the bits half way all the same."""
+    write_patterns(tmp_path, SCENE, [*phase_patterns("row", 96), *gray_patterns("column", inverse=False)], gamma=2.2)
+    data = json.loads((tmp_path / "capture.json").read_text())
+    edit_manifest(tmp_path, projector={**data["projector"], "response": (np.linspace(0, 1, 256) ** 2.2).tolist()})
+    maps, _ = solve(relit, tmp_path)
+    assert maps.mask[LIT].mean() > 0.93
+    assert np.abs(maps.projector_u - SCENE.uv[..., 0])[maps.mask].max() <= 1.0
+
+
 @pytest.mark.parametrize(("patterns", "words"), [
     ([{"code": "ramp", "axis": "column", "direction": "up"}], "column ramp needs its opposite or a white frame"),
     (kary(4, 4, 1, levels=[0, 0.33, 0.67, 1]), "column kary code needs a white and a black frame"),
