@@ -8,6 +8,7 @@ from stage.correction import Correction
 from stage.environment_maps import read_environment
 from stage.errors import ImageError
 from stage.ingest import open_stack
+from stage.pixels import PixelChoices
 from stage.radiance import check_radiance, clip_negative, noise_floor
 from tests.scenes.captures import make_scene, write_capture, write_exr
 
@@ -104,12 +105,12 @@ def test_a_capture_clips_and_remembers_how_many(tmp_path):
     write_exr(tmp_path / "002.exr", low)
     with pytest.raises(ImageError, match=r"002\.exr: 3 pixels are negative.*: --clip-negative sets such values to 0"):
         open_stack(Capture.open(tmp_path))
-    capture = Capture.open(tmp_path, clip_negative=True)
+    capture = Capture.open(tmp_path, PixelChoices(clip_negative=True))
     pixels = Correction.of(capture).apply(capture.manifest.frames[2]).pixels
     np.testing.assert_array_equal(pixels, np.maximum(low, 0).astype(np.float32))
     assert capture.clipped == {"002.exr": 3}
     assert open_stack(capture).clipped == {"002.exr": 3}
-    again = Capture.open(tmp_path, clip_negative=True)
+    again = Capture.open(tmp_path, PixelChoices(clip_negative=True))
     assert open_stack(again).clipped == again.clipped == {"002.exr": 3}  # from the cache
 
 
