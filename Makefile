@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PYTEST := $(BIN)/python -m pytest -q -n auto --maxprocesses 4 --dist loadfile
 
-.PHONY: demo serve test test-all clients lint bench gpu-bench figures samples screenshots lock vendor colour-table clean
+.PHONY: demo serve test test-all clients lint bench gpu-bench manifest-page figures samples screenshots lock vendor colour-table clean
 demo: $(VENV)/installed
 	$(BIN)/relit demo
 
@@ -31,6 +31,10 @@ bench: $(VENV)/installed
 # the kernels on cuda:0, after their tests; needs nothing but Warp and NumPy: python -m benchmarks.gpu in any environment with them
 gpu-bench: $(VENV)/installed
 	$(BIN)/python -m benchmarks.gpu
+
+# docs/manifest.md, every field of capture.json, from the models in stage/
+manifest-page: $(VENV)/installed-dev
+	$(BIN)/python -m stage.manifest_page
 
 # the tables of docs/figures.md; FIGURES="--data DIR --glossy DIR --large DIR" measures what needs data or space
 figures: $(VENV)/installed-dev

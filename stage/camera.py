@@ -20,8 +20,11 @@ class Distortion(Strict):
     """
 
     model: Literal["brown_conrady"]
+    """The model of the distortion."""
     k: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """The radial coefficients k1, k2 and k3 of OpenCV."""
     p: tuple[float, float] = (0.0, 0.0)
+    """The tangential coefficients p1 and p2 of OpenCV."""
 
     def apply(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the distorted image-plane coordinates of ideal ones, x = X/Z and y = Y/Z, arrays of one shape."""
@@ -46,15 +49,23 @@ class Camera(Strict):
     """
 
     projection: Literal["perspective", "orthographic"]
+    """How the camera projects: `orthographic` for a distant camera, or one that nobody calibrated."""
     resolution: Resolution
+    """The size of every image."""
     focal_px: tuple[Positive, Positive] | None = None
+    """The focal lengths along u and v; a perspective camera needs them, an orthographic one has none."""
     principal_px: tuple[float, float] | None = None
+    """The principal point, u to the right and v down from the top-left corner of the image: OpenCV's cx + 0.5 and cy + 0.5. None: the
+    centre of the image."""
     distortion: Distortion | None = None
+    """The lens distortion of a perspective camera; None: none."""
     pixel_size_m: Positive | None = None
+    """The side of a pixel on the object, of an orthographic camera; None: a scene of unknown scale."""
     surface_z_m: float | None = None
-    """The camera-frame z of the mean of the masked surface. None means 0 for an orthographic camera, and a scene of unknown scale for
-    a perspective camera."""
+    """The camera-frame z of the mean of the masked surface; a perspective camera sees z below 0. None: 0 for an orthographic camera, and
+    a scene of unknown scale for a perspective camera."""
     world_from_camera: Transform | None = None
+    """The place of the camera in the world, which assets have too; None: the world is the camera frame."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

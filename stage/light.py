@@ -11,6 +11,7 @@ class DistantLight(Strict):
     """A distant light, which has the same direction and irradiance at every point."""
 
     type: Literal["distant"]
+    """The type of the light."""
     direction: Direction
     """The unit vector from the surface to the light, in the camera frame."""
     irradiance: LitRgb
@@ -28,10 +29,15 @@ class PointLight(Strict):
     """
 
     type: Literal["point"]
+    """The type of the light."""
     position_m: Vector
+    """The place of the light in the camera frame: x to the right, y up, z towards the viewer. The camera must have a scale."""
     intensity: LitRgb
+    """The irradiance that the light causes at normal incidence one metre away, on its axis, in the unit of the other lights."""
     axis: Direction | None = None
+    """The direction in which the light shines most, from the light outwards; None: it shines alike in all directions."""
     anisotropy: Annotated[float, Field(ge=0)] | None = None
+    """The exponent μ of the cosine of the angle from `axis`, 1 for a flat LED; it needs `axis`. None: 0, alike in all directions."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -44,8 +50,11 @@ class ExtendedLight(Strict):
     """An area source, given as samples of the sphere of directions (photometric sampling, Nayar, Ikeuchi and Kanade 1990)."""
 
     type: Literal["extended"]
+    """The type of the light."""
     directions: Annotated[tuple[Direction, ...], Field(min_length=1), FirstFault]
+    """The unit vector from the surface to each sample, in the camera frame."""
     radiance: Annotated[tuple[Rgb, ...], Field(min_length=1), FirstFault]
+    """The radiance of each sample, all of one colour; radiance times solid angle has the unit of `irradiance`."""
     solid_angle: Annotated[tuple[Positive, ...], Field(min_length=1), FirstFault]
     """The solid angle of each sample in steradians."""
 
@@ -63,28 +72,36 @@ class GradientLight(Strict):
     """Spherical gradient illumination, whose radiance from direction ω is (1 ± ω_axis) / 2, or 1 for axis `full` (Ma et al. 2007)."""
 
     type: Literal["gradient"]
+    """The type of the light."""
     axis: Literal["x", "y", "z", "full"]
+    """The axis of the camera frame along which the radiance grows from 0 to 1, or `full` for 1 everywhere."""
     sign: Literal[1, -1] = 1
+    """-1 where the radiance falls along the axis."""
     polarization: Literal["none", "parallel", "cross"] = "none"
+    """How the polariser of the camera stands to those of the lights; `none` without polarisers."""
 
 
 class EnvironmentLight(Strict):
     """An environment, given as a lat-long map; its frame is a photograph with which relit images are compared."""
 
     type: Literal["environment"]
+    """The type of the light."""
     image: Text
+    """The lat-long map, a file of the folder: .exr or .hdr, twice as wide as high."""
 
 
 class OffLight(Strict):
     """Ambient light alone; its frames are subtracted from the other frames."""
 
     type: Literal["off"]
+    """The type of the light."""
 
 
 class FullLight(Strict):
     """All lights together, as in a tracking frame."""
 
     type: Literal["full"]
+    """The type of the light."""
 
 
 Light = Annotated[

@@ -29,11 +29,17 @@ class Frame(Strict):
     """One image of a capture and what lit it: exactly one of a light, a pattern, a laser and a time-of-flight source."""
 
     image: FileName
+    """The image, a file of the folder that no other frame has; for `tof` it may be a NumPy array, .npy."""
     exposure_s: Positive | None = None
+    """The exposure time, by which the readings are divided; give it for every frame or for none. None: all exposures are equal."""
     light: Light | None = None
+    """The light, of one of the types below."""
     pattern: Pattern | None = None
+    """The projected pattern, of one of the codes below."""
     laser: Laser | None = None
+    """The laser ray or plane."""
     tof: TimeOfFlight | None = None
+    """The time-of-flight source."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -48,17 +54,28 @@ class Manifest(Strict):
     """The content of capture.json."""
 
     schema_: Literal["relit.capture/1"] = Field(alias="schema")
+    """The kind and version of the file."""
     name: Text
+    """The name of the capture and of its asset."""
     color_space: ColorSpaceName = "lin_rec709_scene"
+    """The colour space of the images: scene-linear, or display-encoded as `srgb_texture` for the 8-bit images of most cameras."""
     camera: Camera
+    """The camera, which took all images from one place."""
     projector: AnyProjector | None = None
+    """The projector of pattern frames; None: there is none, or nobody has measured anything of it."""
     mask: FileName | None = None
+    """An image whose first channel is above one half on the object; None: every pixel is object."""
     dark: FileName | None = None
+    """A dark image at the exposure of the frames, which is subtracted; None: none."""
     flat: FileName | None = None
+    """An image of an evenly lit white card, by which images are divided; None: none."""
     saturation: Positive | None = None
+    """The recorded value from which readings are not used; integers count as fractions of full scale. None: the largest integer of
+    frames of lights alone."""
     irradiance_scale: Literal["absolute", "relative"] = "absolute"
     """`relative` where the irradiance (and intensity and radiance) of all lights lacks one common factor, and albedo with it."""
     frames: Annotated[tuple[Frame, ...], Field(min_length=1), FirstFault]
+    """The images, in the order in which they were taken if the subject moves."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -15,8 +15,9 @@ class UncalibratedProjector(Strict):
     """A projector whose lens and place nobody has measured yet: how many pixels it has, and what its light does."""
 
     resolution: Resolution
+    """The size of the image that the projector shows."""
     response: Annotated[tuple[NotNegative, ...], Field(min_length=2), FirstFault] | None = None
-    """The light of the projector at even levels from 0 to 1, rising, as `relit calibrate response` writes it; None means linear."""
+    """The light of the projector at even levels from 0 to 1, rising, as `relit calibrate response` writes it; None: linear."""
     crosstalk: tuple[Rgb, Rgb, Rgb] | None = None
     """The rows are the red, green and blue that the camera records of the red, green and blue of the projector; None: no crosstalk."""
 
@@ -31,9 +32,13 @@ class Projector(UncalibratedProjector):
     """A projector, with the intrinsics and conventions of a perspective camera; its column and row are the continuous u and v."""
 
     focal_px: tuple[Positive, Positive]
+    """The focal lengths along u and v."""
     principal_px: tuple[float, float] | None = None
+    """The principal point, as of the camera; None: the centre of the image."""
     distortion: Distortion | None = None
+    """The lens distortion; None: none."""
     camera_from_projector: Transform
+    """The place of the projector in the camera frame, with the translation in metres; the projector looks along its own -z."""
 
     def projector_from_camera(self) -> np.ndarray:
         """Return the transform from the camera frame to the frame of the projector with OpenCV's axes, x right, y down, z forward.

@@ -20,6 +20,7 @@ class UniformPattern(Strict):
     """Projector black (ambient) or full on."""
 
     code: Literal["black", "white"]
+    """`black`: ambient light and what the projector gives for black; `white`: all pixels on."""
 
     def level(self, u: np.ndarray, v: np.ndarray, extent: int) -> np.ndarray:
         """Return one level everywhere."""

@@ -20,11 +20,17 @@ class BinaryPattern(Strict):
     """One bit of the code floor(u / stripe_px); gray: of c XOR (c >> 1). Bit bits - 1 is the coarsest."""
 
     code: Literal["binary", "gray"]
+    """The code: the number of the stripe, or its Gray code."""
     axis: Axis
+    """The axis of the projector along which the code varies."""
     bit: Index
+    """The bit that the frame shows: `bits` - 1 is the coarsest, 0 the finest."""
     bits: Count
+    """The number of bits of the code."""
     stripe_px: Positive = 1
+    """The width of the finest stripe in projector pixels."""
     inverse: bool = False
+    """Whether black and white are exchanged."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -50,12 +56,19 @@ class XorPattern(Strict):
     """
 
     code: Literal["xor"]
+    """The code."""
     axis: Axis
+    """The axis of the projector along which the code varies."""
     bit: Index
+    """The bit that the frame shows: `bits` - 1 is the coarsest, 0 the finest."""
     bits: Count
+    """The number of bits of the code."""
     base_bit: Index = 0
+    """The bit that is laid over the coarser ones."""
     stripe_px: Positive = 1
+    """The width of the finest stripe in projector pixels."""
     inverse: bool = False
+    """Whether black and white are exchanged."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -33,14 +33,23 @@ class KaryPattern(Strict):
     """One base-k digit as a grey level or a colour; digit digits - 1 is most significant."""
 
     code: Literal["kary"]
+    """The code."""
     axis: Axis
+    """The axis of the projector along which the code varies."""
     base: Annotated[int, Field(ge=2)]
+    """The number k of values that a digit has."""
     digit: Index
+    """The digit that the frame shows: `digits` - 1 is the coarsest, 0 the finest."""
     digits: Count
+    """The number of digits of the code."""
     stripe_px: Positive = 1
+    """The width of the finest stripe in projector pixels."""
     reflected: bool = False
+    """Whether a digit t is shown as k - 1 - t where the sum of the coarser digits is odd (k-ary Gray code)."""
     levels: Annotated[tuple[Level, ...], FirstFault] | None = None
+    """The light of each value of a digit, `base` of them; give these or `colors`. None: the digits are colours."""
     colors: Annotated[tuple[Rgb, ...], FirstFault] | None = None
+    """The colour of each value of a digit, `base` of them; give these or `levels`. None: the digits are grey levels."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

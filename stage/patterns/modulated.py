@@ -23,13 +23,21 @@ class ModulatedPattern(Strict):
     """
 
     code: Literal["modulated"]
+    """The code."""
     axis: Axis
+    """The axis of the projector along which the code varies."""
     period_px: Positive
+    """The period P along the axis in projector pixels."""
     step: Index
+    """The shift i of this frame, from 0 to `steps` - 1."""
     steps: Steps
+    """The number N of shifts."""
     carrier_period_px: Positive
+    """The period Q of the carrier, across the axis, in projector pixels."""
     carrier_step: Index
+    """The shift j of the carrier in this frame, from 0 to `carrier_steps` - 1."""
     carrier_steps: Steps
+    """The number M of shifts of the carrier."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -26,13 +26,18 @@ MICRO_TRIALS = 400
 
 
 class PhasePattern(Strict):
-    """(1 + cos(2πu/P - 2πi/N))/2."""
+    """One shift of a wave along the axis: (1 + cos(2πu/P - 2πi/N))/2."""
 
     code: Literal["phase"]
+    """The code."""
     axis: Axis
+    """The axis of the projector along which the code varies."""
     period_px: Positive
+    """The period P in projector pixels."""
     step: Index
+    """The shift i of this frame, from 0 to `steps` - 1."""
     steps: Steps
+    """The number N of shifts of a whole turn. Micro phase shifting shows only the first step of some periods."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

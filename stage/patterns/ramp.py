@@ -16,8 +16,11 @@ class RampPattern(Strict):
     """u / width, or 1 - u / width: with its opposite or white, the intensity-ratio pair."""
 
     code: Literal["ramp"]
+    """The code."""
     axis: Axis
+    """The axis of the projector along which the code varies."""
     direction: Literal["up", "down"]
+    """Whether the light rises or falls along the axis."""
 
     def level(self, u: np.ndarray, v: np.ndarray, extent: int) -> np.ndarray:
         """Return 0 to 1 at each place."""
