@@ -1,7 +1,7 @@
 """relit import LAYOUT: make a capture of files that are laid out another way, and say how they were understood."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -33,6 +33,9 @@ if TYPE_CHECKING:
     from stage.importers.view import Selection, View
 
 
+FolderArgument = Annotated[Path, typer.Argument(metavar="SRC", help="Folder of the data.", show_default=False)]
+
+
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     layouts = typer.Typer(name="import", no_args_is_help=True,
@@ -41,7 +44,21 @@ def register(app: typer.Typer) -> None:
                            ("near-lights", _near_lights), ("opencv-gray", _opencv_gray), ("gray", _gray), ("phase", _phase),
                            ("scanner", _scanner), ("tof", _tof), ("histogram", _histogram), ("kinect", _kinect)):
         local_command(layouts, name, function)
+    layouts.command("guess")(_guess)
     app.add_typer(layouts)
+
+
+def _guess(folder: FolderArgument) -> None:
+    """Look at a folder: what it seems to be, why, and the command that imports it."""
+    from stage.importers.guess import guess
+
+    found = guess(folder)
+    print(f"looks    like {found.layout}")
+    print(f"because  {found.reason}")
+    for sentence in found.assumed:
+        print(f"assumed  {sentence}")
+    print(f"run      {found.command}")
+    print(f"then     {found.then}")
 
 
 def _diligent(request: DiligentImport) -> None:

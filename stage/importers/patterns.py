@@ -158,7 +158,8 @@ def _write(source: Path, destination: Path, stack: Stack, entries: list[Entry], 
                             f"{describe(entries)}")
     resolution = image_resolution(source / frames[0])
     data: dict[str, Any] = {"schema": SCHEMA, "name": source.resolve().name, "color_space": stack.color_space, "mask": mask,
-                            "camera": {"projection": "orthographic", "resolution": list(resolution)}}
+                            "camera": {"projection": "orthographic", "resolution": list(resolution)},
+                            "projector": {"resolution": list(stack.projector)}}
     if stack.calibration is not None:
         data |= camera_and_projector(stack.calibration, resolution, stack.projector, stack.unit_m)
         if shifted:

@@ -1,0 +1,306 @@
+"""What the files of a folder seem to be, and the command that imports them; what files do not say stands in the command in capitals."""
+
+import shlex
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from stage import images
+from stage.calibration.opencv_file import read_matrices
+from stage.errors import ManifestError, StageError, storage
+from stage.importers import kinect
+from stage.importers.layout import image_names, natural_order
+from stage.importers.light_rig import CAMERA_MATRIX, read_rig
+from stage.importers.light_table import SUFFIXES as TABLES
+from stage.importers.light_table import LightTable, read_light_table
+from stage.importers.opencv_gray import gray_order
+from stage.importers.procam_file import PROJECTOR_MATRIX, projector_size
+from stage.importers.raw_arrays import ArrayFiles
+from stage.importers.view import AMBIENT_WORDS, MASK_WORDS, words_of
+from stage.manifest import FILE_NAME
+from stage.mat_file import read_mat_arrays
+from stage.tof.frames import read_array
+
+PROJECTORS = ((1280, 800), (1920, 1080), (1024, 768), (1280, 720), (854, 480), (912, 1140), (800, 600), (1920, 1200), (640, 480),
+              (3840, 2160))
+"""Sizes of projectors, the more frequent first."""
+SAMPLE = 4000
+"""Pixels of an image that are compared."""
+STEADY = 0.05
+"""How far the sums of images may differ, as a part of their median, that are taken for an image and its inverse, or for steps of a wave."""
+MOST_STEPS = 16
+
+
+class Guess(NamedTuple):
+    """What a folder seems to be."""
+
+    layout: str
+    """In words: `an object of the DiLiGenT benchmark`."""
+    reason: str
+    assumed: tuple[str, ...]
+    """What the files do not say and the command assumes."""
+    command: str
+    """The command to run; words in capitals are to be replaced."""
+    then: str
+    """The command that makes the result."""
+
+
+class Folder(NamedTuple):
+    """The names of the files in a folder."""
+
+    path: Path
+    names: tuple[str, ...]
+    pictures: tuple[str, ...]
+    """Images that are neither mask nor ambient light, in natural order."""
+
+    def with_suffix(self, *suffixes: str) -> list[Path]:
+        """Return the files with one of these suffixes, and those of the folder above after them."""
+        here = [self.path / name for name in self.names if Path(name).suffix.lower() in suffixes and name != FILE_NAME]
+        with storage("read", self.path.parent):
+            above = [path for path in sorted(self.path.absolute().parent.iterdir()) if path.suffix.lower() in suffixes and path.is_file()]
+        return [*here, *above]
+
+
+def guess(source: Path) -> Guess:
+    """Return what the files of a folder seem to be.
+
+    Raises:
+        ManifestError: nothing fits, or the folder is a capture already.
+        StorageError: the folder cannot be read.
+    """
+    with storage("read", source):
+        names = tuple(natural_order(path.name for path in source.iterdir() if path.is_file() and not path.name.startswith(".")))
+    if FILE_NAME in names:
+        raise ManifestError(f"{source}: is a capture already: relit info {shlex.quote(str(source))} looks at it")
+    pictures = tuple(name for name in image_names(source) if not words_of(name) & (MASK_WORDS | AMBIENT_WORDS))
+    folder = Folder(source, names, pictures)
+    for look in (_diligent, _relightlab, _lp, _kinect, _near_lights, _table, _scanner, _gray, _phase, _correlations, _histograms):
+        if (found := look(folder)) is not None:
+            return found
+    suffixes = Counter(Path(name).suffix.lower() for name in names)
+    held = ", ".join(f"{count} {suffix or 'without suffix'}" for suffix, count in suffixes.items())
+    raise ManifestError(f"{source}: holds {held or 'no files'}, which is no layout that relit import knows: docs/captures.md shows them")
+
+
+def _made(layout: str, reason: str, words: list[object], source: Path, *, solve: bool, assumed: tuple[str, ...] = ()) -> Guess:
+    program = "solve" if solve else "depth"
+    return Guess(layout, reason, assumed, shlex.join(["relit", "import", *map(str, words)]),
+                 shlex.join(["relit", program, str(source), "--out", f"{source.resolve().name}-{'maps' if solve else 'depth'}"]))
+
+
+def _tried(read: Callable[[], object]) -> object:
+    """Return what a reader returns, or None where it refuses the file."""
+    try:
+        return read()
+    except (StageError, ValueError):
+        return None
+
+
+def _diligent(folder: Folder) -> Guess | None:
+    wanted = {"filenames.txt", "light_directions.txt", "light_intensities.txt"}
+    if not wanted <= set(folder.names):
+        return None
+    return _made("an object of the DiLiGenT benchmark", "it has filenames.txt, light_directions.txt and light_intensities.txt",
+                 ["diligent", folder.path], folder.path, solve=True)
+
+
+def _relightlab(folder: Folder) -> Guess | None:
+    files = [name for suffix in (".relight", ".dome") for name in folder.names if name.lower().endswith(suffix)]
+    if not files:
+        return None
+    return _made("a project or a dome of RelightLab", f"it has {files[0]}", ["relightlab", folder.path / files[0], folder.path],
+                 folder.path, solve=True)
+
+
+def _lp(folder: Folder) -> Guess | None:
+    files = [name for name in folder.names if name.lower().endswith(".lp")]
+    if not files:
+        return None
+    return _made("images of RTI with a light list", f"it has {files[0]}", ["lp", folder.path / files[0], folder.path], folder.path,
+                 solve=True)
+
+
+def _kinect(folder: Folder) -> Guess | None:
+    packets = [name for name in folder.names if (folder.path / name).stat().st_size == max(kinect.PACKET_BYTES)]
+    tables = [name for name in folder.names if "p0" in name.lower() and (folder.path / name).stat().st_size >= kinect.P0_BYTES]
+    if not packets or not tables:
+        return None
+    more = ["--packet", folder.path / packets[0]] if len(packets) > 1 else []
+    return _made("depth packets of a Kinect v2",
+                 f"{packets[0]} has the size of a packet of libfreenect2, and {tables[0]} that of P0 tables",
+                 ["kinect", folder.path, *more, "--focal-px", "365.456", "--principal-px", "254.878,205.395"], folder.path, solve=False,
+                 assumed=("the intrinsics are those of a usual device: getIrCameraParams of yours says better ones",))
+
+
+def _near_lights(folder: Folder) -> Guess | None:
+    for path in folder.with_suffix(".mat", ".json"):
+        if path.suffix.lower() == ".mat" and not {"s", "phi"} <= {name.rpartition(".")[2].lower() for name in _arrays_of(path)}:
+            continue
+        if path.suffix.lower() == ".json" and path.parent.absolute() != folder.path.absolute():
+            continue
+        rig = _tried(lambda path=path: read_rig(path))  # type: ignore[misc]
+        if rig is None or (path.suffix.lower() == ".json" and getattr(rig, "anisotropy", None) is None):
+            continue
+        chosen = _group_of(folder, len(rig.positions))  # type: ignore[attr-defined]
+        if chosen is None:
+            continue
+        camera = next((other for other in folder.with_suffix(".mat", ".yml", ".yaml", ".xml") if other != path
+                       and set(CAMERA_MATRIX) & set(_arrays_of(other))), None)
+        words = ["near-lights", folder.path, "--lights", path, *(["--camera", camera] if camera else []), "--axes", "right,down,away",
+                 "--unit-m", "0.001", *chosen, "--surface-z-m", "Z"]
+        return _made("images under LEDs, as near_ps has them", f"{path} holds as many positions of lights as there are images", words,
+                     folder.path, solve=True, assumed=("axes and millimetres are those of near_ps",
+                                          "Z is the mean z of the object in metres, negative, such as -0.5"))
+    return None
+
+
+def _table(folder: Folder) -> Guess | None:
+    if not folder.pictures:
+        return None
+    for path in folder.with_suffix(*TABLES):
+        if path.parent.absolute() != folder.path.absolute() and path.suffix.lower() != ".txt":
+            continue
+        table = _tried(lambda path=path: read_light_table(path))  # type: ignore[misc]
+        if not isinstance(table, LightTable) or len(table.vectors) < 3:
+            continue
+        chosen = [] if table.names is not None else _group_of(folder, len(table.vectors))
+        if chosen is None:
+            continue
+        reason = f"{path} holds {len(table.vectors)} lights" + (" with names of images" if table.names else ", as many as there are images")
+        ahead = table.vectors[:, 2].mean() > 0
+        axes = f"right,up,{'towards' if ahead else 'away'}"
+        return _made("images under one far light each with a table of the lights", reason,
+                     ["olat", folder.path, "--lights", path, "--axes", axes, "--vectors", "to-light", *chosen],
+                     folder.path, solve=True, assumed=(
+                         "x is right and y is up as seen by the camera, and vectors point to the light: the table does not say it",
+                         f"z points {'towards the camera' if ahead else 'away from it'}, because then the lights are on its side"))
+    return None
+
+
+def _group_of(folder: Folder, count: int) -> list[str] | None:
+    """Return the option --images that selects so many images: none if it is all, those of one spelling, or None if neither is so many."""
+    if len(folder.pictures) == count:
+        return []
+    spelled = Counter(_spelling(name) for name in folder.pictures)
+    fitting = [spelling for spelling, number in spelled.items() if number == count]
+    return ["--images", fitting[0]] if len(fitting) == 1 else None
+
+
+def _spelling(name: str) -> str:
+    """Return a name with an asterisk in place of its last number: photo_*.png."""
+    stem, suffix = Path(name).stem, Path(name).suffix
+    return (stem.rstrip("0123456789") + "*" if stem[-1:].isdigit() else stem) + suffix
+
+
+def _scanner(folder: Folder) -> Guess | None:
+    count = len(folder.pictures)
+    for path in folder.with_suffix(".xml", ".yml", ".yaml"):
+        matrices = _arrays_of(path)
+        if not set(PROJECTOR_MATRIX) & set(matrices):
+            continue
+        size = projector_size(path)
+        if size is None:
+            continue
+        bits = [min(most, (side - 1).bit_length()) for most, side in zip((10, 6), size, strict=True)]
+        codecs = {2 + bits[0]: ("slstudio-gray", "column"), 2 + sum(bits): ("slstudio-gray", "both"), 6: ("slstudio-phase-2x3", "column"),
+                  12: ("slstudio-phase-2x3", "both"), 3: ("slstudio-phase-3", "column"), 4: ("slstudio-phase-4", "column")}
+        if count not in codecs:
+            continue
+        codec, axis = codecs[count]
+        return _made("a scan of SLStudio", f"{path} is its calibration, and {count} images are those of {codec}",
+                     ["scanner", folder.path, "--calibration", path, "--codec", codec, "--axis", axis, "--unit-m", "0.001"], folder.path,
+                     solve=False, assumed=("the calibration is in millimetres",))
+    return None
+
+
+def _gray(folder: Folder) -> Guess | None:
+    count = len(folder.pictures)
+    sizes = [size for size in PROJECTORS if len(gray_order(*size)) == count]
+    if not sizes or not _steady(_sums(folder, folder.pictures[:-2], 2)):
+        return None
+    names = [f"{width}x{height}" for width, height in sizes]
+    return _made("a Gray code in OpenCV's order", f"{count} images, each second of which is the inverse of the one before",
+                 ["opencv-gray", folder.path, "--projector", names[0]], folder.path, solve=False,
+                 assumed=(f"the projector has {' or '.join(names)} pixels: these have as many bits",))
+
+
+def _phase(folder: Folder) -> Guess | None:
+    count = len(folder.pictures)
+    for steps in range(3, MOST_STEPS + 1):
+        if count % steps == 0 and count > steps and _steady(_sums(folder, folder.pictures, steps)):
+            return _made("phase shifts", f"the sums of each {steps} images are alike", [
+                "phase", folder.path, "--projector", "WIDTHxHEIGHT", "--periods", ",".join(f"P{n + 1}" for n in range(count // steps)),
+                "--steps", steps], folder.path, solve=False, assumed=(
+                    "WIDTHxHEIGHT is the projector in pixels, P1 and so on are the periods in its pixels",
+                    "the columns are coded, and waves move to larger columns: else --axis and --shift"))
+    return None
+
+
+def _correlations(folder: Folder) -> Guess | None:
+    planes = [name for name in folder.names if name.lower().endswith(".npy") and _shape(folder.path / name, 2)]
+    spelled = Counter(_spelling(name) for name in planes)
+    group = next((spelling for spelling, number in spelled.items() if number >= 3 and "*" in spelling), None)
+    if group is None:
+        return None
+    chosen = natural_order(name for name in planes if _spelling(name) == group)
+    numbers = [int("".join(filter(str.isdigit, Path(name).stem.removeprefix(group.split("*")[0]))) or -1) for name in chosen]
+    told = max(numbers) >= 90 and max(numbers) < 360
+    phases = ",".join(map(str, numbers)) if told else ",".join(f"{360 * step / len(chosen):g}" for step in range(len(chosen)))
+    return _made("correlation images of a time-of-flight camera", f"{len(chosen)} arrays of one image each, {chosen[0]} to {chosen[-1]}",
+                 ["tof", folder.path, "--arrays", group, "--frequencies-hz", "HZ", "--phases-deg", phases, "--signal", "minus"],
+                 folder.path, solve=False, assumed=(
+                     "HZ is the modulation frequency", "the images are P + Q cos(φ − δ): if ranges run backwards, --signal plus",
+                     *(() if told else ("one frequency at even phases: their order is not in the names",))))
+
+
+def _histograms(folder: Folder) -> Guess | None:
+    for name in folder.names:
+        path = folder.path / name
+        if path.suffix.lower() not in (".npy", ".npz", ".mat"):
+            continue
+        arrays = _tried(lambda path=path: ArrayFiles().read(path))  # type: ignore[misc]
+        if isinstance(arrays, list) and len(arrays) == 1 and arrays[0].ndim == 3 and arrays[0].dtype.kind in "fiu" and arrays[0].min() >= 0:
+            rows, cols, bins = arrays[0].shape
+            return _made("photon histograms", f"{name} holds {rows} x {cols} x {bins} counts",
+                         ["histogram", folder.path, "--arrays", name, "--bin-s", "SECONDS"], folder.path, solve=False,
+                         assumed=("SECONDS is the width of a bin", f"the last of the three, {bins}, counts the bins: else --bins first"))
+    return None
+
+
+def _arrays_of(path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of a .mat or an OpenCV file by name; none where it cannot be read."""
+    found = _tried(lambda: read_mat_arrays(path) if path.suffix.lower() == ".mat" else read_matrices(path))
+    return found if isinstance(found, dict) else {}
+
+
+def _shape(path: Path, dimensions: int) -> bool:
+    """Return whether a .npy file holds real numbers in so many dimensions."""
+    found = _tried(lambda: read_array(path))
+    return isinstance(found, np.ndarray) and found.ndim == dimensions and found.dtype.kind in "fiu" and min(found.shape) > 1
+
+
+def _sums(folder: Folder, names: tuple[str, ...], count: int) -> Iterator[np.ndarray]:
+    """Yield the sum of each so many images, at a sample of pixels."""
+    for at in range(0, len(names) - count + 1, count):
+        total = 0.0
+        for name in names[at:at + count]:
+            grey = images.read_pixels(folder.path / name).astype(np.float32).mean(axis=-1).ravel()
+            total = total + grey[::max(1, len(grey) // SAMPLE)]
+        yield np.asarray(total)
+
+
+def _steady(sums: Iterator[np.ndarray]) -> bool:
+    """Return whether sums of images are alike, over more than one of them."""
+    first, count = None, 0
+    for total in sums:
+        if first is None:
+            first, scale = total, float(np.median(total))
+            if scale <= 0:
+                return False
+        elif total.shape != first.shape or np.median(np.abs(total - first)) > STEADY * scale:
+            return False
+        count += 1
+    return count > 1

@@ -1,0 +1,132 @@
+"""relit import guess: each layout is told by its files, and the printed command makes the capture."""
+
+import json
+import shlex
+
+import numpy as np
+import pytest
+
+from stage.capture import Capture
+from tests.scenes import near_lights
+from tests.scenes.captures import files_in, make_scene, write_image
+from tests.service.captures.test_import_patterns import BLACK, SIZES, SLSTUDIO, WHITE, U, V, gray, wave, write_calibration, write_stack
+from tests.service.captures.test_import_tof import ROWS, correlations, histograms, kinect_packet
+from tests.service.captures.test_imports import write_near_ps
+
+SCENE = make_scene(8, 4)
+
+
+def write_images(folder, names=("a1.png", "a2.png", "a10.png", "a11.png")):
+    for name, image in zip(names, SCENE.images, strict=True):
+        write_image(folder / name, np.round(image / SCENE.images.max() * 60000).astype(np.uint16))
+    return list(names)
+
+
+def text(rows):
+    return "".join(" ".join(f"{value:g}" for value in row) + "\n" for row in rows)
+
+
+def diligent(folder):
+    (folder / "filenames.txt").write_text("\n".join(write_images(folder)))
+    (folder / "light_directions.txt").write_text(text(SCENE.directions))
+    (folder / "light_intensities.txt").write_text(text(SCENE.irradiance))
+
+
+def lp(folder):
+    (folder / "dome.lp").write_text("4\n" + "".join(f"{name} {' '.join(map(str, row))}\n"
+                                                    for name, row in zip(write_images(folder), SCENE.directions, strict=True)))
+
+
+def relightlab(folder):
+    write_images(folder)
+    (folder / "d.dome").write_text(json.dumps({"directions": [dict(zip("xyz", row, strict=True)) for row in SCENE.directions.tolist()]}))
+
+
+def near_ps(folder):
+    dome = near_lights.dome(8, perspective=True)
+    write_near_ps(folder, dome, near_lights.lamps(dome, 4, 3.0, widest=50, exponent=1.4))
+
+
+def table(folder):
+    write_images(folder)
+    write_image(folder / "a_mask.png", np.full((8, 8), 255, np.uint8))
+    (folder / "lights.txt").write_text("4\n" + text(SCENE.directions))
+
+
+def slstudio(folder):
+    write_calibration(folder / "calibration.xml", SLSTUDIO, **SIZES)
+    write_stack(folder, [wave(U - 0.5, 128 / parts, -step / 3) for parts in (16, 1) for step in range(3)], "frameSeq_{}.png")
+
+
+def opencv_gray(folder):
+    write_stack(folder, [*(gray(at, bit, inverse=turned) for at, bits in ((U, 11), (V, 10)) for bit in reversed(range(bits))
+                           for turned in (False, True)), WHITE, BLACK])
+
+
+def phase(folder):
+    write_stack(folder, [wave(U, period, -step / 4) for period in (16, 18, 21) for step in range(4)])
+
+
+def tof(folder):
+    for name, image in zip((0, 90, 180, 270), correlations([60e6], [0, 90, 180, 270]), strict=True):
+        np.save(folder / f"phase{name}.npy", image)
+    np.save(folder / "dist.npy", np.ones((ROWS, 32)))
+
+
+def spad(folder):
+    np.save(folder / "h.npy", histograms((4, 5))[1])
+
+
+def kinect(folder):
+    (folder / "frame.depth").write_bytes(kinect_packet(np.zeros((9, 424, 512))))
+    (folder / "p0.bin").write_bytes(bytes(1302572))
+
+
+LAYOUTS = {
+    "diligent": (diligent, {}), "lp": (lp, {}), "relightlab": (relightlab, {}), "near-lights": (near_ps, {"Z": "-0.5"}),
+    "olat": (table, {}), "scanner": (slstudio, {}), "opencv-gray": (opencv_gray, {}),
+    "phase": (phase, {"WIDTHxHEIGHT": "128x96", "P1,P2,P3": "16,18,21"}), "tof": (tof, {"HZ": "60e6"}),
+    "histogram": (spad, {"SECONDS": "1e-9"}), "kinect": (kinect, {}),
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_the_printed_command_makes_the_capture(relit, tmp_path, layout):
+    write, capitals = LAYOUTS[layout]
+    folder = tmp_path / "My files" / "set"
+    folder.mkdir(parents=True)
+    write(folder)
+    before = files_in(tmp_path)
+    outcome = relit("import", "guess", folder)
+    assert (outcome.code, outcome.err) == (0, "")
+    assert files_in(tmp_path) == before  # it only looks
+    said = dict(line.split(maxsplit=1) for line in outcome.out.splitlines())
+    assert said["because"] and said["looks"].startswith("like ")
+    words = shlex.split(said["run"])
+    assert words[:3] == ["relit", "import", layout]
+    assert {word for word in words if word in capitals} == set(capitals)
+    assumed = [line for line in outcome.out.splitlines() if line.startswith("assumed")]
+    assert all(any(word.split(",")[0] in line for line in assumed) for word in capitals)  # each is explained
+    outcome = relit(*(capitals.get(word, word) for word in words[1:]))
+    assert (outcome.code, outcome.err) == (0, "")
+    assert Capture.open(folder).manifest.frames
+    then = shlex.split(said["then"])
+    assert then[:3] == ["relit", "solve" if layout in ("diligent", "lp", "relightlab", "near-lights", "olat") else "depth", str(folder)]
+
+
+def test_what_is_no_layout_and_what_is_a_capture(relit, tmp_path):
+    (tmp_path / "thesis.pdf").write_bytes(b"%PDF")
+    write_image(tmp_path / "photo.jpg", np.zeros((4, 4, 3), np.uint8))
+    outcome = relit("import", "guess", tmp_path)
+    assert outcome.code == 2 and "holds 1 .jpg, 1 .pdf, which is no layout that relit import knows" in outcome.err
+    (tmp_path / "capture.json").write_text("{}")
+    outcome = relit("import", "guess", tmp_path)
+    assert outcome.code == 2 and "is a capture already: relit info" in outcome.err
+
+
+@pytest.mark.parametrize("name", ["light.mat", "calibration.xml", "lights.csv", "a.npy", "b.dome", "c.npz", "d.json"])
+def test_damaged_files_are_passed_over(relit, tmp_path, name):
+    (tmp_path / name).write_bytes(b"\x93NUMPY damaged")
+    write_images(tmp_path)
+    outcome = relit("import", "guess", tmp_path)
+    assert outcome.code == (0 if name == "b.dome" else 2) and outcome.err.count("\n") == (0 if name == "b.dome" else 1)
