@@ -134,6 +134,8 @@ def kinds(folder: Path) -> list[Kind]:
         Kind("TIFF, float", write_image(folder / "b.tif", noise.astype(np.float32)), read_image),
         Kind("HDR", write_image(folder / "a.hdr", rng.random((SIDE, SIDE, 3)).astype(np.float32)), read_image),
         Kind("DPX", write_image(folder / "a.dpx", noise), read_image),
+        Kind("TGA", write_image(folder / "a.tga", noise), read_image),
+        Kind("BMP", write_image(folder / "a.bmp", noise), read_image),
         Kind("JPEG XL", write_image(folder / "a.jxl", noise), read_image),
     ]
     parts = [exr.Part(name, {f"{prefix}{channel}": rng.random((SIDE, SIDE)).astype(np.float16) for channel in "RGB"}, "lin_rec709_scene")

@@ -14,6 +14,7 @@ from stage.camera import Camera
 from stage.errors import MOST_FAULTS, ImageError, ManifestError, ResultError, StageError, listed, storage
 from stage.light import DistantLight, EnvironmentLight, ExtendedLight, FullLight, GradientLight, OffLight, PointLight
 from stage.manifest import FILE_NAME, Frame, Manifest, read_manifest
+from stage.orientation import check_agreement
 from stage.pixels import AS_RECORDED, Crop, PixelChoices
 
 SOURCES = (DistantLight, PointLight, ExtendedLight, GradientLight)
@@ -192,6 +193,8 @@ class Capture:
                        whole=replace(self, pixels=self.pixels._replace(crop=None)))
 
     def _check_files(self) -> None:
+        frames = {f"frames[{index}].image" for index in range(len(self.manifest.frames))}
+        orientations: dict[str, int] = {}
         arrays = {f"frames[{index}].image" for index, frame in enumerate(self.manifest.frames) if frame.tof is not None}
 
         def fault(item: tuple[str, str]) -> StageError | None:
@@ -206,7 +209,9 @@ class Capture:
                 if field.endswith(".light.image"):
                     images.read_header(path)  # an environment has a size of its own
                 else:
-                    images.check_resolution(path, self.camera.resolution)
+                    header = images.check_resolution(path, self.camera.resolution)
+                    if field in frames:
+                        orientations[name] = header.orientation
             except StageError as error:
                 return error
             return None
@@ -218,3 +223,5 @@ class Capture:
         if errors:
             kind = ImageError if all(isinstance(error, ImageError) for error in errors) else ManifestError
             raise kind(*listed(map(str, errors), f"{self.folder}: has {len(errors) - MOST_FAULTS} faults more"))
+        check_agreement(str(self.folder / FILE_NAME), {frame.image: orientations[frame.image] for frame in self.manifest.frames
+                                                       if frame.image in orientations})

@@ -1,4 +1,4 @@
-"""Reading of images (EXR, PNG, TIFF, HDR, JPEG, JPEG XL, DPX), the header first and then the recorded pixels; and writing of PNG."""
+"""Reading of images (EXR, PNG, TIFF, HDR, JPEG, JPEG XL, DPX, TGA, BMP), the header first and then the recorded pixels; writing of PNG."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,9 +11,12 @@ import OpenImageIO as oiio
 
 from stage import exr, inputs, integrity, jxl
 from stage.errors import ImageError
+from stage.orientation import TURNS, UPRIGHT, upright, upright_size
 from stage.pixels import Crop
 
-OIIO_SUFFIXES = {".png", ".tif", ".tiff", ".hdr", ".jpg", ".jpeg", ".jxl", ".dpx"}
+OIIO_SUFFIXES = {".png", ".tif", ".tiff", ".hdr", ".jpg", ".jpeg", ".jxl", ".dpx", ".tga", ".bmp"}
+ORIENTED_SUFFIXES = {".png", ".tif", ".tiff", ".hdr", ".jpg", ".jpeg"}
+"""Suffixes of files with an orientation that their decoder leaves to the reader; that of JPEG XL turns the pixels by itself."""
 SUFFIXES = {".exr", *OIIO_SUFFIXES}
 FLOATING = {oiio.HALF, oiio.FLOAT, oiio.DOUBLE}
 CODES = {oiio.UINT8, oiio.UINT16}
@@ -23,11 +26,12 @@ CODES = {oiio.UINT8, oiio.UINT16}
 class ImageHeader(NamedTuple):
     """The size and the channels of an image, which are known before any pixel is decoded."""
 
-    width: int
+    width: int  # of the upright image
     height: int
     channels: int  # 1 for grey, 3 for RGB; alpha is not counted
     stored: int  # the count of all channels in the file, which are decoded together
     integer: bool  # integers, whose largest value a camera writes for everything brighter too
+    orientation: int = UPRIGHT  # in which the pixels are recorded, a key of `stage.orientation.TURNS`; they are read upright
 
 
 class Decoder(Protocol):
@@ -80,11 +84,13 @@ def header_of(source: inputs.Source) -> ImageHeader:
         source.check_pixels(*jxl.resolution_of(path, source.file))
     with _decoder(source) as decoder:
         spec = decoder.spec()
-        return ImageHeader(spec.width, spec.height, 1 if spec.nchannels < 3 else 3, spec.nchannels, spec.format.basetype not in FLOATING)
+        orientation = _orientation(path, spec)
+        return ImageHeader(*upright_size(spec.width, spec.height, orientation), 1 if spec.nchannels < 3 else 3, spec.nchannels,
+                           spec.format.basetype not in FLOATING, orientation)
 
 
 def read_pixels(path: str | Path) -> np.ndarray:
-    """Read the recorded values of an image: integers as fractions of full scale, floating-point values unchanged.
+    """Read the recorded values of an image, upright: integers as fractions of full scale, floating-point values unchanged.
 
     Returns:
         [rows, cols, 3] float32, or float16 when the file holds half values; grey images repeat their one channel.
@@ -109,7 +115,7 @@ def fractions(kind: np.dtype) -> np.ndarray:
 
 
 def read_recorded(path: str | Path) -> np.ndarray:
-    """Read the recorded values of an image as the file has them, which `fractions` converts to those of `read_pixels`.
+    """Read the recorded values of an image, upright, as the file has them; `fractions` converts them to those of `read_pixels`.
 
     Returns:
         [rows, cols, 3] uint8 or uint16 when the file holds integers of up to so many bits, else float32 or float16 as `read_pixels`
@@ -154,7 +160,7 @@ def _decoded(source: inputs.Source, suffix: str) -> np.ndarray:
         decoded = decoder.read_image(0, 0, 0, channels, spec.format if spec.format.basetype in CODES else oiio.FLOAT)
         if decoded is None:
             raise ImageError(f"{source.path}: cannot be decoded: {_reason(decoder.geterror())}")
-        return np.asarray(decoded)
+        return upright(np.asarray(decoded), _orientation(source.path, spec))
 
 
 def read_mask(path: str | Path, resolution: tuple[int, int], crop: Crop | None = None) -> np.ndarray:
@@ -223,15 +229,17 @@ def write_png(path: Path, codes: np.ndarray, *, srgb: bool) -> None:
         raise OSError(f"{path.name}: the disk took only part of it") from error
 
 
-def check_resolution(path: str | Path, resolution: tuple[int, int]) -> None:
-    """Check that an image has the width and height that the camera declares.
+def check_resolution(path: str | Path, resolution: tuple[int, int]) -> ImageHeader:
+    """Check that an image has the width and height that the camera declares, and return its header.
 
     Raises:
         ImageError: the size differs.
     """
     header = read_header(path)
     if (header.width, header.height) != resolution:
-        raise ImageError(f"{path}: is {header.width}x{header.height}, camera.resolution says {resolution[0]}x{resolution[1]}")
+        turned = "" if header.orientation == UPRIGHT else f" once it is {TURNS[header.orientation].words} (EXIF orientation)"
+        raise ImageError(f"{path}: is {header.width}x{header.height}{turned}, camera.resolution says {resolution[0]}x{resolution[1]}")
+    return header
 
 
 @contextmanager
@@ -247,6 +255,12 @@ def _decoder(source: inputs.Source) -> Iterator[oiio.ImageInput]:
             yield decoder
         finally:
             decoder.close()
+
+
+def _orientation(path: Path, spec: oiio.ImageSpec) -> int:
+    """Return the orientation in which the pixels of a file are recorded."""
+    found = int(spec.get_int_attribute("Orientation", UPRIGHT)) if path.suffix.lower() in ORIENTED_SUFFIXES else UPRIGHT
+    return found if found in TURNS else UPRIGHT
 
 
 def _check_suffix(path: str | Path) -> None:

@@ -26,7 +26,7 @@ from stage.motion.align import VERSION, Alignment, Warp
 from stage.motion.tracking import Tracking
 from stage.stack import CHANNELS, LIGHT_PAD, PIXEL_PAD, Stack
 
-LAYOUT = 2
+LAYOUT = 3
 """The version of the cache; a change of the layout or the arithmetic raises it, so that older caches are rebuilt."""
 CACHE_FOLDER = ".relit"
 """The folder of the cache inside the folder of a capture."""

@@ -20,6 +20,7 @@ from stage.gradients import gradient_frames, has_gradients
 from stage.light import DistantLight, PointLight
 from stage.lighting import MEASURED_BY, check_solvable, has_placeholders, lights_from_centre
 from stage.manifest import Frame
+from stage.orientation import TURNS, UPRIGHT
 from stage.point_lights import PlacedLights, place_lights
 from stage.projector import Projector
 from stage.radiance import clipping_sentences
@@ -126,6 +127,10 @@ def _facts(capture: Capture) -> Iterator[tuple[str, str]]:
     scale = f"{camera.pixel_size_m:g} m a pixel" if camera.pixel_size_m else "metric" if camera.metric else "no scale"
     yield "camera", f"{camera.projection}, {camera.width}x{camera.height}, {scale}"
     yield "colour", manifest.color_space
+    with suppress(StageError):
+        orientation = images.read_header(capture.file(manifest.frames[0].image)).orientation
+        if orientation != UPRIGHT:
+            yield "orientation", f"{TURNS[orientation].words}, as EXIF orientation {orientation} of every frame says"
     kinds = Counter(_kind(frame) for frame in manifest.frames)
     yield "frames", ", ".join(f"{count} {kind}" for kind, count in kinds.items())
     given = [name for name in ("dark", "flat", "mask", "saturation", "projector") if getattr(manifest, name) is not None]

@@ -60,8 +60,8 @@ def write_exr(path: Path, pixels: np.ndarray, dtype: type[np.floating] = np.floa
     return path
 
 
-def write_image(path: Path, pixels: np.ndarray) -> Path:
-    """Write [rows, cols] or [rows, cols, channels] with OpenImageIO; the array's type is the file's."""
+def write_image(path: Path, pixels: np.ndarray, **attributes: Any) -> Path:
+    """Write [rows, cols] or [rows, cols, channels] with OpenImageIO and its attributes; the array's type is the file's."""
     path.parent.mkdir(parents=True, exist_ok=True)
     values = np.ascontiguousarray(pixels if pixels.ndim == 3 else pixels[..., None])
     rows, cols, channels = values.shape
@@ -69,6 +69,8 @@ def write_image(path: Path, pixels: np.ndarray) -> Path:
     if channels in (2, 4):
         spec.alpha_channel = channels - 1
         spec.attribute("oiio:UnassociatedAlpha", 1)  # the values are what they are, not multiplied by alpha
+    for name, value in attributes.items():
+        spec.attribute(name, value)
     output = oiio.ImageOutput.create(str(path))
     assert output.open(str(path), spec), output.geterror()
     assert output.write_image(values), output.geterror()

@@ -20,7 +20,8 @@ NOISE = np.random.default_rng(0).integers(0, 40, (SIDE, SIDE, 3), dtype=np.uint8
 WRITERS = {
     "a.exr": lambda path, value: exr.write(path, dict.fromkeys("RGB", np.full((SIDE, SIDE), value / 255, np.float16)),
                                            color_space="lin_rec709_scene", metadata={}),
-    **{f"a.{suffix}": lambda path, value: write_image(path, NOISE + np.uint8(value)) for suffix in ("png", "tif", "jpg", "dpx", "jxl")},
+    **{f"a.{suffix}": lambda path, value: write_image(path, NOISE + np.uint8(value)) 
+       for suffix in ("png", "tif", "jpg", "dpx", "jxl", "tga", "bmp")},
     "a.hdr": lambda path, value: write_image(path, np.full((SIDE, SIDE, 3), value / 255, np.float32)),
 }
 

@@ -33,8 +33,9 @@ def made():
 @pytest.fixture
 def folder(tmp_path):
     codes = NOISE.integers(0, 256, (20, 30, 3), dtype=np.uint8)
-    for suffix in ("png", "tif", "jpg", "dpx", "jxl"):
+    for suffix in ("png", "tif", "jpg", "dpx", "jxl", "tga", "bmp"):
         write_image(tmp_path / f"a.{suffix}", codes)
+    write_image(tmp_path / "turned.png", codes, Orientation=6)
     write_image(tmp_path / "grey.png", codes[..., 0])
     write_image(tmp_path / "deep.png", NOISE.integers(0, 65536, (20, 30, 4), dtype=np.uint16))
     write_image(tmp_path / "a.hdr", NOISE.random((20, 30, 3)).astype(np.float32))

@@ -75,6 +75,16 @@ def lying_jxl(width: int, height: int) -> bytes:
     return b"\xff\x0a" + bits.to_bytes(-(-at // 8), "little") + bytes(64)
 
 
+def lying_tga(width: int, height: int) -> bytes:
+    """The header of a run-length encoded true-colour image with the origin at the top (Truevision TGA 2.0), and one run."""
+    return struct.pack("<BBBHHBHHHHBB", 0, 0, 10, 0, 0, 0, 0, 0, width, height, 24, 0x20) + b"\xff\0\0\0"
+
+
+def lying_bmp(width: int, height: int) -> bytes:
+    """The headers of a 24-bit Windows bitmap, and a few pixels."""
+    return b"BM" + struct.pack("<IHHIIiiHHIIiiII", 154, 0, 0, 54, 40, width, height, 1, 24, 0, 0, 0, 0, 0, 0) + bytes(100)
+
+
 def lying_npy(shape: str, kind: str = "<f4", content: bytes = b"") -> bytes:
     """A header of NumPy's format 1.0 with any text for the shape."""
     header = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}".encode().ljust(117) + b"\n"

@@ -15,10 +15,12 @@ import pytest
 
 from service.captures.admit import MAX_MANIFEST_BYTES
 from tests.service.server.api.captures import (
+    lying_bmp,
     lying_exr,
     lying_jxl,
     lying_npy,
     lying_png,
+    lying_tga,
     lying_tiff,
     manifest,
     write_capture,
@@ -230,6 +232,8 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
     "billion png": (replaced("big.png", lying_png(HUGE, HUGE)), "big.png: "),
     "billion tiff": (replaced("big.tif", lying_tiff(HUGE, HUGE)), "big.tif: "),
     "channels": (replaced("big.tif", lying_tiff(8, 8, 65_535)), "big.tif: "),
+    "billion tga": (replaced("big.tga", lying_tga(65_535, 65_535)), "big.tga: "),
+    "billion bmp": (replaced("big.bmp", lying_bmp(HUGE, HUGE)), "big.bmp: "),
     "billion jxl": (replaced("big.jxl", lying_jxl(HUGE, HUGE)), f"big.jxl: has {HUGE}x{HUGE} pixels"),
     "camera": (edited(camera=manifest([], side=HUGE)["camera"]), f"camera.resolution: {HUGE}x{HUGE}"),
     "text": (replaced("a.exr", b"no image"), "a.exr: is not an OpenEXR file"),
