@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from service import __version__
-from service.calibrate.results import digits, write_results
+from service.calibrate.results import digits, manifest_to_write, write_results
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import DarkRequest, FlatFieldRequest, SaturationRequest
@@ -17,7 +17,6 @@ from stage.calibration.flat_field import make_flat, mean_image, recorded_values
 from stage.calibration.saturation import TopHistogram, capture_saturation
 from stage.capture import Capture
 from stage.errors import CalibrationError
-from stage.manifest import FILE_NAME
 from stage.radiance import check_radiance
 
 DARK_FILE, FLAT_FILE = "dark.exr", "flat.exr"
@@ -52,11 +51,12 @@ def dark(request: DarkRequest, progress: Progress | None = None) -> ImageCalibra
     timings = Timings(progress)
     timings.stage("open", 1)
     capture = Capture.open(request.capture)
-    _refuse_overwrite(request.images, capture.folder / DARK_FILE)
+    manifest_path = manifest_to_write(capture, request.out)
+    _refuse_overwrite(request.images, manifest_path.parent / DARK_FILE)
     timings.stage("images", len(request.images))
     mean = mean_image(request.images, capture, progress=timings.advance)
     timings.close()
-    return _write(DARK_FILE, "dark", request, capture, mean.pixels.astype(np.float32), {
+    return _write(DARK_FILE, "dark", request, capture, manifest_path, mean.pixels.astype(np.float32), {
         "images": mean.images, "noise": float(f"{mean.noise:.4g}"), "mean": digits(mean.pixels.mean(axis=(0, 1)))})
 
 
@@ -69,7 +69,8 @@ def flat_field(request: FlatFieldRequest, progress: Progress | None = None) -> I
     timings = Timings(progress)
     timings.stage("open", 1)
     capture = Capture.open(request.capture)
-    _refuse_overwrite([*request.images, *request.dark_images], capture.folder / FLAT_FILE)
+    manifest_path = manifest_to_write(capture, request.out)
+    _refuse_overwrite([*request.images, *request.dark_images], manifest_path.parent / FLAT_FILE)
     timings.stage("images", len(request.images) + len(request.dark_images))
     white = mean_image(request.images, capture, refuse_saturated=True, progress=timings.advance)
     white_dark = None
@@ -78,7 +79,7 @@ def flat_field(request: FlatFieldRequest, progress: Progress | None = None) -> I
     flat = make_flat(white, white_dark, capture)
     timings.close()
     seen = flat[capture.mask()]
-    return _write(FLAT_FILE, "flat", request, capture, flat, {
+    return _write(FLAT_FILE, "flat", request, capture, manifest_path, flat, {
         "images": white.images, "noise": float(f"{white.noise:.4g}"),
         "least": digits(seen.min(axis=0)), "most": digits(seen.max(axis=0))})
 
@@ -92,6 +93,7 @@ def saturation(request: SaturationRequest, progress: Progress | None = None) -> 
     timings = Timings(progress)
     timings.stage("open", 1)
     capture = Capture.open(request.capture)
+    manifest_path = manifest_to_write(capture, request.out)
     paths = [capture.file(frame.image) for frame in capture.manifest.frames if Path(frame.image).suffix.lower() != ".npy"]
     timings.stage("peaks", len(paths))
     peaks = np.zeros(3)
@@ -112,9 +114,8 @@ def saturation(request: SaturationRequest, progress: Progress | None = None) -> 
     except CalibrationError as error:
         raise CalibrationError(f"{capture.folder}: {error}") from error
     counts = channels[0].readings, channels[1].readings, channels[2].readings
-    if not request.write:
+    if not request.write and request.out is None:
         return Saturation(level, counts, None, None)
-    manifest_path = capture.folder / FILE_NAME
     report = write_results("saturation", request, capture.manifest.model_copy(update={"saturation": level}), manifest_path,
                            {"level": level, "counts": counts})
     return Saturation(level, counts, manifest_path, report)
@@ -132,15 +133,15 @@ def _refuse_overwrite(inputs: Sequence[Path], target: Path) -> None:
             raise RequestError(f"{path}: is the file that is written: give it another name")
 
 
-def _write(name: str, field: str, request: DarkRequest | FlatFieldRequest, capture: Capture, linear: np.ndarray,
+def _write(name: str, field: str, request: DarkRequest | FlatFieldRequest, capture: Capture, manifest_path: Path, linear: np.ndarray,
            section: dict[str, Any]) -> ImageCalibration:
     """Write the image, then the report, and last the manifest that names the image."""
+    image_path = manifest_path.parent / name
     recorded = recorded_values(linear, capture)
     channels = {channel: recorded[..., index] for index, channel in enumerate("RGB")}
     kind = "flat-field" if field == "flat" else field
-    exr.write(capture.folder / name, channels, color_space=capture.manifest.color_space, metadata={
+    exr.write(image_path, channels, color_space=capture.manifest.color_space, metadata={
         "relit:version": __version__, "relit:capture": capture.name, "relit:calibration": kind,
         "relit:inputs": " ".join(path.name for path in request.images)})
-    manifest_path = capture.folder / FILE_NAME
     report = write_results(kind, request, capture.manifest.model_copy(update={field: name}), manifest_path, section)
-    return ImageCalibration(manifest_path, report, capture.folder / name, section["noise"])
+    return ImageCalibration(manifest_path, report, image_path, section["noise"])

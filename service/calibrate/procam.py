@@ -1,5 +1,6 @@
 """Calibration of a projector-camera pair from poses of a chessboard under projected patterns, with the error of each view."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -40,8 +41,13 @@ class ProcamResult(NamedTuple):
     baseline_m: float
 
 
-def procam(request: ProcamRequest, progress: Progress | None = None) -> ProcamResult:
+def procam(request: ProcamRequest, progress: Progress | None = None, *, manifest_paths: Sequence[Path] | None = None) -> ProcamResult:
     """Calibrate a projector-camera pair, and write camera, projector and their pose to the manifests.
+
+    Args:
+        request: the captures of the board, and those that are written too.
+        progress: told how far the work is.
+        manifest_paths: the manifest to write for each of `captures`, then for each of `apply_to`; None: their own.
 
     Raises:
         StageError, KernelError: the input is wrong, or too few views show the board; nothing is written.
@@ -82,7 +88,9 @@ def procam(request: ProcamRequest, progress: Progress | None = None) -> ProcamRe
     for view in (view for view, bad in zip(views, out, strict=True) if bad):
         remarks[view.name] = "its error stands out: see --drop-outliers"
     timings.close()
-    return _write(request, [*captures, *others], found, views, remarks, size)
+    targets = [*captures, *others]
+    paths = tuple(capture.folder / FILE_NAME for capture in targets) if manifest_paths is None else tuple(manifest_paths)
+    return _write(request, targets, paths, found, views, remarks, size)
 
 
 def view_of(capture: Capture, size: Resolution, request: ProcamRequest, device: str) -> BoardView | str:
@@ -130,8 +138,8 @@ def _projector_size(captures: list[Capture], request: ProcamRequest) -> Resoluti
     return sizes.pop()
 
 
-def _write(request: ProcamRequest, targets: list[Capture], found: ProCam, views: list[BoardView], remarks: dict[str, str],
-           size: Resolution) -> ProcamResult:
+def _write(request: ProcamRequest, targets: list[Capture], paths: tuple[Path, ...], found: ProCam, views: list[BoardView],
+           remarks: dict[str, str], size: Resolution) -> ProcamResult:
     entries = [{"view": view.name, "corners": len(view.kept), "camera_px": float(f"{camera:.4g}"), "projector_px": float(f"{lit:.4g}"),
                 "remark": remarks.get(view.name, "")}
                for view, camera, lit in zip(views, found.camera_error_px, found.projector_error_px, strict=True)]
@@ -141,16 +149,13 @@ def _write(request: ProcamRequest, targets: list[Capture], found: ProCam, views:
     section = {"captures": [str(path) for path in request.captures], "rms_px": float(f"{found.rms_px:.4g}"),
                "baseline_m": float(f"{baseline:.6g}"), "camera": _entry(found.camera), "projector": _entry(found.projector),
                "views": entries, "left_out": left}
-    paths, reports = [], []
-    for capture in targets:
-        path = capture.folder / FILE_NAME
-        reports.append(write_results("procam", request, _updated(capture.manifest, found, size), path, section))
-        paths.append(path)
+    reports = [write_results("procam", request, _updated(capture.manifest, found, size), path, section)
+               for capture, path in zip(targets, paths, strict=True)]
     rows: list[tuple[str, ...]] = [
         (view.name, f"{camera:.3f}", f"{lit:.3f}", remarks.get(view.name, ""))
         for view, camera, lit in zip(views, found.camera_error_px, found.projector_error_px, strict=True)]
     rows += [(name, "", "", remark) for name, remark in remarks.items() if name not in used]
-    return ProcamResult(tuple(paths), reports[0], rows, found.rms_px, baseline)
+    return ProcamResult(paths, reports[0], rows, found.rms_px, baseline)
 
 
 def _updated(manifest: Manifest, found: ProCam, size: Resolution) -> Manifest:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.calibrate.results import digits, write_results
+from service.calibrate.results import digits, manifest_to_write, write_results
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import ResponseRequest
@@ -41,6 +41,7 @@ def response(request: ResponseRequest, progress: Progress | None = None) -> Resp
     manifest = capture.manifest
     if manifest.projector is None:
         raise ManifestError(f"{capture.folder / FILE_NAME}: projector: is missing: the response is written into it")
+    manifest_path = manifest_to_write(capture, request.out)
     levels = request.levels or tuple(np.linspace(0, 1, len(request.images)).tolist())
     if len(levels) != len(request.images):
         raise RequestError(f"--levels: has {len(levels)} values, there are {len(request.images)} images: give one for each")
@@ -64,9 +65,8 @@ def response(request: ResponseRequest, progress: Progress | None = None) -> Resp
         raise CalibrationError(f"{capture.folder}: {error}") from error
     timings.close()
     values = tuple(float(f"{value:.7g}") for value in found.values)
-    path = capture.folder / FILE_NAME
     updated = manifest.model_copy(update={"projector": manifest.projector.model_copy(update={"response": values})})
-    report = write_results("response", request, updated, path, {
+    report = write_results("response", request, updated, manifest_path, {
         "images": len(request.images), "levels": digits(levels), "gamma": float(f"{found.gamma:.4g}"),
         "spread": float(f"{found.spread:.3g}")})
-    return ResponseResult(path, report, found.gamma, found.spread)
+    return ResponseResult(manifest_path, report, found.gamma, found.spread)

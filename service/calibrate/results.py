@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from service.errors import RequestError
-from service.reporting.provenance import requested, versions
+from service.reporting.provenance import requested, versions, with_names
 from service.requests.base import Options
 from service.requests.calibrate import LightsRequest
 from stage.calibration.apply import LitFrame, SingleLight, check_same_setup, lit_frames, with_lights
@@ -66,10 +66,19 @@ def open_captures(request: LightsRequest) -> LightCaptures:
     if request.apply_to is not None:
         target = Capture.open(request.apply_to)
         check_same_setup(source, target)
-    path = target.folder / FILE_NAME if request.out is None else request.out
+    return LightCaptures(source, target, manifest_to_write(target, request.out), lit)
+
+
+def manifest_to_write(capture: Capture, out: Path | None) -> Path:
+    """Return the path of the manifest that a calibration writes: `out`, or that of the capture.
+
+    Raises:
+        RequestError: `out` is not a .json file of its own.
+    """
+    path = capture.folder / FILE_NAME if out is None else out
     if path.suffix.lower() != ".json" or path.name == CALIBRATION_FILE or path.is_dir():
         raise RequestError(f"--out {path}: must be a .json file of its own: it takes the place of {FILE_NAME}")
-    return LightCaptures(source, target, path, lit)
+    return path
 
 
 def leave_out_failures(captures: LightCaptures, results: Sequence[MeasuredLight | CalibrationError], *,
@@ -129,7 +138,7 @@ def write_results(kind: str, request: Options, manifest: Manifest, manifest_path
     """
     path = manifest_path.parent / CALIBRATION_FILE
     data = {"schema": SCHEMA, **_earlier(path), kind: {"options": requested(request), **section, "versions": versions()}}
-    write_text(path, json.dumps(data, indent=2) + "\n")
+    write_text(path, with_names(json.dumps(data, indent=2) + "\n"))
     write_manifest(manifest, manifest_path)
     return path
 

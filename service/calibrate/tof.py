@@ -1,5 +1,6 @@
 """Calibration of a time-of-flight camera from a sweep over known distances: wiggling, scale, offset and drift."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,6 +15,7 @@ from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import TofCalibrationRequest
 from service.requests.depth import TofOptions
 from stage.capture import Capture
+from stage.files import resolved
 from stage.tof.calibration import Harmonics, TofCalibration, fit_harmonics, fit_line, fit_temperature, write_calibration
 from stage.tof.frames import is_pulsed, read_correlations, read_source
 from stage.tof.source import SourcePath
@@ -37,21 +39,23 @@ class TofCalibrationResult(NamedTuple):
     steps: int
 
 
-def calibrate_tof(request: TofCalibrationRequest, progress: Progress | None = None) -> TofCalibrationResult:
+def calibrate_tof(request: TofCalibrationRequest, progress: Progress | None = None, *,
+                  allowed: Sequence[Path] | None = None) -> TofCalibrationResult:
     """Calibrate a time-of-flight camera, and write the calibration.
 
     Args:
         request: the sweep, and the file to write.
         progress: told how far the work is.
+        allowed: folders of the captures that the sweep may name; None: any.
 
     Raises:
         StageError, KernelError: a capture or the sweep cannot be used, or does not determine the calibration; nothing is written.
-        RequestError: steps of both kinds, or a step without a solved pixel.
+        RequestError: steps of both kinds, a step without a solved pixel, or a capture that is not allowed.
     """
     timings = Timings(progress)
     device, sweep = devices.resolve(request.device), request.sweep
     plan = read_sweep(sweep)
-    captures = [Capture.open(sweep.parent / step.capture) for step in plan.steps]
+    captures = [Capture.open(_folder(sweep, step, allowed)) for step in plan.steps]
     kinds = {is_pulsed(capture) for capture in captures}
     if len(kinds) > 1:
         raise RequestError(f"{sweep}: steps: some are cw and some pulsed: give a sweep for each")
@@ -71,6 +75,17 @@ def calibrate_tof(request: TofCalibrationRequest, progress: Progress | None = No
     timings.close()
     before_m, after_m = (float(np.sqrt(np.mean(errors**2))) for errors in (plain, after))
     return TofCalibrationResult(calibration, request.out, before_m, after_m, len(plan.steps))
+
+
+def _folder(sweep: Path, step: SweepDistance, allowed: Sequence[Path] | None) -> Path:
+    folder = sweep.parent / step.capture
+    if allowed is None:
+        return folder
+    place = resolved(folder)
+    found = next((each for each in allowed if each.resolve() == place), None)
+    if found is None:
+        raise RequestError(f"{sweep}: steps: {step.capture!r} is none of the captures that lie beside one another in its folder")
+    return found
 
 
 def _range_errors(plan: Sweep, captures: list[Capture], calibration: TofCalibration | None, device: str, timings: Timings) -> np.ndarray:

@@ -1,7 +1,8 @@
-"""relit submit: the work of solve, depth, relight, shade, export and view, done by a service; and most of it in one job, pipeline."""
+"""relit submit: the work of most commands, done by a service; and solve, export and relight in one job, pipeline."""
 
 import re
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,8 +17,10 @@ from service.requests.identifiers import ALPHABET, CAPTURE, ENVIRONMENT, LENGTH,
 from service.requests.jobs import (
     DEFAULT_SERVER,
     BasisJob,
+    DarkJob,
     DepthJob,
     ExportJob,
+    FlatFieldJob,
     GreyBallJob,
     IntensityJob,
     JobRequest,
@@ -25,10 +28,14 @@ from service.requests.jobs import (
     MirrorBallJob,
     PatternsJob,
     PipelineJob,
+    ProcamJob,
     RelightJob,
+    ResponseJob,
+    SaturationJob,
     ScanJob,
     ShadeJob,
     SolveJob,
+    TofCalibrationJob,
     ViewJob,
 )
 from service.requests.light_keys import LightKeys
@@ -40,7 +47,9 @@ if TYPE_CHECKING:
 JOBS: dict[str, type[JobRequest]] = {"solve": SolveJob, "depth": DepthJob, "relight": RelightJob, "shade": ShadeJob, "export": ExportJob,
                                      "view": ViewJob, "pipeline": PipelineJob, "basis": BasisJob, "scan": ScanJob, "patterns": PatternsJob,
                                      "calibrate-mirror-ball": MirrorBallJob, "calibrate-light-positions": LightPositionsJob,
-                                     "calibrate-grey-ball": GreyBallJob, "calibrate-intensity": IntensityJob}
+                                     "calibrate-grey-ball": GreyBallJob, "calibrate-intensity": IntensityJob, "calibrate-dark": DarkJob,
+                                     "calibrate-flat-field": FlatFieldJob, "calibrate-saturation": SaturationJob,
+                                     "calibrate-procam": ProcamJob, "calibrate-response": ResponseJob, "calibrate-tof": TofCalibrationJob}
 REGISTERED = "server:"
 SOURCES = "Give a path of this machine, which is uploaded; an identifier, {prefix}_…; or server:/path, which is registered."
 
@@ -69,15 +78,25 @@ def _submit(given: Given[JobRequest], server: str, key: str | None, wait: bool, 
         frame_numbers(given.values["frames"], 1)
     if "keys" in given.values:
         given.values["keys"] = LightKeys.read(given.values["keys"])
-    request = given.build(**{name: f"{prefix}_{ALPHABET[0] * LENGTH}" for name, prefix in inputs.items()})  # refused before files are sent
+    request = given.build(**{name: _each(given.values[name], partial(_placeholder, prefix)) for name, prefix in inputs.items()})
     with connected(server, key) as client:
         if out is not None:
             make_folder(out)  # before hours of waiting
-        sent = {name: _send(client, prefix, given.values[name]) for name, prefix in inputs.items()}
+        sent = {name: _each(given.values[name], partial(_send, client, prefix)) for name, prefix in inputs.items()}
         job = client.jobs.submit(request.model_copy(update=sent))
         print(f"job         {job.id}", flush=True)
         if wait or out is not None:
             wait_for(client, job.id, out=out, cancel_on_interrupt=cancel_on_interrupt)
+
+
+def _each(given: str | list[str], identify: Callable[[str], str]) -> str | tuple[str, ...]:
+    """Return the identifier of what was given, or of each of several."""
+    return identify(given) if isinstance(given, str) else tuple(map(identify, given))
+
+
+def _placeholder(prefix: str, given: str) -> str:
+    """Return an identifier in place of what was given, with which a request is refused before files are sent."""
+    return f"{prefix}_{ALPHABET[0] * LENGTH}"
 
 
 def _send(client: "Client", prefix: str, given: str) -> str:
@@ -97,8 +116,7 @@ def _send(client: "Client", prefix: str, given: str) -> str:
 
 def _prefix(option: Option) -> str | None:
     """Return the prefix of the identifiers that an option takes, where it is a capture or an environment."""
-    patterns = {getattr(constraint, "pattern", None) for constraint in option.constraints}
-    return next((prefix for prefix in (CAPTURE, ENVIRONMENT) if pattern(prefix) in patterns), None)
+    return next((prefix for prefix in (CAPTURE, ENVIRONMENT) if pattern(prefix) == option.pattern), None)
 
 
 def _words(option: Option, model: type[JobRequest]) -> str:

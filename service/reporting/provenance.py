@@ -90,6 +90,11 @@ def report(request: Options, *, inputs: Mapping[str, Any], **sections: Any) -> s
     """Return the text of a report.json: inputs, options, the other sections in the order given, and software versions."""
     text = json.dumps({"schema": "relit.report/1", "inputs": inputs, "options": requested(request), **sections,
                        "versions": versions()}, indent=2) + "\n"
+    return with_names(text)
+
+
+def with_names(text: str) -> str:
+    """Return the text of a JSON file with the names that `name_place` gave in place of paths."""
     for path, name in sorted((_names.get() or {}).items(), key=lambda item: -len(item[0])):  # a folder after what lies in it
         text = text.replace(json.dumps(path)[1:-1], name)
     return text

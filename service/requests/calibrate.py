@@ -19,6 +19,9 @@ Corners = Annotated[int, Field(ge=3)]
 LARGEST_SQUARE_M = 1.0
 """The largest side of a square of a chessboard, metres: larger numbers are millimetres."""
 IMAGES = Spelling(argument=True, metavar="IMAGE...")
+POSES = Spelling(argument=True, metavar="CAPTURE...")
+LEAST_GREYS = 3
+"""The fewest images of evenly grey projections that a response is fitted to."""
 
 
 class Circle(Options):
@@ -58,7 +61,7 @@ def _albedo(given: Any) -> Any:
 
 def _board(given: Any) -> Any:
     if not isinstance(given, str):
-        return given
+        return tuple(given) if isinstance(given, list) else given
     parts = given.lower().split("x")
     if len(parts) != 2 or not all(part.isdecimal() for part in parts):
         _refuse(f"--board {given}: give two whole numbers with an x between, as 9x6")
@@ -163,7 +166,14 @@ class IntensityRequest(IntensityOptions, LightsRequest):
     """Brightness of lights of known direction from images of the object itself."""
 
 
-class FramesRequest(Options):
+class ManifestRequest(Options):
+    """Base of the kinds that change one value of a capture's manifest."""
+
+    out: Annotated[Path | None, Role.OUTPUT] = None
+    """Manifest to write, with the files that the calibration makes beside it; None: the capture's own capture.json."""
+
+
+class FramesRequest(ManifestRequest):
     """Base of the kinds that average images."""
 
     capture: Annotated[Path, Role.INPUT, CAPTURE]
@@ -183,41 +193,51 @@ class FlatFieldRequest(FramesRequest):
     """A dark image at the exposure of the white card; may be repeated. Without it the dark frame of the capture is used."""
 
 
-class SaturationRequest(Options):
+class SaturationRequest(ManifestRequest):
     """The level at which the readings of the frames saturate, from the top of their histogram."""
 
     capture: Annotated[Path, Role.INPUT, CAPTURE]
     """Folder with a capture.json."""
     write: bool = False
-    """Set `saturation` in the manifest, in place of only printing it."""
+    """Set `saturation` in the manifest, in place of only printing it; `out` sets it too."""
 
 
-class ProcamRequest(Request):
-    """Camera, projector and their pose from a chessboard under projected columns and rows."""
+class ProcamOptions(Options):
+    """What is known of the chessboard and the projector."""
 
-    captures: Annotated[tuple[Path, ...], Field(min_length=1), Role.INPUT, Spelling(argument=True, metavar="CAPTURE...")]
-    """Folders with a capture.json, one for each pose of the board."""
     board: Annotated[tuple[Corners, Corners], BeforeValidator(_board), Spelling(metavar="9x6")]
     """Inner corners of the chessboard, across and down."""
     square_m: Annotated[Positive, AfterValidator(_square)]
     """Side of a square in metres."""
     projector: Annotated[tuple[Count, Count] | None, WidthHeight, Spelling(metavar="1280x800")] = None
     """Width and height of the projector in pixels; None: as in the manifests."""
-    apply_to: Annotated[tuple[Path, ...], Role.INPUT, Spelling(metavar="CAPTURE")] = ()
-    """Another capture of the same rig, whose manifest is written too; may be repeated."""
     drop_outliers: bool = False
     """Leave out poses whose error is much larger than that of the others, and fit again."""
 
 
-class ResponseRequest(Options):
+class ProcamRequest(ProcamOptions, Request):
+    """Camera, projector and their pose from a chessboard under projected columns and rows."""
+
+    captures: Annotated[tuple[Path, ...], Field(min_length=1), Role.INPUT, POSES]
+    """Folders with a capture.json, one for each pose of the board."""
+    apply_to: Annotated[tuple[Path, ...], Role.INPUT, Spelling(metavar="CAPTURE")] = ()
+    """Another capture of the same rig, whose manifest is written too; may be repeated."""
+
+
+class ResponseOptions(Options):
+    """What the images of evenly grey projections show."""
+
+    levels: Annotated[tuple[Annotated[float, Field(ge=0, le=1)], ...], BeforeValidator(_levels), Commas, Spelling(metavar="0,0.25,…")] = ()
+    """Level of each image, 0 to 1; without it even steps from 0 to 1 in the order of the images."""
+
+
+class ResponseRequest(ResponseOptions, ManifestRequest):
     """The projector's light at each level (its gamma), for ramps, from images of evenly grey projections."""
 
     capture: Annotated[Path, Role.INPUT, CAPTURE]
     """Folder with a capture.json: its camera took the images, its projector gets the response."""
-    images: Annotated[tuple[Path, ...], Field(min_length=3), Role.INPUT, IMAGES]
+    images: Annotated[tuple[Path, ...], Field(min_length=LEAST_GREYS), Role.INPUT, IMAGES]
     """Images of evenly grey projections."""
-    levels: Annotated[tuple[Annotated[float, Field(ge=0, le=1)], ...], BeforeValidator(_levels), Commas, Spelling(metavar="0,0.25,…")] = ()
-    """Level of each image, 0 to 1; without it even steps from 0 to 1 in the order of the images."""
 
 
 class TofCalibrationRequest(DeviceRequest):

@@ -6,7 +6,17 @@ from pydantic import Field, TypeAdapter
 
 from service.requests.base import CAPTURE, Options, Role, Spelling
 from service.requests.basis import BasisOptions
-from service.requests.calibrate import GreyBallOptions, IntensityOptions, LightPositionsOptions, MirrorBallOptions
+from service.requests.calibrate import (
+    IMAGES,
+    LEAST_GREYS,
+    POSES,
+    GreyBallOptions,
+    IntensityOptions,
+    LightPositionsOptions,
+    MirrorBallOptions,
+    ProcamOptions,
+    ResponseOptions,
+)
 from service.requests.depth import DepthOptions
 from service.requests.export import AssetFormat, ExportOptions
 from service.requests.identifiers import CaptureId, EnvironmentId, JobId
@@ -25,6 +35,8 @@ DEFAULT_SERVER = f"http://127.0.0.1:{DEFAULT_PORT}"
 
 MAPS = Spelling(argument=True, metavar="JOB")
 KEYS = Spelling(metavar="FILE")
+MOST_CAPTURES = 100
+"""The most captures that one field of a job names."""
 
 
 class JobRequest(Options):
@@ -208,8 +220,72 @@ class IntensityJob(CalibrationJob):
     options: IntensityOptions = IntensityOptions()
 
 
+class DarkJob(JobRequest):
+    """Mean of images with the lens covered: dark.exr, capture.json that names it, calibration.json."""
+
+    kind: Literal["calibrate-dark"]
+    capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
+    """The capture that the images lie in and belong to."""
+    images: Annotated[tuple[Line, ...], Field(min_length=1), Role.INPUT, IMAGES]
+    """Names of the images in the capture's folder, of its resolution and encoding, at the exposure of its frames."""
+
+
+class FlatFieldJob(JobRequest):
+    """Mean of images of an evenly lit white card: flat.exr, capture.json that names it, calibration.json."""
+
+    kind: Literal["calibrate-flat-field"]
+    capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
+    """The capture that the images lie in and belong to."""
+    images: Annotated[tuple[Line, ...], Field(min_length=1), Role.INPUT, IMAGES]
+    """Names of the images in the capture's folder, of its resolution and encoding."""
+    dark_images: Annotated[tuple[Line, ...], Role.INPUT, Spelling(flag="--dark", metavar="NAME")] = ()
+    """Name of a dark image at the exposure of the white card; may be repeated. Without it the dark frame of the capture is used."""
+
+
+class SaturationJob(JobRequest):
+    """The level at which the readings of the frames saturate: capture.json with it, calibration.json."""
+
+    kind: Literal["calibrate-saturation"]
+    capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
+    """The capture."""
+
+
+class ProcamJob(JobRequest):
+    """Camera, projector and their pose from a chessboard under projected columns and rows: ID.capture.json for each capture,
+    calibration.json."""
+
+    kind: Literal["calibrate-procam"]
+    captures: Annotated[tuple[CaptureId, ...], Field(min_length=1, max_length=MOST_CAPTURES), Role.INPUT, POSES]
+    """The captures, one for each pose of the board."""
+    apply_to: Annotated[tuple[CaptureId, ...], Field(max_length=MOST_CAPTURES), Role.INPUT, Spelling(metavar="CAPTURE")] = ()
+    """Another capture of the same rig, whose manifest is written too; may be repeated."""
+    options: ProcamOptions
+
+
+class ResponseJob(JobRequest):
+    """The projector's light at each level (its gamma), from images of evenly grey projections: capture.json, calibration.json."""
+
+    kind: Literal["calibrate-response"]
+    capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
+    """The capture: the images lie in its folder, its camera took them, its projector gets the response."""
+    images: Annotated[tuple[Line, ...], Field(min_length=LEAST_GREYS), Role.INPUT, IMAGES]
+    """Names of the images of evenly grey projections in the capture's folder."""
+    options: ResponseOptions = ResponseOptions()
+
+
+class TofCalibrationJob(JobRequest):
+    """Wiggling, scale, offset and drift of a time-of-flight camera from captures of a flat target at known distances: tof.json."""
+
+    kind: Literal["calibrate-tof"]
+    capture: Annotated[CaptureId, Role.INPUT, Spelling(argument=True, metavar="SWEEP")]
+    """A folder with the captures of the sweep, each in a folder of its own, and the relit.tof-sweep/1 file."""
+    sweep: Annotated[Line, Role.INPUT, Spelling(metavar="NAME")] = "sweep.json"
+    """Name of the relit.tof-sweep/1 file in the folder."""
+
+
 OneJob = (SolveJob | DepthJob | RelightJob | ShadeJob | ExportJob | ViewJob | PipelineJob | BasisJob | ScanJob | PatternsJob | MirrorBallJob
-          | LightPositionsJob | GreyBallJob | IntensityJob)
+          | LightPositionsJob | GreyBallJob | IntensityJob | DarkJob | FlatFieldJob | SaturationJob | ProcamJob | ResponseJob
+          | TofCalibrationJob)
 UserJob = Annotated[OneJob, Field(discriminator="kind")]
 """Every kind of job that the API accepts."""
 AnyJob = Annotated[CheckJob | OneJob, Field(discriminator="kind")]

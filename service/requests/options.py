@@ -48,6 +48,12 @@ class Option(NamedTuple):
         return self.spelling.off or f"--no-{self.flag.removeprefix('--')}"
 
     @property
+    def pattern(self) -> str | None:
+        """The regular expression of the text, or of each of several texts; None where there is none."""
+        inner = FieldInfo.from_annotation(get_args(self.kind)[0]).metadata if self.is_repeated else ()
+        return next((found for limit in (*self.constraints, *inner) if (found := getattr(limit, "pattern", None)) is not None), None)
+
+    @property
     def is_repeated(self) -> bool:
         """Whether several values are typed by giving the option several times."""
         return get_origin(self.kind) is tuple and get_args(self.kind)[-1] is Ellipsis and Commas not in self.constraints

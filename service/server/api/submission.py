@@ -45,9 +45,9 @@ def inputs_of(service: Service, project: str, request: JobRequest) -> list[str]:
         ApiError: one of them does not exist or is not ready.
     """
     read = []
-    for field in ("capture", "environment", "reference_ball", "rig", "apply_to"):
-        identifier = getattr(request, field, None)
-        if identifier is not None:
+    for field in ("capture", "captures", "environment", "reference_ball", "rig", "apply_to"):
+        value = getattr(request, field, None)
+        for identifier in value if isinstance(value, tuple) else () if value is None else (value,):
             _require_ready(service, project, field, identifier)
             read.append(identifier)
     if isinstance(request, RelightJob | ShadeJob | ExportJob | ViewJob) and request.maps is not None:

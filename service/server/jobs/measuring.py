@@ -1,26 +1,11 @@
-"""Steps of the jobs that make no maps: bases, scans, patterns to project, and calibrations of lights."""
+"""Steps of the jobs that make no maps: bases, scans and patterns to project."""
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-from service.errors import RequestError
 from service.reporting.progress import Progress
 from service.requests.basis import BasisKind
-from service.requests.jobs import (
-    BallJob,
-    BasisJob,
-    CalibrationJob,
-    GreyBallJob,
-    IntensityJob,
-    JobRequest,
-    LightPositionsJob,
-    MirrorBallJob,
-    PatternsJob,
-    ScanJob,
-)
-from stage.files import resolved
-from stage.manifest import FILE_NAME
+from service.requests.jobs import BasisJob, JobRequest, PatternsJob, ScanJob
 
 BASIS = "basis"
 """Name of the file of a basis, without its suffix."""
@@ -30,7 +15,7 @@ Intake = Callable[[str], Path]
 
 def can_run(request: JobRequest) -> bool:
     """Return whether a job is one of these kinds."""
-    return isinstance(request, BasisJob | ScanJob | PatternsJob | CalibrationJob)
+    return isinstance(request, BasisJob | ScanJob | PatternsJob)
 
 
 def run(request: JobRequest, out: Path, intake: Intake, *, device: str, cache: Path, progress: Progress) -> None:
@@ -48,11 +33,9 @@ def run(request: JobRequest, out: Path, intake: Intake, *, device: str, cache: P
         _basis(request, out, intake, device, cache, progress)
     elif isinstance(request, ScanJob):
         _scan(request, out, intake, device, progress)
-    elif isinstance(request, PatternsJob):
-        _patterns(request, out, progress)
     else:
-        assert isinstance(request, CalibrationJob), request
-        _calibrate(request, out, intake, progress)
+        assert isinstance(request, PatternsJob), request
+        _patterns(request, out, progress)
 
 
 def _basis(request: BasisJob, out: Path, intake: Intake, device: str, cache: Path, progress: Progress) -> None:
@@ -78,31 +61,3 @@ def _patterns(request: PatternsJob, out: Path, progress: Progress) -> None:
 
     given = request.options.model_dump(exclude_defaults=True)  # options of other codes are refused if they are given
     make_patterns(PatternsRequest(out=out, **given), progress)
-
-
-def _calibrate(request: CalibrationJob, out: Path, intake: Intake, progress: Progress) -> None:
-    from service.calibrate.intensity import intensity
-    from service.calibrate.lights import grey_ball, light_positions, mirror_ball
-    from service.requests.calibrate import GreyBallRequest, IntensityRequest, LightPositionsRequest, MirrorBallRequest
-
-    capture = intake(request.capture)
-    values: dict[str, Any] = {"capture": capture, "apply_to": None if request.apply_to is None else intake(request.apply_to),
-                              "out": out / FILE_NAME}
-    if isinstance(request, BallJob):
-        values["masks"] = tuple(_within(capture, name) for name in request.masks)
-    if isinstance(request, MirrorBallJob):
-        mirror_ball(MirrorBallRequest(**values, **dict(request.options)), progress)
-    elif isinstance(request, LightPositionsJob):
-        light_positions(LightPositionsRequest(**values, **dict(request.options)), progress)
-    elif isinstance(request, GreyBallJob):
-        grey_ball(GreyBallRequest(**values, **dict(request.options)), progress)
-    else:
-        assert isinstance(request, IntensityJob), request
-        intensity(IntensityRequest(**values, **dict(request.options)), progress)
-
-
-def _within(capture: Path, name: str) -> Path:
-    place = None if "\0" in name else resolved(capture / name)
-    if place is None or not place.is_relative_to(capture.resolve()) or not place.is_file():
-        raise RequestError(f"masks: {name!r} is no file of the capture")
-    return capture / name

@@ -12,8 +12,9 @@ from service.requests.frame_range import frame_numbers
 from service.requests.identifiers import CAPTURE
 from service.requests.jobs import CheckJob, DepthJob, ExportJob, PipelineJob, RelightJob, ShadeJob, SolveJob, ViewJob
 from service.server.database import intakes, quotas
-from service.server.jobs import measuring
+from service.server.jobs import calibrating, measuring
 from service.server.jobs.context import Job, WorkerContext
+from service.server.jobs.named_files import file_within
 from service.server.jobs.pieces import JobPieces
 from service.server.storage import layout
 from stage import inputs
@@ -73,8 +74,9 @@ def _steps_of(job: Job, context: WorkerContext) -> list[JobStep]:
         return [JobStep("export", lambda progress: _export(job, request, context, progress))]
     if isinstance(request, ViewJob):
         return [JobStep("view", lambda progress: _view(job, request, context, progress))]
-    if measuring.can_run(request):
-        return [JobStep("measure", lambda progress: measuring.run(
+    run = measuring.run if measuring.can_run(request) else calibrating.run if calibrating.can_run(request) else None
+    if run is not None:
+        return [JobStep("measure", lambda progress: run(
             request, _out(job, context), lambda capture: _intake(job, capture, context, progress), device=context.device,
             cache=context.cache, progress=progress))]
     if isinstance(request, RelightJob):
@@ -152,7 +154,7 @@ def _depth(job: Job, request: DepthJob, context: WorkerContext, progress: Progre
     from service.requests.depth import DepthRequest, TofOptions
 
     capture = _intake(job, request.capture, context, progress)
-    calibration = None if request.tof_calibration is None else _within(capture, request.tof_calibration)
+    calibration = None if request.tof_calibration is None else file_within(capture, request.tof_calibration, "tof_calibration")
     options = dict(request.options) | {"tof": TofOptions(calibration=calibration, **dict(request.options.tof))}
     depth(DepthRequest(capture=capture, out=_out(job, context), device=context.device, cache=context.cache / request.capture, **options),
           progress)
@@ -248,12 +250,3 @@ def _environment(job: Job, identifier: str | None, context: WorkerContext, progr
 
     return None if identifier is None else environment_file(_intake(job, identifier, context, progress))
 
-
-def _within(capture: Path, name: str) -> Path:
-    path = capture / name
-    place = None if "\0" in name else resolved(path)
-    if place is None or not place.is_relative_to(capture.resolve()):
-        raise RequestError(f"tof_calibration: {name!r} leads out of the capture's folder")
-    if not place.is_file():
-        raise RequestError(f"tof_calibration: {name!r} is no file of the capture")
-    return path

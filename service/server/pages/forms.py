@@ -13,16 +13,46 @@ from pydantic import BaseModel
 
 from service.requests.base import Choice, Role
 from service.requests.identifiers import CAPTURE, ENVIRONMENT, JOB, pattern
-from service.requests.jobs import DepthJob, ExportJob, JobRequest, PipelineJob, RelightJob, ShadeJob, SolveJob
+from service.requests.jobs import (
+    DarkJob,
+    DepthJob,
+    ExportJob,
+    FlatFieldJob,
+    GreyBallJob,
+    IntensityJob,
+    JobRequest,
+    LightPositionsJob,
+    MirrorBallJob,
+    PipelineJob,
+    ProcamJob,
+    RelightJob,
+    ResponseJob,
+    SaturationJob,
+    ShadeJob,
+    SolveJob,
+    TofCalibrationJob,
+)
 from service.requests.light_keys import LightKeys
 from service.requests.options import Option, help_text, places_of, typed
 
-CAPTURE_JOBS: dict[str, type[JobRequest]] = {"solve": SolveJob, "pipeline": PipelineJob, "depth": DepthJob, "relight": RelightJob}
+CAPTURE_JOBS: dict[str, type[JobRequest]] = {
+    "solve": SolveJob, "pipeline": PipelineJob, "depth": DepthJob, "relight": RelightJob, "calibrate-mirror-ball": MirrorBallJob,
+    "calibrate-light-positions": LightPositionsJob, "calibrate-grey-ball": GreyBallJob, "calibrate-intensity": IntensityJob,
+    "calibrate-dark": DarkJob, "calibrate-flat-field": FlatFieldJob, "calibrate-saturation": SaturationJob, "calibrate-procam": ProcamJob,
+    "calibrate-response": ResponseJob, "calibrate-tof": TofCalibrationJob,
+}
 """Jobs that begin with a capture, by kind."""
 MAPS_JOBS: dict[str, type[JobRequest]] = {"export": ExportJob, "shade": ShadeJob}
 """Jobs that begin with the maps of another job, by kind."""
 TITLES = {"solve": "Solve normals and materials", "pipeline": "Solve, export and relight", "depth": "Decode depth",
-          "relight": "Relight frames", "export": "Export an asset", "shade": "Shade one picture"}
+          "relight": "Relight frames", "export": "Export an asset", "shade": "Shade one picture",
+          "calibrate-mirror-ball": "Calibrate light directions: one mirror ball",
+          "calibrate-light-positions": "Calibrate light positions: two or more mirror balls",
+          "calibrate-grey-ball": "Calibrate the brightness of lights: a grey ball",
+          "calibrate-intensity": "Calibrate the brightness of lights: the object itself", "calibrate-dark": "Calibrate the dark frame",
+          "calibrate-flat-field": "Calibrate the flat field", "calibrate-saturation": "Calibrate the saturation",
+          "calibrate-procam": "Calibrate camera and projector", "calibrate-response": "Calibrate the response of the projector",
+          "calibrate-tof": "Calibrate a time-of-flight camera"}
 IDENTIFIERS = {pattern(CAPTURE): "capture", pattern(ENVIRONMENT): "environment", pattern(JOB): "job"}
 """What the identifiers of a pattern name."""
 
@@ -37,8 +67,8 @@ class Field(NamedTuple):
     label: str
     help: str
     control: str
-    """checkbox, select, number, text, lines (several values, one a line), json, or the kind of thing that an identifier names: capture,
-    environment, job."""
+    """checkbox, select, number, text, lines (several values, one a line), captures (several identifiers, one a line), json, or the kind of
+    thing that an identifier names: capture, environment, job."""
     value_type: str
     """Type in JSON: boolean, integer, number, string, strings or json."""
     flag: str
@@ -59,9 +89,9 @@ class Form(NamedTuple):
     title: str
     about: str
     main: tuple[Field, ...]
-    """What the job reads."""
+    """What the job reads, and options without a default."""
     more: tuple[Field, ...]
-    """Options, which all have defaults."""
+    """Options with a default."""
 
 
 def form_of(kind: str, model: type[JobRequest]) -> Form:
@@ -71,9 +101,10 @@ def form_of(kind: str, model: type[JobRequest]) -> Form:
     for path, option in places_of(model):
         places.setdefault(option.name, []).append(".".join(path))
         options.setdefault(option.name, option)
-    fields = [(option.role, _field(model, tuple(places[name]), option)) for name, option in options.items()]
-    return Form(kind, TITLES[kind], " ".join((model.__doc__ or "").split()), tuple(field for role, field in fields if role is Role.INPUT),
-                tuple(field for role, field in fields if role is not Role.INPUT))
+    fields = [(option.role is Role.INPUT, _field(model, tuple(places[name]), option)) for name, option in options.items()]
+    main = [field for is_input, field in fields if is_input] + [field for is_input, field in fields if field.required and not is_input]
+    return Form(kind, TITLES[kind], " ".join((model.__doc__ or "").split()), tuple(main),
+                tuple(field for _, field in fields if field not in main))
 
 
 def _field(model: type[BaseModel], paths: tuple[str, ...], option: Option) -> Field:
@@ -90,9 +121,8 @@ def _field(model: type[BaseModel], paths: tuple[str, ...], option: Option) -> Fi
 def _control(option: Option) -> tuple[str, str, tuple[tuple[str, str], ...]]:
     """Return control, JSON type and choices of an option."""
     kind = option.kind
-    for limit in option.constraints:
-        if (named := IDENTIFIERS.get(getattr(limit, "pattern", None) or "")) is not None:
-            return named, "string", ()
+    if (named := IDENTIFIERS.get(option.pattern or "")) is not None:
+        return (f"{named}s", "strings", ()) if option.is_repeated else (named, "string", ())
     if kind is LightKeys:
         return "json", "json", ()
     if option.is_repeated:

@@ -56,6 +56,9 @@ COMMANDS: dict[str, list[type[Options]]] = {
     "submit basis": [jobs.BasisJob], "submit scan": [jobs.ScanJob], "submit patterns": [jobs.PatternsJob],
     "submit calibrate-mirror-ball": [jobs.MirrorBallJob], "submit calibrate-light-positions": [jobs.LightPositionsJob],
     "submit calibrate-grey-ball": [jobs.GreyBallJob], "submit calibrate-intensity": [jobs.IntensityJob],
+    "submit calibrate-dark": [jobs.DarkJob], "submit calibrate-flat-field": [jobs.FlatFieldJob],
+    "submit calibrate-saturation": [jobs.SaturationJob], "submit calibrate-procam": [jobs.ProcamJob],
+    "submit calibrate-response": [jobs.ResponseJob], "submit calibrate-tof": [jobs.TofCalibrationJob],
     "farm template relight": [relight.RelightRequest], "farm template shade": [shade.ShadeRequest],
 }
 OWN = {

@@ -1,5 +1,6 @@
 """relit submit and relit jobs, against a real service."""
 
+import json
 import os
 import signal
 import subprocess
@@ -7,11 +8,12 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from service.client import Client
 from service.requests.relight import RelightOptions
-from tests.scenes.captures import write_capture
+from tests.scenes.captures import make_scene, write_capture, write_exr
 from tests.service.client.conftest import OWL, SKY
 
 
@@ -62,6 +64,22 @@ def test_sources_of_all_three_kinds(relit, owl: str, sky: str, tmp_path: Path):
     one, other = [said(relit("submit", "solve", write_capture(tmp_path / place / "ball"), "--method", "lambert").out)["capture"]
                   for place in ("here", "there")]
     assert one == other
+
+
+def test_images_and_captures_that_are_several(relit, tmp_path: Path):
+    capture = write_capture(tmp_path / "ball")
+    for name in ("d0.exr", "d1.exr"):
+        write_exr(capture / name, np.full((16, 16, 3), 0.01))
+    done = relit("submit", "calibrate-dark", capture, "d0.exr", "d1.exr", "--out", tmp_path / "out")
+    assert (done.code, done.err) == (0, "")
+    assert (tmp_path / "out" / "dark.exr").is_file()
+    assert json.loads((tmp_path / "out" / "capture.json").read_text())["dark"] == "dark.exr"
+    other = write_capture(tmp_path / "other", make_scene(16, 5))
+    done = relit("submit", "calibrate-procam", capture, other, said(done.out)["capture"], "--apply-to", other, "--board", "9x6",
+                 "--square-m", "0.03", "--projector", "64x48", "--wait")
+    assert done.code == 1 and "no column code" in done.err  # the captures are of lights: all were sent and read
+    assert [line.split()[0] for line in done.out.splitlines()].count("capture") == 3
+    assert relit("submit", "calibrate-procam", tmp_path / "none", "--board", "9", "--square-m", "0.03").code == 2
 
 
 def test_light_keys_go_with_the_job(relit, owl: str, tmp_path: Path):

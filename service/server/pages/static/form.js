@@ -27,9 +27,10 @@ export function enableForms(root, subject) {
 export function commandOf(kind, options) {
   const parts = ["relit", "submit", kind];
   if (location.port !== "8470" || !["localhost", "127.0.0.1"].includes(location.hostname)) parts.push("--server", location.origin);
+  parts.splice(3, 0, ...options.filter(({ isArgument }) => isArgument).map(({ value }) => quoted(value)));
   for (const { flag, value, isArgument } of options) {
-    if (isArgument) parts.splice(3, 0, quoted(value));
-    else if (value === true) parts.push(flag);
+    if (isArgument) continue;
+    if (value === true) parts.push(flag);
     else parts.push(flag, quoted(value));
   }
   return parts.join(" ");
@@ -49,6 +50,7 @@ async function open(form, subject) {
       select.value = subject;
     }
   }
+  for (const area of form.querySelectorAll(".field[data-argument] textarea[data-lists]")) area.value ||= subject;
   present(form);
 }
 

@@ -1,4 +1,4 @@
-"""Jobs that make no maps: bases, scans, patterns to project, and calibrations of lights."""
+"""Jobs that make no maps: bases, scans and patterns to project."""
 
 import base64
 import io
@@ -81,22 +81,6 @@ def test_patterns_are_those_of_the_command(server, client, tmp_path):
 def test_an_option_of_another_code_is_refused(server, client):
     job = submit(client, kind="patterns", options={"code": "gray", "projector": [64, 40], "micro_periods": 4})
     assert "micro_periods" in finish(server, client, job, "failed")["error"].replace(" ", "_")
-
-
-def test_the_brightness_of_lights(server, client, dome):
-    job = submit(client, kind="calibrate-intensity", capture=dome, options={"pixels": 100})
-    finish(server, client, job)
-    assert made_by(client, job) == {"capture.json", "calibration.json"}
-    measured = client.get(f"/v1/jobs/{job['id']}/results/calibration.json").json()["intensity"]
-    assert len(measured["lights"]) == len(client.get(f"/v1/jobs/{job['id']}/results/capture.json").json()["frames"])
-    assert str(server.data) not in json.dumps(measured)
-
-
-def test_a_ball_that_is_not_given(server, client, dome):
-    job = submit(client, kind="calibrate-mirror-ball", capture=dome)
-    assert "ball" in finish(server, client, job, "failed")["error"]
-    job = submit(client, kind="calibrate-grey-ball", capture=dome, masks=["../../x.png"])
-    assert "is no file of the capture" in finish(server, client, job, "failed")["error"]
 
 
 @pytest.mark.parametrize("request_", [{"kind": "patterns"}, {"kind": "patterns", "options": {"code": "gray", "projector": [0, 4]}},

@@ -1,18 +1,35 @@
 """Forms have every option of the request models, with names, defaults and limits of the models."""
 
+import copy
+
 import pytest
 
 from service.requests.base import Role
-from service.requests.jobs import ANY_JOB, RelightJob, SolveJob
+from service.requests.jobs import ANY_JOB, ProcamJob, RelightJob, SolveJob
 from service.requests.options import build, options_of
 from service.server.pages.forms import CAPTURE_JOBS, MAPS_JOBS, Form, form_of
 
 KINDS = CAPTURE_JOBS | MAPS_JOBS
 CAPTURE, JOB = "cap_0123456789abcdefghjk", "job_0123456789abcdefghjk"
 
+REQUIRED = {
+    "calibrate-dark": {"capture": CAPTURE, "images": ["0.exr"]}, "calibrate-flat-field": {"capture": CAPTURE, "images": ["0.exr"]},
+    "calibrate-response": {"capture": CAPTURE, "images": ["0.exr", "1.exr", "2.exr"]},
+    "calibrate-procam": {"captures": [CAPTURE], "options": {"board": "9x6", "square_m": 0.025}},
+}
+"""What a job must have beside a capture, where it must."""
+TYPED = {"calibrate-procam": {"captures": [CAPTURE], "board": "9x6", "square_m": 0.025}}
+
 
 def fields(form: Form):
     return {field.name: field for field in (*form.main, *form.more)}
+
+
+def allowed(field) -> float:
+    """A number within the limits of a field."""
+    if field.low and field.high:
+        return (float(field.low) + float(field.high)) / 2
+    return float(field.low or 0) + 1
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -21,30 +38,35 @@ def test_every_option_has_a_control(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_is_read_stands_first(kind):
+def test_what_is_read_or_has_no_default_stands_first(kind):
     form = form_of(kind, KINDS[kind])
-    assert {field.name for field in form.main} == {option.name for option in options_of(KINDS[kind]) if option.role is Role.INPUT}
+    options = options_of(KINDS[kind])
+    first = [option.name for option in options if option.role is Role.INPUT]
+    assert [field.name for field in form.main] == first + [
+        option.name for option in options if option.role is not Role.INPUT and option.field.is_required()]
+    assert not any(field.required for field in form.more)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_places_lead_to_the_values_of_the_command_line(kind):
     """A value put at its places is read as the same request that `relit submit` builds from the flag."""
     model = KINDS[kind]
-    inputs = {"capture": CAPTURE} if kind in CAPTURE_JOBS else {"maps": JOB}
+    inputs = REQUIRED.get(kind, {"capture": CAPTURE} if kind in CAPTURE_JOBS else {"maps": JOB})
+    typed = TYPED.get(kind, inputs)
     for field in fields(form_of(kind, model)).values():
-        value = {"boolean": field.default != "true", "integer": 1, "number": 1.0}.get(field.value_type)
+        value = {"boolean": field.default != "true", "integer": int(allowed(field)), "number": allowed(field)}.get(field.value_type)
         if value is None and field.choices:
             value = next(each for each, _ in field.choices if each != field.default)
         if value is None:
             continue
-        request = {"kind": kind, **inputs}
+        request = copy.deepcopy({"kind": kind, **inputs})
         for path in field.paths:
             target = request
             *parents, last = path.split(".")
             for name in parents:
                 target = target.setdefault(name, {})
             target[last] = value
-        assert ANY_JOB.validate_python(request) == build(model, inputs | {field.name: value}), field.name
+        assert ANY_JOB.validate_python(request) == build(model, typed | {field.name: value}), field.name
 
 
 def test_limits_and_defaults_are_those_of_the_model():
@@ -55,3 +77,6 @@ def test_limits_and_defaults_are_those_of_the_model():
     solve = fields(form_of("solve", SolveJob))
     assert [value for value, _ in solve["method"].choices] == ["lambert", "robust", "gradient", "reference", "svbrdf"]
     assert solve["capture"].required and solve["capture"].control == "capture"
+    procam = fields(form_of("calibrate-procam", ProcamJob))
+    assert [(procam[name].control, procam[name].value_type, procam[name].required) for name in ("captures", "apply_to", "board")] == [
+        ("captures", "strings", True), ("captures", "strings", False), ("text", "string", True)]

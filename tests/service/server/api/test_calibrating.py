@@ -1,0 +1,208 @@
+"""Jobs that calibrate: their results are those of the commands, byte by byte, and captures stay as they are."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service.calibrate.images import dark, flat_field, saturation
+from service.calibrate.procam import procam
+from service.calibrate.response import response
+from service.calibrate.tof import calibrate_tof
+from service.requests.calibrate import (
+    DarkRequest,
+    FlatFieldRequest,
+    ProcamRequest,
+    ResponseRequest,
+    SaturationRequest,
+    TofCalibrationRequest,
+)
+from tests.reference import tof
+from tests.scenes.captures import make_scene, write_capture, write_exr, write_manifest
+from tests.service.calibrate.test_calibrate_tof import cw, sweep
+from tests.service.calibrate.test_procam import write_view
+from tests.service.depth.test_tof import pulsed_frames
+from tests.service.server.api.conftest import SAMPLES
+from tests.service.server.api.test_jobs import finish, made_by, refused, submit
+from tests.service.server.api.test_measuring import upload
+from tests.stage.calibration import test_procam as boards
+
+LEVELS = np.linspace(0, 1, 5)
+BOARD = {"board": "9x6", "square_m": 0.03, "projector": "256x192"}
+
+
+def sent(server, client, folder: Path) -> str:
+    """The identifier of a folder, uploaded with all its files."""
+    files = {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+    return upload(server, client, files)["id"]
+
+
+def compare(client, job: dict, made: Path, names: dict[str, str], places: dict[Path, str]) -> None:
+    """Compare results with the files that a command made: `names` gives the file of the command for each result."""
+    assert made_by(client, job) == set(names)
+    for name, there in names.items():
+        found = client.get(f"/v1/jobs/{job['id']}/results/{name}").raise_for_status().content
+        wanted = (made / there).read_bytes()
+        for folder, identifier in places.items():  # a service does not say where its folders lie
+            wanted = wanted.replace(str(folder).encode(), identifier.encode())
+        assert found == wanted, name
+
+
+def same(found, wanted) -> None:
+    """Compare what two fits wrote: LAPACK adds in an order that depends on where arrays lie in memory, by 1e-12 in a focal length."""
+    if isinstance(wanted, dict | list):
+        assert type(found) is type(wanted) and len(found) == len(wanted)
+        for key in wanted if isinstance(wanted, dict) else range(len(wanted)):
+            same(found[key], wanted[key])
+    else:
+        assert found == (pytest.approx(wanted, rel=1e-6, abs=1e-9) if isinstance(wanted, float) else wanted)
+
+
+@pytest.fixture(scope="module")
+def sensor(tmp_path_factory):
+    """A capture with saturated readings, dark images, white cards and a projector's greys in its folder."""
+    scene = make_scene(32, 4)
+    folder = write_capture(tmp_path_factory.mktemp("sensor") / "cap", scene._replace(images=np.minimum(scene.images, 0.15)))
+    ramp = np.linspace(0.5, 1, 32)[None, :, None] * np.ones((32, 32, 3))
+    for number in range(2):
+        write_exr(folder / f"dark{number}.exr", np.full((32, 32, 3), 0.001 * (1 + number)))
+        write_exr(folder / "cards" / f"white{number}.exr", (0.6 + 0.1 * number) * ramp)
+    for number, level in enumerate(LEVELS):
+        write_exr(folder / f"grey{number}.exr", 0.01 + 0.1 * ramp * level**2.2)
+    projector = {"resolution": [64, 48], "focal_px": [60, 60], "camera_from_projector": np.eye(4).tolist()}
+    write_manifest(folder, json.loads((folder / "capture.json").read_text()) | {"projector": projector})
+    return folder
+
+
+@pytest.fixture(scope="module")
+def uploaded(server, client, sensor):
+    return sent(server, client, sensor)
+
+
+def greys(folder: Path = Path()) -> list[str]:
+    return [str(folder / f"grey{number}.exr") for number in range(len(LEVELS))]
+
+
+@pytest.mark.parametrize("kind", ["dark", "flat-field", "saturation", "response"])
+def test_results_are_those_of_the_command(server, client, sensor, uploaded, tmp_path, kind):
+    here = Path(shutil.copytree(sensor, tmp_path / "cap"))
+    darks, whites = ("dark0.exr", "dark1.exr"), ("cards/white0.exr", "cards/white1.exr")
+    fields, files = {}, {"capture.json", "calibration.json"}
+    match kind:
+        case "dark":
+            fields, files = {"images": darks}, files | {"dark.exr"}
+            dark(DarkRequest(capture=here, images=tuple(here / name for name in darks)))
+        case "flat-field":
+            fields, files = {"images": whites, "dark_images": darks[:1]}, files | {"flat.exr"}
+            flat_field(FlatFieldRequest(capture=here, images=tuple(here / name for name in whites), dark_images=(here / darks[0],)))
+        case "saturation":
+            saturation(SaturationRequest(capture=here, write=True))
+        case "response":
+            fields = {"images": greys(), "options": {"levels": LEVELS.tolist()}}
+            response(ResponseRequest(capture=here, images=tuple(map(Path, greys(here))), levels=tuple(LEVELS.tolist())))
+    job = submit(client, kind=f"calibrate-{kind}", capture=uploaded, **fields)
+    finish(server, client, job)
+    compare(client, job, here, {name: name for name in files}, {here: uploaded})
+
+
+def test_the_time_of_flight_of_a_sweep(server, client, tmp_path):
+    steps = [(f"d{k}", depth, 0.05 + 0.01 * depth, None) for k, depth in enumerate(np.linspace(1, 8, 4))]
+    path = sweep(tmp_path / "sweep", steps, lambda view: pulsed_frames(tof.histogram(view, 1e6, seed=0)))
+    calibrate_tof(TofCalibrationRequest(sweep=path, out=tmp_path / "camera.json", device="cpu"))
+    job = submit(client, kind="calibrate-tof", capture=sent(server, client, path.parent))
+    finish(server, client, job)
+    compare(client, job, tmp_path, {"tof.json": "camera.json"}, {})
+
+
+@pytest.mark.parametrize("away", ["../../{other}/d0", "/etc", "d0/../../{other}/d0", "none"])
+def test_a_sweep_of_another_capture(server, client, tmp_path, away):
+    """What it names beside its own captures may be of another project."""
+    path = sweep(tmp_path / "sweep", [(f"d{k}", 1.0 + k, 0.0, None) for k in range(2)], cw)
+    other = sent(server, client, path.parent)
+    data = json.loads(path.read_text())
+    data["steps"][1]["capture"] = away.format(other=other)
+    path.write_text(json.dumps(data))
+    job = submit(client, kind="calibrate-tof", capture=sent(server, client, path.parent))
+    error = finish(server, client, job, "failed")["error"]
+    assert "is none of the captures" in error and str(server.data) not in error
+    away_too = submit(client, kind="calibrate-tof", capture=other, sweep="../sweep.json")
+    assert "sweep: '../sweep.json' leads out" in finish(server, client, away_too, "failed")["error"]
+
+
+def test_a_rig_from_registered_poses(server, client, registered, tmp_path):
+    ids, folders = [], []
+    for number, pose in enumerate(boards.poses(4)):
+        folder = registered / f"pose{number}"
+        write_view(folder, pose)
+        folders.append(Path(shutil.copytree(folder, tmp_path / folder.name)))
+        made = client.post("/v1/captures", json={"name": folder.name, "folder": str(folder)}).raise_for_status().json()
+        ids.append(server.wait(client, f"/v1/captures/{made['id']}", ("ready", "refused"))["id"])
+    before = {path: path.read_bytes() for path in registered.glob("pose*/*.json")}
+    job = submit(client, kind="calibrate-procam", captures=ids[:3], apply_to=ids[3:], options=BOARD)
+    request = client.get(f"/v1/jobs/{job['id']}").json()["request"]
+    assert request["options"]["board"] == [9, 6] and request["captures"] == ids[:3]
+    finish(server, client, job)
+    procam(ProcamRequest(captures=tuple(folders[:3]), apply_to=tuple(folders[3:]), device="cpu", **BOARD))
+    assert made_by(client, job) == {"calibration.json", *(f"{identifier}.capture.json" for identifier in ids)}
+    for identifier, folder in zip(ids, folders, strict=True):
+        found = client.get(f"/v1/jobs/{job['id']}/results/{identifier}.capture.json").json()
+        same(found, json.loads((folder / "capture.json").read_text()))
+        assert found["name"] == folder.name and found["projector"]["resolution"] == [256, 192]
+    report = client.get(f"/v1/jobs/{job['id']}/results/calibration.json").json()["procam"]
+    assert report["captures"] == [view["view"] for view in report["views"]] == ids[:3]
+    assert report["options"]["apply_to"] == ids[3:]
+    assert before == {path: path.read_bytes() for path in registered.glob("pose*/*.json")}
+    assert client.delete(f"/v1/captures/{ids[1]}").status_code in (204, 409)  # whichever it is, the results stay
+    assert client.get(f"/v1/jobs/{job['id']}/results/{ids[1]}.capture.json").status_code == 200
+
+
+@pytest.mark.parametrize(("fields", "words"), [
+    ({"kind": "calibrate-dark"}, "images"), ({"kind": "calibrate-dark", "images": []}, "images"),
+    ({"kind": "calibrate-dark", "images": ["a\0b"]}, "images"),
+    ({"kind": "calibrate-response", "images": ["a.exr", "b.exr"]}, "images"),
+    ({"kind": "calibrate-response", "images": greys(), "options": {"levels": [0, 2]}}, "levels"),
+])
+def test_requests_that_are_refused(client, uploaded, fields, words):
+    answer = client.post("/v1/jobs", json={"capture": uploaded, **fields})
+    refused(answer, 422, "")
+    assert words in answer.text
+
+
+@pytest.mark.parametrize(("fields", "words"), [
+    ({"captures": []}, "captures"), ({"captures": ["cap_x"]}, "captures"), ({"captures": None}, "captures"),
+    ({"options": {"square_m": 0.03}}, "board"), ({"options": {"board": [9], "square_m": 0.03}}, "board"),
+    ({"options": {"board": "9", "square_m": 0.03}}, "board"), ({"options": {"board": "9x6", "square_m": 75}}, "square"),
+])
+def test_boards_that_are_refused(client, uploaded, fields, words):
+    answer = client.post("/v1/jobs", json={"kind": "calibrate-procam", "captures": [uploaded], "options": BOARD} | fields)
+    refused(answer, 422, "")
+    assert words in answer.text
+
+
+def test_images_that_are_not_there(server, client, uploaded):
+    for kind, names in (("dark", ["none.exr"]), ("dark", ["../x.exr"]), ("flat-field", ["/etc/passwd"])):
+        error = finish(server, client, submit(client, kind=f"calibrate-{kind}", capture=uploaded, images=names), "failed")["error"]
+        assert error.startswith(f"images: {names[0]!r} ") and str(server.data) not in error
+    job = submit(client, kind="calibrate-response", capture=uploaded, images=greys(), options={"levels": [0, 1]})
+    assert "--levels: has 2 values, there are 5 images" in finish(server, client, job, "failed")["error"]
+    missing = client.post("/v1/jobs", json={"kind": "calibrate-procam", "captures": [f"cap_{'0' * 20}"], "options": BOARD})
+    refused(missing, 404, "captures: cap_00000000000000000000 is not in this project")
+
+
+def test_the_brightness_of_lights(server, client, dome):
+    job = submit(client, kind="calibrate-intensity", capture=dome, options={"pixels": 100})
+    finish(server, client, job)
+    assert made_by(client, job) == {"capture.json", "calibration.json"}
+    measured = client.get(f"/v1/jobs/{job['id']}/results/calibration.json").json()["intensity"]
+    assert len(measured["lights"]) == len(client.get(f"/v1/jobs/{job['id']}/results/capture.json").json()["frames"])
+    assert str(server.data) not in json.dumps(measured) and str(SAMPLES) not in json.dumps(measured)
+    assert measured["options"]["capture"] == measured["capture"] == dome
+
+
+def test_a_ball_that_is_not_given(server, client, dome):
+    job = submit(client, kind="calibrate-mirror-ball", capture=dome)
+    assert "ball" in finish(server, client, job, "failed")["error"]
+    job = submit(client, kind="calibrate-grey-ball", capture=dome, masks=["../../x.png"])
+    assert "leads out of the capture's folder" in finish(server, client, job, "failed")["error"]
