@@ -4,6 +4,7 @@ StageError
 ├── ManifestError    capture.json or another JSON description is wrong; the message names file and field
 ├── ImageError       a file does not hold the pixels that it should hold; the message names the file
 ├── CalibrationError images do not show what is measured in them, as a spot on a ball; the message names frame, ball or field
+├── BoardError       the tiles of a board do not fit together, or a board does not fit its design; the message names them
 ├── ResultError      a result file such as maps.exr lacks a layer; the message names file and layer
 └── StorageError     the file system refuses for lack of space or permission; the message names path and reason
 """
@@ -34,6 +35,10 @@ class ImageError(StageError, ValueError):
 
 class CalibrationError(StageError, ValueError):
     """The images do not determine a calibration; the message names the frame, the ball or the field."""
+
+
+class BoardError(StageError, ValueError):
+    """Tiles of a board do not fit together, or a board does not fit its nominal heights; the message names the tiles or the file."""
 
 
 class ResultError(StageError, ValueError):

@@ -18,6 +18,7 @@ from service.requests import (
     export,
     imports_tof,
     inspect,
+    inspect_board,
     jobs,
     keys,
     patterns,
@@ -35,7 +36,7 @@ from service.requests.options import build, help_text, options_of, typed, values
 COMMANDS: dict[str, list[type[Options]]] = {
     "solve": [solve.SolveRequest], "export": [export.ExportRequest], "inspect": [inspect.InspectRequest],
     "depth": [depth.DepthRequest], "scan": [scan.ScanRequest],
-    "separate": [separate.SeparateRequest],
+    "separate": [separate.SeparateRequest], "inspect-board": [inspect_board.InspectBoardRequest],
     "simulate cw": [simulate.SimulateCwRequest], "simulate pulsed": [simulate.SimulatePulsedRequest],
     "patterns": [patterns.PatternsRequest, patterns.PlanRequest], "relight": [relight.RelightRequest], "shade": [shade.ShadeRequest],
     "basis": [basis.BasisRequest], "view": [view.ViewRequest], "demo": [demo.DemoRequest],

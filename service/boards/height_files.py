@@ -1,0 +1,98 @@
+"""Height maps of boards as files: board.exr, and the nominal map of a golden board or a design."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from stage import exr
+from stage.board.grid import BoardGrid, HeightMap
+from stage.board.records import DESIGN_SCHEMA, BoardDesign, Region
+from stage.errors import ManifestError, ResultError
+from stage.records import read_record
+from stage.result_metadata import camera_and_provenance, result_metadata
+
+BOARD_FILE = "board.exr"
+HEIGHT, SIGMA, NOISE, MASK = "height.Z", "sigma.Z", "noise.Z", "mask.Y"
+
+
+class Nominal(NamedTuple):
+    """What a board is compared with."""
+
+    path: Path
+    """The file that was named."""
+    name: str
+    heights: HeightMap
+    regions: tuple[Region, ...]
+
+
+def write_board(path: Path, heights: HeightMap, provenance: dict[str, str]) -> None:
+    """Write board.exr: the height, its σ and the part of σ that is noise, all 0 outside of the mask.
+
+    Raises:
+        StorageError: the file cannot be written.
+    """
+    there = heights.measured
+    layers = {HEIGHT: heights.height, SIGMA: heights.sigma, NOISE: np.sqrt(heights.variance)}
+    channels = {name: np.where(there, values, 0).astype(np.float32) for name, values in layers.items()}
+    exr.write(path, {**channels, MASK: there.astype(np.float16)}, color_space=exr.DATA,
+              metadata=result_metadata(heights.grid.camera(), provenance))
+
+
+def read_golden(path: Path) -> Nominal:
+    """Read the height map of a good board.
+
+    Args:
+        path: a result folder of relit inspect-board, or its board.exr.
+
+    Raises:
+        ResultError, ImageError: the file is no height map.
+    """
+    file = path / BOARD_FILE if path.is_dir() else path
+    channels, metadata = exr.read(file)
+    camera, _ = camera_and_provenance(metadata, file, file_name=BOARD_FILE)
+    try:
+        grid = BoardGrid.of(camera)
+    except ValueError as error:
+        raise ResultError(f"{file}: {error}") from error
+    return Nominal(file, file.parent.name, _heights(file, channels, grid), ())
+
+
+def read_design(path: Path) -> Nominal:
+    """Read a design: its JSON file and the height map that it names.
+
+    Raises:
+        ManifestError: the file is wrong, or the height map has another size than it says.
+        ResultError, ImageError: the height map cannot be used.
+    """
+    design = read_record(path, BoardDesign, DESIGN_SCHEMA)
+    file = path.parent / design.height_map.path
+    channels, _ = exr.read(file)
+    shape = next(iter(channels.values())).shape
+    width, height = design.height_map.resolution
+    if shape != (height, width):
+        raise ManifestError(f"{path}: height_map: {design.height_map.path} has {shape[1]}x{shape[0]} pixels, resolution says "
+                            f"{width}x{height}")
+    grid = BoardGrid(design.height_map.pixel_m, *design.height_map.top_left_m, height, width)
+    for region in design.regions:
+        (x, y), (across, down) = region.centre_m, region.size_m
+        row, col = grid.place(np.array([x - across / 2, x + across / 2]), np.array([y + down / 2, y - down / 2]))
+        if min(row.min(), col.min()) < -0.6 or row.max() > height - 0.4 or col.max() > width - 0.4:
+            raise ManifestError(f"{path}: regions: {region.name} lies beyond the height map, which is "
+                                f"{grid.size_m[0]:.4g} m wide and {grid.size_m[1]:.4g} m high: give lengths in metres")
+    return Nominal(path, design.name, _heights(file, channels, grid), design.regions)
+
+
+def _heights(file: Path, channels: dict[str, np.ndarray], grid: BoardGrid) -> HeightMap:
+    if HEIGHT not in channels:
+        raise ResultError(f"{file}: has no layer {HEIGHT}")
+    height = channels[HEIGHT].astype(np.float64)
+    there = np.isfinite(height)
+    if MASK in channels:
+        there &= channels[MASK] > 0.5
+    if not there.any():
+        raise ResultError(f"{file}: its mask leaves no pixel")
+    sigma = channels[SIGMA].astype(np.float64) if SIGMA in channels else np.zeros(height.shape)
+    noise = channels[NOISE].astype(np.float64) if NOISE in channels else sigma
+    shared = np.sqrt(np.maximum(sigma**2 - noise**2, 0))
+    return HeightMap(grid, *(np.where(there, values, np.nan) for values in (height, noise**2, shared)))

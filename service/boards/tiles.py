@@ -1,0 +1,109 @@
+"""Read the tiles of a board: depth results as they are, captures decoded by the depth product."""
+
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from service.depth.depth import depth
+from service.reporting.progress import Progress
+from service.requests.depth import DepthRequest
+from stage.board.records import SCAN_FILE, SCAN_SCHEMA, BoardScan, Tile
+from stage.board.stitching import TilePoints
+from stage.depth_maps import DEPTH_FILE, DepthMaps
+from stage.errors import BoardError, ManifestError
+from stage.manifest import FILE_NAME
+from stage.records import read_record
+
+
+class BoardTiles(NamedTuple):
+    """The tiles of a board."""
+
+    path: Path
+    """The board.json."""
+    scan: BoardScan
+    tiles: list[TilePoints]
+    contents: dict[str, str]
+    """What each tile was made from, by its path: the content hash that its depth carries."""
+
+
+def read_tiles(path: Path, *, device: str | None, cache: Path | None, progress: Progress) -> BoardTiles:
+    """Read a board.json and all of its tiles.
+
+    Args:
+        path: the file, or the folder with it.
+        device: on which captures are decoded.
+        cache: folder for the image stacks of captures; None: beside each.
+        progress: told of every tile.
+
+    Raises:
+        StageError, KernelError: the file or a tile cannot be used; the message names it.
+    """
+    file = path / SCAN_FILE if path.is_dir() else path
+    scan = read_record(file, BoardScan, SCAN_SCHEMA)
+    progress.stage("tiles", len(scan.tiles))
+    tiles, contents = [], {}
+    for number, tile in enumerate(scan.tiles):
+        maps = _maps(file, tile, device, cache)
+        tiles.append(_points(file, tile, maps, number))
+        contents[tile.path] = maps.provenance.get("relit:inputs", "")
+        progress.advance(number + 1)
+    return BoardTiles(file, scan, tiles, contents)
+
+
+def _maps(file: Path, tile: Tile, device: str | None, cache: Path | None) -> DepthMaps:
+    folder = file.parent / tile.path
+    if (folder / DEPTH_FILE).is_file():
+        return DepthMaps.read(folder / DEPTH_FILE)
+    if not (folder / FILE_NAME).is_file():
+        raise ManifestError(f"{file}: tiles: {tile.path} holds neither {DEPTH_FILE} nor {FILE_NAME}: give folders of depth results or "
+                            "captures")
+    with tempfile.TemporaryDirectory(prefix="relit-tile-") as out:
+        maps = depth(DepthRequest(capture=folder, out=Path(out), device=device, cache=None if cache is None else cache / tile.path)).maps
+    if not isinstance(maps, DepthMaps):
+        raise ManifestError(f"{folder / FILE_NAME}: projector is missing: its pixels have projector coordinates and no depth in metres")
+    return maps
+
+
+def _points(file: Path, tile: Tile, maps: DepthMaps, number: int) -> TilePoints:
+    """Return the points of a tile in the board frame, at the pose that the stage or the manifest gives."""
+    where = f"{file}: tiles[{number}] ({tile.path})"
+    if maps.sigma is None:
+        raise ManifestError(f"{where}: its depth has no layer sigma.Z: an inspection decides by the uncertainty of every depth")
+    if not maps.camera.metric and maps.camera.projection == "orthographic":
+        raise ManifestError(f"{where}: camera.pixel_size_m is missing: tiles are placed in metres")
+    used = maps.mask & (maps.sigma > 0)
+    if not used.any():
+        raise BoardError(f"{where}: no pixel has a depth with a σ")
+    pose = _pose(where, tile, maps)
+    points = maps.camera.points(-maps.depth)[used].astype(np.float64) @ pose[:3, :3].T
+    along = float(abs(pose[2, 2]))  # σ is that of the depth, whose axis the camera looks along
+    if along < 0.5:
+        raise ManifestError(f"{where}: its camera looks along the board, not at it: check its pose")
+    middle = np.median(points, axis=0)
+    local = (points - middle).astype(np.float32)
+    return TilePoints(tile.path, local[:, 0], local[:, 1], local[:, 2], (maps.sigma[used] * along).astype(np.float32),
+                      middle + pose[:3, 3], _distance(points, used, where))
+
+
+def _pose(where: str, tile: Tile, maps: DepthMaps) -> np.ndarray:
+    """Return world_from_camera of a tile, [4, 4]."""
+    if tile.position_m is not None:
+        pose = np.eye(4)
+        pose[: len(tile.position_m), 3] = tile.position_m
+        return pose
+    if maps.camera.world_from_camera is None:
+        raise ManifestError(f"{where}: position_m is missing, and so is world_from_camera of its camera: give where the stage held it")
+    return np.array(maps.camera.world_from_camera, dtype=np.float64)
+
+
+def _distance(points: np.ndarray, used: np.ndarray, where: str) -> float:
+    """Return the median distance in the plane of the board between points of neighbouring pixels, the larger of both directions."""
+    place = np.full((*used.shape, 2), np.nan)
+    place[used] = points[:, :2]
+    apart = [np.linalg.norm(np.diff(place, axis=axis), axis=-1) for axis in (0, 1)]
+    known = [values[np.isfinite(values)] for values in apart]
+    if min(values.size for values in known) == 0:
+        raise BoardError(f"{where}: no two neighbouring pixels have a depth")
+    return float(f"{max(float(np.median(values)) for values in known):.6g}")  # positions are float32, which says no more

@@ -1,0 +1,44 @@
+"""relit inspect-board: tiles of a board to one height map, and what is wrong with it."""
+
+import typer
+
+from service.cli.printing import print_warnings
+from service.cli.progress import ProgressBar
+from service.cli.request_commands import local_command
+from service.requests.inspect_board import InspectBoardRequest
+
+MOST_PRINTED = 10
+"""Findings that are printed; the table has all."""
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    local_command(app, "inspect-board", _inspect_board)
+
+
+def _inspect_board(request: InspectBoardRequest) -> None:
+    from service.boards.inspect_board import inspect_board
+
+    with ProgressBar() as bar:
+        result = inspect_board(request, bar)
+    print(f"height   {result.board_path}")
+    print(f"picture  {result.picture_path}")
+    print(f"report   {result.report_path}")
+    if result.findings_path is not None and result.verdict is not None and result.inspected is not None:
+        print(f"findings {result.findings_path}")
+        for defect in result.defects[:MOST_PRINTED]:
+            area = defect.area
+            print(f"defect   at ({1e3 * area.x_m:.4f}, {1e3 * area.y_m:.4f}) mm, {1e3 * area.width_m:.3f} x {1e3 * area.height_m:.3f} mm: "
+                  f"{1e6 * defect.deviation_m:+.3f} ± {1e6 * defect.sigma_m:.3f} µm, {defect.significance:.1f} σ")
+        if len(result.defects) > MOST_PRINTED:
+            print(f"defects  {len(result.defects) - MOST_PRINTED} more are in the table")
+        wrong = [each for each in result.regions if each.verdict != "pass"]
+        for each in wrong[:MOST_PRINTED]:
+            measured = "" if each.deviation_m is None else f" {1e6 * each.deviation_m:+.3f} ± {1e6 * (each.sigma_m or 0):.3f} µm"
+            print(f"region   {each.region.name}: {each.verdict}{measured}")
+        if len(wrong) > MOST_PRINTED:
+            print(f"regions  {len(wrong) - MOST_PRINTED} more that did not pass are in the table")
+        print(f"verdict  {result.verdict}, {100 * result.inspected:.2f} % inspected")
+    print_warnings(result.warnings)
+    if result.verdict not in (None, "pass"):
+        raise typer.Exit(1)

@@ -1,0 +1,61 @@
+"""What `relit inspect-board` takes."""
+
+from pathlib import Path
+from typing import Annotated, Self
+
+from pydantic import Field, model_validator
+
+from service.requests.base import Choice, DeviceRequest, Options, Role, Spelling
+from stage.model import Fraction, NotNegative, Positive
+
+
+class BoardForm(Choice):
+    """What is removed from the deviations before they are judged."""
+
+    PLANE = "plane", "offset and tilt of the board"
+    QUADRATIC = "quadratic", "offset, tilt, bow and twist of the board"
+
+
+class InspectBoardOptions(Options):
+    """How tiles are stitched, and when a deviation is a defect."""
+
+    pixel_m: Positive | None = None
+    """Side of a pixel of the height map in metres, where no golden map or design gives it. None: the largest distance of neighbouring
+    points of a tile."""
+    placement_m: Positive | None = None
+    """Standard deviation of the place of a board in its fixture along x and y, metres. None: 5 pixels."""
+    remove: BoardForm = BoardForm.PLANE
+    """What is removed from the deviations before they are judged."""
+    tolerance_m: NotNegative = 0.0
+    """Deviation in metres up to which a place is no defect; in a region of the design, the wider of its limits counts if it is larger."""
+    smallest_defect_m: Positive | None = None
+    """Side of the smallest defect that is looked for, metres. None: 3 pixels."""
+    must_find_m: Positive | None = None
+    """Height of a defect of the smallest size, metres, that must be found with a probability of 95 %: pixels where the uncertainty hides it
+    count as not inspected. None: every measured pixel counts as inspected, and the report says what would be found."""
+    false_alarm: Annotated[float, Field(gt=0, lt=0.5)] = 0.01
+    """Largest probability of any false alarm on a board without defects; the windows of the map, and the regions of a design, each
+    have half."""
+    least_inspected: Fraction = 1.0
+    """Least part of the nominal pixels that must be inspected for a board to pass."""
+
+
+class InspectBoardRequest(InspectBoardOptions, DeviceRequest):
+    """Stitch the tiles of a board to one height map, compare it with a golden map or a design, and list what is wrong."""
+
+    board: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="BOARD")]
+    """A folder with a board.json, or the file: the tiles, each a depth result or a capture."""
+    out: Annotated[Path, Role.OUTPUT]
+    """Folder for board.exr, deviation.exr, findings.csv, inspection.png and report.json."""
+    golden: Annotated[Path | None, Role.INPUT] = None
+    """Result folder or board.exr of a good board. None: the design, or else only the height map is made."""
+    design: Annotated[Path | None, Role.INPUT] = None
+    """Nominal height map and tolerance regions (JSON, schema relit.board-design/1)."""
+    cache: Annotated[Path | None, Role.MACHINE] = None
+    """Folder for the image stacks of captures; None: .relit in each capture's folder."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.golden is not None and self.design is not None:
+            raise ValueError("golden and design are both given: give one of them")
+        return self

@@ -1,0 +1,187 @@
+"""relit inspect-board: planted defects are found where they are and nothing else, and what does not fit is one sentence."""
+
+import csv
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stage import exr
+from tests.scenes.board import PIXEL, SIGMA, domes, scan, write_scan
+from tests.scenes.captures import write_exr
+from tests.scenes.depth import BLACK_WHITE, CAMERA, gray_patterns, make_scene, phase_patterns, write_patterns
+
+SIDE, STEP = (120, 130), (1.0e-3, 0.9e-3)
+SQUARE, DISC = (3.0e-4, 2.0e-4), (-4.0e-4, -3.5e-4)
+"""Where the defects are: a square of 5 x 5 pixels and a disc of 8 pixels radius, each 5 σ high or deep."""
+SURFACE = domes(4e-3, 4e-3, bow=5e-5)
+
+
+def faulty(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    square = (np.abs(x - SQUARE[0]) < 2.5 * PIXEL) & (np.abs(y - SQUARE[1]) < 2.5 * PIXEL)
+    return SURFACE(x, y) + 5 * SIGMA * square - 5 * SIGMA * (np.hypot(x - DISC[0], y - DISC[1]) < 8 * PIXEL)
+
+
+def board(folder: Path, surface, *, seed: int, across: int = 2, down: int = 2, **options) -> Path:
+    return write_scan(folder, scan(surface, across=across, down=down, side=SIDE, step=STEP, seed=seed, stage=PIXEL, **options))
+
+
+@pytest.fixture(scope="module")
+def golden(tmp_path_factory) -> Path:
+    """The result folder of a good board."""
+    from service.boards.inspect_board import inspect_board
+    from service.requests.inspect_board import InspectBoardRequest
+
+    folder = tmp_path_factory.mktemp("golden")
+    result = inspect_board(InspectBoardRequest(board=board(folder / "scan", SURFACE, seed=1), out=folder / "out", device="cpu"))
+    assert result.verdict is None and result.findings_path is None
+    return folder / "out"
+
+
+def inspect(relit, scan_folder: Path, *arguments):
+    """The outcome, the rows of the table and the report of a run that is compared with something."""
+    out = scan_folder / "out"
+    outcome = relit("inspect-board", scan_folder, "--out", out, "--device", "cpu", *arguments)
+    if not (out / "report.json").exists():
+        return outcome, [], {}
+    with open(out / "findings.csv", newline="") as table:
+        return outcome, list(csv.DictReader(table)), json.loads((out / "report.json").read_text())
+
+
+def test_planted_defects_are_found_and_nothing_else(relit, tmp_path, golden):
+    """The defects lie in the frame of the golden board, whose stage errs by up to a pixel."""
+    outcome, rows, report = inspect(relit, board(tmp_path / "b", faulty, seed=2), "--golden", golden)
+    assert outcome.code == 1 and "verdict  fail" in outcome.out
+    defects = [row for row in rows if row["kind"] == "defect"]
+    assert len(defects) == 2
+    for centre, side, sign in ((SQUARE, 5, 1), (DISC, 16, -1)):
+        row = min(defects, key=lambda row: np.hypot(float(row["x_m"]) - centre[0], float(row["y_m"]) - centre[1]))
+        assert np.hypot(float(row["x_m"]) - centre[0], float(row["y_m"]) - centre[1]) < 2 * PIXEL
+        assert float(row["width_m"]) == pytest.approx(side * PIXEL, abs=2.5 * PIXEL)
+        assert float(row["height_m"]) == pytest.approx(side * PIXEL, abs=2.5 * PIXEL)
+        assert float(row["deviation_m"]) == pytest.approx(sign * 5 * SIGMA, abs=4 * float(row["sigma_m"]) + 0.5 * SIGMA)
+        assert float(row["significance"]) > report["comparison"]["windows"]["threshold_sigma"]
+    channels, _ = exr.read(tmp_path / "b" / "out" / "deviation.exr")
+    assert set(channels) == {"deviation.Z", "sigma.Z", "score.Y", "mask.Y", "defect.Y"}
+    assert (tmp_path / "b" / "out" / "inspection.png").stat().st_size > 10_000
+
+
+def test_a_good_board_with_missing_pixels_does_not_pass_as_a_whole(relit, tmp_path, golden):
+    views = scan(SURFACE, across=2, down=2, side=SIDE, step=STEP, seed=3, stage=PIXEL)
+    views[0].height[40:60, 30:45] = np.nan
+    outcome, rows, report = inspect(relit, write_scan(tmp_path / "b", views), "--golden", golden, "--tolerance-m", "1e-6")
+    assert outcome.code == 1 and "verdict  not inspected" in outcome.out
+    assert not [row for row in rows if row["kind"] == "defect"]
+    hole = next(row for row in rows if row["kind"] == "area" and abs(float(row["width_m"]) - 15 * PIXEL) < 3 * PIXEL
+                and abs(float(row["height_m"]) - 20 * PIXEL) < 3 * PIXEL)
+    told = views[0].told
+    assert float(hole["x_m"]) == pytest.approx(told[0] - 27.5 * PIXEL, abs=4 * PIXEL)
+    assert float(hole["y_m"]) == pytest.approx(told[1] + 10 * PIXEL, abs=4 * PIXEL)
+    assert report["comparison"]["pixels"]["not_inspected"] >= 300
+    passed, _, _ = inspect(relit, tmp_path / "b", "--golden", golden, "--least-inspected", "0.9")
+    assert passed.code == 0 and "verdict  pass" in passed.out
+
+
+def test_what_must_be_found_and_cannot_is_not_inspected(relit, tmp_path, golden):
+    """The smallest window has a σ of √2 / 3 σ: a defect of 3 σ in it cannot be told at 5.8 + 1.6 of that, one of 5 σ can."""
+    folder = board(tmp_path / "b", SURFACE, seed=4)
+    assert inspect(relit, folder, "--golden", golden, "--must-find-m", "5e-6")[2]["comparison"]["pixels"]["inspected"] > 30_000
+    outcome, _, report = inspect(relit, folder, "--golden", golden, "--must-find-m", "2e-6")
+    assert outcome.code == 1 and report["comparison"]["pixels"]["inspected"] < 15_000
+
+
+def test_regions_of_a_design_are_decided(relit, tmp_path):
+    """The design is the exact surface; regions over both defects fail, one beside them passes, one without tiles is not inspected."""
+    rows, cols = 210, 230
+    top_left = (-cols / 2 * PIXEL, rows / 2 * PIXEL)
+    x, y = np.meshgrid(top_left[0] + (np.arange(cols) + 0.5) * PIXEL, top_left[1] - (np.arange(rows) + 0.5) * PIXEL)
+    folder = board(tmp_path / "b", faulty, seed=5)
+    write = {"compression": exr.Compression.ZIP}
+    exr.write(tmp_path / "b" / "design.exr", {"height.Z": SURFACE(x, y).astype(np.float32)}, color_space=exr.DATA, metadata={}, **write)
+
+    def pad(name, centre, size, **changes):
+        return {"name": name, "shape": "rectangle", "centre_m": centre, "size_m": size, "tolerance_m": [-2e-6, 2e-6], **changes}
+
+    regions = [pad("square", SQUARE, [4e-5, 4e-5]), pad("disc", DISC, [1.2e-4, 1.2e-4], shape="circle"),
+               pad("good", [0.0, 4e-4], [1e-4, 1e-4]), pad("loose", SQUARE, [4e-5, 4e-5], tolerance_m=[-2e-5, 2e-5]),
+               pad("edge", [-1.1e-3, 0.0], [1e-4, 1e-4])]
+    design = {"schema": "relit.board-design/1", "name": "board", "regions": regions,
+              "height_map": {"path": "design.exr", "resolution": [cols, rows], "pixel_m": PIXEL, "top_left_m": top_left}}
+    (tmp_path / "b" / "design.json").write_text(json.dumps(design))
+    outcome, rows_, report = inspect(relit, folder, "--design", folder / "design.json", "--tolerance-m", "1e-5")
+    assert outcome.code == 1, outcome
+    verdicts = {row["name"]: row["verdict"] for row in rows_ if row["kind"] == "region"}
+    assert verdicts == {"square": "fail", "disc": "fail", "good": "pass", "loose": "pass", "edge": verdicts["edge"]}
+    assert not [row for row in rows_ if row["kind"] == "defect"]  # 5 σ are within 10 µm
+    fails = {entry["name"]: entry for entry in report["regions"]}
+    assert fails["disc"]["deviation_m"] == pytest.approx(-5 * SIGMA, abs=4 * fails["disc"]["sigma_m"] + 0.2 * SIGMA)
+    design["height_map"]["pixel_m"] = PIXEL * 1e3
+    (tmp_path / "b" / "design.json").write_text(json.dumps(design | {"regions": []}))
+    refused = relit("inspect-board", folder, "--design", folder / "design.json", "--out", tmp_path / "o", "--device", "cpu")
+    assert refused.code == 2 and "design.json: is not of this board" in refused.err and refused.err.count("\n") == 1
+
+
+@pytest.mark.parametrize(("surface", "options", "words"), [
+    (domes(4e-3, 4e-3, seed=9), {}, "is not of this board: the correlation of their heights"),
+    (lambda x, y: SURFACE(-x, y), {}, "the board is mirrored against it"),
+    (lambda x, y: 1e3 * SURFACE(x, y), {"sigma": 1e3 * SIGMA}, "its heights span .* as millimetres taken for metres do"),
+    (SURFACE, {"across": 4, "down": 3}, "it covers 4[0-9] % of what was measured"),
+    (SURFACE, {"across": 1, "down": 1}, "of its pixels were measured"),
+], ids=["another board", "mirrored", "millimetres", "larger", "smaller"])
+def test_a_golden_map_that_does_not_fit_is_one_sentence(relit, tmp_path, golden, surface, options, words):
+    folder = board(tmp_path / "b", surface, seed=6, **options)
+    outcome = relit("inspect-board", folder, "--golden", golden, "--out", tmp_path / "o", "--device", "cpu")
+    assert outcome.code == 2 and outcome.err.count("\n") == 1
+    assert re.search(words, outcome.err), outcome.err
+    assert not (tmp_path / "o").exists()
+
+
+@pytest.mark.parametrize(("change", "words"), [
+    ({"schema": "relit.board-scan/2"}, "schema: is \"relit.board-scan/2\", this program reads relit.board-scan/1"),
+    ({"tiles": []}, "tiles: has 0 entries, needs 1 or more"),
+    ({"tiles": [{"path": "tile_00"}, {"path": "tile_00"}]}, "tiles: tile_00 is given twice"),
+    ({"tiles": [{"path": "../tile_00"}]}, "../tile_00 leads out of the folder"),
+    ({"tiles": [{"path": "tile_00"}]}, "position_m is missing, and so is world_from_camera"),
+    ({"tiles": [{"path": "nothing", "position_m": [0, 0]}]}, "nothing holds neither depth.exr nor capture.json"),
+    ({"stage_sigma": 1e-5}, "stage_sigma: is not a known key"),
+])
+def test_a_bad_board_file_is_one_sentence(relit, tmp_path, change, words):
+    folder = board(tmp_path / "b", SURFACE, seed=7, across=1, down=1)
+    data = json.loads((folder / "board.json").read_text()) | change
+    (folder / "board.json").write_text(json.dumps(data))
+    outcome = relit("inspect-board", folder, "--out", tmp_path / "o", "--device", "cpu")
+    assert outcome.code == 2 and words in outcome.err and outcome.err.count("\n") == 1, outcome.err
+    assert "board.json" in outcome.err and not (tmp_path / "o").exists()
+
+
+def test_tiles_without_sigma_and_designs_of_another_size_are_refused(relit, tmp_path):
+    folder = board(tmp_path / "b", SURFACE, seed=8, across=1, down=1)
+    write_exr(folder / "design.exr", np.zeros((20, 30, 3)))
+    design = {"schema": "relit.board-design/1", "name": "d", "height_map": {
+        "path": "design.exr", "resolution": [30, 21], "pixel_m": PIXEL, "top_left_m": [0, 0]}}
+    (folder / "design.json").write_text(json.dumps(design))
+    outcome = relit("inspect-board", folder, "--design", folder / "design.json", "--out", tmp_path / "o", "--device", "cpu")
+    assert outcome.code == 2 and "design.exr has 30x20 pixels, resolution says 30x21" in outcome.err
+    channels, metadata = exr.read(folder / "tile_00" / "depth.exr")
+    channels.pop("sigma.Z")
+    exr.write(folder / "tile_00" / "depth.exr", channels, color_space=exr.DATA, metadata={"relit:camera": metadata["relit:camera"]})
+    outcome = relit("inspect-board", folder, "--out", tmp_path / "o", "--device", "cpu")
+    assert outcome.code == 2 and "tiles[0] (tile_00): its depth has no layer sigma.Z" in outcome.err
+
+
+def test_a_capture_is_a_tile_too(relit, tmp_path):
+    """A tilted plane under Gray code and phase shifting, seen in perspective: the board is flat within the noise that its σ says."""
+    patterns = [*gray_patterns("column", stripe=8), *phase_patterns("column", 16.0), *BLACK_WHITE]
+    write_patterns(tmp_path / "tile", make_scene(sphere=False), patterns, noise=0.002)
+    (tmp_path / "board.json").write_text(json.dumps({"schema": "relit.board-scan/1", "name": "plane",
+                                                     "tiles": [{"path": "tile", "position_m": [0, 0]}]}))
+    outcome = relit("inspect-board", tmp_path, "--out", tmp_path / "out", "--device", "cpu")
+    assert outcome.code == 0, outcome.err
+    channels, _ = exr.read(tmp_path / "out" / "board.exr")
+    there = channels["mask.Y"] > 0.5
+    assert there.sum() > 0.7 * CAMERA.width * CAMERA.height
+    normal = channels["height.Z"][there] / channels["sigma.Z"][there]
+    assert 0.3 < 1.4826 * np.median(np.abs(normal - np.median(normal))) < 1.3
+    assert "single tile" in outcome.out
