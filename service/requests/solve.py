@@ -34,12 +34,21 @@ class Intensities(Choice):
     DECLARED = "declared", "those of the manifest"
 
 
+class LightsKnown(Choice):
+    """What is known of the lights of a solve."""
+
+    DECLARED = "declared", "the lights of the manifest"
+    UNKNOWN = "unknown", "distant lights that are found from the images; those of the manifest are placeholders"
+
+
 class SolveOptions(StackOptions):
     """How normals, albedo and height are solved."""
 
     method: Method | None = Field(default=None, description=(
         "How normals are solved; None: gradient where there are gradient frames; else svbrdf where there are extended lights, or "
         f"{SVBRDF_LIGHTS} lights or more; else robust."))
+    lights: LightsKnown = LightsKnown.DECLARED
+    """What is known of the lights."""
     intensities: Intensities = Intensities.CHOSEN
     """Which intensities of distant lights are used; the report says what was found."""
     max_sigma: Positive | None = Field(default=None, description=(

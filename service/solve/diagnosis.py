@@ -52,7 +52,7 @@ def diagnose(given: SolveInput, capture: Capture, lights: Any, declared: Any, so
             repaired = estimated and found.cause in (Cause.IRRADIANCE, Cause.NORMALISED)
             solution.warnings.append(_sentence(found, sample) + (REPAIRED if repaired else ""))
             if not repaired:
-                _raise_error(solution, found.degrees)
+                raise_error(solution, found.degrees)
             if found.cause in UNORDERED:
                 return
         if estimated:
@@ -63,9 +63,9 @@ def diagnose(given: SolveInput, capture: Capture, lights: Any, declared: Any, so
     if axes is not None:
         solution.warnings.append(f"{field}: {axes.sentence}")
         if axes.degrees is not None:
-            _raise_error(solution, axes.degrees)
+            raise_error(solution, axes.degrees)
         elif axes.matrices:
-            _raise_error(solution, _turned_by(solution.normal, axes))
+            raise_error(solution, _turned_by(solution.normal, axes))
 
 
 def _sample(given: SolveInput, capture: Capture, lights: DistantLights) -> Sample:
@@ -77,8 +77,13 @@ def _sample(given: SolveInput, capture: Capture, lights: DistantLights) -> Sampl
     return Sample(radiance, usable, lights.direction, lights.irradiance, exposure, capture.manifest.color_space)
 
 
-def _raise_error(solution: Solution, degrees: np.ndarray | float) -> None:
-    """Add an independent error to the standard error of every normal; the confidence falls as 1 / (1 + standard error / 1°)."""
+def raise_error(solution: Solution, degrees: np.ndarray | float) -> None:
+    """Add an independent error to the standard error of every normal; the confidence falls as 1 / (1 + standard error / 1°).
+
+    Args:
+        solution: its standard errors and confidence are changed.
+        degrees: the error of all normals, or [pixels] of each.
+    """
     before = solution.standard_error()
     after = np.where(np.isin(solution.status, ESTIMATED), np.hypot(before, degrees), before)
     solution.confidence = (solution.confidence.astype(np.float32) * (1 + before) / (1 + after)).astype(np.float16)

@@ -1,29 +1,22 @@
 """Solve a capture: images → normals, reflectance and height, in maps.exr and report.json."""
 
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from kernels import device as devices
-from kernels.photometric.lambert import solve_lambert
-from kernels.photometric.near import NearField
-from kernels.photometric.readings import Lights
-from kernels.photometric.robust import solve_robust
 from kernels.status import ESTIMATED, SOLVED, Status
 from kernels.surface.integrate import Integration
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, metadata, report
-from service.requests.solve import MAX_SIGMA, SVBRDF_LIGHTS, Intensities, Method, SolveRequest
+from service.requests.solve import MAX_SIGMA, SVBRDF_LIGHTS, Intensities, LightsKnown, Method, SolveRequest
 from service.solve import integrability
-from service.solve.diagnosis import diagnose
-from service.solve.diffuse import solve_diffuse
-from service.solve.distant import solve_distant
+from service.solve.diagnosis import diagnose, raise_error
 from service.solve.intensities import choose_intensities
-from service.solve.near import MATERIAL_ROUNDS, Rounds, solve_near
+from service.solve.methods import METHODS, Solver
 from service.solve.parts import numbered, place_solution
 from service.solve.sharing import SharedSolve
 from service.solve.solution import Solution, SolveInput, SuspectLight, mark_not_facing, refine_status
@@ -32,102 +25,17 @@ from stage.brackets import merge_brackets, one_frame_a_light
 from stage.capture import Capture
 from stage.colour_spaces import linear_space
 from stage.errors import ManifestError
-from stage.extended_lights import ExtendedLights
 from stage.files import write_text
-from stage.gradients import GradientFrames, gradient_frames, has_gradients
 from stage.ingest import open_stack
-from stage.light import DistantLight, ExtendedLight, PointLight
-from stage.lighting import check_solvable
+from stage.lighting import check_surface, distant_lights
 from stage.manifest import FILE_NAME
 from stage.maps import MAPS_FILE, SurfaceMaps
 from stage.motion.tracking import tracking_frames
 from stage.point_lights import DistantLights, PlacedLights
 from stage.radiance import clipping_sentences
-from stage.reference_ball import ReferenceBall, reference_ball
 
-Solver = Callable[[SolveInput, Any], Solution]
-
-
-class MethodEntry(NamedTuple):
-    """What one method needs of a capture, and the functions that solve it."""
-
-    read_lights: Callable[..., Any]
-    """Returns the lights or frames that the method works with. Takes the capture, and that of the reference ball where there is one;
-    raises a StageError that says what they lack."""
-    solvers: Mapping[type, Solver]
-    """One function for each kind of lights; a kind that is not here is refused."""
-    residual: str
-    """What the residual of a pixel is, as the report says it."""
-    is_default: Callable[[Capture], bool] = lambda capture: False
-    """Whether a capture is solved by this method when the request names none."""
-
-
-def _suits_svbrdf(capture: Capture) -> bool:
-    places = {light.position_m if isinstance(light, PointLight) else light.direction
-              for frame in capture.sources() if isinstance(light := frame.light, DistantLight | PointLight)}
-    return bool(capture.lit_by(ExtendedLight)) or len(places) >= SVBRDF_LIGHTS  # exposures of one light are one
-
-
-def _single_lights(*series: Rounds) -> dict[type, Solver]:
-    """Return the functions for lights of one direction each: distant lights are solved by the last solver of those for near ones."""
-    return {DistantLights: partial(solve_distant, solver=series[-1].solver), PlacedLights: partial(solve_near, series=series)}
-
-
-# solvers that few captures need are imported, with their kernels, when they are called: all of them take a tenth of a second
-
-
-def _solve_material(given: SolveInput, lights: Lights, field: NearField | None = None) -> Solution:
-    from service.solve.material import solve_material
-
-    return solve_material(given, lights, field)
-
-
-def _refine_material(given: SolveInput, lights: Lights, field: NearField, before: Solution) -> Solution:
-    from service.solve.material import refine_material
-
-    return refine_material(given, lights, field, before)
-
-
-def _solve_extended(given: SolveInput, lights: ExtendedLights) -> Solution:
-    from service.solve.extended import solve_extended
-
-    return solve_extended(given, lights)
-
-
-def _solve_gradients(given: SolveInput, frames: GradientFrames) -> Solution:
-    from service.solve.gradient import solve_gradients
-
-    return solve_gradients(given, frames)
-
-
-def _solve_by_reference(given: SolveInput, ball: ReferenceBall) -> Solution:
-    from service.solve.reference import solve_by_reference
-
-    return solve_by_reference(given, ball)
-
-
-LAMBERT = Rounds(Method.LAMBERT, partial(solve_diffuse, fit_normals=solve_lambert))
-ROBUST = Rounds(Method.ROBUST, partial(solve_diffuse, fit_normals=solve_robust))
-MATERIAL = Rounds(Method.SVBRDF, _solve_material, MATERIAL_ROUNDS, _refine_material)
-
-OF_THE_LARGEST = ("of grey readings over irradiance less b·l, relative to the length of b, which is the reading under a light along "
-                  "the normal")
-IN_NOISE = ("square root of the mean over the lights of log(1 + r²/σ²), where r is reading less model and σ the noise that the search "
-            "assumes: 0.83 where r is σ everywhere; a shadow counts 1")
-
-METHODS: Mapping[Method, MethodEntry] = {
-    Method.GRADIENT: MethodEntry(gradient_frames, {GradientFrames: _solve_gradients},
-                                 "root mean square of the grey readings less the fit, relative to the reading under the full frame",
-                                 has_gradients),
-    Method.SVBRDF: MethodEntry(check_solvable, {**_single_lights(ROBUST, MATERIAL), ExtendedLights: _solve_extended}, IN_NOISE,
-                               _suits_svbrdf),
-    Method.ROBUST: MethodEntry(check_solvable, _single_lights(ROBUST),
-                               f"root mean square, by the weights of the fit and without rejected readings, {OF_THE_LARGEST}",
-                               is_default=lambda capture: True),
-    Method.LAMBERT: MethodEntry(check_solvable, _single_lights(LAMBERT), f"root mean square {OF_THE_LARGEST}"),
-    Method.REFERENCE: MethodEntry(reference_ball, {ReferenceBall: _solve_by_reference}, IN_NOISE),
-}
-"""Every method. The default for a capture is the first whose `is_default` says so."""
+if TYPE_CHECKING:
+    from service.solve.unknown_lights import UnknownLights
 
 
 class SolveResult(NamedTuple):
@@ -157,6 +65,8 @@ class _Opened(NamedTuple):
     given: SolveInput
     facts: dict[str, Any]
     """What the report says of the lights."""
+    unknown: "UnknownLights | None" = None
+    """How the lights were found, where they are those of the images."""
 
 
 def solve(request: SolveRequest, progress: Progress | None = None, *, sharing: SharedSolve | None = None) -> SolveResult:
@@ -172,13 +82,16 @@ def solve(request: SolveRequest, progress: Progress | None = None, *, sharing: S
         StorageError: the results cannot be written; nothing is left half-written.
     """
     timings = Timings(progress)
-    capture, method, lights, declared, solver, given, facts = _open(request, timings, sharing)
+    capture, method, lights, declared, solver, given, facts, unknown = _open(request, timings, sharing)
     stack, mask = given.stack, given.mask
     solution = solver(given, lights)
     solution.facts = facts | solution.facts
     mark_not_facing(capture.camera, solution)
     timings.stage("diagnosis", 1)
     diagnose(given, capture, lights, declared, solution)
+    if unknown is not None:
+        solution.warnings += unknown.warnings
+        raise_error(solution, unknown.doubt(solution.normal))
     estimated = np.isin(solution.status, ESTIMATED).reshape(mask.shape)
     sigma = solution.standard_error()
     if solution.integration is None:  # near lights have found the height with the normals
@@ -249,11 +162,17 @@ def _open(request: SolveRequest, timings: Timings, sharing: SharedSolve | None) 
     chosen = devices.resolve_all(request.device)
     timings.stage("open", 1)
     capture = Capture.open(request.capture, request.pixels)
-    method = request.method or next(method for method, entry in METHODS.items() if entry.is_default(capture))
+    unknown = request.lights is LightsKnown.UNKNOWN
+    method = request.method or (_method_of_unknown(capture) if unknown else
+                                next(method for method, entry in METHODS.items() if entry.is_default(capture)))
     if (method is Method.REFERENCE) != (request.reference_ball is not None):
         raise RequestError("--method reference and --reference-ball CAPTURE go together: give both or neither")
+    if unknown and DistantLights not in METHODS[method].solvers:
+        raise RequestError(f"--lights unknown: --method {method} is not for distant lights: take svbrdf, robust or lambert")
     balls = [] if request.reference_ball is None else [Capture.open(request.reference_ball, request.pixels._replace(crop=None))]
-    lights = METHODS[method].read_lights(capture, *balls)
+    if unknown:
+        check_surface(capture)
+    lights = distant_lights(capture) if unknown else METHODS[method].read_lights(capture, *balls)
     solver = METHODS[method].solvers.get(type(lights))
     if solver is None:  # only extended lights can be missing here: every method takes distant and near ones
         raise ManifestError(f"{capture.folder / FILE_NAME}: frames[].light: some are extended: --method svbrdf solves these, "
@@ -262,19 +181,29 @@ def _open(request: SolveRequest, timings: Timings, sharing: SharedSolve | None) 
     tracking = tracking_frames(capture, to=request.align_to) if request.aligned else None
     timings.stage("ingest", len(capture.sources()))
     stack = open_stack(capture, cache=request.cache, tracking=tracking, progress=lambda done, _: timings.advance(done))
-    if isinstance(lights, DistantLights | PlacedLights):
+    if isinstance(lights, DistantLights | PlacedLights) and not unknown:  # placeholders say nothing of which frames have one light
         stack, lights = one_frame_a_light(merge_brackets(stack, capture.sources(), lights), lights)
     if sharing is not None:
         sharing.identify(chosen[0], str(method), stack.key, mask, stack.scale, capture.manifest.model_dump_json())
     given = SolveInput(stack, capture.camera, mask, chosen, timings, request.cache, sharing=sharing,
-                       relative=capture.manifest.irradiance_scale == "relative",
+                       relative=unknown or capture.manifest.irradiance_scale == "relative",
                        refine_intensities=request.intensities is Intensities.CHOSEN)
+    if unknown:
+        from service.solve.unknown_lights import find_lights
+
+        timings.stage("lights", 1)
+        found = find_lights(given)
+        return _Opened(capture, method, found.lights, found.lights, solver, given, found.facts, found)
     used: Any = lights
     facts: dict[str, Any] = {}
     if isinstance(lights, DistantLights) and given.refine_intensities:
         timings.stage("intensities", 1)
         used, facts = choose_intensities(given, lights)
     return _Opened(capture, method, used, lights, solver, given, facts)
+
+
+def _method_of_unknown(capture: Capture) -> Method:
+    return Method.SVBRDF if len(capture.sources()) >= SVBRDF_LIGHTS else Method.ROBUST
 
 
 def _maps(solution: Solution, solved: np.ndarray, estimated: np.ndarray, method: Method, capture: Capture,

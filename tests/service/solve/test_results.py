@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from service.requests.solve import Method
-from service.solve.solve import METHODS
+from service.solve.methods import METHODS
 from stage import exr
 from stage.maps import SurfaceMaps
 from tests.scenes.captures import angles_degrees, files_in, make_scene, write_capture
@@ -57,7 +57,7 @@ def test_the_report_and_the_maps_say_where_they_come_from(relit, tmp_path):
     assert report["residual"]["meaning"] == METHODS[Method.LAMBERT].residual
     metadata = exr.read_header(tmp_path / "out" / "maps.exr").metadata
     assert metadata["relit:capture"] == "cap" and metadata["relit:inputs"] == report["inputs"]["content"]
-    assert json.loads(metadata["relit:options"]) == {"method": "lambert"}
+    assert json.loads(metadata["relit:options"]) == {"method": "lambert", "intensities": "chosen", "lights": "declared"}
     assert metadata["colorInteropID"] == "lin_rec709_scene" and "chromaticities" in metadata
 
 

@@ -1,0 +1,111 @@
+"""Normals without lights: an ellipsoid that no axis of the camera suits, under lights of which the manifest knows nothing."""
+
+import json
+
+import numpy as np
+import pytest
+
+from service.errors import RequestError
+from service.requests.solve import SolveRequest
+from service.solve.solve import solve
+from stage.errors import CalibrationError, ManifestError
+from tests.reference import microfacet
+from tests.scenes.captures import angles_degrees, edit_frame, edit_manifest, make_scene, write_capture
+from tests.scenes.ellipsoid import ellipsoid
+
+VIEW = np.array([0.0, 0.0, 1.0])
+LIGHTS = 24
+
+
+def shiny(scene, roughness, f0):
+    """The scene with highlights of the contract's lobe, of two roughnesses side by side."""
+    left = np.arange(scene.mask.shape[1]) < scene.mask.shape[1] // 2
+    alpha = np.where(left, roughness[0], roughness[1])[None, :] ** 2
+    lobes = np.stack([microfacet.specular(scene.normal, direction, VIEW, alpha, f0) for direction in scene.directions])
+    images = scene.images + scene.mask[..., None] * lobes[..., None] * scene.irradiance[:, None, None]
+    return scene._replace(images=images)
+
+
+def solved(tmp_path, scene, method="robust", **options):
+    """The result and report under lights that are declared to shine from the camera, all alike; the error where there is an estimate."""
+    count = len(scene.directions)
+    placeholders = scene._replace(directions=np.tile(VIEW, (count, 1)), irradiance=np.ones((count, 3)))
+    folder = write_capture(tmp_path / "capture", placeholders)
+    result = solve(SolveRequest(capture=folder, out=tmp_path / "out", method=method, lights="unknown", device="cpu", **options))
+    error = angles_degrees(result.maps.normal, scene.normal)[result.maps.estimated]
+    return result, json.loads((tmp_path / "out" / "report.json").read_text()), error
+
+
+@pytest.fixture(scope="module")
+def glossy(tmp_path_factory):
+    scene = shiny(ellipsoid(count=LIGHTS), (0.45, 0.6), 0.08)
+    return scene, *solved(tmp_path_factory.mktemp("glossy"), scene)
+
+
+def test_highlights_tell_normals_without_lights(glossy):
+    scene, _, report, error = glossy
+    told = report["found"]["unknown_lights"]
+    assert told["resolved_by"] == "highlights"
+    assert np.mean(error) < 4, np.mean(error)  # texture, noise and highlights under 24 lights: 2° with known lights
+    assert np.mean(angles_degrees(np.array(told["directions"]), scene.directions)) < 4
+
+
+def test_irradiance_is_found_up_to_one_factor(glossy):
+    scene, _, report, _ = glossy
+    ratio = np.array(report["found"]["unknown_lights"]["irradiance"]) / scene.irradiance[:, 0]
+    assert np.std(np.log(ratio)) < 0.05  # the declared ones vary by 35 %
+
+
+def test_the_standard_error_counts_the_lights(glossy):
+    _, result, report, error = glossy
+    sigma = result.maps.sigma[result.maps.estimated]
+    assert np.median(sigma) >= report["found"]["unknown_lights"]["sigma_degrees"] * 0.9
+    assert np.mean(error < 2 * sigma) > 0.9
+
+
+def test_the_report_says_that_the_manifest_has_other_lights(glossy):
+    _, result, *_ = glossy
+    assert any("found.unknown_lights" in warning for warning in result.warnings)
+
+
+def test_a_matt_object_of_one_albedo_is_told_by_it_and_doubted(tmp_path):
+    scene = ellipsoid(count=LIGHTS)
+    even = np.where(scene.albedo > 0, scene.images / np.maximum(scene.albedo, 1e-9) * 0.4, 0)
+    result, report, error = solved(tmp_path, scene._replace(images=even))
+    assert report["found"]["unknown_lights"]["resolved_by"] == "albedo"
+    assert np.mean(error) < 5, np.mean(error)
+    assert np.median(result.maps.sigma[result.maps.estimated]) > 10
+    assert any("no highlights" in warning for warning in result.warnings)
+
+
+def test_lights_that_are_placeholders_are_no_bracket_and_choose_svbrdf(tmp_path):
+    scene = shiny(ellipsoid(size=40, count=LIGHTS), (0.45, 0.6), 0.08)
+    _, report, error = solved(tmp_path, scene, None)
+    assert report["method"] == "svbrdf"
+    assert np.mean(error) < 6, np.mean(error)
+
+
+def test_what_lights_cannot_be_found_for_is_refused(tmp_path):
+    with pytest.raises(RequestError, match="8 or more"):
+        solved(tmp_path / "few", make_scene(24, 7))
+    with pytest.raises(RequestError, match="not for distant lights"):
+        solved(tmp_path / "gradient", make_scene(24, 9), "gradient")
+    scene = make_scene(40, 12)
+    noise = np.random.default_rng(0).random(scene.images.shape) * scene.mask[..., None]
+    with pytest.raises(CalibrationError, match="--lights unknown: "):
+        solved(tmp_path / "noise", scene._replace(images=noise))
+    flat = scene._replace(images=np.broadcast_to(scene.images[:, 20:21, 20:21], scene.images.shape) * scene.mask[..., None])
+    with pytest.raises(CalibrationError, match="--lights unknown: "):
+        solved(tmp_path / "flat", flat)
+
+
+def test_a_perspective_camera_and_a_near_light_are_refused(tmp_path):
+    folder = write_capture(tmp_path / "capture", make_scene(24, 9))
+    request = SolveRequest(capture=folder, out=tmp_path / "out", lights="unknown", device="cpu")
+    edit_manifest(folder, camera={"projection": "perspective", "resolution": [24, 24], "focal_px": [50, 50], "principal_px": [12, 12]})
+    with pytest.raises(RequestError, match="orthographic"):
+        solve(request)
+    edit_frame(folder, 3, light={"type": "point", "position_m": [0, 0, 1], "intensity": [1, 1, 1]})
+    with pytest.raises(ManifestError, match="distant lights"):
+        solve(request)
+    assert not (tmp_path / "out").exists()
