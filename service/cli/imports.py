@@ -22,6 +22,7 @@ from service.requests.captures import (
     ScannerImport,
     Sense,
     StackOptions,
+    WaveOrigin,
 )
 from service.requests.imports_tof import ArrayOptions, HistogramImport, KinectImport, Signal, TofImport
 from service.requests.patterns import PatternAxis
@@ -118,9 +119,9 @@ def _phase(request: PhaseImport) -> None:
 
     phase = PhaseStack(axes=_axes(request.axis), periods_px=request.periods, row_periods_px=request.row_periods, steps=request.steps,
                        order=request.order, advancing=request.shift is PhaseShift.MINUS, offset_deg=request.offset_deg)
+    gray = GrayStack(inverses=request.gray_inverses, fine_first=request.gray_fine_first)
     _print(import_phase(request.source, request.folder, stack=_stack(request, request), phase=phase, gray_images=request.gray_images,
-                        gray_stripe_px=request.gray_stripe, gray=GrayStack(inverses=request.gray_inverses,
-                                                                           fine_first=request.gray_fine_first)))
+                        gray_stripe_px=request.gray_stripe, gray=gray, from_centre=request.origin is WaveOrigin.CENTRE))
 
 
 def _scanner(request: ScannerImport) -> None:

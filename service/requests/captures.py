@@ -209,6 +209,13 @@ class PhaseShift(Choice):
     PLUS = "plus", "cos(2πu/P + 2πi/N)"
 
 
+class WaveOrigin(Choice):
+    """Where the column 0 of a wave lies in the projector."""
+
+    EDGE = "edge", "at the outer edge of the first pixel, as relit has it"
+    CENTRE = "centre", "at its centre, as in cos(2πx/P) with the number x of the pixel"
+
+
 class PhaseImport(StackOptions, RigOptions, ImportRequest):
     """Images of phase shifts in any order, with a Gray code that numbers the periods or without."""
 
@@ -225,7 +232,9 @@ class PhaseImport(StackOptions, RigOptions, ImportRequest):
     shift: PhaseShift = PhaseShift.MINUS
     """Direction in which the waves move from step to step."""
     offset_deg: Finite = 0.0
-    """Phase at column 0 in the first step, degrees: a whole number of steps. Waves that are sines have -90."""
+    """Phase at `origin` in the first step, degrees: a whole number of steps. Waves that are sines have -90."""
+    origin: WaveOrigin = WaveOrigin.EDGE
+    """Where the waves have column 0."""
     gray_images: Annotated[str | None, Spelling(metavar="GLOB")] = None
     """Names of the images of a Gray code that numbers the periods."""
     gray_stripe: Positive | None = None

@@ -12,7 +12,7 @@ from stage import images
 from stage.calibration.opencv_file import read_matrices
 from stage.errors import ManifestError, StageError, storage
 from stage.importers import kinect
-from stage.importers.layout import image_names, natural_order
+from stage.importers.layout import color_space_of, image_names, natural_order
 from stage.importers.light_rig import CAMERA_MATRIX, read_rig
 from stage.importers.light_table import SUFFIXES as TABLES
 from stage.importers.light_table import LightTable, read_light_table
@@ -153,7 +153,7 @@ def _near_lights(folder: Folder) -> Guess | None:
                  "--unit-m", "0.001", *chosen, "--surface-z-m", "Z"]
         return _made("images under LEDs, as near_ps has them", f"{path} holds as many positions of lights as there are images", words,
                      folder.path, solve=True, assumed=("axes and millimetres are those of near_ps",
-                                          "Z is the mean z of the object in metres, negative, such as -0.5"))
+                                          "Z is the mean z of the object in metres, negative, such as -0.5", *_encoding(folder)))
     return None
 
 
@@ -176,8 +176,16 @@ def _table(folder: Folder) -> Guess | None:
                      ["olat", folder.path, "--lights", path, "--axes", axes, "--vectors", "to-light", *chosen],
                      folder.path, solve=True, assumed=(
                          "x is right and y is up as seen by the camera, and vectors point to the light: the table does not say it",
-                         f"z points {'towards the camera' if ahead else 'away from it'}, because then the lights are on its side"))
+                         f"z points {'towards the camera' if ahead else 'away from it'}, because then the lights are on its side",
+                         *_encoding(folder)))
     return None
+
+
+def _encoding(folder: Folder) -> tuple[str, ...]:
+    """Return what is assumed of the encoding of 8-bit images."""
+    if _tried(lambda: color_space_of(folder.path / folder.pictures[0])) != "srgb_texture":
+        return ()
+    return ("the images have 8 bits and are taken as sRGB: many of cameras for measurements are linear, --color-space lin_rec709_scene",)
 
 
 def _group_of(folder: Folder, count: int) -> list[str] | None:

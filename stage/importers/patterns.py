@@ -46,7 +46,7 @@ def import_gray(source: Path, destination: Path, *, stack: Stack, gray: GrayStac
 
 
 def import_phase(source: Path, destination: Path, *, stack: Stack, phase: PhaseStack, gray_images: str | None = None,
-                 gray_stripe_px: float | None = None, gray: GrayStack | None = None) -> Imported:
+                 gray_stripe_px: float | None = None, gray: GrayStack | None = None, from_centre: bool = False) -> Imported:
     """Write a capture.json for phase shifts, with a Gray code that numbers their periods or without.
 
     Args:
@@ -57,6 +57,8 @@ def import_phase(source: Path, destination: Path, *, stack: Stack, phase: PhaseS
         gray_images: the names of the images of a Gray code, as the shell matches them; None: there is none.
         gray_stripe_px: the width of its finest stripe in projector pixels.
         gray: how it was taken; its sequence and bits follow from the axes and the images.
+        from_centre: whether the waves have column 0 at the centre of the first pixel. The coordinates of the capture are then 0.5 smaller
+            than elsewhere, and the principal point of the projector with them.
 
     Raises:
         ManifestError: images and patterns do not fit, or the calibration cannot be read; the message names the file.
@@ -75,7 +77,7 @@ def import_phase(source: Path, destination: Path, *, stack: Stack, phase: PhaseS
             of_axis = gray_entries(axis, 2**each, None, inverses=inverses, fine_first=fine_first)
             entries += [{**entry, "stripe_px": gray_stripe_px} for entry in of_axis]
         extra = list(zip(names, entries, strict=True))
-    return _write(source, destination, stack, phase.entries(), extra)
+    return _write(source, destination, stack, phase.entries(), extra, shifted=from_centre)
 
 
 def import_scanner(source: Path, destination: Path, *, calibration: Path, codec: str, axes: tuple[str, ...], unit_m: float,
@@ -172,6 +174,7 @@ def _write(source: Path, destination: Path, stack: Stack, entries: list[Entry], 
         facts.append(("Gray", f"{len(extra)} images in their order, {extra[0][0]} to {extra[-1][0]}: {describe([e for _, e in extra])}"))
     facts += [(code, name) for code, name in even.items()]
     facts += [("colour", f"{stack.color_space}: --color-space says another"), ("mask", mask or "none: every pixel is taken"),
+              *([("columns", "counted from the centre of the first one, as the waves are")] if shifted else []),
               ("rig", f"from {stack.calibration}, in units of {stack.unit_m:g} m" if stack.calibration else
                       "not calibrated: relit calibrate procam measures it, or give --calibration")]
     return Imported(written, tuple(facts))

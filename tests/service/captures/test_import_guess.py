@@ -55,7 +55,7 @@ def table(folder):
 
 def slstudio(folder):
     write_calibration(folder / "calibration.xml", SLSTUDIO, **SIZES)
-    write_stack(folder, [wave(U - 0.5, 128 / parts, -step / 3) for parts in (16, 1) for step in range(3)], "frameSeq_{}.png")
+    write_stack(folder, [wave(U - 0.5, 128 / parts, -step / 3) for parts in (16, 1) for step in range(3)], "frameSeq_{}.bmp")
 
 
 def opencv_gray(folder):
