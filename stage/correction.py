@@ -1,6 +1,6 @@
 """Correction of recorded values to scene-linear radiance by colour space, dark frame, flat field, exposure and ambient light."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -106,10 +106,28 @@ class Correction:
             saturated = _any_from(limit, recorded)
         if recorded.dtype.kind == "u" and self.dark is None and self.flat is None and self.ambient is None:
             every = np.arange(np.iinfo(recorded.dtype).max + 1, dtype=recorded.dtype)
-            return CodedRadiance(recorded, self._corrected(every, frame), saturated)
-        return Radiance(self._corrected(recorded, frame), saturated)
+            return CodedRadiance(recorded, self.corrected(every, frame), saturated)
+        return Radiance(self.corrected(recorded, frame), saturated)
 
-    def _corrected(self, recorded: np.ndarray, frame: Frame) -> np.ndarray:
+    def at(self, pixels: np.ndarray) -> "Correction":
+        """Return the correction of single pixels.
+
+        Args:
+            pixels: [n] row-major positions in the image.
+
+        Returns:
+            A correction whose images are [n, 1, 3], for `corrected`.
+        """
+        dark, flat, ambient = (None if image is None else image.reshape(-1, 1, 3)[pixels] for image in (self.dark, self.flat, self.ambient))
+        return replace(self, dark=dark, flat=flat, ambient=ambient)
+
+    def corrected(self, recorded: np.ndarray, frame: Frame) -> np.ndarray:
+        """Return the scene-linear radiance of recorded values of a frame, [rows, cols, 3] float32 of the same size as the images here.
+
+        Args:
+            recorded: [rows, cols, 3] float32 fractions of full scale, or uint8 or uint16.
+            frame: which gives the exposure.
+        """
         pixels = linearise(recorded, self.capture.manifest.color_space)
         if self.dark is not None:
             pixels = pixels - self.dark

@@ -22,7 +22,7 @@ from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import GreyBallRequest, LightPositionsRequest, MirrorBallRequest
 from stage.calibration.apply import LitFrame, SingleLight, as_direction, as_position, lit_frames, with_brightness
 from stage.calibration.ball import BallView, view_ball
-from stage.calibration.grey_ball import fit_brightness, fit_direction
+from stage.calibration.grey_ball import better_encoding, fit_brightness, fit_direction
 from stage.calibration.light_positions import nearest_point
 from stage.calibration.mirror_ball import SpotOptions, find_spot
 from stage.correction import Correction
@@ -139,8 +139,14 @@ def grey_ball(request: GreyBallRequest, progress: Progress | None = None) -> Lig
             light = as_direction(light, shading.direction)
             entry = {"direction": digits(shading.direction), "uncertainty_degrees": round(shading.uncertainty_degrees, 4)}
         found = fit_brightness(patch.radiance, patch.saturated, light, view)
-        entry |= {"scale": digits(found.scale), "residual": round(found.residual, 5), "pixels": found.pixels,
-                  "flags": ["not Lambertian under this light"] if found.residual > 0.1 else []}
+        declared = captures.source.manifest.color_space
+        other = better_encoding(patch.radiance, patch.saturated, light, view, exposure=lit.frame.exposure_s or 1.0, declared=declared,
+                                residual=found.residual)
+        flags = ["not Lambertian under this light"] if found.residual > 0.1 else []
+        if other is not None:
+            flags = [f"color_space: {declared} is declared, but as {other[0]} the shading of the ball fits to {100 * other[1]:.1f} %, as "
+                     f"declared to {100 * found.residual:.1f} %"]
+        entry |= {"scale": digits(found.scale), "residual": round(found.residual, 5), "pixels": found.pixels, "flags": flags}
         return MeasuredLight(with_brightness(light, found.scale), entry, (), found.residual)
 
     results = leave_out_failures(captures, _measure_each(captures, [view], measure, timings), drop_failed=request.drop_failed)

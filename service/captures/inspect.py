@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from service.captures.explained import findings, pixels_to_look_at
 from service.reporting.progress import Progress, Timings
 from service.requests.captures import InfoRequest
 from stage import images
@@ -32,6 +33,8 @@ class Inspection(NamedTuple):
 
     facts: list[tuple[str, str]]
     faults: list[str]
+    findings: list[str]
+    """Sentences about what explains the images better than the manifest; nothing is changed by them."""
 
 
 class _FrameLevel(NamedTuple):
@@ -41,6 +44,7 @@ class _FrameLevel(NamedTuple):
     peak: float
     saturated: int
     fault: str | None
+    picked: np.ndarray | None = None  # [n, 3] float32, values at some pixels
     unread: int = 0
     """Readings of a time-of-flight frame that are not finite."""
 
@@ -61,8 +65,9 @@ def inspect(request: InfoRequest, progress: Progress | None = None) -> Inspectio
     frames = capture.manifest.frames
     timings.stage("frames", len(frames))
     levels = []
+    positions = pixels_to_look_at(capture)
     with ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="relit-inspect") as pool:
-        for level in pool.map(lambda frame: _level(capture, frame), frames):
+        for level in pool.map(lambda frame: _level(capture, frame, positions), frames):
             levels.append(level)
             timings.advance(len(levels))
     timings.close()
@@ -87,7 +92,11 @@ def inspect(request: InfoRequest, progress: Progress | None = None) -> Inspectio
     if capture.lit_by(PointLight):
         with suppress(StageError):
             facts.append(("near lights", _near_lights(place_lights(capture))))
-    return Inspection(facts, faults)
+    looks = []
+    if positions is not None and not faults:
+        looks = findings(capture, positions, {frame.image: level.picked for frame, level in zip(frames, levels, strict=True)
+                                              if level.picked is not None})
+    return Inspection(facts, faults, looks)
 
 
 def standing_faults(capture: Capture, *, readable: bool = True) -> list[str]:
@@ -168,7 +177,7 @@ def _kind(frame: Frame) -> str:
     return f"{frame.laser.type} laser" if frame.laser is not None else "time of flight"
 
 
-def _level(capture: Capture, frame: Frame) -> _FrameLevel:
+def _level(capture: Capture, frame: Frame, positions: np.ndarray | None) -> _FrameLevel:
     """Return the lowest and the brightest value and the saturated readings of one frame, or its fault."""
     path = capture.file(frame.image)
     try:
@@ -185,4 +194,5 @@ def _level(capture: Capture, frame: Frame) -> _FrameLevel:
     if not finite.any():
         return _FrameLevel(0.0, 0.0, 0, f"{path}: no reading is finite")
     lowest, peak = float(pixels.min(where=finite, initial=np.inf)), float(pixels.max(where=finite, initial=-np.inf))
-    return _FrameLevel(lowest, peak, saturated, None, int(finite.size - finite.sum()))
+    picked = pixels.reshape(-1, pixels.shape[-1])[positions] if positions is not None and frame.tof is None else None
+    return _FrameLevel(lowest, peak, saturated, None, picked, int(finite.size - finite.sum()))

@@ -20,6 +20,8 @@ def _info(request: InfoRequest) -> None:
         found = inspect(request, bar)
     for name, value in found.facts:
         print(f"{name:<12} {value}")
+    for finding in found.findings:
+        print(f"{'finding':<12} {finding}")
     for fault in found.faults:
         print(f"{'wrong':<12} {fault}")
     if found.faults:

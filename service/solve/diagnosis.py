@@ -14,13 +14,12 @@ from kernels.status import ESTIMATED
 from service.solve.orientation import LightAxes, find_axes, find_inversion
 from service.solve.solution import PIXELS_AT_ONCE, Solution, SolveInput, suspect_lights
 from stage.capture import Capture
-from stage.consistency.explanations import Cause, Explanation, Sample, better_explanation, fit_manifest
+from stage.consistency.explanations import PIXELS, Cause, Sample, better_explanation, fit_manifest
+from stage.consistency.sentences import explanation_sentence
 from stage.extended_lights import ExtendedLights
 from stage.gradients import GradientFrames
 from stage.point_lights import DistantLights, PlacedLights
 
-PIXELS = 600
-"""Number of pixels, spread over the object, on which explanations are compared: three times as many change no misfit by a tenth."""
 UNORDERED = (Cause.REVERSED, Cause.SHIFTED, Cause.DIRECTIONS)
 """Causes after which the normals say nothing about the axes."""
 REPAIRED = "; the solve has used the brightness that the images ask for (found.light_intensities)"
@@ -50,7 +49,7 @@ def diagnose(given: SolveInput, capture: Capture, lights: Any, declared: Any, so
         estimated = lights is not declared
         if found is not None:
             repaired = estimated and found.cause in (Cause.IRRADIANCE, Cause.NORMALISED)
-            solution.warnings.append(_sentence(found, sample) + (REPAIRED if repaired else ""))
+            solution.warnings.append(explanation_sentence(found, sample) + (REPAIRED if repaired else ""))
             if not repaired:
                 raise_error(solution, found.degrees)
             if found.cause in UNORDERED:
@@ -99,28 +98,3 @@ def _turned_by(normal: np.ndarray, axes: LightAxes) -> np.ndarray:
             cosine = np.clip((part * (matrix.astype(np.float32) @ part)).sum(axis=0), -1, 1)
             squares[first : first + PIXELS_AT_ONCE] += np.degrees(np.arccos(cosine)) ** 2 / len(axes.matrices)
     return np.sqrt(squares)
-
-
-def _sentence(found: Explanation, sample: Sample) -> str:
-    """Return the sentence for what explains the images better than the manifest."""
-    fits = f"the readings then fit to {100 * found.left:.1f} %, as declared to {100 * found.misfit:.1f} %"
-    alike = " (every light is declared alike)" if np.ptp(sample.irradiance, axis=0).max() < 1e-6 * sample.irradiance.max() else ""
-    measure = "`relit calibrate intensity` measures it"
-    return {
-        Cause.ENCODED: f"color_space: the images look display-encoded, but {sample.color_space} is declared: decoded as sRGB, {fits}; "
-                       "declare srgb_texture if they are",
-        Cause.LINEAR: f"color_space: the images look linear, but {sample.color_space} is declared: taken as linear, {fits}; declare a "
-                      "linear space, such as lin_rec709_scene",
-        Cause.IRRADIANCE: f"frames[].light.irradiance: it is missing or wrong{alike}: with the brightness that the images ask for, "
-                          f"{fits}; {measure} (a missing exposure_s, and near lights that are declared distant, act alike)",
-        Cause.ENCODED_OR_IRRADIANCE: f"color_space or frames[].light.irradiance: the images look display-encoded, or the irradiance is "
-                                     f"missing or wrong{alike}: {fits}; declare srgb_texture if they are encoded, else {measure}",
-        Cause.NORMALISED: f"frames[].light.irradiance: the images look as if they were divided by it already: with equal lights, {fits}; "
-                          "declare the same irradiance for every light",
-        Cause.REVERSED: f"frames[].light: the order looks reversed: with the lights from last to first, {fits}; check which light "
-                        "belongs to which image",
-        Cause.SHIFTED: f"frames[].light: the lights look one frame off: with each light one image earlier or later, {fits}; check which "
-                       "light belongs to which image",
-        Cause.DIRECTIONS: f"frames[].light.direction: images and directions do not belong together: with other directions, {fits}; "
-                          "check which light belongs to which image, and the directions",
-    }[found.cause]

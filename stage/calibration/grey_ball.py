@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stage.calibration.ball import BallView
+from stage.consistency.encodings import other_readings
 from stage.errors import CalibrationError
 from stage.light import DistantLight, PointLight
 
@@ -24,6 +25,9 @@ MIN_PIXELS = 50
 """The least count of pixels from which a light is measured."""
 WEIGHT_SCALE = 2.385
 """The scale of the Cauchy weights 1/(1 + (r/(2.385 σ))²), which are 95 % efficient for normal noise (Holland and Welsch 1977)."""
+LEAST_MISFIT, TIMES = 0.05, 2.5
+"""Least residual of the shading as declared at which another encoding is tried, which good grey balls stay below; and how many times less
+an encoding must leave, which has no free parameter."""
 ROUNDS = 20
 """The iterations of the re-weighted least squares."""
 
@@ -97,6 +101,30 @@ def fit_brightness(radiance: np.ndarray, saturated: np.ndarray | None, light: Di
     relative = (readings / model[:, None])[:, lit] / scale[lit] - 1
     residual = math.sqrt(float((weight[:, lit] * relative**2).sum() / weight[:, lit].sum()))
     return Brightness(np.maximum(scale, 0), residual, int(usable.sum()))
+
+
+def better_encoding(radiance: np.ndarray, saturated: np.ndarray | None, light: DistantLight | PointLight, view: BallView, *,
+                    exposure: float, declared: str, residual: float) -> tuple[str, float] | None:
+    """Return another encoding under which the shading of the ball is much more Lambertian, or None.
+
+    Args:
+        radiance: [h, w, 3] scene-linear as declared, the box of `view`.
+        saturated: [h, w] bool, or None.
+        light: the light, which gives direction or position.
+        view: the pixels of the ball.
+        exposure: recorded values over radiance.
+        declared: the colour space of the manifest.
+        residual: of `fit_brightness` as declared.
+
+    Returns:
+        The colour space that declares the encoding, and the residual under it.
+    """
+    if residual < LEAST_MISFIT:
+        return None
+    others = [(space, fit_brightness(values, saturated, light, view).residual)
+              for space, values in other_readings(radiance, exposure, declared)]
+    better = [(space, left) for space, left in others if residual >= TIMES * left]
+    return min(better, key=lambda one: one[1], default=None)
 
 
 def fit_direction(radiance: np.ndarray, saturated: np.ndarray | None, view: BallView) -> Shading:

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from stage.calibration.ball import Ball, view_ball
-from stage.calibration.grey_ball import fit_brightness, fit_direction, received
+from stage.calibration.grey_ball import better_encoding, fit_brightness, fit_direction, received
+from stage.colour import convert
+from stage.colour_spaces import linear_space
 from stage.errors import CalibrationError
 from stage.light import DistantLight, PointLight
 from tests.reference.balls import lambertian, lambertian_near, render
@@ -94,3 +96,22 @@ def test_balls_that_show_nothing():
         fit_brightness(0 * image, None, distant(unit(0, 0, 1)), view)
     with pytest.raises(CalibrationError, match="pixels of the ball are in light"):
         fit_direction(0 * image, None, view)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+@pytest.mark.parametrize(("declared", "recorded_as", "named"), [
+    ("lin_rec709_scene", "lin_rec709_scene", None), ("srgb_texture", "srgb_texture", None),
+    ("lin_rec709_scene", "srgb_texture", "srgb_texture"), ("lin_rec709_scene", "g22_rec709_scene", "g22_rec709_scene"),
+    ("srgb_texture", "lin_rec709_scene", "lin_rec709_scene"),
+])
+def test_the_shading_tells_how_images_are_encoded(declared, recorded_as, named, noise):
+    """Lambert's law holds under one encoding alone. The recorded values of a capture of two seconds are twice the radiance."""
+    view, geometry = exact("orthographic")
+    light = distant(unit(0.4, 0.3, 0.8))
+    image = np.asarray(box(seen(lambertian(light.direction, albedo=0.8, irradiance=3.0), geometry), view) * [1.0, 0.5, 0.8])
+    image = np.maximum(image * (1 + noise * np.random.default_rng(0).normal(size=image.shape)), 0).clip(0, 1).astype(np.float32)
+    recorded = convert(image, linear_space(recorded_as), recorded_as)
+    radiance = convert(recorded, declared, linear_space(declared)) / 2
+    residual = fit_brightness(radiance, None, light, view).residual
+    found = better_encoding(radiance, None, light, view, exposure=2.0, declared=declared, residual=residual)
+    assert found is None if named is None else found is not None and found[0] == named and found[1] < 0.01 + 1.2 * noise
