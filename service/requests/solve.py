@@ -38,6 +38,7 @@ class LightsKnown(Choice):
     """What is known of the lights of a solve."""
 
     DECLARED = "declared", "the lights of the manifest"
+    REFINED = "refined", "the lights of the manifest, whose directions are only rough and are refined by the images"
     UNKNOWN = "unknown", "distant lights that are found from the images; those of the manifest are placeholders"
 
 

@@ -35,6 +35,7 @@ from stage.point_lights import DistantLights, PlacedLights
 from stage.radiance import clipping_sentences
 
 if TYPE_CHECKING:
+    from service.solve.refined_lights import RefinedLights
     from service.solve.unknown_lights import UnknownLights
 
 
@@ -65,7 +66,7 @@ class _Opened(NamedTuple):
     given: SolveInput
     facts: dict[str, Any]
     """What the report says of the lights."""
-    unknown: "UnknownLights | None" = None
+    found: "UnknownLights | RefinedLights | None" = None
     """How the lights were found, where they are those of the images."""
 
 
@@ -82,16 +83,16 @@ def solve(request: SolveRequest, progress: Progress | None = None, *, sharing: S
         StorageError: the results cannot be written; nothing is left half-written.
     """
     timings = Timings(progress)
-    capture, method, lights, declared, solver, given, facts, unknown = _open(request, timings, sharing)
+    capture, method, lights, declared, solver, given, facts, found = _open(request, timings, sharing)
     stack, mask = given.stack, given.mask
     solution = solver(given, lights)
     solution.facts = facts | solution.facts
     mark_not_facing(capture.camera, solution)
     timings.stage("diagnosis", 1)
     diagnose(given, capture, lights, declared, solution)
-    if unknown is not None:
-        solution.warnings += unknown.warnings
-        raise_error(solution, unknown.doubt(solution.normal))
+    if found is not None:
+        solution.warnings += found.warnings
+        raise_error(solution, found.doubt(solution.normal))
     estimated = np.isin(solution.status, ESTIMATED).reshape(mask.shape)
     sigma = solution.standard_error()
     if solution.integration is None:  # near lights have found the height with the normals
@@ -188,11 +189,9 @@ def _open(request: SolveRequest, timings: Timings, sharing: SharedSolve | None) 
     given = SolveInput(stack, capture.camera, mask, chosen, timings, request.cache, sharing=sharing,
                        relative=unknown or capture.manifest.irradiance_scale == "relative",
                        refine_intensities=request.intensities is Intensities.CHOSEN)
-    if unknown:
-        from service.solve.unknown_lights import find_lights
-
+    if request.lights is not LightsKnown.DECLARED:
         timings.stage("lights", 1)
-        found = find_lights(given)
+        found = _find_lights(request.lights, given, lights, capture)
         return _Opened(capture, method, found.lights, found.lights, solver, given, found.facts, found)
     used: Any = lights
     facts: dict[str, Any] = {}
@@ -200,6 +199,19 @@ def _open(request: SolveRequest, timings: Timings, sharing: SharedSolve | None) 
         timings.stage("intensities", 1)
         used, facts = choose_intensities(given, lights)
     return _Opened(capture, method, used, lights, solver, given, facts)
+
+
+def _find_lights(known: LightsKnown, given: SolveInput, lights: Any, capture: Capture) -> "UnknownLights | RefinedLights":
+    """Return the lights that the images ask for; their kernels and methods are imported for captures that need them."""
+    if known is LightsKnown.UNKNOWN:
+        from service.solve.unknown_lights import find_lights
+
+        return find_lights(given)
+    if not isinstance(lights, DistantLights):
+        raise ManifestError(f"{capture.folder / FILE_NAME}: frames[].light: --lights refined is for distant lights alone")
+    from service.solve.refined_lights import refine_lights
+
+    return refine_lights(given, lights)
 
 
 def _method_of_unknown(capture: Capture) -> Method:
