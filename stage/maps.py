@@ -27,6 +27,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], type[np.floating[Any]]]] = {
     "regime": (("Y",), np.float16),
     "specular_normal": (_XYZ, np.float32),
     "height": (("Z",), np.float32),
+    "height_sigma": (("Z",), np.float32),
     "part": (("Y",), np.float16),
     "sigma": (("Y",), np.float16),
     "confidence": (("Y",), np.float16),
@@ -56,6 +57,7 @@ class SurfaceMaps:
     regime: np.ndarray | None = None  # [rows, cols] 1 Lambertian, 2 glossy, 3 mirror, 4 mixture of diffuse and specular
     specular_normal: np.ndarray | None = None  # [rows, cols, 3] float32, unit, of the highlight; 0 where none was found
     height: np.ndarray | None = None  # [rows, cols] float32, camera-frame z; metres, or pixels without a scale
+    height_sigma: np.ndarray | None = None  # [rows, cols] float32 standard error of the height, in its unit; where depth has placed it
     part: np.ndarray | None = None  # [rows, cols] uint8, parts with a break of the height between them, 1 the largest; None: there is one
     sigma: np.ndarray | None = None  # [rows, cols] standard error of the normal, degrees
     confidence: np.ndarray | None = None  # [rows, cols] 0…1

@@ -1,6 +1,6 @@
 """Normals to height: least squares over all pairs of neighbours, breaking at discontinuities where asked."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -11,7 +11,7 @@ from kernels.errors import ArrayError
 from kernels.surface.components import label_runs, place
 from kernels.surface.conjugate import Convergence, Solver
 from kernels.surface.discontinuities import find_breaks, integrate_broken
-from kernels.surface.grid import make_grid
+from kernels.surface.grid import EdgeWeights, Grid, make_grid
 from kernels.surface.slopes import Slopes, pair_slopes, usable_pixels
 from kernels.surface.support import supported_normals
 
@@ -50,6 +50,7 @@ def integrate_normals(
     perspective: bool,
     mean_z: float,
     sigma: np.ndarray | wp.array | None = None,  # [rows, cols] float32, radians
+    cuts: tuple[np.ndarray, np.ndarray] | None = None,  # [rows, cols] bool each
     options: IntegrationOptions | None = None,
     device: str,
     progress: Callable[[float], None] | None = None,
@@ -66,6 +67,8 @@ def integrate_normals(
         perspective: which of the two the camera is.
         mean_z: mean camera-frame z of the surface; negative for a perspective camera.
         sigma: standard errors of the normals; None: all are sure.
+        cuts: edges between a pixel and its right neighbour, and between it and the one below, that the surface breaks along; what
+            they cut off is a part.
         options: None for the defaults.
         device: "cpu" or "cuda:0".
         progress: told the fraction done, 0…1.
@@ -98,6 +101,8 @@ def integrate_normals(
         inputs[0], trust = supported_normals(inputs[0], _upload(sigma, wp.float32, device), *inputs[1:], perspective=perspective,
                                              device=device)
     slopes = pair_slopes(inputs[0], usable, *inputs[1:], trust, grid=grid, perspective=perspective, spacing=spacing)
+    if cuts is not None:
+        cut_edges(slopes.weights, tuple(cut[box] for cut in cuts), grid=grid)
     runs = label_runs(usable.numpy())
 
     def improve(slopes: Slopes, h: wp.array) -> Convergence:
@@ -123,6 +128,20 @@ def integrate_normals(
     if progress is not None:
         progress(1.0)
     return Integration(height, runs.count, done.iterations, done.residual, done.converged, part)
+
+
+def cut_edges(weights: EdgeWeights, cuts: Iterable[np.ndarray], *, grid: Grid) -> None:
+    """Take edges away.
+
+    Args:
+        weights: of the edges of a grid; changed.
+        cuts: [rows, cols] bool, edges to the right and edges down.
+        grid: the layout.
+    """
+    for plane, cut in zip((weights.right, weights.down), cuts, strict=True):
+        kept = plane.numpy()
+        kept[: grid.pitch * (grid.rows + 2)].reshape(-1, grid.pitch)[1 : grid.rows + 1, 1 : grid.cols + 1][cut] = 0
+        plane.assign(kept)
 
 
 def _box(mask: np.ndarray | wp.array) -> tuple[slice, slice]:

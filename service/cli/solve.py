@@ -7,6 +7,7 @@ from service.cli.progress import ProgressBar
 from service.cli.request_commands import local_command
 from service.requests.basis import BasisRequest
 from service.requests.export import ExportRequest
+from service.requests.join import JoinRequest
 from service.requests.solve import SolveRequest
 
 
@@ -15,6 +16,7 @@ def register(app: typer.Typer) -> None:
     local_command(app, "solve", _solve)
     local_command(app, "export", _export)
     local_command(app, "basis", _basis)
+    local_command(app, "join", _join)
 
 
 def _solve(request: SolveRequest) -> None:
@@ -45,6 +47,19 @@ def _export(request: ExportRequest) -> None:
     for name, (vertices, faces) in exported.sizes.items():
         print(f"{name:<8} {vertices} vertices, {faces} faces")
     print_warnings(exported.warnings)
+
+
+def _join(request: JoinRequest) -> None:
+    from service.joining.join import join
+
+    with ProgressBar() as bar:
+        result = join(request, bar)
+    pixels, sigma = result.facts["pixels"], result.facts["sigma_m"]
+    print(f"maps     {result.maps_path}")
+    print(f"report   {result.report_path}")
+    print(f"pixels   {pixels['solved']} solved of {pixels['mask']}, {pixels['with_depth']} with a depth")
+    print(f"sigma    {sigma['joined_median'] * 1000:.3g} mm, of the depth alone {sigma['depth_median'] * 1000:.3g} mm")
+    print_warnings(result.warnings)
 
 
 def _basis(request: BasisRequest) -> None:

@@ -29,6 +29,7 @@ class Timings:
         """Args: inner: receives every call too; None: there is no other."""
         self._inner = inner
         self._started: tuple[str, float] | None = None
+        self._furthest = 0
         self.seconds: dict[str, float] = {}
         self.parts: dict[str, float] = {}
         """Seconds of the named parts of stages."""
@@ -36,7 +37,7 @@ class Timings:
     def stage(self, name: str, total: int) -> None:
         """Begin a stage, and end the one before it."""
         self.close()
-        self._started = (name, time.perf_counter())
+        self._started, self._furthest = (name, time.perf_counter()), 0
         if self._inner is not None:
             self._inner.stage(name, total)
 
@@ -44,6 +45,11 @@ class Timings:
         """Pass the finished steps on."""
         if self._inner is not None:
             self._inner.advance(done)
+
+    def advance_percent(self, fraction: float) -> None:
+        """Tell the fraction done of a stage of 100 steps by an iteration that may go back, which is not told."""
+        self._furthest = max(self._furthest, round(100 * fraction))
+        self.advance(self._furthest)
 
     @contextmanager
     def part(self, name: str) -> Iterator[None]:

@@ -37,18 +37,12 @@ def integrate(given: SolveInput, normal: np.ndarray, solved: np.ndarray, *, sigm
     if not solved.any():
         return None
     given.timings.stage(stage, 100)
-    camera, told = given.camera, 0
-
-    def tell(part: float) -> None:
-        nonlocal told
-        told = max(told, round(100 * part))  # the residual of conjugate gradients also grows for a few iterations
-        given.timings.advance(told)
-
+    camera = given.camera
     x, y = (plane.astype(np.float32) for plane in camera.plane_coordinates())
     return integrate_normals(normal.reshape(3, *solved.shape), solved, x, y,
                              perspective=camera.projection == "perspective", mean_z=mean_height(camera),
                              sigma=None if sigma is None else np.radians(sigma, dtype=np.float32).reshape(solved.shape), options=OPTIONS,
-                             device=given.device, progress=tell)
+                             device=given.device, progress=given.timings.advance_percent)
 
 
 def guessed_part(sigma: np.ndarray, estimated: np.ndarray) -> float:

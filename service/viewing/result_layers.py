@@ -30,6 +30,7 @@ SURFACE = {
     "specular": Appearance("Specular (F0)", COLOUR),
     "roughness": Appearance("Roughness", SCALAR),
     "height": Appearance("Height", SCALAR, "m"),
+    "height_sigma": Appearance("Standard error of the height", SCALAR, "m"),
     "specular_normal": Appearance("Specular normals", VECTOR),
     "abundance": Appearance("Share of the first material", SCALAR),
     "first_specular": Appearance("First material: specular (F0)", COLOUR),

@@ -21,7 +21,7 @@ def make_maps(**changes) -> SurfaceMaps:
     three, one = (lambda: RNG.random((ROWS, COLS, 3)).astype(np.float32)), (lambda: RNG.random((ROWS, COLS)).astype(np.float32))
     layers = {"normal": three(), "diffuse_albedo": three(), "specular": three(), "roughness": one(), "height": one() - 1,
               "confidence": one(), "specular_normal": three(), "regime": one(), "sigma": one(),
-              "abundance": one(), "first_specular": three(), "first_roughness": one(), "second_specular": three(),
+              "abundance": one(), "height_sigma": one(), "first_specular": three(), "first_roughness": one(), "second_specular": three(),
               "second_roughness": one(), "part": np.ones(MASK.shape, np.uint8),
               "status": MASK.astype(np.uint8)}
     return SurfaceMaps(**{"camera": CAMERA, "mask": MASK, "provenance": {"relit:capture": "owl"}, **layers, **changes})
@@ -48,7 +48,7 @@ def test_the_channels_are_those_of_the_contract(tmp_path):
     half = [f"{layer}.{c}" for layer in ("diffuse_albedo", "specular", "first_specular", "second_specular") for c in "RGB"]
     half += [f"{layer}.Y" for layer in ("roughness", "abundance", "first_roughness", "second_roughness", "regime", "part", "sigma",
                                         "confidence", "status", "mask")]
-    floats = [f"{layer}.{c}" for layer in ("normal", "specular_normal") for c in "XYZ"] + ["height.Z"]
+    floats = [f"{layer}.{c}" for layer in ("normal", "specular_normal") for c in "XYZ"] + ["height.Z", "height_sigma.Z"]
     assert types == {**dict.fromkeys(half, "float16"), **dict.fromkeys(floats, "float32")}
     assert header["colorInteropID"] == "lin_rec709_scene" and "chromaticities" in header and "relit:camera" in header
 

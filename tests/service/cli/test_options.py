@@ -20,6 +20,7 @@ from service.requests import (
     inspect,
     inspect_board,
     jobs,
+    join,
     keys,
     patterns,
     relight,
@@ -35,6 +36,7 @@ from service.requests.options import build, help_text, options_of, typed, values
 
 COMMANDS: dict[str, list[type[Options]]] = {
     "solve": [solve.SolveRequest], "export": [export.ExportRequest], "inspect": [inspect.InspectRequest],
+    "join": [join.JoinRequest],
     "depth": [depth.DepthRequest], "scan": [scan.ScanRequest],
     "separate": [separate.SeparateRequest], "inspect-board": [inspect_board.InspectBoardRequest],
     "simulate cw": [simulate.SimulateCwRequest], "simulate pulsed": [simulate.SimulatePulsedRequest],

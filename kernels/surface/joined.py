@@ -1,0 +1,219 @@
+"""Depth and normals of one view joined: the shape of the normals where the depth is noisy, the depth where normals drift.
+
+The surface is cut where depth shows steps that the normals do not explain, the normals are integrated between the cuts, each part is
+placed by its depths, and what is left of the difference corrects heights and normals scale by scale, as far as it is error of the
+normals and not noise of the depth.
+
+Source: Nehab, Rusinkiewicz, Davis and Ramamoorthi, "Efficiently combining positions and normals for precise 3D geometry", SIGGRAPH 2005,
+which filters with one fixed scale in place of the noise and error of each.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from kernels.errors import ArrayError
+from kernels.surface.depth_steps import SLOPE_ERROR, Edges, find_steps
+from kernels.surface.integrate import IntegrationOptions, integrate_normals
+from kernels.surface.scales import correct
+from kernels.surface.slopes import STEEPEST
+
+LEAST_DEPTHS = 12
+"""Number of depths by which a part is placed; one with fewer has no place of its own."""
+
+
+class Joined(NamedTuple):
+    """A surface from depth and normals."""
+
+    height: np.ndarray  # [rows, cols] float32 camera-frame z, 0 where there is no normal
+    sigma: np.ndarray  # [rows, cols] float32 standard error of the height; 0 where it has no place
+    normal: np.ndarray  # [3, rows, cols] float32, corrected; 0 where there was none
+    part: np.ndarray  # [rows, cols] int, pixels of one number are connected across no break; -1: no normal there
+    placed: np.ndarray  # [rows, cols] bool, where depth tells the height
+    rejected: np.ndarray  # [rows, cols] bool, depths that are mixtures of two surfaces, or contradict those around them
+    guessed: np.ndarray  # [rows, cols] bool, beside a step without a depth of its own: which side it belongs to is a guess
+    unexplained: float | None
+    """Part of the variance of the depths within parts, without their noise, that the integrated normals leave; None: there is none."""
+
+
+def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray, depth: np.ndarray, depth_sigma: np.ndarray,
+               measured: np.ndarray, x: np.ndarray, y: np.ndarray, *, perspective: bool, device: str,
+               progress: Callable[[float], None] | None = None) -> Joined:
+    """Join the depth map and the normal map of one camera.
+
+    Args:
+        normal: [3, rows, cols] unit, camera frame.
+        normal_sigma: [rows, cols] standard errors of the normals, radians.
+        solved: [rows, cols] bool, where there is a normal.
+        depth: [rows, cols] −z of the camera frame, above 0 for a perspective camera.
+        depth_sigma: [rows, cols] standard deviations of the depth, above 0 and independent between pixels.
+        measured: [rows, cols] bool, where there is a depth.
+        x, y: [rows, cols] plane coordinates of the pixels, as for `integrate_normals`.
+        perspective: which of the two cameras it is.
+        device: "cpu" or "cuda:0".
+        progress: told the fraction done, 0…1.
+
+    Raises:
+        ArrayError: shapes do not fit, fewer than LEAST_DEPTHS pixels have both, or values are not finite or not positive where they must
+            be.
+    """
+    _check(normal, normal_sigma, solved, depth, depth_sigma, measured, perspective=perspective)
+    plane = _Plane(x.astype(np.float64), y.astype(np.float64), perspective)
+    both = solved & measured
+    u, u_sigma = plane.to_heights(-depth.astype(np.float64), both), plane.to_sigmas(depth, depth_sigma, both)
+    slopes = plane.slopes(np.where(solved, normal, 0).astype(np.float64))
+    error = plane.slope_error(slopes, normal_sigma + SLOPE_ERROR)
+    cuts = find_steps(u, u_sigma, both, *(_edges(plane, normal, slopes, error, solved, axis) for axis in (1, 0)))
+    mean_z = -float(np.median(depth[measured]))
+    found = integrate_normals(normal.astype(np.float32), solved, x.astype(np.float32), y.astype(np.float32), perspective=perspective,
+                              mean_z=mean_z, sigma=normal_sigma.astype(np.float32), cuts=(cuts.right, cuts.down),
+                              options=IntegrationOptions(discontinuities=True), device=device, progress=progress)
+    assert found.part is not None
+    base = plane.to_heights(found.height.numpy().astype(np.float64), solved)
+    part = np.where(solved, found.part, -1)
+    correction, variance = np.zeros(solved.shape), np.zeros(solved.shape)
+    placed, rejected = np.zeros(solved.shape, dtype=bool), both & ~cuts.depth
+    known, relief, left = both & cuts.depth, 0.0, 0.0
+    for box, here in _parts(part):
+        seen = here & known[box]
+        if seen.sum() < LEAST_DEPTHS:
+            continue
+        fixed = correct(u[box] - base[box], u_sigma[box], seen, here)
+        for target, values in ((correction, fixed.value), (variance, fixed.variance)):
+            target[box][here] = values[here]
+        placed[box][here] = True
+        rejected[box][fixed.rejected] = True
+        used = seen & ~fixed.rejected
+        relief += _variation(u[box][used], u_sigma[box][used])
+        left += _variation((u - base)[box][used], u_sigma[box][used])
+    corrected = plane.turned(normal.astype(np.float64), slopes, correction, part, solved)
+    z = np.where(placed, plane.to_z(base + correction), 0)
+    sigma = np.where(placed, plane.to_depth_sigmas(z, np.sqrt(variance)), 0)
+    unplaced = solved & ~placed
+    if unplaced.any():
+        known_z = z[placed].mean() if placed.any() else mean_z
+        z = np.where(unplaced, found.height.numpy() + (known_z - mean_z), z)
+    return Joined(z.astype(np.float32), sigma.astype(np.float32), corrected.astype(np.float32), part, placed, rejected, cuts.guessed,
+                  None if relief <= 0 else max(left, 0.0) / relief)
+
+
+def _variation(values: np.ndarray, sigma: np.ndarray) -> float:
+    """Return the sum of squares about the mean, in units of the noise, without what noise makes of it: above 3 of its standard deviations,
+    else 0."""
+    weight = 1 / sigma**2
+    found = float((weight * (values - np.average(values, weights=weight)) ** 2).sum())
+    expected = len(values) - 1
+    return found - expected if found > expected + 3 * np.sqrt(2 * expected) else 0.0
+
+
+class _Plane:
+    """Conversions between camera-frame z and heights in pixels' distances: of z (orthographic) or of −log depth (perspective)."""
+
+    def __init__(self, x: np.ndarray, y: np.ndarray, perspective: bool) -> None:
+        self._x, self._y, self._perspective = x, y, perspective
+        self.spacing = float(np.hypot(np.diff(x, axis=1), np.diff(y, axis=1)).mean()) if x.shape[1] > 1 else 1.0
+        self._gradients = [_differences(plane) for plane in (x, y)]
+
+    def to_heights(self, z: np.ndarray, there: np.ndarray) -> np.ndarray:
+        return np.where(there, -np.log(np.where(there, -z, 1)) if self._perspective else z, 0) / self.spacing
+
+    def to_z(self, heights: np.ndarray) -> np.ndarray:
+        return -np.exp(-heights * self.spacing) if self._perspective else heights * self.spacing
+
+    def to_sigmas(self, depth: np.ndarray, sigma: np.ndarray, there: np.ndarray) -> np.ndarray:
+        scale = np.where(there, depth, 1) * self.spacing if self._perspective else self.spacing
+        return np.where(there, sigma / scale, 1)
+
+    def to_depth_sigmas(self, z: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+        return sigma * self.spacing * (np.abs(z) if self._perspective else 1)
+
+    def slopes(self, normal: np.ndarray) -> np.ndarray:
+        """Return [2, rows, cols] derivatives along x and y of spacing · heights that the normals have."""
+        toward = normal[2] - (normal[0] * self._x + normal[1] * self._y if self._perspective else 0)
+        return -normal[:2] / np.maximum(toward, STEEPEST)
+
+    def slope_error(self, slopes: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+        """Return [rows, cols] the error of a step to a neighbour, in its distance, for an error of the angle."""
+        return sigma * (1 + (slopes**2).sum(axis=0))
+
+    def rise(self, slopes: np.ndarray, axis: int) -> np.ndarray:
+        """Return the rises over the edges along an axis by the mean slope of both ends, in pixels' distances."""
+        step = [np.diff(plane, axis=axis) for plane in (self._x, self._y)]
+        mean = [(_head(s, axis) + _tail(s, axis)) / 2 for s in slopes]
+        return (mean[0] * step[0] + mean[1] * step[1]) / self.spacing
+
+    def turned(self, normal: np.ndarray, slopes: np.ndarray, correction: np.ndarray, part: np.ndarray, solved: np.ndarray) -> np.ndarray:
+        """Return the normals with the slopes of a correction, in pixels' distances, added."""
+        along = [_within(correction, part, axis) for axis in (1, 0)]  # per column, per row
+        (x_col, x_row), (y_col, y_row) = ((g[0], g[1]) for g in self._gradients)
+        determinant = x_col * y_row - x_row * y_col
+        added = self.spacing * np.stack([along[0] * y_row - along[1] * y_col, along[1] * x_col - along[0] * x_row]) / determinant
+        new = slopes + added
+        third = 1 - (new[0] * self._x + new[1] * self._y if self._perspective else np.zeros(solved.shape))
+        turned = np.stack([-new[0], -new[1], third])
+        turned /= np.linalg.norm(turned, axis=0)
+        return np.where(solved & (added != 0).any(axis=0), turned, np.where(solved, normal, 0))
+
+
+def _edges(plane: _Plane, normal: np.ndarray, slopes: np.ndarray, error: np.ndarray, solved: np.ndarray, axis: int) -> Edges:
+    """Return the edges along an axis, 1 for those to the right."""
+    joined = _head(solved, axis) & _tail(solved, axis)
+    turn = np.linalg.norm(np.diff(np.where(solved, normal, 0), axis=1 + axis), axis=0)
+    values = (np.where(joined, plane.rise(slopes, axis), 0), np.maximum(_head(error, axis), _tail(error, axis)), turn, joined)
+    after = [(0, int(axis == 0)), (0, int(axis == 1))]
+    return Edges(*(np.pad(each, after) for each in values))
+
+
+def _head(plane: np.ndarray, axis: int) -> np.ndarray:
+    return plane[:, :-1] if axis == 1 else plane[:-1]
+
+
+def _tail(plane: np.ndarray, axis: int) -> np.ndarray:
+    return plane[:, 1:] if axis == 1 else plane[1:]
+
+
+def _differences(plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return central differences per column and per row."""
+    return tuple(np.gradient(plane, axis=axis) if plane.shape[axis] > 1 else np.ones_like(plane) for axis in (1, 0))  # type: ignore[return-value]
+
+
+def _within(values: np.ndarray, part: np.ndarray, axis: int) -> np.ndarray:
+    """Return differences per pixel along an axis, central where both neighbours are of the pixel's part, one-sided where one is, else 0."""
+    total, count = np.zeros(values.shape), np.zeros(values.shape)
+    step = np.diff(values, axis=axis)
+    same = (_head(part, axis) == _tail(part, axis)) & (_head(part, axis) >= 0)
+    for ends in (_head, _tail):
+        ends(total, axis)[...] += np.where(same, step, 0)
+        ends(count, axis)[...] += same
+    return total / np.maximum(count, 1)
+
+
+def _parts(part: np.ndarray) -> Iterator[tuple[tuple[slice, slice], np.ndarray]]:
+    """Yield the box of each part and [rows, cols] of it where the part is, the part of the smallest number first."""
+    rows, cols = np.nonzero(part >= 0)
+    labels = part[rows, cols]
+    order = np.argsort(labels, kind="stable")
+    bounds = np.flatnonzero(np.diff(labels[order], prepend=-1))
+    for begin, end in zip(bounds, [*bounds[1:], len(order)], strict=True):
+        members = order[begin:end]
+        box = (slice(int(rows[members].min()), int(rows[members].max()) + 1), slice(int(cols[members].min()), int(cols[members].max()) + 1))
+        yield box, part[box] == labels[members[0]]
+
+
+def _check(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray, depth: np.ndarray, depth_sigma: np.ndarray,
+           measured: np.ndarray, *, perspective: bool) -> None:
+    shape = solved.shape
+    if normal.shape != (3, *shape):
+        raise ArrayError(f"normal has shape {normal.shape}, solved {shape}: give [3, rows, cols]")
+    for name, plane in (("normal_sigma", normal_sigma), ("depth", depth), ("depth_sigma", depth_sigma), ("measured", measured)):
+        if plane.shape != shape:
+            raise ArrayError(f"{name} has shape {plane.shape}, solved {shape}: give one value per pixel")
+    if (count := int((solved & measured).sum())) < LEAST_DEPTHS:
+        raise ArrayError(f"{count} pixels have both a depth and a normal: {LEAST_DEPTHS} are needed")
+    if not (np.isfinite(depth[measured]).all() and np.isfinite(normal[:, solved]).all()):
+        raise ArrayError("depth and normals must be finite where they are known")
+    if perspective and (depth[measured] <= 0).any():
+        raise ArrayError("a depth before a perspective camera must be above 0")
+    if not (depth_sigma[measured] > 0).all():
+        raise ArrayError("the standard deviation of a depth must be above 0")

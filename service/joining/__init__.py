@@ -1,0 +1,1 @@
+"""Depth and normals of one view joined into one surface."""
