@@ -61,7 +61,7 @@ def read_mat(path: Path) -> dict[str, Value]:
             if kind == MATRIX:
                 name, value = _matrix(content, order)
                 _keep(found, name, value)
-    except (ValueError, struct.error, zlib.error, StopIteration, LookupError) as error:
+    except (ValueError, struct.error, zlib.error, StopIteration, LookupError, RecursionError, MemoryError) as error:
         raise ManifestError(f"{path}: is a damaged .mat file") from error
     return found
 

@@ -138,7 +138,7 @@ def _pick(path: Path, fields: dict[str, Any], names: tuple[str, ...], width: int
         return None
     try:
         values = np.asarray(fields[name], dtype=np.float64)
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, OverflowError) as error:
         raise ManifestError(f"{path}: {name}: must be numbers, equally many for each light") from error
     values = values.reshape(-1, 1) if values.ndim == 1 or 1 in values.shape else values
     widths = (1, 3) if width is None else (width,)

@@ -12,6 +12,7 @@ from stage import inputs
 from stage.errors import ManifestError
 from stage.mat_file import read_mat_arrays
 from stage.text import name_fault
+from stage.tof.frames import read_array
 
 SUFFIXES = (".csv", ".txt", ".tsv", ".mat", ".npy", ".json", ".lp", ".dat")
 NAME_KEYS = ("image", "file", "filename", "name", "img")
@@ -19,6 +20,8 @@ VECTOR_KEYS = ("direction", "position", "vector", "light", "dir", "pos", "xyz", 
 STRENGTH_KEYS = ("intensity", "irradiance", "strength", "rgb", "colour", "color")
 """Keys and headings of a light, in small letters, in order of preference."""
 LIST_KEYS = ("lights", "directions", "positions", "light_directions", "light_positions")
+MOST = 1e300
+"""Numbers from here on are no lights; JSON has integers of any length."""
 COMMENTS = ("#", "%", "//")
 
 Run = str
@@ -56,11 +59,7 @@ def read_light_table(path: Path, *, variable: str | None = None, run: Run | None
         name, values = _variable(path, read_mat_arrays(path), variable)
         return _numbers(path, values, run, f"{path}: {name}")
     if suffix == ".npy":
-        try:
-            values = np.load(path, allow_pickle=False)
-        except (ValueError, EOFError) as error:
-            raise ManifestError(f"{path}: is no .npy file of numbers") from error
-        return _numbers(path, values, run, str(path))
+        return _numbers(path, read_array(path), run, str(path))
     if suffix == ".json":
         return _from_json(path, variable, run)
     if suffix not in SUFFIXES:
@@ -243,7 +242,8 @@ def _from_json(path: Path, variable: str | None, run: Run | None) -> LightTable:
     entries = list(data.items()) if isinstance(data, dict) else [(None, entry) for entry in data] if isinstance(data, list) else []
     if not entries:
         raise ManifestError(f"{path}: holds no list of lights" + ("" if variable else ": name its key with --variable"))
-    if isinstance(data, list) and all(isinstance(entry, list) and all(isinstance(value, int | float) for value in entry) for entry in data):
+    if isinstance(data, list) and all(isinstance(entry, list) and all(isinstance(value, int | float) and abs(value) < MOST
+                                                                      for value in entry) for entry in data):
         if len({len(entry) for _, entry in entries}) > 1:
             raise ManifestError(f"{path}: its lights have different counts of numbers")
         return _numbers(path, np.array([entry for _, entry in entries], dtype=np.float64), run, str(path))
@@ -273,7 +273,7 @@ def _light(path: Path, index: int, key: str | None, entry: Any) -> tuple[str | N
     strength = [strength] * 3 if isinstance(strength, int | float) else strength
     for what, values in (("direction or position", vector), ("strength", strength)):
         if values is not None and not (isinstance(values, list) and len(values) == 3
-                                       and all(isinstance(value, int | float) and np.isfinite(value) for value in values)):
+                                       and all(isinstance(value, int | float) and abs(value) < MOST for value in values)):
             raise ManifestError(f"{path}: light {index + 1}: its {what} is {str(values)[:60]}: give three numbers")
     name = key or next((small[name] for name in NAME_KEYS if name in small), None)
     return (None if name is None else str(name)), [float(value) for value in vector], strength

@@ -1,16 +1,18 @@
 """Arrays as sensors and programs write them: .npy, .npz, .mat, .json and raw .bin files."""
 
 import json
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
 from stage import inputs
-from stage.errors import ManifestError, storage
+from stage.errors import ManifestError, StorageError, storage
 from stage.importers.layout import natural_order
 from stage.mat_file import read_mat_arrays
 from stage.tof.frames import read_array
@@ -103,9 +105,9 @@ def _npz(path: Path) -> dict[str, np.ndarray]:
     try:
         with storage("read", path), np.load(path, allow_pickle=False) as found:
             return {name: found[name] for name in found.files}
-    except (ValueError, KeyError, EOFError, OSError) as error:
-        if isinstance(error, OSError) and error.errno:
-            raise
+    except StorageError:
+        raise
+    except (ValueError, KeyError, EOFError, OSError, RuntimeError, BadZipFile, zlib.error, MemoryError) as error:
         raise ManifestError(f"{path}: is no whole .npz file of numbers") from error
 
 
@@ -129,7 +131,7 @@ def _at(path: Path, data: Any, place: str) -> np.ndarray:
             raise ManifestError(f"{path}: --variable {place}: there is no {part} in {held}")
     try:
         found = np.array(data, dtype=np.float64)
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, OverflowError) as error:
         held = f": the keys are {', '.join(map(str, data))[:200]}" if isinstance(data, dict) else ""
         where = f" at {place}" if place else ""
         raise ManifestError(f"{path}: holds no array of numbers{where}: say with --variable where it is{held}") from error

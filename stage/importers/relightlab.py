@@ -24,7 +24,7 @@ from stage.text import name_fault
 SUFFIXES = (".relight", ".dome")
 POSITIONS = {"spherical": "positionsSphere", "lights3d": "positions3d"}
 """lightConfiguration of near lights → key of their positions."""
-MM = 0.001
+MM, MOST_MM = 0.001, 1e9
 
 
 def import_folder(source: Path, destination: Path | None) -> Imported:
@@ -146,7 +146,7 @@ def _of_images(path: Path, dome: dict[str, Any], key: str, parts: str, entries: 
 def _vectors(path: Path, field: str, values: list[Any], parts: str) -> np.ndarray:
     try:
         found = np.array([[float(value[part]) for part in parts] for value in values], dtype=np.float64)
-    except (TypeError, KeyError, ValueError) as error:
+    except (TypeError, KeyError, ValueError, OverflowError) as error:
         raise ManifestError(f"{path}: {field}: each must have the numbers {', '.join(parts)}") from error
     if not np.isfinite(found).all():
         raise ManifestError(f"{path}: {field}: holds a number that is not finite")
@@ -155,6 +155,6 @@ def _vectors(path: Path, field: str, values: list[Any], parts: str) -> np.ndarra
 
 def _number(path: Path, dome: dict[str, Any], key: str) -> float:
     value = dome.get(key, 0.0)
-    if not isinstance(value, int | float) or not np.isfinite(value) or value < 0:
+    if not isinstance(value, int | float) or not 0 <= value < MOST_MM:
         raise ManifestError(f"{path}: dome.{key}: is {str(value)[:60]}: must be a number, 0 or above")
     return float(value)

@@ -210,3 +210,14 @@ def test_a_kinect_dump_that_is_none(relit, tmp_path):
     (tmp_path / "b.depth").write_bytes(bytes(100))
     outcome = relit("import", "kinect", tmp_path, "--packet", tmp_path / "b.depth", "--p0", tmp_path / "a.depth")
     assert outcome.code == 2 and "b.depth: has 100 bytes, a depth packet of a Kinect v2 has 2984960" in outcome.err
+
+
+@pytest.mark.parametrize("cut", [3, 40, 200, -30])
+def test_a_damaged_archive_is_named(relit, tmp_path, cut):
+    np.savez(tmp_path / "h.npz", counts=np.ones((4, 4, 9), np.int32))
+    content = (tmp_path / "h.npz").read_bytes()
+    (tmp_path / "h.npz").write_bytes(content[:cut])
+    outcome = relit("import", "histogram", tmp_path, "--bin-s", "1e-10")
+    assert outcome.code == 2 and "h.npz: is no whole .npz file of numbers" in outcome.err and outcome.err.count("\n") == 1
+    outcome = relit("import", "histogram", tmp_path / "none.npz", "--bin-s", "1e-10")
+    assert outcome.code == 2 and "none.npz" in outcome.err and outcome.err.count("\n") == 1

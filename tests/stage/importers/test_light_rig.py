@@ -8,7 +8,7 @@ from scipy.io import savemat
 
 from stage.capture import Capture
 from stage.errors import ManifestError
-from stage.importers import near_lights, relightlab
+from stage.importers import near_lights, olat, relightlab
 from stage.importers.light_rig import read_camera_matrix
 from stage.importers.view import View
 from tests.scenes.captures import files_in, write_image
@@ -130,3 +130,22 @@ def test_faults_of_a_dome(folder, content, words):
     with pytest.raises(ManifestError, match=words) as caught:
         relightlab.import_folder(folder, None)
     assert "\n" not in str(caught.value) and files_in(folder) == before
+
+
+HUGE = "1" + "0" * 400
+
+
+@pytest.mark.parametrize("content", [f"[[1,0,0],[0,1,0],[0,0,{HUGE}],[0,0,1]]", "[[[1]],[2],[3],[4]]", "[null,null,null,null]",
+                                     '{"a": 1}', '{"lights": [{"direction": [1, 2, 1e999]}]}', '{"lights": [{"position": {"x": "1"}}]}',
+                                     '{"S": [[1e999,0,0]], "images": []}', f'{{"S": [[{HUGE},0,0]]}}', "3", '"S"', "[[]]", "{}"])
+def test_numbers_that_are_none_are_one_sentence(folder, content):
+
+
+    (folder / "light.json").write_text(content)
+    for read in (lambda: lights_of(folder), lambda: olat.import_folder(folder, folder, axes=("right", "up", "towards"), to_light=True)):
+        with pytest.raises(ManifestError, match=r"light\.json") as caught:
+            read()
+        assert "\n" not in str(caught.value)
+    (folder / "light.json").rename(folder / "rig.dome")
+    with pytest.raises(ManifestError, match=r"rig\.dome"):
+        relightlab.import_folder(folder, None)
