@@ -10,7 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kernels.structured.binary import decode_binary, decode_gray, decode_xor
+from kernels.structured.binary import FINE_BITS, decode_binary, decode_gray, decode_xor
+from kernels.structured.confirm import AROUND, confirm_stripes
 from kernels.structured.decoded import Decoded
 from kernels.structured.edges import REACH, refine_edges
 from kernels.structured.frames import NoiseModel
@@ -169,18 +170,23 @@ def stripe_decoder(axis: AxisCodes) -> AxisDecoder | None:
         return None
     inverses = code.inverses if isinstance(code, BinaryCode) else None
     edges = axis.refine and inverses is not None and code.name == "gray"
+    confirmed = inverses is not None and len(inverses) >= FINE_BITS
+    halo = (REACH if edges and axis.axis == "row" else 0) + (AROUND if confirmed else 0)
 
     def decode(readings: Readings, noise: NoiseModel) -> Decoded:
         found = _decode_stripes(code, axis, readings, noise)
-        if not edges or inverses is None:
-            return found
-        return refine_edges(found, readings.grey, code.frames, inverses, columns=readings.columns, down=axis.axis == "row",
-                            extent=axis.extent, stripe_px=code.stripe_px, noise=noise)
+        if edges and inverses is not None:
+            found = refine_edges(found, readings.grey, code.frames, inverses, columns=readings.columns, down=axis.axis == "row",
+                                 extent=axis.extent, stripe_px=code.stripe_px, noise=noise)
+        if confirmed and inverses is not None:
+            found = confirm_stripes(found, readings.grey, code.frames, inverses, columns=readings.columns, stripe_px=code.stripe_px,
+                                    noise=noise)
+        return found
 
     made = axis.made_for(code)
     name = (f"{code.name}{' with inverses' if inverses else ''}{', edges refined' if edges else ''}"
             f"{', white and black from phases' if made else ''}")
-    return AxisDecoder(axis.axis, name, _coloured(code), decode, (code,), halo=REACH if edges and axis.axis == "row" else 0, made=made)
+    return AxisDecoder(axis.axis, name, _coloured(code), decode, (code,), halo=halo, made=made)
 
 
 def ramp_decoder(axis: AxisCodes) -> AxisDecoder | None:
