@@ -1,6 +1,6 @@
 """A capture folder: its manifest, and the checks of the files that the manifest names."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,6 +12,8 @@ from stage import images
 from stage import radiance as radiances
 from stage.camera import Camera
 from stage.errors import MOST_FAULTS, ImageError, ManifestError, ResultError, StageError, listed, storage
+from stage.exif import Exposure, exposure_times, unused_exposures
+from stage.images import ImageHeader
 from stage.light import DistantLight, EnvironmentLight, ExtendedLight, FullLight, GradientLight, OffLight, PointLight
 from stage.manifest import FILE_NAME, Frame, Manifest, read_manifest
 from stage.orientation import check_agreement
@@ -58,6 +60,9 @@ class Capture:
     clipped: dict[str, int] = field(default_factory=dict, compare=False)
     """The number of pixels in which a value was set to 0, by the names of the images that were read so far."""
 
+    doubts: tuple[str, ...] = ()
+    """A sentence for each thing that the files say and the manifest does not heed."""
+
     @classmethod
     def open(cls, path: str | Path, pixels: PixelChoices = AS_RECORDED) -> "Capture":
         """Open a capture, and check its manifest and the header of every file.
@@ -79,7 +84,7 @@ class Capture:
             if not (folder / FILE_NAME).exists():
                 raise ManifestError(f"{folder}: holds no {FILE_NAME}: see `relit import` for data laid out another way")
         capture = cls(folder, read_manifest(folder / FILE_NAME), pixels)
-        capture._check_files()
+        capture = capture._exposed(capture._check_files())
         return capture if pixels.crop is None else capture._part(pixels.crop)
 
     @property
@@ -192,9 +197,20 @@ class Capture:
         return replace(self, manifest=self.manifest.model_copy(update={"camera": self.camera.cropped(crop)}),
                        whole=replace(self, pixels=self.pixels._replace(crop=None)))
 
-    def _check_files(self) -> None:
+    def _exposed(self, headers: Mapping[str, ImageHeader]) -> "Capture":
+        """Return the capture with the exposure times that its files hold, where the manifest asks for them."""
+        exposures = {frame.image: headers[frame.image].exposure if frame.image in headers else Exposure() for frame in self.manifest.frames}
+        if self.manifest.exposure_from is not None:
+            times = exposure_times(str(self.folder / FILE_NAME), exposures)
+            frames = tuple(frame.model_copy(update={"exposure_s": times[frame.image]}) for frame in self.manifest.frames)
+            return replace(self, manifest=self.manifest.model_copy(update={"frames": frames, "exposure_from": None}))
+        timed = any(frame.exposure_s is not None for frame in self.manifest.frames)
+        return self if timed else replace(self, doubts=tuple(unused_exposures(exposures)))
+
+    def _check_files(self) -> dict[str, ImageHeader]:
+        """Check the header of every file, and return those of frames by the names of their images."""
         frames = {f"frames[{index}].image" for index in range(len(self.manifest.frames))}
-        orientations: dict[str, int] = {}
+        headers: dict[str, ImageHeader] = {}
         arrays = {f"frames[{index}].image" for index, frame in enumerate(self.manifest.frames) if frame.tof is not None}
 
         def fault(item: tuple[str, str]) -> StageError | None:
@@ -211,7 +227,7 @@ class Capture:
                 else:
                     header = images.check_resolution(path, self.camera.resolution)
                     if field in frames:
-                        orientations[name] = header.orientation
+                        headers[name] = header
             except StageError as error:
                 return error
             return None
@@ -223,5 +239,6 @@ class Capture:
         if errors:
             kind = ImageError if all(isinstance(error, ImageError) for error in errors) else ManifestError
             raise kind(*listed(map(str, errors), f"{self.folder}: has {len(errors) - MOST_FAULTS} faults more"))
-        check_agreement(str(self.folder / FILE_NAME), {frame.image: orientations[frame.image] for frame in self.manifest.frames
-                                                       if frame.image in orientations})
+        check_agreement(str(self.folder / FILE_NAME), {frame.image: headers[frame.image].orientation for frame in self.manifest.frames
+                                                       if frame.image in headers})
+        return headers

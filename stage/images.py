@@ -11,6 +11,7 @@ import OpenImageIO as oiio
 
 from stage import exr, inputs, integrity, jxl
 from stage.errors import ImageError
+from stage.exif import Exposure, sound
 from stage.orientation import TURNS, UPRIGHT, upright, upright_size
 from stage.pixels import Crop
 
@@ -32,6 +33,7 @@ class ImageHeader(NamedTuple):
     stored: int  # the count of all channels in the file, which are decoded together
     integer: bool  # integers, whose largest value a camera writes for everything brighter too
     orientation: int = UPRIGHT  # in which the pixels are recorded, a key of `stage.orientation.TURNS`; they are read upright
+    exposure: Exposure = Exposure()  # as EXIF says
 
 
 class Decoder(Protocol):
@@ -86,7 +88,7 @@ def header_of(source: inputs.Source) -> ImageHeader:
         spec = decoder.spec()
         orientation = _orientation(path, spec)
         return ImageHeader(*upright_size(spec.width, spec.height, orientation), 1 if spec.nchannels < 3 else 3, spec.nchannels,
-                           spec.format.basetype not in FLOATING, orientation)
+                           spec.format.basetype not in FLOATING, orientation, _exposure(spec))
 
 
 def read_pixels(path: str | Path) -> np.ndarray:
@@ -261,6 +263,12 @@ def _orientation(path: Path, spec: oiio.ImageSpec) -> int:
     """Return the orientation in which the pixels of a file are recorded."""
     found = int(spec.get_int_attribute("Orientation", UPRIGHT)) if path.suffix.lower() in ORIENTED_SUFFIXES else UPRIGHT
     return found if found in TURNS else UPRIGHT
+
+
+def _exposure(spec: oiio.ImageSpec) -> Exposure:
+    """Return the EXIF exposure of a file."""
+    names = ("ExposureTime", "FNumber", "Exif:PhotographicSensitivity")
+    return Exposure(*(sound(float(spec.get_float_attribute(name, 0.0))) for name in names))
 
 
 def _check_suffix(path: str | Path) -> None:

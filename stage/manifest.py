@@ -72,6 +72,8 @@ class Manifest(Strict):
     saturation: Positive | None = None
     """The recorded value from which readings are not used; integers count as fractions of full scale. None: the largest integer of
     frames of lights alone."""
+    exposure_from: Literal["exif"] | None = None
+    """`exif` where the exposure time of every frame is the one that EXIF in its file says. None: `exposure_s` of the frames."""
     irradiance_scale: Literal["absolute", "relative"] = "absolute"
     """`relative` where the irradiance (and intensity and radiance) of all lights lacks one common factor, and albedo with it."""
     frames: Annotated[tuple[Frame, ...], Field(min_length=1), FirstFault]
@@ -82,6 +84,8 @@ class Manifest(Strict):
         fault = next(_between_frames([frame.image for frame in self.frames], [frame.exposure_s is not None for frame in self.frames]), None)
         if fault is not None:
             raise ValueError(fault)
+        if self.exposure_from is not None and self.frames[0].exposure_s is not None:
+            raise ValueError("exposure_from: is given beside frames[0].exposure_s: give one of them")
         return self
 
 

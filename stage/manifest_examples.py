@@ -28,7 +28,8 @@ EXAMPLES: dict[type[Strict], tuple[Example, ...]] = {
     Manifest: ({
         "schema": SCHEMA, "name": "statue", "color_space": "srgb_texture", "camera": _ORTHOGRAPHIC,
         "projector": {"resolution": [1280, 800]},
-        "mask": "mask.png", "dark": "dark.png", "flat": "card.png", "saturation": 0.98, "irradiance_scale": "relative",
+        "mask": "mask.png", "dark": "dark.png", "flat": "card.png", "saturation": 0.98, "exposure_from": "exif",
+        "irradiance_scale": "relative",
         "frames": [{"image": "000.png", "light": _DISTANT}],
     },),
     Camera: (

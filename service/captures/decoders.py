@@ -23,6 +23,7 @@ import numpy as np
 from service.captures.processes import bare_environment, limit
 from stage import images, inputs
 from stage.errors import ImageError, StageError
+from stage.exif import Exposure
 from stage.images import ImageHeader
 
 BASE_BYTES, PIXEL_BYTES = 2 << 30, 24
@@ -85,7 +86,8 @@ class Decoders:
         """Return the header of an image; errors are those of `stage.images.read_header`."""
         with self._headers:
             answer, _ = self._ask("header", path)
-        return ImageHeader(*answer["header"])
+        header = ImageHeader(*answer["header"])
+        return header._replace(exposure=Exposure(*header.exposure))
 
     def recorded(self, path: Path) -> np.ndarray:
         """Return the pixels of an image; errors are those of `stage.images.read_recorded`."""

@@ -92,9 +92,9 @@ def inspect(request: InfoRequest, progress: Progress | None = None) -> Inspectio
     if capture.lit_by(PointLight):
         with suppress(StageError):
             facts.append(("near lights", _near_lights(place_lights(capture))))
-    looks = []
+    looks = list(capture.doubts)
     if positions is not None and not faults:
-        looks = findings(capture, positions, {frame.image: level.picked for frame, level in zip(frames, levels, strict=True)
+        looks += findings(capture, positions, {frame.image: level.picked for frame, level in zip(frames, levels, strict=True)
                                               if level.picked is not None})
     return Inspection(facts, faults, looks)
 

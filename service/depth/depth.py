@@ -128,7 +128,7 @@ def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResul
         maps.write(depth_path)
         write_ply(cloud, points_path, comments=tuple(f"{key} {value}" for key, value in sources.items()))
         measured = solution.statistics()
-    solution.warnings += clipping_sentences(capture.clipped)
+    solution.warnings += [*capture.doubts, *clipping_sentences(capture.clipped)]
     points = 0 if cloud is None else len(cloud.points)
     counts = solution.counts(mask)
     write_text(report_path, report(

@@ -115,7 +115,7 @@ def solve(request: SolveRequest, progress: Progress | None = None, *, sharing: S
         solution.warnings.append(_nothing_solved(counts))
     guessed = guessed_part(sigma, estimated)
     solution.warnings += height_warnings(guessed, method)
-    solution.warnings += clipping_sentences(capture.clipped)
+    solution.warnings += [*capture.doubts, *clipping_sentences(capture.clipped)]
     sources = metadata(request, method=method, capture=capture.name, inputs=stack.key, contents=solution.contents)
     maps = _maps(solution, solved, estimated, method, capture, sources)
     timings.stage("write", 1)
