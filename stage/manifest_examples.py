@@ -28,10 +28,12 @@ EXAMPLES: dict[type[Strict], tuple[Example, ...]] = {
     Manifest: ({
         "schema": SCHEMA, "name": "statue", "color_space": "srgb_texture", "camera": _ORTHOGRAPHIC,
         "projector": {"resolution": [1280, 800]},
-        "mask": "mask.png", "dark": "dark.png", "flat": "card.png", "saturation": 0.98, "exposure_from": "exif",
-        "irradiance_scale": "relative",
+        "mask": "mask.png", "dark": "dark.png", "flat": "card.png", "saturation": 0.98, "irradiance_scale": "relative",
         "frames": [{"image": "000.png", "light": _DISTANT}],
-    },),
+    }, {
+        "schema": SCHEMA, "name": "statue", "color_space": "srgb_texture", "camera": _ORTHOGRAPHIC, "exposure_from": "exif",
+        "frames": [{"image": "000.jpg", "light": _DISTANT}],
+    }),
     Camera: (
         {"projection": "perspective", "resolution": [1024, 768], "focal_px": [2100.0, 2100.0], "principal_px": [512.5, 384.5],
          "distortion": _DISTORTION, "surface_z_m": -0.8,
