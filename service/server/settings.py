@@ -170,9 +170,9 @@ class Settings(BaseSettings):
     max_requests: Count = 256
     """Requests of one key that may be under way at one time, event streams among them, in each API process."""
     max_streams: Count = 128
-    """Event streams of one key at most, in each API process."""
+    """Event streams of one key at most, over all API processes."""
     max_project_streams: Count = 512
-    """Event streams of one project at most, in each API process."""
+    """Event streams of one project at most, over all API processes."""
     trusted_proxies: Annotated[tuple[str, ...], NoDecode] = ()
     """Addresses or networks of proxies whose `X-Forwarded-For` is believed, separated by commas; without it that of none."""
     min_free_bytes: Annotated[int, Field(ge=0)] = 1024**3

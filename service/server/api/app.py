@@ -11,9 +11,11 @@ from service.server.api import document, environment_files, events, intakes, job
 from service.server.api.access import RateLimiter, RunningRequests
 from service.server.api.context import Service
 from service.server.api.metrics import Metrics
+from service.server.api.stream_leases import StreamLeases
 from service.server.api.tokens import TokenReader
-from service.server.api.watch import MAX_STREAMS, StreamLimits, Watcher
+from service.server.api.watch import MAX_STREAMS, Watcher
 from service.server.database.engine import Database
+from service.server.database.streams import Limits
 from service.server.jobs.queue import JobQueue
 from service.server.pages import routes as pages
 from service.server.settings import Settings
@@ -36,12 +38,12 @@ def create_app(settings: Settings, database: Database, tracing: TracerProvider |
                   docs_url=None, redoc_url=None,  # these pages would load scripts from elsewhere
                   telemetry=_telemetry(tracing), generate_unique_id_function=lambda route: route.name)
     closing = threading.Event()
-    streams = StreamLimits(min(max_streams, MAX_STREAMS), settings.max_project_streams, settings.max_streams)
     storage = open_storage(settings)
     app.state.service = Service(
         settings, database, JobQueue(database), storage, open_upload_parts(settings, database, storage),
         RateLimiter(settings.requests_per_second, settings.request_burst), RunningRequests(settings.max_requests),
-        draining=threading.Event(), closing=closing, watcher=Watcher(database, closing, streams),
+        draining=threading.Event(), closing=closing, watcher=Watcher(database, closing, most=min(max_streams, MAX_STREAMS)),
+        leases=StreamLeases(database, Limits(settings.max_project_streams, settings.max_streams)),
         tokens=None if settings.oidc_issuer is None else TokenReader(settings))
     app.state.metrics, app.state.readiness = Metrics(settings, database), operations.Readiness()
     problems.install(app)

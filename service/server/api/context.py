@@ -14,6 +14,7 @@ from starlette.concurrency import run_in_threadpool
 from service.requests.keys import Scope
 from service.server.api.access import RateLimiter, RunningRequests, require_local
 from service.server.api.problems import ApiError
+from service.server.api.stream_leases import StreamLeases
 from service.server.api.tokens import PROJECT_HEADER, TokenReader
 from service.server.api.watch import Watcher
 from service.server.database import idempotency, keys, quotas
@@ -45,6 +46,8 @@ class Service(NamedTuple):
     closing: threading.Event
     """Set when the workers have ended: streams of events end, and then the service."""
     watcher: Watcher
+    leases: StreamLeases
+    """Count the streams of events of each key and project."""
     tokens: TokenReader | None = None
     """Reads the tokens of the identity provider; None: there is none."""
 

@@ -8,10 +8,12 @@ from fastapi import APIRouter, Depends, Header, Response
 from fastapi.sse import KEEPALIVE_COMMENT, EventSourceResponse, format_sse_event
 from starlette.types import Receive, Scope, Send
 
-from service.server.api.context import Reader, ServiceDep
+from service.server.api.context import Reader, Service, ServiceDep
 from service.server.api.jobs import get_job
-from service.server.api.problems import responses
-from service.server.api.watch import Change, Listener, Watcher
+from service.server.api.problems import ApiError, responses
+from service.server.api.watch import Change, Listener
+from service.server.database.keys import Caller
+from service.server.database.streams import Holder
 from service.views.jobs import JobView
 from service.views.states import ENDED
 
@@ -36,27 +38,38 @@ async def stream_job(service: ServiceDep, caller: Reader, found: Annotated[JobVi
     known = int(last) if last is not None and int(last) <= found.revision else 0
     if found.state in ENDED and known == found.revision:
         return Response(status_code=204)
-    return _Stream(service.watcher, service.watcher.listen(found.id, after=known, caller=caller), to_its_end=True)
+    return await _stream(service, caller, found.id, after=known, to_its_end=True)
 
 
 @router.get("/v1/events", responses={200: STREAM}, response_class=Response, summary="Watch all jobs of the project")
 async def stream_jobs(service: ServiceDep, caller: Reader) -> Response:
     """Send the jobs that have not ended or ended lately, then every job of the project as it changes; the stream does not end."""
-    return _Stream(service.watcher, service.watcher.listen(caller.project, caller=caller), to_its_end=False)
+    return await _stream(service, caller, caller.project, after=0, to_its_end=False)
+
+
+async def _stream(service: Service, caller: Caller, topic: str, *, after: int, to_its_end: bool) -> "_Stream":
+    holder = await service.leases.take(caller)
+    try:
+        listener = service.watcher.listen(topic, after=after, caller=caller)
+    except ApiError:
+        service.leases.release(holder)
+        raise
+    return _Stream(service, holder, listener, to_its_end=to_its_end)
 
 
 class _Stream(EventSourceResponse):
     """The events of a listener, which is removed when the answer ends, also if it never began."""
 
-    def __init__(self, watcher: Watcher, listener: Listener, *, to_its_end: bool) -> None:
-        self._watcher, self._listener = watcher, listener
+    def __init__(self, service: Service, holder: Holder, listener: Listener, *, to_its_end: bool) -> None:
+        self._service, self._holder, self._listener = service, holder, listener
         super().__init__(_events(listener, to_its_end=to_its_end), headers=HEADERS)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         try:
             await super().__call__(scope, receive, send)
         finally:
-            self._watcher.remove(self._listener)
+            self._service.watcher.remove(self._listener)
+            self._service.leases.release(self._holder)
 
 
 async def _events(listener: Listener, *, to_its_end: bool) -> AsyncIterator[bytes]:

@@ -26,14 +26,6 @@ MAX_PENDING = 2000
 """Changed jobs that a listener has not taken at most: the stream of a slower one ends, and its client connects again."""
 
 
-class StreamLimits(NamedTuple):
-    """Listeners at most."""
-
-    of_process: int = MAX_STREAMS
-    of_project: int = MAX_STREAMS
-    of_key: int = MAX_STREAMS
-
-
 class Change(NamedTuple):
     """A change of a job."""
 
@@ -85,9 +77,9 @@ class Listener:
 class Watcher:
     """Queries the jobs that have listeners. Everything except the queries runs in the event loop."""
 
-    def __init__(self, database: Database, closing: threading.Event, limits: StreamLimits | None = None) -> None:
-        """Args: database: of the service. closing: set when the service ends, and streams with it. limits: of listeners."""
-        self._database, self._closing, self._limits = database, closing, limits or StreamLimits()
+    def __init__(self, database: Database, closing: threading.Event, *, most: int = MAX_STREAMS) -> None:
+        """Args: database: of the service. closing: set when the service ends, and streams with it. most: listeners at most."""
+        self._database, self._closing, self._most = database, closing, most
         self._listeners: dict[str, set[Listener]] = {}
         self._seen: dict[str, tuple[str, int]] = {}  # project and revision of jobs as they were told last
         self._task: asyncio.Task[None] | None = None
@@ -99,21 +91,13 @@ class Watcher:
         Args:
             topic: a job; or a project, for all its jobs that have not ended or ended lately.
             after: revision of the job that the client has.
-            caller: who listens, whose key and project may have so many listeners and no more; None: this program.
+            caller: who listens, whose stream ends with the key; None: this program.
 
         Raises:
             ApiError: there are too many listeners, or the service ends.
         """
-        present = self._all()
-        if self._closing.is_set() or len(present) >= self._limits.of_process:
+        if self._closing.is_set() or len(self._all()) >= self._most:
             raise ApiError("unavailable", "no further stream of events can be opened here now", headers={"Retry-After": str(RETRY_S)})
-        if caller is not None:
-            others = (listener.caller for listener in present if listener.caller is not None)
-            theirs = [other.key for other in others if other.project == caller.project]
-            if theirs.count(caller.key) >= self._limits.of_key:
-                raise _too_many(f"this key has {self._limits.of_key} streams of events")
-            if len(theirs) >= self._limits.of_project:
-                raise _too_many(f"this project has {self._limits.of_project} streams of events")
         listener = Listener(topic, after, caller)
         self._listeners.setdefault(topic, set()).add(listener)
         if self._task is None or self._task.done():
@@ -200,7 +184,3 @@ class Watcher:
 
     def _all(self) -> list[Listener]:
         return [listener for listeners in self._listeners.values() for listener in listeners]
-
-
-def _too_many(sentence: str) -> ApiError:
-    return ApiError("too-many", f"{sentence}, and no more may be open", headers={"Retry-After": str(RETRY_S)})

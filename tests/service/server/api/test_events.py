@@ -18,7 +18,7 @@ from service.server import log
 from service.server.api import events, watch
 from service.server.api.app import create_app
 from service.server.api.problems import ApiError
-from service.server.api.watch import Change, Listener, StreamLimits, Watcher
+from service.server.api.watch import Change, Listener, Watcher
 from service.server.database import jobs, tables
 from service.server.database.engine import Database, connect
 from service.server.jobs.queue import prepare
@@ -299,7 +299,7 @@ def test_there_is_a_limit_and_an_end(database, quick):
     closing = threading.Event()
 
     async def follow() -> None:
-        watcher = Watcher(database, closing, StreamLimits(of_process=2))
+        watcher = Watcher(database, closing, most=2)
         first, _second = watcher.listen(PROJECT), watcher.listen(OTHER)
         with pytest.raises(ApiError) as refused:
             watcher.listen(OTHER)
