@@ -17,6 +17,7 @@ from service.requests.captures import (
     OpencvGrayImport,
     PhaseImport,
     PhaseShift,
+    PhotosImport,
     RelightlabImport,
     RigOptions,
     ScannerImport,
@@ -41,7 +42,7 @@ def register(app: typer.Typer) -> None:
     """Add the commands."""
     layouts = typer.Typer(name="import", no_args_is_help=True,
                           help="Write a capture.json for files that are laid out another way; docs/captures.md shows each layout.")
-    for name, function in (("diligent", _diligent), ("lp", _lp), ("relightlab", _relightlab), ("olat", _olat),
+    for name, function in (("diligent", _diligent), ("lp", _lp), ("relightlab", _relightlab), ("olat", _olat), ("photos", _photos),
                            ("near-lights", _near_lights), ("opencv-gray", _opencv_gray), ("gray", _gray), ("phase", _phase),
                            ("scanner", _scanner), ("tof", _tof), ("histogram", _histogram), ("kinect", _kinect)):
         local_command(layouts, name, function)
@@ -88,6 +89,13 @@ def _olat(request: OlatImport) -> None:
         request.source, request.folder, axes=request.axes, to_light=request.sense is Sense.TO_LIGHT, lights=request.lights,
         variable=request.variable, run=request.lights_in, strengths=request.strengths, selection=_selection(request), view=_view(request),
         color_space=request.color_space))
+
+
+def _photos(request: PhotosImport) -> None:
+    from stage.importers import photos
+
+    _print(photos.import_folder(request.source, request.folder, selection=_selection(request), view=_view(request),
+                                color_space=request.color_space))
 
 
 def _near_lights(request: NearLightsImport) -> None:

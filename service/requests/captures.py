@@ -134,6 +134,11 @@ class OlatImport(CameraOptions, ImageOptions, ImportRequest):
     """File with the strength of each light, one or three numbers; None: that in the table, else equal."""
 
 
+class PhotosImport(CameraOptions, ImageOptions, ImportRequest):
+    """Images under one far light each where nothing says where the lights were: relit solve --lights unknown finds them, or relit
+    calibrate measures them."""
+
+
 class NearLightsImport(CameraOptions, ImageOptions, ImportRequest):
     """Images under one near light each (LEDs), with a .mat or .json file of the rig as near_ps has it: S, Dir, Phi and mu."""
 

@@ -12,7 +12,7 @@ from stage import images
 from stage.calibration.opencv_file import read_matrices
 from stage.errors import ManifestError, StageError, storage
 from stage.importers import kinect
-from stage.importers.layout import color_space_of, image_names, natural_order
+from stage.importers.layout import color_space_of, image_names, image_resolution, natural_order
 from stage.importers.light_rig import CAMERA_MATRIX, read_rig
 from stage.importers.light_table import SUFFIXES as TABLES
 from stage.importers.light_table import LightTable, read_light_table
@@ -32,6 +32,8 @@ SAMPLE = 4000
 STEADY = 0.05
 """How far the sums of images may differ, as a part of their median, that are taken for an image and its inverse, or for steps of a wave."""
 MOST_STEPS = 16
+FEWEST_PHOTOS = 4
+"""Images of one size that may be frames of one capture; fewer are likelier pictures of something."""
 
 
 class Guess(NamedTuple):
@@ -77,7 +79,7 @@ def guess(source: Path) -> Guess:
         raise ManifestError(f"{source}: is a capture already: relit info {shlex.quote(str(source))} looks at it")
     pictures = tuple(name for name in image_names(source) if not words_of(name) & (MASK_WORDS | AMBIENT_WORDS))
     folder = Folder(source, names, pictures)
-    for look in (_diligent, _relightlab, _lp, _kinect, _near_lights, _table, _scanner, _gray, _phase, _correlations, _histograms):
+    for look in (_diligent, _relightlab, _lp, _kinect, _near_lights, _table, _scanner, _gray, _phase, _correlations, _histograms, _photos):
         if (found := look(folder)) is not None:
             return found
     suffixes = Counter(Path(name).suffix.lower() for name in names)
@@ -276,6 +278,20 @@ def _histograms(folder: Folder) -> Guess | None:
                          ["histogram", folder.path, "--arrays", name, "--bin-s", "SECONDS"], folder.path, solve=False,
                          assumed=("SECONDS is the width of a bin", f"the last of the three, {bins}, counts the bins: else --bins first"))
     return None
+
+
+def _photos(folder: Folder) -> Guess | None:
+    if len(folder.pictures) < FEWEST_PHOTOS or not _of_one_size(folder):
+        return None
+    found = _made("images under lights of which nothing says where they were", f"{len(folder.pictures)} images of one size and no table",
+                  ["photos", folder.path], folder.path, solve=True, assumed=(
+                      "each image has one far light of its own, and the camera stood still", *_encoding(folder)))
+    return found._replace(then=found.then + " --lights unknown")
+
+
+def _of_one_size(folder: Folder) -> bool:
+    sizes = {_tried(lambda name=name: image_resolution(folder.path / name)) for name in folder.pictures}  # type: ignore[misc]
+    return len(sizes) == 1 and None not in sizes
 
 
 def _arrays_of(path: Path) -> dict[str, np.ndarray]:

@@ -86,7 +86,7 @@ LAYOUTS = {
     "diligent": (diligent, {}), "lp": (lp, {}), "relightlab": (relightlab, {}), "near-lights": (near_ps, {"Z": "-0.5"}),
     "olat": (table, {}), "scanner": (slstudio, {}), "opencv-gray": (opencv_gray, {}),
     "phase": (phase, {"WIDTHxHEIGHT": "128x96", "P1,P2,P3": "16,18,21"}), "tof": (tof, {"HZ": "60e6"}),
-    "histogram": (spad, {"SECONDS": "1e-9"}), "kinect": (kinect, {}),
+    "photos": (write_images, {}), "histogram": (spad, {"SECONDS": "1e-9"}), "kinect": (kinect, {}),
 }
 
 
@@ -111,7 +111,8 @@ def test_the_printed_command_makes_the_capture(relit, tmp_path, layout):
     assert (outcome.code, outcome.err) == (0, "")
     assert Capture.open(folder).manifest.frames
     then = shlex.split(said["then"])
-    assert then[:3] == ["relit", "solve" if layout in ("diligent", "lp", "relightlab", "near-lights", "olat") else "depth", str(folder)]
+    lit = layout in ("diligent", "lp", "relightlab", "near-lights", "olat", "photos")
+    assert then[:3] == ["relit", "solve" if lit else "depth", str(folder)]
 
 
 def test_what_is_no_layout_and_what_is_a_capture(relit, tmp_path):
@@ -127,6 +128,8 @@ def test_what_is_no_layout_and_what_is_a_capture(relit, tmp_path):
 @pytest.mark.parametrize("name", ["light.mat", "calibration.xml", "lights.csv", "a.npy", "b.dome", "c.npz", "d.json"])
 def test_damaged_files_are_passed_over(relit, tmp_path, name):
     (tmp_path / name).write_bytes(b"\x93NUMPY damaged")
-    write_images(tmp_path)
     outcome = relit("import", "guess", tmp_path)
     assert outcome.code == (0 if name == "b.dome" else 2) and outcome.err.count("\n") == (0 if name == "b.dome" else 1)
+    write_images(tmp_path)
+    outcome = relit("import", "guess", tmp_path)
+    assert outcome.code == 0 and f"relit import {'relightlab' if name == 'b.dome' else 'photos'}" in outcome.out

@@ -108,3 +108,21 @@ def test_a_project_of_relightlab_gives_the_true_normals(relit, tmp_path):
     maps = SurfaceMaps.read(tmp_path / "maps" / "maps.exr")
     assert degrees_between(maps.normal, scene.normal)[scene.mask & maps.mask].max() < 0.1
     assert maps.mask.sum() > 0.9 * scene.mask.sum()
+
+
+def test_images_without_lights_are_solved_as_unknown_and_refused_as_known(relit, tmp_path):
+    """What `--lights unknown` makes of them is judged in tests/service/solve/test_unknown_lights.py."""
+    scene = make_scene(24, 12)
+    for number, image in enumerate(scene.images):
+        write_exr(tmp_path / f"IMG_{number}.exr", image)
+    write_image(tmp_path / "mask.png", scene.mask.astype(np.uint8) * 255)
+    outcome = relit("import", "photos", tmp_path)
+    assert outcome.code == 0 and "12 placeholders, IMG_0.exr to IMG_11.exr" in outcome.out
+    refused = relit("solve", tmp_path, "--out", tmp_path / "maps")
+    assert refused.code == 2 and "placeholder" in refused.err
+    outcome = relit("solve", tmp_path, "--out", tmp_path / "maps", "--lights", "unknown", "--method", "robust")
+    assert (outcome.code, outcome.err) == (0, ""), outcome.err
+    (tmp_path / "few").mkdir()
+    write_exr(tmp_path / "few" / "a.exr", scene.images[0])
+    refused = relit("import", "photos", tmp_path / "few")
+    assert refused.code == 2 and "few: has 1 images: normals need 3 or more" in refused.err

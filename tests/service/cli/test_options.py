@@ -45,6 +45,7 @@ COMMANDS: dict[str, list[type[Options]]] = {
     "bench": [demo.BenchRequest],
     "import diligent": [captures.DiligentImport], "import lp": [captures.LpImport], "import olat": [captures.OlatImport],
     "import opencv-gray": [captures.OpencvGrayImport], "import near-lights": [captures.NearLightsImport],
+    "import photos": [captures.PhotosImport],
     "import relightlab": [captures.RelightlabImport], "import gray": [captures.GrayImport], "import phase": [captures.PhaseImport],
     "import scanner": [captures.ScannerImport], "import tof": [imports_tof.TofImport], "import histogram": [imports_tof.HistogramImport],
     "import kinect": [imports_tof.KinectImport],
