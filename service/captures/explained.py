@@ -1,17 +1,23 @@
-"""What explains the images of a capture better than its manifest, from some pixels of each frame: encoding, brightness, order of lights."""
+"""What the images of a capture contradict in its manifest, from some pixels of each frame: encoding, brightness, order, single lights."""
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
 from stage.capture import Capture
-from stage.consistency.explanations import MIN_LIGHTS, PIXELS, Sample, better_explanation, fit_manifest
+from stage.consistency.explanations import MIN_LIGHTS, PIXELS, Sample, better_explanation, fit_manifest, grey_readings
+from stage.consistency.lambertian import Fit
 from stage.consistency.sentences import explanation_sentence
+from stage.consistency.suspects import Suspect, suspects
 from stage.correction import FULL_SCALE, Correction
 from stage.errors import StageError
 from stage.images import read_header
 from stage.light import DistantLight
 from stage.lighting import has_placeholders
+
+MOST_NAMED = 6
+"""The most lights that a sentence names."""
 
 
 def pixels_to_look_at(capture: Capture) -> np.ndarray | None:
@@ -29,8 +35,16 @@ def pixels_to_look_at(capture: Capture) -> np.ndarray | None:
     return inside[np.unique(np.linspace(0, len(inside) - 1, min(PIXELS, len(inside))).astype(int))]
 
 
-def findings(capture: Capture, positions: np.ndarray, recorded: Mapping[str, np.ndarray]) -> list[str]:
-    """Return a sentence about what explains the images much better than the manifest; none where it explains them well.
+class Findings(NamedTuple):
+    """What the images contradict."""
+
+    sentences: list[str]
+    suspects: dict[str, float]
+    """The misfit of each light that disagrees with the others, by its image, worst first."""
+
+
+def findings(capture: Capture, positions: np.ndarray, recorded: Mapping[str, np.ndarray]) -> Findings:
+    """Return what explains the images much better than the manifest, else the lights that disagree with the others.
 
     Args:
         capture: whose frames are lit by distant lights.
@@ -48,5 +62,23 @@ def findings(capture: Capture, positions: np.ndarray, recorded: Mapping[str, np.
     usable = np.stack([(recorded[frame.image] < np.float32(most)).all(axis=-1) for (frame, _), most in zip(lit, limits, strict=True)])
     sample = Sample(radiance, usable, np.array([light.direction for _, light in lit]), np.array([light.irradiance for _, light in lit]),
                     np.array([frame.exposure_s or 1.0 for frame, _ in lit]), capture.manifest.color_space)
-    found = better_explanation(sample, fit_manifest(sample))
-    return [] if found is None else [explanation_sentence(found, sample)]
+    fit = fit_manifest(sample)
+    if (found := better_explanation(sample, fit)) is not None:
+        return Findings([explanation_sentence(found, sample)], {})
+    off = _suspects(sample, fit)
+    named = {lit[each.light][0].image: each.misfit for each in off}
+    if not named:
+        return Findings([], {})
+    some = ", ".join(f"{image} (by {100 * misfit:.0f} %)" for image, misfit in list(named.items())[:MOST_NAMED])
+    more = f" and {len(named) - MOST_NAMED} more" if len(named) > MOST_NAMED else ""
+    return Findings([f"frames[].light: readings disagree with those under the other lights in {some}{more}: check the direction and "
+                     "irradiance of these lights"], named)
+
+
+def _suspects(sample: Sample, fit: Fit) -> list[Suspect]:
+    """Return the lights that disagree with the others on the pixels that fit best, half of those with readings to spare."""
+    if not fit.spare.any():
+        return []
+    left = np.sqrt((fit.residual**2).sum(axis=0) / np.maximum(fit.lit.sum(axis=0), 1))
+    sure = fit.spare & (left <= np.median(left[fit.spare]))
+    return suspects(grey_readings(sample.radiance, sample.irradiance)[:, sure], sample.directions, fit.normal[:, sure])

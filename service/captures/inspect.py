@@ -2,14 +2,15 @@
 
 import os
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from service.captures.explained import findings, pixels_to_look_at
+from service.captures.explained import Findings, findings, pixels_to_look_at
 from service.reporting.progress import Progress, Timings
 from service.requests.captures import InfoRequest
 from stage import images
@@ -20,12 +21,15 @@ from stage.front_lights import front_lights
 from stage.gradients import gradient_frames, has_gradients
 from stage.light import DistantLight, PointLight
 from stage.lighting import MEASURED_BY, check_solvable, has_placeholders, lights_from_centre
-from stage.manifest import Frame
+from stage.manifest import FILE_NAME, Frame
 from stage.orientation import TURNS, UPRIGHT
 from stage.point_lights import PlacedLights, place_lights
 from stage.projector import Projector
 from stage.radiance import clipping_sentences
 from stage.tof.frames import check_frames, read_frame
+
+SHOWN = ("frames", "lights", "near lights", "not seen")
+"""The facts that stand below a picture."""
 
 
 class Inspection(NamedTuple):
@@ -70,7 +74,6 @@ def inspect(request: InfoRequest, progress: Progress | None = None) -> Inspectio
         for level in pool.map(lambda frame: _level(capture, frame, positions), frames):
             levels.append(level)
             timings.advance(len(levels))
-    timings.close()
     faults = [level.fault for level in levels if level.fault is not None]
     faults += standing_faults(capture, readable=not faults)
     facts = list(_facts(capture))
@@ -92,11 +95,35 @@ def inspect(request: InfoRequest, progress: Progress | None = None) -> Inspectio
     if capture.lit_by(PointLight):
         with suppress(StageError):
             facts.append(("near lights", _near_lights(place_lights(capture))))
-    looks = list(capture.doubts)
+    found = Findings([], {})
     if positions is not None and not faults:
-        looks += findings(capture, positions, {frame.image: level.picked for frame, level in zip(frames, levels, strict=True)
+        found = findings(capture, positions, {frame.image: level.picked for frame, level in zip(frames, levels, strict=True)
                                               if level.picked is not None})
+    looks = [*capture.doubts, *found.sentences]
+    if request.picture is not None:
+        sentences = [*(f"wrong: {fault}" for fault in faults), *(f"finding: {sentence}" for sentence in looks),
+                     *(f"{name}: {value}" for name, value in facts if name in SHOWN)]
+        peak = max((level.peak for level in read), default=1.0)
+        facts.append(("picture", _picture(request.picture, capture, peak, found.suspects, sentences, timings)))
+    timings.close()
     return Inspection(facts, faults, looks)
+
+
+def _picture(path: Path, capture: Capture, peak: float, suspects: Mapping[str, float], sentences: list[str], timings: Timings) -> str:
+    """Write the picture of a capture, and return its path, or why there is none."""
+    from service.captures.frame_views import view_capture
+    from service.captures.picture import write_picture
+    from service.light.outputs import check_outputs
+
+    check_outputs([(f"--picture {path}", path)], (capture.folder / FILE_NAME, *(capture.file(name) for _, name in capture.files())))
+    timings.stage("picture", len(capture.manifest.frames))
+    try:
+        view = view_capture(capture, peak, timings.advance)
+    except StageError as error:  # of the mask, or the dark, flat or ambient frames
+        timings.advance(len(capture.manifest.frames))
+        return f"none: {error}"
+    write_picture(path, capture, view, suspects, sentences)
+    return str(path)
 
 
 def standing_faults(capture: Capture, *, readable: bool = True) -> list[str]:

@@ -283,8 +283,17 @@ class ScannerImport(ImportRequest):
     """Names of the frames, taken in natural order; None: every image but the mask."""
 
 
+def _png(path: Path | None) -> Path | None:
+    if path is not None and path.suffix.lower() != ".png":
+        raise ValueError(f"{path} is no PNG: end the name in .png")
+    return path
+
+
 class InfoRequest(PixelOptions):
     """Say what a capture holds, and what is wrong with it."""
 
     capture: Annotated[Path, Role.INPUT, CAPTURE]
     """Folder with a capture.json."""
+    picture: Annotated[Path | None, AfterValidator(_png), Role.RUN] = None
+    """PNG that shows what was understood: the lights on the dome with their images, those that disagree with the others in red, the mask,
+    and how bright the readings are."""

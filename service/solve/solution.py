@@ -16,6 +16,7 @@ from service.reporting.progress import Timings
 from service.solve.sharing import SharedSolve
 from stage.camera import Camera
 from stage.colour import GREY_WEIGHTS
+from stage.consistency.suspects import LEAST_PIXELS, suspects
 from stage.stack import Stack
 
 LOOSE_CONFIDENCE = 1.0 / (1.0 + 5.0)
@@ -25,16 +26,6 @@ PIXELS_AT_ONCE = 1 << 16
 
 SUSPECT_PIXELS = 512
 """Number of pixels, spread over the object, on which the lights are compared."""
-LEAST_COSINE = 0.25
-"""Least n·l of a reading that is compared: below it, shadows and grazing reflection cause misfits that are not the light's fault."""
-LEAST_TOWARDS = 0.4
-"""Least cosine between a light and the view axis at which the light is judged: lights further round are mirrored by rims and hidden from
-most pixels."""
-LEAST_PIXELS = 20
-"""Least number of these pixels that must see a light for it to be judged."""
-SUSPECT_OFF, SUSPECT_TIMES = 0.1, 4.0
-"""A light is suspect when its median relative misfit is above the first number, and above the second number times the median of all
-lights."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +58,7 @@ class SuspectLight(NamedTuple):
 
     image: str
     misfit: float
-    """Median over pixels of |reading / (level · n·l) - 1|, the level being the pixel's own median over its lights."""
+    """That of `stage.consistency.suspects`."""
 
 
 @dataclass
@@ -181,14 +172,5 @@ def suspect_lights(solution: Solution, stack: Stack, lights: Lights) -> list[Sus
     factor = np.divide(weights * lights.scale[:count, None], lights.irradiance[:count],
                        out=np.zeros((count, 3)), where=lights.irradiance[:count] > 0)
     readings = np.einsum("lc,clp->lp", factor, values[:, :count].astype(np.float64))
-    cosine = lights.direction[:count].astype(np.float64) @ solution.normal[:, chosen]
-    seen = (cosine > LEAST_COSINE) & (lights.direction[:count, 2:] > LEAST_TOWARDS)
-    ratio = np.where(seen, readings / np.maximum(cosine, LEAST_COSINE), np.nan)
-    lit = seen.any(axis=0)
-    judged = np.flatnonzero(seen[:, lit].sum(axis=1) >= LEAST_PIXELS)
-    if not len(judged):
-        return []
-    level = np.maximum(np.nanmedian(ratio[:, lit], axis=0), 1e-12)
-    misfit = np.nanmedian(np.abs(ratio[np.ix_(judged, lit)] / level - 1), axis=1)
-    limit = max(SUSPECT_OFF, SUSPECT_TIMES * float(np.median(misfit)))
-    return [SuspectLight(stack.frames[judged[i]], round(float(misfit[i]), 3)) for i in np.argsort(-misfit) if misfit[i] > limit]
+    found = suspects(readings, lights.direction[:count].astype(np.float64), solution.normal[:, chosen])
+    return [SuspectLight(stack.frames[each.light], round(each.misfit, 3)) for each in found]
