@@ -21,14 +21,15 @@ from kernels.structured.phase import WrappedPhase, add_frame, weights, write_pha
 from kernels.structured.response import modulated_wave, phase_table, straighten
 
 
-def decode_modulated(frames: Band, numbers: Sequence[Sequence[int]], *, period_px: float, response: Sequence[float] | None = None,
-                     noise: NoiseModel) -> WrappedPhase:
+def decode_modulated(frames: Band, numbers: Sequence[Sequence[int]], *, period_px: float, offset_rad: float = 0.0,
+                     response: Sequence[float] | None = None, noise: NoiseModel) -> WrappedPhase:
     """Decode the wrapped phase of one period from direct light alone.
 
     Args:
         frames: linear images of one channel.
         numbers: [steps][carrier steps] frames; both even over a turn.
         period_px: of the phase.
+        offset_rad: phase of the wave at place 0 in the first step.
         response: the projector's light at even levels from 0 to 1, rising; None: linear.
         noise: of a reading.
 
@@ -49,7 +50,8 @@ def decode_modulated(frames: Band, numbers: Sequence[Sequence[int]], *, period_p
     order = [number for row in numbers for number in row]
     require_frames(frames, *order)
     device = frames.device
-    outer, inner = (weights(np.arange(n) / n, period_px) for n in (steps, carriers))
+    shifts = np.arange(steps) / steps - offset_rad / (2 * np.pi)
+    outer, inner = weights(shifts, period_px), weights(np.arange(carriers) / carriers, period_px)
     rows = [unwritten(frames.pixel_count, dtype, device, rows=1) for dtype in (*[wp.float32] * 4, wp.uint8)]
     devices.launch(_modulated_kernel(devices.pack_width(device)), frames.packs,
                    [frames.values, frames.saturated, saturation_masks(frames, order), wp.array(numbers, dtype=wp.int32, device=device),
@@ -57,7 +59,7 @@ def decode_modulated(frames: Band, numbers: Sequence[Sequence[int]], *, period_p
                     noise.read**2, noise.gain], [as_packs(row, device) for row in rows], device=device)
     if response is not None:
         wave = modulated_wave(response, inner)
-        bend = phase_table((wave - wave.min()) / np.ptp(wave), outer, np.arange(steps) / steps, period_px)
+        bend = phase_table((wave - wave.min()) / np.ptp(wave), outer, shifts, period_px)
         straighten(rows, [bend], [0.0], device=device)
     return WrappedPhase(*rows, (float(period_px),), frames.pixel_count, device)
 

@@ -127,7 +127,8 @@ def modulated_decoder(axis: AxisCodes) -> AxisDecoder | None:
         plain = None
 
     def wrapped(readings: Readings, noise: NoiseModel) -> WrappedPhase:
-        parts = [decode_modulated(readings.grey, wave.frames, period_px=wave.period_px, response=axis.projector.response, noise=noise)
+        parts = [decode_modulated(readings.grey, wave.frames, period_px=wave.period_px, offset_rad=wave.offset_rad,
+                                  response=axis.projector.response, noise=noise)
                  for wave in waves]
         if plain is not None:
             parts.append(_wrapped_phase(plain, axis, readings, noise))

@@ -237,7 +237,7 @@ class PhaseImport(StackOptions, RigOptions, ImportRequest):
     shift: PhaseShift = PhaseShift.MINUS
     """Direction in which the waves move from step to step."""
     offset_deg: Finite = 0.0
-    """Phase at `origin` in the first step, degrees: a whole number of steps. Waves that are sines have -90."""
+    """Phase at `origin` in the first step, degrees. Waves that are sines have -90."""
     origin: WaveOrigin = WaveOrigin.EDGE
     """Where the waves have column 0."""
     gray_images: Annotated[str | None, Spelling(metavar="GLOB")] = None

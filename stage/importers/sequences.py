@@ -6,6 +6,7 @@ The orders of SLStudio are those of its codecs (Wilm et al., "SLStudio: Open-sou
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
+from math import radians
 from typing import Any
 
 from stage.errors import ManifestError
@@ -101,7 +102,7 @@ class PhaseStack:
         """Return the patterns in the order of the images.
 
         Raises:
-            ManifestError: the order is none, or the offset is no whole number of steps.
+            ManifestError: the order is none, or the periods of the rows are of another count.
         """
         if sorted(self.order) != sorted(LOOPS):
             raise ManifestError(f"--order {','.join(self.order)}: give {', '.join(LOOPS)}, each once, what changes slowest first")
@@ -109,15 +110,16 @@ class PhaseStack:
         if len(rows) != len(self.periods_px):
             raise ManifestError(f"--row-periods: has {len(rows)} periods, --periods {len(self.periods_px)}")
         shift = self.offset_deg * self.steps / 360
-        if abs(shift - round(shift)) > 1e-6:
-            raise ManifestError(f"--offset-deg {self.offset_deg:g}: must be a whole number of steps of {360 / self.steps:g} degrees")
+        whole = abs(shift - round(shift)) < 1e-6
+        offset = {} if whole else {"offset_rad": radians(self.offset_deg)}
         choices: dict[str, Sequence[Any]] = {"axis": self.axes, "period": range(len(self.periods_px)), "step": range(self.steps)}
         found = []
         for values in product(*(choices[name] for name in self.order)):
             at = dict(zip(self.order, values, strict=True))
             period = (self.periods_px if at["axis"] == "column" else rows)[at["period"]]
-            step = (at["step"] if self.advancing else -at["step"]) - round(shift)
-            found.append({"code": "phase", "axis": at["axis"], "period_px": period, "step": step % self.steps, "steps": self.steps})
+            step = (at["step"] if self.advancing else -at["step"]) - (round(shift) if whole else 0)
+            found.append({"code": "phase", "axis": at["axis"], "period_px": period, "step": step % self.steps, "steps": self.steps,
+                          **offset})
         return found
 
 

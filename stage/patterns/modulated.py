@@ -11,13 +11,13 @@ import numpy as np
 from pydantic import model_validator
 
 from stage.errors import ManifestError
-from stage.model import Positive, Strict
+from stage.model import Finite, Positive, Strict
 from stage.patterns.base import Axis, Index, Steps, check_agreement, check_index
-from stage.patterns.phase import raised_cosine
+from stage.patterns.phase import TURN, raised_cosine
 
 
 class ModulatedPattern(Strict):
-    """A phase frame under a fine carrier across it: (1 + cos(2πu/P - 2πi/N))/2 · (1 + cos(2πv/Q - 2πj/M))/2.
+    """A phase frame under a fine carrier across it: (1 + cos(2πu/P + offset - 2πi/N))/2 · (1 + cos(2πv/Q - 2πj/M))/2.
 
     Chen, Seidel and Lensch, "Modulated phase-shifting for 3D scanning", CVPR 2008: what varies with the carrier is direct light.
     """
@@ -38,6 +38,8 @@ class ModulatedPattern(Strict):
     """The shift j of the carrier in this frame, from 0 to `carrier_steps` - 1."""
     carrier_steps: Steps
     """The number M of shifts of the carrier."""
+    offset_rad: Finite = 0.0
+    """The phase of the wave at the outer edge of the first pixel in step 0; the same in every frame of a period. A sine has -π/2."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -47,7 +49,7 @@ class ModulatedPattern(Strict):
 
     def level(self, u: np.ndarray, v: np.ndarray, extent: int) -> np.ndarray:
         """Return 0 to 1 at each place."""
-        return raised_cosine(u / self.period_px - self.step / self.steps) * raised_cosine(
+        return raised_cosine(u / self.period_px - self.step / self.steps + self.offset_rad / TURN) * raised_cosine(
             v / self.carrier_period_px - self.carrier_step / self.carrier_steps)
 
     def describe(self) -> str:
@@ -63,6 +65,8 @@ class ModulatedCode(NamedTuple):
     period_px: float
     frames: tuple[tuple[int, ...], ...]
     """[steps][carrier steps]"""
+    offset_rad: float = 0.0
+    """The phase of the wave at the outer edge of the first pixel in step 0."""
 
     @property
     def name(self) -> str:
@@ -77,14 +81,14 @@ class ModulatedCode(NamedTuple):
             ManifestError: a frame is missing, or the frames disagree about their steps or carrier.
         """
         one = next(iter(frames))
-        check_agreement(frames, ("steps", "carrier_steps", "carrier_period_px"))
+        check_agreement(frames, ("steps", "carrier_steps", "carrier_period_px", "offset_rad"))
         grid = {(pattern.step, pattern.carrier_step): index for pattern, index in frames.items()}
         for step, carrier in product(range(one.steps), range(one.carrier_steps)):
             if (step, carrier) not in grid:
                 raise ManifestError(f"the {one.axis} modulated phase of {one.period_px:g} px has no frame of step {step}, "
                                     f"carrier step {carrier}: project it")
         return cls(one.axis, one.period_px, tuple(tuple(grid[step, carrier] for carrier in range(one.carrier_steps))
-                                                  for step in range(one.steps)))
+                                                  for step in range(one.steps)), one.offset_rad)
 
     def lacks(self, white: int | None, black: int | None) -> str | None:
         """Return None: phases need no reference frames."""

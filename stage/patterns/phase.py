@@ -11,9 +11,10 @@ from typing import Literal, NamedTuple, Self
 import numpy as np
 from pydantic import model_validator
 
-from stage.model import Positive, Strict
+from stage.model import Finite, Positive, Strict
 from stage.patterns.base import Axis, Index, Steps, check_index
 
+TURN = 2 * np.pi
 FULL_STEPS = 3
 """Number of frames of different shifts that determine a phase without other periods."""
 JOINT = (((16.0, 18.0, 21.0), 1008), ((16.0, 18.0, 22.0), 1280), ((16.0, 22.0, 26.0), 2048), ((16.0, 17.0, 19.0), 4096))
@@ -26,7 +27,7 @@ MICRO_TRIALS = 400
 
 
 class PhasePattern(Strict):
-    """One shift of a wave along the axis: (1 + cos(2πu/P - 2πi/N))/2."""
+    """One shift of a wave along the axis: (1 + cos(2πu/P + offset - 2πi/N))/2."""
 
     code: Literal["phase"]
     """The code."""
@@ -38,6 +39,8 @@ class PhasePattern(Strict):
     """The shift i of this frame, from 0 to `steps` - 1."""
     steps: Steps
     """The number N of shifts of a whole turn. Micro phase shifting shows only the first step of some periods."""
+    offset_rad: Finite = 0.0
+    """The phase of the wave at the outer edge of the first pixel in step 0. A sine has -π/2."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -46,11 +49,17 @@ class PhasePattern(Strict):
 
     def level(self, u: np.ndarray, v: np.ndarray, extent: int) -> np.ndarray:
         """Return 0 to 1 at each place."""
-        return raised_cosine(u / self.period_px - self.step / self.steps)
+        return raised_cosine(u / self.period_px - self.shift)
+
+    @property
+    def shift(self) -> float:
+        """Return the shift δ of the wave cos(2πu/P - 2πδ) in turns."""
+        return self.step / self.steps - self.offset_rad / TURN
 
     def describe(self) -> str:
         """Return a few words that name the frame."""
-        return f"{self.axis} phase of {self.period_px:g} px, step {self.step} of {self.steps}"
+        offset = f", offset {self.offset_rad:g} rad" if self.offset_rad else ""
+        return f"{self.axis} phase of {self.period_px:g} px, step {self.step} of {self.steps}{offset}"
 
 
 class PhaseCode(NamedTuple):
@@ -61,7 +70,7 @@ class PhaseCode(NamedTuple):
     periods_px: tuple[float, ...]
     """The period of each frame."""
     shifts: tuple[float, ...]
-    """The shift of each frame in turns: step / steps."""
+    """The shift of each frame in turns: step / steps, without the offset of its set."""
 
     @property
     def name(self) -> str:
@@ -78,7 +87,7 @@ class PhaseCode(NamedTuple):
     def collect(cls, frames: Mapping[PhasePattern, int]) -> "PhaseCode":
         """List the frames of one axis with their periods and shifts."""
         return cls(next(iter(frames)).axis, tuple(frames.values()), tuple(pattern.period_px for pattern in frames),
-                   tuple(pattern.step / pattern.steps for pattern in frames))
+                   tuple(pattern.shift for pattern in frames))
 
     def lacks(self, white: int | None, black: int | None) -> str | None:
         """Return None: phases need no reference frames."""

@@ -84,11 +84,13 @@ def shown(pattern: dict[str, Any], uv: np.ndarray) -> np.ndarray:
             return 1.0 - bit if pattern.get("inverse") else bit.astype(float)
         case "modulated":
             across = uv[..., 1 if pattern["axis"] == "column" else 0]
-            wave = (1 + np.cos(2 * np.pi * (u / pattern["period_px"] - pattern["step"] / pattern["steps"]))) / 2
+            turns = u / pattern["period_px"] - pattern["step"] / pattern["steps"]
+            wave = (1 + np.cos(2 * np.pi * turns + pattern.get("offset_rad", 0))) / 2
             carrier = across / pattern["carrier_period_px"] - pattern["carrier_step"] / pattern["carrier_steps"]
             return wave * (1 + np.cos(2 * np.pi * carrier)) / 2
         case "phase":
-            return (1 + np.cos(2 * np.pi * (u / pattern["period_px"] - pattern["step"] / pattern["steps"]))) / 2
+            turns = u / pattern["period_px"] - pattern["step"] / pattern["steps"]
+            return (1 + np.cos(2 * np.pi * turns + pattern.get("offset_rad", 0))) / 2
     raise ValueError(pattern["code"])
 
 

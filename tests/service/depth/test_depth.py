@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from stage import exr
 from stage.depth_maps import DepthMaps
 from stage.ply import read_ply
 from tests.reference import projector as reference
@@ -144,6 +145,24 @@ def test_captures_without_white_and_black(relit, tmp_path, patterns, name, worst
     assert report["found"]["codes"]["column"] == name
     assert maps.mask[LIT].mean() > 0.93
     assert np.abs(maps.projector_u - SCENE.uv[..., 0])[maps.mask].max() <= worst_px
+
+
+def test_waves_with_an_offset(relit, tmp_path):
+    """The projector shows waves of another phase at its first column: sines, and waves that were generated from pixel centres."""
+    frames = [*phase_patterns("column", 16), *phase_patterns("column", 128), *modulated(128)]
+    write_patterns(tmp_path, SCENE, [{**frame, "offset_rad": -0.7 * np.pi} for frame in frames], projector=None)
+    data = json.loads((tmp_path / "capture.json").read_text())
+    found = []
+    for code in ("phase", "modulated"):
+        edit_manifest(tmp_path, projector={"resolution": [PROJECTOR.width, PROJECTOR.height]},
+                      frames=[frame for frame in data["frames"] if frame["pattern"]["code"] == code])
+        outcome = relit("depth", tmp_path, "--out", tmp_path / "out")
+        assert (outcome.code, outcome.err) == (0, "")
+        channels, _ = exr.read(tmp_path / "out" / "depth.exr")
+        mask = channels["mask.Y"] > 0.5
+        assert mask[LIT].mean() > 0.9
+        found.append(np.abs(channels["projector.U"] - SCENE.uv[..., 0])[mask].max())
+    assert max(found) < 0.05  # 16 bits; an offset that is not heeded is 5.6 and 45 columns
 
 
 def test_a_bent_wave_still_tells_white_and_black(relit, tmp_path):
