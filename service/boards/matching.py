@@ -7,7 +7,7 @@ import numpy as np
 from service.boards.height_files import Nominal
 from stage.board.grid import HeightMap, HeightPatch
 from stage.board.overlap import Evidence, Overlap, measure_overlap
-from stage.board.stitching import MILLI, SEARCH_SIGMA, SHIFT_SIGMA_PX, Stitched
+from stage.board.stitching import MILLI, SEARCH_SIGMA, SHIFT_SIGMA_PX, TURN_SIGMA_DEGREES, Stitched
 from stage.errors import BoardError
 
 LEAST_SHARE = 0.5
@@ -70,9 +70,12 @@ def match(measured: HeightMap, stitched: Stitched, nominal: Nominal, *, placemen
         away = float(np.hypot(*(several[1].difference[:2] - several[0].difference[:2])))
         raise BoardError(f"{nominal.path}: places of the board that differ by {away:.3g} m fit alike, because it repeats itself: give "
                          "--placement-m if its fixture is more exact")
-    lateral = found.information[:2, :2]
-    shift = np.sqrt(np.diag(np.linalg.inv(lateral))) if found.evidence is Evidence.SHIFT else np.array([sigma, sigma])
-    return Match(-found.difference, found.evidence, found.correlation, (float(shift[0]), float(shift[1])), warnings)
+    turn = np.radians(TURN_SIGMA_DEGREES) * stitched.length_m
+    prior = np.diag([sigma**-2, sigma**-2, turn**-2, 0, 0, 0])  # what is not measured lies where the stage says
+    covariance = np.linalg.inv(found.information + prior)
+    motion = -covariance @ found.information @ found.difference
+    shift = np.sqrt(np.diag(covariance))
+    return Match(motion, found.evidence, found.correlation, (float(shift[0]), float(shift[1])), warnings)
 
 
 def check_size(measured: HeightMap, stitched: Stitched, nominal: Nominal) -> None:

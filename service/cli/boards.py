@@ -1,10 +1,11 @@
-"""relit inspect-board: tiles of a board to one height map, and what is wrong with it."""
+"""relit inspect-board and gauge-board: what is wrong with a board, and how well inspections repeat."""
 
 import typer
 
 from service.cli.printing import print_warnings
 from service.cli.progress import ProgressBar
 from service.cli.request_commands import local_command
+from service.requests.gauge_board import GaugeBoardRequest
 from service.requests.inspect_board import InspectBoardRequest
 
 MOST_PRINTED = 10
@@ -14,6 +15,7 @@ MOST_PRINTED = 10
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     local_command(app, "inspect-board", _inspect_board)
+    local_command(app, "gauge-board", _gauge_board)
 
 
 def _inspect_board(request: InspectBoardRequest) -> None:
@@ -42,3 +44,20 @@ def _inspect_board(request: InspectBoardRequest) -> None:
     print_warnings(result.warnings)
     if result.verdict not in (None, "pass"):
         raise typer.Exit(1)
+
+
+def _gauge_board(request: GaugeBoardRequest) -> None:
+    from service.boards.gauge_board import gauge_board
+
+    with ProgressBar() as bar:
+        result = gauge_board(request, bar)
+    study = result.study
+    print(f"table    {result.table_path}")
+    print(f"report   {result.report_path}")
+    print(f"repeat   {1e6 * study.repeatability:.4g} µm, {study.degrees_of_freedom} degrees of freedom; the inspections state "
+          f"{1e6 * result.noise_m:.4g} µm")
+    print("operator not measured: there is one" if study.reproducibility is None else f"operator {1e6 * study.reproducibility:.4g} µm")
+    print(f"gauge    {1e6 * study.gauge:.4g} µm: {study.gauge_percent:.3g} % of the variation of {result.parts} parts, "
+          f"{result.tolerance_percent:.3g} % of the narrowest tolerance (6 σ)")
+    if result.left_out:
+        print(f"left out {len(result.left_out)} regions that not every run measured: {', '.join(result.left_out[:5])}")

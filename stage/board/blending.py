@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stage.board.grid import BoardGrid, HeightMap, HeightPatch, gradients
+from stage.board.grid import BoardGrid, HeightMap, HeightPatch, shift_error
 
 LEAST_SHIFT_PX = 0.02
 """The least standard deviation of a tile's shift, pixels: what interpolation leaves of the shift that the overlaps measure."""
@@ -73,8 +73,6 @@ class Blender:
         plane = np.einsum("...i,ij,...j->...", basis, errors.covariance[3:, 3:], basis)
         to_middle = np.array([[1, 0, -basis[..., 2].mean()], [0, 1, basis[..., 1].mean()]])
         shift = np.diag(to_middle @ errors.covariance[:3, :3] @ to_middle.T) / self.grid.pixel_m**2 + LEAST_SHIFT_PX**2
-        across, down, gain = gradients(patch.height)
-        noise = 4 * float(gain) * float(np.sqrt(np.nanmedian(patch.variance)))
-        clear = np.hypot(across, down) > noise
-        slopes = np.where(clear, shift[0] * across**2 + shift[1] * down**2, 0)
-        return np.asarray(np.sqrt(np.maximum(plane, 0) + errors.shared_m**2 + slopes))
+        right, up = (float(value) for value in np.sqrt(shift))
+        slopes = shift_error(patch.height, (right, up), float(np.sqrt(np.nanmedian(patch.variance))))
+        return np.asarray(np.sqrt(np.maximum(plane, 0) + errors.shared_m**2 + slopes**2))

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stage.board.grid import BEND_NOISE, BLOCK_PX, BoardGrid, HeightMap, bends, blocks_of, gradients, robust_sigma
+from stage.board.grid import BEND_NOISE, BLOCK_PX, BoardGrid, HeightMap, bends, blocks_of, robust_sigma, shift_error
 from stage.board.overlap import TUKEY
 
 BEND_SHARE = 1 / 3
@@ -65,11 +65,9 @@ def compare(measured: HeightMap, nominal: HeightMap, *, shift_sigma_m: tuple[flo
     whole = np.where(np.isfinite(nominal.height), nominal.height, measured.height - offset)
     seen = np.where(np.isfinite(measured.height), measured.height - offset, whole)
     bend = np.maximum(*(np.where(np.isfinite(found := bends(heights)), found, 0) for heights in (whole, seen)))
-    across, down, gain = gradients((whole + seen) / 2)
-    clear = np.hypot(across, down) > CLEAR_BEND * gain * noise
-    shift = [max(sigma / measured.grid.pixel_m, MATCH_PX) for sigma in shift_sigma_m]
+    right, up = (max(sigma / measured.grid.pixel_m, MATCH_PX) for sigma in shift_sigma_m)
     edges = np.where(bend > CLEAR_BEND * BEND_NOISE * noise, BEND_SHARE * bend, 0) ** 2
-    edges += np.where(clear, (shift[0] * across) ** 2 + (shift[1] * down) ** 2, 0)
+    edges += shift_error((whole + seen) / 2, (right, up), noise) ** 2
     systematic = np.sqrt(measured.systematic**2 + nominal.systematic**2 + edges)
     return Deviation(measured.grid, deviation, variance, np.where(known, systematic, np.nan))
 

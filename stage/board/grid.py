@@ -134,6 +134,49 @@ def bends(height: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(larger), larger, np.inf)
 
 
+def shift_error(height: np.ndarray, sigma_px: tuple[float, float], noise: float) -> np.ndarray:
+    """Return σ of the error of heights that an uncertain shift makes, [rows, cols] in the unit of the heights.
+
+    Slope times σ, where a slope is clear; of a shift that is uncertain by more than WIDE_PX, half of what heights differ by within 2.5 σ
+    of a pixel, less what noise alone differs by.
+
+    Args:
+        height: [rows, cols], NaN where not measured.
+        sigma_px: standard deviation of the shift along columns and rows, pixels.
+        noise: standard deviation of the noise of a pixel.
+    """
+    across, down, gain = gradients(height)
+    clear = np.hypot(across, down) > CLEAR_SLOPE * float(gain) * noise
+    error = np.where(clear, np.hypot(sigma_px[0] * across, sigma_px[1] * down), 0.0)
+    if max(sigma_px) > WIDE_PX:
+        reach = [int(np.ceil(2.5 * sigma)) for sigma in sigma_px]
+        high, low = (_extreme(height, reach, sign) for sign in (1, -1))
+        error = np.maximum(error, np.clip(np.nan_to_num(high + low) - NOISE_SPAN * noise, 0, None) / 2)
+    return np.asarray(error)
+
+
+def _extreme(height: np.ndarray, reach: list[int], sign: int) -> np.ndarray:
+    """Return the largest value of sign · height within `reach` columns and rows of each pixel."""
+    out = sign * height
+    for axis, steps in ((1, reach[0]), (0, reach[1])):
+        done = 0
+        while done < steps:  # windows grow by at most their own size
+            step = min(done + 1, steps - done)
+            pad = [(0, 0), (0, 0)]
+            pad[axis] = (step, step)
+            padded = np.pad(out, pad, constant_values=np.nan)
+            length = out.shape[axis]
+            out = np.fmax(out, np.fmax(padded.take(range(length), axis), padded.take(range(2 * step, length + 2 * step), axis)))
+            done += step
+    return np.asarray(out)
+
+
+WIDE_PX = 0.4
+"""A shift that is more uncertain than this is beyond what the slope at a pixel tells."""
+CLEAR_SLOPE = 4.0
+"""A slope counts where it is this many times its noise."""
+NOISE_SPAN = 8.0
+"""What noise differs by within a window of some hundred pixels, in σ."""
 BEND_NOISE = float(np.sqrt(6 * 6 / 16))
 """The factor by which `bends` multiplies the standard deviation of independent noise along either direction."""
 

@@ -120,7 +120,7 @@ def _apart(values: np.ndarray, pair: tuple[int, int], overlap: Overlap) -> float
         return 0.0
     error = values[pair[0]] - values[pair[1]] - overlap.difference
     lateral = overlap.information[LATERAL, LATERAL]
-    along = np.linalg.solve(information + 1e-12 * np.trace(information) * np.eye(2), lateral[:2] @ error[LATERAL])
+    along = np.linalg.pinv(information, rcond=1e-9, hermitian=True) @ lateral[:2] @ error[LATERAL]
     return float(np.hypot(*along))
 
 

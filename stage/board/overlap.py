@@ -30,6 +30,8 @@ LEAST_CORRELATION, LEAST_MISFIT = 0.6, 1.6
 """Two patches do not show the same surface if the correlation of their reliefs at the best shift is below this, and the root mean square of
 the residuals is above this many times the noise."""
 CAPPED = 5.0
+CLEAR_DIRECTION = 10.0
+"""Information about a shift counts in directions where it is this many times what the noise of slopes alone gives."""
 LEAST_CLEAR = 150
 """The fewest pixels with a clear slope that measure a shift."""
 MOST_CANDIDATES = 8
@@ -118,10 +120,10 @@ def measure_overlap(first: HeightPatch, second: HeightPatch, grid: BoardGrid, *,
     order = np.argsort(costs)
     best = fits[order[0]][1]
     rivals = [fits[k][1] for k in order[1:] if costs[k] - costs[order[0]] < LEAST_LOG_ODDS
-              and np.hypot(*(fits[k][1].difference[:2] - best.difference[:2])) > 1.5 * grid.pixel_m]
+              and np.hypot(*(best.measured @ (fits[k][1].difference[:2] - best.difference[:2]))) > 1.5 * grid.pixel_m]
     if best.misfit > LEAST_MISFIT and (best.relief_differs or (best.relief and best.correlation < LEAST_CORRELATION)):
         evidence = Evidence.DIFFERS
-    elif best.informative < LEAST_CLEAR:
+    elif not best.measured.any():
         evidence = Evidence.FLAT
     else:
         evidence = Evidence.REPEATS if rivals else Evidence.SHIFT
@@ -156,7 +158,7 @@ class _Fit(NamedTuple):
     difference: np.ndarray
     information: np.ndarray
     pixels: int
-    informative: int
+    measured: np.ndarray  # [2, 2] projection onto the directions, x and y, in which slopes measure the shift
     correlation: float
     relief: bool
     relief_differs: bool
@@ -240,8 +242,12 @@ def _fit(first: HeightPatch, second: HeightPatch, common: _Common, shift: tuple[
     field[both] = np.where(kept, left, np.nan)
     shared = _shared(field, float(np.median(variance)) * max(scale, 1.0) ** 2)
     information = (rows * weight) @ rows.T / max(scale, 1.0) ** 2
-    if int(clear.sum()) < LEAST_CLEAR:
-        information[LATERAL], information[:, LATERAL] = 0, 0
+    spurious = float(weight[clear].sum()) * float(gain) ** 2 * float(np.median(variance)) / 4 / grid.pixel_m**2 / max(scale, 1.0) ** 2
+    measured = _directions(information, spurious if int(clear.sum()) >= LEAST_CLEAR else np.inf)
+    keep = np.eye(UNKNOWNS)
+    keep[:2, :2] = measured
+    keep[2, 2] = float(measured.any())
+    information = keep @ information @ keep
     moved = solution.copy()  # the whole shift belongs to the difference: first − second = fitted − the shift of the second
     moved[0] -= shift[1] * grid.pixel_m
     moved[1] += shift[0] * grid.pixel_m
@@ -253,9 +259,20 @@ def _fit(first: HeightPatch, second: HeightPatch, common: _Common, shift: tuple[
     product = deviation[0] * deviation[1]
     correlation = float(np.mean((clipped[0] - clipped[0].mean()) * (clipped[1] - clipped[1].mean())) / product) if product > 0 else 0.0
     reliefs = [value > SIGNAL * noise for value, noise in zip(spread, noises, strict=True)]
-    return _Fit(moved, information, residual.size, int(clear.sum()), correlation, all(reliefs),
+    return _Fit(moved, information, residual.size, measured, correlation, all(reliefs),
                 reliefs[0] != reliefs[1] and max(spread) > 2 * SIGNAL * max(noises), scale, shared, robust_sigma(left),
                 float(np.sqrt(np.mean(np.square(np.clip(left / noise, -CAPPED, CAPPED))))))
+
+
+def _directions(information: np.ndarray, spurious: float) -> np.ndarray:
+    """Return the projection onto the directions in which a shift is measured, [2, 2].
+
+    Along a straight edge nothing measures the shift (the aperture problem), though the noise of slopes makes it look so: `spurious` is the
+    information that this noise gives in every direction.
+    """
+    values, vectors = np.linalg.eigh(information[:2, :2])
+    kept = vectors[:, values > CLEAR_DIRECTION * spurious]
+    return np.asarray(kept @ kept.T)
 
 
 def robust_range(values: np.ndarray) -> float:

@@ -9,6 +9,7 @@ from stage.model import Count, Finite, FirstFault, Fraction, NotNegative, Positi
 
 SCAN_FILE, SCAN_SCHEMA = "board.json", "relit.board-scan/1"
 DESIGN_SCHEMA = "relit.board-design/1"
+STUDY_SCHEMA = "relit.gauge-study/1"
 Place = tuple[Finite, Finite]
 """x and y in metres, board frame."""
 
@@ -104,4 +105,30 @@ class BoardDesign(Strict):
         twice = next((name for at, name in enumerate(sorted(names)[1:]) if name == sorted(names)[at]), None)
         if twice is not None:
             raise ValueError(f"regions: the name {twice} is given twice")
+        return self
+
+
+class GaugeRun(Strict):
+    """One inspection of one board by one operator."""
+
+    result: Beneath
+    """The result folder of relit inspect-board with a design that has regions, relative to the file."""
+    board: Text
+    operator: Text = "operator"
+    """Who, or which station, measured."""
+
+
+class GaugeRuns(Strict):
+    """The inspections of a gauge study (schema relit.gauge-study/1): every operator measures every board as often."""
+
+    schema_: Literal["relit.gauge-study/1"] = Field(alias="schema")
+    name: Text
+    runs: Annotated[tuple[GaugeRun, ...], Field(min_length=2), FirstFault]
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        results = [run.result for run in self.runs]
+        twice = next((result for at, result in enumerate(results) if result in results[:at]), None)
+        if twice is not None:
+            raise ValueError(f"runs: the result {twice} is given twice")
         return self

@@ -91,3 +91,20 @@ def write_scan(folder: Path, views: list[View], *, sigma: float = SIGMA, pixel: 
         tiles.append({"path": f"tile_{number:02d}", "position_m": list(view.told)})
     (folder / "board.json").write_text(json.dumps({"schema": "relit.board-scan/1", "name": "board", "tiles": tiles, **changes}))
     return folder
+
+
+def components(width: float, height: float, *, seed: int = 0, count: int = 14, tall: float = 3e-4) -> Heights:
+    """Boxes with vertical walls, turned at random, on a flat board with a thin trace; between them there is no relief."""
+    rng = np.random.default_rng(seed)
+    boxes = [(rng.uniform(-width / 2, width / 2), rng.uniform(-height / 2, height / 2), rng.uniform(1e-4, 3e-4), rng.uniform(5e-5, 2e-4),
+              rng.uniform(0, np.pi), tall * rng.uniform(0.3, 1)) for _ in range(count)]
+
+    def at(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        out = 1e-5 * (np.abs(y - 0.2 * x) < 4e-5)
+        for px, py, half_x, half_y, turn, top in boxes:
+            u = np.cos(turn) * (x - px) + np.sin(turn) * (y - py)
+            v = np.cos(turn) * (y - py) - np.sin(turn) * (x - px)
+            out = np.where((np.abs(u) < half_x) & (np.abs(v) < half_y), top, out)
+        return out
+
+    return at

@@ -138,3 +138,17 @@ def test_a_tile_far_from_where_the_stage_says_is_found_and_told():
     shift = stitched.motions.values[:, :2] - np.array([view.true[:2] for view in views])
     assert np.ptp(shift, axis=0) == pytest.approx([3.1e-4, 1.7e-4], abs=0.3 * PIXEL)
     assert any("tile t1 lies" in sentence and "from where the stage says" in sentence for sentence in stitched.warnings)
+
+
+def test_along_a_straight_edge_no_shift_is_measured():
+    """The aperture problem: a step across all tiles measures their shift across it, and along it they lie where the stage says."""
+    views = views_of(lambda x, y: 5e-5 / (1 + np.exp(-(y - 0.3 * x) / 1.5e-5)), stage=PIXEL)
+    stitched = stitch(points(views))
+    across = np.array([-0.3, 1.0]) / np.hypot(0.3, 1.0)
+    shift = stitched.motions.values[:, :2] - np.array([view.true[:2] for view in views])
+    pair = (shift[0] - shift[1]) @ across  # the step crosses the overlap of tiles 0 and 1, or of 2 and 3
+    other = (shift[2] - shift[3]) @ across
+    assert min(abs(pair), abs(other)) < 0.1 * PIXEL
+    for tile in range(len(views)):
+        sigma = np.sqrt(np.linalg.eigvalsh(stitched.motions.of_tile(tile)[:2, :2])[-1])
+        assert sigma > 2 * PIXEL  # along the step the stage's 5 pixels remain

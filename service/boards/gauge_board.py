@@ -1,0 +1,141 @@
+"""Gauge studies of board inspections: the values that inspections measured at the same regions → gauge.csv and report.json."""
+
+import csv
+import io
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from service.reporting.progress import Progress, Timings
+from service.reporting.provenance import REPORT_FILE, report
+from service.requests.gauge_board import GaugeBoardRequest
+from stage import inputs
+from stage.board.gauge import GaugeStudy, gauge_study
+from stage.board.records import STUDY_SCHEMA, GaugeRuns
+from stage.errors import BoardError, ManifestError
+from stage.files import write_text
+from stage.fingerprint import digest
+from stage.records import read_record
+
+GAUGE_FILE = "gauge.csv"
+METHOD = "gauge R&R (ANOVA)"
+COLUMNS = ("board", "region", "mean_m", "repeatability_m", "sigma_m", "values")
+
+
+class GaugeBoardResult(NamedTuple):
+    """The files and numbers of a study that was written."""
+
+    table_path: Path
+    report_path: Path
+    study: GaugeStudy
+    tolerance_percent: float
+    """Six standard deviations of the gauge over the narrowest tolerance of a region, per cent."""
+    parts: int
+    left_out: tuple[str, ...]
+    """Regions of boards that not every run measured."""
+    noise_m: float
+    """Root mean square of the σ that the inspections state: what the repeatability should be if only noise and placing matter."""
+
+
+class _Part(NamedTuple):
+    """One region of one board in all runs."""
+
+    board: str
+    region: str
+    values: np.ndarray  # [operators, trials] metres
+    sigmas: np.ndarray  # [operators, trials] metres
+    width_m: float
+
+
+def gauge_board(request: GaugeBoardRequest, progress: Progress | None = None) -> GaugeBoardResult:
+    """Divide the variance of what several inspections measured into that of the gauge and that of the boards.
+
+    A part of the study is a region of a board; its values are the deviations from the nominal height.
+
+    Args:
+        request: the study and where to put the result.
+        progress: told of every stage.
+
+    Raises:
+        StageError: the study or a result cannot be used, or runs are missing; nothing is written.
+        StorageError: the results cannot be written.
+    """
+    timings = Timings(progress)
+    runs = read_record(request.study, GaugeRuns, STUDY_SCHEMA)
+    timings.stage("read", len(runs.runs))
+    found: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for number, run in enumerate(runs.runs, start=1):
+        found.setdefault((run.board, run.operator), []).append(_regions(request.study.parent / run.result / REPORT_FILE))
+        timings.advance(number)
+    parts, left_out = _parts(request.study, found)
+    try:
+        study = gauge_study(np.array([part.values for part in parts]))
+    except ValueError as error:
+        raise BoardError(f"{request.study}: {error}") from error
+    width = min(part.width_m for part in parts)
+    noise = float(np.sqrt(np.mean([np.square(part.sigmas).mean() for part in parts])))
+    percent = study.tolerance_percent(width)
+    timings.stage("write", 1)
+    table_path, report_path = request.out / GAUGE_FILE, request.out / REPORT_FILE
+    write_text(table_path, _table(parts))
+    write_text(report_path, report(
+        request, inputs={"study": str(request.study), "name": runs.name, "content": digest(request.study)}, method=METHOD,
+        study={"parts": len(parts), "operators": len({operator for _, operator in found}), "trials": parts[0].values.shape[1],
+               **{f"{name}_m": None if value is None else float(f"{value:.6g}") for name, value in study._asdict().items()
+                  if name != "degrees_of_freedom"},
+               "degrees_of_freedom": study.degrees_of_freedom, "gauge_percent": float(f"{study.gauge_percent:.4g}"),
+               "tolerance_percent": float(f"{percent:.4g}"), "narrowest_tolerance_m": width, "distinct_categories": study.categories,
+               "stated_sigma_m": float(f"{noise:.4g}"), "left_out": left_out},
+        timings_s=timings.close()))
+    return GaugeBoardResult(table_path, report_path, study, percent, len(parts), tuple(left_out), noise)
+
+
+def _regions(path: Path) -> dict[str, Any]:
+    """Return the regions of an inspection's report by name."""
+    try:
+        content = json.loads(inputs.read_bytes(path))
+        return {region["name"]: region for region in content["regions"]}
+    except (ValueError, KeyError, TypeError) as error:
+        raise ManifestError(f"{path}: is no report of relit inspect-board with a design") from error
+
+
+def _parts(path: Path, found: dict[tuple[str, str], list[dict[str, Any]]]) -> tuple[list[_Part], list[str]]:
+    """Return the regions of boards that every run measured, and the names of the others."""
+    boards = list(dict.fromkeys(board for board, _ in found))
+    operators = list(dict.fromkeys(operator for _, operator in found))
+    trials = len(next(iter(found.values())))
+    for board in boards:
+        for operator in operators:
+            count = len(found.get((board, operator), []))
+            if count != trials:
+                raise BoardError(f"{path}: runs: {operator} measured {board} {count} times, others measured boards {trials} times: give "
+                                 "every operator every board as often")
+    parts, left_out = [], []
+    for board in boards:
+        cells = [found[board, operator] for operator in operators]
+        for name in dict.fromkeys(name for cell in cells for run in cell for name in run):
+            entries = [[run.get(name, {}) for run in cell] for cell in cells]
+            if any(entry.get("deviation_m") is None for cell in entries for entry in cell):
+                left_out.append(f"{board} {name}")
+                continue
+            low, high = entries[0][0]["tolerance_m"]
+            values, sigmas = (np.array([[entry[key] for entry in cell] for cell in entries], dtype=np.float64)
+                              for key in ("deviation_m", "sigma_m"))
+            parts.append(_Part(board, name, values, sigmas, high - low))
+    if not parts:
+        raise BoardError(f"{path}: no region was measured in every run")
+    return parts, left_out
+
+
+def _table(parts: list[_Part]) -> str:
+    out = io.StringIO()
+    table = csv.DictWriter(out, COLUMNS, lineterminator="\n")
+    table.writeheader()
+    for part in parts:
+        table.writerow({"board": part.board, "region": part.region, "mean_m": f"{part.values.mean():.6g}",
+                        "repeatability_m": f"{np.sqrt(part.values.var(axis=1, ddof=1).mean()) if part.values.shape[1] > 1 else 0:.6g}",
+                        "sigma_m": f"{np.sqrt(np.square(part.sigmas).mean()):.6g}",
+                        "values": " ".join(f"{value:.6g}" for value in part.values.ravel())})
+    return out.getvalue()

@@ -1,0 +1,82 @@
+"""relit gauge-board: variances that were put into the reports of inspections come back, and what is missing is one sentence."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+REGIONS, BOARDS, OPERATORS, TRIALS = 6, 5, 3, 4
+
+
+def write_study(folder: Path, *, seed: int = 0) -> Path:
+    """Reports with 0.5 µm repeatability, 0.3 µm between operators and 4 µm between parts."""
+    rng = np.random.default_rng(seed)
+    truth, bias = 4e-6 * rng.standard_normal((BOARDS, REGIONS)), 3e-7 * np.array([-1.0, 0.0, 1.0])
+    runs = []
+    for board in range(BOARDS):
+        for operator in range(OPERATORS):
+            for trial in range(TRIALS):
+                name = f"run_{board}_{operator}_{trial}"
+                regions = [{"name": f"pad {k}", "verdict": "pass", "tolerance_m": [-2e-5, 3e-5], "sigma_m": 5e-7,
+                            "deviation_m": truth[board, k] + bias[operator] + 5e-7 * rng.standard_normal()} for k in range(REGIONS)]
+                (folder / name).mkdir(parents=True)
+                (folder / name / "report.json").write_text(json.dumps({"schema": "relit.report/1", "regions": regions}))
+                runs.append({"result": name, "board": f"board {board}", "operator": f"station {operator}"})
+    (folder / "study.json").write_text(json.dumps({"schema": "relit.gauge-study/1", "name": "pads", "runs": runs}))
+    return folder / "study.json"
+
+
+def change(study: Path, edit) -> None:
+    data = json.loads(study.read_text())
+    edit(data)
+    study.write_text(json.dumps(data))
+
+
+def test_the_variances_come_back(relit, tmp_path):
+    """270 degrees of freedom give the repeatability to 4 %; three operators give their σ of 0.3 µm to a factor, 30 parts theirs to 13 %."""
+    outcome = relit("gauge-board", write_study(tmp_path), "--out", tmp_path / "out")
+    assert (outcome.code, outcome.err) == (0, "")
+    study = json.loads((tmp_path / "out" / "report.json").read_text())["study"]
+    assert (study["parts"], study["operators"], study["trials"]) == (30, 3, 4)
+    assert study["repeatability_m"] == pytest.approx(5e-7, rel=0.13)  # 3 σ
+    assert study["reproducibility_m"] == pytest.approx(3e-7, rel=0.4)
+    assert study["part_m"] == pytest.approx(4e-6, rel=0.4)
+    assert study["gauge_m"] ** 2 == pytest.approx(study["repeatability_m"] ** 2 + study["reproducibility_m"] ** 2, rel=1e-4)
+    assert study["tolerance_percent"] == pytest.approx(100 * 6 * study["gauge_m"] / 5e-5, rel=1e-3)
+    with open(tmp_path / "out" / "gauge.csv", newline="") as table:
+        rows = list(csv.DictReader(table))
+    assert len(rows) == 30 and len(rows[0]["values"].split()) == OPERATORS * TRIALS
+
+
+def test_regions_that_a_run_did_not_measure_are_named(relit, tmp_path):
+    study = write_study(tmp_path)
+    path = tmp_path / "run_2_1_0" / "report.json"
+    report = json.loads(path.read_text())
+    report["regions"][3]["deviation_m"] = None
+    path.write_text(json.dumps(report))
+    outcome = relit("gauge-board", study, "--out", tmp_path / "out")
+    assert outcome.code == 0 and "left out 1 regions that not every run measured: board 2 pad 3" in outcome.out
+
+
+@pytest.mark.parametrize(("edit", "words"), [
+    (lambda data: data["runs"].pop(), "station 2 measured board 4 3 times, others measured boards 4 times"),
+    (lambda data: data["runs"][1].update(result="run_0_0_0"), "runs: the result run_0_0_0 is given twice"),
+    (lambda data: data["runs"][0].update(result="../x"), "../x leads out of the folder of the file"),
+    (lambda data: data["runs"][0].update(result="nothing"), "nothing/report.json"),
+    (lambda data: data.update(runs=[run for run in data["runs"] if run["result"].endswith("_0")]), "30 parts and 1 trials"),
+])
+def test_what_is_no_study_is_one_sentence(relit, tmp_path, edit, words):
+    study = write_study(tmp_path)
+    change(study, edit)
+    outcome = relit("gauge-board", study, "--out", tmp_path / "out")
+    assert outcome.code == 2 and words in outcome.err and outcome.err.count("\n") == 1, outcome.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_report_without_regions_is_named(relit, tmp_path):
+    study = write_study(tmp_path)
+    (tmp_path / "run_0_0_0" / "report.json").write_text("{}")
+    outcome = relit("gauge-board", study, "--out", tmp_path / "out")
+    assert outcome.code == 2 and "run_0_0_0/report.json: is no report of relit inspect-board with a design" in outcome.err
