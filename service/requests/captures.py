@@ -8,7 +8,7 @@ from pydantic import AfterValidator, Field, model_validator
 from service.requests.base import CAPTURE, Choice, Commas, Options, PixelOptions, Role, Spelling, WidthHeight
 from service.requests.patterns import PatternAxis
 from stage.colour_spaces import ColorSpaceName
-from stage.model import Count, Finite, Positive, Resolution
+from stage.model import Count, Finite, Line, Positive, Resolution
 
 
 class ImportRequest(Options):
@@ -77,11 +77,11 @@ class CameraOptions(Options):
 class ImageOptions(Options):
     """Which images of the folder are frames, and how they are encoded."""
 
-    images: Annotated[str | None, Spelling(metavar="GLOB")] = None
+    images: Annotated[Line | None, Spelling(metavar="GLOB")] = None
     """Names of the frames, such as 'img_*.png'; None: every image but the mask and the one of ambient light."""
-    mask: Annotated[str | None, Spelling(metavar="NAME")] = None
+    mask: Annotated[Line | None, Spelling(metavar="NAME")] = None
     """Image of the mask; None: the one with the word mask in its name, if there is one."""
-    ambient: Annotated[str | None, Spelling(metavar="NAME")] = None
+    ambient: Annotated[Line | None, Spelling(metavar="NAME")] = None
     """Image without any of the lights, which is subtracted; None: the one with the word ambient in its name, if there is one."""
     color_space: ColorSpaceName | None = None
     """Colour space of the images; None: sRGB for 8-bit images, scene-linear for others."""
@@ -126,7 +126,7 @@ class OlatImport(CameraOptions, ImageOptions, ImportRequest):
     lights: Annotated[Path | None, Role.INPUT] = None
     """Table of the lights: rows of an image name or none, three numbers, and one or three of the strength or none; None: the only table in
     SRC."""
-    variable: str | None = None
+    variable: Line | None = None
     """Variable of a .mat table, or key of a .json; None: the only one that can be meant."""
     lights_in: Run | None = None
     """What a light is in a table of numbers; None: as its shape says."""
@@ -172,13 +172,13 @@ class RigOptions(Options):
 class StackOptions(Options):
     """Which images of the folder are frames of patterns."""
 
-    images: Annotated[str | None, Spelling(metavar="GLOB")] = None
+    images: Annotated[Line | None, Spelling(metavar="GLOB")] = None
     """Names of the frames, such as 'phase_*.png', taken in natural order; None: every image that is not named otherwise."""
-    mask: Annotated[str | None, Spelling(metavar="NAME")] = None
+    mask: Annotated[Line | None, Spelling(metavar="NAME")] = None
     """Image of the mask; None: the one with the word mask in its name, if there is one."""
-    white: Annotated[str | None, Spelling(metavar="NAME")] = None
+    white: Annotated[Line | None, Spelling(metavar="NAME")] = None
     """Image under a white projection; None: the one with the word white in its name, if there is one."""
-    black: Annotated[str | None, Spelling(metavar="NAME")] = None
+    black: Annotated[Line | None, Spelling(metavar="NAME")] = None
     """Image under a black projection; None: the one with the word black in its name, if there is one."""
     color_space: ColorSpaceName = "lin_rec709_scene"
     """Colour space of the images: those of most scanners are linear."""
@@ -195,7 +195,7 @@ class Inverses(Choice):
 class GrayImport(StackOptions, RigOptions, ImportRequest):
     """Images of a Gray code in any order."""
 
-    sequence: Annotated[tuple[str, ...], Commas, Spelling(metavar="PART,PART,…")] = ("columns", "rows", "white", "black")
+    sequence: Annotated[tuple[Line, ...], Commas, Spelling(metavar="PART,PART,…")] = ("columns", "rows", "white", "black")
     """What follows what in the images: columns, rows, white and black, each once or not at all."""
     inverses: Inverses = Inverses.PAIRS
     """Where the inverse images are."""
@@ -232,7 +232,7 @@ class PhaseImport(StackOptions, RigOptions, ImportRequest):
     """The projector coordinate that is coded; both: columns first."""
     row_periods: Annotated[tuple[Positive, ...] | None, Commas, Spelling(metavar="P,P,…")] = None
     """Periods along the rows; None: as `periods`."""
-    order: Annotated[tuple[str, ...], Commas, Spelling(metavar="WORD,WORD,WORD")] = ("axis", "period", "step")
+    order: Annotated[tuple[Line, ...], Commas, Spelling(metavar="WORD,WORD,WORD")] = ("axis", "period", "step")
     """What changes from image to image, slowest first: axis, period and step."""
     shift: PhaseShift = PhaseShift.MINUS
     """Direction in which the waves move from step to step."""
@@ -240,7 +240,7 @@ class PhaseImport(StackOptions, RigOptions, ImportRequest):
     """Phase at `origin` in the first step, degrees. Waves that are sines have -90."""
     origin: WaveOrigin = WaveOrigin.EDGE
     """Where the waves have column 0."""
-    gray_images: Annotated[str | None, Spelling(metavar="GLOB")] = None
+    gray_images: Annotated[Line | None, Spelling(metavar="GLOB")] = None
     """Names of the images of a Gray code that numbers the periods."""
     gray_stripe: Positive | None = None
     """Width of the finest stripe of the Gray code in projector pixels: half a period, or less."""
@@ -279,7 +279,7 @@ class ScannerImport(ImportRequest):
     """The projector coordinate that is coded."""
     projector: Annotated[Resolution | None, WidthHeight, Spelling(metavar="1280x800")] = None
     """Width and height of the projector in pixels; None: as the calibration says."""
-    images: Annotated[str | None, Spelling(metavar="GLOB")] = None
+    images: Annotated[Line | None, Spelling(metavar="GLOB")] = None
     """Names of the frames, taken in natural order; None: every image but the mask."""
 
 

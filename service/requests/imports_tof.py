@@ -5,7 +5,7 @@ from typing import Annotated
 
 from service.requests.base import Choice, Commas, Role, Spelling, WidthHeight
 from service.requests.captures import CameraOptions, ImportRequest
-from stage.model import Count, Finite, Positive, Resolution
+from stage.model import Count, Finite, Line, Positive, Resolution
 
 
 class Signal(Choice):
@@ -32,13 +32,13 @@ class End(Choice):
 class ArrayOptions(CameraOptions):
     """Which files hold arrays, and what the files do not say."""
 
-    arrays: Annotated[str | None, Spelling(metavar="GLOB")] = None
+    arrays: Annotated[Line | None, Spelling(metavar="GLOB")] = None
     """Names of the files, such as 'phase*.npy', taken in natural order; None: every .npy, .npz, .mat, .json, .bin, .raw and .dat file."""
-    variable: Annotated[tuple[str, ...], Commas, Spelling(metavar="NAME,…")] = ()
+    variable: Annotated[tuple[Line, ...], Commas, Spelling(metavar="NAME,…")] = ()
     """Variables of .mat and .npz files, or places in .json files such as 0.hists; None: the only array."""
     size: Annotated[Resolution | None, WidthHeight, Spelling(metavar="320x240")] = None
     """Width and height of an image in raw files (.bin, .raw, .dat), or of histograms that are in one row."""
-    dtype: str | None = None
+    dtype: Line | None = None
     """Type of the numbers in raw files: uint16, int16, float32 and so on, with > in front for the other order of bytes."""
     source_m: Annotated[tuple[Finite, Finite, Finite] | None, Commas, Spelling(metavar="X,Y,Z")] = None
     """Place of the light source in the camera frame, metres; None: at the camera."""
