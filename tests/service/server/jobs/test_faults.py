@@ -47,7 +47,7 @@ def test_restarts_of_postgresql_cost_nothing(tmp_path, server_postgres, on_postg
 @pytest.mark.long
 @pytest.mark.parametrize("how", ["stopped", "in a step"])
 def test_a_worker_that_hangs_is_killed_and_its_job_taken_over(tmp_path, undisturbed, how):
-    with harness(tmp_path, stall_s=3, takeover_s=0.5) as made:
+    with harness(tmp_path, stall_s=10, takeover_s=0.5) as made:  # a worker on a loaded machine takes some seconds to begin
         made.start(**({} if how == "stopped" else {"PYTHONPATH": SABOTAGE, "SABOTAGE": "hang"}))
         made.ready(1)
         job = begin(made, undisturbed)

@@ -57,6 +57,13 @@ def page(browser, server: Server):
     assert errors == []
 
 
+@pytest.fixture
+def small_page(page):
+    """A page of 640 × 480 px, for views in 3D: the processor renders every pixel of them again and again."""
+    page.set_viewport_size({"width": 640, "height": 480})
+    return page
+
+
 class Solved:
     """A capture that is registered, solved and prepared, and its pages."""
 

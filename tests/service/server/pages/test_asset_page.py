@@ -17,6 +17,11 @@ patch of light on one side of a ball gives a tenth or more."""
 PICTURE = """() => { const { rows, cols, pixels } = globalThis.asset.picture(); return { rows, cols, pixels: Array.from(pixels) }; }"""
 
 
+@pytest.fixture
+def page(small_page):
+    return small_page
+
+
 @pytest.fixture(scope="module")
 def exported(server, solved) -> dict[str, str]:
     """The jobs that exported the solved capture, by format."""

@@ -16,6 +16,11 @@ DIGITS = 2e-3
 PICTURE = "() => Array.from(globalThis.cloud.picture().pixels)"
 
 
+@pytest.fixture
+def page(small_page):
+    return small_page
+
+
 @pytest.fixture(scope="module")
 def depth(server) -> tuple[str, str]:
     """The job of a depth, and that of its view."""
