@@ -57,6 +57,12 @@ def read_image(path: Path) -> None:
         check_radiance(path, images.read_pixels(path).astype(np.float32))
 
 
+def _avif(path: Path, codes: np.ndarray) -> Path:
+    """Write 8-bit codes as AVIF."""
+    cv2.imwrite(str(path), codes)
+    return path
+
+
 def read_exr(path: Path) -> None:
     """Read an EXR as an image, and its channels as maps are read."""
     header = exr.read_header(path)
@@ -134,6 +140,7 @@ def kinds(folder: Path) -> list[Kind]:
         Kind("TIFF, float", write_image(folder / "b.tif", noise.astype(np.float32)), read_image),
         Kind("HDR", write_image(folder / "a.hdr", rng.random((SIDE, SIDE, 3)).astype(np.float32)), read_image),
         Kind("DPX", write_image(folder / "a.dpx", noise), read_image),
+        Kind("AVIF", _avif(folder / "a.avif", noise), read_image),
         Kind("TGA", write_image(folder / "a.tga", noise), read_image),
         Kind("BMP", write_image(folder / "a.bmp", noise), read_image),
         Kind("JPEG XL", write_image(folder / "a.jxl", noise), read_image),

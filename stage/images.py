@@ -1,4 +1,4 @@
-"""Reading of images (EXR, PNG, TIFF, HDR, JPEG, JPEG XL, DPX, TGA, BMP), the header first and then the recorded pixels; writing of PNG."""
+"""Reading of images (EXR, PNG, TIFF, HDR, JPEG, JPEG XL, AVIF, DPX, TGA, BMP), the header first and then the pixels; writing of PNG."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 import OpenImageIO as oiio
 
-from stage import exr, inputs, integrity, jxl
+from stage import avif, exr, inputs, integrity, jxl
 from stage.errors import ImageError
 from stage.exif import Exposure, sound
 from stage.orientation import TURNS, UPRIGHT, upright, upright_size
@@ -18,7 +18,7 @@ from stage.pixels import Crop
 OIIO_SUFFIXES = {".png", ".tif", ".tiff", ".hdr", ".jpg", ".jpeg", ".jxl", ".dpx", ".tga", ".bmp"}
 ORIENTED_SUFFIXES = {".png", ".tif", ".tiff", ".hdr", ".jpg", ".jpeg"}
 """Suffixes of files with an orientation that their decoder leaves to the reader; that of JPEG XL turns the pixels by itself."""
-SUFFIXES = {".exr", *OIIO_SUFFIXES}
+SUFFIXES = {".exr", ".avif", *OIIO_SUFFIXES}
 FLOATING = {oiio.HALF, oiio.FLOAT, oiio.DOUBLE}
 CODES = {oiio.UINT8, oiio.UINT16}
 """Integers that `read_recorded` leaves as they are: tables of what each stands for are short."""
@@ -84,6 +84,9 @@ def header_of(source: inputs.Source) -> ImageHeader:
         integrity.check_png(path, source.file, contents=False)
     elif suffix == ".jxl":
         source.check_pixels(*jxl.resolution_of(path, source.file))
+    elif suffix == ".avif":
+        found = avif.header_of(path, source.file)
+        return ImageHeader(found.width, found.height, found.channels, found.channels + 1, True)
     with _decoder(source) as decoder:
         spec = decoder.spec()
         orientation = _orientation(path, spec)
@@ -155,6 +158,10 @@ def _decoded(source: inputs.Source, suffix: str) -> np.ndarray:
         integrity.check_jpeg(source.path, source.file)
     elif suffix == ".jxl":
         source.check_pixels(*jxl.resolution_of(source.path, source.file))
+    elif suffix == ".avif":
+        found = avif.header_of(source.path, source.file)
+        source.check_pixels(found.width, found.height)
+        return avif.decode(source.path, source.file, found)
     with _decoder(source) as decoder:
         spec = decoder.spec()
         source.check_pixels(spec.width, spec.height)

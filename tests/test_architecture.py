@@ -90,8 +90,8 @@ def test_a_library_lives_in_its_places(library, homes):
     assert {i.importer for i in IMPORTS if top(i.target) == library and not under(i.importer, *homes)} == set()
 
 
-def test_opencv_lives_where_motion_is_tracked_rigs_are_calibrated_and_distances_measured():
-    allowed = "stage.motion", "stage.calibration", "stage.mask_border"
+def test_opencv_lives_where_motion_is_tracked_rigs_are_calibrated_distances_measured_and_avif_decoded():
+    allowed = "stage.motion", "stage.calibration", "stage.mask_border", "stage.avif"
     assert {i.importer for i in IMPORTS if top(i.target) == "cv2" and not under(i.importer, *allowed)} == set()
 
 

@@ -8,6 +8,7 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -35,6 +36,7 @@ def folder(tmp_path):
     codes = NOISE.integers(0, 256, (20, 30, 3), dtype=np.uint8)
     for suffix in ("png", "tif", "jpg", "dpx", "jxl", "tga", "bmp"):
         write_image(tmp_path / f"a.{suffix}", codes)
+    assert cv2.imwrite(str(tmp_path / "a.avif"), codes)
     write_image(tmp_path / "turned.png", codes, Orientation=6)
     write_image(tmp_path / "grey.png", codes[..., 0])
     write_image(tmp_path / "deep.png", NOISE.integers(0, 65536, (20, 30, 4), dtype=np.uint16))
