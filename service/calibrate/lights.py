@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from service.calibrate.ball_finder import find_grey_ball, find_mirror_ball
 from service.calibrate.balls import ball_entry, balls_of, check_metric
 from service.calibrate.results import (
     LightCalibration,
@@ -50,9 +51,12 @@ def mirror_ball(request: MirrorBallRequest, progress: Progress | None = None) ->
     timings = Timings(progress)
     timings.stage("open", 1)
     captures = open_captures(request)
-    (ball,) = balls_of(request, captures.source.camera, exactly=1)
-    view = view_ball(ball, captures.source.camera)
     options = SpotOptions(level=request.level)
+    if request.circles or request.masks:
+        (ball,) = balls_of(request, captures.source.camera, exactly=1)
+    else:
+        ball = find_mirror_ball(captures, options)
+    view = view_ball(ball, captures.source.camera)
     # what is not measured stays as the target has it
     targets = _targets(captures)
 
@@ -120,8 +124,12 @@ def grey_ball(request: GreyBallRequest, progress: Progress | None = None) -> Lig
     timings.stage("open", 1)
     captures = open_captures(request)
     camera = captures.source.camera
-    (ball,) = balls_of(request, camera, exactly=1, radii=() if request.ball_radius_m is None else (request.ball_radius_m,),
-                     heights=() if request.ball_z_m is None else (request.ball_z_m,))
+    if request.circles or request.masks:
+        (ball,) = balls_of(request, camera, exactly=1, radii=() if request.ball_radius_m is None else (request.ball_radius_m,),
+                         heights=() if request.ball_z_m is None else (request.ball_z_m,))
+    else:
+        level = camera.surface_z_m if camera.projection == "orthographic" else None
+        ball = find_grey_ball(captures, request.ball_radius_m, level if request.ball_z_m is None else request.ball_z_m)
     near = next((lit for lit in captures.lit if isinstance(lit.light, PointLight)), None)
     if near is not None:
         where = f"{captures.source.folder / FILE_NAME}: frames[{near.number}].light: is point"

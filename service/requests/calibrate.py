@@ -92,7 +92,8 @@ class BallOptions(LightsOptions):
     """Base of what is chosen to look at balls."""
 
     circles: Annotated[tuple[Annotated[Circle, BeforeValidator(_circle)], ...], Role.INPUT, Spelling(flag="--ball", metavar="U,V,R")] = ()
-    """Outline of a ball: centre and radius in pixels. Give one for each ball."""
+    """Outline of a ball: centre and radius in pixels. Give one for each ball; without it and without a mask, mirror-ball and grey-ball
+    find the ball in the images."""
 
 
 class MirrorBallOptions(BallOptions):
@@ -147,7 +148,7 @@ class BallRequest(BallOptions, LightsRequest):
     """Base of the kinds that look at balls: circles first, then masks."""
 
     masks: Annotated[tuple[Path, ...], Role.INPUT, Spelling(flag="--ball-mask")] = ()
-    """Mask image of a ball, in place of `ball`; better for a perspective camera. Give one for each ball."""
+    """Mask image of a ball, in place of `ball`; more precise. Give one for each ball."""
 
 
 class MirrorBallRequest(MirrorBallOptions, BallRequest):

@@ -51,15 +51,34 @@ def ball_from_mask(camera: Camera, coverage: np.ndarray, *, radius_m: float | No
             best, best_ball = inliers, ball
     if best_ball is None:
         raise CalibrationError("the outline of the ball's mask lies on a line")
-    for _ in range(3):  # the points near the fitted circle are a few more than those near the proposal
-        best_ball = ball_from_outline(camera, outline[best], error_px=0.0)
-        distance = _distance_px(best_ball, camera, outline)
-        best = np.abs(distance) < INLIER_PX
+    best_ball, best, error_px = refine_outline(camera, outline, best)
     share = best.sum() / (POINTS_PER_PX * 2 * np.pi * best_ball.radius_px)
     if share < MIN_SHARE:
         raise CalibrationError(f"the mask of the ball is not round: {share:.0%} of the best circle's outline is in it")
-    error_px = float(np.sqrt((distance[best] ** 2).mean() * 2 / best.sum()))
     return ball_from_outline(camera, outline[best], error_px=error_px, radius_m=radius_m, z_m=z_m)
+
+
+def refine_outline(camera: Camera, outline: np.ndarray, inside: np.ndarray) -> tuple[Ball, np.ndarray, float]:
+    """Fit a ball to the points near its outline, and choose these points anew, in turn.
+
+    Args:
+        camera: the camera of the image.
+        outline: [points, 2] u, v.
+        inside: [points] bool, those that a proposal takes for points of the outline.
+
+    Returns:
+        The ball without a scale, which points lie within a pixel of its outline, and the standard error of its centre in pixels.
+
+    Raises:
+        CalibrationError: the points lie on a line.
+    """
+    for _ in range(3):  # the points near the fitted circle are a few more than those near the proposal
+        ball = ball_from_outline(camera, outline[inside], error_px=0.0)
+        distance = _distance_px(ball, camera, outline)
+        inside = np.abs(distance) < INLIER_PX
+        if not inside.any():
+            raise CalibrationError("no point of the outline lies on a circle")
+    return ball, inside, float(np.sqrt((distance[inside] ** 2).mean() * 2 / inside.sum()))
 
 
 def outline_points(coverage: np.ndarray) -> np.ndarray:

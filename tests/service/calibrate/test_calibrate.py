@@ -248,7 +248,7 @@ def test_saturation_is_said_and_written(relit, tmp_path):
 
 BALL = ["--ball", CIRCLE]
 BAD = {
-    "no ball": (["mirror-ball"], {}, "--ball, --ball-mask: 0 balls are given: this needs exactly 1"),
+    "no ball": (["light-positions"], {}, "--ball, --ball-mask: 0 balls are given: this needs 2 or more"),
     "two balls": (["mirror-ball", *BALL, *BALL], {}, "2 balls are given: this needs exactly 1"),
     "one ball for positions": (["light-positions", *BALL], {}, "1 balls are given: this needs 2 or more"),
     "a ball in words": (["mirror-ball", "--ball", "middle"], {}, "--ball middle: give centre and radius in pixels"),

@@ -1,0 +1,106 @@
+"""Balls that nobody points at: found among other round and bright things, or refused with a sentence."""
+
+import json
+
+import numpy as np
+import pytest
+
+from service.calibrate.lights import grey_ball, mirror_ball
+from service.errors import RequestError
+from service.requests.calibrate import GreyBallRequest, MirrorBallRequest
+from tests.reference.balls import lambertian, render
+from tests.scenes.captures import angles_degrees, files_in, write_exr, write_manifest
+from tests.stage.calibration.balls import spread
+
+WIDTH, HEIGHT = 320, 240
+PLACEHOLDER = {"type": "distant", "direction": [0, 0, 1], "irradiance": [1, 1, 1]}
+DIRECTIONS = spread(12, 0.15)
+RADIUS = 58.0
+CAMERAS = {
+    "orthographic": ({"projection": "orthographic"}, {"centre": np.array([-47.3, 21.8, 0.0]), "radius": RADIUS, "pixel_size": 1.0}),
+    # the same size, 12 degrees off the axis: the outline is an ellipse
+    "perspective": ({"projection": "perspective", "focal_px": [400.0, 400.0]},
+                    {"centre": np.array([-0.17, 0.07, -0.8]), "radius": 0.12, "focal": 400.0}),
+}
+
+
+def chrome(direction):
+    """A mirror in a room: a bright floor of tiles, a dim ceiling, and the lamp of 2 degrees."""
+    def shade(point, normal, viewer):
+        seen = 2 * (normal * viewer).sum(-1, keepdims=True) * normal - viewer
+        tiles = 0.12 + 0.06 * np.sign(np.sin(9 * seen[:, 0]) * np.sin(9 * seen[:, 2]))
+        room = np.where(seen[:, 1] < -0.2, tiles, 0.05 + 0.03 * seen[:, 1])
+        return room + 4.0 * np.exp((seen @ direction - 1) / np.radians(2.0) ** 2)
+    return shade
+
+
+def room(number, seed=0):
+    """What stands behind the ball: a wall, a white disc, a striped box, and a glossy spot that stays where it is."""
+    rows, cols = np.mgrid[:HEIGHT, :WIDTH]
+    wall = 0.3 + 0.1 * cols / WIDTH + 0.05 * (number % 3)
+    disc = (cols - 250) ** 2 + (rows - 60) ** 2 < 35**2
+    box = (cols > 210) & (rows > 140)
+    values = np.where(disc, 0.6 + 0.02 * number, np.where(box, 0.2 + 0.1 * np.sign(np.sin(cols / 5)), wall))
+    return np.where((cols - 255) ** 2 + (rows - 180) ** 2 < 9, 3.0, values)
+
+
+def photograph(folder, camera, shade_of, *, hidden=False, ball=True, noise=0.005):
+    """The capture of a ball in the room, a book before its lower right side where `hidden`."""
+    lens, place = CAMERAS[camera]
+    random = np.random.default_rng(3)
+    for number, direction in enumerate(DIRECTIONS):
+        image, coverage = render(shade_of(direction), width=WIDTH, height=HEIGHT, samples=3, **place)
+        behind = room(number)
+        values = image + (1 - coverage) * behind if ball else behind
+        if hidden:
+            rows, cols = np.mgrid[:HEIGHT, :WIDTH]
+            values = np.where((cols > 130) & (rows > 145), 0.15 + 0.02 * (cols % 7), values)
+        values = np.maximum(values + noise * random.normal(size=values.shape), 0)
+        write_exr(folder / f"{number:03d}.exr", np.repeat(values[..., None], 3, axis=2))
+    write_manifest(folder, {"schema": "relit.capture/1", "name": "ball", "camera": {"resolution": [WIDTH, HEIGHT], **lens},
+                            "frames": [{"image": f"{i:03d}.exr", "light": PLACEHOLDER} for i in range(len(DIRECTIONS))]})
+    return folder
+
+
+def measured(folder):
+    frames = json.loads((folder / "capture.json").read_text())["frames"]
+    return np.array([frame["light"]["direction"] for frame in frames])
+
+
+@pytest.mark.parametrize(("camera", "hidden"), [("orthographic", False), ("orthographic", True), ("perspective", False)])
+def test_a_chrome_ball_is_found_and_gives_directions(tmp_path, camera, hidden):
+    """Off the centre, among other round and bright things, half behind a book in one case, with noise."""
+    folder = photograph(tmp_path / "capture", camera, chrome, hidden=hidden)
+    mirror_ball(MirrorBallRequest(capture=folder, drop_failed=hidden))
+    kept = [int(frame["image"][:3]) for frame in json.loads((folder / "capture.json").read_text())["frames"]]
+    error = angles_degrees(measured(folder), DIRECTIONS[kept])
+    if hidden:  # lamps whose reflection the book hides are wrong or left out
+        error = error[[i for i, k in enumerate(kept) if not (DIRECTIONS[k][0] > -0.1 and DIRECTIONS[k][1] < 0.1)]]
+    assert len(error) >= 5 and error.max() < 0.5, error
+
+
+def test_a_grey_ball_is_found_and_gives_directions(tmp_path):
+    folder = photograph(tmp_path / "capture", "orthographic", lambda direction: lambertian(direction, albedo=0.6, irradiance=2.0))
+    grey_ball(GreyBallRequest(capture=folder, refine_direction=True))
+    error = angles_degrees(measured(folder), DIRECTIONS)
+    assert error.max() < 0.5, error
+
+
+@pytest.mark.parametrize(("kind", "shade"), [("mirror", lambda d: lambertian(d, albedo=0.6, irradiance=2.0)), ("grey", chrome)])
+def test_a_ball_of_another_kind_is_refused(tmp_path, kind, shade):
+    folder = photograph(tmp_path / "capture", "orthographic", shade)
+    before = files_in(folder)
+    with pytest.raises(RequestError, match=f"no {kind} ball is found in the images"):
+        if kind == "mirror":
+            mirror_ball(MirrorBallRequest(capture=folder))
+        else:
+            grey_ball(GreyBallRequest(capture=folder, refine_direction=True))
+    assert files_in(folder) == before
+
+
+def test_no_ball_is_refused(tmp_path):
+    folder = photograph(tmp_path / "capture", "orthographic", chrome, ball=False)
+    with pytest.raises(RequestError, match="no mirror ball is found"):
+        mirror_ball(MirrorBallRequest(capture=folder))
+    with pytest.raises(RequestError, match="no grey ball is found"):
+        grey_ball(GreyBallRequest(capture=folder))
