@@ -108,8 +108,9 @@ def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResul
     maps: DepthMaps | CoordinateMaps
     if isinstance(solution, DecodedSolution):
         if not solution.estimated.any():
+            declared = [sentence for sentence in solution.warnings if sentence.startswith("frames: as declared")]
             raise ManifestError(f"{capture.folder}: no pixel is decoded ({_reasons(solution)}): "
-                                f"{_advice(solution.counts(mask), using)}")
+                                f"{'; '.join(declared) or _advice(solution.counts(mask), using)}")
         refuse_unsure(solution.status, None, solution.confidence_map(), max_sigma=None, least_confidence=least)
         timings.stage("write", 1)
         maps = solution.maps(capture.camera, sources)

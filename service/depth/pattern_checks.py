@@ -17,6 +17,7 @@ from service.depth.readings import Readings
 from stage.camera import Camera
 from stage.colour import GREY_WEIGHTS
 from stage.errors import StageError
+from stage.patterns.base import Axis
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected, Pattern, collect
 from stage.patterns.phase import PhaseCode
@@ -32,6 +33,10 @@ DOUBTFUL_SHARE = 0.5
 """Share of the pixels with signal that agree with a neighbour, below which other readings of the manifest are tried."""
 CLEAR_SHARE, CLEAR_TIMES = 0.4, 2.0
 """Another reading is named where it makes at least this share agree, and this many times as many as declared."""
+UNEVEN, LARGEST_STEP = 0.01, 0.05
+"""Mean distance of neighbouring pixels in the projector, as a part of its extent, above which other readings are tried, and the distance
+that pixels which are farther apart count with."""
+AXES: tuple[Axis, Axis] = ("column", "row")
 NOT_LIT = (Status.UNSOLVED, Status.SHADOWED, Status.LOW_MODULATION, Status.SATURATED)
 """Statuses of pixels that cannot tell whether the frames are declared rightly."""
 MEAN_TOLERANCE = 0.04
@@ -157,6 +162,50 @@ def check_declaration(sample: Sample, patterns: list[Pattern], projector: Patter
         return None
     return (f"frames: as declared, {100 * share:.0f} % of the pixels with signal agree with their neighbours; {100 * best:.0f} % do if "
             f"{chosen.words}")
+
+
+def check_unevenness(sample: Sample, patterns: list[Pattern], projector: PatternProjector, noise: NoiseModel, device: str) -> str | None:
+    """Return a sentence if the coordinates are far more even when the frames are understood in another way than the manifest declares.
+
+    This tells without any calibration what `check_declaration` tells with it, but for exchanged axes and mirrored images: they are as
+    even.
+    """
+    declared = unevenness(sample, patterns, projector, noise, device)
+    if not declared > UNEVEN:
+        return None
+    best, chosen = declared, None
+    for reading in READINGS:
+        try:
+            other = reading.patterns(patterns)
+            found = float("nan") if reading.mirrored or other == patterns else unevenness(sample, other, projector, noise, device)
+        except (StageError, KernelError, ValueError):  # the frames cannot be a code in that reading
+            continue
+        if found < best:
+            best, chosen = found, reading
+    if chosen is None or best > declared / CLEAR_TIMES:
+        return None
+    return (f"frames: as declared, neighbouring pixels lie {100 * declared:.2g} % of the projector apart on average; {100 * best:.2g} % if "
+            f"{chosen.words}")
+
+
+def unevenness(sample: Sample, patterns: list[Pattern], projector: PatternProjector, noise: NoiseModel, device: str) -> float:
+    """Return how far apart neighbouring pixels of a row lie in the projector, on average, as a part of its extent.
+
+    Pairs that are far apart or not decoded count as LARGEST_STEP, as do pairs without light. NaN without enough of them.
+    """
+    collected = collect(list(patterns))
+    steps = []
+    for axis, extent in zip(AXES, projector.resolution, strict=True):
+        decoder, _ = choose_decoder(collected, axis, projector)
+        if decoder is None:
+            continue
+        decoded = decode_sample(sample, decoder, noise, device)
+        u, status = (array.numpy()[:sample.mask.size].reshape(sample.mask.shape) for array in (decoded.coordinate, decoded.status))
+        sure = (status == OK)[:, 1:] & (status == OK)[:, :-1]
+        pairs = sample.mask[:, 1:] & sample.mask[:, :-1]
+        step = np.where(sure, np.minimum(np.abs(np.diff(u, axis=1)) / extent, LARGEST_STEP), LARGEST_STEP)[pairs]
+        steps.append(float(step.mean()) if step.size >= ENOUGH else float("nan"))
+    return max(steps, default=float("nan"))
 
 
 def find_exponent(sample: Sample, collected: Collected, projector: PatternProjector, noise: NoiseModel, device: str) -> float:

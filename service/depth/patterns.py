@@ -16,7 +16,7 @@ from service.depth.agreement import ADVICE, conclude, doubt_coordinates, doubt_p
 from service.depth.codes import choose_decoder
 from service.depth.coordinates import Coordinates, DecodedSolution
 from service.depth.decoders import AxisDecoder, PatternProjector
-from service.depth.pattern_checks import check_declaration, find_exponent, response_sentence, sample_of
+from service.depth.pattern_checks import check_declaration, check_unevenness, find_exponent, response_sentence, sample_of
 from service.depth.readings import Readings, even_light
 from service.depth.solution import DepthSolution
 from service.errors import RequestError
@@ -164,10 +164,10 @@ def _checked(planes: Planes, mask: np.ndarray, codes: PatternCodes, shown: Patte
     """Return what a sample of the frames says about all of them, and the decoders that heed it."""
     sample = sample_of(planes, capture.camera, mask)
     patterns = [frame.pattern for frame in frames if frame.pattern is not None]
-    if projector is not None:
-        wrong = check_declaration(sample, patterns, shown, projector_model(projector), noise, device)
-        if wrong is not None:
-            return [wrong], codes
+    wrong = (check_unevenness(sample, patterns, shown, noise, device) if projector is None
+             else check_declaration(sample, patterns, shown, projector_model(projector), noise, device))
+    if wrong is not None:
+        return [wrong], codes
     if shown.response is None:
         exponent = find_exponent(sample, codes.collected, shown, noise, device)
         if exponent != 1.0:

@@ -104,6 +104,21 @@ def test_coordinates_are_the_result_where_no_pixel_has_a_depth(relit, tmp_path):
     assert "out_of_range" in report["found"]["decoded_only"] and "check the frames' patterns, projector.camera_from_projector" in said
 
 
+@pytest.mark.parametrize(("change", "words"), [
+    (lambda pattern: {**pattern, "inverse": not pattern["inverse"]}, "patterns and inverses are exchanged"),
+    (lambda pattern: {**pattern, "bit": pattern["bits"] - 1 - pattern["bit"]}, "the order of bits is reversed"),
+])
+def test_frames_that_are_declared_wrongly_are_named_and_nothing_is_believed(relit, tmp_path, change, words):
+    patterns = [*gray_patterns("column"), *gray_patterns("row")]
+    write_patterns(tmp_path, SCENE, [*patterns, *BLACK_WHITE], projector=SIZE)
+    frames = json.loads((tmp_path / "capture.json").read_text())["frames"]
+    edit_manifest(tmp_path, frames=[{**frame, "pattern": change(frame["pattern"]) if "axis" in frame["pattern"] else frame["pattern"]}
+                                    for frame in frames])
+    channels, report, said = decode(relit, tmp_path, code=1)
+    assert words in said and any(words in sentence for sentence in report["warnings"])
+    assert not channels["mask.Y"].any() and channels["confidence.Y"].max() < 0.11
+
+
 def test_wrong_codes_among_right_ones_are_doubted(relit, tmp_path):
     """Light of a coarse bit and its inverse is exchanged in single pixels, as a flash or a moving edge does."""
     folder = write_patterns(tmp_path, SCENE, [*gray_patterns("column"), *BLACK_WHITE], suffix="exr", projector=SIZE)
