@@ -132,7 +132,7 @@ def fails(relit, folder: Path, words: str, *arguments):
     (phases(256), [], "frames: the shortest period is 256 px, which light between surfaces follows"),
     ([*phases(16), *phases(18)], ["--period-px", 20], "--period-px 20: the phase frames have periods of 16, 18 px"),
     ([*phases(), BLACK], ["--black-level", 0.1], "--black-level 0.1: the capture has a black frame"),
-    (phases(), ["--black-level", 1], "black_level"),
+    (phases(), ["--black-level", 1], "--black-level"),
     ([*phases(), phases()[0]], [], "frames 0 and 4 show one pattern"),
 ])
 def test_what_cannot_be_separated_is_one_sentence(relit, tmp_path, patterns, options, words):
