@@ -15,6 +15,7 @@ from service.requests.captures import (
     NearLightsImport,
     OlatImport,
     OpencvGrayImport,
+    PatternImageOptions,
     PhaseImport,
     PhaseShift,
     PhotosImport,
@@ -22,7 +23,6 @@ from service.requests.captures import (
     RigOptions,
     ScannerImport,
     Sense,
-    StackOptions,
     WaveOrigin,
 )
 from service.requests.imports_tof import ArrayOptions, HistogramImport, KinectImport, Signal, TofImport
@@ -30,7 +30,7 @@ from service.requests.patterns import PatternAxis
 
 if TYPE_CHECKING:
     from stage.importers.layout import Imported
-    from stage.importers.patterns import Stack
+    from stage.importers.patterns import PatternImages
     from stage.importers.raw_arrays import ArrayFiles
     from stage.importers.view import Selection, View
 
@@ -118,7 +118,7 @@ def _gray(request: GrayImport) -> None:
 
     gray = GrayStack(sequence=request.sequence, inverses=request.inverses, fine_first=request.fine_first, column_bits=request.column_bits,
                      row_bits=request.row_bits)
-    _print(import_gray(request.source, request.folder, stack=_stack(request, request), gray=gray))
+    _print(import_gray(request.source, request.folder, pictures=_pattern_images(request, request), gray=gray))
 
 
 def _phase(request: PhaseImport) -> None:
@@ -128,8 +128,9 @@ def _phase(request: PhaseImport) -> None:
     phase = PhaseStack(axes=_axes(request.axis), periods_px=request.periods, row_periods_px=request.row_periods, steps=request.steps,
                        order=request.order, advancing=request.shift is PhaseShift.MINUS, offset_deg=request.offset_deg)
     gray = GrayStack(inverses=request.gray_inverses, fine_first=request.gray_fine_first)
-    _print(import_phase(request.source, request.folder, stack=_stack(request, request), phase=phase, gray_images=request.gray_images,
-                        gray_stripe_px=request.gray_stripe, gray=gray, from_centre=request.origin is WaveOrigin.CENTRE))
+    _print(import_phase(request.source, request.folder, pictures=_pattern_images(request, request), phase=phase,
+                        gray_images=request.gray_images, gray_stripe_px=request.gray_stripe, gray=gray,
+                        from_centre=request.origin is WaveOrigin.CENTRE))
 
 
 def _scanner(request: ScannerImport) -> None:
@@ -173,11 +174,11 @@ def _axes(axis: PatternAxis) -> tuple[str, ...]:
     return ("column", "row") if axis is PatternAxis.BOTH else (axis.value,)
 
 
-def _stack(images: StackOptions, rig: RigOptions) -> "Stack":
-    from stage.importers.patterns import Stack
+def _pattern_images(images: PatternImageOptions, rig: RigOptions) -> "PatternImages":
+    from stage.importers.patterns import PatternImages
 
-    return Stack(projector=rig.projector, images=images.images, mask=images.mask, white=images.white, black=images.black,
-                 calibration=rig.calibration, unit_m=rig.unit_m, color_space=images.color_space)
+    return PatternImages(projector=rig.projector, images=images.images, mask=images.mask, white=images.white, black=images.black,
+                         calibration=rig.calibration, unit_m=rig.unit_m, color_space=images.color_space)
 
 
 def _view(request: CameraOptions) -> "View":

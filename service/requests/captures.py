@@ -169,7 +169,7 @@ class RigOptions(Options):
     """Metres in one unit of the translation in `calibration`, such as 0.001 for millimetres."""
 
 
-class StackOptions(Options):
+class PatternImageOptions(Options):
     """Which images of the folder are frames of patterns."""
 
     images: Annotated[Line | None, Spelling(metavar="GLOB")] = None
@@ -192,7 +192,7 @@ class Inverses(Choice):
     NONE = "none", "there are none"
 
 
-class GrayImport(StackOptions, RigOptions, ImportRequest):
+class GrayImport(PatternImageOptions, RigOptions, ImportRequest):
     """Images of a Gray code in any order."""
 
     sequence: Annotated[tuple[Line, ...], Commas, Spelling(metavar="PART,PART,…")] = ("columns", "rows", "white", "black")
@@ -221,7 +221,7 @@ class WaveOrigin(Choice):
     CENTRE = "centre", "at its centre, as in cos(2πx/P) with the number x of the pixel"
 
 
-class PhaseImport(StackOptions, RigOptions, ImportRequest):
+class PhaseImport(PatternImageOptions, RigOptions, ImportRequest):
     """Images of phase shifts in any order, with a Gray code that numbers the periods or without."""
 
     periods: Annotated[tuple[Positive, ...], Commas, Spelling(metavar="P,P,…")]

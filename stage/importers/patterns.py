@@ -18,8 +18,8 @@ LINEAR: ColorSpaceName = "lin_rec709_scene"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Stack:
-    """Which images of a folder are the frames of a stack, and the rig that took them."""
+class PatternImages:
+    """Which images of a folder are frames of patterns, and the rig that took them."""
 
     projector: tuple[int, int]
     images: str | None = None
@@ -35,24 +35,24 @@ class Stack:
     color_space: ColorSpaceName = LINEAR
 
 
-def import_gray(source: Path, destination: Path, *, stack: Stack, gray: GrayStack) -> Imported:
+def import_gray(source: Path, destination: Path, *, pictures: PatternImages, gray: GrayStack) -> Imported:
     """Write a capture.json for a Gray code.
 
     Raises:
         ManifestError: images and patterns do not fit, or the calibration cannot be read; the message names the file.
         StorageError: a file cannot be read or written.
     """
-    return _write(source, destination, stack, gray.entries(stack.projector), ())
+    return _write(source, destination, pictures, gray.entries(pictures.projector), ())
 
 
-def import_phase(source: Path, destination: Path, *, stack: Stack, phase: PhaseStack, gray_images: str | None = None,
+def import_phase(source: Path, destination: Path, *, pictures: PatternImages, phase: PhaseStack, gray_images: str | None = None,
                  gray_stripe_px: float | None = None, gray: GrayStack | None = None, from_centre: bool = False) -> Imported:
     """Write a capture.json for phase shifts, with a Gray code that numbers their periods or without.
 
     Args:
         source: the folder of the images.
         destination: the folder of the capture; another folder than `source` gets links to, or copies of, the images.
-        stack: the frames of the phases, and the rig.
+        pictures: the frames of the phases, and the rig.
         phase: how they were taken.
         gray_images: the names of the images of a Gray code, as the shell matches them; None: there is none.
         gray_stripe_px: the width of its finest stripe in projector pixels.
@@ -77,7 +77,7 @@ def import_phase(source: Path, destination: Path, *, stack: Stack, phase: PhaseS
             of_axis = gray_entries(axis, 2**each, None, inverses=inverses, fine_first=fine_first)
             entries += [{**entry, "stripe_px": gray_stripe_px} for entry in of_axis]
         extra = list(zip(names, entries, strict=True))
-    return _write(source, destination, stack, phase.entries(), extra, shifted=from_centre)
+    return _write(source, destination, pictures, phase.entries(), extra, shifted=from_centre)
 
 
 def import_scanner(source: Path, destination: Path, *, calibration: Path, codec: str, axes: tuple[str, ...], unit_m: float,
@@ -101,8 +101,8 @@ def import_scanner(source: Path, destination: Path, *, calibration: Path, codec:
     size = projector or projector_size(calibration)
     if size is None:
         raise ManifestError(f"{calibration}: does not say how many pixels the projector has: give --projector")
-    stack = Stack(projector=size, images=images, calibration=calibration, unit_m=unit_m)
-    return _write(source, destination, stack, CODECS[codec](size, axes), (), shifted=codec in HALF_PIXEL)
+    pictures = PatternImages(projector=size, images=images, calibration=calibration, unit_m=unit_m)
+    return _write(source, destination, pictures, CODECS[codec](size, axes), (), shifted=codec in HALF_PIXEL)
 
 
 def _slstudio_gray(projector: tuple[int, int], axes: tuple[str, ...]) -> list[Entry]:
@@ -140,41 +140,41 @@ HALF_PIXEL = ("slstudio-phase-2x3", "slstudio-phase-3", "slstudio-phase-4")
 those of their calibration are, whose principal point then stays as it is."""
 
 
-def _write(source: Path, destination: Path, stack: Stack, entries: list[Entry], extra: Sequence[tuple[str, Entry]], *,
+def _write(source: Path, destination: Path, pictures: PatternImages, entries: list[Entry], extra: Sequence[tuple[str, Entry]], *,
            shifted: bool = False) -> Imported:
     """Write the capture of the images that the options name and of those of `extra`, which are paired with their patterns already."""
     names = image_names(source)
-    mask = only_image(source, names, stack.mask, MASK_WORDS, "mask")
+    mask = only_image(source, names, pictures.mask, MASK_WORDS, "mask")
     even: dict[str, str] = {}
-    for code, given in (("white", stack.white), ("black", stack.black)):
+    for code, given in (("white", pictures.white), ("black", pictures.black)):
         if not any(entry["code"] == code for entry in entries):
             name = only_image(source, names, given, frozenset({code}), code)
             even |= {} if name is None else {code: name}
         elif given is not None:
             raise ManifestError(f"--{code} {given}: {code} is in --sequence already: give one of both")
     taken = {mask, *even.values(), *(name for name, _ in extra)}
-    frames = [name for name in names if name not in taken and (stack.images is None or fnmatch(name, stack.images))]
+    frames = [name for name in names if name not in taken and (pictures.images is None or fnmatch(name, pictures.images))]
     if len(frames) != len(entries):
         shown = f" ({frames[0]} to {frames[-1]})" if frames else ""
         raise ManifestError(f"{source}: has {len(frames)} images{shown} where these options have {len(entries)} patterns: "
                             f"{describe(entries)}")
     resolution = image_resolution(source / frames[0])
-    data: dict[str, Any] = {"schema": SCHEMA, "name": source.resolve().name, "color_space": stack.color_space, "mask": mask,
+    data: dict[str, Any] = {"schema": SCHEMA, "name": source.resolve().name, "color_space": pictures.color_space, "mask": mask,
                             "camera": {"projection": "orthographic", "resolution": list(resolution)},
-                            "projector": {"resolution": list(stack.projector)}}
-    if stack.calibration is not None:
-        data |= camera_and_projector(stack.calibration, resolution, stack.projector, stack.unit_m)
+                            "projector": {"resolution": list(pictures.projector)}}
+    if pictures.calibration is not None:
+        data |= camera_and_projector(pictures.calibration, resolution, pictures.projector, pictures.unit_m)
         if shifted:
             data["projector"]["principal_px"] = [value - 0.5 for value in data["projector"]["principal_px"]]
     pairs = [*zip(frames, entries, strict=True), *extra, *((name, {"code": code}) for code, name in even.items())]
     data["frames"] = [{"image": name, "pattern": pattern} for name, pattern in pairs]
-    written = write_capture(data, stack.calibration or source, destination, folder=source)
+    written = write_capture(data, pictures.calibration or source, destination, folder=source)
     facts = [("frames", f"{len(frames)} images in their order, {frames[0]} to {frames[-1]}"), ("patterns", describe(entries))]
     if extra:
         facts.append(("Gray", f"{len(extra)} images in their order, {extra[0][0]} to {extra[-1][0]}: {describe([e for _, e in extra])}"))
     facts += [(code, name) for code, name in even.items()]
-    facts += [("colour", f"{stack.color_space}: --color-space says another"), ("mask", mask or "none: every pixel is taken"),
+    facts += [("colour", f"{pictures.color_space}: --color-space says another"), ("mask", mask or "none: every pixel is taken"),
               *([("columns", "counted from the centre of the first one, as the waves are")] if shifted else []),
-              ("rig", f"from {stack.calibration}, in units of {stack.unit_m:g} m" if stack.calibration else
+              ("rig", f"from {pictures.calibration}, in units of {pictures.unit_m:g} m" if pictures.calibration else
                       "not calibrated: relit calibrate procam measures it, or give --calibration")]
     return Imported(written, tuple(facts))
