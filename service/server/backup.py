@@ -4,6 +4,9 @@ The database is copied first, in one snapshot. Files of the storage get their na
 afterwards, so what the database tells about at that moment is there when the files are copied; files that are newer do no harm, because a
 step that runs again finds its frames and keeps them. `backup.json`, with the size and the SHA-256 of every file, is written last: without
 it a backup is not whole.
+
+With `storage_url` the files of captures and results are objects of a store. `backup.json` names those that there were after the database
+was copied, with size and ETag, and `restore` looks for them; or they are copied too, and `restore` sends what the store lacks.
 """
 
 import hashlib
@@ -22,16 +25,20 @@ import sqlalchemy as sa
 
 from service import __version__
 from service.errors import RequestError
+from service.server.database import tables
 from service.server.database.engine import connect, usable
 from service.server.database.schema import require_current
 from service.server.settings import Settings
+from service.server.storage import layout, saved_objects
+from service.server.storage.bucket import Bucket, Object
 from service.server.storage.part_files import part_files_folder
+from service.views.states import ACTIVE
 from stage.errors import storage
 from stage.files import write_text
 
 SCHEMA = "relit.backup/1"
-CONTENTS, SQLITE, DUMP = "backup.json", "relit.sqlite", "database.dump"
-PROJECTS = "projects"
+CONTENTS, SQLITE, DUMP, OBJECTS = "backup.json", "relit.sqlite", "database.dump", "objects"
+PROJECTS = saved_objects.PROJECTS
 """Folder of captures and results, in the data folder and in the backup."""
 BLOCK = 1 << 20
 
@@ -43,14 +50,29 @@ class Backup(NamedTuple):
     files: int
     size: int
     """Bytes of all files."""
+    objects: int = 0
+    """Objects of the store of `storage_url` that belong to it."""
+    copied: bool = False
+    """Whether copies of the objects are among the files."""
+    differing: int = 0
+    """Objects that were missing or had changed when it was restored: sent again where there are copies, else accepted."""
 
 
-def backup(settings: Settings, out: Path) -> Backup:
+class _Contents(NamedTuple):
+    """What backup.json says."""
+
+    files: dict[str, dict[str, Any]]
+    storage: dict[str, Any] | None
+    """Of a service with storage_url: the URL, whether its objects are copied, and the objects."""
+
+
+def backup(settings: Settings, out: Path, *, copy_objects: bool = False) -> Backup:
     """Copy the database and the files of a service, which may run meanwhile.
 
     Args:
         settings: of the service.
         out: folder that does not exist or is empty.
+        copy_objects: whether to copy the objects of `storage_url` too, in place of naming them.
 
     Raises:
         RequestError: there is no service, the folder is not empty, or the database cannot be copied; nothing is changed in the service.
@@ -62,13 +84,16 @@ def backup(settings: Settings, out: Path) -> Backup:
         raise RequestError(f"--out {out}: lies in the data folder, which is to be saved: give a folder elsewhere")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise RequestError(f"--out {out}: is not empty: give a new folder")
+    if copy_objects and settings.storage_url is None:
+        raise RequestError("--objects: this service has no storage_url: its captures and results are in the backup without it")
+    bucket = None if settings.storage_url is None else Bucket(settings.storage_url)
     with storage("make", out):
         out.mkdir(parents=True, exist_ok=True, mode=0o700)
     with usable(settings):
         database = connect(settings.sqlalchemy_url, connections=1)
         require_current(database)
         database.close()
-    at = time.time()
+    at, active = time.time(), set() if bucket is None else _active_jobs(settings)
     if settings.is_sqlite:
         with usable(settings):
             _copy_sqlite(settings.sqlite_file, out / SQLITE)
@@ -85,22 +110,34 @@ def backup(settings: Settings, out: Path) -> Backup:
         name = path.relative_to(settings.data).as_posix()
         if _copy(path, out / name):
             found[name] = _entry(out / name)
-    write_text(out / CONTENTS, json.dumps({"schema": SCHEMA, "version": __version__, "at": at, "files": found}, indent=1) + "\n")
-    return Backup(out, len(found), sum(entry["size"] for entry in found.values()))
+    contents: dict[str, Any] = {"schema": SCHEMA, "version": __version__, "at": at, "files": found}
+    objects: dict[str, Object] = {}
+    if bucket is not None:
+        objects = saved_objects.save(bucket, out / OBJECTS) if copy_objects else saved_objects.present(bucket, pieces=False)
+        active |= _active_jobs(settings)
+        contents["storage"] = {"url": bucket.url, "copied": copy_objects, "objects": {
+            path: {"size": each.size, "version": each.version} | ({"changes": True} if layout.is_of_job(path, active) else {})
+            for path, each in sorted(objects.items())}}
+        if copy_objects:
+            found |= {f"{OBJECTS}/{path}": _entry(out / OBJECTS / path) for path in sorted(objects)}
+    write_text(out / CONTENTS, json.dumps(contents, indent=1) + "\n")
+    return Backup(out, len(found), sum(entry["size"] for entry in found.values()), len(objects), copy_objects)
 
 
-def restore(settings: Settings, folder: Path) -> Backup:
+def restore(settings: Settings, folder: Path, *, accept_differences: bool = False) -> Backup:
     """Make a service from a backup; workers take over the jobs that ran when it was made.
 
     Args:
         settings: of the new service, whose data folder is empty and whose database has no tables.
         folder: the backup.
+        accept_differences: whether objects of the store may be missing, or differ from those that the backup names.
 
     Raises:
-        RequestError: the backup is not whole or damaged, or there is a service already; nothing is changed then.
-        StorageError: the data folder cannot be written.
+        RequestError: the backup is not whole or damaged, the store lacks objects of it, or there is a service already; nothing is changed
+            then.
+        StorageError: the data folder cannot be written, or the store not be read or written.
     """
-    files = _contents(folder)
+    files, stored = _contents(folder)
     kind = SQLITE if settings.is_sqlite else DUMP
     if kind not in files:
         raise RequestError(f"{folder}: is of a service with {'PostgreSQL' if settings.is_sqlite else 'SQLite'}: "
@@ -117,17 +154,51 @@ def restore(settings: Settings, folder: Path) -> Backup:
     for name, entry in files.items():
         if not (folder / name).is_file() or _entry(folder / name) != entry:
             raise RequestError(f"{folder / name}: is missing or differs from its checksum: the backup is damaged")
+    differing = _restore_objects(settings, folder, files, stored, accept_differences=accept_differences)
     with storage("make", settings.data):
         settings.data.mkdir(parents=True, exist_ok=True)
     for name in files:
-        if name not in (SQLITE, DUMP):
+        if name not in (SQLITE, DUMP) and not name.startswith(f"{OBJECTS}/"):
             _copy(folder / name, settings.data / name)
     if settings.is_sqlite:
         _copy(folder / SQLITE, settings.sqlite_file)
     else:
         _postgres(settings, "pg_restore", "--no-owner", "--no-privileges", "--exit-on-error", "--single-transaction", "--dbname",
                   str(urlsplit(str(settings.database_url)).path.lstrip("/")), str(folder / DUMP))
-    return Backup(folder, len(files), sum(entry["size"] for entry in files.values()))
+    return Backup(folder, len(files), sum(entry["size"] for entry in files.values()), 0 if stored is None else len(stored["objects"]),
+                  stored is not None and stored["copied"], differing)
+
+
+def _active_jobs(settings: Settings) -> set[str]:
+    """Return the jobs that have not ended, whose objects may still change."""
+    with usable(settings):
+        database = connect(settings.sqlalchemy_url, connections=1)
+        found = {row["id"] for row in database.rows(sa.select(tables.jobs.c.id).where(tables.jobs.c.state.in_(ACTIVE)))}
+        database.close()
+    return found
+
+
+def _restore_objects(settings: Settings, folder: Path, files: dict[str, dict[str, Any]], stored: dict[str, Any] | None, *,
+                     accept_differences: bool) -> int:
+    """Look for the objects of a backup in the store, and send those of which there are copies; return how many were missing or differed."""
+    if stored is None:
+        if settings.storage_url is not None and any(name.startswith(f"{PROJECTS}/") for name in files):
+            raise RequestError(f"{folder}: is of a service whose captures and results lie in its data folder: leave out storage_url")
+        return 0
+    if settings.storage_url is None:
+        raise RequestError(f"{folder}: is of a service with storage_url {stored['url']}: give this one, or another"
+                           f"{'' if stored['copied'] else ' with the same objects'}")
+    bucket, wanted = Bucket(settings.storage_url), stored["objects"]
+    missing, changed = saved_objects.compare(bucket, {path: (entry["size"], entry["version"]) for path, entry in wanted.items()})
+    if stored["copied"]:
+        saved_objects.send(bucket, folder / OBJECTS, [*missing, *changed])
+    else:
+        changed = [path for path in changed if not wanted[path].get("changes")]  # its job went on after the backup
+        if (missing or changed) and not accept_differences:
+            first, fault = (missing[0], "is not in the store") if missing else (changed[0], "is not what it was")
+            raise RequestError(f"{bucket.url}/{first}: {fault} ({len(missing)} objects of the backup are missing and {len(changed)} have "
+                               "changed): bring them back from the versions of the bucket, or give --accept-differences")
+    return len(missing) + len(changed)
 
 
 def _copy_sqlite(source: Path, target: Path) -> None:
@@ -156,12 +227,16 @@ def _postgres(settings: Settings, program: str, *arguments: str) -> None:
         raise RequestError(f"{program}: {' '.join(done.stderr.split())[:500]}")
 
 
-def _contents(folder: Path) -> dict[str, dict[str, Any]]:
+def _contents(folder: Path) -> _Contents:
     path = folder / CONTENTS
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
-        files = found["files"]
+        files, stored = found["files"], found.get("storage")
         assert found["schema"] == SCHEMA
+        if stored is not None:
+            assert isinstance(stored["url"], str)
+            copied = {f"{OBJECTS}/{path}" for path, entry in stored["objects"].items() if isinstance(entry["version"], str)}
+            assert not stored["copied"] or copied <= files.keys()
     except OSError:
         raise RequestError(f"{folder}: is no whole backup: there is no {CONTENTS} in it") from None
     except (ValueError, KeyError, TypeError, AssertionError, RecursionError):
@@ -169,7 +244,7 @@ def _contents(folder: Path) -> dict[str, dict[str, Any]]:
     for name in files:
         if Path(name).is_absolute() or ".." in Path(name).parts:
             raise RequestError(f"{path}: {name} leads out of the backup")
-    return dict(files)
+    return _Contents(dict(files), stored)
 
 
 def _files(folder: Path) -> Iterator[Path]:

@@ -7,6 +7,8 @@ projects/PROJECT/shared/ID/…          of a job that runs: pieces of its solve 
 uploads/ID/…                          in an object store: pieces of incomplete uploads
 """
 
+from collections.abc import Container
+
 from service.requests.identifiers import CAPTURE, ENVIRONMENT
 
 MAPS = "maps.exr"
@@ -38,3 +40,14 @@ def results(project: str, job: str) -> str:
 def shared(project: str, job: str) -> str:
     """Return the prefix of what the workers of a running job have done so far; it is deleted when the job ends."""
     return f"projects/{project}/shared/{job}"
+
+
+def is_shared(path: str) -> bool:
+    """Return whether a path is below a prefix of `shared`."""
+    return path.split("/")[2:3] == ["shared"]
+
+
+def is_of_job(path: str, jobs: Container[str]) -> bool:
+    """Return whether a path is below the results of one of these jobs."""
+    parts = path.split("/")
+    return parts[2:3] == ["jobs"] and parts[3:4] != [] and parts[3] in jobs
