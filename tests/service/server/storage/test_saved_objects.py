@@ -140,6 +140,7 @@ def test_an_object_that_is_replaced_or_deleted_while_it_is_copied(store, tmp_pat
     assert (tmp_path / "copies" / MAPS).read_bytes() == b"newer maps" and not (tmp_path / "copies" / FRAME).exists()
 
 
+@pytest.mark.long
 def test_a_job_that_ran_is_finished_by_the_restored_service_in_another_store(tmp_path, undisturbed):  # noqa: F811
     roots = str(undisturbed.capture.parent)
     first, other = ((tmp_path / name).as_uri() for name in ("store", "other"))
