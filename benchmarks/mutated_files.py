@@ -13,6 +13,7 @@ import OpenImageIO as oiio
 
 from service.captures.admit import admit_capture, admit_environment
 from service.captures.inspect import inspect
+from service.requests.captures import InfoRequest
 from service.requests.light_keys import LightKeys
 from service.server.settings import Settings
 from stage import exr, images
@@ -80,7 +81,7 @@ def read_capture(path: Path) -> None:
         open_stack(capture)
         shutil.rmtree(folder / ".relit")
     capture.mask_values()
-    inspect(folder)
+    inspect(InfoRequest(capture=folder))
 
 
 def read_sky(path: Path) -> None:
