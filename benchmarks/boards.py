@@ -20,6 +20,7 @@ from service.reporting.progress import Timings
 from service.requests.inspect_board import InspectBoardRequest
 from stage.board.grid import blocks_of, robust_sigma
 from stage.board.stitching import blend, stitch
+from stage.errors import BoardError
 from tests.scenes.board import PIXEL, SIGMA, Heights, components, domes, scan, write_scan
 
 SIDE, STEP, ACROSS, DOWN = (160, 180), (1.5e-3, 1.3e-3), 3, 2
@@ -106,16 +107,20 @@ def stitching(scene: Scene) -> str:
 def detection(scene: Scene, boards: int, keep: Path | None) -> str:
     """One line of the table of defects: those found by side, and the false alarms on boards with and without defects."""
     surface = scene.surface()
-    found, alarms, beside = dict.fromkeys(SIDES, 0), 0, 0
+    found, alarms, beside, refused = dict.fromkeys(SIDES, 0), 0, 0, 0
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         inspected(surface, folder / "golden", 1, scene, None)
         golden = folder / "golden" / "out"
         for number in range(boards):
-            rows = inspected(surface, folder / "good", 100 + number, scene, golden)
+            try:
+                rows = inspected(surface, folder / "good", 100 + number, scene, golden)
+                faulty, squares = planted(surface, number)
+                defects = [row for row in inspected(faulty, folder / "bad", 200 + number, scene, golden) if row["kind"] == "defect"]
+            except BoardError:
+                refused += 1
+                continue
             alarms += any(row["kind"] == "defect" for row in rows)
-            faulty, squares = planted(surface, number)
-            defects = [row for row in inspected(faulty, folder / "bad", 200 + number, scene, golden) if row["kind"] == "defect"]
             places = np.array([[float(row["x_m"]), float(row["y_m"])] for row in defects]).reshape(-1, 2)
             own = np.zeros(len(places), dtype=bool)
             for x, y, side in squares:
@@ -125,8 +130,9 @@ def detection(scene: Scene, boards: int, keep: Path | None) -> str:
             beside += int((~own).sum())
             if keep is not None and number == 0:
                 shutil.copy(folder / "bad" / "out" / "inspection.png", keep)
-    cells = " | ".join(f"{found[side]} of {2 * boards}" for side in SIDES)
-    return f"| {scene.name} | {cells} | {alarms} of {boards} | {beside} |"
+    judged = boards - refused
+    cells = " | ".join(f"{found[side]} of {2 * judged}" for side in SIDES)
+    return f"| {scene.name} | {cells} | {alarms} of {judged} | {beside} | {refused} of {boards} |"
 
 
 def main() -> None:
@@ -139,7 +145,7 @@ def main() -> None:
     for scene in SCENES:
         print(stitching(scene), flush=True)
     heads = " | ".join(f"{side} x {side} px" for side in SIDES)
-    print(f"\n| board | {heads} | good boards with an alarm | alarms beside defects |\n|---|{'---|' * len(SIDES)}---|---|")
+    print(f"\n| board | {heads} | good boards with an alarm | alarms beside defects | refused |\n|---|{'---|' * len(SIDES)}---|---|---|")
     for number, scene in enumerate(SCENES):
         print(detection(scene, arguments.boards, arguments.picture if number == 0 else None), flush=True)
 

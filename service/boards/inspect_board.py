@@ -155,7 +155,7 @@ def _judge(board: BoardTiles, stitched: Stitched, nominal: Nominal, request: Ins
     grid = nominal.heights.grid
     timings.stage("match", 2 * len(board.tiles))
     first = blend(board.tiles, stitched, grid, progress=timings.advance)
-    check_size(first, stitched, nominal)
+    check_size(first, board.tiles, stitched, nominal)
     found = match(first, stitched, nominal, placement_m=request.placement_m)
     heights = blend(board.tiles, stitched, grid, motion=found.motion, progress=lambda done: timings.advance(len(board.tiles) + done))
     timings.stage("judge", 1)

@@ -1,5 +1,6 @@
 """Where a stitched board lies on its nominal height map; a board of another size, unit or handedness is refused."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -7,7 +8,7 @@ import numpy as np
 from service.boards.height_files import Nominal
 from stage.board.grid import HeightMap, HeightPatch
 from stage.board.overlap import Evidence, Overlap, measure_overlap
-from stage.board.stitching import MILLI, SEARCH_SIGMA, SHIFT_SIGMA_PX, TURN_SIGMA_DEGREES, Stitched
+from stage.board.stitching import MILLI, SEARCH_SIGMA, SHIFT_SIGMA_PX, TURN_SIGMA_DEGREES, Stitched, TilePoints
 from stage.errors import BoardError
 
 LEAST_SHARE = 0.5
@@ -78,11 +79,12 @@ def match(measured: HeightMap, stitched: Stitched, nominal: Nominal, *, placemen
     return Match(motion, found.evidence, found.correlation, (float(shift[0]), float(shift[1])), warnings)
 
 
-def check_size(measured: HeightMap, stitched: Stitched, nominal: Nominal) -> None:
+def check_size(measured: HeightMap, tiles: Sequence[TilePoints], stitched: Stitched, nominal: Nominal) -> None:
     """Refuse a nominal map that is not as large as the board, or lies elsewhere.
 
     Args:
         measured: the blend of the tiles on the nominal grid.
+        tiles: that were measured.
         stitched: of the tiles, with the grid of what was measured.
         nominal: the map.
 
@@ -98,15 +100,26 @@ def check_size(measured: HeightMap, stitched: Stitched, nominal: Nominal) -> Non
         raise BoardError(f"{nominal.path}: is not of this board: {sizes}; the sizes differ {max(ratio, 1 / ratio):.3g}-fold{hint}")
     wanted, there = nominal.heights.measured, measured.measured
     share = float((there & wanted).sum() / wanted.sum())
-    area = (own[0] - pixel) * (own[1] - pixel)
-    covered = float(there.sum()) * grid.pixel_m**2 / area
+    covered = _covered(tiles, stitched, nominal)
     if share < LEAST_SHARE:
-        if pixel > 1.2 * grid.pixel_m and covered < LEAST_SHARE:
+        if pixel > 1.2 * grid.pixel_m and covered >= LEAST_SHARE:
             raise BoardError(f"{nominal.path}: its pixels of {grid.pixel_m:.3g} m are finer than the points of the tiles, which are "
                              f"{pixel:.3g} m apart")
         raise BoardError(f"{nominal.path}: is not of this board: {100 * share:.0f} % of its pixels were measured; {sizes}")
     if covered < LEAST_SHARE:
         raise BoardError(f"{nominal.path}: is not of this board: it covers {100 * covered:.0f} % of what was measured; {sizes}")
+
+
+def _covered(tiles: Sequence[TilePoints], stitched: Stitched, nominal: Nominal) -> float:
+    """Return the part of the measured points that lie on pixels with a nominal height."""
+    grid, on, points = nominal.heights.grid, 0, 0
+    for tile, motion in zip(tiles, stitched.motions.values, strict=True):
+        x, y, _ = tile.moved(motion, centre=stitched.centre, length_m=stitched.length_m)
+        row, col = (np.rint(place).astype(np.int64) for place in grid.place(x, y))
+        inside = (row >= 0) & (row < grid.rows) & (col >= 0) & (col < grid.cols)
+        on += int(nominal.heights.measured[row[inside], col[inside]].sum())
+        points += x.size
+    return on / points
 
 
 def _check_unit(measured: HeightMap, nominal: Nominal) -> None:

@@ -7,11 +7,15 @@ from service.light.sequence import time_steps
 from service.reporting.progress import Progress, Timings
 from stage import images, inputs, jxl
 from stage.arrays import array_shape
+from stage.board.records import SCAN_FILE as BOARD_FILE
+from stage.board.records import SCAN_SCHEMA, BoardScan
 from stage.capture import Capture
+from stage.depth_maps import DEPTH_FILE
 from stage.environment_maps import SUFFIXES
 from stage.errors import ImageError, ManifestError, storage
 from stage.files import resolved
 from stage.manifest import FILE_NAME, Manifest, read_manifest
+from stage.records import read_record
 from stage.tof.scan import FILE_NAME as SCAN_FILE
 from stage.tof.scan import read_scan
 
@@ -22,7 +26,8 @@ MAX_CHANNELS = 4
 
 
 def admit_capture(folder: Path, *, max_pixels: int, progress: Progress | None = None) -> dict[str, Any]:
-    """Check the manifest of a capture, or of a sequence of captures, and the header of every file that it names; or the shots of a scan.
+    """Check the manifest of a capture, or of a sequence of captures, and the header of every file that it names; or the shots of a scan,
+    or the tiles of a board.
 
     Args:
         folder: folder of the capture or of the sequence.
@@ -30,13 +35,16 @@ def admit_capture(folder: Path, *, max_pixels: int, progress: Progress | None = 
         progress: told of every capture.
 
     Returns:
-        A description: number of captures and frames, resolution, colour space, name; of a scan its number of shots and name.
+        A description: number of captures and frames, resolution, colour space, name; of a scan its number of shots and name; of a
+        board its number of tiles and name.
 
     Raises:
         ManifestError: the manifest is wrong, or a file lies outside the folder; names the field.
         ImageError: a file is not an image, is cut short, or has more pixels than are allowed; names the file.
         StorageError: a file cannot be read.
     """
+    if (folder / BOARD_FILE).is_file() and not (folder / FILE_NAME).exists():
+        return _admit_board(folder, max_pixels)
     if (folder / SCAN_FILE).is_file() and not (folder / FILE_NAME).exists():
         shots = read_scan(folder)
         return {"captures": 0, "frames": 0, "shots": len(shots.time_s), "name": shots.scan.name}
@@ -55,6 +63,22 @@ def admit_capture(folder: Path, *, max_pixels: int, progress: Progress | None = 
     assert manifest is not None, "time_steps gives at least one"
     return {"captures": len(steps), "frames": frames, "resolution": list(manifest.camera.resolution), "color_space": manifest.color_space,
             "name": manifest.name}
+
+
+def _admit_board(folder: Path, max_pixels: int) -> dict[str, Any]:
+    """Check the tiles of a board as `admit_capture` checks captures."""
+    _check_place(folder / BOARD_FILE, folder, BOARD_FILE)
+    scan = read_record(folder / BOARD_FILE, BoardScan, SCAN_SCHEMA)
+    for number, tile in enumerate(scan.tiles):
+        place = folder / tile.path
+        if (depth := place / DEPTH_FILE).exists() or depth.is_symlink():
+            raise ManifestError(f"{folder / BOARD_FILE}: tiles[{number}]: {tile.path} holds a {DEPTH_FILE}: the service takes captures as "
+                                "tiles, whose images it decodes in other processes")
+        _check_place(place / FILE_NAME, folder, f"{folder / BOARD_FILE}: tiles[{number}]: {tile.path}/{FILE_NAME}")
+        _check_manifest_files(place)
+        _check_places(place, read_manifest(place / FILE_NAME), folder, max_pixels)
+        Capture.open(place)
+    return {"captures": 0, "frames": 0, "tiles": len(scan.tiles), "name": scan.name}
 
 
 def recheck_capture(folder: Path, *, max_pixels: int) -> None:

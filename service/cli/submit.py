@@ -22,6 +22,7 @@ from service.requests.jobs import (
     ExportJob,
     FlatFieldJob,
     GreyBallJob,
+    InspectBoardJob,
     IntensityJob,
     JobRequest,
     LightPositionsJob,
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
 
 JOBS: dict[str, type[JobRequest]] = {"solve": SolveJob, "depth": DepthJob, "relight": RelightJob, "shade": ShadeJob, "export": ExportJob,
                                      "view": ViewJob, "pipeline": PipelineJob, "basis": BasisJob, "scan": ScanJob, "patterns": PatternsJob,
+                                     "inspect-board": InspectBoardJob,
                                      "calibrate-mirror-ball": MirrorBallJob, "calibrate-light-positions": LightPositionsJob,
                                      "calibrate-grey-ball": GreyBallJob, "calibrate-intensity": IntensityJob, "calibrate-dark": DarkJob,
                                      "calibrate-flat-field": FlatFieldJob, "calibrate-saturation": SaturationJob,

@@ -20,6 +20,7 @@ from service.requests.calibrate import (
 from service.requests.depth import DepthOptions
 from service.requests.export import AssetFormat, ExportOptions
 from service.requests.identifiers import CaptureId, EnvironmentId, JobId
+from service.requests.inspect_board import InspectBoardOptions
 from service.requests.light_keys import LightKeys
 from service.requests.patterns import PatternsOptions
 from service.requests.relight import RelightOptions
@@ -169,6 +170,17 @@ class ScanJob(JobRequest):
     options: ScanOptions = ScanOptions()
 
 
+class InspectBoardJob(JobRequest):
+    """What is wrong with a board that was measured in tiles: board.exr, deviation.exr, findings.csv, inspection.png, report.json."""
+
+    kind: Literal["inspect-board"]
+    capture: Annotated[CaptureId, Role.INPUT, Spelling(argument=True, metavar="BOARD")]
+    """An uploaded folder with a board.json, each of whose tiles is a capture."""
+    golden: Annotated[JobId | None, Role.INPUT, Spelling(metavar="JOB")] = None
+    """The job that inspected a good board, with which this one is compared. None: only the height map is made."""
+    options: InspectBoardOptions = InspectBoardOptions()
+
+
 class PatternsJob(JobRequest):
     """Images to project and their manifest entries: PNG files and patterns.json."""
 
@@ -283,9 +295,9 @@ class TofCalibrationJob(JobRequest):
     """Name of the relit.tof-sweep/1 file in the folder."""
 
 
-OneJob = (SolveJob | DepthJob | RelightJob | ShadeJob | ExportJob | ViewJob | PipelineJob | BasisJob | ScanJob | PatternsJob | MirrorBallJob
-          | LightPositionsJob | GreyBallJob | IntensityJob | DarkJob | FlatFieldJob | SaturationJob | ProcamJob | ResponseJob
-          | TofCalibrationJob)
+OneJob = (SolveJob | DepthJob | RelightJob | ShadeJob | ExportJob | ViewJob | PipelineJob | BasisJob | ScanJob | InspectBoardJob
+          | PatternsJob | MirrorBallJob | LightPositionsJob | GreyBallJob | IntensityJob | DarkJob | FlatFieldJob | SaturationJob
+          | ProcamJob | ResponseJob | TofCalibrationJob)
 UserJob = Annotated[OneJob, Field(discriminator="kind")]
 """Every kind of job that the API accepts."""
 AnyJob = Annotated[CheckJob | OneJob, Field(discriminator="kind")]

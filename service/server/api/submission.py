@@ -1,9 +1,11 @@
 """Whether a job can be submitted: its captures and environments are ready, and it keeps within the limits."""
 
+from collections.abc import Sequence
+
 import sqlalchemy as sa
 
 from service.requests.frame_range import frame_numbers
-from service.requests.jobs import CheckJob, ExportJob, JobRequest, PipelineJob, RelightJob, ShadeJob, ViewJob
+from service.requests.jobs import CheckJob, ExportJob, InspectBoardJob, JobRequest, PipelineJob, RelightJob, ShadeJob, ViewJob
 from service.requests.relight import RelightOptions
 from service.server import telemetry
 from service.server.api.context import Service, require_quota
@@ -51,8 +53,12 @@ def inputs_of(service: Service, project: str, request: JobRequest) -> list[str]:
             _require_ready(service, project, field, identifier)
             read.append(identifier)
     if isinstance(request, RelightJob | ShadeJob | ExportJob | ViewJob) and request.maps is not None:
-        _require_maps(service, project, request.maps, depth=isinstance(request, ExportJob | ViewJob))
+        kinds = ("solve", "pipeline", *(("depth",) if isinstance(request, ExportJob | ViewJob) else ()))
+        _require_results(service, project, "maps", request.maps, kinds)
         read.append(request.maps)
+    if isinstance(request, InspectBoardJob) and request.golden is not None:
+        _require_results(service, project, "golden", request.golden, (request.kind,))
+        read.append(request.golden)
     return read
 
 
@@ -89,12 +95,11 @@ def _require_ready(service: Service, project: str, field: str, identifier: str) 
         raise ApiError("conflict", f"{field}: {identifier} is {row['state']}, not ready")
 
 
-def _require_maps(service: Service, project: str, identifier: str, *, depth: bool) -> None:
+def _require_results(service: Service, project: str, field: str, identifier: str, kinds: Sequence[str]) -> None:
     row = jobs.find(service.database, identifier, project)
-    kinds = ("solve", "pipeline", "depth") if depth else ("solve", "pipeline")
     if row is None:
-        raise ApiError("not-found", f"maps: {identifier} is not in this project")
+        raise ApiError("not-found", f"{field}: {identifier} is not in this project")
     if row["request"]["kind"] not in kinds:
-        raise ApiError("invalid", f"maps: {identifier} is a {row['request']['kind']} job: give one of {', '.join(kinds)}")
+        raise ApiError("invalid", f"{field}: {identifier} is a {row['request']['kind']} job: give one of {', '.join(kinds)}")
     if row["state"] != states.SUCCEEDED:
-        raise ApiError("conflict", f"maps: {identifier} is {row['state']}, not succeeded")
+        raise ApiError("conflict", f"{field}: {identifier} is {row['state']}, not succeeded")

@@ -10,7 +10,7 @@ from service.reporting.progress import Progress
 from service.reporting.provenance import name_place
 from service.requests.frame_range import frame_numbers
 from service.requests.identifiers import CAPTURE
-from service.requests.jobs import CheckJob, DepthJob, ExportJob, PipelineJob, RelightJob, ShadeJob, SolveJob, ViewJob
+from service.requests.jobs import CheckJob, DepthJob, ExportJob, InspectBoardJob, PipelineJob, RelightJob, ShadeJob, SolveJob, ViewJob
 from service.server.database import intakes, quotas
 from service.server.jobs import calibrating, measuring
 from service.server.jobs.context import Job, WorkerContext
@@ -72,6 +72,8 @@ def _steps_of(job: Job, context: WorkerContext) -> list[JobStep]:
         return [JobStep("shade", lambda progress: _shade(job, request, context, progress))]
     if isinstance(request, ExportJob):
         return [JobStep("export", lambda progress: _export(job, request, context, progress))]
+    if isinstance(request, InspectBoardJob):
+        return [JobStep("inspect", lambda progress: _inspect_board(job, request, context, progress))]
     if isinstance(request, ViewJob):
         return [JobStep("view", lambda progress: _view(job, request, context, progress))]
     run = measuring.run if measuring.can_run(request) else calibrating.run if calibrating.can_run(request) else None
@@ -118,8 +120,8 @@ def _check(job: Job, request: CheckJob, context: WorkerContext, progress: Progre
     folder, root = _place(job, request.intake, context, progress)
     facts = check_in_process(folder, environment=not request.intake.startswith(CAPTURE), root=root, max_pixels=context.max_pixels,
                              progress=progress)
-    if "shots" in facts and root is not None:
-        raise RequestError("a scan is not registered: upload its folder")
+    if root is not None and (what := "scan" if "shots" in facts else "board" if "tiles" in facts else None) is not None:
+        raise RequestError(f"a {what} is not registered: upload its folder")
     settings, more = context.settings, quotas.pixels_of(facts)
     intakes.accept(context.database, request.intake, facts, None if settings is None else lambda connection: quotas.require(
         connection, settings, quotas.PIXELS, job.project, more))
@@ -158,6 +160,19 @@ def _depth(job: Job, request: DepthJob, context: WorkerContext, progress: Progre
     options = dict(request.options) | {"tof": TofOptions(calibration=calibration, **dict(request.options.tof))}
     depth(DepthRequest(capture=capture, out=_out(job, context), device=context.device, cache=context.cache / request.capture, **options),
           progress)
+
+
+def _inspect_board(job: Job, request: InspectBoardJob, context: WorkerContext, progress: Progress) -> None:
+    from service.boards.height_files import BOARD_FILE
+    from service.boards.inspect_board import inspect_board
+    from service.requests.inspect_board import InspectBoardRequest
+
+    board = _intake(job, request.capture, context, progress)
+    golden = None
+    if request.golden is not None:
+        golden = _named(context.storage.local(layout.results(job.project, request.golden), {BOARD_FILE}, progress), request.golden)
+    inspect_board(InspectBoardRequest(board=board, out=_out(job, context), golden=golden, device=context.device,
+                                      cache=context.cache / request.capture, **dict(request.options)), progress)
 
 
 def _shade(job: Job, request: ShadeJob, context: WorkerContext, progress: Progress) -> None:

@@ -19,6 +19,7 @@ from service.requests.jobs import (
     ExportJob,
     FlatFieldJob,
     GreyBallJob,
+    InspectBoardJob,
     IntensityJob,
     JobRequest,
     LightPositionsJob,
@@ -36,7 +37,8 @@ from service.requests.light_keys import LightKeys
 from service.requests.options import Option, help_text, places_of, typed
 
 CAPTURE_JOBS: dict[str, type[JobRequest]] = {
-    "solve": SolveJob, "pipeline": PipelineJob, "depth": DepthJob, "relight": RelightJob, "calibrate-mirror-ball": MirrorBallJob,
+    "solve": SolveJob, "pipeline": PipelineJob, "depth": DepthJob, "inspect-board": InspectBoardJob,
+    "relight": RelightJob, "calibrate-mirror-ball": MirrorBallJob,
     "calibrate-light-positions": LightPositionsJob, "calibrate-grey-ball": GreyBallJob, "calibrate-intensity": IntensityJob,
     "calibrate-dark": DarkJob, "calibrate-flat-field": FlatFieldJob, "calibrate-saturation": SaturationJob, "calibrate-procam": ProcamJob,
     "calibrate-response": ResponseJob, "calibrate-tof": TofCalibrationJob,
@@ -45,7 +47,7 @@ CAPTURE_JOBS: dict[str, type[JobRequest]] = {
 MAPS_JOBS: dict[str, type[JobRequest]] = {"export": ExportJob, "shade": ShadeJob}
 """Jobs that begin with the maps of another job, by kind."""
 TITLES = {"solve": "Solve normals and materials", "pipeline": "Solve, export and relight", "depth": "Decode depth",
-          "relight": "Relight frames", "export": "Export an asset", "shade": "Shade one picture",
+          "inspect-board": "Inspect a board", "relight": "Relight frames", "export": "Export an asset", "shade": "Shade one picture",
           "calibrate-mirror-ball": "Calibrate light directions: one mirror ball",
           "calibrate-light-positions": "Calibrate light positions: two or more mirror balls",
           "calibrate-grey-ball": "Calibrate the brightness of lights: a grey ball",

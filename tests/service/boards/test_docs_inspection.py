@@ -10,7 +10,7 @@ DOCS = (Path(__file__).resolve().parents[3] / "docs" / "inspection.md").read_tex
 
 
 def test_the_options_exist(relit):
-    shown = relit("inspect-board", "--help").out
+    shown = relit("inspect-board", "--help").out + relit("submit", "inspect-board", "--help").out
     used = set(re.findall(r"--[a-z][a-z-]+", DOCS))
     assert {"--golden", "--design", "--false-alarm"} <= used
     assert {option for option in used if option not in shown} == set()
