@@ -82,7 +82,7 @@ def test_the_black_level_of_the_paper(relit, tmp_path):
     np.testing.assert_allclose(direct, truth[0], atol=2e-6)
     np.testing.assert_allclose(indirect, truth[1], atol=4e-6)
     assert report["found"]["ambient"] == "none" and report["found"]["sum_over_white"] is None
-    assert report["options"] == {"capture": str(tmp_path), "period_px": None, "black_level": 0.04}
+    assert report["options"] == {"capture": str(tmp_path), "period_px": None, "black_level": 0.04, "clip_negative": False, "crop": None}
 
 
 def test_off_frames_are_ambient_light_and_a_period_is_chosen(relit, tmp_path):
