@@ -67,6 +67,23 @@ def test_a_form_submits_a_job_that_is_followed_to_its_results(server, page, capt
     assert json.loads(download.value.path().read_text()) == report
 
 
+def test_forms_of_several_captures_and_images(page, capture):
+    page.goto(f"/captures/{capture}")
+    form = opened_form(page, "Calibrate camera and projector", options=False)
+    form.get_by_label("Board").fill("9x6")
+    form.get_by_label("Square m").fill("0.03")
+    command = form.locator("[data-shows=command]").inner_text()
+    assert f"calibrate-procam {capture} " in command and command.endswith("--board 9x6 --square-m 0.03")  # the page's capture is entered
+    page.goto(f"/captures/{capture}")
+    form = opened_form(page, "Calibrate the dark frame", options=False)
+    form.get_by_label("Images").fill("b.exr\na.exr")
+    assert f"calibrate-dark {capture} b.exr a.exr" in form.locator("[data-shows=command]").inner_text()
+    form.get_by_label("Images").fill("")
+    submit = form.locator("button[type=submit]")
+    submit.click()
+    form.locator(".fault", has_text="Images: ").wait_for()
+
+
 def test_what_a_form_sends_is_shown_as_a_command_and_as_curl(server, page, capture, sky):
     """Both are run as they are shown, and make the same request as the form."""
     page.goto(f"/captures/{capture}")
