@@ -52,12 +52,13 @@ def test_the_report_and_the_maps_say_that_frames_were_aligned(relit, tmp_path):
     errors(relit, tmp_path, GLIDING, "--align")
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     unaligned = {"capture": str(tmp_path), "method": "lambert", "reference_ball": None, "align": False, "align_to": None,
-                 "max_sigma": None, "least_confidence": None}
+                 "crop": None, "clip_negative": False, "lights": "declared", "intensities": "chosen", "max_sigma": None,
+                 "least_confidence": None}
     assert report["options"] == unaligned | {"align": True}
     assert report["inputs"]["content"].startswith("aligned-") and report["inputs"]["frames"] == 8
     assert report["motion"]["reference"] == "05.exr" and len(report["motion"]["intervals"]) == 2
     metadata = exr.read_header(tmp_path / "out" / "maps.exr").metadata
-    assert json.loads(metadata["relit:options"]) == {"method": "lambert", "align": True}
+    assert json.loads(metadata["relit:options"]) == {"method": "lambert", "align": True, "intensities": "chosen", "lights": "declared"}
     errors(relit, tmp_path, GLIDING)
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert "motion" not in report and report["options"] == unaligned
