@@ -13,12 +13,11 @@ from typing import NamedTuple
 import numpy as np
 
 from stage.board.grid import BLOCK_PX, BoardGrid, HeightPatch, blocks_of, gradients, robust_sigma
+from stage.board.shift_search import LEAST_PIXELS, SHARED_PX, find_shifts
 
 UNKNOWNS = 6
 LATERAL = slice(0, 3)
 """The unknowns of a motion in the plane of the board: x, y and rotation."""
-LEAST_PIXELS = 400
-"""The fewest common pixels with which two patches overlap."""
 TUKEY = 4.685
 """Tukey's constant: residuals beyond so many σ count nothing."""
 ROUNDS = 8
@@ -34,11 +33,8 @@ CLEAR_DIRECTION = 10.0
 """Information about a shift counts in directions where it is this many times what the noise of slopes alone gives."""
 LEAST_CLEAR = 150
 """The fewest pixels with a clear slope that measure a shift."""
-MOST_CANDIDATES = 8
 LEAST_LOG_ODDS = 7.0
 """Log odds (1000 : 1) by which the best shift must be more probable than any other; else the shift counts as not measured."""
-SHARED_PX = 9.0
-"""Pixels that share an error of interpolation: the evidence of the pixels is divided by it."""
 
 
 class Evidence(StrEnum):
@@ -88,6 +84,8 @@ class _Common(NamedTuple):
     first: np.ndarray  # [rows, cols] heights, NaN outside
     second: np.ndarray
     variance: np.ndarray  # of the difference
+    window: tuple[slice, slice]
+    """Rows and columns of the grid that the arrays cover."""
 
 
 def measure_overlap(first: HeightPatch, second: HeightPatch, grid: BoardGrid, *, centre: tuple[float, float], length_m: float,
@@ -108,7 +106,8 @@ def measure_overlap(first: HeightPatch, second: HeightPatch, grid: BoardGrid, *,
     common = _common(first, second, (0, 0))
     if common is None:
         return None
-    candidates = _candidates(first, second, common, grid, shift_sigma_m, search_px)
+    candidates = find_shifts(first, second, *common.window, pixels=common.row.size, sigma_px=shift_sigma_m / grid.pixel_m,
+                             search_px=search_px)
     fits = []
     for shift in candidates:
         fit = _refine(first, second, shift, grid, centre, length_m)
@@ -184,7 +183,7 @@ def _common(first: HeightPatch, second: HeightPatch, shift: tuple[int, int]) -> 
         return None
     row, col = np.nonzero(both)
     return _Common(row + top, col + left, np.where(both, first.height[a], np.nan), np.where(both, second.height[b], np.nan),
-                   first.variance[a] + second.variance[b])
+                   first.variance[a] + second.variance[b], (slice(top, bottom), slice(left, right)))
 
 
 def _refine(first: HeightPatch, second: HeightPatch, shift: tuple[int, int], grid: BoardGrid, centre: tuple[float, float],
@@ -313,68 +312,3 @@ def _cost(fit: _Fit, pixels: int, shift_sigma_m: float) -> float:
     """Return minus the log posterior probability of a shift, but for a constant, from the pixels of the overlap as the stage tells it."""
     evidence = pixels / SHARED_PX * np.log(max(fit.misfit, 1e-12))
     return float(evidence + (fit.difference[0] ** 2 + fit.difference[1] ** 2) / (2 * shift_sigma_m**2))
-
-
-def _candidates(first: HeightPatch, second: HeightPatch, common: _Common, grid: BoardGrid, shift_sigma_m: float,
-                search_px: int) -> list[tuple[int, int]]:
-    """Return the shifts of whole pixels at which the mean squared difference has a minimum, the most probable first."""
-    if search_px == 0:
-        return [(0, 0)]
-    top, left = int(common.row.min()), int(common.col.min())
-    shape = common.first.shape
-    a = _detrended(first, top, left, shape, 0)
-    b = _detrended(second, top, left, shape, search_px)
-    score = _differences(a, b, search_px)
-    if not np.isfinite(score).any():
-        return [(0, 0)]
-    steps = np.arange(-search_px, search_px + 1)
-    padded = np.pad(np.where(np.isfinite(score), score, np.inf), 1, constant_values=np.inf)
-    around = np.min([padded[1 + i : padded.shape[0] - 1 + i, 1 + j : padded.shape[1] - 1 + j] for i in (-1, 0, 1) for j in (-1, 0, 1)],
-                    axis=0)
-    lowest = np.isfinite(score) & (score <= around)
-    prior = (steps[:, None] ** 2 + steps[None] ** 2) * grid.pixel_m**2 / (2 * shift_sigma_m**2)
-    cost = common.row.size / SHARED_PX / 2 * np.log(np.maximum(score, 1e-30)) + prior
-    at = np.argwhere(lowest)
-    order = np.argsort(cost[lowest])[:MOST_CANDIDATES]
-    found = [(int(steps[i]), int(steps[j])) for i, j in at[order]]
-    return found if (0, 0) in found else [*found, (0, 0)]
-
-
-def _detrended(patch: HeightPatch, top: int, left: int, shape: tuple[int, ...], margin: int) -> np.ndarray:
-    """Return a window of a patch, `margin` larger on every side, less a plane and with spikes clipped; NaN outside."""
-    window = np.full((shape[0] + 2 * margin, shape[1] + 2 * margin), np.nan)
-    row, col = top - margin - patch.row, left - margin - patch.col
-    rows = slice(max(row, 0), min(row + window.shape[0], patch.height.shape[0]))
-    cols = slice(max(col, 0), min(col + window.shape[1], patch.height.shape[1]))
-    window[rows.start - row : rows.stop - row, cols.start - col : cols.stop - col] = patch.height[rows, cols]
-    there = np.isfinite(window)
-    y, x = np.nonzero(there)
-    values = window[there]
-    kept = np.abs(values - np.median(values)) <= 5 * max(robust_sigma(values), 1e-12)
-    basis = np.stack([np.ones(x.size), x / window.shape[1], y / window.shape[0]], axis=1)
-    values = values - basis @ np.linalg.lstsq(basis[kept], values[kept], rcond=None)[0]
-    window[there] = np.clip(values, *np.percentile(values, [0.5, 99.5]))
-    return window
-
-
-def _differences(a: np.ndarray, b: np.ndarray, reach: int) -> np.ndarray:
-    """Return the variance of a − b over their common pixels for every shift of b up to `reach`, [2 reach + 1]²; NaN with too few."""
-    shape = [length + 2 * reach for length in b.shape]
-
-    def transform(values: np.ndarray) -> np.ndarray:
-        return np.fft.rfft2(values, shape)
-
-    mask_a, mask_b = np.isfinite(a), np.isfinite(b)
-    fa, fb = np.where(mask_a, a, 0), np.where(mask_b, b, 0)
-    ma, mb, ha, hb = (transform(values.astype(np.float64)) for values in (mask_a, mask_b, fa, fb))
-    sa, sb = transform(fa * fa), transform(fb * fb)
-
-    def correlate(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-        whole = np.fft.irfft2(np.conj(one) * other, shape)[: 2 * reach + 1, : 2 * reach + 1]
-        return whole[::-1, ::-1]  # the window of b begins `reach` before that of a: a shift of b by s is the lag reach − s
-
-    count = correlate(ma, mb)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        mean = (correlate(ha, mb) - correlate(ma, hb)) / count
-        square = (correlate(sa, mb) + correlate(ma, sb) - 2 * correlate(ha, hb)) / count
-        return np.where(count >= max(LEAST_PIXELS, 0.3 * count.max()), square - mean**2, np.nan)
