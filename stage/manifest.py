@@ -103,16 +103,21 @@ def read_manifest(path: str | Path) -> Manifest:
 
 
 def write_manifest(manifest: Manifest, path: str | Path) -> None:
-    """Write a capture.json whole or not at all, with `color_space` always and other keys when they differ from their default.
+    """Write a capture.json whole or not at all.
 
     Raises:
         StorageError: the file cannot be written.
     """
+    write_text(path, manifest_text(manifest))
+
+
+def manifest_text(manifest: Manifest) -> str:
+    """Return the content of a capture.json, with `color_space` always and other keys when they differ from their default."""
     data = manifest.model_dump(mode="json", by_alias=True, exclude_defaults=True)
     frames = ",\n".join("    " + json.dumps(frame) for frame in data.pop("frames"))
     first = {"schema": data.pop("schema"), "name": data.pop("name"), "color_space": manifest.color_space}
     body = json.dumps({**first, **data}, indent=2)
-    write_text(path, body[:-2] + f',\n  "frames": [\n{frames}\n  ]\n}}\n')
+    return body[:-2] + f',\n  "frames": [\n{frames}\n  ]\n}}\n'
 
 
 def _frame_faults(data: dict[str, Any]) -> Iterator[str]:

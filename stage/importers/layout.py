@@ -16,8 +16,11 @@ from stage import images, inputs
 from stage.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError, storage
 from stage.files import replacing
-from stage.manifest import FILE_NAME, Manifest, write_manifest
+from stage.manifest import FILE_NAME, Manifest, manifest_text, write_manifest
 from stage.records import describe
+
+PREVIOUS_NAME = "capture.previous.json"
+"""What a capture.json that an import replaces by another is kept as."""
 
 
 class Imported(NamedTuple):
@@ -129,6 +132,8 @@ def write_capture(data: dict[str, Any], table: Path, destination: Path, *, folde
                   arrays: Mapping[str, np.ndarray] | None = None) -> Path:
     """Check a manifest, place its images, and write it last, so that a capture.json never names files that do not exist.
 
+    A capture.json that was there and differs is kept as PREVIOUS_NAME.
+
     Args:
         data: the manifest as plain data.
         table: the file that the manifest was made from; errors name it.
@@ -158,6 +163,9 @@ def write_capture(data: dict[str, Any], table: Path, destination: Path, *, folde
         with replacing(destination / name) as temporary:
             temporary.write_bytes(content)
     path = destination / FILE_NAME
+    if path.is_file() and (before := inputs.read_bytes(path)) != manifest_text(manifest).encode():
+        with replacing(destination / PREVIOUS_NAME) as temporary:
+            temporary.write_bytes(before)
     write_manifest(manifest, path)
     return path
 

@@ -177,3 +177,17 @@ def test_images_chosen_by_name(folder):
         lights_of(folder, folder / "dirs.txt", selection=Selection(images="IMG_3*"))
     with pytest.raises(ManifestError, match=r"--mask m\.png: there is no such image"):
         lights_of(folder, folder / "dirs.txt", selection=Selection(mask="m.png"))
+
+
+def test_a_manifest_that_is_replaced_by_another_is_kept(folder):
+    """The folder may be written into without being named, and somebody may have worked on its capture.json."""
+    (folder / "table.txt").write_text(rows(X, Y, Z))
+    lights_of(folder, folder / "table.txt")
+    own = (folder / "capture.json").read_bytes().replace(b'"color_space"', b'"notes": "mine", "color_space"')
+    (folder / "capture.json").write_bytes(own)
+    lights_of(folder, folder / "table.txt")
+    made = (folder / "capture.json").read_bytes()
+    assert (folder / "capture.previous.json").read_bytes() == own != made
+    lights_of(folder, folder / "table.txt")  # the same again keeps what was kept
+    assert (folder / "capture.previous.json").read_bytes() == own
+    assert (folder / "capture.json").read_bytes() == made
