@@ -105,7 +105,8 @@ def unwrap_by_code(wrapped: WrappedPhase, coarse: Decoded, *, stripe_px: float, 
     Args:
         wrapped: phases of one or more periods.
         coarse: the same pixels from a binary, Gray, XOR or k-ary code.
-        stripe_px: its finest stripe: at most half of the shortest period, so that a pixel at its edge is not a period off.
+        stripe_px: its finest stripe, at most the shortest period. If it is more than half of it, places farther than WRAP_MARGIN from
+            the coordinate that `coarse` gives are UNDECIDED: give edges refined (edges.py), not the stripes' centres.
         extent: projector pixels along the axis.
 
     Returns:
@@ -115,9 +116,9 @@ def unwrap_by_code(wrapped: WrappedPhase, coarse: Decoded, *, stripe_px: float, 
     Raises:
         ArrayError: stripes too wide to number the periods, or other pixels.
     """
-    if 2 * stripe_px > min(wrapped.periods_px):
+    if stripe_px > min(wrapped.periods_px):
         raise ArrayError(f"stripes of {stripe_px:g} px cannot number periods of {min(wrapped.periods_px):g} px: "
-                         "give stripes of half a period or less")
+                         "give stripes of a period or less")
     if coarse.coordinate.shape[0] != wrapped.phase.shape[1]:
         raise ArrayError(f"the code has {coarse.coordinate.shape[0]} pixels, the phase {wrapped.phase.shape[1]}: decode the same frames")
     result = unwritten_decoded(wrapped.pixel_count, wrapped.device)

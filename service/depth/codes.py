@@ -69,7 +69,8 @@ def _gray_phase_frames(request: PatternsRequest, axis: Axis, extent: int) -> Seq
     periods = request.periods or (16.0,)
     stripe = request.stripe or min(periods) / 2
     if 2 * stripe > min(periods):
-        raise ValueError(f"stripes of {stripe:g} px cannot number periods of {min(periods):g} px: give half a period or less")
+        raise ValueError(f"stripes of {stripe:g} px number periods of {min(periods):g} px less surely than they might: "
+                         "give half a period or less")
     return (*binary_patterns(extent, axis, stripe_px=stripe, inverses=request.inverses), *phase_patterns(axis, periods, request.steps))
 
 

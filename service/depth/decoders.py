@@ -107,8 +107,14 @@ class AxisCodes:
         return [code for code in self.codes if isinstance(code, BinaryCode | KaryCode)]
 
     def numbering(self, periods_px: Sequence[float]) -> BinaryCode | KaryCode | None:
-        """Return a code whose stripes are fine enough to number the periods of phases; None without one."""
-        return next((code for code in self.stripes if 2 * code.stripe_px <= min(periods_px)), None)
+        """Return a code whose stripes are fine enough to number the periods of phases; None without one.
+
+        Stripes of half a period number it by themselves. Those of a Gray code may be up to a period wide, as most scanners have them: its
+        edges are refined by its inverses, and without inverses a quarter of the pixels stays undecided.
+        """
+        fine = next((code for code in self.stripes if 2 * code.stripe_px <= min(periods_px)), None)
+        return fine or next((code for code in self.stripes if isinstance(code, BinaryCode) and code.name == "gray"
+                             and code.stripe_px <= min(periods_px)), None)
 
     @property
     def phase(self) -> PhaseCode | None:
@@ -219,12 +225,18 @@ def _unwrapped(name: str, axis: AxisCodes, waves: Sequence[PhaseCode | Modulated
         return AxisDecoder(axis.axis, name, False, lambda readings, noise: unwrap_jointly(wrapped(readings, noise), extent=axis.extent),
                            tuple(waves))
 
-    def decode(readings: Readings, noise: NoiseModel) -> Decoded:
-        return unwrap_by_code(wrapped(readings, noise), _decode_stripes(numbering, axis, readings, noise),
-                              stripe_px=numbering.stripe_px, extent=axis.extent)
+    inverses = numbering.inverses if isinstance(numbering, BinaryCode) and 2 * numbering.stripe_px > min(periods_px) else None
 
-    return AxisDecoder(axis.axis, f"{name} numbered by {numbering.name}", _coloured(numbering), decode, (*waves, numbering),
-                       made=axis.made_for(numbering))
+    def decode(readings: Readings, noise: NoiseModel) -> Decoded:
+        stripes = _decode_stripes(numbering, axis, readings, noise)
+        if inverses is not None:
+            stripes = refine_edges(stripes, readings.grey, numbering.frames, inverses, columns=readings.columns, down=axis.axis == "row",
+                                   extent=axis.extent, stripe_px=numbering.stripe_px, noise=noise)
+        return unwrap_by_code(wrapped(readings, noise), stripes, stripe_px=numbering.stripe_px, extent=axis.extent)
+
+    return AxisDecoder(axis.axis, f"{name} numbered by {numbering.name}{', edges refined' if inverses else ''}", _coloured(numbering),
+                       decode, (*waves, numbering), made=axis.made_for(numbering),
+                       halo=REACH if inverses is not None and axis.axis == "row" else 0)
 
 
 def _decode_stripes(code: BinaryCode | KaryCode, axis: AxisCodes, readings: Readings, noise: NoiseModel) -> Decoded:

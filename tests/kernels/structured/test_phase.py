@@ -207,8 +207,8 @@ def frames(device, count=8):
     (lambda f: unwrap_jointly(decode_phase(f, range(6), [16] * 3 + [18] * 3, [0, 0.3, 0.6] * 2, noise=NOISE), extent=1280),
      "phases of 16, 18 px repeat after 144 px, the projector has 1280: add a period, or Gray frames"),
     (lambda f: unwrap_by_code(decode_phase(f, range(3), [16] * 3, [0, 0.3, 0.6], noise=NOISE),
-                              decode_gray(f, [3, 4], white=5, black=6, extent=64, stripe_px=16, noise=NOISE), stripe_px=16, extent=64),
-     "stripes of 16 px cannot number periods of 16 px"),
+                              decode_gray(f, [3, 4], white=5, black=6, extent=64, stripe_px=17, noise=NOISE), stripe_px=17, extent=64),
+     "stripes of 17 px cannot number periods of 16 px: give stripes of a period or less"),
 ])
 def test_what_cannot_be_decoded_is_one_sentence(call, words, device):
     with pytest.raises(ArrayError, match=words):
