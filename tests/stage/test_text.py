@@ -106,7 +106,7 @@ def test_a_sentence_does_not_repeat_a_long_value(tmp_path, content):
     (tmp_path / "capture.json").write_text(content.replace("LONG", "x" * 100_000))
     with pytest.raises(ManifestError) as error:
         read_manifest(tmp_path / "capture.json")
-    assert len(str(error.value).removeprefix(str(tmp_path))) < 400
+    assert max(len(fault.removeprefix(str(tmp_path))) for fault in str(error.value).split("; ")) < 400
 
 
 def test_a_number_that_no_float_holds_is_no_matrix(tmp_path):

@@ -110,7 +110,7 @@ def test_a_job_that_fails_is_one_sentence_and_exit_code_1(relit, owl: str):
     (["solve", "missing"], "missing: there is no such file or folder"),
     (["solve", "cap_0123456789abcdefghjk"], "cap_0123456789abcdefghjk"),
     (["solve", "server:/elsewhere"], "folder: "),
-    (["export", "no-job"], "maps: "),
+    (["export", "no-job"], "JOB: "),
     (["relight", str(OWL), "--exposure", "99"], "exposure: "),
     (["relight", str(OWL), "--weights", "other"], "'--weights'"),
     (["relight", str(OWL), "--frames", "9-1"], "runs backwards"),

@@ -60,9 +60,9 @@ def test_one_capture_is_open_at_a_time(relit, sequence, tmp_path, monkeypatch):
     """When a capture is opened, the frame before the last has been written: nothing piles up."""
     written = []
 
-    def opened(path):
+    def opened(path, *choices):
         written.append(len(files_in(tmp_path / "f")))
-        return open_capture(path)
+        return open_capture(path, *choices)
 
     open_capture = Capture.open
     monkeypatch.setattr("service.light.sequence.Capture.open", opened)

@@ -61,7 +61,7 @@ def test_cut_connections_lose_nothing_between_machines_that_share_no_folder(tmp_
                     done = 0 if view.progress is None or view.progress.stage != "frames" else view.progress.done
                     if done >= 4 and to_database.cuts == 0:
                         to_database.cut(away_s=2.0)
-                    if done >= 12 and to_store.cuts == 0:
+                    if done >= 8 and to_store.cuts == 0:
                         to_store.cut(away_s=2.0)
                 ended = client.jobs.get(job.id)
                 assert (ended.state, ended.error) == ("succeeded", None), (tmp_path / "worker.log").read_text()[-4000:]

@@ -30,17 +30,23 @@ export async function upload(listingName, name, files, progress, signal) {
   for await (const file of listing(`/v1/${listingName}/${intake.id}/files`, "files", "after")) known.set(file.path, file);
   const total = files.reduce((sum, { file }) => sum + file.size, 0);
   const sent = new Map();
+  let over = false; // one file failed, or the person stopped: the others end too, and tell nothing any more
   const tell = (path, bytes) => {
+    if (over) return;
     sent.set(path, bytes);
     progress([...sent.values()].reduce((sum, each) => sum + each, 0), total, "uploading");
   };
   const waiting = [...files];
   const one = async () => {
-    for (let next = waiting.shift(); next !== undefined; next = waiting.shift()) {
+    for (let next = waiting.shift(); next !== undefined && !over; next = waiting.shift()) {
       await uploadFile(`/v1/${listingName}/${intake.id}/files`, next, known.get(next.path), (bytes) => tell(next.path, bytes), signal);
     }
   };
-  await Promise.all(Array.from({ length: PARALLEL }, one));
+  try {
+    await Promise.all(Array.from({ length: PARALLEL }, one));
+  } finally {
+    over = true;
+  }
   progress(total, total, "checking");
   let found = await post(`/v1/${listingName}/${intake.id}/validate`);
   while (found.state === "checking") {
