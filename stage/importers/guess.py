@@ -3,8 +3,9 @@
 import shlex
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from stage.importers import kinect
 from stage.importers.layout import color_space_of, image_names, image_resolution, natural_order
 from stage.importers.light_rig import CAMERA_MATRIX, read_rig
 from stage.importers.light_table import SUFFIXES as TABLES
-from stage.importers.light_table import LightTable, read_light_table
+from stage.importers.light_table import read_light_table
 from stage.importers.opencv_gray import gray_order
 from stage.importers.procam_file import PROJECTOR_MATRIX, projector_size
 from stage.importers.raw_arrays import ArrayFiles
@@ -24,6 +25,7 @@ from stage.manifest import FILE_NAME
 from stage.mat_file import read_mat_arrays
 from stage.tof.frames import read_array
 
+T = TypeVar("T")
 PROJECTORS = ((1280, 800), (1920, 1080), (1024, 768), (1280, 720), (854, 480), (912, 1140), (800, 600), (1920, 1200), (640, 480),
               (3840, 2160))
 """Sizes of projectors, the more frequent first."""
@@ -93,7 +95,7 @@ def _made(layout: str, reason: str, words: list[object], source: Path, *, solve:
                  shlex.join(["relit", program, str(source), "--out", f"{source.resolve().name}-{'maps' if solve else 'depth'}"]))
 
 
-def _tried(read: Callable[[], object]) -> object:
+def _tried(read: Callable[[], T]) -> T | None:
     """Return what a reader returns, or None where it refuses the file."""
     try:
         return read()
@@ -143,10 +145,10 @@ def _near_lights(folder: Folder) -> Guess | None:
             continue
         if path.suffix.lower() == ".json" and path.parent.absolute() != folder.path.absolute():
             continue
-        rig = _tried(lambda path=path: read_rig(path))  # type: ignore[misc]
-        if rig is None or (path.suffix.lower() == ".json" and getattr(rig, "anisotropy", None) is None):
+        rig = _tried(partial(read_rig, path))
+        if rig is None or (path.suffix.lower() == ".json" and rig.anisotropy is None):
             continue
-        chosen = _group_of(folder, len(rig.positions))  # type: ignore[attr-defined]
+        chosen = _group_of(folder, len(rig.positions))
         if chosen is None:
             continue
         camera = next((other for other in folder.with_suffix(".mat", ".yml", ".yaml", ".xml") if other != path
@@ -165,8 +167,8 @@ def _table(folder: Folder) -> Guess | None:
     for path in folder.with_suffix(*TABLES):
         if path.parent.absolute() != folder.path.absolute() and path.suffix.lower() != ".txt":
             continue
-        table = _tried(lambda path=path: read_light_table(path))  # type: ignore[misc]
-        if not isinstance(table, LightTable) or len(table.vectors) < 3:
+        table = _tried(partial(read_light_table, path))
+        if table is None or len(table.vectors) < 3:
             continue
         chosen = [] if table.names is not None else _group_of(folder, len(table.vectors))
         if chosen is None:
@@ -185,7 +187,7 @@ def _table(folder: Folder) -> Guess | None:
 
 def _encoding(folder: Folder) -> tuple[str, ...]:
     """Return what is assumed of the encoding of 8-bit images."""
-    if _tried(lambda: color_space_of(folder.path / folder.pictures[0])) != "srgb_texture":
+    if _tried(partial(color_space_of, folder.path / folder.pictures[0])) != "srgb_texture":
         return ()
     return ("the images have 8 bits and are taken as sRGB: many of cameras for measurements are linear, --color-space lin_rec709_scene",)
 
@@ -271,8 +273,8 @@ def _histograms(folder: Folder) -> Guess | None:
         path = folder.path / name
         if path.suffix.lower() not in (".npy", ".npz", ".mat"):
             continue
-        arrays = _tried(lambda path=path: ArrayFiles().read(path))  # type: ignore[misc]
-        if isinstance(arrays, list) and len(arrays) == 1 and arrays[0].ndim == 3 and arrays[0].dtype.kind in "fiu" and arrays[0].min() >= 0:
+        arrays = _tried(partial(ArrayFiles().read, path))
+        if arrays is not None and len(arrays) == 1 and arrays[0].ndim == 3 and arrays[0].dtype.kind in "fiu" and arrays[0].min() >= 0:
             rows, cols, bins = arrays[0].shape
             return _made("photon histograms", f"{name} holds {rows} x {cols} x {bins} counts",
                          ["histogram", folder.path, "--arrays", name, "--bin-s", "SECONDS"], folder.path, solve=False,
@@ -290,20 +292,19 @@ def _photos(folder: Folder) -> Guess | None:
 
 
 def _of_one_size(folder: Folder) -> bool:
-    sizes = {_tried(lambda name=name: image_resolution(folder.path / name)) for name in folder.pictures}  # type: ignore[misc]
+    sizes = {_tried(partial(image_resolution, folder.path / name)) for name in folder.pictures}
     return len(sizes) == 1 and None not in sizes
 
 
 def _arrays_of(path: Path) -> dict[str, np.ndarray]:
     """Return the arrays of a .mat or an OpenCV file by name; none where it cannot be read."""
-    found = _tried(lambda: read_mat_arrays(path) if path.suffix.lower() == ".mat" else read_matrices(path))
-    return found if isinstance(found, dict) else {}
+    return _tried(partial(read_mat_arrays if path.suffix.lower() == ".mat" else read_matrices, path)) or {}
 
 
 def _shape(path: Path, dimensions: int) -> bool:
     """Return whether a .npy file holds real numbers in so many dimensions."""
-    found = _tried(lambda: read_array(path))
-    return isinstance(found, np.ndarray) and found.ndim == dimensions and found.dtype.kind in "fiu" and min(found.shape) > 1
+    found = _tried(partial(read_array, path))
+    return found is not None and found.ndim == dimensions and found.dtype.kind in "fiu" and min(found.shape) > 1
 
 
 def _sums(folder: Folder, names: tuple[str, ...], count: int) -> Iterator[np.ndarray]:
