@@ -1,4 +1,4 @@
-"""The metadata of a result file: the camera, and the provenance as texts whose names begin with `relit:`."""
+"""Result files: how they are given, and their metadata, the camera and the provenance as texts whose names begin with `relit:`."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -35,3 +35,20 @@ def camera_and_provenance(metadata: Mapping[str, Any], path: str | Path, *, file
     except ValidationError as error:
         raise ResultError(f"{path}: its {CAMERA} attribute is not a camera") from error
     return camera, {name: value for name, value in metadata.items() if name.startswith(PREFIX) and name != CAMERA}
+
+
+def result_file(given: Path, name: str, *, command: str) -> Path:
+    """Return a result file that is given as itself or by its folder.
+
+    Args:
+        given: the file, or its folder.
+        name: of the file in a folder: maps.exr or depth.exr.
+        command: the command that makes such files, for the message.
+
+    Raises:
+        ResultError: it is not there.
+    """
+    file = given / name if given.is_dir() else given
+    if not file.is_file():
+        raise ResultError(f"{file}: is not there: run `{command}` first")
+    return file

@@ -21,6 +21,7 @@ from stage.errors import ResultError
 from stage.files import write_text
 from stage.fingerprint import digest
 from stage.maps import MAPS_FILE, SurfaceMaps
+from stage.result_metadata import result_file
 
 CAMERA_TOLERANCE = 1e-3
 """Largest difference of a number of the two cameras, pixels or parts of it: both results have them from manifests."""
@@ -55,7 +56,8 @@ def join(request: JoinRequest, progress: Progress | None = None) -> JoinResult:
     timings = Timings(progress)
     device = devices.resolve(request.device)
     timings.stage("open", 1)
-    maps_file, depth_file = _file(request.maps, MAPS_FILE, "relit solve"), _file(request.depth, DEPTH_FILE, "relit depth")
+    maps_file = result_file(request.maps, MAPS_FILE, command="relit solve")
+    depth_file = result_file(request.depth, DEPTH_FILE, command="relit depth")
     target = request.out / MAPS_FILE
     if target.exists() and target.samefile(maps_file):
         raise RequestError(f"--out {request.out}: would replace {maps_file}, which is joined: give another folder")
@@ -87,14 +89,6 @@ def join(request: JoinRequest, progress: Progress | None = None) -> JoinResult:
         request, inputs={"maps": str(maps_file), "depth": str(depth_file), "name": maps.provenance.get("relit:capture", "")},
         device=devices.describe(device), timings_s=timings.close(), **facts, warnings=warnings))
     return JoinResult(target, report_path, facts, tuple(warnings))
-
-
-def _file(given: Path, name: str, command: str) -> Path:
-    """Return the file of a result, which may be given by its folder."""
-    file = given / name if given.is_dir() else given
-    if not file.is_file():
-        raise ResultError(f"{file}: is not there: run `{command}` first")
-    return file
 
 
 def _check_cameras(one: Camera, other: Camera, maps_file: Path, depth_file: Path) -> None:

@@ -35,13 +35,13 @@ from service.requests.picture import FrameMatte, Layer
 from service.requests.shade import ShadeRequest
 from stage.brackets import merge_brackets
 from stage.capture import Capture
-from stage.errors import ResultError
 from stage.frames import fibonacci_sphere, rotation_about_y
 from stage.ingest import open_stack
 from stage.lighting import lights_from_centre
 from stage.maps import MAPS_FILE, SurfaceMaps
 from stage.matte import Matte
 from stage.radiance import clipping_sentences
+from stage.result_metadata import result_file
 
 SHADOW_DIRECTIONS = 64
 """Number of directions in which the shadows of broad light are marched where there are no captured lights; between them, visibility is
@@ -121,9 +121,7 @@ def check(request: ShadeRequest) -> Path:
     if Layer.LIGHTS in request.aov:
         raise RequestError(f"--aov {Layer.LIGHTS} is a layer of relit frames: make one picture for each light, or use `relit relight`")
     check_layers(request, request.maps)
-    path = request.maps / MAPS_FILE if request.maps.is_dir() else request.maps
-    if not path.is_file():
-        raise ResultError(f"{path}: is not there: run `relit solve` first")
+    path = result_file(request.maps, MAPS_FILE, command="relit solve")
     check_outputs([(f"--out {request.out}", request.out)], [path, *([request.environment] if request.environment else []),
                                                             *(capture_files(request.capture) if request.capture else ())])
     if request.environment is not None:
