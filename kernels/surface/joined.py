@@ -95,7 +95,7 @@ def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray,
         known_z = z[placed].mean() if placed.any() else mean_z
         z = np.where(unplaced, found.height.numpy() + (known_z - mean_z), z)
     return Joined(z.astype(np.float32), sigma.astype(np.float32), corrected.astype(np.float32), part, placed, rejected, cuts.guessed,
-                  None if relief <= 0 else max(left, 0.0) / relief)
+                  None if relief == 0 else left / relief)
 
 
 def _variation(values: np.ndarray, sigma: np.ndarray) -> float:
@@ -175,7 +175,10 @@ def _tail(plane: np.ndarray, axis: int) -> np.ndarray:
 
 def _differences(plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return central differences per column and per row."""
-    return tuple(np.gradient(plane, axis=axis) if plane.shape[axis] > 1 else np.ones_like(plane) for axis in (1, 0))  # type: ignore[return-value]
+    def along(axis: int) -> np.ndarray:
+        return np.gradient(plane, axis=axis) if plane.shape[axis] > 1 else np.ones_like(plane)
+
+    return along(1), along(0)
 
 
 def _within(values: np.ndarray, part: np.ndarray, axis: int) -> np.ndarray:

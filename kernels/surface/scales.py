@@ -13,14 +13,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from kernels.surface.discontinuities import MAD_TO_SIGMA
+
 PASSES = 2
 """Number of times each scale is looked at: cells are interpolated, which leaves part of a correction undone."""
 REJECTED = 5.0
 """Difference from its surroundings, in robust standard deviations, beyond which a reading is left out."""
 SURROUNDINGS = 3
 """Scale of these surroundings, cells of 2^3 pixels."""
-MAD_TO_SIGMA = 1.4826
-"""Ratio of the standard deviation of Gaussian values to the median of their magnitudes."""
 
 
 class Correction(NamedTuple):
