@@ -49,7 +49,7 @@ class InspectBoardResult(NamedTuple):
     findings_path: Path | None
     """None if there was nothing to compare with."""
     verdict: Verdict | None
-    """Of the whole board; None if there was nothing to compare with."""
+    """The verdict on the whole board; None if there was nothing to compare with."""
     defects: list[Defect]
     regions: list[RegionResult]
     inspected: float | None

@@ -1,4 +1,4 @@
-"""Where a stitched board lies on its nominal height map; a board of another size, unit or handedness is refused."""
+"""Finds where a stitched board lies on its nominal height map, and refuses a board of another size, unit or handedness."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

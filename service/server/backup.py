@@ -63,7 +63,7 @@ class _Contents(NamedTuple):
 
     files: dict[str, dict[str, Any]]
     storage: dict[str, Any] | None
-    """Of a service with storage_url: the URL, whether its objects are copied, and the objects."""
+    """What a service with storage_url keeps in its store: the URL, whether the objects are copied, and the objects; None without one."""
 
 
 def backup(settings: Settings, out: Path, *, copy_objects: bool = False) -> Backup:

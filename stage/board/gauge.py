@@ -20,18 +20,18 @@ class GaugeStudy(NamedTuple):
     """Standard deviations of what makes measured values differ, in the unit of the values."""
 
     repeatability: float
-    """Of one part by one operator (equipment variation)."""
+    """How far measurements of one part by one operator scatter (equipment variation)."""
     reproducibility: float | None
     """Between operators, with the interaction of parts and operators (appraiser variation); None with one operator."""
     interaction: float | None
-    """Of parts and operators; None where it was pooled, or with one operator."""
+    """How far operators differ from part to part; None where it was pooled, or with one operator."""
     gauge: float
-    """Of both together (GRR)."""
+    """Repeatability and reproducibility together (GRR)."""
     part: float
     """Between parts."""
     total: float
     degrees_of_freedom: int
-    """Of the repeatability."""
+    """Degrees of freedom from which the repeatability is known."""
 
     @property
     def gauge_percent(self) -> float:

@@ -58,7 +58,7 @@ class Overlap(NamedTuple):
     information: np.ndarray  # [6, 6] 1/m²: the inverse of its covariance
     pixels: int
     correlation: float
-    """Of both heights at the best shift."""
+    """Correlation of the heights of both patches at the best shift."""
     noise_factor: float
     """The scatter of the residuals over what the noise of both patches says."""
     shared_m: float
@@ -66,7 +66,7 @@ class Overlap(NamedTuple):
     residual_m: float
     """Robust standard deviation of the residuals, metres."""
     candidates: tuple["Candidate", ...] = ()
-    """Of REPEATS: the motions that fit alike, the most probable first."""
+    """Motions that fit alike, the most probable first, where the evidence is REPEATS."""
 
 
 class Candidate(NamedTuple):

@@ -33,9 +33,9 @@ class RegionResult(NamedTuple):
     deviation_m: float | None
     sigma_m: float | None
     pixels: int
-    """Of the grid within the region."""
+    """Pixels of the grid that lie within the region."""
     measured: int
-    """Of these, those with a deviation."""
+    """How many of these have a deviation."""
 
 
 def pixels_of(region: Region, grid: BoardGrid, *, grow: float = 0.0) -> tuple[tuple[slice, slice], np.ndarray]:
