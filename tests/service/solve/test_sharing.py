@@ -28,11 +28,19 @@ from tests.service.solve.test_several_devices import (
 class Store:
     """A store in memory, which counts who has claimed what."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, second: str | None = None) -> None:
+        """Create a store.
+
+        Args:
+            second: a worker that may be slow: no other claims a second piece before this one has claimed its first.
+        """
         self.files: dict[str, bytes] = {}
         self.claims: dict[str, str] = {}
         self.gone: set[str] = set()
+        self._second, self._second_has_one = second, threading.Event()
         self._lock = threading.Lock()
+        if second is None:
+            self._second_has_one.set()
 
     def of(self, worker: str) -> "Part":
         return Part(self, worker)
@@ -52,12 +60,16 @@ class Part:
         self._store.files[name] = content
 
     def claim(self, name: str) -> bool:
+        if self._worker != self._store._second and self._store.done_by(self._worker):
+            assert self._store._second_has_one.wait(120)
         with self._store._lock:
             holder = self._store.claims.get(name, self._worker)
-            if holder == self._worker or holder in self._store.gone:
-                self._store.claims[name] = self._worker
-                return True
-            return False
+            if holder != self._worker and holder not in self._store.gone:
+                return False
+            self._store.claims[name] = self._worker
+        if self._worker == self._store._second:
+            self._store._second_has_one.set()
+        return True
 
 
 class Quiet:
@@ -125,7 +137,7 @@ def test_two_workers_find_the_same_to_the_last_bit_as_one(tmp_path, small_pieces
     if method in ("lambert", "robust"):  # each worker judges the intensities, which takes longer here than all pieces of these methods
         request["intensities"] = "declared"
     alone = solve(SolveRequest(**request, out=tmp_path / "alone", device="cpu"))
-    store = Store()
+    store = Store(second="two")
     maps, progress = shared_solve(request, tmp_path / "shared", store)
     assert maps.read_bytes() == alone.maps_path.read_bytes()
     assert store.done_by("one") and store.done_by("two")
@@ -138,7 +150,7 @@ def test_an_object_that_throws_light_on_itself(tmp_path, small_pieces):
     """What follows from the whole object is found by both workers, and has to be the same."""
     request = {"capture": write_small_owl(tmp_path / "owl", 10)}
     alone = solve(SolveRequest(**request, out=tmp_path / "alone", device="cpu"))
-    store = Store()
+    store = Store(second="two")
     maps, _ = shared_solve(request, tmp_path / "shared", store)
     assert maps.read_bytes() == alone.maps_path.read_bytes()
     assert store.done_by("one") and store.done_by("two")

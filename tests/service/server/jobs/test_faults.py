@@ -1,6 +1,7 @@
 """What else may happen to workers: the database restarts, a step hangs, a job kills whoever takes it, they are asked to end, the disk is
 full."""
 
+import errno
 import os
 import signal
 import subprocess
@@ -135,10 +136,17 @@ def small_disk(tmp_path):
 
 
 def fill(folder: Path, *, leave: int) -> Path:
-    """Take the space of a file system but for some bytes."""
+    """Take the space of a file system but for some bytes; with none left, what others free or take meanwhile does not matter."""
     ballast = folder / "ballast"
     free = os.statvfs(folder)
-    ballast.write_bytes(bytes(free.f_bavail * free.f_frsize - leave))
+    with ballast.open("wb", buffering=0) as file:
+        try:
+            file.write(bytes(free.f_bavail * free.f_frsize - leave))
+            while leave == 0:
+                file.write(bytes(4096))
+        except OSError as error:  # others write to it, so that less is free than was said
+            if leave or error.errno != errno.ENOSPC:
+                raise
     return ballast
 
 
