@@ -1,7 +1,8 @@
 """Normals of a depth map, from the plane that fits the neighbourhood of each pixel.
 
 Along the lines of sight (x, y, -1) of a perspective camera the inverse depth of the plane n·p = c is (n_x x + n_y y - n_z) / c: linear
-in x and y. The plane is therefore a linear least-squares fit of the inverse depth over the neighbours, exact for every plane.
+in x and y. The plane is therefore a linear least-squares fit of the inverse depth over the neighbours, exact for every plane. Under an
+orthographic camera the depth of the plane is linear in x and y.
 """
 
 import numpy as np
@@ -24,7 +25,7 @@ def depth_normals(depth: np.ndarray, mask: np.ndarray, camera: Camera, *, sigma:
     Args:
         depth: [rows, cols] metres.
         mask: [rows, cols] bool, True where there is a depth.
-        camera: a perspective camera.
+        camera: whose depth it is.
         sigma: [rows, cols] metres, standard deviation of the depth, by which noise is told from a break; None: there is no noise.
         radius: the radius of the neighbourhood in pixels; 1 is 3×3 pixels.
 
@@ -46,7 +47,8 @@ def _fit(depth: np.ndarray, mask: np.ndarray, x: np.ndarray, y: np.ndarray, came
          sigma: np.ndarray | None, radius: int) -> np.ndarray:
     """Return the normals of a range of rows, the outermost of which lack neighbours."""
     depth = np.where(mask, depth, 1.0).astype(np.float64)
-    inverse = 1 / depth
+    perspective = camera.projection == "perspective"
+    inverse = 1 / depth if perspective else depth
     count = mask.astype(np.float64)
     sums = {name: np.zeros(depth.shape) for name in ("x", "y", "i", "xx", "xy", "yy", "xi", "yi")}
     height, width = depth.shape
@@ -72,6 +74,6 @@ def _fit(depth: np.ndarray, mask: np.ndarray, x: np.ndarray, y: np.ndarray, came
     det = np.where(good, det, 1)
     across, up = (xi * yy - yi * xy) / det, (yi * xx - xi * xy) / det
     toward = across * x + up * y - (inverse + mean_i - across * mean_x - up * mean_y)  # -n_z/c from the fit at the pixel
-    normal = np.stack([-across, -up, -toward], axis=-1)
+    normal = np.stack([-across, -up, -toward] if perspective else [across, up, np.ones_like(up)], axis=-1)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     return np.where(good[..., None], normal, 0).astype(np.float32)

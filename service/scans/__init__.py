@@ -1,0 +1,1 @@
+"""Many scans of one object: reading them, and finding their poses."""

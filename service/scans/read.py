@@ -1,0 +1,183 @@
+"""Read the scans of a scan set: depth results with what lies beside them, and PLY files."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from stage.depth_maps import DEPTH_FILE, DepthMaps
+from stage.depth_normals import depth_normals
+from stage.errors import ManifestError, ResultError
+from stage.maps import MAPS_FILE, SurfaceMaps
+from stage.ply import POINTS_FILE, read_ply
+from stage.result_metadata import result_file
+from stage.scans.planes import LocalPlanes, local_planes, robust_scatter
+from stage.scans.ply_points import PlyPoints, read_ply_points
+from stage.scans.records import UNITS_M, ScanEntry, ScanSet
+from stage.scans.scan import Scan
+
+NORMAL_RADIUS_PX = 2
+"""Radius of the neighbourhood that a normal of a range image is fitted to: 25 pixels."""
+FLOAT_STEP = 2.0**-22
+"""A float32 resolves a coordinate to this part of it: no σ is smaller."""
+ORTHOGRAPHIC_RANGE_M = 1e3
+"""How far above its image the camera position of an orthographic camera is put, in extents of the scan."""
+
+
+class _Sigma(NamedTuple):
+    values: np.ndarray
+    source: str
+
+
+def read_scans(file: Path, scans: ScanSet) -> Iterator[Scan]:
+    """Yield the scans of a set in its order, read one by one, so that only what the caller keeps stays in memory.
+
+    Args:
+        file: the scan-set.json, which paths are relative to.
+        scans: its content.
+
+    Raises:
+        StageError: a scan cannot be used; the message names it.
+    """
+    for number in range(len(scans.scans)):
+        yield read_scan(file, scans, number)
+
+
+def read_scan(file: Path, scans: ScanSet, number: int) -> Scan:
+    """Read one scan of a set.
+
+    Args:
+        file: the scan-set.json, which paths are relative to.
+        scans: its content.
+        number: of the scan, from 0.
+
+    Raises:
+        ManifestError: the scan holds no depth or points, has a unit or maps that do not fit, or no σ can be estimated.
+        ResultError, ImageError, StorageError: a file is missing or damaged.
+    """
+    entry = scans.scans[number]
+    where = f"{file}: scans[{number}] ({entry.name})"
+    path = file.parent / entry.path
+    pose = None if entry.scan_to_world is None else nearest_rigid(np.array(entry.scan_to_world, dtype=np.float64))
+    covariance = None if entry.pose_covariance is None else np.array(entry.pose_covariance, dtype=np.float64)
+    if path.is_file() and path.suffix.lower() == ".ply":
+        return _point_set(path, entry, where, pose, covariance)
+    if not (path / DEPTH_FILE).is_file() and not (path.is_file() and path.suffix.lower() == ".exr"):
+        raise ManifestError(f"{where}: path: {path} is neither a folder with a {DEPTH_FILE} nor a PLY file")
+    return _range_image(path / DEPTH_FILE if path.is_dir() else path, entry, where, file.parent, pose, covariance)
+
+
+def nearest_rigid(pose: np.ndarray) -> np.ndarray:
+    """Return the rigid transform [4, 4] nearest to one whose rotation was typed with few digits."""
+    u, _, vt = np.linalg.svd(pose[:3, :3])
+    rigid = pose.copy()
+    rigid[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return rigid
+
+
+def _range_image(path: Path, entry: ScanEntry, where: str, home: Path, pose: np.ndarray | None, covariance: np.ndarray | None) -> Scan:
+    if entry.unit != "m":
+        raise ManifestError(f"{where}: unit: is {entry.unit}, but {path.name} is in metres: leave it out")
+    depth = DepthMaps.read(path)
+    camera = depth.camera
+    if pose is None and camera.world_from_camera is not None:
+        pose = nearest_rigid(np.array(camera.world_from_camera, dtype=np.float64))
+    if camera.projection == "orthographic" and camera.pixel_size_m is None:
+        raise ManifestError(f"{where}: camera.pixel_size_m of {path} is missing: scans are placed in metres")
+    used = depth.mask & np.isfinite(depth.depth) & (depth.depth > 0 if camera.projection == "perspective" else True)
+    if depth.sigma is not None:
+        used &= np.isfinite(depth.sigma) & (depth.sigma > 0)
+    if not used.any():
+        raise ManifestError(f"{where}: no pixel of {path} has a depth" + ("" if depth.sigma is None else " with a σ"))
+    pixels = np.flatnonzero(used)
+    x, y = camera.plane_coordinates()
+    points = camera.points(-depth.depth).reshape(-1, 3)[pixels]
+    stretch = np.sqrt(1 + x**2 + y**2).reshape(-1)[pixels] if camera.projection == "perspective" else np.ones(len(pixels))
+    origin = np.zeros(3) if camera.projection == "perspective" else points.mean(axis=0) + ORTHOGRAPHIC_RANGE_M * np.array(
+        [0, 0, max(float(np.ptp(points, axis=0).max()), np.finfo(np.float32).tiny)])
+    measured = None if depth.sigma is None else depth.sigma.reshape(-1)[pixels] * stretch
+    sigma = _sigma(measured, entry, points, None if measured is not None or entry.sigma_m is not None
+                   else local_planes(points, origin=origin), where)
+    maps = None if entry.maps is None else result_file(home / entry.maps, MAPS_FILE, command="relit solve")
+    if maps is not None:
+        normals, source = _photometric(maps, where, used), "photometric"
+    else:
+        per_depth = np.zeros(used.size, dtype=np.float32)
+        per_depth[pixels] = sigma.values / stretch
+        normals = depth_normals(depth.depth, used, camera, sigma=per_depth.reshape(used.shape), radius=NORMAL_RADIUS_PX)
+        source = "estimated"
+    return Scan(name=entry.name, path=path, points=points, sigma=sigma.values, sigma_source=sigma.source,
+                normals=normals.reshape(-1, 3)[pixels], normals_source=source, colours=_colours(path, depth.mask, used),
+                confidence=None if depth.confidence is None else depth.confidence.reshape(-1)[pixels].astype(np.float32), origin=origin,
+                camera=camera, pixels=pixels, pose=pose, pose_covariance=covariance, maps=maps)
+
+
+def _photometric(path: Path, where: str, used: np.ndarray) -> np.ndarray:
+    """Return the normals of solved maps, [rows, cols, 3], 0 where they have none."""
+    maps = SurfaceMaps.read(path, layers=("normal",))
+    if maps.normal is None:
+        raise ResultError(f"{path}: has no layer normal")
+    if maps.mask.shape != used.shape:
+        raise ManifestError(f"{where}: maps: {path} is {maps.mask.shape[1]}x{maps.mask.shape[0]} pixels, the depth "
+                            f"{used.shape[1]}x{used.shape[0]}: both must be of one camera in one place")
+    return maps.normal
+
+
+def _colours(path: Path, mask: np.ndarray, used: np.ndarray) -> np.ndarray | None:
+    """Return the colours of the used pixels from the points.ply beside a depth, which has one point for each pixel of its mask; or None."""
+    file = path.parent / POINTS_FILE
+    if path.name != DEPTH_FILE or not file.is_file():
+        return None
+    colours = read_ply(file).colours
+    return colours[used[mask]] if len(colours) == mask.sum() else None  # a laser has points between pixels
+
+
+def _point_set(path: Path, entry: ScanEntry, where: str, pose: np.ndarray | None, covariance: np.ndarray | None) -> Scan:
+    if entry.maps is not None:
+        raise ManifestError(f"{where}: maps: {path.name} is a set of points: solved maps belong to a range image")
+    ply = _kept(read_ply_points(path))
+    unit = UNITS_M[entry.unit]
+    points = (ply.points * unit).astype(np.float32)
+    origin = np.zeros(3)
+    planes = None
+    if ply.normals is None or (ply.sigma is None and entry.sigma_m is None):
+        planes = local_planes(points, origin=origin)
+    sigma = _sigma(None if ply.sigma is None else ply.sigma * unit, entry, points, planes, where)
+    if ply.normals is None and planes is not None:
+        normals, source = planes.normals, "estimated"
+    else:
+        assert ply.normals is not None
+        length = np.linalg.norm(ply.normals, axis=1, keepdims=True)
+        normals, source = np.where(length > 0, ply.normals / np.maximum(length, 1e-30), 0).astype(np.float32), "given"
+    return Scan(name=entry.name, path=path, points=points, sigma=sigma.values, sigma_source=sigma.source, normals=normals,
+                normals_source=source, colours=ply.colours, confidence=ply.confidence, origin=origin, camera=None, pixels=None, pose=pose,
+                pose_covariance=covariance, maps=None)
+
+
+def _kept(ply: PlyPoints) -> PlyPoints:
+    """Return the points without those whose σ says that they are none."""
+    if ply.sigma is None:
+        return ply
+    there = np.isfinite(ply.sigma) & (ply.sigma > 0)
+    return PlyPoints(*(None if values is None else values[there] for values in ply))  # type: ignore[arg-type]
+
+
+def _sigma(measured: np.ndarray | None, entry: ScanEntry, points: np.ndarray, planes: LocalPlanes | None, where: str) -> _Sigma:
+    """Return σ along the line of sight of each point.
+
+    Raises:
+        ManifestError: there is none in the files, and too few points lie together to estimate it.
+    """
+    if len(points) == 0:
+        raise ManifestError(f"{where}: has no point with a σ above 0")
+    least = FLOAT_STEP * float(np.abs(points).max())
+    if measured is not None:
+        return _Sigma(np.maximum(measured, least).astype(np.float32), "measured")
+    if entry.sigma_m is not None:
+        return _Sigma(np.full(len(points), max(entry.sigma_m, least), dtype=np.float32), "declared")
+    assert planes is not None
+    scatter = robust_scatter(planes)
+    if not np.isfinite(scatter):
+        raise ManifestError(f"{where}: sigma_m: is missing, and {len(points)} points are too few or too far apart to estimate it")
+    return _Sigma(np.full(len(points), max(scatter, least), dtype=np.float32), "estimated")
