@@ -19,7 +19,8 @@ def write(path: Path, order: str, *, colour: str = "uchar") -> Path:
               "quality": np.arange(4), "sigma": np.full(4, 0.5)}
     header = ["ply", f"format {order} 1.0", "comment made by another program", "element sensor 2", "property float t",
               "element vertex 4",
-              *(f"property {kind} {name}" for name, kind in kinds), "element face 1", "property list uchar int vertex_indices", "end_header"]
+              *(f"property {kind} {name}" for name, kind in kinds),
+              "element face 1", "property list uchar int vertex_indices", "end_header"]
     text = ("\n".join(header) + "\n").encode()
     if order == "ascii":
         rows = np.stack([values[name] for name, _ in kinds], axis=1)
