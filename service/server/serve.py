@@ -25,6 +25,7 @@ from service.server import log, telemetry
 from service.server.api.app import create_app
 from service.server.connections import AT_ONCE, BACKLOG, ConnectionLimits, Connections, GuardedConnection, limits_of, raise_descriptors
 from service.server.database.engine import Database, open_database
+from service.server.garbage import collect_seldom
 from service.server.housekeeping import Housekeeper
 from service.server.jobs.queue import JobQueue, prepare
 from service.server.jobs.supervisor import Supervisor
@@ -87,6 +88,7 @@ def serve(settings: Settings, *, before_answering: Callable[[str, Database, JobQ
     housekeeper.start()
     ending = threading.Thread(target=end, name="relit-end", daemon=True)
     ending.start()
+    collect_seldom()
     try:
         server.run(sockets=[listening])
     finally:
