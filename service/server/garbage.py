@@ -2,7 +2,8 @@
 
 A collection of the oldest generation stops the event loop while it looks at every object of the process: .3 s on one core where some
 thousands of connections are open, most of it for modules, routes and tables that stay until the end. CPython's own condition for it
-(a quarter more objects than at the last one, https://docs.python.org/3.11/library/gc.html) holds every few seconds when clients come and go.
+(a quarter more objects than at the last one, https://docs.python.org/3.11/library/gc.html) holds every few seconds while clients come and
+go.
 """
 
 import gc

@@ -6,14 +6,15 @@ command.
 
 from enum import Enum
 from types import NoneType
-from typing import Any, Literal, NamedTuple, get_args, get_origin
+from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin
 
 from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel
 
-from service.requests.base import Choice, Role
+from service.requests.base import Choice, Commas, Role
 from service.requests.identifiers import CAPTURE, ENVIRONMENT, JOB, pattern
 from service.requests.jobs import (
+    BasisJob,
     DarkJob,
     DepthJob,
     ExportJob,
@@ -24,11 +25,13 @@ from service.requests.jobs import (
     JobRequest,
     LightPositionsJob,
     MirrorBallJob,
+    PatternsJob,
     PipelineJob,
     ProcamJob,
     RelightJob,
     ResponseJob,
     SaturationJob,
+    ScanJob,
     ShadeJob,
     SolveJob,
     TofCalibrationJob,
@@ -37,8 +40,8 @@ from service.requests.light_keys import LightKeys
 from service.requests.options import Option, help_text, places_of, typed
 
 CAPTURE_JOBS: dict[str, type[JobRequest]] = {
-    "solve": SolveJob, "pipeline": PipelineJob, "depth": DepthJob, "inspect-board": InspectBoardJob,
-    "relight": RelightJob, "calibrate-mirror-ball": MirrorBallJob,
+    "solve": SolveJob, "pipeline": PipelineJob, "depth": DepthJob, "scan": ScanJob, "inspect-board": InspectBoardJob,
+    "relight": RelightJob, "basis": BasisJob, "calibrate-mirror-ball": MirrorBallJob,
     "calibrate-light-positions": LightPositionsJob, "calibrate-grey-ball": GreyBallJob, "calibrate-intensity": IntensityJob,
     "calibrate-dark": DarkJob, "calibrate-flat-field": FlatFieldJob, "calibrate-saturation": SaturationJob, "calibrate-procam": ProcamJob,
     "calibrate-response": ResponseJob, "calibrate-tof": TofCalibrationJob,
@@ -46,8 +49,12 @@ CAPTURE_JOBS: dict[str, type[JobRequest]] = {
 """Jobs that begin with a capture, by kind."""
 MAPS_JOBS: dict[str, type[JobRequest]] = {"export": ExportJob, "shade": ShadeJob}
 """Jobs that begin with the maps of another job, by kind."""
+FREE_JOBS: dict[str, type[JobRequest]] = {"patterns": PatternsJob}
+"""Jobs that read nothing, by kind."""
 TITLES = {"solve": "Solve normals and materials", "pipeline": "Solve, export and relight", "depth": "Decode depth",
-          "inspect-board": "Inspect a board", "relight": "Relight frames", "export": "Export an asset", "shade": "Shade one picture",
+          "scan": "Turn shots of a scanning laser into points",
+          "inspect-board": "Inspect a board", "relight": "Relight frames", "basis": "Reduce to a few coefficient images",
+          "patterns": "Draw patterns to project", "export": "Export an asset", "shade": "Shade one picture",
           "calibrate-mirror-ball": "Calibrate light directions: one mirror ball",
           "calibrate-light-positions": "Calibrate light positions: two or more mirror balls",
           "calibrate-grey-ball": "Calibrate the brightness of lights: a grey ball",
@@ -72,7 +79,7 @@ class Field(NamedTuple):
     """checkbox, select, number, text, lines (several values, one a line), captures (several identifiers, one a line), json, or the kind of
     thing that an identifier names: capture, environment, job."""
     value_type: str
-    """Type in JSON: boolean, integer, number, string, strings or json."""
+    """Type in JSON: boolean, integer, number, string, strings (one a line), json; integers, numbers or words, typed with commas between."""
     flag: str
     off: str
     is_argument: bool
@@ -129,6 +136,8 @@ def _control(option: Option) -> tuple[str, str, tuple[tuple[str, str], ...]]:
         return "json", "json", ()
     if option.is_repeated:
         return "lines", "strings", ()
+    if Commas in option.constraints:
+        return "text", {int: "integers", float: "numbers"}.get(_bare(get_args(kind)[0]), "words"), ()
     if kind is bool:
         return "checkbox", "boolean", ()
     if isinstance(kind, type) and issubclass(kind, Enum):
@@ -141,6 +150,11 @@ def _control(option: Option) -> tuple[str, str, tuple[tuple[str, str], ...]]:
     if kind is float:
         return "number", "number", ()
     return "text", "string", ()
+
+
+def _bare(kind: Any) -> Any:
+    """Return a type without what it is annotated with."""
+    return get_args(kind)[0] if get_origin(kind) is Annotated else kind
 
 
 def _limits(limit: Any) -> list[tuple[str, float]]:

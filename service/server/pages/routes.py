@@ -16,7 +16,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoes
 
 from service import __version__
 from service.requests.identifiers import CaptureId, JobId
-from service.server.pages.forms import CAPTURE_JOBS, MAPS_JOBS, form_of
+from service.server.pages.forms import CAPTURE_JOBS, FREE_JOBS, MAPS_JOBS, form_of
 
 HOME = Path(str(files("service.server.pages")))
 STATIC = "/static"
@@ -75,8 +75,8 @@ async def capture(capture: CaptureId) -> Response:
 
 @router.get("/jobs")
 async def jobs() -> Response:
-    """Show the jobs as they change."""
-    return _page("jobs.html")
+    """Show the jobs as they change, and the forms of the jobs that read nothing."""
+    return _page("jobs.html", forms=[form_of(kind, model) for kind, model in FREE_JOBS.items()])
 
 
 @router.get("/jobs/{job}")

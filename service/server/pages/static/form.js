@@ -113,7 +113,7 @@ function entered(form) {
     if (value === undefined) continue;
     for (const path of field.dataset.paths.split(" ")) place(request, path.split("."), value);
     const isArgument = field.hasAttribute("data-argument");
-    for (const each of Array.isArray(value) ? value : [value]) {
+    for (const each of field.dataset.type === "strings" ? value : [Array.isArray(value) ? value.join(",") : value]) {
       const flag = each === false ? field.dataset.off : field.dataset.flag;
       const typed = field.dataset.type === "json" ? `${field.dataset.name}.json` : typeof each === "boolean" ? true : String(each);
       options.push({ flag, value: typed, isArgument });
@@ -137,6 +137,11 @@ function valueOf(field) {
       return number(label, text, control, field.dataset.type === "integer");
     case "strings":
       return text.split("\n").map((line) => line.trim()).filter((line) => line !== "");
+    case "integers":
+    case "numbers":
+      return parts(text).map((part) => number(label, part, control, field.dataset.type === "integers"));
+    case "words":
+      return parts(text);
     case "json":
       try {
         return JSON.parse(text);
@@ -148,9 +153,14 @@ function valueOf(field) {
   }
 }
 
+/** Return what stands between the commas of a text. */
+function parts(text) {
+  return text.split(",").map((part) => part.trim());
+}
+
 function number(label, text, control, whole) {
   const value = Number(text);
-  const { low, high } = control.dataset;
+  const { low = "", high = "" } = control.dataset;
   if (!Number.isFinite(value) || (whole && !Number.isInteger(value))) {
     throw new Refusal(422, `${label}: is ${text}: give a ${whole ? "whole " : ""}number`);
   }

@@ -1,8 +1,9 @@
-/** The page of all jobs. */
+/** The page of all jobs, with the forms of those that read nothing. */
 
 import { attempt, read } from "./api.js";
 import { byId, show } from "./element.js";
 import { watch } from "./events.js";
+import { enableForms } from "./form.js";
 import { JobsTable } from "./jobs_table.js";
 
 const table = new JobsTable(byId("jobs"));
@@ -15,6 +16,7 @@ async function more() {
   show(byId("more"), next !== null);
 }
 
+enableForms(byId("work"), "");
 byId("more").addEventListener("click", () => attempt(more));
 await attempt(more);
 await attempt(() => watch("/v1/events", { job: (job) => table.put(job), gone: ({ id }) => table.drop(id) }));

@@ -7,18 +7,20 @@ import pytest
 from service.requests.base import Role
 from service.requests.jobs import ANY_JOB, ProcamJob, RelightJob, SolveJob
 from service.requests.options import build, options_of
-from service.server.pages.forms import CAPTURE_JOBS, MAPS_JOBS, Form, form_of
+from service.server.pages.forms import CAPTURE_JOBS, FREE_JOBS, MAPS_JOBS, Form, form_of
 
-KINDS = CAPTURE_JOBS | MAPS_JOBS
+KINDS = CAPTURE_JOBS | MAPS_JOBS | FREE_JOBS
 CAPTURE, JOB = "cap_0123456789abcdefghjk", "job_0123456789abcdefghjk"
 
 REQUIRED = {
     "calibrate-dark": {"capture": CAPTURE, "images": ["0.exr"]}, "calibrate-flat-field": {"capture": CAPTURE, "images": ["0.exr"]},
     "calibrate-response": {"capture": CAPTURE, "images": ["0.exr", "1.exr", "2.exr"]},
     "calibrate-procam": {"captures": [CAPTURE], "options": {"board": "9x6", "square_m": 0.025}},
+    "patterns": {"options": {"code": "gray", "projector": "64x32"}},
 }
 """What a job must have beside a capture, where it must."""
-TYPED = {"calibrate-procam": {"captures": [CAPTURE], "board": "9x6", "square_m": 0.025}}
+TYPED = {"calibrate-procam": {"captures": [CAPTURE], "board": "9x6", "square_m": 0.025},
+         "patterns": {"code": "gray", "projector": "64x32"}}
 
 
 def fields(form: Form):
@@ -26,9 +28,10 @@ def fields(form: Form):
 
 
 def allowed(field) -> float:
-    """A number within the limits of a field."""
+    """A number within the limits of a field, whole eights where there is room: bits are."""
     if field.low and field.high:
-        return (float(field.low) + float(field.high)) / 2
+        middle = (float(field.low) + float(field.high)) / 2
+        return middle // 8 * 8 if middle > 8 else middle
     return float(field.low or 0) + 1
 
 
@@ -54,7 +57,8 @@ def test_places_lead_to_the_values_of_the_command_line(kind):
     inputs = REQUIRED.get(kind, {"capture": CAPTURE} if kind in CAPTURE_JOBS else {"maps": JOB})
     typed = TYPED.get(kind, inputs)
     for field in fields(form_of(kind, model)).values():
-        value = {"boolean": field.default != "true", "integer": int(allowed(field)), "number": allowed(field)}.get(field.value_type)
+        value = {"boolean": field.default != "true", "integer": int(allowed(field)), "number": allowed(field), "integers": [1, 2, 3, 4],
+                 "numbers": [0.25, 0.5, 1]}.get(field.value_type)
         if value is None and field.choices:
             value = next(each for each, _ in field.choices if each != field.default)
         if value is None:
@@ -66,7 +70,8 @@ def test_places_lead_to_the_values_of_the_command_line(kind):
             for name in parents:
                 target = target.setdefault(name, {})
             target[last] = value
-        assert ANY_JOB.validate_python(request) == build(model, typed | {field.name: value}), field.name
+        text = ",".join(map(str, value)) if isinstance(value, list) else value
+        assert ANY_JOB.validate_python(request) == build(model, typed | {field.name: text}), field.name
 
 
 def test_limits_and_defaults_are_those_of_the_model():

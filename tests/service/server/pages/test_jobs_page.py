@@ -67,6 +67,20 @@ def test_a_form_submits_a_job_that_is_followed_to_its_results(server, page, capt
     assert json.loads(download.value.path().read_text()) == report
 
 
+def test_patterns_are_drawn_from_the_page_of_jobs(page):
+    """A job that reads nothing; its periods are typed as in a command."""
+    page.goto("/jobs")
+    form = opened_form(page, "Draw patterns to project")
+    form.get_by_label("Code").select_option("phase")
+    form.get_by_label("Projector").fill("64x32")
+    form.get_by_label("Periods", exact=True).fill("16,18")
+    command = form.locator("[data-shows=command]").inner_text()
+    assert " patterns phase " in command and command.endswith(" --projector 64x32 --periods 16,18")
+    submitted(page)
+    page.locator(".state.succeeded").wait_for(timeout=JOB_MS)
+    page.locator("#results").get_by_text("patterns.json").wait_for()
+
+
 def test_forms_of_several_captures_and_images(page, capture):
     page.goto(f"/captures/{capture}")
     form = opened_form(page, "Calibrate camera and projector", options=False)
