@@ -11,6 +11,8 @@ import numpy as np
 from stage import images
 from stage import radiance as radiances
 from stage.camera import Camera
+from stage.camera_raw import path_is_raw
+from stage.colour_spaces import is_linear
 from stage.errors import MOST_FAULTS, ImageError, ManifestError, ResultError, StageError, listed, storage
 from stage.exif import Exposure, exposure_times, unused_exposures
 from stage.images import ImageHeader
@@ -144,7 +146,7 @@ class Capture:
             if count:
                 self.clipped[name] = count
         else:
-            radiances.check_radiance(path, pixels, remedy=radiances.CLIP_NEGATIVE)
+            radiances.check_radiance(path, pixels, remedy=radiances.CLIP_NEGATIVE, stray=radiances.RAW_STRAY if path_is_raw(path) else 0.0)
         return self.part_of(pixels).astype(np.float32, copy=False)
 
     def part_of(self, image: np.ndarray) -> np.ndarray:
@@ -226,6 +228,9 @@ class Capture:
                     images.read_header(path)  # an environment has a size of its own
                 else:
                     header = images.check_resolution(path, self.camera.resolution)
+                    if field != "mask" and path_is_raw(path) and not is_linear(self.manifest.color_space):
+                        return ManifestError(f"{self.folder / FILE_NAME}: color_space: {self.manifest.color_space} is encoded for "
+                                             f"displays, and {name} is camera raw, which is linear: give lin_rec709_scene")
                     if field in frames:
                         headers[name] = header
             except StageError as error:

@@ -1,4 +1,4 @@
-"""Correction of recorded values to scene-linear radiance by colour space, dark frame, flat field, exposure and ambient light."""
+"""Correction of recorded values to scene-linear radiance by colour space, dark frame, flat field, colours, exposure and ambient light."""
 
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -35,7 +35,7 @@ class CodedRadiance(NamedTuple):
 class Correction:
     """The correction of every frame of a capture.
 
-    radiance = (linear(recorded) - dark) / flat / exposure - ambient, with the flat field scaled to mean 1 over the mask.
+    radiance = color_matrix · (linear(recorded) - dark) / flat / exposure - ambient, with the flat field scaled to mean 1 over the mask.
     """
 
     capture: Capture
@@ -104,7 +104,8 @@ class Correction:
             limit = FULL_SCALE
         if limit is not None:
             saturated = _any_from(limit, recorded)
-        if recorded.dtype.kind == "u" and self.dark is None and self.flat is None and self.ambient is None:
+        coded = recorded.dtype.kind == "u" and manifest.color_matrix is None
+        if coded and self.dark is None and self.flat is None and self.ambient is None:
             every = np.arange(np.iinfo(recorded.dtype).max + 1, dtype=recorded.dtype)
             return CodedRadiance(recorded, self.corrected(every, frame), saturated)
         return Radiance(self.corrected(recorded, frame), saturated)
@@ -135,6 +136,8 @@ class Correction:
             pixels = pixels / self.flat
         if frame.exposure_s is not None:
             pixels = pixels / np.float32(frame.exposure_s)
+        if self.capture.manifest.color_matrix is not None:
+            pixels = pixels @ np.array(self.capture.manifest.color_matrix, np.float32).T
         if self.ambient is not None:
             pixels = pixels - self.ambient
         return pixels

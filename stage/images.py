@@ -1,4 +1,4 @@
-"""Reading of images (EXR, PNG, TIFF, HDR, JPEG, JPEG XL, AVIF, DPX, TGA, BMP), the header first and then the pixels; writing of PNG."""
+"""Reading of images (EXR, PNG, TIFF, HDR, JPEG, JPEG XL, AVIF, DPX, TGA, BMP, raw), the header first, then pixels; writing of PNG."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 import OpenImageIO as oiio
 
-from stage import avif, exr, inputs, integrity, jxl
+from stage import avif, camera_raw, exr, inputs, integrity, jxl
 from stage.errors import ImageError
 from stage.exif import Exposure, sound
 from stage.orientation import TURNS, UPRIGHT, upright, upright_size
@@ -18,7 +18,7 @@ from stage.pixels import Crop
 OIIO_SUFFIXES = {".png", ".tif", ".tiff", ".hdr", ".jpg", ".jpeg", ".jxl", ".dpx", ".tga", ".bmp"}
 ORIENTED_SUFFIXES = {".png", ".tif", ".tiff", ".hdr", ".jpg", ".jpeg"}
 """Suffixes of files with an orientation that their decoder leaves to the reader; that of JPEG XL turns the pixels by itself."""
-SUFFIXES = {".exr", ".avif", *OIIO_SUFFIXES}
+SUFFIXES = {".exr", ".avif", *OIIO_SUFFIXES, *camera_raw.SUFFIXES}
 FLOATING = {oiio.HALF, oiio.FLOAT, oiio.DOUBLE}
 CODES = {oiio.UINT8, oiio.UINT16}
 """Integers that `read_recorded` leaves as they are: tables of what each stands for are short."""
@@ -87,6 +87,9 @@ def header_of(source: inputs.Source) -> ImageHeader:
     elif suffix == ".avif":
         found = avif.header_of(path, source.file)
         return ImageHeader(found.width, found.height, found.channels, found.channels + 1, True)
+    elif suffix in camera_raw.SUFFIXES:
+        raw = camera_raw.header_of(source)
+        return ImageHeader(raw.width, raw.height, 3, 3, True, raw.orientation, raw.exposure)
     with _decoder(source) as decoder:
         spec = decoder.spec()
         orientation = _orientation(path, spec)
@@ -162,6 +165,8 @@ def _decoded(source: inputs.Source, suffix: str) -> np.ndarray:
         found = avif.header_of(source.path, source.file)
         source.check_pixels(found.width, found.height)
         return avif.decode(source.path, source.file, found)
+    elif suffix in camera_raw.SUFFIXES:
+        return camera_raw.decode(source)
     with _decoder(source) as decoder:
         spec = decoder.spec()
         source.check_pixels(spec.width, spec.height)
@@ -280,7 +285,8 @@ def _exposure(spec: oiio.ImageSpec) -> Exposure:
 
 def _check_suffix(path: str | Path) -> None:
     if Path(path).suffix.lower() not in SUFFIXES:
-        raise ImageError(f"{path}: has an unknown suffix: relit reads {', '.join(sorted(SUFFIXES))}")
+        listed = ", ".join(sorted(SUFFIXES - camera_raw.SUFFIXES))
+        raise ImageError(f"{path}: has an unknown suffix: relit reads {listed} and camera raw ({', '.join(sorted(camera_raw.SUFFIXES))})")
 
 
 def _colour_channels(path: str | Path, names: tuple[str, ...]) -> tuple[str, ...]:

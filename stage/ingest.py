@@ -139,6 +139,8 @@ def _key(capture: Capture, frames: list[Frame], tracking: Tracking | None, finge
     }
     if manifest.saturation is None and any(Path(frame.image).suffix.lower() not in FLOATING for frame in frames):
         inputs["saturation"] = "largest integer"
+    if manifest.color_matrix is not None:
+        inputs["color_matrix"] = manifest.color_matrix
     if capture.pixels.clip_negative:
         inputs["negative"] = "clipped"
     if capture.pixels.crop is not None:

@@ -6,13 +6,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from stage.camera import Camera
 from stage.colour_spaces import ColorSpaceName
 from stage.files import write_text
 from stage.light import Light
-from stage.model import FirstFault, Positive, Strict, Text
+from stage.model import FirstFault, Positive, Strict, Text, Vector
 from stage.patterns.codes import Pattern
 from stage.projector import AnyProjector
 from stage.ranging import Laser, TimeOfFlight
@@ -23,6 +23,16 @@ FILE_NAME = "capture.json"
 
 FileName = Text
 """The name of a file of the capture, relative to its folder."""
+
+
+ColorMatrix = tuple[Vector, Vector, Vector]
+
+
+def _invertible(rows: ColorMatrix) -> ColorMatrix:
+    (a, b, c), (d, e, f), (g, h, i) = rows
+    if a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) == 0:
+        raise ValueError("maps different colours to the same one: its determinant is 0")
+    return rows
 
 
 class Frame(Strict):
@@ -72,6 +82,9 @@ class Manifest(Strict):
     saturation: Positive | None = None
     """The recorded value from which readings are not used; integers count as fractions of full scale. None: the largest integer of
     frames of lights alone."""
+    color_matrix: Annotated[ColorMatrix, AfterValidator(_invertible)] | None = None
+    """By rows, the matrix from the linear colours of the images to those of `color_space`: white balance, and the colours of the sensor
+    of a camera raw file, as `relit calibrate white-balance` measures it. None: the colours are used as they are."""
     exposure_from: Literal["exif"] | None = None
     """`exif` where the exposure time of every frame is the one that EXIF in its file says. None: `exposure_s` of the frames."""
     irradiance_scale: Literal["absolute", "relative"] = "absolute"

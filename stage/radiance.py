@@ -28,17 +28,21 @@ STRIDE = 3
 """Pixels between the neighbours of a triple: demosaicing and filters make the noise of closer ones alike."""
 ROUNDING = 1e-6
 """Part of the brightest value down to which a value below zero counts as rounding of the sums and filters of an image."""
+RAW_STRAY = 1e-3
+"""The part of the pixels of a camera raw image that may be below the noise: sensors have dead pixels, and the colours between pixels have
+less noise than the recorded ones, so that the measured noise is below that of the latter. A wrong black level moves all dark pixels."""
 CLIP_NEGATIVE = "--clip-negative sets such values to 0"
 """What an error message says where the command has this option."""
 
 
-def check_radiance(path: str | Path, pixels: np.ndarray, *, remedy: str = "mend the image") -> None:
+def check_radiance(path: str | Path, pixels: np.ndarray, *, remedy: str = "mend the image", stray: float = 0.0) -> None:
     """Check that no value is NaN, infinite, or further below zero than the noise of the image.
 
     Args:
         path: of the image, for messages.
         pixels: [rows, cols, channels] floating point.
         remedy: what the message about negative values says can be done.
+        stray: the part of the pixels that may be below the noise, such as RAW_STRAY.
 
     Raises:
         ImageError: some values are; the message counts the pixels and names the first.
@@ -46,7 +50,7 @@ def check_radiance(path: str | Path, pixels: np.ndarray, *, remedy: str = "mend 
     check_finite(path, pixels)
     floor = noise_floor(pixels)
     negative = pixels < floor
-    if negative.any():
+    if negative.any() and negative.any(axis=-1).mean() > stray:
         found = _found(negative, "negative")
         raise ImageError(f"{path}: {found}, down to {float(pixels.min()):.4g} where noise explains {float(floor.max()):.2g}: {remedy}")
 

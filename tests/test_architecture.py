@@ -72,7 +72,7 @@ def test_the_imports_are_read():
 
 
 @pytest.mark.parametrize(("layer", "allowed"), [
-    ("stage", {"stage", "numpy", "pydantic", "OpenEXR", "OpenImageIO", "cv2", "laspy"}),
+    ("stage", {"stage", "numpy", "pydantic", "OpenEXR", "OpenImageIO", "cv2", "laspy", "rawpy"}),
     ("kernels", {"kernels", "numpy", "warp"}),
 ])
 def test_a_layer_imports_only_its_own_libraries(layer, allowed):
@@ -84,14 +84,15 @@ def test_a_layer_imports_only_its_own_libraries(layer, allowed):
 @pytest.mark.parametrize(("library", "homes"), [
     ("pxr", ["service.usd"]), ("pygltflib", ["service.gltf"]), ("typer", ["service.cli"]), ("rich", ["service.cli"]),
     ("fastapi", ["service.server.api", "service.server.pages"]), ("jinja2", ["service.server.pages"]), ("dbos", ["service.server.jobs"]),
-    ("laspy", ["stage.las"]), ("fast_simplification", ["service.asset.levels"]), ("MaterialX", ["service.asset.openpbr"]),
+    ("laspy", ["stage.las"]), ("rawpy", ["stage.camera_raw"]),
+    ("fast_simplification", ["service.asset.levels"]), ("MaterialX", ["service.asset.openpbr"]),
 ])
 def test_a_library_lives_in_its_places(library, homes):
     assert {i.importer for i in IMPORTS if top(i.target) == library and not under(i.importer, *homes)} == set()
 
 
-def test_opencv_lives_where_motion_is_tracked_rigs_are_calibrated_distances_measured_and_avif_decoded():
-    allowed = "stage.motion", "stage.calibration", "stage.mask_border", "stage.avif"
+def test_opencv_lives_where_motion_is_tracked_rigs_calibrated_distances_measured_and_avif_and_camera_raw_decoded():
+    allowed = "stage.motion", "stage.calibration", "stage.mask_border", "stage.avif", "stage.camera_raw"
     assert {i.importer for i in IMPORTS if top(i.target) == "cv2" and not under(i.importer, *allowed)} == set()
 
 
@@ -172,7 +173,7 @@ def test_no_cycles():
 
 @pytest.mark.parametrize("arguments", [["--help"], ["solve", "--help"], ["relight", "--help"]])
 def test_the_command_line_starts_without_heavy_libraries(arguments):
-    heavy = "warp", "pxr", "OpenEXR", "OpenImageIO", "numpy", "cv2", "MaterialX", "pygltflib", "fast_simplification", "laspy"
+    heavy = "warp", "pxr", "OpenEXR", "OpenImageIO", "numpy", "cv2", "MaterialX", "pygltflib", "fast_simplification", "laspy", "rawpy"
     code = ("import sys, service.cli.main\n"
             f"sys.argv[1:] = {arguments!r}\n"
             "try: service.cli.main.main()\n"

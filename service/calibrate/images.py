@@ -15,9 +15,10 @@ from service.requests.calibrate import DarkRequest, FlatFieldRequest, Saturation
 from stage import exr, images
 from stage.calibration.flat_field import make_flat, mean_image, recorded_values
 from stage.calibration.saturation import TopHistogram, capture_saturation
+from stage.camera_raw import path_is_raw
 from stage.capture import Capture
 from stage.errors import CalibrationError
-from stage.radiance import check_radiance
+from stage.radiance import RAW_STRAY, check_radiance
 
 DARK_FILE, FLAT_FILE = "dark.exr", "flat.exr"
 
@@ -123,7 +124,7 @@ def saturation(request: SaturationRequest, progress: Progress | None = None) -> 
 
 def _recorded(path: Path) -> np.ndarray:
     pixels = images.read_pixels(path)
-    check_radiance(path, pixels)
+    check_radiance(path, pixels, stray=RAW_STRAY if path_is_raw(path) else 0.0)
     return pixels
 
 

@@ -18,6 +18,7 @@ from service.requests.calibrate import (
     ResponseRequest,
     SaturationRequest,
     TofCalibrationRequest,
+    WhiteBalanceRequest,
 )
 
 if TYPE_CHECKING:
@@ -33,9 +34,10 @@ VIEW_ROWS = 40
 def register(app: typer.Typer) -> None:
     """Add the command and its kinds."""
     kinds = typer.Typer(name="calibrate", no_args_is_help=True,
-                        help="Lights, projector and camera, dark frame, flat field and saturation from images; with residuals.")
+                        help="Lights, projector and camera, dark frame, flat field, colours and saturation from images; with residuals.")
     for name, function in (("mirror-ball", _mirror_ball), ("light-positions", _light_positions), ("grey-ball", _grey_ball),
                            ("intensity", _intensity), ("dark", _dark), ("flat-field", _flat_field), ("saturation", _saturation),
+                           ("white-balance", _white_balance),
                            ("procam", _procam), ("response", _response), ("tof", _tof)):
         local_command(kinds, name, function)
     app.add_typer(kinds)
@@ -99,6 +101,18 @@ def _saturation(request: SaturationRequest) -> None:
     if result.manifest_path is not None:
         print(f"capture  {result.manifest_path}")
         print(f"report   {result.report_path}")
+
+
+def _white_balance(request: WhiteBalanceRequest) -> None:
+    from service.calibrate.white_balance import white_balance
+
+    with ProgressBar() as bar:
+        result = white_balance(request, bar)
+    print(f"capture  {result.manifest_path}")
+    print(f"report   {result.report_path}")
+    print("gains    " + ", ".join(f"{gain:.4f} {name}" for gain, name in zip(result.gains, ("red", "green", "blue"), strict=True)))
+    for row in result.matrix:
+        print("matrix   " + " ".join(f"{value:9.5f}" for value in row))
 
 
 def _procam(request: ProcamRequest) -> None:

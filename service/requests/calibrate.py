@@ -5,7 +5,7 @@ from typing import Annotated, Any, NoReturn
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from service.requests.base import CAPTURE, Commas, DeviceRequest, Options, Request, Role, Spelling, WidthHeight
+from service.requests.base import CAPTURE, Commas, CropBox, DeviceRequest, Options, Request, Role, Spelling, WidthHeight
 from stage.model import Count, Finite, Positive
 
 
@@ -192,6 +192,15 @@ class FlatFieldRequest(FramesRequest):
 
     dark_images: Annotated[tuple[Path, ...], Role.INPUT, Spelling(flag="--dark")] = ()
     """A dark image at the exposure of the white card; may be repeated. Without it the dark frame of the capture is used."""
+
+
+class WhiteBalanceRequest(FramesRequest):
+    """The colours of the capture from a grey or white card in its light: white balance, and the colours of the sensor of camera raw."""
+
+    region: Annotated[CropBox | None, Commas, Spelling(metavar="X,Y,W,H")] = None
+    """Part of the images that the card fills: first column, first row, width and height in pixels; None: all of it."""
+    sensor_colors: bool = False
+    """Keep the primaries of the sensor of camera raw files, in place of those of `color_space`: balance white alone."""
 
 
 class SaturationRequest(ManifestRequest):

@@ -11,11 +11,12 @@ from typing import NamedTuple
 import numpy as np
 
 from stage import images
+from stage.camera_raw import path_is_raw
 from stage.capture import Capture
 from stage.colour import convert, linearise
 from stage.colour_spaces import linear_space
 from stage.errors import CalibrationError, ImageError
-from stage.radiance import check_radiance
+from stage.radiance import RAW_STRAY, check_radiance
 
 
 class MeanImage(NamedTuple):
@@ -51,7 +52,7 @@ def mean_image(paths: Sequence[Path], capture: Capture, *, refuse_saturated: boo
     for index, path in enumerate(paths):
         images.check_resolution(path, capture.camera.resolution)
         recorded = images.read_pixels(path).astype(np.float32, copy=False)
-        check_radiance(path, recorded)
+        check_radiance(path, recorded, stray=RAW_STRAY if path_is_raw(path) else 0.0)
         if mask is not None and manifest.saturation is not None:
             count = int((np.any(recorded >= manifest.saturation, axis=-1) & mask).sum())
             if count:

@@ -20,7 +20,7 @@ from stage.importers.light_table import read_light_table
 from stage.importers.opencv_gray import gray_order
 from stage.importers.procam_file import PROJECTOR_MATRIX, projector_size
 from stage.importers.raw_arrays import ArrayFiles
-from stage.importers.view import AMBIENT_WORDS, MASK_WORDS, words_of
+from stage.importers.view import AMBIENT_WORDS, MASK_WORDS, refuse_twins, words_of
 from stage.manifest import FILE_NAME
 from stage.mat_file import read_mat_arrays
 from stage.tof.frames import read_array
@@ -80,6 +80,7 @@ def guess(source: Path) -> Guess:
     if FILE_NAME in names:
         raise ManifestError(f"{source}: is a capture already: relit info {shlex.quote(str(source))} looks at it")
     pictures = tuple(name for name in image_names(source) if not words_of(name) & (MASK_WORDS | AMBIENT_WORDS))
+    refuse_twins(source, pictures)
     folder = Folder(source, names, pictures)
     for look in (_diligent, _relightlab, _lp, _kinect, _near_lights, _table, _scanner, _gray, _phase, _correlations, _histograms, _photos):
         if (found := look(folder)) is not None:

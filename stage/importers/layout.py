@@ -13,6 +13,7 @@ import OpenImageIO as oiio
 from pydantic import ValidationError
 
 from stage import images, inputs
+from stage.camera_raw import path_is_raw
 from stage.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError, storage
 from stage.files import replacing
@@ -87,7 +88,7 @@ def color_space_of(path: Path) -> ColorSpaceName:
     Raises:
         ManifestError: the file is no image.
     """
-    if path.suffix.lower() == ".exr":
+    if path.suffix.lower() == ".exr" or path_is_raw(path):
         return "lin_rec709_scene"
     source = oiio.ImageInput.open(str(path))
     if source is None:

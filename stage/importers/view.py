@@ -1,10 +1,12 @@
 """What an importer is told of the camera and of the images, and the entries of the manifest that follow from it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from stage.camera_raw import path_is_raw
 from stage.errors import ManifestError
 from stage.importers.layout import image_names
 from stage.text import name_fault
@@ -89,10 +91,26 @@ def select(folder: Path, selection: Selection) -> Selected:
     for name in wanted:
         if (fault := name_fault(name)) is not None:
             raise ManifestError(f"{folder}: the name {ascii(name)[1:-1]} {fault}")
+    if selection.images is None:
+        refuse_twins(folder, wanted)
     if not wanted:
         raise ManifestError(f"{folder}: holds no image" + (f" that {selection.images} names" if selection.images else "")
                             + (": give --images" if names else ""))
     return Selected(tuple(wanted), mask, ambient)
+
+
+def refuse_twins(folder: Path, names: Sequence[str]) -> None:
+    """Refuse images that are one photograph, as cameras write it twice: camera raw and JPEG under one name.
+
+    Raises:
+        ManifestError: names two such images.
+    """
+    raws = {Path(name).stem.lower(): name for name in names if path_is_raw(name)}
+    twin = next((name for name in names if not path_is_raw(name) and Path(name).stem.lower() in raws), None)
+    if twin is not None:
+        raw = raws[Path(twin).stem.lower()]
+        raise ManifestError(f"{folder}: {raw} and {twin} are one photograph: choose which are used, --images '*{Path(raw).suffix}' "
+                            f"or --images '*{Path(twin).suffix}'")
 
 
 def words_of(name: str) -> frozenset[str]:

@@ -55,6 +55,7 @@ COMMANDS: dict[str, list[type[Options]]] = {
     "calibrate light-positions": [calibrate.LightPositionsRequest], "calibrate grey-ball": [calibrate.GreyBallRequest],
     "calibrate intensity": [calibrate.IntensityRequest], "calibrate dark": [calibrate.DarkRequest],
     "calibrate flat-field": [calibrate.FlatFieldRequest], "calibrate saturation": [calibrate.SaturationRequest],
+    "calibrate white-balance": [calibrate.WhiteBalanceRequest],
     "calibrate procam": [calibrate.ProcamRequest], "calibrate response": [calibrate.ResponseRequest],
     "calibrate tof": [calibrate.TofCalibrationRequest],
     "submit solve": [jobs.SolveJob], "submit depth": [jobs.DepthJob], "submit relight": [jobs.RelightJob], "submit shade": [jobs.ShadeJob],
