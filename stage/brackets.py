@@ -1,25 +1,23 @@
-"""Frames of one light at several exposures, merged: each reading is the mean of those that are not clipped.
+"""Frames of one light, merged: of several exposures the mean of those that are not clipped, of a polarised pair the sum of both.
 
 Neither a sum of images nor a solver should take a clipped reading, or a noisy one for as much as a sure one, while another exposure of the
-same light has the whole value.
+same light has the whole value. A cross- and a parallel-polarised image of a light are each merged first, then added (`polarised_pairs`).
 
 Source: the maximum-likelihood weight of an exposure under photon noise is the light that it gathers, Hasinoff, Durand and Freeman,
 "Noise-optimal capture for high dynamic range photography", CVPR 2010, section 3; readings that saturate have weight 0.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple, TypeVar
 
 import numpy as np
 
+from stage.light import DistantLight, PointLight
 from stage.manifest import Frame
 from stage.point_lights import DistantLights, PlacedLights
+from stage.polarised_pairs import Component, first_in_place
 from stage.stack import LIGHT_PAD, Stack, padded
-
-SAME_PLACE = 1e-4
-"""Lights closer together than this part of their distance, 0.006 degrees, are one light: as close as the weights of images take them for
-one."""
 
 Lights = TypeVar("Lights", bound=DistantLights | PlacedLights)
 
@@ -30,6 +28,15 @@ class Bracket(NamedTuple):
     rows: np.ndarray  # [frames] positions in the stack
     irradiance: np.ndarray  # [frames, 3] of the light in each
     weight: np.ndarray  # [frames] in proportion to the light that each gathers
+    crossed: np.ndarray  # [frames] bool: the cross-polarised ones
+    gains: tuple[float, float]
+    """The factors of the others (all where there is no polariser) and of the cross-polarised ones in the sum."""
+
+    def parts(self) -> Iterator[tuple[np.ndarray, float]]:
+        """Yield the frames whose mean is taken, as [frames] bool, with the factor of the mean."""
+        for among, gain in zip((~self.crossed, self.crossed), self.gains, strict=True):
+            if among.any():
+                yield among, gain
 
 
 @dataclass(frozen=True)
@@ -70,7 +77,8 @@ class BracketedStack(Stack):
     def _clipped(self, bits: np.ndarray) -> np.ndarray:
         clipped = np.unpackbits(bits, axis=0, bitorder="little")
         for bracket in self.brackets:
-            clipped[bracket.rows] = clipped[bracket.rows].all(axis=0)
+            every = [clipped[bracket.rows[among]].all(axis=0) for among, _ in bracket.parts()]
+            clipped[bracket.rows] = np.any(every, axis=0)
         clipped = clipped[self.kept]
         clipped[self.light_count :] = 0
         return np.packbits(clipped, axis=0, bitorder="little")
@@ -79,29 +87,39 @@ class BracketedStack(Stack):
         assert self.recorded is not None
         clipped = np.unpackbits(bits, axis=0, bitorder="little").astype(bool)
         merged = np.array(values)
-        for rows, irradiance, weight in self.brackets:
-            # radiance under an irradiance of one: the frames of a bracket agree in it
-            readings = values[:, rows].astype(np.float32) * (self.recorded.scale[rows, None] / irradiance).T[..., None].astype(np.float32)
-            counted = np.where(clipped[rows], 0, weight[:, None]).astype(np.float32)
-            total = counted.sum(axis=0)
-            mean = (readings * counted).sum(axis=1) / np.where(total > 0, total, 1)
-            mean = np.where(total > 0, mean, readings.max(axis=1))
-            merged[:, rows] = mean[:, None] * (irradiance / self.whole_scale[rows, None]).T[..., None].astype(np.float32)
+        for bracket in self.brackets:
+            whole = np.zeros((len(values), values.shape[2]), np.float32)
+            for among, gain in bracket.parts():
+                rows, weight = bracket.rows[among], bracket.weight[among]
+                # radiance under an irradiance of one: the frames of a bracket agree in it
+                factor = (self.recorded.scale[rows, None] / bracket.irradiance[among]).T[..., None].astype(np.float32)
+                readings = values[:, rows].astype(np.float32) * factor
+                counted = np.where(clipped[rows], 0, weight[:, None]).astype(np.float32)
+                total = counted.sum(axis=0)
+                mean = (readings * counted).sum(axis=1) / np.where(total > 0, total, 1)
+                whole += np.float32(gain) * np.where(total > 0, mean, readings.max(axis=1))
+            back = (bracket.irradiance / self.whole_scale[bracket.rows, None]).T[..., None].astype(np.float32)
+            merged[:, bracket.rows] = whole[:, None] * back
         merged = merged[:, self.kept]
         merged[:, self.light_count :] = 0
         return merged, self._clipped(bits)
 
 
-def merge_brackets(stack: Stack, frames: Sequence[Frame], lights: DistantLights | PlacedLights) -> Stack:
-    """Return a stack whose frames of one light at several exposures are merged; without such frames, the stack as it is.
+def merge_brackets(stack: Stack, frames: Sequence[Frame], lights: DistantLights | PlacedLights, *,
+                   component: Component = Component.WHOLE, leak: float = 0.0) -> Stack:
+    """Return a stack whose frames of one light are merged; where every light has one frame, the stack as it is.
 
     Args:
         stack: of the frames.
         frames: of the stack, in its order.
         lights: of the frames.
+        component: what the images of a polarised pair become.
+        leak: of the polarisers, `Manifest.polarizer_leak`.
     """
     exposure = np.array([frame.exposure_s or 1.0 for frame in frames])
-    owner = _first_in_place(lights)
+    kind = np.array([frame.light.polarization if isinstance(frame.light, DistantLight | PointLight) else "none" for frame in frames])
+    of_cross, of_parallel = component.gains(leak)
+    owner = first_in_place(lights.place if isinstance(lights, PlacedLights) else lights.direction)
     brackets, scale = [], stack.scale.copy()
     for first in np.unique(owner):
         rows = np.flatnonzero(owner == first)
@@ -109,9 +127,11 @@ def merge_brackets(stack: Stack, frames: Sequence[Frame], lights: DistantLights 
         if len(rows) < 2 or not (irradiance > 0).all():
             continue
         gathered = exposure[rows] * irradiance.mean(axis=1)
-        brackets.append(Bracket(rows, irradiance, gathered / gathered.sum()))
+        gains = (1.0 if (kind[rows] == "none").all() else of_parallel, of_cross)
+        brackets.append(Bracket(rows, irradiance, gathered / gathered.sum(), kind[rows] == "cross", gains))
+        largest = sum(abs(gain) for _, gain in brackets[-1].parts())
         for row, strength in zip(rows, irradiance, strict=True):  # a power of two that the largest merged value fits into
-            scale[row] = np.exp2(np.ceil(np.log2((stack.scale[rows] * (strength / irradiance).max(axis=1)).max())))
+            scale[row] = np.exp2(np.ceil(np.log2(largest * (stack.scale[rows] * (strength / irradiance).max(axis=1)).max())))
     if not brackets:
         return stack
     return BracketedStack(stack.folder, stack.key, stack.frames, scale, stack.pixel_count, stack.motion, kept=np.arange(len(scale)),
@@ -137,9 +157,3 @@ def one_frame_a_light(stack: Stack, lights: Lights) -> tuple[Stack, Lights]:
     frames = tuple(stack.frames[row] for row in chosen)
     return replace(stack, frames=frames, scale=scale.astype(np.float32), kept=kept), type(lights)(**picked)
 
-
-def _first_in_place(lights: DistantLights | PlacedLights) -> np.ndarray:
-    """Return [lights] the first light in the place of each."""
-    place = lights.place if isinstance(lights, PlacedLights) else lights.direction
-    distance = np.linalg.norm(place[:, None] - place, axis=2)
-    return np.asarray((distance < SAME_PLACE * np.linalg.norm(place[:, :3], axis=1)).argmax(axis=1))

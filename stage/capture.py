@@ -126,6 +126,12 @@ class Capture:
         kinds = (*SOURCES, FullLight) if self.lit_by(GradientLight) else SOURCES
         return [frame for frame in self.manifest.frames if isinstance(frame.light, kinds)]
 
+    @property
+    def is_polarised(self) -> bool:
+        """Whether distant or point lights have cross- and parallel-polarised frames."""
+        return any(isinstance(frame.light, DistantLight | PointLight) and frame.light.polarization != "none"
+                   for frame in self.manifest.frames)
+
     def recorded(self, name: str) -> np.ndarray:
         """Read the recorded values of an image that holds radiance.
 

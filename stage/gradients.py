@@ -29,6 +29,8 @@ class GradientFrames(NamedTuple):
     parallel: np.ndarray | None  # [frames, 4] float64, the rows of the parallel-polarised frames, or None
     polarised: bool
     """True when `diffuse` holds cross-polarised frames, which record half of the diffuse light and none of the specular light."""
+    leak: float
+    """The part of a highlight's light that crossed polarisers pass."""
     unused: tuple[str, ...]
     """The images of gradient and full frames that the solver does not use."""
 
@@ -70,7 +72,10 @@ def gradient_frames(capture: Capture) -> GradientFrames:
     unused = tuple(frame.image for frame, used in zip(frames, taken, strict=True)
                    if not used and isinstance(frame.light, GradientLight | FullLight))
     check_surface(capture)
-    return GradientFrames(rows[solved[0]], rows.get("parallel") if polarised else None, polarised, unused)
+    leak = capture.manifest.polarizer_leak or 0.0
+    if leak > 0 and polarised and "parallel" not in rows:
+        raise ManifestError(f"{where}: polarizer_leak: is {leak:g}, and no frame has polarization parallel: what leaks is known from these")
+    return GradientFrames(rows[solved[0]], rows.get("parallel") if polarised else None, polarised, leak, unused)
 
 
 def _row(light: GradientLight) -> tuple[float, float, float, float]:

@@ -6,6 +6,9 @@ from pydantic import Field, model_validator
 
 from stage.model import Direction, FirstFault, LitRgb, Positive, Rgb, Strict, Text, Vector
 
+Polarization = Literal["none", "parallel", "cross"]
+"""How the polariser of the camera stands to that of the light."""
+
 
 class DistantLight(Strict):
     """A distant light, which has the same direction and irradiance at every point."""
@@ -16,6 +19,8 @@ class DistantLight(Strict):
     """The unit vector from the surface to the light, in the camera frame."""
     irradiance: LitRgb
     """The irradiance at normal incidence in relative units, which are the same for all lights of a capture."""
+    polarization: Polarization = "none"
+    """How the polariser of the camera stands to that of the light; a light that has a `cross` frame has a `parallel` one too."""
 
 
 PLACEHOLDER = DistantLight(type="distant", direction=(0.0, 0.0, 1.0), irradiance=(1.0, 1.0, 1.0))
@@ -38,6 +43,8 @@ class PointLight(Strict):
     """The direction in which the light shines most, from the light outwards; None: it shines alike in all directions."""
     anisotropy: Annotated[float, Field(ge=0)] | None = None
     """The exponent μ of the cosine of the angle from `axis`, 1 for a flat LED; it needs `axis`. None: 0, alike in all directions."""
+    polarization: Polarization = "none"
+    """How the polariser of the camera stands to that of the light; a light that has a `cross` frame has a `parallel` one too."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -77,7 +84,7 @@ class GradientLight(Strict):
     """The axis of the camera frame along which the radiance grows from 0 to 1, or `full` for 1 everywhere."""
     sign: Literal[1, -1] = 1
     """-1 where the radiance falls along the axis."""
-    polarization: Literal["none", "parallel", "cross"] = "none"
+    polarization: Polarization = "none"
     """How the polariser of the camera stands to those of the lights; `none` without polarisers."""
 
 

@@ -8,6 +8,7 @@ from stage.extended_lights import ExtendedLights, extended_lights, lie_in_one_pl
 from stage.light import PLACEHOLDER, DistantLight, ExtendedLight, GradientLight, PointLight
 from stage.manifest import FILE_NAME
 from stage.point_lights import DistantLights, PlacedLights, place_lights
+from stage.polarised_pairs import check_pairs
 
 MEASURED_BY = "relit calibrate mirror-ball or light-positions measures where they are, grey-ball or intensity how strong"
 """How placeholders are replaced."""
@@ -27,13 +28,16 @@ def distant_lights(capture: Capture) -> DistantLights:
     lights = [light for _, light in capture.lit_by(DistantLight)]
     if not lights:
         raise ManifestError(f"{where}: frames: none is lit by a distant light")
-    return DistantLights(np.array([light.direction for light in lights]), np.array([light.irradiance for light in lights]))
+    found = DistantLights(np.array([light.direction for light in lights]), np.array([light.irradiance for light in lights]))
+    check_pairs(capture, found.direction)
+    return found
 
 
 def has_placeholders(capture: Capture) -> bool:
     """Return whether the lights of a capture are yet to be measured: two frames or more are lit, all of them by the placeholder."""
     lit = [frame.light for frame in capture.sources()]
-    return len(lit) > 1 and all(light == PLACEHOLDER for light in lit)
+    return len(lit) > 1 and all(isinstance(light, DistantLight) and light.model_copy(update={"polarization": "none"}) == PLACEHOLDER
+                                for light in lit)
 
 
 def check_solvable(capture: Capture) -> DistantLights | PlacedLights | ExtendedLights:
@@ -51,6 +55,9 @@ def check_solvable(capture: Capture) -> DistantLights | PlacedLights | ExtendedL
         raise ManifestError(f"{where}: frames[].light: all are the placeholder, direction [0, 0, 1] and irradiance [1, 1, 1]: "
                             f"{MEASURED_BY}")
     if capture.lit_by(ExtendedLight):
+        if capture.is_polarised:
+            raise ManifestError(f"{where}: frames[].light: some are extended and others polarised: polarised pairs are of distant and "
+                                "point lights alone")
         check_surface(capture)
         return extended_lights(capture)
     near = bool(capture.lit_by(PointLight))

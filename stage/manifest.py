@@ -89,6 +89,9 @@ class Manifest(Strict):
     """`exif` where the exposure time of every frame is the one that EXIF in its file says. None: `exposure_s` of the frames."""
     irradiance_scale: Literal["absolute", "relative"] = "absolute"
     """`relative` where the irradiance (and intensity and radiance) of all lights lacks one common factor, and albedo with it."""
+    polarizer_leak: Annotated[float, Field(ge=0, lt=0.5)] | None = None
+    """The part of a highlight's light that `cross` frames still show, over what `cross` and `parallel` frames show of it together. None: 0,
+    ideal polarisers."""
     frames: Annotated[tuple[Frame, ...], Field(min_length=1), FirstFault]
     """The images, in the order in which they were taken if the subject moves."""
 

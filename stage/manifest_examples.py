@@ -20,6 +20,8 @@ Example = dict[str, Any]
 _DISTORTION: Example = {"model": "brown_conrady", "k": [-0.12, 0.03, 0.0], "p": [0.0004, -0.0002]}
 _ORTHOGRAPHIC: Example = {"projection": "orthographic", "resolution": [1024, 768], "pixel_size_m": 0.0002, "surface_z_m": 0.0}
 _DISTANT: Example = {"type": "distant", "direction": [0.36, 0.48, 0.8], "irradiance": [3.1, 3.1, 3.0]}
+_CROSSED: Example = {**_DISTANT, "polarization": "cross"}
+_PARALLEL: Example = {**_DISTANT, "polarization": "parallel"}
 _WHITE: Example = {"code": "white"}
 _RAY: Example = {"type": "ray", "origin_m": [0.15, 0.0, 0.0], "direction": [-0.2, 0.0, -1.0]}
 _CONTINUOUS: Example = {"type": "cw", "modulation_hz": 60_000_000, "reference_phase_rad": 1.570796, "source_m": [0.02, 0.0, 0.0]}
@@ -34,6 +36,9 @@ EXAMPLES: dict[type[Strict], tuple[Example, ...]] = {
         "schema": SCHEMA, "name": "statue", "color_space": "srgb_texture", "camera": _ORTHOGRAPHIC, "exposure_from": "exif",
         "color_matrix": [[1.62, -0.55, -0.07], [-0.2, 1.58, -0.38], [0.03, -0.48, 1.45]],
         "frames": [{"image": "000.jpg", "light": _DISTANT}],
+    }, {
+        "schema": SCHEMA, "name": "statue", "camera": _ORTHOGRAPHIC, "polarizer_leak": 0.01,
+        "frames": [{"image": "000_cross.exr", "light": _CROSSED}, {"image": "000_parallel.exr", "light": _PARALLEL}],
     }),
     Camera: (
         {"projection": "perspective", "resolution": [1024, 768], "focal_px": [2100.0, 2100.0], "principal_px": [512.5, 384.5],
@@ -52,9 +57,9 @@ EXAMPLES: dict[type[Strict], tuple[Example, ...]] = {
                                                           "crosstalk": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}),
     Frame: ({"image": "000.png", "exposure_s": 0.0125, "light": _DISTANT}, {"image": "pattern_00.png", "pattern": _WHITE},
             {"image": "spot_00.png", "laser": _RAY}, {"image": "phase_090.npy", "tof": _CONTINUOUS}),
-    DistantLight: (_DISTANT,),
+    DistantLight: (_DISTANT, _CROSSED),
     PointLight: ({"type": "point", "position_m": [0.2, 0.1, 0.3], "intensity": [0.5, 0.5, 0.48], "axis": [-0.2, -0.1, -0.3],
-                  "anisotropy": 1.0},),
+                  "anisotropy": 1.0, "polarization": "parallel"},),
     ExtendedLight: ({"type": "extended", "directions": [[0.0, 0.0, 1.0], [0.1, 0.0, 1.0]], "radiance": [[4.0, 4.0, 4.0], [2.0, 2.0, 2.0]],
                      "solid_angle": [0.01, 0.01]},),
     GradientLight: ({"type": "gradient", "axis": "x", "sign": -1, "polarization": "cross"},),

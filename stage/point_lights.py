@@ -9,6 +9,7 @@ from stage.capture import SOURCES, Capture
 from stage.errors import ManifestError
 from stage.light import DistantLight, GradientLight, PointLight
 from stage.manifest import FILE_NAME
+from stage.polarised_pairs import check_pairs
 
 NAMED = 4
 """The most frames that an error message names; it counts the others."""
@@ -65,6 +66,7 @@ def place_lights(capture: Capture) -> PlacedLights:
                 lobe[row] = *light.axis, light.anisotropy
     centre = camera.points(np.full(mask.shape, camera.surface_z_m or 0.0))[mask].mean(axis=0, dtype=np.float64)
     _check_places([index for index, _ in lights], place, camera, mask, str(where))
+    check_pairs(capture, place)
     way = place[:, :3] - place[:, 3:] * centre
     distance = np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-12)
     direction = way / distance

@@ -42,23 +42,26 @@ class SeparatedMoments(NamedTuple):
     specular: wp.array  # [6, pixels] float32, of the highlight: M₀ in red, green, blue, then grey M; 0 where not separated
 
 
-def separate_polarised(cross: Moments, parallel: Moments, grey_weights: tuple[float, float, float], *,
+def separate_polarised(cross: Moments, parallel: Moments, grey_weights: tuple[float, float, float], *, leak: float = 0.0,
                        pixel_count: int, device: str) -> SeparatedMoments:
-    """Separate responses by polarisation: specular = parallel - cross.
+    """Separate responses by polarisation: specular = (parallel - cross) / (1 - 2 leak).
 
-    The diffuse responses are those of the cross frames, of half the diffuse light.
+    The diffuse responses are those of the cross frames less the part of the highlight that leaks, of half the diffuse light.
 
     Args:
         cross: responses of the cross-polarised frames.
         parallel: of the parallel-polarised ones.
         grey_weights: of the channels; they add up to one.
+        leak: part of a highlight's light that crossed polarisers pass, 0 to below 0.5.
         pixel_count: pixels of the band.
         device: where the responses are.
     """
+    diffuse = Moments(*(wp.clone(array) for array in cross)) if leak > 0 else cross
     specular = zeros(pixel_count, wp.float32, device, rows=6)
     devices.launch(_difference_kernel, pixel_count, [cross.values, cross.status, parallel.values, parallel.status,
-                                                     wp.vec3(*grey_weights)], [specular], device=device)
-    return SeparatedMoments(cross, specular)
+                                                     wp.vec3(*grey_weights), leak], [diffuse.values, diffuse.variance, specular],
+                   device=device)
+    return SeparatedMoments(diffuse, specular)
 
 
 def separate_by_colour(mixed: Moments, view: np.ndarray, *, pixel_count: int, device: str) -> SeparatedMoments:
@@ -104,16 +107,26 @@ def _difference_kernel(first: int,
                        parallel: wp.array2d(dtype=float),  # [12, N]
                        parallel_status: wp.array(dtype=int),  # [N]
                        grey: wp.vec3,
+                       leak: float,
                        # outputs
+                       moments: wp.array2d(dtype=float),  # [12, N] in: of the cross frames, out: of half the diffuse light
+                       variance: wp.array(dtype=float),  # [N] in: of the cross frames, out: of half the diffuse light
                        specular: wp.array2d(dtype=float)):  # [6, N]
     p = first + wp.tid()
     if cross_status[p] != OK or parallel_status[p] != OK:
         return
+    apart = 1.0 / (1.0 - 2.0 * leak)
     for c in range(3):
-        specular[c, p] = parallel[4 * c, p] - cross[4 * c, p]
+        specular[c, p] = apart * (parallel[4 * c, p] - cross[4 * c, p])
     for i in range(1, 4):
-        specular[2 + i, p] = (grey[0] * (parallel[i, p] - cross[i, p]) + grey[1] * (parallel[4 + i, p] - cross[4 + i, p])
-                              + grey[2] * (parallel[8 + i, p] - cross[8 + i, p]))
+        specular[2 + i, p] = apart * (grey[0] * (parallel[i, p] - cross[i, p]) + grey[1] * (parallel[4 + i, p] - cross[4 + i, p])
+                                      + grey[2] * (parallel[8 + i, p] - cross[8 + i, p]))
+    if leak > 0.0:
+        for row in range(12):
+            leaked = leak * apart * (parallel[row, p] - cross[row, p])
+            moments[row, p] = cross[row, p] - leaked
+        gain = 1.0 + leak * apart
+        variance[p] = variance[p] * (gain * gain + leak * leak * apart * apart)
 
 
 @wp.kernel(enable_backward=False, module="unique")

@@ -26,7 +26,7 @@ def pixels_to_look_at(capture: Capture) -> np.ndarray | None:
     Lambert's law contradicts a manifest of distant lights only, and only where there are more of them than unknowns.
     """
     lit = capture.lit_by(DistantLight)
-    if len(lit) < MIN_LIGHTS or len(lit) < len(capture.sources()) or has_placeholders(capture):
+    if len(lit) < MIN_LIGHTS or len(lit) < len(capture.sources()) or has_placeholders(capture) or capture.is_polarised:
         return None
     try:
         inside = np.flatnonzero(capture.mask())

@@ -69,10 +69,11 @@ def diagnose(given: SolveInput, capture: Capture, lights: Any, declared: Any, so
 
 def _sample(given: SolveInput, capture: Capture, lights: DistantLights) -> Sample:
     """Return the readings of pixels that are spread over the mask."""
-    stack, count = given.stack, given.stack.light_count
+    stack = given.stack
     inside = np.flatnonzero(given.mask)
     radiance, usable = stack.pick_radiance(inside[evenly(len(inside), PIXELS)])
-    exposure = np.array([frame.exposure_s or 1.0 for frame in capture.sources()])[:count]
+    times = {frame.image: frame.exposure_s or 1.0 for frame in capture.sources()}
+    exposure = np.array([times[image] for image in stack.frames])
     return Sample(radiance, usable, lights.direction, lights.irradiance, exposure, capture.manifest.color_space)
 
 

@@ -62,7 +62,8 @@ def solve_gradients(given: SolveInput, frames: GradientFrames) -> Solution:
             _store(result.specular_normal, here, kept, normal)
         elif frames.parallel is not None:
             parallel = _moments(band, frames.parallel, stack)
-            parts = separate_polarised(diffuse, parallel, GREY_WEIGHTS, pixel_count=band.pixel_count, device=device)
+            parts = separate_polarised(diffuse, parallel, GREY_WEIGHTS, leak=frames.leak, pixel_count=band.pixel_count, device=device)
+            diffuse = parts.diffuse
             highlight = fit_highlights(parts, GREY_WEIGHTS, toward, gain=gain, pixel_count=band.pixel_count, device=device)
             _store(result.specular_normal, here, kept, highlight.normal)
             _store(result.specular, here, kept, highlight.f0)

@@ -185,7 +185,7 @@ class _Walk:
             normal = found.best.normal
             result.normal[:, pixels] = normal.T
             if self._interreflection:
-                first = (fit_tinted(samples, normal, shape=self._lobe) if self._supported else
+                first = (fit_tinted(samples, normal, shape=self._lobe) if self._supported and not self._matt else
                          fit_given(samples, normal, MATT, shape=self._lobe))
                 result.albedo[:, pixels], self._roughness[pixels] = first.diffuse_albedo.T, first.roughness
                 self._specular[:, pixels] = first.specular.T
@@ -266,9 +266,10 @@ class _Walk:
                                  metals=self._metals, roughness=roughness, prior=self._prior(pixels),
                                  beside=self._beside(pixels))
             result.normal[:, pixels] = found.normal.T
-            result.albedo[:, pixels] = found.diffuse_albedo.T
-            self._specular[:, pixels] = found.specular.T
-            self._roughness[pixels] = found.roughness
+            material = fit_given(samples, found.normal, MATT, shape=self._lobe) if self._matt else found
+            result.albedo[:, pixels] = material.diffuse_albedo.T
+            self._specular[:, pixels] = material.specular.T
+            self._roughness[pixels] = material.roughness
             abundance[pixels], pair[pixels] = found.mixture
             sigma[pixels], result.confidence[pixels] = found.sigma, found.confidence
             result.residual[pixels] = found.residual
@@ -284,6 +285,11 @@ class _Walk:
     @property
     def _few(self) -> bool:
         return self._given.stack.light_count < FEW_LIGHTS
+
+    @property
+    def _matt(self) -> bool:
+        """Whether the images hold diffuse light alone, so that a specular lobe explains nothing but noise."""
+        return self._given.pairs is not None
 
     def _beside(self, pixels: np.ndarray) -> np.ndarray:
         return neighbours(pixels, self._given.camera.width)

@@ -55,13 +55,22 @@ def _single_lights(*series: Rounds) -> dict[type, Solver]:
 def _solve_material(given: SolveInput, lights: Lights, field: NearField | None = None) -> Solution:
     from service.solve.material import solve_material
 
-    return solve_material(given, lights, field)
+    return _with_highlights(given, lights, field, solve_material(given, lights, field))
 
 
 def _refine_material(given: SolveInput, lights: Lights, field: NearField, before: Solution) -> Solution:
     from service.solve.material import refine_material
 
-    return refine_material(given, lights, field, before)
+    return _with_highlights(given, lights, field, refine_material(given, lights, field, before))
+
+
+def _with_highlights(given: SolveInput, lights: Lights, field: NearField | None, solution: Solution) -> Solution:
+    if given.pairs is None:
+        return solution
+    from service.solve.material import solve_material
+    from service.solve.polarised import solve_pairs
+
+    return solve_pairs(given, lights, field, solution, solve_material)
 
 
 def _solve_extended(given: SolveInput, lights: ExtendedLights) -> Solution:

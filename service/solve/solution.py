@@ -28,6 +28,16 @@ SUSPECT_PIXELS = 512
 """Number of pixels, spread over the object, on which the lights are compared."""
 
 
+class SeparatedPairs(NamedTuple):
+    """The polarised images of a capture beside the diffuse ones, which are the stack of the solve."""
+
+    specular: Stack
+    whole: Stack
+    """Sums of both images of every pair: what a camera without polariser would see."""
+    facts: dict[str, Any]
+    warnings: list[str]
+
+
 @dataclass(frozen=True)
 class SolveInput:
     """The images of a capture, and how they are worked on."""
@@ -46,6 +56,8 @@ class SolveInput:
     """Whether a solver may replace the intensities of the lights by those that the object asks for."""
     sharing: SharedSolve | None = None
     """The part of this worker in a solve that several share; None: it is alone."""
+    pairs: SeparatedPairs | None = None
+    """The other images of polarised pairs, of which the stack holds the diffuse ones; None: the images are not polarised."""
 
     @property
     def device(self) -> str:

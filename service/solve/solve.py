@@ -33,8 +33,10 @@ from stage.maps import MAPS_FILE, SurfaceMaps
 from stage.motion.tracking import tracking_frames
 from stage.point_lights import DistantLights, PlacedLights
 from stage.radiance import clipping_sentences
+from stage.stack import Stack
 
 if TYPE_CHECKING:
+    from service.solve.polarised import Separated
     from service.solve.refined_lights import RefinedLights
     from service.solve.unknown_lights import UnknownLights
 
@@ -88,6 +90,8 @@ def solve(request: SolveRequest, progress: Progress | None = None, *, sharing: S
     solution = solver(given, lights)
     solution.facts = facts | solution.facts
     mark_not_facing(capture.camera, solution)
+    if given.pairs is not None:
+        _say_of_pairs(given, method, solution)
     timings.stage("diagnosis", 1)
     diagnose(given, capture, lights, declared, solution)
     if found is not None:
@@ -172,6 +176,7 @@ def _open(request: SolveRequest, timings: Timings, sharing: SharedSolve | None) 
         raise RequestError(f"--lights unknown: --method {method} is not for distant lights: take svbrdf, robust or lambert")
     balls = [] if request.reference_ball is None else [Capture.open(request.reference_ball, request.pixels._replace(crop=None))]
     if unknown:
+        _check_known(capture)
         check_surface(capture)
     lights = distant_lights(capture) if unknown else METHODS[method].read_lights(capture, *balls)
     solver = METHODS[method].solvers.get(type(lights))
@@ -180,15 +185,19 @@ def _open(request: SolveRequest, timings: Timings, sharing: SharedSolve | None) 
                             f"{method} needs lights of one direction each")
     mask = capture.mask()
     tracking = tracking_frames(capture, to=request.align_to) if request.aligned else None
+    pairs = None
     timings.stage("ingest", len(capture.sources()))
     stack = open_stack(capture, cache=request.cache, tracking=tracking, progress=lambda done, _: timings.advance(done))
     if isinstance(lights, DistantLights | PlacedLights) and not unknown:  # placeholders say nothing of which frames have one light
-        stack, lights = one_frame_a_light(merge_brackets(stack, capture.sources(), lights), lights)
+        if capture.is_polarised:
+            stack, lights, pairs = _separated(stack, capture, lights, mask)
+        else:
+            stack, lights = one_frame_a_light(merge_brackets(stack, capture.sources(), lights), lights)
     if sharing is not None:
         sharing.identify(chosen[0], str(method), stack.key, mask, stack.scale, capture.manifest.model_dump_json())
     given = SolveInput(stack, capture.camera, mask, chosen, timings, request.cache, sharing=sharing,
                        relative=unknown or capture.manifest.irradiance_scale == "relative",
-                       refine_intensities=request.intensities is Intensities.CHOSEN)
+                       refine_intensities=request.intensities is Intensities.CHOSEN, pairs=pairs)
     if request.lights is not LightsKnown.DECLARED:
         timings.stage("lights", 1)
         found = _find_lights(request.lights, given, lights, capture)
@@ -199,6 +208,29 @@ def _open(request: SolveRequest, timings: Timings, sharing: SharedSolve | None) 
         timings.stage("intensities", 1)
         used, facts = choose_intensities(given, lights)
     return _Opened(capture, method, used, lights, solver, given, facts)
+
+
+def _check_known(capture: Capture) -> None:
+    """Refuse polarised pairs whose lights are to be found from the images."""
+    if capture.is_polarised:
+        raise RequestError(f"--lights unknown: {capture.folder} has polarised pairs: their lights must be known, because a pair is the "
+                           "images of one light")
+
+
+def _separated(stack: Stack, capture: Capture, lights: DistantLights | PlacedLights, mask: np.ndarray) -> "Separated":
+    from service.solve.polarised import separate_pairs
+
+    return separate_pairs(stack, capture, lights, mask)
+
+
+def _say_of_pairs(given: SolveInput, method: Method, solution: Solution) -> None:
+    """Add what was found about polarised pairs, and doubt metals where the method does not look at highlights."""
+    assert given.pairs is not None
+    solution.warnings += given.pairs.warnings
+    if method is not Method.SVBRDF:
+        from service.solve.polarised import doubt_metals
+
+        doubt_metals(given, solution)
 
 
 def _find_lights(known: LightsKnown, given: SolveInput, lights: Any, capture: Capture) -> "UnknownLights | RefinedLights":

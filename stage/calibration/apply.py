@@ -83,7 +83,7 @@ def as_direction(light: SingleLight, direction: np.ndarray) -> DistantLight:
     """Return a distant light from a measured direction. The irradiance of a distant light stays; that of a point light becomes 1."""
     irradiance = light.irradiance if isinstance(light, DistantLight) else (1.0, 1.0, 1.0)
     x, y, z = (float(value) for value in direction)
-    return DistantLight(type="distant", direction=(x, y, z), irradiance=irradiance)
+    return DistantLight(type="distant", direction=(x, y, z), irradiance=irradiance, polarization=light.polarization)
 
 
 def as_position(light: SingleLight, position: np.ndarray, seen_from: np.ndarray) -> PointLight:
@@ -92,7 +92,7 @@ def as_position(light: SingleLight, position: np.ndarray, seen_from: np.ndarray)
     if isinstance(light, PointLight):
         return light.model_copy(update={"position_m": (x, y, z)})
     r, g, b = (float(value * ((position - seen_from) ** 2).sum()) for value in light.irradiance)
-    return PointLight(type="point", position_m=(x, y, z), intensity=(r, g, b))
+    return PointLight(type="point", position_m=(x, y, z), intensity=(r, g, b), polarization=light.polarization)
 
 
 def with_brightness(light: SingleLight, rgb: np.ndarray) -> SingleLight:

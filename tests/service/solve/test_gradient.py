@@ -75,6 +75,20 @@ def test_polarised_frames_give_both_normals(relit, tmp_path, diffuse, highlight)
     assert report["residual"]["p95"] < 1e-3
 
 
+def test_a_declared_leak_is_taken_off_the_diffuse_frames(relit, tmp_path, diffuse, highlight):
+    """5 % of a highlight of F₀ 0.04 would be an albedo of 0.002 to 0.008; half rounding of the frames leaves a thousandth of theirs."""
+    leak = 0.05
+    frames = {"cross": diffuse / 2 + leak * highlight, "parallel": diffuse / 2 + (1 - leak) * highlight}
+    maps, _ = solve(relit, write(tmp_path, frames, polarizer_leak=leak), "--method", "gradient")
+    inside = SCENE.mask
+    assert angles_degrees(maps.normal, SCENE.normal)[inside].max() < 0.1
+    assert np.allclose(maps.diffuse_albedo[inside], SCENE.albedo[inside], rtol=3e-3)
+    assert np.allclose(maps.specular[inside], 0.04, atol=0.002)
+    write(tmp_path / "crossed", {"cross": diffuse / 2}, polarizer_leak=leak)
+    outcome = relit("solve", tmp_path / "crossed", "--out", tmp_path / "none")
+    assert outcome.code == 2 and "polarizer_leak: is 0.05, and no frame has polarization parallel" in outcome.err
+
+
 def test_metal_has_the_normal_of_its_highlight(relit, tmp_path, highlight):
     bright = 10 * highlight
     write(tmp_path, {"cross": np.full_like(bright, 1e-5).repeat(3, -1), "parallel": bright.repeat(3, -1) + 1e-5})
