@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 # tests of the service wait much of their time, so that three share two cores well
 WORKERS ?= $(shell $(PYTHON) -c 'import os; print(max(3, min(4, os.cpu_count() or 1)))')
-PYTEST := $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadfile
+PYTEST := $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 .PHONY: demo serve test test-all clients lint bench gpu-bench manifest-page figures samples screenshots lock vendor colour-table clean
 demo: $(VENV)/installed
@@ -51,7 +51,7 @@ samples: $(VENV)/installed-dev
 
 # the pictures of the pages in docs/, by the tests that make them (needs Chromium)
 screenshots: $(VENV)/installed-dev
-	RELIT_TEST_SCREENSHOTS=$(CURDIR)/docs $(BIN)/python -m pytest -q tests/service/server/pages/test_screenshots.py
+	RELIT_TEST_SCREENSHOTS=$(CURDIR)/docs $(BIN)/python -m pytest -q tests/service/server/pages/test_sample_pages.py -k shows_the_sample
 
 # the lock records versions and hashes, and no download address
 lock:

@@ -1,4 +1,6 @@
-"""Fixtures of every test."""
+"""Fixtures of every test, and the order of test files."""
+
+from pathlib import Path
 
 import pytest
 
@@ -9,3 +11,18 @@ from kernels import device as devices
 def device(request: pytest.FixtureRequest) -> str:
     """Each device of this machine: the CPU always, CUDA where present."""
     return request.param
+
+
+PROGRAMS = ("clients", "server")
+"""Folders of tests that start servers, browsers and other programs."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Spread the files that start other programs evenly over the run: side by side they would wait for each other's processor time."""
+    files: dict[Path, list[pytest.Item]] = {}
+    for item in items:
+        files.setdefault(item.path, []).append(item)
+    starts = [path for path in files if set(PROGRAMS) & set(path.parts)]
+    others = [path for path in files if path not in set(starts)]
+    place = {path: (number + 0.5) / len(some) for some in (starts, others) for number, path in enumerate(some)}
+    items[:] = [item for path in sorted(files, key=lambda path: place[path]) for item in files[path]]

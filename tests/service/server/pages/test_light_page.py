@@ -11,11 +11,10 @@ from stage import exr
 from stage.colour import rgb_matrix
 from tests.scenes.captures import edit_manifest
 from tests.service.server.pages.conftest import SAMPLES, Solved, done
+from tests.service.server.pages.frames import assert_same, encoded, picture, rendered
 
 CAPTURED = 7
 """A light of the sample, from whose direction its photograph is compared."""
-STEPS = 2 / 255
-"""Largest mean difference of the picture in the browser from the frame: that of the issue."""
 
 
 @pytest.fixture
@@ -25,56 +24,10 @@ def opened(page, solved):
     return page
 
 
-def picture(page) -> np.ndarray:
-    """What is shown of a square capture, [rows, cols, 3], 0 to 1."""
-    found = np.array(page.evaluate("() => Array.from(relit.pixels())"), dtype=np.uint8).reshape(-1, 4)
-    side = round(len(found) ** 0.5)
-    return (found.reshape(side, side, 4)[..., :3] / 255).astype(np.float64)
-
-
-def encoded(linear: np.ndarray) -> np.ndarray:
-    clipped = np.clip(linear, 0, 1)
-    return np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
-
-
-def rendered(page, solved, folder) -> tuple[np.ndarray, np.ndarray]:
-    """The first frame of the batch that the page submits, encoded as the page does, and its coverage."""
-    page.get_by_label("Frames", exact=True).last.fill("1")
-    page.get_by_role("button", name="Render").click()
-    page.wait_for_url("**/jobs/job_*")
-    page.locator(".state.succeeded").wait_for(timeout=120_000)
-    job = page.url.rpartition("/")[2]
-    channels, metadata = exr.read(solved.result(job, "frame.0001.exr", folder))
-    to_screen = rgb_matrix(exr.color_space_of(metadata), "lin_rec709_scene")
-    return encoded(np.stack([channels[c] for c in "RGB"], axis=-1).astype(np.float32) @ to_screen.T), channels["A"]
-
-
-def assert_same(shown: np.ndarray, frame: np.ndarray, coverage: np.ndarray) -> None:
-    inside = coverage == 1
-    assert inside.sum() > 1000 and frame[inside].mean() > 0.1
-    assert np.abs(shown[inside] - frame[inside]).mean() <= STEPS
-
-
 def test_the_key_light_shows_what_the_batch_renders(opened, solved, tmp_path):
     opened.get_by_label("Size of the light in degrees").fill("10")
     shown = picture(opened)
     assert_same(shown, *rendered(opened, solved, tmp_path))
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("place", [(0.5, 0.5), (0.75, 0.3), (0.3, 0.8)])
-def test_the_light_dragged_over_the_sample_shows_what_the_batch_renders(page, owl, tmp_path, place):
-    """The sample has highlights and shadows as sharp as its pixels, and the light is as small as the sun."""
-    page.goto(owl.pages["light"])
-    owl.wait_for_content(page, "light")
-    box = page.locator("canvas.picture").bounding_box()
-    page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"])
-    page.mouse.down()
-    page.mouse.move(box["x"] + place[0] * box["width"], box["y"] + place[1] * box["height"])
-    page.mouse.up()
-    page.get_by_role("button", name="Expose for this light").click()
-    shown = picture(page)
-    assert_same(shown, *rendered(page, owl, tmp_path))
 
 
 def test_dragging_on_the_picture_moves_the_light(opened):

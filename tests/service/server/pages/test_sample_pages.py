@@ -1,9 +1,12 @@
-"""The pictures of docs/pages.md and of the README: the pages on the shipped sample. `make screenshots` writes them into docs/."""
+"""The pages on the shipped sample: live relighting is what the batch makes, and pictures of docs/pages.md and of the README, which
+`make screenshots` writes into docs/."""
 
 import os
 from pathlib import Path
 
 import pytest
+
+from tests.service.server.pages.frames import assert_same, picture, rendered
 
 FOLDER = os.environ.get("RELIT_TEST_SCREENSHOTS")
 """Where the pictures go; without it they are made and dropped."""
@@ -28,3 +31,19 @@ def test_a_page_shows_the_sample(browser, owl, sky, tmp_path, name):
     page.screenshot(path=path)
     assert path.stat().st_size > 50_000
     page.close()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("place", [(0.5, 0.5), (0.75, 0.3), (0.3, 0.8)])
+def test_the_light_dragged_over_the_sample_shows_what_the_batch_renders(page, owl, tmp_path, place):
+    """The sample has highlights and shadows as sharp as its pixels, and the light is as small as the sun."""
+    page.goto(owl.pages["light"])
+    owl.wait_for_content(page, "light")
+    box = page.locator("canvas.picture").bounding_box()
+    page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"])
+    page.mouse.down()
+    page.mouse.move(box["x"] + place[0] * box["width"], box["y"] + place[1] * box["height"])
+    page.mouse.up()
+    page.get_by_role("button", name="Expose for this light").click()
+    shown = picture(page)
+    assert_same(shown, *rendered(page, owl, tmp_path))

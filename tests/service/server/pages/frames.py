@@ -1,0 +1,42 @@
+"""Pictures of the page that relights live beside frames of the batch that it submits."""
+
+from pathlib import Path
+
+import numpy as np
+
+from stage import exr
+from stage.colour import rgb_matrix
+from tests.service.server.pages.conftest import Solved
+
+STEPS = 2 / 255
+"""Largest mean difference of the picture in the browser from the frame: that of the issue."""
+
+
+def picture(page) -> np.ndarray:
+    """What is shown of a square capture, [rows, cols, 3], 0 to 1."""
+    found = np.array(page.evaluate("() => Array.from(relit.pixels())"), dtype=np.uint8).reshape(-1, 4)
+    side = round(len(found) ** 0.5)
+    return (found.reshape(side, side, 4)[..., :3] / 255).astype(np.float64)
+
+
+def encoded(linear: np.ndarray) -> np.ndarray:
+    clipped = np.clip(linear, 0, 1)
+    return np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
+
+
+def rendered(page, solved: Solved, folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    """The first frame of the batch that the page submits, encoded as the page does, and its coverage."""
+    page.get_by_label("Frames", exact=True).last.fill("1")
+    page.get_by_role("button", name="Render").click()
+    page.wait_for_url("**/jobs/job_*")
+    page.locator(".state.succeeded").wait_for(timeout=120_000)
+    job = page.url.rpartition("/")[2]
+    channels, metadata = exr.read(solved.result(job, "frame.0001.exr", folder))
+    to_screen = rgb_matrix(exr.color_space_of(metadata), "lin_rec709_scene")
+    return encoded(np.stack([channels[c] for c in "RGB"], axis=-1).astype(np.float32) @ to_screen.T), channels["A"]
+
+
+def assert_same(shown: np.ndarray, frame: np.ndarray, coverage: np.ndarray) -> None:
+    inside = coverage == 1
+    assert inside.sum() > 1000 and frame[inside].mean() > 0.1
+    assert np.abs(shown[inside] - frame[inside]).mean() <= STEPS
