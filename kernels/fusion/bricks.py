@@ -1,0 +1,184 @@
+"""Bricks: the parts into which space is cut, each with an array of blocks of 8³ voxels that exist near measured surface alone.
+
+A brick has BRICK³ blocks, and one more on its high side along each axis, which its last cells need. Its blocks are found by their index in
+a dense array, so that neighbours are found without a search. Voxel (i, j, k) of a brick lies at its origin plus that many voxel sizes.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from kernels.fusion.views import (
+    LEAST_COSINE,
+    TILE,
+    TRUNCATION_VOXELS,
+    View,
+    ViewArrays,
+    image_point,
+    line_of_sight,
+    to_camera,
+    truncation,
+)
+
+BLOCK = 8
+"""Voxels along each side of a block."""
+VOXELS = BLOCK**3
+BRICK = 32
+"""Blocks along each side of a brick."""
+SIDE = BRICK + 1
+"""Blocks along each side of the array of a brick."""
+BRICK_VOXELS = BRICK * BLOCK
+"""Voxels along each side of a brick."""
+VOXEL_BYTES = 23
+"""Bytes of one voxel in every array of a brick together."""
+MEMORY_BOUND = SIDE**3 * VOXELS * VOXEL_BYTES
+"""Most bytes on the device that the voxels of a brick can take: every block exists."""
+
+STEP_BLOCKS = 0.5
+"""Distance, in blocks, of the points on the line of sight and across it whose blocks are marked."""
+MARGIN_VOXELS = 1.8
+"""Distance, in voxels, around such a point within which blocks are marked: the corners of a cell lie as far apart."""
+
+
+class Blocks(NamedTuple):
+    """The blocks of a brick that exist."""
+
+    index: Any  # wp.array [SIDE³] int32, number of each block, −1 where there is none
+    place: Any  # wp.array [B] int32, place of each block in `index`
+    count: int
+    voxel: float  # metres
+    device: str
+
+
+@wp.func
+def block_place(x: int, y: int, z: int) -> int:
+    """Return the place of a block in the array of its brick."""
+    return (z * SIDE + y) * SIDE + x
+
+
+@wp.func
+def farthest_ratio(view: View, row: int, col: int) -> float:
+    """Return the length of the line of sight of a pixel for each metre of depth, without distortion."""
+    x = (float(col) + 0.5 - view.principal[0]) / view.focal[0]
+    y = (float(row) + 0.5 - view.principal[1]) / view.focal[1]
+    return wp.sqrt(1.0 + x * x + y * y)
+
+
+@wp.kernel(enable_backward=False)
+def _mark_kernel(first: int, number: int, voxel: float, views: wp.array(dtype=View), inverse: wp.array(dtype=float),
+                 sigma: wp.array(dtype=float), cell: wp.array(dtype=wp.uint8),
+                 # outputs
+                 marked: wp.array(dtype=wp.uint8)):
+    i = first + wp.tid()
+    view = views[number]
+    place = view.first + i
+    if cell[place] != wp.uint8(0):
+        row = i // view.cols
+        col = i - row * view.cols
+        below = place + view.cols
+        i00 = inverse[place]
+        i01 = inverse[place + 1]
+        i10 = inverse[below]
+        i11 = inverse[below + 1]
+        nearest = 1.0 / wp.max(wp.max(i00, i01), wp.max(i10, i11))
+        farthest = 1.0 / wp.min(wp.min(i00, i01), wp.min(i10, i11))
+        step = STEP_BLOCKS * float(BLOCK) * voxel
+        across = farthest / wp.min(view.focal[0], view.focal[1])
+        most = wp.max(across, farthest - nearest)
+        parts = int(most / step) + 1
+        largest = wp.max(wp.max(sigma[place], sigma[place + 1]), wp.max(sigma[below], sigma[below + 1]))
+        reach = truncation(largest * farthest_ratio(view, row, col), voxel)
+        half = int(reach / step) + 1
+        size = float(BLOCK) * voxel
+        margin = MARGIN_VOXELS * voxel
+        back = wp.transpose(view.rotation)
+        for a in range(parts):
+            fv = (float(a) + 0.5) / float(parts)
+            for b in range(parts):
+                fu = (float(b) + 0.5) / float(parts)
+                depth = 1.0 / ((1.0 - fv) * ((1.0 - fu) * i00 + fu * i01) + fv * ((1.0 - fu) * i10 + fu * i11))
+                ray = line_of_sight(view, float(col) + 0.5 + fu, float(row) + 0.5 + fv)
+                length = wp.length(ray)
+                for s in range(-half, half + 1):
+                    along = depth + wp.clamp(float(s) * step, -reach, reach) / length
+                    point = back * (ray * along - view.translation)
+                    x0 = int(wp.floor((point[0] - margin) / size))
+                    x1 = int(wp.floor((point[0] + margin) / size))
+                    y0 = int(wp.floor((point[1] - margin) / size))
+                    y1 = int(wp.floor((point[1] + margin) / size))
+                    z0 = int(wp.floor((point[2] - margin) / size))
+                    z1 = int(wp.floor((point[2] + margin) / size))
+                    for z in range(wp.max(z0, 0), wp.min(z1, SIDE - 1) + 1):
+                        for y in range(wp.max(y0, 0), wp.min(y1, SIDE - 1) + 1):
+                            for x in range(wp.max(x0, 0), wp.min(x1, SIDE - 1) + 1):
+                                marked[block_place(x, y, z)] = wp.uint8(1)
+
+
+def find_blocks(views: ViewArrays, voxel: float, *, device: str) -> Blocks:
+    """Find the blocks of a brick at the origin of the views' coordinates that come near a measured surface.
+
+    Args:
+        views: the range images.
+        voxel: side of a voxel, metres.
+        device: where the views are.
+
+    Convention:
+        Waits for the device.
+    """
+    marked = wp.zeros(SIDE**3, dtype=wp.uint8, device=device)
+    for number, (rows, cols) in enumerate(views.shapes):
+        devices.launch(_mark_kernel, rows * cols, [number, voxel, views.views, views.inverse, views.sigma, views.cell], [marked],
+                       device=device, uneven=True)
+    place = np.flatnonzero(marked.numpy()).astype(np.int32)
+    index = np.full(SIDE**3, -1, dtype=np.int32)
+    index[place] = np.arange(len(place), dtype=np.int32)
+    return Blocks(wp.array(index, dtype=int, device=device), wp.array(place, dtype=int, device=device), len(place), voxel, device)
+
+
+@wp.kernel(enable_backward=False)
+def _watch_kernel(first: int, voxel: float, count: int, place: wp.array(dtype=int), views: wp.array(dtype=View),
+                  farthest: wp.array(dtype=float),
+                  # outputs
+                  watched: wp.array2d(dtype=wp.int16)):
+    i = first + wp.tid()
+    at = place[i]
+    x = at % SIDE
+    y = (at // SIDE) % SIDE
+    z = at // (SIDE * SIDE)
+    half = 0.5 * float(BLOCK) * voxel
+    centre = wp.vec3(float(x) * 2.0 * half + half, float(y) * 2.0 * half + half, float(z) * 2.0 * half + half)
+    radius = 1.7320508 * half
+    found = int(0)
+    for number in range(count):
+        view = views[number]
+        point = to_camera(view, centre)
+        near = -point[2] - radius
+        seen = bool(near <= radius)  # so close that its outline is not bounded
+        if near > radius:
+            uv = image_point(view, point)
+            reach = wp.max(view.focal[0], view.focal[1]) * radius / near * (1.0 + wp.length(point) / near) + 2.0
+            c0 = wp.max(int(wp.floor((uv[0] - reach) / float(TILE))), 0)
+            r0 = wp.max(int(wp.floor((uv[1] - reach) / float(TILE))), 0)
+            tiles = (view.cols + TILE - 1) // TILE
+            c1 = wp.min(int(wp.floor((uv[0] + reach) / float(TILE))), tiles - 1)
+            r1 = wp.min(int(wp.floor((uv[1] + reach) / float(TILE))), (view.rows + TILE - 1) // TILE - 1)
+            far = float(0.0)
+            for r in range(r0, r1 + 1):
+                for c in range(c0, c1 + 1):
+                    far = wp.max(far, farthest[view.first_tile + r * tiles + c])
+            seen = far > 0.0 and near - TRUNCATION_VOXELS / LEAST_COSINE * voxel < far
+        if seen:
+            watched[i, found] = wp.int16(number)
+            found += 1
+    if found < count:
+        watched[i, found] = wp.int16(-1)
+
+
+def find_watching(blocks: Blocks, views: ViewArrays) -> Any:
+    """Return which views can see each block, wp.array [B, V] int16: their numbers, and −1 after the last where there are fewer."""
+    watched = wp.empty((blocks.count, views.count), dtype=wp.int16, device=blocks.device)
+    devices.launch(_watch_kernel, blocks.count, [blocks.voxel, views.count, blocks.place, views.views, views.farthest], [watched],
+                   device=blocks.device)
+    return watched

@@ -1,0 +1,183 @@
+"""The truncated signed distance of every voxel of a brick, from all range images at once.
+
+Each voxel gathers what the views measured on their lines of sight through it: the distance to the measured surface along its normal,
+weighted by the inverse of its variance. Nothing is accumulated from launch to launch, so that a voxel has the same value to the last bit
+whichever brick computes it and in whichever order views are given to the same voxel.
+
+Three rules keep thin parts and gaps as they are. Distances count within the truncation alone. Where the normals of the views disagree,
+as on both sides of a thin sheet, at an edge, or in a narrow gap, those views count whose surface is turned like that of the nearest one. And
+a voxel that as many views saw to be empty as measured a surface there is no surface.
+
+Source: Curless and Levoy, "A Volumetric Method for Building Complex Models from Range Images", SIGGRAPH 1996 (weights, the space in front
+of a surface is empty); Bylow et al., "Real-Time Camera Tracking and 3D Reconstruction Using Signed Distance Functions", RSS 2013 (distance
+along the normal).
+"""
+
+from typing import Any, NamedTuple
+
+import warp as wp
+
+from kernels import device as devices
+from kernels.fusion.bricks import BLOCK, SIDE, VOXELS, Blocks, block_place, find_watching
+from kernels.fusion.views import View, ViewArrays, image_point, read_view, to_camera, truncation
+
+AGREEING = 0.85
+"""Length of the weighted mean of the normals from which on all of them count: they then lie within some 45° of each other."""
+TURNED = 0.5
+"""Cosine between a normal and that of the nearest surface from which on its view counts where normals disagree: 60°."""
+
+ALONG = 1.5
+"""Farthest that a voxel may lie behind the measured point on the line of sight, in truncations: a distance from a plane says nothing far
+beside the point where it was measured, as behind an edge."""
+NEAR_SIGMAS = 3.0
+"""Distance from a measured surface in standard deviations within which a voxel may be that surface. A voxel farther behind it is hidden from
+the view, which is no evidence against another that sees the voxel to be empty."""
+
+UNKNOWN, SURFACE, EMPTY = 0, 1, 2
+"""States of a voxel: not measured; near a measured surface; measured by fewer views than saw it to be empty."""
+
+
+class Volume(NamedTuple):
+    """The voxels of the blocks of a brick."""
+
+    blocks: Blocks
+    value: Any  # wp.array [VOXELS B] metres, signed distance, positive outside; 0 where there is none
+    variance: Any  # wp.array [VOXELS B] square metres
+    state: Any  # wp.array [VOXELS B] uint8
+
+
+@wp.func
+def voxel_position(i: int, place: wp.array(dtype=int)) -> wp.vec3i:
+    """Return the coordinates of a voxel in its brick; voxels of a block follow each other with x the fastest."""
+    block = i // VOXELS
+    inside = i - block * VOXELS
+    at = place[block]
+    return wp.vec3i((at % SIDE) * BLOCK + inside % BLOCK, ((at // SIDE) % SIDE) * BLOCK + (inside // BLOCK) % BLOCK,
+                    (at // (SIDE * SIDE)) * BLOCK + inside // (BLOCK * BLOCK))
+
+
+@wp.func
+def voxel_number(x: int, y: int, z: int, index: wp.array(dtype=int)) -> int:
+    """Return the number of a voxel of a brick, −1 where its block does not exist."""
+    bx = x // BLOCK
+    by = y // BLOCK
+    bz = z // BLOCK
+    if bx >= SIDE or by >= SIDE or bz >= SIDE:
+        return -1
+    block = index[block_place(bx, by, bz)]
+    if block < 0:
+        return -1
+    return block * VOXELS + ((z - bz * BLOCK) * BLOCK + (y - by * BLOCK)) * BLOCK + (x - bx * BLOCK)
+
+
+@wp.func
+def near_surface(sigma: float, voxel: float) -> float:
+    """Return the distance within which a voxel may be the measured surface."""
+    return wp.max(voxel, NEAR_SIGMAS * sigma)
+
+
+@wp.func
+def is_clear(view: View, point: wp.vec3, at: wp.vec2, reach: float, clear: wp.array(dtype=float)) -> bool:
+    """Return whether a view saw that a camera-frame point is empty: it lies nearer than everything that was measured around its pixel."""
+    col = int(wp.floor(at[0]))
+    row = int(wp.floor(at[1]))
+    if col < 0 or row < 0 or col >= view.cols or row >= view.rows:
+        return False
+    return -point[2] + reach < clear[view.first + row * view.cols + col]
+
+
+@wp.kernel(enable_backward=False)
+def _integrate_kernel(first: int, voxel: float, count: int, place: wp.array(dtype=int), watched: wp.array2d(dtype=wp.int16),
+                      views: wp.array(dtype=View), inverse: wp.array(dtype=float), sigma: wp.array(dtype=float),
+                      normal: wp.array(dtype=wp.vec3), cell: wp.array(dtype=wp.uint8), clear: wp.array(dtype=float),
+                      # outputs
+                      value: wp.array(dtype=float), variance: wp.array(dtype=float), state: wp.array(dtype=wp.uint8)):
+    i = first + wp.tid()
+    block = i // VOXELS
+    at = voxel_position(i, place)
+    point = wp.vec3(float(at[0]) * voxel, float(at[1]) * voxel, float(at[2]) * voxel)
+    weights = float(0.0)
+    total = float(0.0)
+    spread = float(0.0)
+    normals = wp.vec3(0.0, 0.0, 0.0)
+    nearest = float(1.0e30)
+    reference = wp.vec3(0.0, 0.0, 0.0)
+    measured = int(0)
+    near = int(0)
+    empty = int(0)
+    for k in range(count):
+        number = int(watched[block, k])
+        if number < 0:
+            break
+        view = views[number]
+        there = to_camera(view, point)
+        if there[2] < 0.0:
+            uv = image_point(view, there)
+            reading = read_view(view, there, uv, inverse, sigma, normal, cell)
+            reach = truncation(reading.sigma, voxel)
+            if reading.known and wp.abs(reading.distance) <= reach and reading.along >= -ALONG * reach:
+                w = 1.0 / (reading.sigma * reading.sigma)
+                weights += w
+                total += w * reading.distance
+                spread += w * w * reading.variance
+                normals += w * reading.normal
+                measured += 1
+                if wp.abs(reading.distance) <= near_surface(reading.sigma, voxel):
+                    near += 1
+                if wp.abs(reading.distance) < nearest:
+                    nearest = wp.abs(reading.distance)
+                    reference = reading.normal
+            elif reading.known:
+                if reading.distance > reach:
+                    empty += 1
+            elif is_clear(view, there, uv, truncation(0.0, voxel), clear):
+                empty += 1
+    if measured > 0 and wp.length(normals) < AGREEING * weights:
+        weights = float(0.0)
+        total = float(0.0)
+        spread = float(0.0)
+        measured = int(0)
+        for k in range(count):
+            number = int(watched[block, k])
+            if number < 0:
+                break
+            view = views[number]
+            there = to_camera(view, point)
+            if there[2] < 0.0:
+                reading = read_view(view, there, image_point(view, there), inverse, sigma, normal, cell)
+                reach = truncation(reading.sigma, voxel)
+                if (reading.known and wp.abs(reading.distance) <= reach and reading.along >= -ALONG * reach
+                        and wp.dot(reading.normal, reference) >= TURNED):
+                    w = 1.0 / (reading.sigma * reading.sigma)
+                    weights += w
+                    total += w * reading.distance
+                    spread += w * w * reading.variance
+                    measured += 1
+    known = int(UNKNOWN)
+    if measured > 0:
+        known = int(SURFACE)
+        value[i] = total / weights
+        variance[i] = spread / (weights * weights)
+    if empty > 0 and empty >= near:
+        known = int(EMPTY)
+    state[i] = wp.uint8(known)
+
+
+def integrate(blocks: Blocks, views: ViewArrays) -> Volume:
+    """Compute the signed distance of every voxel of the blocks of a brick.
+
+    Args:
+        blocks: of find_blocks, with these views.
+        views: the range images, whose coordinates count from the corner of the brick.
+
+    Convention:
+        Returns before the device is done.
+    """
+    count, device = blocks.count * VOXELS, blocks.device
+    value, variance = (wp.zeros(count, dtype=float, device=device) for _ in range(2))
+    state = wp.zeros(count, dtype=wp.uint8, device=device)
+    if count:
+        devices.launch(_integrate_kernel, count, [blocks.voxel, views.count, blocks.place, find_watching(blocks, views), views.views,
+                                                  views.inverse, views.sigma, views.normal, views.cell, views.clear],
+                       [value, variance, state], device=device, uneven=True)
+    return Volume(blocks, value, variance, state)

@@ -1,0 +1,258 @@
+"""Range images on the device: how a point in space falls on them, and what they measured there.
+
+The depth between four pixels is bilinear in inverse depth, exact on planes. Nothing is read between pixels that show two surfaces, one
+behind the other: only cells of four pixels that are marked as one surface count.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from kernels.errors import ArrayError
+
+TILE = 16
+"""Side in pixels of the squares whose farthest depth tells whether a block of voxels is hidden from a view."""
+LATERAL = 0.1
+"""Standard deviation of the place of a reading across the line of sight, in pixels, as calibrations and optics leave it. Seen at a grazing
+angle it is what limits a measurement, whatever the standard deviation of the depth."""
+UNDISTORT_ITERATIONS = 10
+"""Rounds of the iteration that undoes the distortion: ordinary lenses converge to single precision in about six."""
+LEAST_COSINE = 0.2
+"""Smallest cosine between the normal and the line of sight at which a reading counts: 78°."""
+
+TRUNCATION_VOXELS = 3.0
+"""Least distance from a measured surface, in voxels, over which its distances are kept: two on each side of a surface are needed, and one
+for what views differ by."""
+TRUNCATION_SIGMAS = 4.0
+"""Least such distance in standard deviations of the measurement: within it the noise cuts off nothing that would bias the mean."""
+
+
+class RangeImage(NamedTuple):
+    """One range image of a perspective camera that looks along −z, with +x to the right and +y up, and where it stands."""
+
+    depth: np.ndarray  # [rows, cols] metres, −z of the camera frame; read inside cells alone
+    sigma: np.ndarray  # [rows, cols] metres, standard deviation of the depth, above 0 inside cells
+    normal: np.ndarray  # [rows, cols, 3] unit, camera frame, towards the camera; 0 where unknown
+    cell: np.ndarray  # [rows, cols] bool, whether the pixel, its right and its lower neighbours and the one across show one surface
+    clear: np.ndarray  # [rows, cols] metres: what is nearer than this was seen to be empty; 0 where nothing is known
+    camera_from_world: np.ndarray  # [4, 4] rotation and translation, metres
+    focal: tuple[float, float]  # pixels
+    principal: tuple[float, float]  # u and v, pixels from the top-left corner
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)  # k1, k2, k3, p1, p2 of OpenCV
+
+    def cropped(self, first_row: int, last_row: int, first_col: int, last_col: int) -> "RangeImage":
+        """Return the part of the image from the first row and column to those before the last."""
+        box = slice(first_row, last_row), slice(first_col, last_col)
+        return self._replace(depth=self.depth[box], sigma=self.sigma[box], normal=self.normal[box], cell=self.cell[box],
+                             clear=self.clear[box], principal=(self.principal[0] - first_col, self.principal[1] - first_row))
+
+
+@wp.struct
+class View:
+    """The place and the camera of one range image."""
+
+    first: int  # index of its first pixel in the arrays of all pixels
+    first_tile: int
+    rows: int
+    cols: int
+    rotation: wp.mat33  # camera from world
+    translation: wp.vec3
+    focal: wp.vec2
+    principal: wp.vec2
+    radial: wp.vec3
+    tangential: wp.vec2
+
+
+class ViewArrays(NamedTuple):
+    """The range images of several views, one after another, on the device."""
+
+    views: Any  # wp.array [V] of View
+    inverse: Any  # wp.array [P] 1 / depth, 1 / metres
+    sigma: Any  # wp.array [P] metres
+    normal: Any  # wp.array [P] vec3, camera frame
+    cell: Any  # wp.array [P] uint8
+    clear: Any  # wp.array [P] metres
+    farthest: Any  # wp.array [T] metres, depth behind which each tile says nothing, but for the truncation in voxels; 0: nothing at all
+    count: int  # views
+    pixels: int
+    shapes: tuple[tuple[int, int], ...]
+    first: tuple[int, ...]
+
+
+def upload_views(images: Sequence[RangeImage], origin: np.ndarray, *, device: str) -> ViewArrays:
+    """Copy range images to a device.
+
+    Args:
+        images: at least one.
+        origin: [3] world point, metres, that coordinates on the device count from, which keeps them short in single precision.
+        device: where to.
+
+    Raises:
+        ArrayError: arrays of one image differ in shape, or a depth or standard deviation inside a cell is not above 0.
+    """
+    structs, planes = [], {name: [] for name in ("inverse", "sigma", "normal", "cell", "clear", "farthest")}
+    first = first_tile = 0
+    starts, shapes = [], []
+    for number, image in enumerate(images):
+        rows, cols = image.depth.shape
+        for name in ("sigma", "cell", "clear", "normal"):
+            if getattr(image, name).shape[:2] != (rows, cols):
+                raise ArrayError(f"{name} of view {number} has shape {getattr(image, name).shape}, its depth {image.depth.shape}: give one "
+                                 "value per pixel")
+        used = corners_of(image.cell)
+        with np.errstate(invalid="ignore"):
+            if not (image.depth[used] > 0).all() or not (image.sigma[used] > 0).all():
+                raise ArrayError(f"view {number} has a depth or a standard deviation in a cell that is not above 0")
+        view = View()
+        view.first, view.first_tile, view.rows, view.cols = first, first_tile, rows, cols
+        rotation = np.asarray(image.camera_from_world, dtype=np.float64)[:3, :3]
+        shift = rotation @ np.asarray(origin, dtype=np.float64) + np.asarray(image.camera_from_world, dtype=np.float64)[:3, 3]
+        view.rotation = wp.mat33(*(float(v) for v in rotation.ravel()))
+        view.translation = wp.vec3(*(float(v) for v in shift))
+        view.focal, view.principal = wp.vec2(*map(float, image.focal)), wp.vec2(*map(float, image.principal))
+        view.radial, view.tangential = wp.vec3(*map(float, image.distortion[:3])), wp.vec2(*map(float, image.distortion[3:]))
+        structs.append(view)
+        planes["inverse"].append(np.divide(1.0, image.depth, out=np.zeros((rows, cols), dtype=np.float32), where=used).ravel())
+        planes["sigma"].append(np.where(used, image.sigma, 0).astype(np.float32).ravel())
+        planes["normal"].append(np.asarray(image.normal, dtype=np.float32).reshape(-1, 3))
+        planes["cell"].append(image.cell.astype(np.uint8).ravel())
+        planes["clear"].append(image.clear.astype(np.float32).ravel())
+        reach = np.where(used, image.depth + TRUNCATION_SIGMAS / LEAST_COSINE * image.sigma, 0)
+        tiles = _farthest(np.maximum(reach, image.clear))
+        planes["farthest"].append(tiles.ravel())
+        starts.append(first)
+        shapes.append((rows, cols))
+        first += rows * cols
+        first_tile += tiles.size
+    joined = {name: np.concatenate(parts) for name, parts in planes.items()}
+    return ViewArrays(wp.array(structs, dtype=View, device=device),
+                      *(wp.array(joined[name], dtype=dtype, device=device) for name, dtype in (
+                          ("inverse", float), ("sigma", float), ("normal", wp.vec3), ("cell", wp.uint8), ("clear", float),
+                          ("farthest", float))), len(structs), first, tuple(shapes), tuple(starts))
+
+
+def corners_of(cell: np.ndarray) -> np.ndarray:
+    """Return [rows, cols] bool, the pixels that are a corner of a cell; cells of the last row and column do not exist."""
+    inner = cell[:-1, :-1]
+    used = np.zeros(cell.shape, dtype=bool)
+    for down in (0, 1):
+        for right in (0, 1):
+            used[down:cell.shape[0] - 1 + down, right:cell.shape[1] - 1 + right] |= inner
+    return used
+
+
+def _farthest(depth: np.ndarray) -> np.ndarray:
+    """Return the largest value of each tile."""
+    rows, cols = (-(-side // TILE) for side in depth.shape)
+    padded = np.zeros((rows * TILE, cols * TILE), dtype=np.float32)
+    padded[:depth.shape[0], :depth.shape[1]] = depth
+    return padded.reshape(rows, TILE, cols, TILE).max(axis=(1, 3))
+
+
+@wp.func
+def truncation(sigma: float, voxel: float) -> float:
+    """Return the distance from a surface, in metres, over which its distances are kept."""
+    return wp.max(TRUNCATION_VOXELS * voxel, TRUNCATION_SIGMAS * sigma)
+
+
+@wp.func
+def to_camera(view: View, point: wp.vec3) -> wp.vec3:
+    """Return a point in the camera frame of a view."""
+    return view.rotation * point + view.translation
+
+
+@wp.func
+def image_point(view: View, point: wp.vec3) -> wp.vec2:
+    """Return the image coordinates u and v of a camera-frame point in front of the camera, with the distortion of the lens."""
+    x = -point[0] / point[2]
+    y = point[1] / point[2]
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (view.radial[0] + r2 * (view.radial[1] + r2 * view.radial[2]))
+    p = view.tangential
+    u = x * radial + 2.0 * p[0] * x * y + p[1] * (r2 + 2.0 * x * x)
+    v = y * radial + p[0] * (r2 + 2.0 * y * y) + 2.0 * p[1] * x * y
+    return wp.vec2(view.principal[0] + view.focal[0] * u, view.principal[1] + view.focal[1] * v)
+
+
+@wp.func
+def line_of_sight(view: View, u: float, v: float) -> wp.vec3:
+    """Return the direction (x, y, −1) of image coordinates in the camera frame; the distortion is undone by fixed-point iteration."""
+    x = (u - view.principal[0]) / view.focal[0]
+    y = (v - view.principal[1]) / view.focal[1]
+    ideal_x = float(x)
+    ideal_y = float(y)
+    p = view.tangential
+    for _ in range(UNDISTORT_ITERATIONS):
+        r2 = ideal_x * ideal_x + ideal_y * ideal_y
+        radial = 1.0 + r2 * (view.radial[0] + r2 * (view.radial[1] + r2 * view.radial[2]))
+        dx = ideal_x * radial + 2.0 * p[0] * ideal_x * ideal_y + p[1] * (r2 + 2.0 * ideal_x * ideal_x)
+        dy = ideal_y * radial + p[0] * (r2 + 2.0 * ideal_y * ideal_y) + 2.0 * p[1] * ideal_x * ideal_y
+        ideal_x = ideal_x + x - dx
+        ideal_y = ideal_y + y - dy
+    return wp.vec3(ideal_x, -ideal_y, -1.0)
+
+
+@wp.struct
+class Reading:
+    """What a view measured on the line of sight through a point."""
+
+    known: bool
+    distance: float  # metres from the measured surface along its normal, positive in front of it
+    along: float  # metres from the measured surface along −z of the camera, positive in front of it
+    sigma: float  # metres, standard deviation of the distance that one pixel has
+    variance: float  # square metres, that of the distance, which up to four pixels share
+    normal: wp.vec3  # world frame
+    cosine: float  # between the normal and the line of sight
+
+
+@wp.func
+def read_view(view: View, point: wp.vec3, at: wp.vec2, inverse: wp.array(dtype=float), sigma: wp.array(dtype=float),
+              normal: wp.array(dtype=wp.vec3), cell: wp.array(dtype=wp.uint8)) -> Reading:
+    """Return what a view measured on the line of sight through a camera-frame point that falls on `at` of its image."""
+    found = Reading()
+    found.known = False
+    u = at[0] - 0.5
+    v = at[1] - 0.5
+    col = int(wp.floor(u))
+    row = int(wp.floor(v))
+    if col < 0 or row < 0 or col >= view.cols - 1 or row >= view.rows - 1:
+        return found
+    place = view.first + row * view.cols + col
+    if cell[place] == wp.uint8(0):
+        return found
+    below = place + view.cols
+    fu = u - float(col)
+    fv = v - float(row)
+    w00 = (1.0 - fu) * (1.0 - fv)
+    w01 = fu * (1.0 - fv)
+    w10 = (1.0 - fu) * fv
+    w11 = fu * fv
+    n = w00 * normal[place] + w01 * normal[place + 1] + w10 * normal[below] + w11 * normal[below + 1]
+    length = wp.length(n)
+    if length < 0.5:
+        return found
+    n = n / length
+    depth = 1.0 / (w00 * inverse[place] + w01 * inverse[place + 1] + w10 * inverse[below] + w11 * inverse[below + 1])
+    s00 = sigma[place]
+    s01 = sigma[place + 1]
+    s10 = sigma[below]
+    s11 = sigma[below + 1]
+    z = -point[2]
+    toward = -wp.dot(n, point) / z
+    reach = wp.length(point) / z
+    found.cosine = toward / reach
+    if found.cosine < LEAST_COSINE:
+        return found
+    one = w00 * s00 + w01 * s01 + w10 * s10 + w11 * s11
+    shared = w00 * w00 * s00 * s00 + w01 * w01 * s01 * s01 + w10 * w10 * s10 * s10 + w11 * w11 * s11 * s11
+    across = LATERAL * depth / wp.min(view.focal[0], view.focal[1])
+    lateral = across * across * (1.0 - found.cosine * found.cosine)
+    found.along = depth - z
+    found.distance = found.along * toward
+    found.sigma = wp.sqrt(one * one * toward * toward + lateral)
+    found.variance = shared * toward * toward + lateral
+    found.normal = wp.transpose(view.rotation) * n
+    found.known = True
+    return found

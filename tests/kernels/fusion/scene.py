@@ -1,0 +1,50 @@
+"""Range images of the statue as kernels take them, and a fusion over all bricks."""
+
+import cv2
+import numpy as np
+
+from kernels.fusion.bricks import BRICK_VOXELS, find_blocks
+from kernels.fusion.extract import extract
+from kernels.fusion.integrate import integrate
+from kernels.fusion.views import RangeImage, upload_views
+from stage.camera import Camera
+from stage.depth_breaks import connected
+from stage.depth_normals import depth_normals
+from tests.scenes.statue import Shot
+
+
+def range_image(shot: Shot, sigma: float, *, world_from_camera=None) -> RangeImage:
+    rows, cols = shot.side
+    camera = Camera(projection="perspective", resolution=(cols, rows), focal_px=(shot.focal, shot.focal))
+    sigmas = np.full(shot.side, sigma, dtype=np.float32)
+    normal = depth_normals(shot.depth, shot.mask, camera, sigma=sigmas, radius=2)
+    right, down, across, back = (connected(shot.depth, shot.mask, camera, offset, sigma=sigmas) for offset in ((0, 1), (1, 0), (1, 1), (1, -1)))
+    cell = np.zeros(shot.side, dtype=bool)
+    cell[:-1, :-1] = right[:-1, :-1] & right[1:, :-1] & down[:-1, :-1] & down[:-1, 1:] & across[:-1, :-1] & back[:-1, 1:]
+    clear = cv2.erode(np.where(shot.mask, shot.depth, 0).astype(np.float32), np.ones((5, 5)), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    pose = shot.world_from_camera if world_from_camera is None else world_from_camera
+    return RangeImage(shot.depth, sigmas, normal, cell, clear, np.linalg.inv(pose), (shot.focal, shot.focal), (cols / 2, rows / 2))
+
+
+def fuse(images: list[RangeImage], voxel: float, low, high, *, device: str):
+    """Points, standard deviations and faces of the surface within a box, welded over all bricks."""
+    size = BRICK_VOXELS * voxel
+    first, last = (np.floor(np.array(corner) / size).astype(int) for corner in (low, high))
+    points, sigmas, keys, faces, count = [], [], [], [], 0
+    for brick in np.ndindex(*(last - first + 1)):
+        place = np.array(brick) + first
+        views = upload_views(images, place * size, device=device)
+        found = extract(integrate(find_blocks(views, voxel, device=device), views))
+        points.append(found.points + place * size)
+        sigmas.append(found.sigma)
+        keys.append(np.concatenate([found.edge[:, :3] + place * BRICK_VOXELS, found.edge[:, 3:]], axis=1))
+        faces.append(found.faces + count)
+        count += len(found.points)
+    _, kept, number = np.unique(np.concatenate(keys), axis=0, return_index=True, return_inverse=True)
+    return np.concatenate(points)[kept], np.concatenate(sigmas)[kept], number.ravel()[np.concatenate(faces)]
+
+
+def edge_counts(faces: np.ndarray) -> np.ndarray:
+    """How many edges have how many faces, by that number."""
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    return np.bincount(np.unique(edges, axis=0, return_counts=True)[1])

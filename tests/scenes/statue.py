@@ -1,0 +1,106 @@
+"""A statue-like object of 1 m with a closed form, and range images of it from a turntable.
+
+It has round parts, a foot with sharp edges, a blade of 2 mm, an arm that hides the body behind it, and a slot of 6 mm.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+SIGMA = 2.5e-4
+"""Standard deviation of every depth, metres."""
+BLADE, SLOT = 2e-3, 6e-3
+"""Thickness of the blade and width of the slot between two plates, metres."""
+
+
+def _length(p: np.ndarray) -> np.ndarray:
+    return np.sqrt((p * p).sum(axis=-1))
+
+
+def _capsule(p: np.ndarray, a: np.ndarray, b: np.ndarray, radius: float) -> np.ndarray:
+    along = np.clip(((p - a) @ (b - a)) / ((b - a) @ (b - a)), 0, 1)
+    return _length(p - a - along[..., None] * (b - a)) - radius
+
+
+def _box(p: np.ndarray, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
+    q = np.abs(p - centre) - half
+    return _length(np.maximum(q, 0)) + np.minimum(q.max(axis=-1), 0)
+
+
+PARTS = {
+    "foot": lambda p: _box(p, np.array([0, -0.44, 0]), np.array([0.16, 0.06, 0.16])),
+    "body": lambda p: _capsule(p, np.array([0, -0.38, 0]), np.array([0, 0.12, 0]), 0.11),
+    "head": lambda p: _length(p - np.array([0, 0.34, 0])) - 0.12,
+    "neck": lambda p: _capsule(p, np.array([0, 0.12, 0]), np.array([0, 0.34, 0]), 0.05),
+    "arm": lambda p: _capsule(p, np.array([-0.1, 0.15, 0]), np.array([-0.2, -0.1, 0.2]), 0.03),
+    "shoulder": lambda p: _capsule(p, np.array([0, 0.15, 0]), np.array([0.2, 0.15, 0]), 0.04),
+    "blade": lambda p: _box(p, np.array([0.22, 0.0, 0.0]), np.array([0.06, 0.15, BLADE / 2])),
+    "left plate": lambda p: _box(p, np.array([-0.24, 0.3, -(SLOT / 2 + 0.005)]), np.array([0.06, 0.06, 0.005])),
+    "right plate": lambda p: _box(p, np.array([-0.24, 0.3, SLOT / 2 + 0.005]), np.array([0.06, 0.06, 0.005])),
+    "bracket": lambda p: _capsule(p, np.array([-0.2, 0.3, 0]), np.array([0, 0.3, 0]), 0.012),
+}
+"""Signed distances of the parts, metres; the statue is their union."""
+
+
+def distance(points: np.ndarray) -> np.ndarray:
+    """Signed distance to the statue [...] of points [..., 3]; exact outside of it, and near its surface inside but where parts meet."""
+    return np.min([part(points) for part in PARTS.values()], axis=0)
+
+
+def nearest_part(points: np.ndarray) -> np.ndarray:
+    """Name of the part whose surface is nearest."""
+    return np.array(list(PARTS))[np.abs([part(points) for part in PARTS.values()]).argmin(axis=0)]
+
+
+class Shot(NamedTuple):
+    """One range image."""
+
+    depth: np.ndarray  # [rows, cols] metres, 0 where the ray misses
+    true: np.ndarray  # [rows, cols] metres, without noise
+    mask: np.ndarray  # [rows, cols] bool
+    world_from_camera: np.ndarray  # [4, 4]
+    focal: float
+    side: tuple[int, int]  # rows, cols
+
+
+def place(angle: float, height: float, range_m: float, *, target: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:
+    """World from camera of a camera that looks at the target from an angle about +y."""
+    eye = np.array(target) + [range_m * np.sin(angle), height, range_m * np.cos(angle)]
+    back = (eye - target) / np.linalg.norm(eye - target)
+    right = np.cross([0, 1, 0], back)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = right, np.cross(back, right), back, eye
+    return pose
+
+
+def shoot(pose: np.ndarray, side: tuple[int, int], focal: float, *, sigma: float = SIGMA, seed: int = 0, scene=distance) -> Shot:
+    """A range image by sphere tracing, with Gaussian noise on the depth."""
+    rows, cols = side
+    u, v = np.meshgrid(np.arange(cols) + 0.5 - cols / 2, np.arange(rows) + 0.5 - rows / 2)
+    ray = np.stack([u / focal, -v / focal, -np.ones(side)], axis=-1).reshape(-1, 3)
+    length = np.linalg.norm(ray, axis=-1)
+    direction = (ray / length[:, None]) @ pose[:3, :3].T
+    along, alive = np.zeros(len(ray)), np.arange(len(ray))
+    hit = np.zeros(len(ray), dtype=bool)
+    for _ in range(200):
+        d = scene(pose[:3, 3] + along[alive, None] * direction[alive])
+        along[alive] += d
+        close = np.abs(d) < 1e-7
+        hit[alive[close]] = True
+        alive = alive[~close & (along[alive] < 10)]
+        if len(alive) == 0:
+            break
+    true = np.where(hit, along / length, 0).reshape(side)
+    noise = sigma * np.random.default_rng(seed).standard_normal(side)
+    mask = hit.reshape(side)
+    return Shot(np.where(mask, true + noise, 0), true, mask, pose, focal, side)
+
+
+def turntable(count: int = 18, side: tuple[int, int] = (240, 180), *, sigma: float = SIGMA, range_m: float = 2.0,
+              seed: int = 0, scene=distance) -> list[Shot]:
+    """Range images all around, from three heights in turn; the statue fills the image."""
+    focal = 0.83 * side[0] * range_m
+    heights = (0.1, 1.1, -0.5)
+    return [shoot(place(2 * np.pi * k / count, heights[k % 3], range_m), side, focal, sigma=sigma, seed=seed + k, scene=scene)
+            for k in range(count)]
