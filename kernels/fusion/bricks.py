@@ -1,7 +1,8 @@
 """Bricks: the parts into which space is cut, each with an array of blocks of 8³ voxels that exist near measured surface alone.
 
-A brick has BRICK³ blocks, and one more on its high side along each axis, which its last cells need. Its blocks are found by their index in
-a dense array, so that neighbours are found without a search. Voxel (i, j, k) of a brick lies at its origin plus that many voxel sizes.
+A brick has BRICK³ blocks, and one more on its high side along each axis, which its last cells need. Its blocks are found by their index
+in a dense array, so that neighbours are found without a search. Voxels lie on one lattice for all bricks, voxel (i, j, k) at that many
+voxel sizes from the origin.
 """
 
 from typing import Any, NamedTuple
@@ -48,6 +49,7 @@ class Blocks(NamedTuple):
     index: Any  # wp.array [SIDE³] int32, number of each block, −1 where there is none
     place: Any  # wp.array [B] int32, place of each block in `index`
     count: int
+    corner: tuple[int, int, int]  # lattice coordinates, in voxels, of the lowest voxel
     voxel: float  # metres
     device: str
 
@@ -61,13 +63,13 @@ def block_place(x: int, y: int, z: int) -> int:
 @wp.func
 def farthest_ratio(view: View, row: int, col: int) -> float:
     """Return the length of the line of sight of a pixel for each metre of depth, without distortion."""
-    x = (float(col) + 0.5 - view.principal[0]) / view.focal[0]
-    y = (float(row) + 0.5 - view.principal[1]) / view.focal[1]
+    x = (float(col + view.first_col) + 0.5 - view.principal[0]) / view.focal[0]
+    y = (float(row + view.first_row) + 0.5 - view.principal[1]) / view.focal[1]
     return wp.sqrt(1.0 + x * x + y * y)
 
 
 @wp.kernel(enable_backward=False)
-def _mark_kernel(first: int, number: int, voxel: float, views: wp.array(dtype=View), inverse: wp.array(dtype=float),
+def _mark_kernel(first: int, number: int, voxel: float, corner: wp.vec3, views: wp.array(dtype=View), inverse: wp.array(dtype=float),
                  sigma: wp.array(dtype=float), cell: wp.array(dtype=wp.uint8),
                  # outputs
                  marked: wp.array(dtype=wp.uint8)):
@@ -99,11 +101,11 @@ def _mark_kernel(first: int, number: int, voxel: float, views: wp.array(dtype=Vi
             for b in range(parts):
                 fu = (float(b) + 0.5) / float(parts)
                 depth = 1.0 / ((1.0 - fv) * ((1.0 - fu) * i00 + fu * i01) + fv * ((1.0 - fu) * i10 + fu * i11))
-                ray = line_of_sight(view, float(col) + 0.5 + fu, float(row) + 0.5 + fv)
+                ray = line_of_sight(view, float(col + view.first_col) + 0.5 + fu, float(row + view.first_row) + 0.5 + fv)
                 length = wp.length(ray)
                 for s in range(-half, half + 1):
                     along = depth + wp.clamp(float(s) * step, -reach, reach) / length
-                    point = back * (ray * along - view.translation)
+                    point = back * (ray * along - view.translation) - corner
                     x0 = int(wp.floor((point[0] - margin) / size))
                     x1 = int(wp.floor((point[0] + margin) / size))
                     y0 = int(wp.floor((point[1] - margin) / size))
@@ -116,29 +118,31 @@ def _mark_kernel(first: int, number: int, voxel: float, views: wp.array(dtype=Vi
                                 marked[block_place(x, y, z)] = wp.uint8(1)
 
 
-def find_blocks(views: ViewArrays, voxel: float, *, device: str) -> Blocks:
-    """Find the blocks of a brick at the origin of the views' coordinates that come near a measured surface.
+def find_blocks(views: ViewArrays, voxel: float, corner: tuple[int, int, int], *, device: str) -> Blocks:
+    """Find the blocks of a brick that come near a measured surface.
 
     Args:
         views: the range images.
         voxel: side of a voxel, metres.
+        corner: lattice coordinates of the lowest voxel of the brick; voxel (0, 0, 0) lies at the origin of the views' coordinates.
         device: where the views are.
 
     Convention:
         Waits for the device.
     """
     marked = wp.zeros(SIDE**3, dtype=wp.uint8, device=device)
+    low = wp.vec3(*(float(voxel * c) for c in corner))
     for number, (rows, cols) in enumerate(views.shapes):
-        devices.launch(_mark_kernel, rows * cols, [number, voxel, views.views, views.inverse, views.sigma, views.cell], [marked],
+        devices.launch(_mark_kernel, rows * cols, [number, voxel, low, views.views, views.inverse, views.sigma, views.cell], [marked],
                        device=device, uneven=True)
     place = np.flatnonzero(marked.numpy()).astype(np.int32)
     index = np.full(SIDE**3, -1, dtype=np.int32)
     index[place] = np.arange(len(place), dtype=np.int32)
-    return Blocks(wp.array(index, dtype=int, device=device), wp.array(place, dtype=int, device=device), len(place), voxel, device)
+    return Blocks(wp.array(index, dtype=int, device=device), wp.array(place, dtype=int, device=device), len(place), corner, voxel, device)
 
 
 @wp.kernel(enable_backward=False)
-def _watch_kernel(first: int, voxel: float, count: int, place: wp.array(dtype=int), views: wp.array(dtype=View),
+def _watch_kernel(first: int, voxel: float, corner: wp.vec3i, count: int, place: wp.array(dtype=int), views: wp.array(dtype=View),
                   farthest: wp.array(dtype=float),
                   # outputs
                   watched: wp.array2d(dtype=wp.int16)):
@@ -148,9 +152,10 @@ def _watch_kernel(first: int, voxel: float, count: int, place: wp.array(dtype=in
     y = (at // SIDE) % SIDE
     z = at // (SIDE * SIDE)
     half = 0.5 * float(BLOCK) * voxel
-    centre = wp.vec3(float(x) * 2.0 * half + half, float(y) * 2.0 * half + half, float(z) * 2.0 * half + half)
+    centre = voxel * wp.vec3(float(corner[0] + BLOCK * x), float(corner[1] + BLOCK * y), float(corner[2] + BLOCK * z))
+    centre = centre + wp.vec3(half, half, half)
     radius = 1.7320508 * half
-    found = int(0)
+    found = wp.int32(0)
     for number in range(count):
         view = views[number]
         point = to_camera(view, centre)
@@ -159,11 +164,13 @@ def _watch_kernel(first: int, voxel: float, count: int, place: wp.array(dtype=in
         if near > radius:
             uv = image_point(view, point)
             reach = wp.max(view.focal[0], view.focal[1]) * radius / near * (1.0 + wp.length(point) / near) + 2.0
-            c0 = wp.max(int(wp.floor((uv[0] - reach) / float(TILE))), 0)
-            r0 = wp.max(int(wp.floor((uv[1] - reach) / float(TILE))), 0)
+            across = uv[0] - float(view.first_col)
+            down = uv[1] - float(view.first_row)
+            c0 = wp.max(int(wp.floor((across - reach) / float(TILE))), 0)
+            r0 = wp.max(int(wp.floor((down - reach) / float(TILE))), 0)
             tiles = (view.cols + TILE - 1) // TILE
-            c1 = wp.min(int(wp.floor((uv[0] + reach) / float(TILE))), tiles - 1)
-            r1 = wp.min(int(wp.floor((uv[1] + reach) / float(TILE))), (view.rows + TILE - 1) // TILE - 1)
+            c1 = wp.min(int(wp.floor((across + reach) / float(TILE))), tiles - 1)
+            r1 = wp.min(int(wp.floor((down + reach) / float(TILE))), (view.rows + TILE - 1) // TILE - 1)
             far = float(0.0)
             for r in range(r0, r1 + 1):
                 for c in range(c0, c1 + 1):
@@ -179,6 +186,6 @@ def _watch_kernel(first: int, voxel: float, count: int, place: wp.array(dtype=in
 def find_watching(blocks: Blocks, views: ViewArrays) -> Any:
     """Return which views can see each block, wp.array [B, V] int16: their numbers, and −1 after the last where there are fewer."""
     watched = wp.empty((blocks.count, views.count), dtype=wp.int16, device=blocks.device)
-    devices.launch(_watch_kernel, blocks.count, [blocks.voxel, views.count, blocks.place, views.views, views.farthest], [watched],
-                   device=blocks.device)
+    devices.launch(_watch_kernel, blocks.count, [blocks.voxel, wp.vec3i(*blocks.corner), views.count, blocks.place, views.views, views.farthest],
+                   [watched], device=blocks.device)
     return watched

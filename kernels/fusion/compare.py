@@ -22,7 +22,7 @@ def _compare_kernel(first: int, number: int, count: int, reach: float, views: wp
     row = pixels[i] // view.cols
     col = pixels[i] - row * view.cols
     place = view.first + pixels[i]
-    there = line_of_sight(view, float(col) + 0.5, float(row) + 0.5) / inverse[place]
+    there = line_of_sight(view, float(col + view.first_col) + 0.5, float(row + view.first_row) + 0.5) / inverse[place]
     back = wp.transpose(view.rotation)
     point = back * (there - view.translation)
     own = back * normal[place]

@@ -21,9 +21,9 @@ SMALLEST = 1.0e-4
 class Triangles(NamedTuple):
     """The surface in one brick."""
 
-    points: np.ndarray  # [V, 3] float32 metres from the corner of the brick
+    points: np.ndarray  # [V, 3] float32 metres, in the coordinates of the views
     sigma: np.ndarray  # [V] float32 metres, standard deviation along the normal
-    edge: np.ndarray  # [V, 4] int32, voxel coordinates in the brick and axis of the edge on which each vertex lies
+    edge: np.ndarray  # [V, 4] int32, lattice coordinates and axis of the edge on which each vertex lies
     faces: np.ndarray  # [F, 3] int32, counter-clockwise seen from outside
 
 
@@ -31,9 +31,10 @@ class Triangles(NamedTuple):
 def _known(x: int, y: int, z: int, index: wp.array(dtype=int), state: wp.array(dtype=wp.uint8)) -> int:
     """Return the number of a voxel that is measured surface, else −1."""
     number = voxel_number(x, y, z, index)
-    if number >= 0:
-        if int(state[number]) != SURFACE:
-            return -1
+    if number < 0:
+        return -1
+    if int(state[number]) != SURFACE:
+        return -1
     return number
 
 
@@ -46,24 +47,24 @@ def _count_kernel(first: int, place: wp.array(dtype=int), index: wp.array(dtype=
     i = first + wp.tid()
     at = voxel_position(i, place)
     here = _known(at[0], at[1], at[2], index, state)
-    bits = int(0)
-    count = int(0)
-    case = int(0)
+    bits = wp.int32(0)
+    count = wp.int32(0)
+    case = wp.int32(0)
     if here >= 0:
         inside = value[here] < 0.0
         for axis in range(3):
             there = _known(at[0] + wp.where(axis == 0, 1, 0), at[1] + wp.where(axis == 1, 1, 0), at[2] + wp.where(axis == 2, 1, 0),
                            index, state)
             if there >= 0:
-                if (value[there] < 0.0) != inside:
-                    bits = bits | (1 << axis)
-                    count += 1
+                flips = wp.where((value[there] < 0.0) != inside, 1, 0)
+                bits = bits | (flips << axis)
+                count += flips
         if at[0] < BRICK_VOXELS and at[1] < BRICK_VOXELS and at[2] < BRICK_VOXELS:
             for corner in range(8):
                 if case >= 0:
                     number = _known(at[0] + (corner & 1), at[1] + ((corner >> 1) & 1), at[2] + ((corner >> 2) & 1), index, state)
                     if number < 0:
-                        case = int(-1)
+                        case = wp.int32(-1)
                     elif value[number] < 0.0:
                         case = case | (1 << corner)
     case = wp.max(case, 0)
@@ -74,8 +75,8 @@ def _count_kernel(first: int, place: wp.array(dtype=int), index: wp.array(dtype=
 
 
 @wp.kernel(enable_backward=False)
-def _vertex_kernel(first: int, voxel: float, place: wp.array(dtype=int), index: wp.array(dtype=int), value: wp.array(dtype=float),
-                   variance: wp.array(dtype=float), crossed: wp.array(dtype=wp.uint8), start: wp.array(dtype=int),
+def _vertex_kernel(first: int, voxel: float, corner: wp.vec3i, place: wp.array(dtype=int), index: wp.array(dtype=int),
+                   value: wp.array(dtype=float), variance: wp.array(dtype=float), crossed: wp.array(dtype=wp.uint8), start: wp.array(dtype=int),
                    # outputs
                    points: wp.array(dtype=wp.vec3), sigma: wp.array(dtype=float), edge: wp.array(dtype=wp.vec4i)):
     i = first + wp.tid()
@@ -90,9 +91,10 @@ def _vertex_kernel(first: int, voxel: float, place: wp.array(dtype=int), index: 
                 dz = wp.where(axis == 2, 1, 0)
                 there = voxel_number(at[0] + dx, at[1] + dy, at[2] + dz, index)
                 t = wp.clamp(value[i] / (value[i] - value[there]), SMALLEST, 1.0 - SMALLEST)
-                points[out] = voxel * wp.vec3(float(at[0]) + t * float(dx), float(at[1]) + t * float(dy), float(at[2]) + t * float(dz))
+                points[out] = voxel * wp.vec3(float(at[0] + corner[0]) + t * float(dx), float(at[1] + corner[1]) + t * float(dy),
+                                              float(at[2] + corner[2]) + t * float(dz))
                 sigma[out] = (1.0 - t) * wp.sqrt(variance[i]) + t * wp.sqrt(variance[there])
-                edge[out] = wp.vec4i(at[0], at[1], at[2], axis)
+                edge[out] = wp.vec4i(at[0] + corner[0], at[1] + corner[1], at[2] + corner[2], axis)
                 out += 1
 
 
@@ -143,8 +145,8 @@ def extract(volume: Volume) -> Triangles:
     sigma = wp.empty(vertex_count, dtype=float, device=device)
     edge = wp.empty(vertex_count, dtype=wp.vec4i, device=device)
     corner_numbers = wp.empty(3 * face_count, dtype=int, device=device)
-    devices.launch(_vertex_kernel, count, [blocks.voxel, blocks.place, blocks.index, volume.value, volume.variance, crossed, vertex_start],
-                   [points, sigma, edge], device=device)
+    devices.launch(_vertex_kernel, count, [blocks.voxel, wp.vec3i(*blocks.corner), blocks.place, blocks.index, volume.value, volume.variance,
+                                           crossed, vertex_start], [points, sigma, edge], device=device)
     devices.launch(_face_kernel, count, [blocks.place, blocks.index, crossed, vertex_start, cases, face_start, triangles, edges,
                                          wp.array(EDGE_CORNER, dtype=int, device=device)], [corner_numbers], device=device)
     corners = corner_numbers.numpy()

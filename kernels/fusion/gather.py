@@ -48,8 +48,8 @@ def _gather_kernel(first: int, slack: float, vectors: int, views: wp.array(dtype
     point = points[i]
     total = float(0.0)
     largest = float(0.0)
-    chosen = int(-1)
-    number_seen = int(0)
+    chosen = wp.int32(-1)
+    number_seen = wp.int32(0)
     for c in range(channels):
         values[i, c] = 0.0
     for number in range(count):
@@ -65,11 +65,9 @@ def _gather_kernel(first: int, slack: float, vectors: int, views: wp.array(dtype
             if reading.known and cosine > 0.0 and wp.abs(reading.distance) <= limit and wp.dot(reading.normal, normals[i]) > 0.0:
                 u = uv[0] - 0.5
                 v = uv[1] - 0.5
-                col = int(wp.floor(u))
-                row = int(wp.floor(v))
-                place = view.first + row * view.cols + col
-                fu = u - float(col)
-                fv = v - float(row)
+                fu = u - wp.floor(u)
+                fv = v - wp.floor(v)
+                place = view.first + (int(wp.floor(v)) - view.first_row) * view.cols + int(wp.floor(u)) - view.first_col
                 near = _bilinear(feather, place, view.cols, fu, fv, 0)
                 scale = wp.min(view.focal[0], view.focal[1]) / (-there[2])  # pixels for each metre
                 w = near * wp.pow(cosine * scale * 1.0e-3, SHARPNESS)

@@ -4,9 +4,9 @@ Each voxel gathers what the views measured on their lines of sight through it: t
 weighted by the inverse of its variance. Nothing is accumulated from launch to launch, so that a voxel has the same value to the last bit
 whichever brick computes it and in whichever order views are given to the same voxel.
 
-Three rules keep thin parts and gaps as they are. Distances count within the truncation alone. Where the normals of the views disagree,
-as on both sides of a thin sheet, at an edge, or in a narrow gap, those views count whose surface is turned like that of the nearest one. And
-a voxel that as many views saw to be empty as measured a surface there is no surface.
+Three rules keep thin parts and gaps as they are. Distances count within the truncation alone. Where the normals of the views
+disagree, as on both sides of a thin sheet, at an edge, or in a narrow gap, those views count whose surface is turned like that of the
+nearest one. And a voxel that as many views saw to be empty as measured a surface there is no surface.
 
 Source: Curless and Levoy, "A Volumetric Method for Building Complex Models from Range Images", SIGGRAPH 1996 (weights, the space in front
 of a surface is empty); Bylow et al., "Real-Time Camera Tracking and 3D Reconstruction Using Signed Distance Functions", RSS 2013 (distance
@@ -27,11 +27,11 @@ TURNED = 0.5
 """Cosine between a normal and that of the nearest surface from which on its view counts where normals disagree: 60°."""
 
 ALONG = 1.5
-"""Farthest that a voxel may lie behind the measured point on the line of sight, in truncations: a distance from a plane says nothing far
-beside the point where it was measured, as behind an edge."""
+"""Farthest that a voxel may lie behind the measured point on the line of sight, in truncations: a distance from a plane says nothing
+far beside the point where it was measured, as behind an edge."""
 NEAR_SIGMAS = 3.0
-"""Distance from a measured surface in standard deviations within which a voxel may be that surface. A voxel farther behind it is hidden from
-the view, which is no evidence against another that sees the voxel to be empty."""
+"""Distance from a measured surface in standard deviations within which a voxel may be that surface. A voxel farther behind it is hidden
+from the view, which is no evidence against another that sees the voxel to be empty."""
 
 UNKNOWN, SURFACE, EMPTY = 0, 1, 2
 """States of a voxel: not measured; near a measured surface; measured by fewer views than saw it to be empty."""
@@ -79,32 +79,33 @@ def near_surface(sigma: float, voxel: float) -> float:
 @wp.func
 def is_clear(view: View, point: wp.vec3, at: wp.vec2, reach: float, clear: wp.array(dtype=float)) -> bool:
     """Return whether a view saw that a camera-frame point is empty: it lies nearer than everything that was measured around its pixel."""
-    col = int(wp.floor(at[0]))
-    row = int(wp.floor(at[1]))
+    col = int(wp.floor(at[0])) - view.first_col
+    row = int(wp.floor(at[1])) - view.first_row
     if col < 0 or row < 0 or col >= view.cols or row >= view.rows:
         return False
     return -point[2] + reach < clear[view.first + row * view.cols + col]
 
 
 @wp.kernel(enable_backward=False)
-def _integrate_kernel(first: int, voxel: float, count: int, place: wp.array(dtype=int), watched: wp.array2d(dtype=wp.int16),
-                      views: wp.array(dtype=View), inverse: wp.array(dtype=float), sigma: wp.array(dtype=float),
-                      normal: wp.array(dtype=wp.vec3), cell: wp.array(dtype=wp.uint8), clear: wp.array(dtype=float),
+def _integrate_kernel(first: int, voxel: float, corner: wp.vec3i, count: int, place: wp.array(dtype=int),
+                      watched: wp.array2d(dtype=wp.int16), views: wp.array(dtype=View), inverse: wp.array(dtype=float),
+                      sigma: wp.array(dtype=float), normal: wp.array(dtype=wp.vec3), cell: wp.array(dtype=wp.uint8), clear: wp.array(dtype=float),
                       # outputs
                       value: wp.array(dtype=float), variance: wp.array(dtype=float), state: wp.array(dtype=wp.uint8)):
     i = first + wp.tid()
     block = i // VOXELS
     at = voxel_position(i, place)
-    point = wp.vec3(float(at[0]) * voxel, float(at[1]) * voxel, float(at[2]) * voxel)
+    at = at + corner
+    point = voxel * wp.vec3(float(at[0]), float(at[1]), float(at[2]))
     weights = float(0.0)
     total = float(0.0)
     spread = float(0.0)
     normals = wp.vec3(0.0, 0.0, 0.0)
     nearest = float(1.0e30)
     reference = wp.vec3(0.0, 0.0, 0.0)
-    measured = int(0)
-    near = int(0)
-    empty = int(0)
+    measured = wp.int32(0)
+    near = wp.int32(0)
+    empty = wp.int32(0)
     for k in range(count):
         number = int(watched[block, k])
         if number < 0:
@@ -136,7 +137,7 @@ def _integrate_kernel(first: int, voxel: float, count: int, place: wp.array(dtyp
         weights = float(0.0)
         total = float(0.0)
         spread = float(0.0)
-        measured = int(0)
+        measured = wp.int32(0)
         for k in range(count):
             number = int(watched[block, k])
             if number < 0:
@@ -153,13 +154,13 @@ def _integrate_kernel(first: int, voxel: float, count: int, place: wp.array(dtyp
                     total += w * reading.distance
                     spread += w * w * reading.variance
                     measured += 1
-    known = int(UNKNOWN)
+    known = wp.int32(UNKNOWN)
     if measured > 0:
-        known = int(SURFACE)
+        known = wp.int32(SURFACE)
         value[i] = total / weights
         variance[i] = spread / (weights * weights)
     if empty > 0 and empty >= near:
-        known = int(EMPTY)
+        known = wp.int32(EMPTY)
     state[i] = wp.uint8(known)
 
 
@@ -168,7 +169,7 @@ def integrate(blocks: Blocks, views: ViewArrays) -> Volume:
 
     Args:
         blocks: of find_blocks, with these views.
-        views: the range images, whose coordinates count from the corner of the brick.
+        views: the range images.
 
     Convention:
         Returns before the device is done.
@@ -177,7 +178,7 @@ def integrate(blocks: Blocks, views: ViewArrays) -> Volume:
     value, variance = (wp.zeros(count, dtype=float, device=device) for _ in range(2))
     state = wp.zeros(count, dtype=wp.uint8, device=device)
     if count:
-        devices.launch(_integrate_kernel, count, [blocks.voxel, views.count, blocks.place, find_watching(blocks, views), views.views,
-                                                  views.inverse, views.sigma, views.normal, views.cell, views.clear],
+        devices.launch(_integrate_kernel, count, [blocks.voxel, wp.vec3i(*blocks.corner), views.count, blocks.place,
+                                                  find_watching(blocks, views), views.views, views.inverse, views.sigma, views.normal, views.cell, views.clear],
                        [value, variance, state], device=device, uneven=True)
     return Volume(blocks, value, variance, state)

@@ -17,6 +17,9 @@ TILE = 16
 LATERAL = 0.1
 """Standard deviation of the place of a reading across the line of sight, in pixels, as calibrations and optics leave it. Seen at a grazing
 angle it is what limits a measurement, whatever the standard deviation of the depth."""
+SPACING = 0.29
+"""What the weights of readings assume in its place: a uniform distribution over a pixel, 1/√12. Between pixels a bent surface is cut short
+by a chord, by the more the more grazing it is seen; that error does not average out."""
 UNDISTORT_ITERATIONS = 10
 """Rounds of the iteration that undoes the distortion: ordinary lenses converge to single precision in about six."""
 LEAST_COSINE = 0.2
@@ -41,12 +44,14 @@ class RangeImage(NamedTuple):
     focal: tuple[float, float]  # pixels
     principal: tuple[float, float]  # u and v, pixels from the top-left corner
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)  # k1, k2, k3, p1, p2 of OpenCV
+    first_row: int = 0  # of the arrays in the image that `principal` is of
+    first_col: int = 0
 
     def cropped(self, first_row: int, last_row: int, first_col: int, last_col: int) -> "RangeImage":
         """Return the part of the image from the first row and column to those before the last."""
         box = slice(first_row, last_row), slice(first_col, last_col)
         return self._replace(depth=self.depth[box], sigma=self.sigma[box], normal=self.normal[box], cell=self.cell[box],
-                             clear=self.clear[box], principal=(self.principal[0] - first_col, self.principal[1] - first_row))
+                             clear=self.clear[box], first_row=self.first_row + first_row, first_col=self.first_col + first_col)
 
 
 @wp.struct
@@ -57,6 +62,8 @@ class View:
     first_tile: int
     rows: int
     cols: int
+    first_row: int  # of its first pixel in the image: image coordinates do not depend on what part of it is here
+    first_col: int
     rotation: wp.mat33  # camera from world
     translation: wp.vec3
     focal: wp.vec2
@@ -86,7 +93,8 @@ def upload_views(images: Sequence[RangeImage], origin: np.ndarray, *, device: st
 
     Args:
         images: at least one.
-        origin: [3] world point, metres, that coordinates on the device count from, which keeps them short in single precision.
+        origin: [3] world point, metres, that coordinates on the device count from: near the middle of the scene, so that they are short in
+            single precision, and one for all bricks, whose values are the same to the last bit only then.
         device: where to.
 
     Raises:
@@ -107,6 +115,7 @@ def upload_views(images: Sequence[RangeImage], origin: np.ndarray, *, device: st
                 raise ArrayError(f"view {number} has a depth or a standard deviation in a cell that is not above 0")
         view = View()
         view.first, view.first_tile, view.rows, view.cols = first, first_tile, rows, cols
+        view.first_row, view.first_col = image.first_row, image.first_col
         rotation = np.asarray(image.camera_from_world, dtype=np.float64)[:3, :3]
         shift = rotation @ np.asarray(origin, dtype=np.float64) + np.asarray(image.camera_from_world, dtype=np.float64)[:3, 3]
         view.rotation = wp.mat33(*(float(v) for v in rotation.ravel()))
@@ -201,7 +210,7 @@ class Reading:
     known: bool
     distance: float  # metres from the measured surface along its normal, positive in front of it
     along: float  # metres from the measured surface along −z of the camera, positive in front of it
-    sigma: float  # metres, standard deviation of the distance that one pixel has
+    sigma: float  # metres, standard deviation of the distance of one pixel, by which it is weighted
     variance: float  # square metres, that of the distance, which up to four pixels share
     normal: wp.vec3  # world frame
     cosine: float  # between the normal and the line of sight
@@ -215,16 +224,16 @@ def read_view(view: View, point: wp.vec3, at: wp.vec2, inverse: wp.array(dtype=f
     found.known = False
     u = at[0] - 0.5
     v = at[1] - 0.5
-    col = int(wp.floor(u))
-    row = int(wp.floor(v))
+    fu = u - wp.floor(u)
+    fv = v - wp.floor(v)
+    col = int(wp.floor(u)) - view.first_col
+    row = int(wp.floor(v)) - view.first_row
     if col < 0 or row < 0 or col >= view.cols - 1 or row >= view.rows - 1:
         return found
     place = view.first + row * view.cols + col
     if cell[place] == wp.uint8(0):
         return found
     below = place + view.cols
-    fu = u - float(col)
-    fv = v - float(row)
     w00 = (1.0 - fu) * (1.0 - fv)
     w01 = fu * (1.0 - fv)
     w10 = (1.0 - fu) * fv
@@ -247,12 +256,12 @@ def read_view(view: View, point: wp.vec3, at: wp.vec2, inverse: wp.array(dtype=f
         return found
     one = w00 * s00 + w01 * s01 + w10 * s10 + w11 * s11
     shared = w00 * w00 * s00 * s00 + w01 * w01 * s01 * s01 + w10 * w10 * s10 * s10 + w11 * w11 * s11 * s11
-    across = LATERAL * depth / wp.min(view.focal[0], view.focal[1])
-    lateral = across * across * (1.0 - found.cosine * found.cosine)
+    pixel = depth / wp.min(view.focal[0], view.focal[1])
+    across = pixel * pixel * (1.0 - found.cosine * found.cosine)
     found.along = depth - z
     found.distance = found.along * toward
-    found.sigma = wp.sqrt(one * one * toward * toward + lateral)
-    found.variance = shared * toward * toward + lateral
+    found.sigma = wp.sqrt(one * one * toward * toward + SPACING * SPACING * across)
+    found.variance = shared * toward * toward + LATERAL * LATERAL * across
     found.normal = wp.transpose(view.rotation) * n
     found.known = True
     return found

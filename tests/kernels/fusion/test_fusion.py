@@ -38,7 +38,7 @@ def test_every_pattern_of_signs_gives_a_closed_surface(device):
             np.moveaxis(values, axis, 0)[end] = 1.0
     index = np.full(SIDE**3, -1, dtype=np.int32)
     index[0] = 0
-    volume = Volume(Blocks(wp.array(index, dtype=int, device=device), wp.zeros(1, dtype=int, device=device), 1, 1.0, device),
+    volume = Volume(Blocks(wp.array(index, dtype=int, device=device), wp.zeros(1, dtype=int, device=device), 1, (0, 0, 0), 1.0, device),
                     wp.array(values.ravel(), dtype=float, device=device), wp.zeros(VOXELS, dtype=float, device=device),
                     wp.full(VOXELS, SURFACE, dtype=wp.uint8, device=device))
     found = extract(volume)
@@ -59,9 +59,9 @@ def test_a_sphere_is_closed_and_as_sure_as_it_says(device, sphere_shots):
     error = sphere(points)
     assert edge_counts(faces)[:2].tolist() == [0, 0] and len(edge_counts(faces)) == 3
     assert np.median(np.abs(error)) < 0.6745 * SIGMA / np.sqrt(3)  # each point is seen by three views or more
-    assert abs(np.mean(error)) < 0.1 * SIGMA  # pixels of 2.5 mm see chords 8 µm below the sphere, more at an angle
+    assert abs(np.mean(error)) < 0.1 * SIGMA  # pixels of 2.5 mm see chords 8 µm below it, and more at an angle
     normalised = error / sigma
-    assert 0.7 < np.sqrt(np.mean(normalised**2)) < 1.1  # LATERAL allows for 0.25 mm across the line of sight, which this camera does not err by
+    assert 0.5 < np.sqrt(np.mean(normalised**2)) < 1.1  # LATERAL allows for an error of 0.25 mm that this camera does not have
 
 
 def test_without_noise_only_the_chords_between_pixels_are_left(device):
@@ -74,23 +74,13 @@ def test_bricks_meet_without_seams_and_crops_change_nothing(device, sphere_shots
     """A surface over eight bricks is the surface of one, moved: every vertex lies on an edge that two bricks compute alike."""
     voxel = 2.5e-3
     images = [range_image(shot, SIGMA) for shot in sphere_shots]
-    whole = upload_views(images, np.full(3, -64 * voxel), device=device)
-    one = extract(integrate(find_blocks(whole, voxel, device=device), whole))
-    parts, sigma, faces = fuse(images, voxel, *BOX, device=device)
-    assert len(parts) == len(one.points) and len(faces) == len(one.faces)
-    there = np.sort(np.round(one.points - 64 * voxel, 5), axis=0)
-    assert np.abs(there - np.sort(parts, axis=0)).max() < 2e-5  # single precision at 1 m, and rounding
-    box = (20, 100, 15, 110)
-    cropped = [image.cropped(*box) for image in images]
-    inside = [image._replace(cell=np.pad(np.ones((79, 94), dtype=bool), ((20, 21), (15, 11))) & image.cell) for image in images]
-    volumes = []
-    for given in (cropped, inside):
-        views = upload_views(given, np.full(3, -64 * voxel), device=device)
-        volumes.append(integrate(find_blocks(views, voxel, device=device), views))
-    assert volumes[0].blocks.count == volumes[1].blocks.count
-    for left, right in zip(volumes[0][1:3], volumes[1][1:3], strict=True):
-        near = (volumes[0].state.numpy() == SURFACE) & (volumes[1].state.numpy() == SURFACE)
-        assert np.abs(left.numpy() - right.numpy())[near].max() < 2e-6
+    views = upload_views(images, np.zeros(3), device=device)
+    one = extract(integrate(find_blocks(views, voxel, (-64, -64, -64), device=device), views))
+    parts, _, faces = fuse(images, voxel, *BOX, device=device)
+    assert len(faces) == len(one.faces) and np.array_equal(parts, one.points[np.lexsort(one.edge.T[::-1])])
+    cropped = upload_views([image.cropped(10, 110, 5, 115) for image in images], np.zeros(3), device=device)  # all of the sphere
+    again = extract(integrate(find_blocks(cropped, voxel, (-64, -64, -64), device=device), cropped))
+    assert np.array_equal(again.points, one.points)
 
 
 THICK = 4e-3
@@ -112,7 +102,7 @@ def test_a_sheet_thinner_than_the_truncation_keeps_its_thickness(device):
 
 
 def two_plates(points):
-    gap = 5e-3
+    gap = 1e-2  # four pixels
     distances = [np.abs(points - [0, 0, side * (0.03 + gap / 2)]) - [0.08, 0.08, 0.03] for side in (-1, 1)]
     return np.min([np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(axis=-1), 0) for q in distances], axis=0)
 
@@ -121,10 +111,10 @@ def test_a_gap_and_a_step_are_not_bridged(device):
     images = [range_image(shot, SIGMA) for shot in around(two_plates)]
     points, _, _ = fuse(images, 1.25e-3, *BOX, device=device)
     outside = two_plates(points)
-    assert np.percentile(outside, 99.9) < 2.5e-3 + 1e-6  # a pixel: views of one face go on beside its edges
-    assert outside.max() < 3 * 1.25e-3 + SIGMA  # the truncation
-    assert (np.abs(points[:, 2]) < 1e-3).sum() == 0  # the gap is 5 mm wide
-    assert len(points) > 50000
+    assert np.percentile(outside, 99) < 1.3e-3 and outside.max() < 2 * 2.5e-3 + 1e-6  # two pixels, at the mouth of the gap
+    middle = np.abs(points[:, 2]) < 2.5e-3
+    assert middle.mean() < 2e-3  # pixels that see the edge of one plate beside the wall of the other
+    assert (np.abs(points[middle, :2]).max(axis=1) > 0.08 - 2 * 2.5e-3).all()  # two pixels behind the mouth at the most
 
 
 def test_points_that_one_view_sees_and_the_others_see_through_are_no_surface(device):
