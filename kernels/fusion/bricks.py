@@ -186,6 +186,7 @@ def _watch_kernel(first: int, voxel: float, corner: wp.vec3i, count: int, place:
 def find_watching(blocks: Blocks, views: ViewArrays) -> Any:
     """Return which views can see each block, wp.array [B, V] int16: their numbers, and −1 after the last where there are fewer."""
     watched = wp.empty((blocks.count, views.count), dtype=wp.int16, device=blocks.device)
-    devices.launch(_watch_kernel, blocks.count, [blocks.voxel, wp.vec3i(*blocks.corner), views.count, blocks.place, views.views, views.farthest],
+    devices.launch(_watch_kernel, blocks.count, [blocks.voxel, wp.vec3i(*blocks.corner), views.count, blocks.place, views.views,
+                                                 views.farthest],
                    [watched], device=blocks.device)
     return watched

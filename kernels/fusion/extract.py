@@ -76,7 +76,8 @@ def _count_kernel(first: int, place: wp.array(dtype=int), index: wp.array(dtype=
 
 @wp.kernel(enable_backward=False)
 def _vertex_kernel(first: int, voxel: float, corner: wp.vec3i, place: wp.array(dtype=int), index: wp.array(dtype=int),
-                   value: wp.array(dtype=float), variance: wp.array(dtype=float), crossed: wp.array(dtype=wp.uint8), start: wp.array(dtype=int),
+                   value: wp.array(dtype=float), variance: wp.array(dtype=float), crossed: wp.array(dtype=wp.uint8),
+                   start: wp.array(dtype=int),
                    # outputs
                    points: wp.array(dtype=wp.vec3), sigma: wp.array(dtype=float), edge: wp.array(dtype=wp.vec4i)):
     i = first + wp.tid()
@@ -145,7 +146,8 @@ def extract(volume: Volume) -> Triangles:
     sigma = wp.empty(vertex_count, dtype=float, device=device)
     edge = wp.empty(vertex_count, dtype=wp.vec4i, device=device)
     corner_numbers = wp.empty(3 * face_count, dtype=int, device=device)
-    devices.launch(_vertex_kernel, count, [blocks.voxel, wp.vec3i(*blocks.corner), blocks.place, blocks.index, volume.value, volume.variance,
+    devices.launch(_vertex_kernel, count, [blocks.voxel, wp.vec3i(*blocks.corner), blocks.place, blocks.index, volume.value,
+                                           volume.variance,
                                            crossed, vertex_start], [points, sigma, edge], device=device)
     devices.launch(_face_kernel, count, [blocks.place, blocks.index, crossed, vertex_start, cases, face_start, triangles, edges,
                                          wp.array(EDGE_CORNER, dtype=int, device=device)], [corner_numbers], device=device)

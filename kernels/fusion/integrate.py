@@ -89,7 +89,8 @@ def is_clear(view: View, point: wp.vec3, at: wp.vec2, reach: float, clear: wp.ar
 @wp.kernel(enable_backward=False)
 def _integrate_kernel(first: int, voxel: float, corner: wp.vec3i, count: int, place: wp.array(dtype=int),
                       watched: wp.array2d(dtype=wp.int16), views: wp.array(dtype=View), inverse: wp.array(dtype=float),
-                      sigma: wp.array(dtype=float), normal: wp.array(dtype=wp.vec3), cell: wp.array(dtype=wp.uint8), clear: wp.array(dtype=float),
+                      sigma: wp.array(dtype=float), normal: wp.array(dtype=wp.vec3), cell: wp.array(dtype=wp.uint8),
+                      clear: wp.array(dtype=float),
                       # outputs
                       value: wp.array(dtype=float), variance: wp.array(dtype=float), state: wp.array(dtype=wp.uint8)):
     i = first + wp.tid()
@@ -179,6 +180,7 @@ def integrate(blocks: Blocks, views: ViewArrays) -> Volume:
     state = wp.zeros(count, dtype=wp.uint8, device=device)
     if count:
         devices.launch(_integrate_kernel, count, [blocks.voxel, wp.vec3i(*blocks.corner), views.count, blocks.place,
-                                                  find_watching(blocks, views), views.views, views.inverse, views.sigma, views.normal, views.cell, views.clear],
+                                                  find_watching(blocks, views), views.views, views.inverse, views.sigma, views.normal,
+                                                  views.cell, views.clear],
                        [value, variance, state], device=device, uneven=True)
     return Volume(blocks, value, variance, state)
