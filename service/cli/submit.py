@@ -25,6 +25,7 @@ from service.requests.jobs import (
     InspectBoardJob,
     IntensityJob,
     JobRequest,
+    JoinJob,
     LightPositionsJob,
     MirrorBallJob,
     PatternsJob,
@@ -47,7 +48,7 @@ if TYPE_CHECKING:
 
 JOBS: dict[str, type[JobRequest]] = {"solve": SolveJob, "depth": DepthJob, "relight": RelightJob, "shade": ShadeJob, "export": ExportJob,
                                      "view": ViewJob, "pipeline": PipelineJob, "basis": BasisJob, "scan": ScanJob, "patterns": PatternsJob,
-                                     "inspect-board": InspectBoardJob,
+                                     "inspect-board": InspectBoardJob, "join": JoinJob,
                                      "calibrate-mirror-ball": MirrorBallJob, "calibrate-light-positions": LightPositionsJob,
                                      "calibrate-grey-ball": GreyBallJob, "calibrate-intensity": IntensityJob, "calibrate-dark": DarkJob,
                                      "calibrate-flat-field": FlatFieldJob, "calibrate-saturation": SaturationJob,

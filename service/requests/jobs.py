@@ -121,6 +121,16 @@ class ExportJob(JobRequest):
     options: ExportOptions = ExportOptions()
 
 
+class JoinJob(JobRequest):
+    """One surface from the maps of a solve and a depth of the same view: maps.exr, report.json."""
+
+    kind: Literal["join"]
+    maps: Annotated[JobId, Role.INPUT, MAPS]
+    """The job that solved the maps."""
+    depth: Annotated[JobId, Role.INPUT, Spelling(argument=True, metavar="JOB")]
+    """The job that decoded the depth, by the same camera from the same place."""
+
+
 class ViewJob(JobRequest):
     """What a browser needs to show a capture and its maps: view.json, view.bin, thumbnails.jpg."""
 
@@ -128,7 +138,7 @@ class ViewJob(JobRequest):
     capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
     """The capture."""
     maps: Annotated[JobId | None, Role.INPUT, Spelling(metavar="JOB")] = None
-    """A solve, pipeline or depth job of the capture: its maps are shown too."""
+    """A solve, pipeline or depth job of the capture, or a join of such: its maps are shown too."""
     options: ViewOptions = ViewOptions()
 
 
@@ -295,9 +305,9 @@ class TofCalibrationJob(JobRequest):
     """Name of the relit.tof-sweep/1 file in the folder."""
 
 
-OneJob = (SolveJob | DepthJob | RelightJob | ShadeJob | ExportJob | ViewJob | PipelineJob | BasisJob | ScanJob | InspectBoardJob
-          | PatternsJob | MirrorBallJob | LightPositionsJob | GreyBallJob | IntensityJob | DarkJob | FlatFieldJob | SaturationJob
-          | ProcamJob | ResponseJob | TofCalibrationJob)
+OneJob = (SolveJob | DepthJob | JoinJob | RelightJob | ShadeJob | ExportJob | ViewJob | PipelineJob | BasisJob | ScanJob
+          | InspectBoardJob | PatternsJob | MirrorBallJob | LightPositionsJob | GreyBallJob | IntensityJob | DarkJob | FlatFieldJob
+          | SaturationJob | ProcamJob | ResponseJob | TofCalibrationJob)
 UserJob = Annotated[OneJob, Field(discriminator="kind")]
 """Every kind of job that the API accepts."""
 AnyJob = Annotated[CheckJob | OneJob, Field(discriminator="kind")]

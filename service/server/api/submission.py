@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import sqlalchemy as sa
 
 from service.requests.frame_range import frame_numbers
-from service.requests.jobs import CheckJob, ExportJob, InspectBoardJob, JobRequest, PipelineJob, RelightJob, ShadeJob, ViewJob
+from service.requests.jobs import CheckJob, ExportJob, InspectBoardJob, JobRequest, JoinJob, PipelineJob, RelightJob, ShadeJob, ViewJob
 from service.requests.relight import RelightOptions
 from service.server import telemetry
 from service.server.api.context import Service, require_quota
@@ -15,6 +15,8 @@ from service.server.database.keys import Caller
 from service.views import states
 
 QUEUE_RETRY_S = 30
+SOLVES = ("solve", "pipeline")
+"""Kinds of jobs that solve maps."""
 
 
 def submit(service: Service, caller: Caller, request: JobRequest, connection: sa.Connection, inputs: list[str]) -> str:
@@ -53,9 +55,13 @@ def inputs_of(service: Service, project: str, request: JobRequest) -> list[str]:
             _require_ready(service, project, field, identifier)
             read.append(identifier)
     if isinstance(request, RelightJob | ShadeJob | ExportJob | ViewJob) and request.maps is not None:
-        kinds = ("solve", "pipeline", *(("depth",) if isinstance(request, ExportJob | ViewJob) else ()))
+        kinds = (*SOLVES, "join", *(("depth",) if isinstance(request, ExportJob | ViewJob) else ()))
         _require_results(service, project, "maps", request.maps, kinds)
         read.append(request.maps)
+    if isinstance(request, JoinJob):
+        _require_results(service, project, "maps", request.maps, SOLVES)
+        _require_results(service, project, "depth", request.depth, ("depth",))
+        read += [request.maps, request.depth]
     if isinstance(request, InspectBoardJob) and request.golden is not None:
         _require_results(service, project, "golden", request.golden, (request.kind,))
         read.append(request.golden)

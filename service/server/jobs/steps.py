@@ -10,7 +10,18 @@ from service.reporting.progress import Progress
 from service.reporting.provenance import name_place
 from service.requests.frame_range import frame_numbers
 from service.requests.identifiers import CAPTURE
-from service.requests.jobs import CheckJob, DepthJob, ExportJob, InspectBoardJob, PipelineJob, RelightJob, ShadeJob, SolveJob, ViewJob
+from service.requests.jobs import (
+    CheckJob,
+    DepthJob,
+    ExportJob,
+    InspectBoardJob,
+    JoinJob,
+    PipelineJob,
+    RelightJob,
+    ShadeJob,
+    SolveJob,
+    ViewJob,
+)
 from service.server.database import intakes, quotas
 from service.server.jobs import calibrating, measuring
 from service.server.jobs.context import Job, WorkerContext
@@ -68,6 +79,8 @@ def _steps_of(job: Job, context: WorkerContext) -> list[JobStep]:
         return [_solve_step(job, request, context)]
     if isinstance(request, DepthJob):
         return [JobStep("depth", lambda progress: _depth(job, request, context, progress))]
+    if isinstance(request, JoinJob):
+        return [JobStep("join", lambda progress: _join(job, request, context, progress))]
     if isinstance(request, ShadeJob):
         return [JobStep("shade", lambda progress: _shade(job, request, context, progress))]
     if isinstance(request, ExportJob):
@@ -173,6 +186,14 @@ def _inspect_board(job: Job, request: InspectBoardJob, context: WorkerContext, p
         golden = _named(context.storage.local(layout.results(job.project, request.golden), {BOARD_FILE}, progress), request.golden)
     inspect_board(InspectBoardRequest(board=board, out=_out(job, context), golden=golden, device=context.device,
                                       cache=context.cache / request.capture, **dict(request.options)), progress)
+
+
+def _join(job: Job, request: JoinJob, context: WorkerContext, progress: Progress) -> None:
+    from service.joining.join import join
+    from service.requests.join import JoinRequest
+
+    join(JoinRequest(maps=job_maps(job, request.maps, context, progress), depth=job_maps(job, request.depth, context, progress),
+                     out=_out(job, context), device=context.device), progress)
 
 
 def _shade(job: Job, request: ShadeJob, context: WorkerContext, progress: Progress) -> None:

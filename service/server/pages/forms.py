@@ -23,6 +23,7 @@ from service.requests.jobs import (
     InspectBoardJob,
     IntensityJob,
     JobRequest,
+    JoinJob,
     LightPositionsJob,
     MirrorBallJob,
     PatternsJob,
@@ -47,14 +48,15 @@ CAPTURE_JOBS: dict[str, type[JobRequest]] = {
     "calibrate-response": ResponseJob, "calibrate-tof": TofCalibrationJob,
 }
 """Jobs that begin with a capture, by kind."""
-MAPS_JOBS: dict[str, type[JobRequest]] = {"export": ExportJob, "shade": ShadeJob}
+MAPS_JOBS: dict[str, type[JobRequest]] = {"export": ExportJob, "shade": ShadeJob, "join": JoinJob}
 """Jobs that begin with the maps of another job, by kind."""
 FREE_JOBS: dict[str, type[JobRequest]] = {"patterns": PatternsJob}
 """Jobs that read nothing, by kind."""
 TITLES = {"solve": "Solve normals and materials", "pipeline": "Solve, export and relight", "depth": "Decode depth",
           "scan": "Turn shots of a scanning laser into points",
           "inspect-board": "Inspect a board", "relight": "Relight frames", "basis": "Reduce to a few coefficient images",
-          "patterns": "Draw patterns to project", "export": "Export an asset", "shade": "Shade one picture",
+          "join": "Join with a depth of the same view", "patterns": "Draw patterns to project", "export": "Export an asset",
+          "shade": "Shade one picture",
           "calibrate-mirror-ball": "Calibrate light directions: one mirror ball",
           "calibrate-light-positions": "Calibrate light positions: two or more mirror balls",
           "calibrate-grey-ball": "Calibrate the brightness of lights: a grey ball",

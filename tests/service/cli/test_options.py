@@ -61,7 +61,7 @@ COMMANDS: dict[str, list[type[Options]]] = {
     "submit solve": [jobs.SolveJob], "submit depth": [jobs.DepthJob], "submit relight": [jobs.RelightJob], "submit shade": [jobs.ShadeJob],
     "submit export": [jobs.ExportJob], "submit view": [jobs.ViewJob], "submit pipeline": [jobs.PipelineJob],
     "submit basis": [jobs.BasisJob], "submit scan": [jobs.ScanJob], "submit patterns": [jobs.PatternsJob],
-    "submit inspect-board": [jobs.InspectBoardJob],
+    "submit inspect-board": [jobs.InspectBoardJob], "submit join": [jobs.JoinJob],
     "submit calibrate-mirror-ball": [jobs.MirrorBallJob], "submit calibrate-light-positions": [jobs.LightPositionsJob],
     "submit calibrate-grey-ball": [jobs.GreyBallJob], "submit calibrate-intensity": [jobs.IntensityJob],
     "submit calibrate-dark": [jobs.DarkJob], "submit calibrate-flat-field": [jobs.FlatFieldJob],

@@ -4,19 +4,11 @@ import { attempt, listing, read, resultsOf, send } from "./api.js";
 import { byId, bytes, element, tell } from "./element.js";
 import { loadEnvironment, readyEnvironments } from "./environments.js";
 import { canRender } from "./view/basis_renderer.js";
-import { findView } from "./view_jobs.js";
+import { captureOf, findView } from "./view_jobs.js";
 
 const identifier = byId("main").dataset.identifier;
 const SHOWN = /(^|\/)asset\.(usdz|glb)$/;
 const LARGE = 100e6; // bytes, which are asked about before they are loaded
-
-/** Return the capture that a job comes from; null where none is known. */
-async function captureOf(job) {
-  for (let at = job; ; at = await read(`/v1/jobs/${at.request.maps}`)) {
-    if (at.request.capture !== undefined) return at.request.capture;
-    if (at.request.maps === undefined) return null;
-  }
-}
 
 /** Return view.json of the capture that a job comes from; null: no view of it is prepared. */
 async function rigOf(job) {

@@ -5,13 +5,13 @@ import { byId, element } from "./element.js";
 import { mount as mountMaps } from "./view/map_viewer.js";
 import { mount as mountPlot } from "./view/pixel_plot.js";
 import { ViewFile } from "./view/view_file.js";
-import { openView } from "./view_jobs.js";
+import { captureOf, openView } from "./view_jobs.js";
 
 const identifier = byId("main").dataset.identifier;
 
 await attempt(async () => {
   const job = await read(`/v1/jobs/${identifier}`);
-  const { files } = await openView(job.request.capture, identifier);
+  const { files } = await openView(await captureOf(job), identifier);
   const view = await ViewFile.open(files);
   byId("name").textContent = `Maps of ${view.info.name}`;
   document.title = `Maps of ${view.info.name} · Relit`;

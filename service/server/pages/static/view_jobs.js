@@ -16,6 +16,14 @@ export async function findView(wanted) {
   return null;
 }
 
+/** Return the capture that a job comes from, by its maps if it names none; null where none is known. */
+export async function captureOf(job) {
+  for (let at = job; ; at = await read(`/v1/jobs/${at.request.maps}`)) {
+    if (at.request.capture !== undefined) return at.request.capture;
+    if (at.request.maps === undefined) return null;
+  }
+}
+
 /**
  * Return the files of a view, which is prepared first if it is not yet; the page shows how far that is.
  * @param {string} capture Identifier.

@@ -16,6 +16,7 @@ REQUIRED = {
     "calibrate-dark": {"capture": CAPTURE, "images": ["0.exr"]}, "calibrate-flat-field": {"capture": CAPTURE, "images": ["0.exr"]},
     "calibrate-response": {"capture": CAPTURE, "images": ["0.exr", "1.exr", "2.exr"]},
     "calibrate-procam": {"captures": [CAPTURE], "options": {"board": "9x6", "square_m": 0.025}},
+    "join": {"maps": JOB, "depth": JOB},
     "patterns": {"options": {"code": "gray", "projector": "64x32"}},
 }
 """What a job must have beside a capture, where it must."""
