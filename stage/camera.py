@@ -112,6 +112,22 @@ class Camera(Strict):
         """
         return self.plane_at(*pixel_centres(self.width, self.height))
 
+    def plane_views(self, first_row: int = 0, rows: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return `plane_coordinates` of some rows of the image that cannot be written to.
+
+        Without distortion they are views of one row and of one column, and take no memory.
+
+        Args:
+            first_row: the first of the rows.
+            rows: their number; None: all from the first on.
+        """
+        count = self.height - first_row if rows is None else rows
+        u, v = np.arange(self.width) + 0.5, np.arange(first_row, first_row + count) + 0.5
+        if self.distortion is not None:
+            return self.plane_at(*np.meshgrid(u, v))
+        x, y = self.plane_at(u, v)
+        return np.broadcast_to(x, (count, self.width)), np.broadcast_to(y[:, None], (count, self.width))
+
     @property
     def principal_point(self) -> tuple[float, float]:
         """Image coordinates of the principal point, pixels: `principal_px`, or the centre of the image where it is not given."""
@@ -149,16 +165,17 @@ class Camera(Strict):
             x, down = self.distortion.apply(x, down)
         return cu + self.focal_px[0] * x, cv + self.focal_px[1] * down
 
-    def points(self, height: np.ndarray) -> np.ndarray:
+    def points(self, height: np.ndarray, first_row: int = 0) -> np.ndarray:
         """Return the camera-frame points of a height map.
 
         Args:
-            height: [rows, cols] camera-frame z, negative in front of a perspective camera.
+            height: [rows, cols] camera-frame z, negative in front of a perspective camera, of the whole image or of some of its rows.
+            first_row: the first of these rows.
 
         Returns:
             [rows, cols, 3] float32, in the unit of `height`.
         """
-        return self._raised(*self.plane_coordinates(), height)
+        return self._raised(*self.plane_views(first_row, len(height)), height)
 
     def points_at(self, pixels: np.ndarray, height: np.ndarray) -> np.ndarray:
         """Return the camera-frame points of single pixels, as `points` does.
@@ -176,4 +193,7 @@ class Camera(Strict):
     def _raised(self, x: np.ndarray, y: np.ndarray, height: np.ndarray) -> np.ndarray:
         if self.projection == "perspective":
             x, y = -x * height, -y * height
-        return np.stack([x, y, height], axis=-1).astype(np.float32)
+        points = np.empty((*height.shape, 3), dtype=np.float32)
+        for axis, values in enumerate((x, y, height)):
+            points[..., axis] = values
+        return points

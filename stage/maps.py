@@ -89,10 +89,9 @@ class SurfaceMaps:
         channels: dict[str, np.ndarray] = {}
         for name, values in self.layers().items():
             suffixes, dtype = LAYERS[name]
-            known = values if name == "status" else np.where(kept if values.ndim == 2 else kept[..., None], values, 0)
-            masked = known.astype(dtype)
-            for c, suffix in enumerate(suffixes):
-                channels[f"{name}.{suffix}"] = masked if masked.ndim == 2 else masked[..., c]
+            for plane, suffix in zip([values] if values.ndim == 2 else np.moveaxis(values, -1, 0), suffixes, strict=True):
+                stored = channels[f"{name}.{suffix}"] = np.zeros(plane.shape, dtype)
+                np.copyto(stored, plane, where=True if name == "status" else kept, casting="same_kind")
         exr.write(path, channels, color_space=self.color_space, metadata=result_metadata(self.camera, self.provenance))
 
     @classmethod

@@ -127,12 +127,20 @@ def _turn(first: int,
 class Solver:
     """Conjugate gradients on one grid, with their scratch memory and multigrid hierarchy.
 
-    Memory: five arrays of the grid beyond slopes and heights, and five thirds for the coarse levels.
+    Memory: four arrays of the grid beyond slopes and heights, two where the slopes may be overwritten, and four thirds for the coarse
+    levels.
+
+    Args:
+        grid: the layout.
+        slopes: of all edges, and their weights.
+        max_iterations: of `solve`.
+        overwrite: whether the slopes may be overwritten, though not their weights: only the first residual needs them.
     """
 
-    def __init__(self, grid: Grid, slopes: Slopes, *, max_iterations: int):
+    def __init__(self, grid: Grid, slopes: Slopes, *, max_iterations: int, overwrite: bool = False):
         self.grid, self.slopes, self.max_iterations = grid, slopes, max_iterations
-        self.residual, self.z, self.p, self.q = (grid.zeros() for _ in range(4))
+        self.residual, self.z = grid.zeros(), grid.zeros()
+        self.p, self.q = (slopes.right, slopes.down) if overwrite else (grid.zeros(), grid.zeros())
         self.multigrid = Multigrid(grid, slopes.weights, target=self.residual, value=self.z, scratch=self.q)
         self.summer = Summer(grid)
         self.rz = wp.zeros(max_iterations + 1, dtype=wp.float64, device=grid.device)

@@ -13,16 +13,16 @@ Source: slopes that add up to nothing are the integrability of Frankot and Chell
 shading algorithms", TPAMI 1988; weighing edges by it is ours.
 """
 
-from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
 from kernels.surface.conjugate import Convergence
-from kernels.surface.fragments import Fragments, cut
+from kernels.surface.fragments import CELLS_AT_ONCE, Fragments, cut
 from kernels.surface.grid import EdgeWeights, Grid, Walk, end_cell, first_cell, run
+from kernels.surface.normal_map import NormalMap
 from kernels.surface.parts import assemble, connect
 from kernels.surface.slopes import Slopes
 
@@ -40,6 +40,13 @@ MAD_TO_SIGMA = 1.4826
 """Ratio of the standard deviation of Gaussian values to the median of their magnitudes."""
 
 _TRUST = wp.constant(wp.float32(LEAST_TRUST))
+
+
+class Solve(Protocol):
+    """Integrates slopes."""
+
+    def __call__(self, slopes: Slopes, h: wp.array, *, last: bool) -> Convergence:
+        """Improve the heights h [size] of slopes, which may be overwritten if this is the `last` time."""
 
 
 class Breaks(NamedTuple):
@@ -137,36 +144,32 @@ def distrust_loops(slopes: Slopes, *, noise: float, grid: Grid) -> Slopes:
     return lowered
 
 
-def find_breaks(slopes: Slopes, normal: wp.array, x: wp.array, y: wp.array, *, grid: Grid, perspective: bool, spacing: float) -> Breaks:
+def find_breaks(slopes: Slopes, surface: NormalMap, *, grid: Grid, spacing: float) -> Breaks:
     """Cut a surface where its normals turn abruptly or contradict each other.
 
     Args:
         slopes: of all pairs of neighbours.
-        normal: [3, rows, cols] float32, camera frame.
-        x: [rows, cols] float32, right, in the plane of the projection.
-        y: [rows, cols] float32, up.
+        surface: the normals.
         grid: the layout of the slopes.
-        perspective: whether the slopes are those of -log depth.
         spacing: distance of neighbouring pixels in the plane of x and y.
 
     Convention:
-        Reads slopes, weights and normals back to the host.
+        Reads slopes and weights back to the host.
     """
     noise = loop_noise(slopes, grid=grid)
     lowered = distrust_loops(slopes, noise=noise, grid=grid)
     whole, left = ((w.right.numpy(), w.down.numpy()) for w in (slopes.weights, lowered.weights))
-    slope = slopes.right.numpy(), slopes.down.numpy()
-    found = cut(normal.numpy(), (x.numpy(), y.numpy()), slope, whole, left, grid=grid, perspective=perspective, spacing=spacing)
+    found = cut(surface, (slopes.right.numpy(), slopes.down.numpy()), whole, left, grid=grid, spacing=spacing)
     return Breaks(lowered, noise, found, np.where(found.way == 1, left[1][found.first], left[0][found.first]))
 
 
-def integrate_broken(breaks: Breaks, *, grid: Grid, solve: Callable[[Slopes, wp.array], Convergence]) -> Broken:
+def integrate_broken(breaks: Breaks, *, grid: Grid, solve: Solve) -> Broken:
     """Integrate slopes, with breaks where the normals say so.
 
     Args:
         breaks: of find_breaks.
         grid: the layout of the slopes.
-        solve: integrates slopes, improving the heights that it is given.
+        solve: integrates slopes, improving the heights that it is given; the last time it may overwrite the slopes.
 
     Convention:
         Reads heights back to the host where the normals turn abruptly anywhere.
@@ -174,17 +177,19 @@ def integrate_broken(breaks: Breaks, *, grid: Grid, solve: Callable[[Slopes, wp.
     lowered, noise, found, kept = breaks
     height = grid.zeros()
     if not len(found.first):
-        return Broken(height, found.label, solve(lowered, height))
+        return Broken(height, found.label, solve(lowered, height, last=True))
     edges = (found.way, found.first)
     _set(lowered.weights, edges, np.where(found.turned, 0.0, kept))
-    solve(lowered, height)
+    solve(lowered, height, last=False)
     parts = connect(found, height.numpy(), noise=noise)
     _set(lowered.weights, edges, np.where(parts.between, 0.0, kept))
     height.zero_()  # the tolerance is relative to the first residual
-    convergence = solve(lowered, height)
+    convergence = solve(lowered, height, last=True)
     heights = height.numpy()
     added = np.append(assemble(found, parts, heights), 0.0).astype(np.float32)  # 0 for the label -1
-    heights += added[parts.label]
+    for first in range(0, len(heights), CELLS_AT_ONCE):
+        cells = slice(first, first + CELLS_AT_ONCE)
+        heights[cells] += added[parts.label[cells]]
     height.assign(heights)
     return Broken(height, parts.label, convergence)
 

@@ -4,14 +4,16 @@ Where one part hides another the normals turn abruptly, as they do at a crease: 
 the surface is a few small numbers, since images have tens of millions of pixels.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from kernels.surface.components import join
 from kernels.surface.grid import Grid
-from kernels.surface.slopes import STEEPEST
+from kernels.surface.normal_map import NormalMap, PixelNormals
+from kernels.surface.slopes import STEEPEST, pair_turns
 
 LEAST_TURN = np.radians(8.0)
 """Least angle between the normals of two neighbours that may be a break."""
@@ -29,8 +31,11 @@ LEAST_PART = 48
 EDGE_ON = 0.4
 """Cosine between normal and line of sight below which a surface is seen edge on, and does not tell whether it touches its neighbour: an
 outline where a smooth surface turns away from the viewer is one of a part. It is taken a pixel beyond the last pixel centre."""
-CELLS_AT_ONCE = 1 << 22
+CELLS_AT_ONCE = 1 << 20
 """Cells whose indices and intermediate values are held at one time: they bound the memory."""
+
+TURNS = 1 << 22
+"""Number of edges of each direction, spread over the surface, from which the usual angle is estimated."""
 
 Planes = Sequence[np.ndarray]
 """Two or three arrays of one shape."""
@@ -52,85 +57,106 @@ class Fragments(NamedTuple):
     edge_on: np.ndarray  # [E] bool, whether one of the two sides is seen edge on where it ends
 
 
-def cut(normal: np.ndarray, ray: Planes, slope: Planes, weight: Planes, left: Planes, *, grid: Grid, perspective: bool,
-        spacing: float) -> Fragments:
+def cut(surface: NormalMap, slope: Planes, weight: Planes, left: Planes, *, grid: Grid, spacing: float) -> Fragments:
     """Cut a surface wherever its normals turn abruptly or contradict each other around a loop.
 
     Args:
-        normal: [3, rows, cols] camera frame.
-        ray: x and y of the pixels in the plane of projection, each [rows, cols].
+        surface: the normals.
         slope: of the edges to the right and of those down, each [size], in units of the spacing.
         weight: of these edges before loops are looked at; 0 is no edge.
         left: weights that the loops leave.
         grid: the layout of slope, weight and left.
-        perspective: whether slopes are those of -log depth.
         spacing: distance of neighbouring pixels in the plane of x and y.
     """
-    n = _unit_cells(normal, grid)
     there = np.stack([plane > 0 for plane in weight])
-    turn = [_turn(n, step) for step in (1, grid.pitch)]
-    usual = float(np.median(np.concatenate([angle[edges] for angle, edges in zip(turn, there, strict=True)]), overwrite_input=True)) \
-        if there.any() else 0.0
-    turned = np.stack([edges & (angle > max(LEAST_TURN, TURN_OF_MEDIAN * usual)) for angle, edges in zip(turn, there, strict=True)])
-    for way, step in enumerate((1, grid.pitch)):
-        abrupt = np.flatnonzero(turned[way])
-        turned[way, abrupt[_rounded(n, there[way], abrupt, way, step)]] = False
-    del n, turn  # what follows needs them along the cut alone
-    lost = turned.copy()
-    if turned.any():
-        for edges, held, whole, kept in zip(lost, there, weight, left, strict=True):
-            edges |= held & (kept < LEAST_TRUST * whole)
     usable = there[0] | there[1]
     usable[1:] |= there[0, :-1]
     usable[grid.pitch :] |= there[1, : -grid.pitch]
-    label, count = _part_at_necks(*label_cells(usable, there & ~lost, grid.pitch), there & ~lost, lost, grid.pitch)
-    for way, step in enumerate((1, grid.pitch)):
-        lost[way, :-step] |= there[way, :-step] & (label[:-step] != label[step:])
+    turned = _turned(surface, there, grid)
+    lost = turned.copy()
+    if turned.any():
+        for edges, held, whole, kept in zip(lost, there, weight, left, strict=True):
+            for cells in _pieces(len(held)):
+                edges[cells] |= held[cells] & (kept[cells] < LEAST_TRUST * whole[cells])
+    there &= ~lost
+    label, count = label_cells(usable, there, grid.pitch)
+    del usable
+    if lost.any():  # nothing else makes necks
+        label, count = _part_at_necks(label, count, there, lost, grid.pitch)
+        for way, step in enumerate((1, grid.pitch)):
+            lost[way, :-step] |= there[way, :-step] & (label[:-step] != label[step:])
+    del there
     way, first = np.nonzero(lost)
+    del lost
     second = first + np.where(way == 1, grid.pitch, 1)
-    step = (_at(ray, second, grid) - _at(ray, first, grid)) / spacing
-    sides = _unit_at(normal, first, grid), _unit_at(normal, second, grid)
-
-    def facing(cell: np.ndarray) -> np.ndarray:
-        (x, y), n = _at(ray, cell, grid), _unit_at(normal, cell, grid)
-        return n[2] - (n[0] * x + n[1] * y) * perspective
-
-    alone = [-(side[:2] * step).sum(axis=0) / np.maximum(facing(cell), STEEPEST) for side, cell in zip(sides, (first, second), strict=True)]
+    (sides, rays), ends = zip(*(_at(surface, cell, grid) for cell in (first, second)), strict=True), []
+    step = (rays[1] - rays[0]) / spacing
     inward = np.where(way == 1, grid.pitch, 1)
-    ends = np.minimum(*(_squared_end(facing(cell), facing(inner), label[inner] == label[cell])
-                        for cell, inner in ((first, first - inward), (second, second + inward))))
+    for side, ray, cell, inner in zip(sides, rays, (first, second), (first - inward, second + inward), strict=True):
+        ends.append(_squared_end(_facing(side, ray, surface), _facing(*_at(surface, inner, grid), surface), label[inner] == label[cell]))
+    alone = [-(side[:2] * step).sum(axis=0) / np.maximum(_facing(side, ray, surface), STEEPEST)
+             for side, ray in zip(sides, rays, strict=True)]
 
     def of_edges(planes: Planes) -> np.ndarray:
         return np.where(way == 1, planes[1][first], planes[0][first])
 
     return Fragments(label, count, first, second, way, of_edges(slope), of_edges(weight),
                      np.arccos(np.clip((sides[0] * sides[1]).sum(axis=0), -1.0, 1.0)), turned[way, first],
-                     np.abs(alone[0] - alone[1]), ends < EDGE_ON**2)
+                     np.abs(alone[0] - alone[1]), np.minimum(*ends) < EDGE_ON**2)
 
 
-def _turn(n: np.ndarray, step: int) -> np.ndarray:
-    """Return [size] float32 the angle between the normals of each cell and the cell `step` later; 0 for the last ones."""
-    out = np.zeros(n.shape[1], dtype=np.float32)
-    inside = out[:-step]
-    inside += n[0, :-step] * n[0, step:]
-    for plane in n[1:]:
-        inside += plane[:-step] * plane[step:]
-    np.arccos(np.clip(inside, -1.0, 1.0, out=inside), out=inside)
-    return out
+def _pieces(count: int) -> Iterator[slice]:
+    """Cut cells into pieces that are worked on at one time."""
+    return (slice(first, first + CELLS_AT_ONCE) for first in range(0, count, CELLS_AT_ONCE))
 
 
-def _rounded(n: np.ndarray, there: np.ndarray, edge: np.ndarray, way: int, step: int) -> np.ndarray:
+def _turned(surface: NormalMap, there: np.ndarray, grid: Grid) -> np.ndarray:
+    """Return [2, size] bool, the edges at which the normals turn abruptly, and not as a thin round rod does.
+
+    Args:
+        surface: the normals.
+        there: [2, size] bool, the edges.
+        grid: the layout of the edges.
+    """
+    turn = [angle.numpy() for angle in pair_turns(surface, grid=grid)]
+    stride = max(1, grid.size // TURNS)
+    while math.gcd(stride, grid.pitch) > 1:  # else a few columns alone would tell
+        stride += 1
+    some = slice(None, None, stride)
+    angles = np.concatenate([angle[some][edges[some]] for angle, edges in zip(turn, there, strict=True)]).astype(np.float32)
+    least = max(LEAST_TURN, TURN_OF_MEDIAN * float(np.median(angles, overwrite_input=True))) if len(angles) else LEAST_TURN
+    turned = np.stack([edges & (angle > least) for angle, edges in zip(turn, there, strict=True)])
+    del turn
+    for way, step in enumerate((1, grid.pitch)):
+        abrupt = np.flatnonzero(turned[way])
+        for piece in _pieces(len(abrupt)):
+            cells = abrupt[piece]
+            turned[way, cells[_rounded(surface, there[way], cells, way, step, grid)]] = False
+    return turned
+
+
+def _rounded(surface: NormalMap, there: np.ndarray, edge: np.ndarray, way: int, step: int, grid: Grid) -> np.ndarray:
     """Return which of the edges, [E] cells, turn outwards as steadily as their neighbours in line: there a thin rod or ring is round."""
     def change(at: np.ndarray) -> np.ndarray:
-        held = (at >= 0) & (at < n.shape[1] - step)
+        held = (at >= 0) & (at < len(there) - step)
         cell = np.where(held, at, 0)
-        return np.where(held & there[cell], n[:, cell + step] - n[:, cell], 0)
+        return np.where(held & there[cell], _at(surface, cell + step, grid)[0] - _at(surface, cell, grid)[0], 0)
 
     here = change(edge)
     least = STEADY * (here**2).sum(axis=0)
     two_before, before, after, two_after = ((here * change(edge + k * step)).sum(axis=0) > least for k in (-REACH, -1, 1, REACH))
     outwards = here[0] > 0 if way == 0 else here[1] < 0
     return outwards & ((before & two_before) | (before & after) | (after & two_after))
+
+
+def _at(surface: NormalMap, cell: np.ndarray, grid: Grid) -> PixelNormals:
+    """Return the normals at some cells of a grid; 0 in its padding."""
+    return surface.at(cell // grid.pitch - 1, cell % grid.pitch - 1)
+
+
+def _facing(normal: np.ndarray, ray: np.ndarray, surface: NormalMap) -> np.ndarray:
+    """Return [n] the component of normals [3, n] along the lines of sight of their pixels, of which the third is 1."""
+    return normal[2] - (normal[0] * ray[0] + normal[1] * ray[1]) * surface.perspective
 
 
 def _squared_end(facing: np.ndarray, facing_inner: np.ndarray, alike: np.ndarray) -> np.ndarray:
@@ -146,7 +172,7 @@ def _squared_end(facing: np.ndarray, facing_inner: np.ndarray, alike: np.ndarray
 
 
 def _part_at_necks(label: np.ndarray, count: int, open_edges: np.ndarray, lost: np.ndarray, pitch: int) -> tuple[np.ndarray, int]:
-    """Return the fragments, [size] int with -1 outside, parted where only a neck of few pixels connects them, and their number.
+    """Return the fragments, [size] int32 with -1 outside, parted where only a neck of few pixels connects them, and their number.
 
     What is left without the pixels beside lost edges falls apart at necks. Pieces of at least LEAST_PART pixels grow back until they meet.
     """
@@ -165,13 +191,24 @@ def _part_at_necks(label: np.ndarray, count: int, open_edges: np.ndarray, lost: 
     within = open_edges & inner
     within[0, :-1] &= inner[1:]
     within[1, :-pitch] &= inner[pitch:]
-    core, cores = label_cells(inner, within, pitch)
-    large = np.bincount(core[core >= 0], minlength=cores) >= LEAST_PART
-    seed = np.where((core >= 0) & large[np.maximum(core, 0)], core + count, -1) if cores else core
-    seeded = np.zeros(count, dtype=bool)
-    seeded[label[seed >= 0]] = True
-    grown = np.where((label >= 0) & ~seeded[np.maximum(label, 0)], label, seed)
-    front = np.flatnonzero(seed >= 0)
+    grown, cores = label_cells(inner, within, pitch)
+    del near, inner, within
+    large = np.flatnonzero(sizes_of(grown, cores) >= LEAST_PART)
+    kept = np.full(cores + 1, -1, dtype=np.int32)  # the last is for the label -1
+    kept[large] = count + np.arange(len(large))
+    relabel(grown, kept)
+    seeded = np.zeros(count + 1, dtype=bool)
+    for cells in _pieces(len(label)):
+        seeded[label[cells][grown[cells] >= 0]] = True
+    alone = np.where(seeded, -1, np.arange(count + 1)).astype(np.int32)
+    alone[count] = -1
+    bare = []
+    for cells in _pieces(len(label)):
+        np.maximum(grown[cells], alone[label[cells]], out=grown[cells])
+        bare.append(cells.start + np.flatnonzero((label[cells] >= 0) & (grown[cells] < 0)))
+    bare = np.concatenate(bare)
+    front = np.unique(np.concatenate([bare + step for step in (1, -1, pitch, -pitch)]))
+    front = front[grown[front] >= count]
     while len(front):
         reached = []
         for step, ways, back in ((1, 0, 0), (pitch, 1, 0), (1, 0, 1), (pitch, 1, 1)):
@@ -180,10 +217,20 @@ def _part_at_necks(label: np.ndarray, count: int, open_edges: np.ndarray, lost: 
             grown[into[passed]] = grown[front[passed]]
             reached.append(into[passed])
         front = np.unique(np.concatenate(reached))
-    kept, number = np.unique(grown[grown >= 0], return_inverse=True)
-    out = np.full(label.shape, -1, dtype=np.int32)
-    out[grown >= 0] = number
-    return out, len(kept)
+    found = sizes_of(grown, count + len(large)) > 0
+    relabel(grown, np.append(np.cumsum(found, dtype=np.int32) - 1, np.int32(-1)))
+    return grown, int(found.sum())
+
+
+def sizes_of(label: np.ndarray, count: int) -> np.ndarray:
+    """Return [count] the number of cells of each label; a label of -1 is none."""
+    return np.sum([np.bincount(label[cells] + 1, minlength=count + 1) for cells in _pieces(len(label))], axis=0)[1:]
+
+
+def relabel(label: np.ndarray, number: np.ndarray) -> None:
+    """Replace each label by its number in place; the last number is that of the label -1."""
+    for cells in _pieces(len(label)):
+        label[cells] = number[label[cells]]
 
 
 def label_cells(usable: np.ndarray, open_edges: np.ndarray, pitch: int) -> tuple[np.ndarray, int]:
@@ -200,38 +247,12 @@ def label_cells(usable: np.ndarray, open_edges: np.ndarray, pitch: int) -> tuple
     run -= 1
     count = int(run[-1]) + 1 if len(run) else 0
     pairs = np.zeros(0, dtype=np.int64)
-    for first in range(0, len(run), CELLS_AT_ONCE):
-        upper = first + np.flatnonzero(open_edges[1, first : first + CELLS_AT_ONCE])
+    for cells in _pieces(len(run)):
+        upper = cells.start + np.flatnonzero(open_edges[1, cells])
         pairs = np.union1d(pairs, run[upper].astype(np.int64) * max(count, 1) + run[upper + pitch])
     kept, of_run = np.unique(join(count, pairs // max(count, 1), pairs % max(count, 1)), return_inverse=True)
     if count == 0:
         return np.full(len(usable), -1, dtype=np.int32), 0
-    label = of_run.astype(np.int32)[np.maximum(run, 0, out=run)]
-    label[~usable] = -1
-    return label, len(kept)
-
-
-def _unit_cells(normal: np.ndarray, grid: Grid) -> np.ndarray:
-    """Return [3, size] float32 unit normals in the flat layout of a grid, 0 outside."""
-    out = np.zeros((3, grid.rows + 3, grid.pitch), dtype=np.float32)
-    for plane, values in zip(out, normal, strict=True):
-        plane[1 : grid.rows + 1, 1 : grid.cols + 1] = np.nan_to_num(values)
-    out = out.reshape(3, -1)
-    for first in range(0, out.shape[1], CELLS_AT_ONCE):
-        cells = out[:, first : first + CELLS_AT_ONCE]
-        cells /= np.maximum(np.linalg.norm(cells, axis=0), 1e-9)
-    return out
-
-
-def _unit_at(normal: np.ndarray, cell: np.ndarray, grid: Grid) -> np.ndarray:
-    """Return [3, n] float32 unit normals at some cells of a grid; 0 in its padding."""
-    n = _at(normal, cell, grid)
-    return n / np.maximum(np.linalg.norm(n, axis=0), 1e-9)
-
-
-def _at(planes: Planes | np.ndarray, cell: np.ndarray, grid: Grid) -> np.ndarray:
-    """Return [k, n] float32 planes [rows, cols] at some cells of a grid; 0 in its padding."""
-    row, col = cell // grid.pitch - 1, cell % grid.pitch - 1
-    inside = (row >= 0) & (row < grid.rows) & (col >= 0) & (col < grid.cols)
-    row, col = np.where(inside, row, 0), np.where(inside, col, 0)
-    return np.stack([np.where(inside, np.nan_to_num(plane[row, col]), 0) for plane in planes]).astype(np.float32)
+    relabel(run, np.append(of_run, 0).astype(np.int32))  # cells before the first run are not usable
+    run[~usable] = -1
+    return run, len(kept)

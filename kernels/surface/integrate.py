@@ -12,8 +12,8 @@ from kernels.surface.components import label_runs, place
 from kernels.surface.conjugate import Convergence, Solver
 from kernels.surface.discontinuities import find_breaks, integrate_broken
 from kernels.surface.grid import EdgeWeights, Grid, make_grid
-from kernels.surface.slopes import Slopes, pair_slopes, usable_pixels
-from kernels.surface.support import supported_normals
+from kernels.surface.normal_map import NormalMap
+from kernels.surface.slopes import Slopes, pair_slopes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,12 +44,12 @@ class Integration(NamedTuple):
 def integrate_normals(
     normal: np.ndarray | wp.array,  # [3, rows, cols] float32, camera frame
     mask: np.ndarray | wp.array,  # [rows, cols] bool or uint8
-    x: np.ndarray | wp.array,  # [rows, cols] float32, right
-    y: np.ndarray | wp.array,  # [rows, cols] float32, up
+    x: np.ndarray | wp.array,  # [rows, cols] float32 or float64, right
+    y: np.ndarray | wp.array,  # [rows, cols] float32 or float64, up
     *,
     perspective: bool,
     mean_z: float,
-    sigma: np.ndarray | wp.array | None = None,  # [rows, cols] float32, radians
+    sigma: np.ndarray | wp.array | None = None,  # [rows, cols] float16 or float32, degrees
     cuts: tuple[np.ndarray, np.ndarray] | None = None,  # [rows, cols] bool each
     options: IntegrationOptions | None = None,
     device: str,
@@ -82,40 +82,38 @@ def integrate_normals(
 
     Convention:
         Waits for the device: the mask of usable pixels and one number per mask run are read back, and the residual
-        every few iterations. Needs eleven float32 per pixel beyond the inputs (15 with discontinuities,
-        and before them nine on the host).
+        every few iterations. The inputs are read on the host, a band of rows at a time; arrays on a device are read back, and x and y
+        may be views of one row and one column. Needs nine float32 per pixel beyond the inputs, and twelve where the surface breaks, of
+        which one is on the host.
     """
     options = options or IntegrationOptions()
     _check(normal, mask, x, y, sigma, perspective=perspective, mean_z=mean_z)
+    normal, mask, x, y = (_on_host(a) for a in (normal, mask, x, y))
     whole, box = mask.shape, _box(mask)
-    normal, mask, x, y = normal[:, *box], mask[box], x[box], y[box]
-    sigma = None if sigma is None else sigma[box]
-    rows, cols = mask.shape
+    x, y = x[box], y[box]
+    rows, cols = x.shape
     grid = make_grid(rows, cols, device)
     spacing = _spacing(x, y)
-    inputs = [_upload(a, wp.float32, device) for a in (normal, x, y)]
-    usable = usable_pixels(inputs[0], _upload(mask, wp.uint8, device), *inputs[1:], device=device)
-    if sigma is None:
-        trust = wp.ones((rows, cols), dtype=wp.float32, device=device)
-    else:
-        inputs[0], trust = supported_normals(inputs[0], _upload(sigma, wp.float32, device), *inputs[1:], perspective=perspective,
-                                             device=device)
-    slopes = pair_slopes(inputs[0], usable, *inputs[1:], trust, grid=grid, perspective=perspective, spacing=spacing)
+    surface = NormalMap(normal[:, *box], mask[box], x, y, None if sigma is None else _on_host(sigma)[box], perspective=perspective,
+                        device=device)
+    slopes, usable = pair_slopes(surface, grid=grid, spacing=spacing)
     if cuts is not None:
         cut_edges(slopes.weights, tuple(cut[box] for cut in cuts), grid=grid)
-    runs = label_runs(usable.numpy())
+    runs = label_runs(usable)
+    del usable
 
-    def improve(slopes: Slopes, h: wp.array) -> Convergence:
-        return Solver(grid, slopes, max_iterations=options.max_iterations).solve(h, tolerance=options.tolerance, progress=progress)
+    def improve(slopes: Slopes, h: wp.array, *, last: bool) -> Convergence:
+        solver = Solver(grid, slopes, max_iterations=options.max_iterations, overwrite=last)
+        return solver.solve(h, tolerance=options.tolerance, progress=progress)
 
     if options.discontinuities:
-        breaks = find_breaks(slopes, *inputs, grid=grid, perspective=perspective, spacing=spacing)
-        del inputs, normal, trust, usable, slopes  # the solver needs the memory
+        breaks = find_breaks(slopes, surface, grid=grid, spacing=spacing)
+        del slopes, surface, x, y  # the solver needs the memory
         h, part, done = integrate_broken(breaks, grid=grid, solve=improve)
         del breaks
     else:
         h, part = grid.zeros(), None
-        done = improve(slopes, h)
+        done = improve(slopes, h, last=True)
     height = place(h, runs, grid=grid, perspective=perspective, spacing=spacing, mean_z=mean_z)
     if part is not None:
         part = part.reshape(-1, grid.pitch)[1 : rows + 1, 1 : cols + 1]
@@ -144,10 +142,13 @@ def cut_edges(weights: EdgeWeights, cuts: Iterable[np.ndarray], *, grid: Grid) -
         plane.assign(kept)
 
 
-def _box(mask: np.ndarray | wp.array) -> tuple[slice, slice]:
+def _on_host(a: np.ndarray | wp.array) -> np.ndarray:
+    return a if isinstance(a, np.ndarray) else a.numpy()
+
+
+def _box(mask: np.ndarray) -> tuple[slice, slice]:
     """Return the rows and columns between the first and the last pixel of a mask."""
-    host = mask if isinstance(mask, np.ndarray) else mask.numpy()
-    rows, cols = (np.flatnonzero(host.any(axis=axis)) for axis in (1, 0))
+    rows, cols = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
     return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(cols[0]), int(cols[-1]) + 1)
 
 
@@ -170,25 +171,11 @@ def _check(normal: Any, mask: Any, x: Any, y: Any, sigma: Any, *, perspective: b
         raise ArrayError("mask is empty: mark the pixels that show the surface")
 
 
-def _spacing(x: np.ndarray | wp.array, y: np.ndarray | wp.array) -> float:
+def _spacing(x: np.ndarray, y: np.ndarray) -> float:
     """Return the mean distance between neighbours along the middle row (or column, where the picture is one pixel wide)."""
     rows, cols = x.shape
-
-    def line(a: np.ndarray | wp.array) -> np.ndarray:
-        middle = a[rows // 2] if cols > 1 else a[:, 0]
-        return np.asarray(middle if isinstance(middle, np.ndarray) else middle.contiguous().numpy(), dtype=np.float64)
-
-    step = np.hypot(np.diff(line(x)), np.diff(line(y)))
+    line = [(a[rows // 2] if cols > 1 else a[:, 0]).astype(np.float32).astype(np.float64) for a in (x, y)]
+    step = np.hypot(*(np.diff(values) for values in line))
     step = step[np.isfinite(step)]
     mean = float(step.mean()) if step.size else 0.0
     return mean if mean > 0.0 else 1.0
-
-
-def _upload(a: np.ndarray | wp.array, dtype: type, device: str) -> wp.array:
-    """Return the array on the device, without a copy where it is there already."""
-    if isinstance(a, np.ndarray):
-        kind = np.uint8 if dtype is wp.uint8 else np.float32
-        flat = np.ascontiguousarray((a != 0).view(np.uint8) if kind is np.uint8 else a, dtype=kind)
-        return wp.array(flat, dtype=dtype, device=device, copy=False)
-    moved = a.contiguous().to(device)
-    return moved.view(dtype) if moved.dtype is wp.bool and dtype is wp.uint8 else moved

@@ -67,7 +67,7 @@ def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray,
     cuts = find_steps(u, u_sigma, both, *(_edges(plane, normal, slopes, error, solved, axis) for axis in (1, 0)))
     mean_z = -float(np.median(depth[measured]))
     found = integrate_normals(normal.astype(np.float32), solved, x.astype(np.float32), y.astype(np.float32), perspective=perspective,
-                              mean_z=mean_z, sigma=normal_sigma.astype(np.float32), cuts=(cuts.right, cuts.down),
+                              mean_z=mean_z, sigma=np.degrees(normal_sigma), cuts=(cuts.right, cuts.down),
                               options=IntegrationOptions(discontinuities=True), device=device, progress=progress)
     assert found.part is not None
     base = plane.to_heights(found.height.numpy().astype(np.float64), solved)

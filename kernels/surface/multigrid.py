@@ -38,7 +38,7 @@ class Level(NamedTuple):
     weights: EdgeWeights
     target: wp.array  # [size] float32, right-hand side
     value: wp.array  # [size] float32, the level's answer
-    scratch: wp.array
+    scratch: wp.array  # [size or more] float32, shared with the other levels: a level is done with it before the next begins
 
 
 @wp.func
@@ -167,14 +167,14 @@ class Multigrid:
         weights: of its edges.
         target: the finest right-hand side, read by `cycle`.
         value: where `cycle` leaves its answer.
-        scratch: an array that `cycle` may overwrite.
+        scratch: an array of the finest layout that `cycle` may overwrite, finite.
     """
 
     def __init__(self, grid: Grid, weights: EdgeWeights, *, target: wp.array, value: wp.array, scratch: wp.array):
         self.levels = [Level(grid, weights, target, value, scratch)]
         while max(grid.rows, grid.cols) > COARSEST:
             grid = make_grid(-(-grid.rows // 2), -(-grid.cols // 2), grid.device)
-            self.levels.append(Level(grid, grid.no_edges(), *(grid.zeros() for _ in range(3))))
+            self.levels.append(Level(grid, grid.no_edges(), grid.zeros(), grid.zeros(), scratch))
         for fine, coarse in itertools.pairwise(self.levels):
             g = coarse.grid
             devices.launch(_coarsen, g.rows * g.cols, [fine.weights, g.cols], [coarse.weights], device=g.device)

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kernels.surface.fragments import LEAST_PART, Fragments
+from kernels.surface.fragments import LEAST_PART, Fragments, relabel, sizes_of
 
 MEETING = 0.6
 """Part of the edge between two fragments along which they must meet to belong together."""
@@ -44,7 +44,7 @@ def connect(found: Fragments, height: np.ndarray, *, noise: float) -> Parts:
     """Connect fragments that belong together.
 
     Args:
-        found: the fragments.
+        found: the fragments; their labels become those of the parts.
         height: [size] heights in units of the spacing, integrated without the cut edges: each fragment has a constant of its own.
         noise: standard deviation of the sum of slopes around four pixels.
     """
@@ -59,9 +59,8 @@ def connect(found: Fragments, height: np.ndarray, *, noise: float) -> Parts:
             _join_meeting(seam, low, high, play)
     first, second = seam.sides()
     kept, number = np.unique(seam.group, return_inverse=True)
-    label = number.astype(np.int32)[np.maximum(found.label, 0)]
-    label[found.label < 0] = -1
-    return Parts(label, len(kept), first != second)
+    relabel(found.label, np.append(number, -1).astype(np.int32))
+    return Parts(found.label, len(kept), first != second)
 
 
 def assemble(found: Fragments, parts: Parts, height: np.ndarray) -> np.ndarray:
@@ -93,7 +92,7 @@ class _Seam:
         self.step = height[found.second] - height[found.first] - found.slope
         self.group = np.arange(found.count)
         self.shift = np.zeros(found.count)  # added to the heights of each fragment
-        self.size = np.bincount(found.label[found.label >= 0], minlength=found.count)
+        self.size = sizes_of(found.label, found.count)
 
     def sides(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the groups on both sides of each edge."""

@@ -25,17 +25,17 @@ Sources: Quéau, Durou & Aujol, "Normal Integration: A Survey", 2018, for log-de
 from functools import cache
 from typing import Any, NamedTuple
 
+import numpy as np
 import warp as wp
 
 from kernels import device as devices
 from kernels.surface.grid import EdgeWeights, Grid
+from kernels.surface.normal_map import NormalMap
 
 wp.set_module_options({"enable_backward": False})
 
 STEEPEST = 0.02
 """Cosine of the steepest usable tilt, 88.9°: that of the rim of a sphere of 2500 pixels radius, which normals do not resolve."""
-SHORTEST_NORMAL = 0.5
-"""Least length of a vector that counts as a normal: half storage shortens one by 0.001, and an unsolved pixel holds zeros."""
 
 _FLOOR = wp.constant(wp.float32(STEEPEST))
 _LEAST = wp.constant(wp.float32(STEEPEST**2))
@@ -47,33 +47,6 @@ class Slopes(NamedTuple):
     right: wp.array  # [size] float32, height difference in units of s
     down: wp.array
     weights: EdgeWeights
-
-
-@wp.kernel
-def _mark_usable(first: int,
-                 normal: wp.array3d(dtype=wp.float32),  # [3, rows, cols]
-                 mask: wp.array2d(dtype=wp.uint8),
-                 x: wp.array2d(dtype=wp.float32),
-                 y: wp.array2d(dtype=wp.float32),
-                 # outputs
-                 usable: wp.array2d(dtype=wp.uint8)):
-    p = first + wp.tid()
-    r = p // mask.shape[1]
-    c = p - r * mask.shape[1]
-    n = wp.vec3(normal[0, r, c], normal[1, r, c], normal[2, r, c])
-    length = wp.length(n)
-    good = mask[r, c] != wp.uint8(0) and wp.isfinite(length) and length > SHORTEST_NORMAL
-    if good and wp.isfinite(x[r, c]) and wp.isfinite(y[r, c]):
-        usable[r, c] = wp.uint8(1)
-    else:
-        usable[r, c] = wp.uint8(0)
-
-
-def usable_pixels(normal: wp.array, mask: wp.array, x: wp.array, y: wp.array, *, device: str) -> wp.array:
-    """Return the pixels that take part, [rows, cols] uint8: in the mask, with a finite normal of some length."""
-    usable = wp.empty(mask.shape, dtype=wp.uint8, device=device)
-    devices.launch(_mark_usable, mask.shape[0] * mask.shape[1], [normal, mask, x, y], [usable], device=device)
-    return usable
 
 
 @wp.func
@@ -131,6 +104,7 @@ def _edge_kernel(perspective: bool) -> Any:
 
     @wp.kernel(enable_backward=False, module="unique")
     def edge_kernel(first: int,
+                    row: int,
                     normal: wp.array3d(dtype=wp.float32),
                     usable: wp.array2d(dtype=wp.uint8),
                     x: wp.array2d(dtype=wp.float32),
@@ -146,7 +120,7 @@ def _edge_kernel(perspective: bool) -> Any:
         c = p - r * usable.shape[1]
         if usable[r, c] == wp.uint8(0):
             return
-        i = (r + 1) * weights.pitch + c + 1
+        i = (row + r + 1) * weights.pitch + c + 1
         n, ri = _normal_at(normal, r, c), wp.vec3(x[r, c], y[r, c], -1.0)
         edge = edge_to(normal, usable, x, y, trust, n, ri, trust[r, c], r, c + 1, spacing)
         right[i] = edge[0]
@@ -158,30 +132,58 @@ def _edge_kernel(perspective: bool) -> Any:
     return edge_kernel
 
 
-def pair_slopes(
-    normal: wp.array,  # [3, rows, cols] float32, camera frame
-    usable: wp.array,  # [rows, cols] uint8
-    x: wp.array,  # [rows, cols] float32, right, in the plane of the projection
-    y: wp.array,  # [rows, cols] float32, up
-    trust: wp.array,  # [rows, cols] float32, 0…1 exclusive of 0
-    *,
-    grid: Grid,
-    perspective: bool,
-    spacing: float,
-) -> Slopes:
+@wp.kernel
+def _turn(first: int,
+          row: int,
+          normal: wp.array3d(dtype=wp.float32),
+          usable: wp.array2d(dtype=wp.uint8),
+          pitch: int,
+          # outputs
+          right: wp.array(dtype=wp.float16),
+          down: wp.array(dtype=wp.float16)):
+    p = first + wp.tid()
+    r = p // usable.shape[1]
+    c = p - r * usable.shape[1]
+    if usable[r, c] == wp.uint8(0):
+        return
+    i = (row + r + 1) * pitch + c + 1
+    n = _normal_at(normal, r, c)
+    # nested, because a kernel evaluates both sides of `and`
+    if c + 1 < usable.shape[1]:  # noqa: SIM102
+        if usable[r, c + 1] != wp.uint8(0):
+            right[i] = wp.float16(wp.acos(wp.clamp(wp.dot(n, _normal_at(normal, r, c + 1)), -1.0, 1.0)))
+    if r + 1 < usable.shape[0]:  # noqa: SIM102
+        if usable[r + 1, c] != wp.uint8(0):
+            down[i] = wp.float16(wp.acos(wp.clamp(wp.dot(n, _normal_at(normal, r + 1, c)), -1.0, 1.0)))
+
+
+def pair_slopes(surface: NormalMap, *, grid: Grid, spacing: float) -> tuple[Slopes, np.ndarray]:
     """Return the slopes and weights of every pair of 4-neighbours that are both usable.
 
+    The weight of a pair is the harmonic mean of the trust in its pixels, times the cosines.
+
     Args:
-        normal, usable, x, y: as above.
-        trust: the weight of each pixel; that of a pair is its pixels' harmonic mean, times the cosines.
+        surface: the normals.
         grid: the layout of the result.
-        perspective: whether x and y are the slopes of the rays (z = −1) rather than positions.
         spacing: mean distance of neighbouring pixels in the plane of x and y.
 
     Returns:
-        Slopes in units of the spacing, growing towards the viewer: of z (orthographic) or of −log d (perspective).
+        Slopes in units of the spacing, growing towards the viewer: of z (orthographic) or of −log d (perspective); and which pixels are
+        usable, [rows, cols] bool on the host: in the mask, with a finite normal of some length.
     """
     slopes = Slopes(grid.zeros(), grid.zeros(), grid.no_edges())
-    inputs = [normal, usable, x, y, trust, spacing]
-    devices.launch(_edge_kernel(perspective), grid.rows * grid.cols, inputs, list(slopes), device=grid.device)
-    return slopes
+    usable = np.empty((grid.rows, grid.cols), dtype=bool)
+    for band in surface.bands():
+        inputs = [band.first, band.normal, band.usable, band.x, band.y, band.trust, spacing]
+        devices.launch(_edge_kernel(surface.perspective), band.rows * grid.cols, inputs, list(slopes), device=grid.device)
+        usable[band.first : band.first + band.rows] = band.usable.numpy()[: band.rows]
+    return slopes, usable
+
+
+def pair_turns(surface: NormalMap, *, grid: Grid) -> tuple[wp.array, wp.array]:
+    """Return the angles, radians, between the normals of each pixel and its right and lower neighbour, each [size] float16; 0 where one of
+    the two is not usable."""
+    turns = grid.zeros(wp.float16), grid.zeros(wp.float16)
+    for band in surface.bands():
+        devices.launch(_turn, band.rows * grid.cols, [band.first, band.normal, band.usable, grid.pitch], list(turns), device=grid.device)
+    return turns

@@ -16,6 +16,10 @@ from stage.camera import Camera
 
 REACH = 4.0
 """Standard deviation, in pixels, of the window over which the misfit is pooled: fewer pixels leave the pooled value to chance."""
+REACHES = 3
+"""Standard deviations at which the window ends."""
+BAND_PIXELS = 1 << 20
+"""Number of pixels that are looked at in one piece: it bounds the memory."""
 ROOT_OF_MEAN = 1.6
 """Standard deviation of errors without preferred direction over the mean misfit: the mean of a Rayleigh distribution is 0.886 of its root
 mean square, and half of the variance of the errors is of a gradient and unseen."""
@@ -51,7 +55,23 @@ def misfit(normal: np.ndarray, height: np.ndarray, solved: np.ndarray, camera: C
     Returns:
         [rows, cols] float32; 0 where too few neighbours are solved to say.
     """
-    points = camera.points(height).astype(np.float64)
+    found, reach = np.empty(height.shape, dtype=np.float32), int(REACHES * REACH) + 1
+    step = max(1, BAND_PIXELS // height.shape[1])
+    for first in range(0, len(height), step):
+        above = max(first - reach, 0)
+        band = slice(above, first + step + reach)
+        points = camera.points(height[band], above).astype(np.float64)
+        found[first : first + step] = _misfit_of_rows(normal[band], points, solved[band])[first - above :][:step]
+    return found
+
+
+def _misfit_of_rows(normal: np.ndarray, points: np.ndarray, solved: np.ndarray) -> np.ndarray:
+    """Return `misfit` of some rows; all but the outermost REACHES · REACH + 1 are those of the whole image.
+
+    Args:
+        normal, solved: as for doubt.
+        points: [rows, cols, 3] float64, camera frame.
+    """
     right, left, above, below = _sides(points)
     inside = np.ones_like(solved)
     for side in _sides(solved[..., None].astype(np.float64)):
@@ -80,7 +100,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 def _pool(values: np.ndarray) -> np.ndarray:
     """Return the sum of values around each pixel, weighted by a Gaussian of REACH pixels."""
-    reach = int(3 * REACH)
+    reach = int(REACHES * REACH)
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / REACH) ** 2)
     for axis in (0, 1):
         padded = np.pad(values, [(reach, reach) if other == axis else (0, 0) for other in (0, 1)])

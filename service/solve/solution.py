@@ -22,7 +22,7 @@ from stage.stack import Stack
 LOOSE_CONFIDENCE = 1.0 / (1.0 + 5.0)
 """Confidence of a normal whose standard error is five degrees."""
 PIXELS_AT_ONCE = 1 << 16
-"""Number of pixels whose saturation bits are counted in one piece: it bounds the memory."""
+"""Number of pixels that are looked at in one piece: it bounds the memory."""
 
 SUSPECT_PIXELS = 512
 """Number of pixels, spread over the object, on which the lights are compared."""
@@ -134,11 +134,16 @@ class Solution:
 
 def mark_not_facing(camera: Camera, solution: Solution) -> None:
     """Set the status NOT_FACING where a normal points away from its line of sight: a visible surface cannot."""
-    x, y, toward = solution.normal
-    if camera.projection == "perspective":
-        right, up = (plane.reshape(-1) for plane in camera.plane_coordinates())
-        toward = toward - x * right - y * up
-    solution.status[(solution.status == Status.OK) & (toward <= 0)] = Status.NOT_FACING
+    step = max(1, PIXELS_AT_ONCE // camera.width)
+    for first in range(0, camera.height, step):
+        rows = min(step, camera.height - first)
+        span = slice(first * camera.width, (first + rows) * camera.width)
+        x, y, toward = solution.normal[:, span]
+        if camera.projection == "perspective":
+            right, up = (plane.reshape(-1) for plane in camera.plane_views(first, rows))
+            toward = toward - x * right - y * up
+        status = solution.status[span]
+        status[(status == Status.OK) & (toward <= 0)] = Status.NOT_FACING
 
 
 def refine_status(solution: Solution, stack: Stack, *, max_sigma: float, least_confidence: float) -> None:

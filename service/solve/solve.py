@@ -98,7 +98,7 @@ def solve(request: SolveRequest, progress: Progress | None = None, *, sharing: S
         solution.warnings += found.warnings
         raise_error(solution, found.doubt(solution.normal))
     estimated = np.isin(solution.status, ESTIMATED).reshape(mask.shape)
-    sigma = solution.standard_error()
+    sigma = solution.standard_error() if solution.sigma is None else solution.sigma  # as half: an image has tens of millions of pixels
     if solution.integration is None:  # near lights have found the height with the normals
         solution.integration = integrate(given, solution.normal, estimated, sigma=sigma)
         solution.height = None if solution.integration is None else solution.integration.height.numpy()
@@ -108,7 +108,7 @@ def solve(request: SolveRequest, progress: Progress | None = None, *, sharing: S
         solution.warnings += placed.warnings()
     if solution.judged_by_surface and solution.height is not None:
         normal = np.moveaxis(solution.normal.reshape(3, *mask.shape), 0, -1)
-        factor = integrability.doubt(sigma.reshape(mask.shape), normal, solution.height, estimated, capture.camera)
+        factor = integrability.doubt(sigma.astype(np.float32).reshape(mask.shape), normal, solution.height, estimated, capture.camera)
         solution.confidence = (solution.confidence * factor.reshape(-1)).astype(np.float16)
     refine_status(solution, stack, max_sigma=MAX_SIGMA if request.max_sigma is None else request.max_sigma,
                   least_confidence=request.least_confidence or 0.0)

@@ -38,10 +38,9 @@ def integrate(given: SolveInput, normal: np.ndarray, solved: np.ndarray, *, sigm
         return None
     given.timings.stage(stage, 100)
     camera = given.camera
-    x, y = (plane.astype(np.float32) for plane in camera.plane_coordinates())
-    return integrate_normals(normal.reshape(3, *solved.shape), solved, x, y,
+    return integrate_normals(normal.reshape(3, *solved.shape), solved, *camera.plane_views(),
                              perspective=camera.projection == "perspective", mean_z=mean_height(camera),
-                             sigma=None if sigma is None else np.radians(sigma, dtype=np.float32).reshape(solved.shape), options=OPTIONS,
+                             sigma=None if sigma is None else sigma.reshape(solved.shape), options=OPTIONS,
                              device=given.device, progress=given.timings.advance_percent)
 
 

@@ -75,6 +75,16 @@ def test_orthographic_points_are_metric_or_in_pixels():
     assert np.allclose(bare.points(np.ones((2, 4)))[1, 0], (-1.5, -0.5, 1))
 
 
+@pytest.mark.parametrize("camera", [
+    perspective(), perspective(distortion=Distortion(model="brown_conrady", k=(-0.1, 0.02, 0.0), p=(0.001, -0.002))),
+    Camera(projection="orthographic", resolution=(40, 30), pixel_size_m=0.01, principal_px=(3.0, 8.5))])
+def test_rows_of_the_image_are_those_of_the_whole(camera):
+    height = -1 - np.arange(1200.0).reshape(30, 40) / 1200
+    for rows, whole in zip(camera.plane_views(7, 5), camera.plane_coordinates(), strict=True):
+        np.testing.assert_array_equal(rows, whole[7:12])
+    np.testing.assert_array_equal(camera.points(height[7:], 7), camera.points(height)[7:])
+
+
 def test_principal_point_defaults_to_the_image_centre():
     x, y = perspective(principal_px=None).plane_coordinates()
     assert np.allclose(x, -x[:, ::-1]) and np.allclose(y, -y[::-1])

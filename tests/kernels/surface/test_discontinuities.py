@@ -101,3 +101,20 @@ def test_an_outline_with_a_gap_parts_a_ball_from_a_wall(device):
     found = solve(shape._replace(normal=normal), device, discontinuities=True)
     assert len(parts_of(found)) == 2
     assert np.mean(found.part[ball] == np.median(found.part[ball])) > 0.99 and parts_of(found)[1] < 1.02 * ball.sum()
+
+
+@pytest.mark.parametrize("perspective", [False, True])
+def test_the_size_of_bands_changes_nothing(perspective, device, monkeypatch):
+    """Bands of two rows and pieces of some cells, against the whole surface at one time."""
+    shape, _ = shapes.ball_before_wall(96)
+    noise = np.random.default_rng(0)
+    shape = shape._replace(normal=(shape.normal + noise.normal(0, 0.03, shape.normal.shape)).astype(np.float32))
+    sigma = noise.uniform(0, 20, shape.mask.shape).astype(np.float16)
+    options = {"perspective": perspective, "mean_z": -3.0, "sigma": sigma, "discontinuities": True}
+    whole = solve(shape, device, **options)
+    monkeypatch.setattr("kernels.surface.normal_map.BAND_PIXELS", 2 * 96)
+    monkeypatch.setattr("kernels.surface.fragments.CELLS_AT_ONCE", 1000)
+    banded = solve(shape, device, **options)
+    np.testing.assert_array_equal(banded.height.numpy(), whole.height.numpy())
+    np.testing.assert_array_equal(banded.part, whole.part)
+    assert len(parts_of(whole)) > 1

@@ -12,7 +12,7 @@ from tests.kernels.surface.test_integrate import solve, worst
 
 
 def spread(shape, degrees):
-    return np.full(shape.mask.shape, np.radians(degrees), dtype=np.float32)
+    return np.full(shape.mask.shape, degrees, dtype=np.float32)
 
 
 def spoiled(shape, part, perspective=False, seed=0):
@@ -23,7 +23,7 @@ def spoiled(shape, part, perspective=False, seed=0):
     across = np.sqrt(1 - facing**2)
     normal = shape.normal.copy()
     normal[:, part] = across * np.cos(turn), across * np.sin(turn), facing
-    return shape._replace(normal=normal), np.where(part, np.radians(45), np.radians(0.2)).astype(np.float32)
+    return shape._replace(normal=normal), np.where(part, 45, 0.2).astype(np.float32)
 
 
 @pytest.mark.parametrize("perspective", [False, True])

@@ -34,3 +34,11 @@ def test_normals_of_no_surface_lose_confidence():
     rim = mask & (normal[..., 2] < 0.75)
     assert np.median(misfit(spun, height, mask, camera)[rim]) > 5
     assert np.median(factor[rim]) < 0.4
+
+
+def test_the_size_of_bands_changes_nothing(monkeypatch):
+    normal, height, mask, camera = ball()
+    spoiled = normal + np.random.default_rng(0).normal(0, 0.1, normal.shape)
+    whole = misfit(spoiled, height, mask, camera)
+    monkeypatch.setattr("service.solve.integrability.BAND_PIXELS", 5 * SIDE)
+    np.testing.assert_array_equal(misfit(spoiled, height, mask, camera), whole)

@@ -1,0 +1,126 @@
+"""Normals of a surface on the host, which an integration reads a band of rows at a time, or at some pixels.
+
+An image has tens of millions of pixels: what follows from one normal alone is found again where it is needed, and not kept.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from kernels.surface.support import supported_normals
+
+wp.set_module_options({"enable_backward": False})
+
+SHORTEST_NORMAL = 0.5
+"""Least length of a vector that counts as a normal: half storage shortens one by 0.001, and an unsolved pixel holds zeros."""
+BAND_PIXELS = 1 << 19
+"""Number of pixels of a band: it bounds the memory."""
+
+
+class NormalBand(NamedTuple):
+    """Some rows of a surface on the device."""
+
+    first: int  # row of the image that row 0 of the arrays is
+    rows: int  # of the band; the arrays have one row more, where the image has
+    normal: wp.array  # [3, rows + 1, cols] float32, as far as its standard error supports it
+    usable: wp.array  # [rows + 1, cols] uint8
+    x: wp.array  # [rows + 1, cols] float32
+    y: wp.array
+    trust: wp.array  # [rows + 1, cols] float32, 0…1, the weight of each pixel
+
+
+class PixelNormals(NamedTuple):
+    """The normals of some pixels on the host."""
+
+    normal: np.ndarray  # [3, n] float32, unit, as far as its standard error supports it; 0 outside the image
+    ray: np.ndarray  # [2, n] float32, x and y of the pixel in the plane of projection
+
+
+@wp.kernel
+def _mark_usable(first: int,
+                 normal: wp.array3d(dtype=wp.float32),  # [3, rows, cols]
+                 mask: wp.array2d(dtype=wp.uint8),
+                 x: wp.array2d(dtype=wp.float32),
+                 y: wp.array2d(dtype=wp.float32),
+                 # outputs
+                 usable: wp.array2d(dtype=wp.uint8)):
+    p = first + wp.tid()
+    r = p // mask.shape[1]
+    c = p - r * mask.shape[1]
+    n = wp.vec3(normal[0, r, c], normal[1, r, c], normal[2, r, c])
+    length = wp.length(n)
+    good = mask[r, c] != wp.uint8(0) and wp.isfinite(length) and length > SHORTEST_NORMAL
+    if good and wp.isfinite(x[r, c]) and wp.isfinite(y[r, c]):
+        usable[r, c] = wp.uint8(1)
+    else:
+        usable[r, c] = wp.uint8(0)
+
+
+def _usable_pixels(normal: wp.array, mask: wp.array, x: wp.array, y: wp.array, *, device: str) -> wp.array:
+    """Return the pixels that take part, [rows, cols] uint8: in the mask, with a finite normal of some length."""
+    usable = wp.empty(mask.shape, dtype=wp.uint8, device=device)
+    devices.launch(_mark_usable, mask.shape[0] * mask.shape[1], [normal, mask, x, y], [usable], device=device)
+    return usable
+
+
+class NormalMap:
+    """Normals with their pixels' places and standard errors.
+
+    Args:
+        normal: [3, rows, cols] float32, camera frame.
+        mask: [rows, cols], above 0 where there is surface.
+        x: [rows, cols] plane coordinates of the pixels, to the right; may be a view of one row.
+        y: the same, upwards.
+        sigma: [rows, cols] standard errors of the normals, degrees; None: all are sure.
+        perspective: whether x and y are slopes of rays rather than positions.
+        device: where bands are sent.
+    """
+
+    def __init__(self, normal: np.ndarray, mask: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray | None, *,
+                 perspective: bool, device: str):
+        self._normal, self._mask, self._x, self._y, self._sigma = normal, mask, x, y, sigma
+        self.perspective, self.device = perspective, device
+        self.rows, self.cols = mask.shape
+
+    def bands(self) -> Iterator[NormalBand]:
+        """Send the surface to the device band by band, from the first row to the last."""
+        step = max(1, BAND_PIXELS // self.cols)
+        for first in range(0, self.rows, step):
+            part = slice(first, min(first + step, self.rows) + 1)
+            normal, x, y = self._floats(self._normal[:, part]), self._floats(self._x[part]), self._floats(self._y[part])
+            inside = np.ascontiguousarray((self._mask[part] != 0).view(np.uint8))
+            usable = _usable_pixels(normal, wp.array(inside, dtype=wp.uint8, device=self.device), x, y, device=self.device)
+            rows = min(step, self.rows - first)
+            if self._sigma is None:
+                yield NormalBand(first, rows, normal, usable, x, y, wp.ones(inside.shape, dtype=wp.float32, device=self.device))
+            else:
+                supported = supported_normals(normal, self._floats(_radians(self._sigma[part])), x, y, perspective=self.perspective,
+                                              device=self.device)
+                yield NormalBand(first, rows, supported.normal, usable, x, y, supported.trust)
+
+    def at(self, row: np.ndarray, col: np.ndarray) -> PixelNormals:
+        """Return the unit normals of some pixels; waits for the device.
+
+        Args:
+            row, col: [n] int, which may lie outside the image.
+        """
+        inside = (row >= 0) & (row < self.rows) & (col >= 0) & (col < self.cols)
+        place = np.where(inside, row, 0), np.where(inside, col, 0)
+        normal = np.stack([plane[place] for plane in self._normal]).astype(np.float32)
+        ray = np.stack([plane[place] for plane in (self._x, self._y)]).astype(np.float32)
+        if self._sigma is not None and len(row):
+            line = self._floats(normal[:, None]), *(self._floats(values[None]) for values in (_radians(self._sigma[place]), *ray))
+            normal = supported_normals(*line, perspective=self.perspective, device=self.device).normal.numpy()[:, 0]
+        normal, ray = (np.where(inside, np.nan_to_num(values), 0) for values in (normal, ray))
+        return PixelNormals(normal / np.maximum(np.linalg.norm(normal, axis=0), 1e-9), ray)
+
+    def _floats(self, values: np.ndarray) -> wp.array:
+        """Return float32 values on the device, without a copy where they are there already."""
+        return wp.array(np.ascontiguousarray(values, dtype=np.float32), dtype=wp.float32, device=self.device, copy=False)
+
+
+def _radians(degrees: np.ndarray) -> np.ndarray:
+    return np.radians(degrees, dtype=np.float32)
