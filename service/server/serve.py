@@ -6,7 +6,6 @@ taken over, as after a crash.
 """
 
 import asyncio
-import multiprocessing
 import os
 import signal
 import socket
@@ -16,12 +15,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from queue import SimpleQueue
-from typing import Any, TypeVar, cast
+from typing import Any, cast
 
 import uvicorn
 
 from service.errors import RequestError
-from service.server import log, telemetry
+from service.server import devices, log, telemetry
 from service.server.api.app import create_app
 from service.server.connections import AT_ONCE, BACKLOG, ConnectionLimits, Connections, GuardedConnection, limits_of, raise_descriptors
 from service.server.database.engine import Database, open_database
@@ -32,11 +31,10 @@ from service.server.jobs.supervisor import Supervisor
 from service.server.log import logger
 from service.server.malloc import keep_freed_blocks
 from service.server.permissions import keep_private
-from service.server.settings import NO_WORKER, Settings, unknown_variables
+from service.server.settings import Settings, unknown_variables
 from service.server.storage.folder import Storage
 from service.server.storage.open import open_storage
 
-T = TypeVar("T")
 CLOSE_S = 5
 """Seconds that open requests, streams of events among them, may take to end when the service ends."""
 SIGNALS = (signal.SIGTERM, signal.SIGINT)
@@ -52,7 +50,8 @@ def serve(settings: Settings, *, before_answering: Callable[[str, Database, JobQ
         before_answering: called before the service answers, with its address, its database, its queue and its storage.
 
     Raises:
-        RequestError: the address, the data folder or the database cannot be used, or a device is not on this machine.
+        RequestError: the address, the data folder or the database cannot be used.
+        DeviceError: a device is not on this machine.
     """
     supervisors: list[Supervisor] = []
     asked = _signals(supervisors)
@@ -61,7 +60,7 @@ def serve(settings: Settings, *, before_answering: Callable[[str, Database, JobQ
     limits = limits_of(settings, raise_descriptors())
     listening = _listen(settings)
     database = open_database(settings, prepare)
-    supervisor = Supervisor(settings, _devices(settings))
+    supervisor = Supervisor(settings, devices.of_workers(settings))
     supervisors.append(supervisor)
     tracing = telemetry.provider(settings)
     app = create_app(settings, database, tracing, max_streams=limits.connections // 2)
@@ -107,7 +106,7 @@ def work(settings: Settings, device: str | None) -> None:
     _configure(settings)
     open_database(settings, prepare).close()
     telemetry.close(telemetry.provider(settings))  # so that a missing extra is reported here, and not by every worker
-    supervisors.append(Supervisor(settings, [_elsewhere(_resolve, device)]))
+    supervisors.append(Supervisor(settings, [devices.resolve(device)]))
     supervisors[0].start()
     asked.get()
     supervisors[0].stop()
@@ -179,29 +178,3 @@ def _listen(settings: Settings) -> socket.socket:
 
 def _address(host: str, port: int) -> str:
     return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
-
-
-def _devices(settings: Settings) -> list[str]:
-    if settings.devices == (NO_WORKER,):
-        return []
-    if settings.devices:
-        return [_elsewhere(_resolve, device) for device in settings.devices]
-    return [name for name in _elsewhere(_names) if name.startswith("cuda")] or ["cpu"]
-
-
-def _elsewhere(ask: Callable[..., T], *arguments: object) -> T:
-    """Call a function in another process: this one never loads CUDA, so that a failing driver does not end it."""
-    with multiprocessing.get_context("spawn").Pool(1) as pool:
-        return pool.apply(ask, arguments)
-
-
-def _names() -> list[str]:
-    from kernels.device import names
-
-    return names()
-
-
-def _resolve(device: str | None) -> str:
-    from kernels.device import resolve
-
-    return resolve(device)
