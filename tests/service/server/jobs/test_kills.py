@@ -14,7 +14,7 @@ WORKERS = 2
 
 
 @pytest.mark.parametrize(("database_url", "kills"), [
-    ("sqlite", 1), pytest.param("sqlite", 3, marks=pytest.mark.long), pytest.param("postgresql", 3, marks=pytest.mark.long),
+    ("sqlite", 1), pytest.param("postgresql", 3, marks=pytest.mark.long),
 ], indirect=["database_url"])
 def test_every_frame_is_there_once_and_as_undisturbed(tmp_path, database_url, kills, undisturbed):
     seed = random.randrange(2**32)

@@ -67,8 +67,8 @@ def both_at_work(made, job: str) -> tuple[str, str]:
     return holder, next(worker for worker in begun(made, job) if worker != holder)
 
 
-@pytest.mark.parametrize("database_url", ["sqlite", pytest.param("postgresql", marks=pytest.mark.long)], indirect=True)
-@pytest.mark.parametrize("method", ["lambert", "svbrdf"])
+@pytest.mark.parametrize(("method", "database_url"), [("lambert", "sqlite"), pytest.param("svbrdf", "postgresql", marks=pytest.mark.long)],
+                         indirect=["database_url"])
 def test_two_workers_make_the_same_maps_as_one(tmp_path, database_url, capture, monkeypatch, method):
     alone = maps_alone(capture, method, tmp_path / "alone", monkeypatch)
     with harness(tmp_path / "service", database_url, log_level="debug") as made:
