@@ -5,6 +5,7 @@ StageError
 ├── ImageError       a file does not hold the pixels that it should hold; the message names the file
 ├── CalibrationError images do not show what is measured in them, as a spot on a ball; the message names frame, ball or field
 ├── BoardError       the tiles of a board do not fit together, or a board does not fit its design; the message names them
+├── ScanError        scans of one object cannot be placed; the message names them
 ├── ResultError      a result file such as maps.exr lacks a layer; the message names file and layer
 └── StorageError     the file system refuses for lack of space or permission; the message names path and reason
 """
@@ -39,6 +40,10 @@ class CalibrationError(StageError, ValueError):
 
 class BoardError(StageError, ValueError):
     """Tiles of a board do not fit together, or a board does not fit its nominal heights; the message names the tiles or the file."""
+
+
+class ScanError(StageError, ValueError):
+    """Scans of one object cannot be placed against each other; the message names the file or the scans."""
 
 
 class ResultError(StageError, ValueError):

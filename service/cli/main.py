@@ -23,6 +23,7 @@ from service.cli import (
     jobs,
     keys,
     light,
+    scans,
     server,
     solve,
     submit,
@@ -31,8 +32,8 @@ from service.cli import (
 
 app = typer.Typer(name="relit", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
                   help="Active-illumination captures to normals, materials, depth, USD assets and relit frames.")
-for module in (demo, imports, captures, calibrate, solve, inspect, depth, boards, light, view, doctor, server, submit, jobs, keys, backup,
-               farm):
+for module in (demo, imports, captures, calibrate, solve, inspect, depth, boards, scans, light, view, doctor, server, submit, jobs, keys,
+               backup, farm):
     module.register(app)
 
 BAD_INPUT, INTERRUPTED = 2, 130

@@ -24,6 +24,7 @@ from service.requests import (
     join,
     keys,
     patterns,
+    register,
     relight,
     scan,
     separate,
@@ -37,7 +38,7 @@ from service.requests.options import build, help_text, options_of, typed, values
 
 COMMANDS: dict[str, list[type[Options]]] = {
     "solve": [solve.SolveRequest], "export": [export.ExportRequest], "inspect": [inspect.InspectRequest],
-    "join": [join.JoinRequest],
+    "join": [join.JoinRequest], "register": [register.RegisterRequest],
     "depth": [depth.DepthRequest], "scan": [scan.ScanRequest],
     "separate": [separate.SeparateRequest], "inspect-board": [inspect_board.InspectBoardRequest],
     "gauge-board": [gauge_board.GaugeBoardRequest],

@@ -1,0 +1,57 @@
+"""What `relit register` takes."""
+
+from pathlib import Path
+from typing import Annotated, Self
+
+from pydantic import Field, model_validator
+
+from service.requests.base import Choice, Options, Role, Spelling
+from stage.model import Fraction, Line, Positive
+
+
+class GivenPoses(Choice):
+    """What the poses of the scan set are taken for."""
+
+    REFINED = "refined", "starts, right to about a sixtieth of the object; pairs that do not overlap there are not tried"
+    IGNORED = "ignored", "nothing: all pairs are searched"
+
+
+class TableUse(Choice):
+    """What the turntable of the scan set is taken for."""
+
+    START = "start", "its angles give the starts of all poses, which then move freely"
+    ANGLES = "angles", "the axis is right, and only the angles are found"
+    FIXED = "fixed", "axis and angles are right: nothing is moved, and the report says what the surfaces say of it"
+
+
+class RegisterOptions(Options):
+    """How scans are registered."""
+
+    poses: GivenPoses = GivenPoses.REFINED
+    """What the poses of the scan set are taken for."""
+    turntable: TableUse = TableUse.START
+    """What the turntable of the scan set is taken for, where it has one."""
+    cell_m: Positive | None = None
+    """Side of the cells whose points are averaged for the search without starts, metres. None: a sixtieth of the median extent of the
+    scans."""
+    least_overlap: Annotated[Fraction, Field(gt=0)] = 0.1
+    """Least part of the smaller of two scans that must lie on the surface of the other."""
+    reference: Line | None = None
+    """Name of the scan whose pose stays. None: the first with a pose, or the first."""
+
+
+class RegisterRequest(RegisterOptions):
+    """Find the poses of scans of one object by their surfaces, and say how sure each is and which scans could not be joined."""
+
+    scan_set: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="SCAN_SET")]
+    """A folder with a scan-set.json, or the file: depth results and PLY files, with or without poses."""
+    out: Annotated[Path, Role.OUTPUT]
+    """Folder for scan-set.json with the poses, and report.json."""
+    threads: Annotated[int | None, Field(ge=1), Role.MACHINE] = None
+    """Pairs that are registered at one time. None: one for each core."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.turntable is not TableUse.START and self.poses is GivenPoses.IGNORED:
+            raise ValueError(f"poses is ignored, but turntable is {self.turntable}: give one of them")
+        return self

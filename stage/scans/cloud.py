@@ -1,0 +1,84 @@
+"""The points of a scan as registration uses them: thinned, with normals, uncertainty and borders, at one scale."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from stage.scans.neighbours import Neighbours
+from stage.scans.scan import Scan
+
+NEIGHBOURS = 16
+"""The number of neighbours that a normal is fitted to."""
+OFF_CENTRE = 0.3
+"""A point is on a border if the mean of its neighbours lies this part of their distance to one side."""
+SPACING_NEIGHBOUR = 4
+"""The spacing is the distance to the neighbour of this number: on a square grid the fourth is one step away."""
+NOISE_CELLS = 3.0
+"""Points are averaged in cells of this many σ: with closer points normals would be those of the noise."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cloud:
+    """Points of one scan at one scale, in the scan's frame."""
+
+    points: np.ndarray  # [n, 3] float64 metres
+    normals: np.ndarray  # [n, 3] float64, unit, towards the camera
+    directions: np.ndarray  # [n, 3] float64, unit, from the camera
+    sigma: np.ndarray  # [n] float64 metres along the line of sight
+    spacing: np.ndarray  # [n] float64 metres to the neighbours
+    border: np.ndarray  # [n] bool: the surface was seen on one side of the point alone
+    tree: Neighbours
+    sample: np.ndarray  # [m] int64, the points that are matched with other scans
+
+    @property
+    def middle(self) -> np.ndarray:
+        """The mean of the points, [3] metres."""
+        return self.points.mean(axis=0)
+
+
+class _Thinned(NamedTuple):
+    points: np.ndarray
+    directions: np.ndarray
+    sigma: np.ndarray
+
+
+def prepared(scan: Scan, *, cell_m: float, most: int, threads: int = 1) -> Cloud:
+    """Return the points of a scan at one scale.
+
+    Args:
+        scan: the scan.
+        cell_m: the side of cells whose points are averaged, metres; 0: only as far as the noise demands it.
+        most: the most points that are matched with other scans; they are drawn evenly, and always the same.
+        threads: for the search of neighbours.
+    """
+    cell = max(cell_m, NOISE_CELLS * float(np.median(scan.sigma)))
+    thinned = _thin(scan, cell)
+    tree = Neighbours(thinned.points, threads=threads)
+    index, distance = tree.nearest(thinned.points, NEIGHBOURS + 1)
+    around = thinned.points[index] - thinned.points[:, None]
+    mean = around.mean(axis=1)
+    spread, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around) / index.shape[1] - mean[:, :, None] * mean[:, None, :])
+    normals = axes[:, :, 0] * np.where(np.einsum("ni,ni->n", axes[:, :, 0], thinned.directions) > 0, -1.0, 1.0)[:, None]
+    off = np.linalg.norm(mean - normals * np.einsum("ni,ni->n", mean, normals)[:, None], axis=1)
+    spacing = distance[:, min(SPACING_NEIGHBOUR, distance.shape[1] - 1)]
+    border = (off > OFF_CENTRE * distance[:, -1]) | (spread[:, 1] < 0.05 * spread[:, 2])
+    sample = np.random.default_rng(0).permutation(len(thinned.points))[:most]
+    return Cloud(points=thinned.points, normals=normals, directions=thinned.directions, sigma=thinned.sigma, spacing=spacing, border=border,
+                 tree=tree, sample=np.sort(sample))
+
+
+def _thin(scan: Scan, cell: float) -> _Thinned:
+    """Return the means of the points in cells, with the σ of the means."""
+    points = scan.points.astype(np.float64)
+    index = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
+    size = index.max(axis=0) + 1
+    _, of_point, count = np.unique(index @ np.array([1, size[0], size[0] * size[1]]), return_inverse=True, return_counts=True)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return np.bincount(of_point, values, minlength=len(count)) / count
+
+    averaged = np.stack([mean(column) for column in points.T], axis=1)
+    directions = np.stack([mean(column) for column in scan.directions().T], axis=1)
+    directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
+    return _Thinned(averaged, directions, np.sqrt(mean(scan.sigma.astype(np.float64) ** 2) / count))

@@ -1,0 +1,72 @@
+"""The covariance of the poses of a pose graph from the noise of every measured point.
+
+A point that several pairs use has one error, so that pairs are not independent: what the noise of each point does to all poses at once is
+added up (the sandwich estimator; Huber, "The behavior of maximum likelihood estimates under nonstandard conditions", 1967).
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from stage.scans.pairs import Pair
+from stage.scans.pose_graph import Edge, Solved, adjoint
+
+
+def covariances(solved: Solved, pairs: Sequence[Pair], edges: Sequence[Edge]) -> dict[int, np.ndarray]:
+    """Return the covariance of the pose of each scan.
+
+    Args:
+        solved: the poses.
+        pairs: with their fits, in the order of the edges.
+        edges: those that `solved` was found from.
+
+    Returns:
+        [6, 6] of each scan: of a small rotation (radians, about the world's axes through the origin of the scan), then of a translation
+        (metres, world); 0 of the scan whose pose is fixed. What loops leave beyond the noise of the points multiplies all of them.
+    """
+    order = list(solved.poses)
+    place = {number: 6 * k for k, number in enumerate(order)}
+    spread = np.zeros((6 * len(order), 6 * len(order)))
+    onto = [_onto(edge, solved, place) for edge in edges]
+    for number in order:
+        of_scan = [k for k, pair in enumerate(pairs) if number in (pair.a, pair.b)]
+        if not of_scan:
+            continue
+        shares = [_shares(pairs[k], number, float(solved.weights[k])) for k in of_scan]
+        most = max(map(len, shares))
+        every = np.concatenate([np.pad(share, ((0, most - len(share)), (0, 0))) for share in shares], axis=1)
+        together = np.concatenate([onto[k] for k in of_scan])
+        spread += together.T @ (every.T @ every) @ together
+    basis = solved.basis
+    inverse = np.linalg.pinv(basis.T @ solved.hessian @ basis + solved.held, hermitian=True)
+    total = basis @ inverse @ (basis.T @ spread @ basis + solved.held) @ inverse @ basis.T
+    total *= max(solved.factor, 1.0) ** 2 if np.isfinite(solved.factor) else 1.0
+    out = {}
+    for number in order:
+        shift = np.eye(6)
+        x, y, z = solved.poses[number][:3, 3] - solved.centre
+        shift[3:, :3] = -np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        k = place[number]
+        own = shift @ total[k:k + 6, k:k + 6] @ shift.T
+        out[number] = (own + own.T) / 2
+    return out
+
+
+def _onto(edge: Edge, solved: Solved, place: dict[int, int]) -> np.ndarray:
+    """Return what small motions of all scans do at the pivot of a pair, [6, 6n]."""
+    out = np.zeros((6, 6 * len(place)))
+    jacobian = adjoint(edge, solved.poses[edge.a], solved.centre)
+    out[:, place[edge.a]:place[edge.a] + 6] = -jacobian
+    out[:, place[edge.b]:place[edge.b] + 6] = jacobian
+    return out
+
+
+def _shares(pair: Pair, number: int, weight: float) -> np.ndarray:
+    """Return what the noise of each point of a scan adds to the gradient of a pair, [point, 6]; points that it does not use have 0."""
+    assert pair.fit is not None
+    rows = pair.fit.rows
+    index, sigma = (rows.at, -rows.sigma_a) if number == pair.a else (rows.of, rows.sigma_b)
+    values = rows.gradient * sigma[:, None] * (weight / max(pair.fit.ratio, 1.0))
+    size = int(index.max()) + 1
+    return np.stack([np.bincount(index, column, minlength=size) for column in values.T], axis=1)
+

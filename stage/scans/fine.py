@@ -1,0 +1,168 @@
+"""The pose of one scan against another by the distances between their surfaces, weighted by the σ of every point.
+
+Between the planes of two matched points p and q with normals m and n the distance is (p - q)·(m + n) / |m + n|, which is 0 on any sphere
+and not on planes alone (Rusinkiewicz, "A symmetric objective function for ICP", ACM Transactions on Graphics 38(4), 2019). It is the limit
+of generalised ICP (Segal, Haehnel and Thrun, "Generalized-ICP", RSS 2009) for covariances that are flat; the variance across the surface is
+that of the two points along their lines of sight.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from stage.scans.cloud import Cloud
+from stage.scans.coarse import ALIKE
+from stage.scans.rigid import applied, moved
+
+TUKEY = 4.685
+"""Distances beyond this many standard deviations count nothing. Source: Tukey's biweight, 95 % efficient on normal noise."""
+MAD = 1.4826
+"""The standard deviation of normal noise in median absolute deviations."""
+STEPS = 12
+"""The most steps at one reach."""
+STILL = 0.02
+"""Steps end when the scan moves by less than this part of the median σ of its distances divided by the root of their number."""
+LEAST_MATCHES = 30
+"""The fewest matches that a pose of six numbers is fitted to."""
+
+
+class Fit(NamedTuple):
+    """A pose and what the distances say of it."""
+
+    pose: np.ndarray  # [4, 4] a_from_b
+    pivot: np.ndarray  # [3] metres, frame of a: the mean of the matched points, about which rotations count
+    information: np.ndarray  # [6, 6] of rotation vector (radians) and translation (metres), frame of a, if distances were independent
+    noise: np.ndarray  # [6, 6] the part of `information` that noise in the normals alone would make
+    residual: float  # metres: the robust standard deviation of the distances
+    ratio: float  # the robust standard deviation of the distances in units of their σ
+    scale: float  # by how much b would have to grow about the pivot, as a part of its size
+    scale_sigma: float
+    rows: "Rows"
+    matches: int  # with a weight above 0
+
+
+class Rows(NamedTuple):
+    """The matched points of a fit, each a row of its least squares."""
+
+    at: np.ndarray  # [k] int64, point of a
+    of: np.ndarray  # [k] int64, point of b
+    gradient: np.ndarray  # [k, 6] float32: weight times the derivative of the distance
+    sigma_a: np.ndarray  # [k] float32 metres: what the noise of the point of a adds to the distance
+    sigma_b: np.ndarray  # [k] float32
+
+
+def fit(a: Cloud, b: Cloud, start: np.ndarray, reaches: list[float]) -> Fit | None:
+    """Move scan b until its surface lies on that of scan a.
+
+    Args:
+        a, b: the scans.
+        start: [4, 4] a_from_b.
+        reaches: the largest distances, metres, at which points are matched, one after the other.
+
+    Returns:
+        The fit, or None if fewer than `LEAST_MATCHES` points can be matched or they do not determine a pose at all.
+    """
+    pose = start
+    found: _Matches | None = None
+    for reach in reaches:
+        for _ in range(STEPS):
+            found = _match(a, b, pose, reach)
+            if found is None:
+                return None
+            system = _system(found)
+            try:
+                step = -np.linalg.solve(system.information + 1e-9 * np.trace(system.information) / 6 * np.eye(6), system.gradient)
+            except np.linalg.LinAlgError:
+                return None
+            pose = moved(step, system.pivot, pose)
+            size = float(np.sqrt(np.sum((found.placed - system.pivot) ** 2) / len(found.placed)))
+            if float(np.linalg.norm(step[:3])) * size + float(np.linalg.norm(step[3:])) < STILL * found.scale / np.sqrt(len(found.at)):
+                break
+    if found is None or (found := _match(a, b, pose, reaches[-1])) is None:
+        return None
+    return _result(found, pose)
+
+
+def _result(found: "_Matches", pose: np.ndarray) -> Fit:
+    system = _system(found)
+    squared = max(found.ratio, 1.0) ** 2
+    local = found.placed - system.pivot
+    grow = _dots(local, found.normal)
+    weight = found.weight / found.sigma**2
+    cross = system.weighted.T @ grow
+    try:
+        solved = np.linalg.solve(system.information, np.stack([cross, system.gradient], axis=1))
+    except np.linalg.LinAlgError:
+        solved = np.zeros((6, 2))
+    left = float(weight @ grow**2 - cross @ solved[:, 0])
+    scale = -float(weight @ (grow * found.distance) - cross @ solved[:, 1]) / left if left > 0 else 0.0
+    rows = Rows(found.at, found.of, system.weighted.astype(np.float32), found.sigma_a.astype(np.float32), found.sigma_b.astype(np.float32))
+    return Fit(pose, system.pivot, system.information / squared, system.noise / squared, found.scale, found.ratio, scale,
+               float(np.sqrt(squared / left)) if left > 0 else float("inf"), rows, int((found.weight > 0).sum()))
+
+
+class _Matches(NamedTuple):
+    at: np.ndarray
+    of: np.ndarray
+    placed: np.ndarray  # [k, 3] points of b, frame of a
+    normal: np.ndarray  # [k, 3] unit
+    distance: np.ndarray  # [k] metres
+    sigma: np.ndarray  # [k] metres
+    weight: np.ndarray  # [k] 0…1
+    tilt: np.ndarray  # [k] radians: standard deviation of the normals
+    scale: float
+    ratio: float
+    sigma_a: np.ndarray
+    sigma_b: np.ndarray
+
+
+class _System(NamedTuple):
+    pivot: np.ndarray
+    information: np.ndarray
+    gradient: np.ndarray
+    noise: np.ndarray
+    weighted: np.ndarray
+
+
+def _dots(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    return (one * other) @ np.ones(3)
+
+
+def _match(a: Cloud, b: Cloud, pose: np.ndarray, reach: float) -> _Matches | None:
+    placed = applied(pose, b.points[b.sample])
+    index, apart = a.tree.nearest(placed)
+    index, apart = index[:, 0], apart[:, 0]
+    turned = b.normals[b.sample] @ pose[:3, :3].T
+    alike = _dots(turned, a.normals[index])
+    normal = turned + a.normals[index]
+    normal /= np.maximum(np.sqrt(_dots(normal, normal)), 1e-12)[:, None]
+    across = _dots(placed - a.points[index], normal)
+    beside = np.sqrt(np.maximum(apart**2 - across**2, 0))
+    keep = (apart < reach) & (alike > ALIKE) & ~a.border[index] & ~b.border[b.sample] & (beside < 1.5 * a.spacing[index])
+    if keep.sum() < LEAST_MATCHES:
+        return None
+    at, of, normal, across = index[keep], b.sample[keep], normal[keep], across[keep]
+    seen_b = _dots(b.directions[of] @ pose[:3, :3].T, normal) * b.sigma[of]
+    seen_a = _dots(a.directions[at], normal) * a.sigma[at]
+    sigma = np.sqrt(seen_a**2 + seen_b**2 + (0.05 * np.minimum(a.sigma[at], b.sigma[of])) ** 2)  # grazing rays: never 0
+    ratio = MAD * float(np.median(np.abs(across) / sigma))
+    weight = np.maximum(1 - (across / (TUKEY * max(ratio, 1.0) * sigma)) ** 2, 0) ** 2
+    # 16 neighbours that lie about a spacing away tilt a plane by a quarter of σ over the spacing
+    tilt = max(ratio, 1.0) * np.hypot(a.sigma[at] / a.spacing[at], b.sigma[of] / b.spacing[of]) / 4
+    scale = MAD * float(np.median(np.abs(across)))
+    return _Matches(at, of, placed[keep], normal, across, sigma, weight, tilt, scale, ratio, seen_a, seen_b)
+
+
+def _system(found: _Matches) -> _System:
+    """Return the normal equations of a small motion about the mean of the matches."""
+    weight = found.weight / found.sigma**2
+    pivot = found.placed.mean(axis=0)
+    local = found.placed - pivot
+    jacobian = np.concatenate([np.cross(local, found.normal), found.normal], axis=1)
+    weighted = jacobian * weight[:, None]
+    off = weight * found.tilt**2
+    square = (local * off[:, None]).T @ local
+    noise = np.zeros((6, 6))  # of normals that are turned by noise: their components in the plane are tilt² each
+    noise[:3, :3] = np.trace(square) * np.eye(3) - square
+    noise[3:, 3:] = off.sum() * np.eye(3)
+    return _System(pivot, weighted.T @ jacobian, weighted.T @ found.distance, noise, weighted)

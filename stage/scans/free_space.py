@@ -1,0 +1,84 @@
+"""What the range image of one scan says of the points of another: seen, hidden behind the surface, or where the camera saw through."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from stage.scans.rigid import applied, inverse
+from stage.scans.scan import Scan
+
+
+class DepthRange(NamedTuple):
+    """The nearest and farthest depth around each pixel of a range image."""
+
+    scan: Scan
+    nearest: np.ndarray  # [rows, cols] metres; 0 where any of the nine pixels has no depth
+    farthest: np.ndarray  # [rows, cols]
+
+
+class Sight(NamedTuple):
+    """How many points of one scan another scan sees, or contradicts."""
+
+    agreeing: int
+    """Points on the surface that the camera measured."""
+    contradicted: int
+    """Points before that surface, where the camera saw through."""
+    judged: int
+    """Points that fall into the image at pixels with a depth."""
+
+
+def depth_range(scan: Scan) -> DepthRange | None:
+    """Return the range of depths around each pixel of a range image, or None for a set of points."""
+    if scan.camera is None:
+        return None
+    depth = scan.image(-scan.points[:, 2].astype(np.float32))
+    there = depth != 0
+    padded = np.pad(depth, 1)
+    known = np.pad(there, 1)
+    rows, cols = depth.shape
+    views = [(padded[i:i + rows, j:j + cols], known[i:i + rows, j:j + cols]) for i in range(3) for j in range(3)]
+    inner = np.logical_and.reduce([seen for _, seen in views])
+    low = np.minimum.reduce([values for values, _ in views])
+    high = np.maximum.reduce([values for values, _ in views])
+    return DepthRange(scan, np.where(inner, low, 0), np.where(inner, high, 0))
+
+
+def sight(image: DepthRange, points: np.ndarray, pose: np.ndarray, tolerance: np.ndarray | float) -> Sight:
+    """Compare points with what a range image says of the space before and behind its surface.
+
+    Args:
+        image: the range image.
+        points: [n, 3] metres, of another scan.
+        pose: [4, 4] from the frame of the points to that of the image.
+        tolerance: [n] metres: how far before the surface a point may lie without a contradiction.
+    """
+    camera = image.scan.camera
+    assert camera is not None
+    placed = applied(pose, points)
+    front = placed[:, 2] < 0 if camera.projection == "perspective" else np.ones(len(placed), dtype=bool)
+    placed = np.where(front[:, None], placed, [0.0, 0.0, -1.0])
+    u, v = camera.image_coordinates(placed)
+    col, row = (np.clip(np.floor(np.nan_to_num(x)), -1, 2**30).astype(np.int64) for x in (u, v))
+    inside = front & (col >= 0) & (row >= 0) & (col < camera.width) & (row < camera.height)
+    at = np.where(inside, row, 0), np.where(inside, col, 0)
+    near, far = image.nearest[at], image.farthest[at]
+    judged = inside & (near != 0)
+    depth = -placed[:, 2]
+    before = judged & (depth < near - tolerance)
+    on = judged & ~before & (depth <= far + tolerance)
+    return Sight(int(on.sum()), int(before.sum()), int(judged.sum()))
+
+
+def both_sights(a: DepthRange | None, b: DepthRange | None, points_a: np.ndarray, points_b: np.ndarray, pose: np.ndarray,
+                tolerance: float) -> Sight:
+    """Return the sum of what both scans say of each other's points.
+
+    Args:
+        a, b: the range images; None: a set of points, which says nothing.
+        points_a, points_b: [n, 3] and [m, 3] in the frames of a and b.
+        pose: [4, 4] a_from_b.
+        tolerance: metres.
+    """
+    parts = [sight(a, points_b, pose, tolerance)] if a is not None else []
+    parts += [sight(b, points_a, inverse(pose), tolerance)] if b is not None else []
+    return Sight(*(sum(values) for values in zip(*parts, strict=True))) if parts else Sight(0, 0, 0)

@@ -1,0 +1,221 @@
+"""Registration of two scans: poses that are tried, and whether what they leave is one surface, seen twice, in one way alone."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import NamedTuple
+
+import numpy as np
+
+from stage.scans.cloud import Cloud, prepared
+from stage.scans.coarse import is_near, rough_poses
+from stage.scans.features import fpfh
+from stage.scans.fine import TUKEY, Fit, fit
+from stage.scans.free_space import DepthRange, Sight, both_sights, depth_range
+from stage.scans.rigid import inverse, moved, step_between
+from stage.scans.scan import Scan
+
+FEATURE_CELLS = 5.0
+"""Radius of the features in cells of the rough clouds, as Open3D's examples have it."""
+MOST_POSES = 4
+"""The most rough poses of a pair that are refined."""
+ROUGH_POINTS, FINE_POINTS = 3000, 12_000
+"""The most points of a scan that are matched at either scale."""
+CONTRADICTED = 0.05
+"""The largest part of the points in sight that may lie where the other camera saw through: borders and mixed pixels."""
+ROUGH_CONTRADICTED = 0.25
+"""The same of a rough pose."""
+BEND = 0.12
+"""The largest residual as a part of the spacing of the points, whatever σ is: what the bend of the surface between points makes."""
+ROUGH_BEND = 0.15
+"""The largest residual of a rough pose in cells: right poses leave .05 of a cell on a statue, wrong ones .3 and more."""
+RATIO = 2.5
+"""The largest residual in units of σ of scans whose residual is above `BEND`."""
+NOT_DETERMINED, WEAK = 10.0, 60.0
+"""A direction whose information is less than this many times what the noise of the normals makes alone is not determined, or is tried out.
+A vase has 4 about its axis; the statue of tests/scenes has 140 and more at overlaps above a tenth."""
+SHIFTS = (0.1, -0.1, 0.3)
+"""By how much, in parts of the size of the scans, a scan is moved along a weak direction to try it out."""
+AS_GOOD = 1.15
+"""Another pose fits as well if its residual is at most this many times that of the best, and its overlap that part of it at the least."""
+
+
+SCALE_SIGMAS, SCALE_LEAST, SCALE_MOST = 5.0, 0.001, 0.2
+"""The scale of a scan is told if it differs from 1 by so many standard deviations and by these parts."""
+
+
+class PairState(StrEnum):
+    """What became of a pair."""
+
+    JOINED = "joined"
+    NO_POSE = "no pose"
+    """No pose brings enough of the two surfaces together."""
+    LITTLE_OVERLAP = "little overlap"
+    MISFIT = "misfit"
+    """The surfaces lie further apart than σ and the spacing of the points explain."""
+    CONTRADICTED = "contradicted"
+    """One scan has points where the camera of the other saw through."""
+    AMBIGUOUS = "ambiguous"
+    """Several poses fit alike: the surface is symmetric."""
+
+
+class Pair(NamedTuple):
+    """Two scans, and the pose of one against the other."""
+
+    a: int
+    b: int
+    state: PairState
+    fit: Fit | None
+    """Of the best pose; None: none was found."""
+    overlap: float
+    """Part of the smaller scan's surface that is matched."""
+    contradicted: float
+    reason: str
+    """Why it was refused, in words; empty of a joined pair."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prepared:
+    """A scan at both scales."""
+
+    rough: Cloud
+    fine: Cloud
+    features: np.ndarray
+    image: DepthRange | None
+    area: float
+    """Of the surface that is seen, square metres, up to a factor that all scans share."""
+
+    @property
+    def spacing(self) -> float:
+        """Median distance of neighbouring points of the fine cloud, metres."""
+        return float(np.median(self.fine.spacing))
+
+
+def prepare(scan: Scan, *, cell_m: float, threads: int = 1) -> Prepared:
+    """Thin a scan to both scales and describe its rough points.
+
+    Args:
+        scan: the scan.
+        cell_m: side of the cells of the rough scale, metres.
+        threads: for the search of neighbours.
+    """
+    rough = prepared(scan, cell_m=cell_m, most=ROUGH_POINTS, threads=threads)
+    fine = prepared(scan, cell_m=0.0, most=FINE_POINTS, threads=threads)
+    return Prepared(rough=rough, fine=fine, features=fpfh(rough, FEATURE_CELLS * cell_m), image=depth_range(scan),
+                    area=len(rough.points) * cell_m**2)
+
+
+def search(a: Prepared, b: Prepared, *, numbers: tuple[int, int], cell_m: float, least_overlap: float) -> Pair:
+    """Register two scans without a start.
+
+    Args:
+        a, b: the scans.
+        numbers: of the scans, for the result.
+        cell_m: side of the cells of the rough scale, metres.
+        least_overlap: the least part of the smaller scan that must be matched.
+    """
+    poses = rough_poses(a.rough, b.rough, a.features, b.features, cell_m=cell_m, most=MOST_POSES)
+    return _best(a, b, _settled(a, b, poses, cell_m), numbers, cell_m, least_overlap)
+
+
+def refine(a: Prepared, b: Prepared, start: np.ndarray, *, numbers: tuple[int, int], cell_m: float, least_overlap: float) -> Pair:
+    """Register two scans from a start, a_from_b [4, 4], that is right to about a cell; otherwise as `search`."""
+    return _best(a, b, _settled(a, b, [start], cell_m), numbers, cell_m, least_overlap)
+
+
+def _settled(a: Prepared, b: Prepared, poses: list[np.ndarray], cell_m: float) -> Iterator[np.ndarray]:
+    """Yield the poses after a fit at the rough scale, each once, without those that the free space contradicts."""
+    seen: list[np.ndarray] = []
+    for pose in poses:
+        found = fit(a.rough, b.rough, pose, [4 * cell_m, 2 * cell_m])
+        if found is None or any(is_near(found.pose, other, b.rough.middle, cell_m) for other in seen):
+            continue
+        seen.append(found.pose)
+        noise = float(np.median(np.hypot(a.rough.sigma.mean(), b.rough.sigma)))
+        if found.residual > max(ROUGH_BEND * cell_m, RATIO * noise):
+            continue
+        if _part(both_sights(a.image, b.image, a.rough.points, b.rough.points, found.pose, cell_m / 2)) <= ROUGH_CONTRADICTED:
+            yield found.pose
+
+
+def _best(a: Prepared, b: Prepared, poses: Iterator[np.ndarray], numbers: tuple[int, int], cell_m: float, least_overlap: float) -> Pair:
+    found: list[Pair] = []
+    for pose in poses:
+        pair = _judged(a, b, pose, numbers, cell_m, least_overlap)
+        if pair is not None and not any(_same(pair, other, b, cell_m) for other in found):
+            found.append(pair)
+    if not found:
+        return Pair(*numbers, PairState.NO_POSE, None, 0.0, 0.0, "no pose brings enough of the two surfaces together")
+    found.sort(key=lambda pair: (pair.state is not PairState.JOINED, -pair.overlap))
+    best = found[0]
+    if best.state is not PairState.JOINED:
+        return best
+    rival = next((pair for pair in found[1:] if _as_good(pair, best)), None)
+    if rival is not None:
+        return best._replace(state=PairState.AMBIGUOUS, reason="poses that lie apart fit alike: the surface repeats itself")
+    return _tried_out(a, b, best, cell_m, least_overlap)
+
+
+def _judged(a: Prepared, b: Prepared, start: np.ndarray, numbers: tuple[int, int], cell_m: float, least_overlap: float) -> Pair | None:
+    """Return the pair at the pose that the fine scale finds from a start; None if there is none."""
+    spacing = max(a.spacing, b.spacing)
+    found = fit(a.fine, b.fine, start, [max(cell_m, 3 * spacing), 3 * spacing, 1.5 * spacing])
+    if found is None:
+        return None
+    area = found.matches / len(b.fine.sample) * b.area
+    overlap = min(area / min(a.area, b.area), 1.0)
+    tolerance = max(TUKEY * found.residual, 0.5 * spacing)
+    part = _part(both_sights(a.image, b.image, a.fine.points, b.fine.points, found.pose, tolerance))
+    state, reason = PairState.JOINED, ""
+    if found.residual > BEND * spacing and found.ratio > RATIO:
+        state = PairState.MISFIT
+        reason = f"the surfaces lie {1e3 * found.residual:.3g} mm apart (standard deviation): {found.ratio:.3g} times what σ explains"
+        if SCALE_LEAST < abs(found.scale) < SCALE_MOST and abs(found.scale) > SCALE_SIGMAS * found.scale_sigma:
+            reason += f", and one is {abs(found.scale):.2%} larger than the other: check its scale"
+    elif part > CONTRADICTED:
+        state, reason = PairState.CONTRADICTED, f"{part:.0%} of the points in sight lie where the other camera saw through"
+    elif overlap < least_overlap:
+        state, reason = PairState.LITTLE_OVERLAP, f"only {overlap:.1%} of the smaller surface is matched"
+    return Pair(*numbers, state, found, overlap, part, reason)
+
+
+def _tried_out(a: Prepared, b: Prepared, best: Pair, cell_m: float, least_overlap: float) -> Pair:
+    """Return the pair, refused if a move along its weakest direction leads to another pose that fits as well."""
+    assert best.fit is not None
+    size = float(np.sqrt(((b.rough.points - b.rough.middle) ** 2).sum(axis=1).mean()))
+    units = np.array([1 / size] * 3 + [1.0] * 3)  # a step of length 1 moves points by about 1 m
+    values, axes = np.linalg.eigh(best.fit.information * np.outer(units, units))
+    for value, axis in zip(values, axes.T, strict=True):
+        alone = float(axis @ (best.fit.noise * np.outer(units, units)) @ axis)
+        step = units * axis
+        if value < NOT_DETERMINED * alone or (value < WEAK * alone and _slides(a, b, best, size * step, cell_m, least_overlap)):
+            kind = "turned about an axis" if np.linalg.norm(axis[:3]) > 0.5 else "shifted along itself"
+            return best._replace(state=PairState.AMBIGUOUS,
+                                 reason=f"the surface looks the same when it is {kind}, so that its pose is not determined")
+    return best
+
+
+def _slides(a: Prepared, b: Prepared, best: Pair, step: np.ndarray, cell_m: float, least_overlap: float) -> bool:
+    """Return whether a fit from a place along a direction ends about there, and as good."""
+    assert best.fit is not None
+    for shift in SHIFTS:
+        other = _judged(a, b, moved(shift * step, best.fit.pivot, best.fit.pose), (best.a, best.b), cell_m, least_overlap)
+        if other is not None and other.fit is not None and _as_good(other, best):
+            kept = step_between(other.fit.pose @ inverse(best.fit.pose), best.fit.pivot)
+            if float(kept @ step / (step @ step)) / shift > 0.3:
+                return True
+    return False
+
+
+def _as_good(pair: Pair, best: Pair) -> bool:
+    assert pair.fit is not None and best.fit is not None
+    return (pair.state is PairState.JOINED and pair.fit.ratio <= AS_GOOD * best.fit.ratio and pair.overlap >= best.overlap / AS_GOOD / 1.5)
+
+
+def _same(pair: Pair, other: Pair, b: Prepared, cell_m: float) -> bool:
+    assert pair.fit is not None and other.fit is not None
+    return is_near(pair.fit.pose, other.fit.pose, b.rough.middle, cell_m)
+
+
+def _part(sight: Sight) -> float:
+    return sight.contradicted / max(sight.agreeing + sight.contradicted, 1)

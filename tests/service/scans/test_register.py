@@ -1,0 +1,180 @@
+"""relit register: scans of a simulated figure come together, how sure their poses are, and what is refused or flagged with a sentence."""
+
+import json
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stage.depth_maps import DepthMaps
+from stage.ply import PointCloud, write_ply
+from stage.scans.records import read_scan_set
+from stage.scans.rigid import inverse, step_between
+from tests.scenes.turntable import MM, Distance, View, figure, pose, turntable, vase
+
+ROWS = 120
+"""Pixels of 10 mm on the figure: the search must do with some 2500 points a scan."""
+
+
+@cache
+def views(surface: Distance, *angles: float) -> tuple[View, ...]:
+    return tuple(turntable(surface, list(angles), rows=ROWS))
+
+
+def write(folder: Path, seen: tuple[View, ...], **entries: dict) -> Path:
+    """A scan set; `entries` are further keys of the scans s0, s1 …, among them `points`, which changes them and makes a PLY file."""
+    folder.mkdir(parents=True, exist_ok=True)
+    scans = []
+    for number, view in enumerate(seen):
+        name = f"s{number}"
+        further = dict(entries.get(name, {}))
+        change = further.pop("points", None)
+        path = name
+        if change is None:
+            DepthMaps(camera=view.camera, mask=view.mask, depth=view.depth, sigma=view.sigma).write(folder / name / "depth.exr")
+        else:
+            path = f"{name}.ply"
+            points = change(view.camera.points(-view.depth)[view.mask].astype(float))
+            write_ply(PointCloud(points.astype(np.float32), np.zeros((len(points), 3), dtype=np.uint8)), folder / path)
+        scans.append({"name": name, "path": path, **further})
+    data = {"schema": "relit.scan-set/1", "name": "figure", "scans": scans, **entries.get("top", {})}
+    (folder / "scan-set.json").write_text(json.dumps(data))
+    return folder
+
+
+def off(folder: Path, seen: tuple[View, ...]) -> dict[str, tuple[float, float]]:
+    """By how much each pose is wrong against the first: metres at the middle of the figure, and degrees."""
+    _, found = read_scan_set(folder)
+    first = found.scans[0]
+    assert first.scan_to_world is not None
+    world = np.array(first.scan_to_world) @ inverse(seen[0].world_from_scan)
+    out = {}
+    for entry, view in zip(found.scans, seen, strict=True):
+        if entry.scan_to_world is not None:
+            step = step_between(inverse(world) @ np.array(entry.scan_to_world) @ inverse(view.world_from_scan), np.zeros(3))
+            out[entry.name] = float(np.linalg.norm(step[3:])), float(np.degrees(np.linalg.norm(step[:3])))
+    return out
+
+
+def table_of(seen: tuple[View, ...], *angles: float, **further) -> dict:
+    """The turntable in the frame of the camera, whose axis is +y of the figure's world."""
+    camera = inverse(pose(0.0))
+    return {"turntable": {"axis_point_m": camera[:3, 3].tolist(), "axis": (camera[:3, :3] @ [0, 1, 0]).tolist(), "angles_deg": list(angles),
+                          **further}}
+
+
+def test_scans_without_poses_come_together(relit, tmp_path):
+    seen = views(figure, 0, 30, 60, 100, 150)
+    outcome = relit("register", write(tmp_path / "set", seen), "--out", tmp_path / "out")
+    assert outcome.code == 0, outcome.err
+    assert "joined   5 of 5 scans" in outcome.out
+    wrong = off(tmp_path / "out", seen)
+    assert len(wrong) == 5
+    assert max(shift for shift, _ in wrong.values()) < 0.3 * MM and max(turn for _, turn in wrong.values()) < 0.1
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    for entry in report["scans"]:  # five standard deviations of three numbers each
+        shift, turn = wrong[entry["name"]]
+        assert shift < 5 * entry["pose_sigma_m"] + 1e-9 and turn < 5 * entry["pose_sigma_degrees"] + 1e-9
+    states = {tuple(pair["scans"]): pair["state"] for pair in report["pairs"]}
+    assert states["s0", "s1"] == "joined" and states["s0", "s4"] != "joined" and len(states) == 10
+    _, found = read_scan_set(tmp_path / "out")
+    assert (tmp_path / "out" / found.scans[0].path / "depth.exr").is_file()
+    assert np.array(found.scans[0].pose_covariance).max() == 0 and np.array(found.scans[1].pose_covariance).max() > 0
+
+
+def test_poses_of_the_file_are_starts(relit, tmp_path):
+    seen = views(figure, 0, 30, 60)
+    rough = {}
+    for number, view in enumerate(seen):
+        start = view.world_from_scan @ np.eye(4)
+        start[:3, 3] += 8 * MM * (number > 0)
+        rough[f"s{number}"] = {"scan_to_world": start.tolist()}
+    outcome = relit("register", write(tmp_path / "set", seen, **rough), "--out", tmp_path / "out")
+    assert outcome.code == 0, outcome.err
+    assert max(shift for shift, _ in off(tmp_path / "out", seen).values()) < 0.2 * MM
+    _, found = read_scan_set(tmp_path / "out")
+    np.testing.assert_allclose(found.scans[0].scan_to_world, seen[0].world_from_scan, atol=1e-12)  # the reference stays where it is
+
+
+@pytest.mark.parametrize("given", [(0.0, 29.0, 61.0), None], ids=["rough angles", "no angles"])
+def test_the_angles_of_a_turntable_are_refined(relit, tmp_path, given):
+    seen = views(figure, 0, 30, 60)
+    table = table_of(seen, *(given or ()))
+    if given is None:
+        del table["turntable"]["angles_deg"]
+    outcome = relit("register", write(tmp_path / "set", seen, top=table), "--out", tmp_path / "out", "--turntable", "angles")
+    assert outcome.code == 0, outcome.err
+    wrong = off(tmp_path / "out", seen)
+    assert max(shift for shift, _ in wrong.values()) < 0.02 * MM and max(turn for _, turn in wrong.values()) < 0.02
+
+
+def test_a_fixed_turntable_is_kept_and_checked(relit, tmp_path):
+    seen = views(figure, 0, 30, 60)
+    folder = write(tmp_path / "set", seen, top=table_of(seen, 0, 30, 60))
+    outcome = relit("register", folder, "--out", tmp_path / "out", "--turntable", "fixed")
+    assert outcome.code == 0, outcome.err
+    assert "ask for poses" not in outcome.out + outcome.err
+    assert max(shift for shift, _ in off(tmp_path / "out", seen).values()) < 1e-9
+    folder = write(tmp_path / "bad", seen, top=table_of(seen, 0, 30, 61))
+    outcome = relit("register", folder, "--out", tmp_path / "out2", "--turntable", "fixed")
+    assert outcome.code == 0, outcome.err
+    assert "s1 and s2: their surfaces ask for poses that are" in outcome.out + outcome.err
+
+
+def test_a_vase_is_refused_and_placed_by_a_fixed_turntable(relit, tmp_path):
+    seen = views(vase, 0, 40, 80)
+    outcome = relit("register", write(tmp_path / "set", seen), "--out", tmp_path / "out")
+    assert outcome.code == 2
+    assert "the surface looks the same when it is turned about an axis, so that its pose is not determined" in outcome.err
+    assert not (tmp_path / "out").exists()
+    folder = write(tmp_path / "turned", seen, top=table_of(seen, 0, 40, 80))
+    outcome = relit("register", folder, "--out", tmp_path / "out", "--turntable", "fixed")
+    assert outcome.code == 0, outcome.err
+    assert "nothing checks the turntable" in outcome.out + outcome.err
+
+
+@pytest.mark.parametrize(("change", "sentence"), [
+    (lambda points: points * [-1, 1, 1], "s3: has no pose: fits the others if it is mirrored"),
+    (lambda points: points * 1000, "s3: has no pose: fits the others if its coordinates are multiplied by 0.001, as if it were in mil"),
+    (lambda points: points * 1.01, "s3: is about 0."),
+    (lambda points: points[:, [0, 2, 1]] * [1, 1, -1] * [1, 1, 0.3], "s3: has no pose"),
+], ids=["mirrored", "millimetres", "one per cent", "squeezed"])
+def test_a_scan_that_does_not_belong_is_named(relit, tmp_path, change, sentence):
+    seen = views(figure, 0, 30, 60, 45)
+    outcome = relit("register", write(tmp_path / "set", seen, s3={"points": change, "sigma_m": 2.5e-4}), "--out", tmp_path / "out")
+    assert sentence in outcome.out + outcome.err, outcome.out + outcome.err
+    _, found = read_scan_set(tmp_path / "out")
+    assert all(entry.scan_to_world is not None for entry in found.scans[:3])
+    if "has no pose" in sentence:
+        assert outcome.code == 1 and found.scans[3].scan_to_world is None
+
+
+def test_scans_without_overlap_are_refused(relit, tmp_path):
+    seen = views(figure, 0, 180)
+    outcome = relit("register", write(tmp_path / "set", seen), "--out", tmp_path / "out")
+    assert outcome.code == 2 and "s1: " in outcome.err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("options", "sentence"), [
+    (["--turntable", "fixed"], "has no turntable"), (["--reference", "nobody"], "--reference nobody: is no scan of"),
+    (["--turntable", "angles", "--poses", "ignored"], "give one of them"), (["--least-overlap", "0"], "--least-overlap"),
+])
+def test_options_that_do_not_fit_are_refused(relit, tmp_path, options, sentence):
+    outcome = relit("register", write(tmp_path / "set", views(figure, 0, 30)), "--out", tmp_path / "out", *options)
+    assert outcome.code == 2 and sentence in outcome.err
+
+
+def test_the_input_is_not_replaced_and_one_scan_is_refused(relit, tmp_path):
+    folder = write(tmp_path / "set", views(figure, 0, 30))
+    outcome = relit("register", folder, "--out", folder)
+    assert outcome.code == 2 and "would replace" in outcome.err
+    outcome = relit("register", write(tmp_path / "one", views(figure, 0)), "--out", tmp_path / "out")
+    assert outcome.code == 2 and "holds one scan" in outcome.err
+
+
+def test_without_small_gicp_the_extra_is_named(relit, tmp_path, monkeypatch):
+    monkeypatch.setattr("service.scans.register.neighbours_are_installed", lambda: False)
+    outcome = relit("register", write(tmp_path / "set", views(figure, 0, 30)), "--out", tmp_path / "out")
+    assert outcome.code == 2 and "pip install 'relit[scans]'" in outcome.err
