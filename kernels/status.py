@@ -40,6 +40,8 @@ class Status(IntEnum):
     """Depth: frequencies or codes disagree: light came over several ways."""
     UNSURE = 15
     """Estimated, but less surely than was asked for: the value and its standard deviation are kept, outside the mask of the result."""
+    OCCLUDED = 16
+    """Depth: the place is hidden from the other camera, or lies outside its image."""
 
 
 SOLVED = (Status.OK, Status.AMBIGUOUS, Status.NOT_CONVERGED)

@@ -133,7 +133,7 @@ class Capture:
                    for frame in self.manifest.frames)
 
     def recorded(self, name: str) -> np.ndarray:
-        """Read the recorded values of an image that holds radiance.
+        """Read the recorded values of an image that holds radiance, in the part of it that the capture is about.
 
         Returns:
             [rows, cols, 3] uint8 or uint16 as the file has them, or float32; values below 0 are noise.
@@ -142,10 +142,21 @@ class Capture:
             ImageError: the file is unreadable, or a value is NaN, infinite or negative beyond the noise of the image and not to be
                 clipped; the message names the file.
         """
+        return self.part_of(self.recorded_whole(name))
+
+    def recorded_whole(self, name: str) -> np.ndarray:
+        """Read the recorded values of a whole image that holds radiance, of any size, as those of other cameras have.
+
+        Returns:
+            [rows, cols, 3] as `recorded`.
+
+        Raises:
+            ImageError: as `recorded`.
+        """
         path = self.file(name)
         pixels = images.read_recorded(path)
         if pixels.dtype.kind == "u":
-            return self.part_of(pixels)
+            return pixels
         if self.pixels.clip_negative:
             radiances.check_finite(path, pixels)
             pixels, count = radiances.clip_negative(pixels)
@@ -153,7 +164,7 @@ class Capture:
                 self.clipped[name] = count
         else:
             radiances.check_radiance(path, pixels, remedy=radiances.CLIP_NEGATIVE, stray=radiances.RAW_STRAY if path_is_raw(path) else 0.0)
-        return self.part_of(pixels).astype(np.float32, copy=False)
+        return pixels.astype(np.float32, copy=False)
 
     def part_of(self, image: np.ndarray) -> np.ndarray:
         """Return the part of a whole image, [rows, cols, ...], that the capture is about."""
@@ -195,6 +206,8 @@ class Capture:
             yield f"frames[{index}].image", frame.image
             if isinstance(frame.light, EnvironmentLight):
                 yield f"frames[{index}].light.image", frame.light.image
+            for number, name in enumerate(() if frame.stereo is None else frame.stereo.images):
+                yield f"frames[{index}].stereo.images[{number}]", name
 
     def _part(self, crop: Crop) -> "Capture":
         """Return the part of the capture inside a rectangle of its images."""
@@ -219,6 +232,9 @@ class Capture:
         """Check the header of every file, and return those of frames by the names of their images."""
         frames = {f"frames[{index}].image" for index in range(len(self.manifest.frames))}
         headers: dict[str, ImageHeader] = {}
+        others = {f"frames[{index}].stereo.images[{number}]": (camera.resolution, f"other_cameras[{number}].resolution")
+                  for index, frame in enumerate(self.manifest.frames) if frame.stereo is not None
+                  for number, camera in enumerate(self.manifest.other_cameras)}
         arrays = {f"frames[{index}].image" for index, frame in enumerate(self.manifest.frames) if frame.tof is not None}
 
         def fault(item: tuple[str, str]) -> StageError | None:
@@ -233,7 +249,8 @@ class Capture:
                 if field.endswith(".light.image"):
                     images.read_header(path)  # an environment has a size of its own
                 else:
-                    header = images.check_resolution(path, self.camera.resolution)
+                    resolution, declared = others.get(field, (self.camera.resolution, "camera.resolution"))
+                    header = images.check_resolution(path, resolution, declared=declared)
                     if field != "mask" and path_is_raw(path) and not is_linear(self.manifest.color_space):
                         return ManifestError(f"{self.folder / FILE_NAME}: color_space: {self.manifest.color_space} is encoded for "
                                              f"displays, and {name} is camera raw, which is linear: give lin_rec709_scene")

@@ -243,8 +243,13 @@ def write_png(path: Path, codes: np.ndarray, *, srgb: bool) -> None:
         raise OSError(f"{path.name}: the disk took only part of it") from error
 
 
-def check_resolution(path: str | Path, resolution: tuple[int, int]) -> ImageHeader:
-    """Check that an image has the width and height that the camera declares, and return its header.
+def check_resolution(path: str | Path, resolution: tuple[int, int], *, declared: str = "camera.resolution") -> ImageHeader:
+    """Check that an image has the width and height that a camera declares, and return its header.
+
+    Args:
+        path: the file.
+        resolution: width and height.
+        declared: the field that declares them, for the message.
 
     Raises:
         ImageError: the size differs.
@@ -252,7 +257,7 @@ def check_resolution(path: str | Path, resolution: tuple[int, int]) -> ImageHead
     header = read_header(path)
     if (header.width, header.height) != resolution:
         turned = "" if header.orientation == UPRIGHT else f" once it is {TURNS[header.orientation].words} (EXIF orientation)"
-        raise ImageError(f"{path}: is {header.width}x{header.height}{turned}, camera.resolution says {resolution[0]}x{resolution[1]}")
+        raise ImageError(f"{path}: is {header.width}x{header.height}{turned}, {declared} says {resolution[0]}x{resolution[1]}")
     return header
 
 

@@ -17,10 +17,13 @@ from stage.patterns.codes import Pattern
 from stage.projector import AnyProjector
 from stage.ranging import Laser, TimeOfFlight
 from stage.records import faults_of, read_record
+from stage.stereo.other_camera import OtherCamera, StereoImages
 
 SCHEMA = "relit.capture/1"
 FILE_NAME = "capture.json"
 
+LIT_BY = ("light", "pattern", "laser", "tof", "stereo")
+"""The fields of a frame that say what lit it; every frame has exactly one."""
 FileName = Text
 """The name of a file of the capture, relative to its folder."""
 
@@ -36,7 +39,8 @@ def _invertible(rows: ColorMatrix) -> ColorMatrix:
 
 
 class Frame(Strict):
-    """One image of a capture and what lit it: exactly one of a light, a pattern, a laser and a time-of-flight source."""
+    """One image of a capture and what lit it: exactly one of a light, a pattern, a laser, a time-of-flight source, and texture that other
+    cameras see too."""
 
     image: FileName
     """The image, a file of the folder that no other frame has; for `tof` it may be a NumPy array, .npy."""
@@ -50,13 +54,15 @@ class Frame(Strict):
     """The laser ray or plane."""
     tof: TimeOfFlight | None = None
     """The time-of-flight source."""
+    stereo: StereoImages | None = None
+    """The images of other cameras at the same moment, under projected texture without a code."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        given = [name for name in ("light", "pattern", "laser", "tof") if getattr(self, name) is not None]
+        given = [name for name in LIT_BY if getattr(self, name) is not None]
         if len(given) != 1:
             what = " and ".join(given) or "nothing that lit it"
-            raise ValueError(f"has {what}: give exactly one of light, pattern, laser, tof")
+            raise ValueError(f"has {what}: give exactly one of {', '.join(LIT_BY)}")
         return self
 
 
@@ -73,6 +79,8 @@ class Manifest(Strict):
     """The camera, which took all images from one place."""
     projector: AnyProjector | None = None
     """The projector of pattern frames; None: there is none, or nobody has measured anything of it."""
+    other_cameras: tuple[OtherCamera, ...] = ()
+    """Cameras beside the camera, which took the `stereo` images of frames; none for captures of one camera."""
     mask: FileName | None = None
     """An image whose first channel is above one half on the object; None: every pixel is object."""
     dark: FileName | None = None
@@ -98,11 +106,31 @@ class Manifest(Strict):
     @model_validator(mode="after")
     def _check(self) -> Self:
         fault = next(_between_frames([frame.image for frame in self.frames], [frame.exposure_s is not None for frame in self.frames]), None)
+        if fault is None:
+            fault = next(self._stereo_faults(), None)
         if fault is not None:
             raise ValueError(fault)
         if self.exposure_from is not None and self.frames[0].exposure_s is not None:
             raise ValueError("exposure_from: is given beside frames[0].exposure_s: give one of them")
         return self
+
+    def _stereo_faults(self) -> Iterator[str]:
+        """Yield what does not agree between the frames under texture and the other cameras."""
+        names = [camera.name for camera in self.other_cameras]
+        for index, name in enumerate(names):
+            if name in names[:index]:
+                yield f"other_cameras[{index}].name: {name} is already the name of other_cameras[{names.index(name)}]"
+        taken = {posixpath.normpath(frame.image): f"frames[{index}]" for index, frame in enumerate(self.frames)}
+        for index, frame in enumerate(self.frames):
+            if frame.stereo is None:
+                continue
+            if len(frame.stereo.images) != len(self.other_cameras):
+                yield (f"frames[{index}].stereo.images: has {len(frame.stereo.images)} images, other_cameras has {len(self.other_cameras)} "
+                       "cameras: give the image of each, in their order")
+            for image in frame.stereo.images:
+                if taken.setdefault(posixpath.normpath(image), f"frames[{index}].stereo") != f"frames[{index}].stereo" or \
+                        frame.stereo.images.count(image) > 1:
+                    yield f"frames[{index}].stereo.images: {image} is already the image of {taken[posixpath.normpath(image)]}"
 
 
 def read_manifest(path: str | Path) -> Manifest:

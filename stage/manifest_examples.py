@@ -14,6 +14,7 @@ from stage.patterns.phase import PhasePattern
 from stage.patterns.ramp import RampPattern
 from stage.projector import Projector, UncalibratedProjector
 from stage.ranging import ContinuousWave, LaserPlane, LaserRay, Pulsed
+from stage.stereo.other_camera import OtherCamera, StereoImages
 
 Example = dict[str, Any]
 
@@ -24,6 +25,10 @@ _CROSSED: Example = {**_DISTANT, "polarization": "cross"}
 _PARALLEL: Example = {**_DISTANT, "polarization": "parallel"}
 _WHITE: Example = {"code": "white"}
 _RAY: Example = {"type": "ray", "origin_m": [0.15, 0.0, 0.0], "direction": [-0.2, 0.0, -1.0]}
+_STEREO: Example = {"images": ["right_0.png"]}
+_OTHER: Example = {
+    "name": "right", "resolution": [1280, 1024], "focal_px": [1500.0, 1500.0], "principal_px": [641.2, 510.8], "distortion": _DISTORTION,
+    "camera_from_other": [[1, 0, 0, 0.12], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}
 _CONTINUOUS: Example = {"type": "cw", "modulation_hz": 60_000_000, "reference_phase_rad": 1.570796, "source_m": [0.02, 0.0, 0.0]}
 
 EXAMPLES: dict[type[Strict], tuple[Example, ...]] = {
@@ -39,6 +44,10 @@ EXAMPLES: dict[type[Strict], tuple[Example, ...]] = {
     }, {
         "schema": SCHEMA, "name": "statue", "camera": _ORTHOGRAPHIC, "polarizer_leak": 0.01,
         "frames": [{"image": "000_cross.exr", "light": _CROSSED}, {"image": "000_parallel.exr", "light": _PARALLEL}],
+    }, {
+        "schema": SCHEMA, "name": "head", "color_space": "srgb_texture",
+        "camera": {"projection": "perspective", "resolution": [1280, 1024], "focal_px": [1500.0, 1500.0]}, "other_cameras": [_OTHER],
+        "frames": [{"image": "left_0.png", "stereo": _STEREO}],
     }),
     Camera: (
         {"projection": "perspective", "resolution": [1024, 768], "focal_px": [2100.0, 2100.0], "principal_px": [512.5, 384.5],
@@ -56,7 +65,10 @@ EXAMPLES: dict[type[Strict], tuple[Example, ...]] = {
     UncalibratedProjector: ({"resolution": [1280, 800]}, {"resolution": [1280, 800], "response": [0.0, 0.05, 0.22, 0.53, 1.0],
                                                           "crosstalk": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}),
     Frame: ({"image": "000.png", "exposure_s": 0.0125, "light": _DISTANT}, {"image": "pattern_00.png", "pattern": _WHITE},
-            {"image": "spot_00.png", "laser": _RAY}, {"image": "phase_090.npy", "tof": _CONTINUOUS}),
+            {"image": "spot_00.png", "laser": _RAY}, {"image": "phase_090.npy", "tof": _CONTINUOUS},
+            {"image": "left_0.png", "stereo": _STEREO}),
+    OtherCamera: (_OTHER,),
+    StereoImages: (_STEREO,),
     DistantLight: (_DISTANT, _CROSSED),
     PointLight: ({"type": "point", "position_m": [0.2, 0.1, 0.3], "intensity": [0.5, 0.5, 0.48], "axis": [-0.2, -0.1, -0.3],
                   "anisotropy": 1.0, "polarization": "parallel"},),

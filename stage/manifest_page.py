@@ -40,7 +40,7 @@ SCALARS: dict[type, str] = {float: "number", int: "whole number", bool: "`true` 
 LONGEST_EXAMPLE = 60
 """The most characters of an example in a table; longer ones stand below it."""
 HEADINGS = {"camera": "The camera", "projector": "The projector", "light": "Lights", "pattern": "Patterns", "laser": "Lasers",
-            "tof": "Time of flight"}
+            "tof": "Time of flight", "stereo": "Texture seen by several cameras", "other_cameras": "Other cameras"}
 """The sections of the objects, by the key that leads to them."""
 HEAD = """# Every field of capture.json
 

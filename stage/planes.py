@@ -82,7 +82,7 @@ def frame_planes(capture: Capture, frames: Sequence[Frame], *, colour: bool, cac
     correction = Correction.of(capture)
     width, height = capture.camera.resolution
     shape = (len(frames), height, 3 if colour else 1, width)
-    with _allocator(4 * int(np.prod(shape)), capture, cache) as allocate:
+    with scratch_arrays(4 * int(np.prod(shape)), capture, cache) as allocate:
         values = allocate(shape, np.float32)
         saturated = allocate((len(frames), height, width), np.bool_) if capture.manifest.saturation is not None else None
 
@@ -102,8 +102,17 @@ def frame_planes(capture: Capture, frames: Sequence[Frame], *, colour: bool, cac
 
 
 @contextmanager
-def _allocator(size: int, capture: Capture, cache: Path | None) -> Iterator[Callable[[tuple[int, ...], type[np.generic]], np.ndarray]]:
-    """Yield a function that makes arrays: in memory up to MEMORY_BYTES in all, otherwise in unnamed temporary files."""
+def scratch_arrays(size: int, capture: Capture, cache: Path | None) -> Iterator[Callable[[tuple[int, ...], type[np.generic]], np.ndarray]]:
+    """Yield a function that makes arrays: in memory up to MEMORY_BYTES in all, otherwise in unnamed temporary files.
+
+    Args:
+        size: bytes of all arrays together.
+        capture: whose folder has the scratch file, where `cache` does not.
+        cache: the folder for the scratch file; None stands for `.relit` in the folder of the capture.
+
+    Raises:
+        StorageError: when the function is called: the file cannot be made.
+    """
     if size <= MEMORY_BYTES:
         yield lambda shape, dtype: np.empty(shape, dtype)
         return

@@ -201,6 +201,8 @@ def _kind(frame: Frame) -> str:
         return f"{frame.light.type} light"
     if frame.pattern is not None:
         return f"{frame.pattern.code} pattern"
+    if frame.stereo is not None:
+        return "texture seen by several cameras"
     return f"{frame.laser.type} laser" if frame.laser is not None else "time of flight"
 
 

@@ -1,8 +1,8 @@
 """Measure the depth of a capture and write depth.exr, points.ply and report.json.
 
 The way of the data: the kind of the capture's frames chooses a row of `KINDS`, whose `solve` makes a DepthSolution of them: patterns.py
-(with codes.py and decoders.py), laser.py or tof.py; or a DecodedSolution, where patterns cannot be triangulated. points.py makes the cloud
-of a depth, and the files are written here.
+(with codes.py and decoders.py), laser.py, tof.py or stereo.py (with stereo_pair.py); or a DecodedSolution, where patterns cannot be
+triangulated. points.py makes the cloud of a depth, and the files are written here.
 """
 
 import hashlib
@@ -19,6 +19,7 @@ from service.depth.laser import solve_laser
 from service.depth.patterns import solve_patterns
 from service.depth.points import point_cloud
 from service.depth.solution import DepthSolution
+from service.depth.stereo import solve_stereo
 from service.depth.tof import solve_tof
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
@@ -58,6 +59,7 @@ KINDS: dict[Ranging, Kind] = {
                       lambda capture, mask, request, device, timings: solve_tof(
                           capture, request.tof, near_m=request.near_m, far_m=request.far_m, device=device, timings=timings),
                       None),
+    Ranging.STEREO: Kind(lambda frame: frame.stereo is not None, solve_stereo, "other_cameras[].camera_from_other"),
 }
 """How depth is measured with each kind of frames."""
 
@@ -155,7 +157,7 @@ def _ranging(capture: Capture, wanted: Ranging | None) -> Ranging:
     where = f"{capture.folder / FILE_NAME}: frames"
     listed = " and ".join(found)
     if not found:
-        raise ManifestError(f"{where}: none has a pattern with a code, a laser or tof: relit depth needs such frames, "
+        raise ManifestError(f"{where}: none has a pattern with a code, a laser, tof or stereo: relit depth needs such frames, "
                             "relit solve takes light frames")
     if wanted is not None:
         if wanted not in found:

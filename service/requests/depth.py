@@ -19,6 +19,7 @@ class Ranging(Choice):
     PATTERN = "pattern", "structured light: frames under projected patterns"
     LASER = "laser", "frames under spots or stripes of a laser"
     TOF = "tof", "time of flight: phases or photon histograms"
+    STEREO = "stereo", "two or more cameras under projected texture"
 
 
 class TofFilter(Choice):
@@ -74,9 +75,9 @@ class DepthOptions(PixelOptions):
     refine: bool = True
     """Interpolate a Gray code with inverses between the edges of its stripes."""
     read_noise: Positive = 0.003
-    """Standard deviation of a reading in the dark, quantisation included, as a fraction of full scale; patterns only."""
+    """Standard deviation of a reading in the dark, quantisation included, as a fraction of full scale; patterns and stereo only."""
     photon_gain: NotNegative = 1e-4
-    """Photon noise: 1 / (electrons at full scale); patterns only."""
+    """Photon noise: 1 / (electrons at full scale); patterns and stereo only."""
     tof: TofChoices = TofChoices()
     """How time of flight is solved; `near_m` and `far_m` are ranges along the ray there."""
     max_sigma: Positive | None = None
@@ -90,7 +91,7 @@ class DepthOptions(PixelOptions):
 
 
 class DepthRequest(DepthOptions, Request):
-    """Depth from projected patterns, a laser or time of flight."""
+    """Depth from projected patterns, a laser, time of flight, or several cameras under projected texture."""
 
     capture: Annotated[Path, Role.INPUT, CAPTURE]
     """Folder with a capture.json."""

@@ -17,7 +17,7 @@ from stage.ingest import BYTES_PER_PIXEL, DECODE_BYTES
 from stage.light import DistantLight, PointLight
 from stage.light_basis import numbers
 from stage.lighting import lights_from_centre
-from stage.manifest import Frame
+from stage.manifest import LIT_BY, Frame
 
 PREVIEW_PIXELS = 144 * 144
 """Most pixels of the reduced image of a frame, from which its thumbnail and the exposure are taken."""
@@ -135,8 +135,8 @@ def describe_frames(capture: Capture, found: CaptureImages, thumbnails: list[lis
 
 
 def kind_of(frame: Frame) -> str:
-    """Return light, pattern, laser or tof."""
-    return next(name for name in ("light", "pattern", "laser", "tof") if getattr(frame, name) is not None)
+    """Return which of `LIT_BY` a frame has."""
+    return next(name for name in LIT_BY if getattr(frame, name) is not None)
 
 
 def label_of(frame: Frame) -> str:
@@ -145,6 +145,8 @@ def label_of(frame: Frame) -> str:
         return f"distant light, {_angles(np.array(frame.light.direction))}"
     if isinstance(frame.light, PointLight):
         return "near light at {:.3g}, {:.3g}, {:.3g} m".format(*frame.light.position_m)
+    if frame.stereo is not None:
+        return f"texture, {1 + len(frame.stereo.images)} cameras"
     source = getattr(frame, kind_of(frame))
     facts = source.model_dump(mode="json", exclude_defaults=True)
     first = facts.pop("type", None) or facts.pop("code", "")

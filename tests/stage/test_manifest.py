@@ -147,9 +147,9 @@ def test_wrong_values_are_named(tmp_path, change, said):
 
 
 @pytest.mark.parametrize(("frame", "said"), [
-    ({"image": "b.exr"}, "frames[1]: has nothing that lit it: give exactly one of light, pattern, laser, tof"),
+    ({"image": "b.exr"}, "frames[1]: has nothing that lit it: give exactly one of light, pattern, laser, tof, stereo"),
     ({"image": "b.exr", "light": DISTANT, "pattern": {"code": "white"}},
-     "frames[1]: has light and pattern: give exactly one of light, pattern, laser, tof"),
+     "frames[1]: has light and pattern: give exactly one of light, pattern, laser, tof, stereo"),
     ({"image": "b.exr", "light": {**DISTANT, "direction": [0, 0, 0]}},
      "frames[1].light.direction: has zero length: give a direction"),
     ({"image": "b.exr", "light": {**DISTANT, "direction": [0, 0]}}, "frames[1].light.direction[2]: is missing"),
@@ -200,7 +200,7 @@ def test_all_faults_are_named_at_once(tmp_path):
         "frames[2].laser.origin_m: is missing",
         "frames[2].laser.direction: is missing",
         "frames[3]: is 3: must be an object",
-        "frames[4]: has nothing that lit it: give exactly one of light, pattern, laser, tof",
+        "frames[4]: has nothing that lit it: give exactly one of light, pattern, laser, tof, stereo",
         "frames[2].image: a.exr is already the image of frames[0]",
         "frames[1].exposure_s: is missing: give it for every frame or for none",
     ]

@@ -16,7 +16,8 @@ KEYS = {name: key for key, hint in (("light", "Light"), ("pattern", "Pattern"), 
         (model.__name__ for model in EXAMPLES) if name.startswith(hint) or name.endswith(hint)}
 PLACES = {"Manifest": (), "Camera": ("camera",), "Distortion": ("camera", "distortion"), "Projector": ("projector",),
           "UncalibratedProjector": ("projector",), "Frame": ("frames", 0), **{name: ("frames", 0, key) for name, key in KEYS.items()},
-          "ContinuousWave": ("frames", 0, "tof"), "Pulsed": ("frames", 0, "tof")}
+          "ContinuousWave": ("frames", 0, "tof"), "Pulsed": ("frames", 0, "tof"), "StereoImages": ("frames", 0, "stereo"),
+          "OtherCamera": ("other_cameras", 0)}
 """Where in a manifest each model lies."""
 SHOWN = [(model.__name__, number) for model, examples in EXAMPLES.items() for number in range(len(examples))]
 
@@ -25,14 +26,15 @@ def manifest_with(place, value):
     """The example of a manifest with a value at a place."""
     if not place:
         return value
-    data = json.loads(json.dumps(BASE))
+    stereo = place in (("other_cameras", 0), ("frames", 0, "stereo")) or (place == ("frames", 0) and "stereo" in value)
+    data = json.loads(json.dumps(EXAMPLES[Manifest][-1] if stereo else BASE))
     if place == ("camera", "distortion"):
         data["camera"] = {"projection": "perspective", "resolution": [8, 6], "focal_px": [9, 9]}
     inside = data
     for part in place[:-1]:
         inside = inside[part]
     if place[:2] == ("frames", 0) and len(place) == 3:
-        inside.pop("light")
+        inside.pop("light", None)
     inside[place[-1]] = value
     return data
 

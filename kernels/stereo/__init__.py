@@ -1,0 +1,1 @@
+"""Matching of two rectified images: census, semi-global matching, checks, and refinement to a fraction of a pixel."""

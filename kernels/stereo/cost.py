@@ -1,0 +1,110 @@
+"""The cost of every disparity at every pixel: how many bits of the census differ, over all frames."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from kernels.device import once
+from kernels.packs import new_array, pack_type
+from kernels.stereo.census import BITS, census
+from kernels.stereo.windows import sliding
+
+SCALE = 4
+"""Units of cost for one differing bit of the 62, so that the mean over frames keeps a fraction and fits eight bits."""
+CHANCE = SCALE * BITS // 2
+"""Cost of two places that have nothing to do with each other. Disparities that lead out of the other image have it too."""
+
+
+class Labels(NamedTuple):
+    """The disparities that are compared: `highest`, `highest - 1`, … in `packs` packs, so that the right column rises with the label."""
+
+    highest: int
+    packs: int
+
+    def count(self, device: str) -> int:
+        """Return how many disparities there are."""
+        return self.packs * devices.pack_width(device)
+
+    @classmethod
+    def covering(cls, least: float, most: float, device: str) -> "Labels":
+        """Return labels for all disparities from `least` to `most`."""
+        highest = int(np.ceil(most))
+        return cls(highest, -(-(highest - int(np.floor(least)) + 1) // devices.pack_width(device)))
+
+
+class Margins(NamedTuple):
+    """Columns before the first of the right image and after its last, to which labels of a pixel and of its neighbours lead."""
+
+    before: int
+    after: int
+
+    @classmethod
+    def of(cls, columns: int, right_columns: int, labels: Labels, device: str) -> "Margins":
+        """Return the margins that labels of a left image need."""
+        pack = devices.pack_width(device)
+        last = columns - 1 - labels.highest + labels.count(device) + pack
+        return cls(max(0, labels.highest) + pack, max(0, last - right_columns) + pack)
+
+
+def matching_cost(left: np.ndarray, right: np.ndarray, seen: np.ndarray, labels: Labels, *, device: str) -> wp.array:
+    """Return the cost of each label at each pixel.
+
+    Args:
+        left: [frames, rows, cols] float32, rectified.
+        right: [frames, rows, right cols] float32.
+        seen: [rows, right cols] bool, False where the right camera sees nothing.
+        labels: the disparities.
+        device: where.
+
+    Returns:
+        [rows, cols, packs] packs of uint8: `SCALE` units for each differing bit, the mean over the frames.
+    """
+    frames, rows, cols = left.shape
+    margins = Margins.of(cols, right.shape[2], labels, device)
+    left_bits = census(left, device=device)
+    right_bits = census(right, before=margins.before, after=margins.after, device=device)
+    held = np.zeros(right_bits.shape[1:], np.uint8)
+    held[:, margins.before:margins.before + right.shape[2]] = seen
+    held_bits = wp.array(held, dtype=wp.uint8, device=device)
+    pack = devices.pack_width(device)
+    volume = new_array((rows, cols, labels.packs), pack_type(pack, wp.uint8), device, cleared=False)
+    devices.launch(_kernel(pack), rows * cols,
+                   [left_bits, sliding(right_bits), sliding(held_bits), cols, margins.before - labels.highest, SCALE / frames], [volume],
+                   device=device)
+    return volume
+
+
+@once
+def _kernel(pack: int) -> Any:
+    cost_pack, bit_pack, sum_pack = pack_type(pack, wp.uint8), pack_type(pack, wp.uint64), pack_type(pack, wp.int32)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
+    def cost_kernel(first: int,
+                    left: wp.array(dtype=wp.uint64, ndim=3),  # [F, R, C …]
+                    right: wp.array(dtype=bit_pack, ndim=3),  # [F, R, margin + C' + margin] overlapping packs
+                    seen: wp.array(dtype=cost_pack, ndim=2),  # [R, margin + C' + margin] overlapping packs
+                    cols: int,
+                    start: int,
+                    scale: float,
+                    # outputs
+                    volume: wp.array(dtype=cost_pack, ndim=3)):  # [R, C, packs]
+        i = first + wp.tid()
+        r = i // cols
+        c = i - r * cols
+        for j in range(volume.shape[2]):
+            at = c + start + j * pack
+            sums = sum_pack()
+            for f in range(left.shape[0]):
+                here = left[f, r, c]
+                there = right[f, r, at]
+                for k in range(pack):
+                    sums[k] = sums[k] + int(wp.bit_count(here ^ there[k]))
+            held = seen[r, at]
+            costs = cost_pack()
+            for k in range(pack):
+                costs[k] = wp.uint8(wp.where(held[k] > wp.uint8(0), int(scale * float(sums[k]) + 0.5), CHANCE))
+            volume[r, c, j] = costs
+
+    return cost_kernel

@@ -1,0 +1,118 @@
+"""The disparities that a scene has, from few places that are compared with all columns of the other image.
+
+Without a range of depths nothing says which disparities semi-global matching has to consider. Every few pixels one place is compared with
+its whole row, in both directions: what is unique there bounds the disparities, and tells when the two images are swapped.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from kernels.device import once
+from kernels.packs import new_array, pack_type
+from kernels.stereo.census import census
+from kernels.stereo.choice import APART, SPREAD
+from kernels.stereo.cost import CHANCE, SCALE, Labels, Margins
+from kernels.stereo.paths import FAR
+from kernels.stereo.windows import sliding
+
+
+class Probe(NamedTuple):
+    """The best disparity of each sampled place."""
+
+    label: wp.array  # [rows, cols] int32 of `Labels`, over the grid of samples
+    lead: wp.array  # [rows, cols] float32, by how much the best rival fits worse, relative to chance
+
+
+def probe(left: np.ndarray, right: np.ndarray, seen: np.ndarray, labels: Labels, *, step: int, device: str) -> Probe:
+    """Compare some places of the left image with whole rows of the right one.
+
+    Args:
+        left: [frames, rows, cols] float32, rectified.
+        right: [frames, rows, right cols] float32.
+        seen: [rows, right cols] bool, False where the right camera sees nothing.
+        labels: the disparities that are compared.
+        step: distance between sampled places, in rows and columns; the first lies half a step from the corner.
+        device: where.
+
+    Returns:
+        Arrays on the device, not synchronised on CUDA.
+    """
+    frames, rows, cols = left.shape
+    margins = Margins.of(cols, right.shape[2], labels, device)
+    left_bits = census(left, device=device)
+    right_bits = census(right, before=margins.before, after=margins.after, device=device)
+    held = np.zeros(right_bits.shape[1:], np.uint8)
+    held[:, margins.before:margins.before + right.shape[2]] = seen
+    held_bits = wp.array(held, dtype=wp.uint8, device=device)
+    shape = max(1, rows // step), max(1, cols // step)
+    found = Probe(new_array(shape, wp.int32, device, cleared=True), new_array(shape, wp.float32, device, cleared=True))
+    pack = devices.pack_width(device)
+    devices.launch(_probe_kernel(pack), shape[0] * shape[1],
+                   [left_bits, sliding(right_bits), sliding(held_bits), rows, cols, labels.packs, margins.before - labels.highest, step,
+                    SCALE / frames], list(found), device=device)
+    return found
+
+
+@once
+def _probe_kernel(pack: int) -> Any:
+    bit_pack, mask_pack, sum_pack = pack_type(pack, wp.uint64), pack_type(pack, wp.uint8), pack_type(pack, wp.int32)
+    cost_pack = pack_type(pack, wp.float32)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
+    def probe_kernel(first: int,
+                     left: wp.array(dtype=wp.uint64, ndim=3),  # [F, R, C …]
+                     right: wp.array(dtype=bit_pack, ndim=3),  # [F, R, margin + C' + margin] overlapping packs
+                     seen: wp.array(dtype=mask_pack, ndim=2),  # [R, margin + C' + margin] overlapping packs
+                     rows: int,
+                     cols: int,
+                     packs: int,
+                     start: int,
+                     step: int,
+                     scale: float,
+                     # outputs
+                     label: wp.array(dtype=wp.int32, ndim=2),  # [samples down, samples across]
+                     lead: wp.array(dtype=wp.float32, ndim=2)):  # [samples down, samples across]
+        i = first + wp.tid()
+        across = label.shape[1]
+        row = i // across
+        col = i - row * across
+        r = wp.min(row * step + step // 2, rows - 1)
+        c = wp.min(col * step + step // 2, cols - 1)
+        best = cost_pack()
+        where = sum_pack()
+        for k in range(pack):
+            best[k] = float(FAR)
+        for j in range(packs):
+            at = c + start + j * pack
+            sums = sum_pack()
+            for f in range(left.shape[0]):
+                for dy in range(-1, 2):
+                    y = wp.clamp(r + SPREAD * dy, 0, rows - 1)
+                    for dx in range(-1, 2):
+                        x = wp.clamp(c + SPREAD * dx, 0, cols - 1)
+                        here = left[f, y, x]
+                        there = right[f, y, at + x - c]
+                        for k in range(pack):
+                            sums[k] = sums[k] + int(wp.bit_count(here ^ there[k]))
+            held = seen[r, at]
+            for k in range(pack):
+                cost = wp.where(held[k] > wp.uint8(0), scale * float(sums[k]), float(9 * CHANCE))
+                where[k] = wp.where(cost < best[k], j * pack + k, where[k])
+                best[k] = wp.min(cost, best[k])
+        least = best[0]
+        chosen = where[0]
+        for k in range(1, pack):
+            if best[k] < least:
+                least = best[k]
+                chosen = where[k]
+        second = float(FAR)
+        for k in range(pack):
+            if wp.abs(where[k] - chosen) > APART:
+                second = wp.min(second, best[k])
+        label[row, col] = chosen
+        lead[row, col] = (second - least) / float(9 * CHANCE)
+
+    return probe_kernel

@@ -1,0 +1,163 @@
+"""Pairs of views under projected texture with a known depth: planes, spheres and rectangles traced in closed form in float64.
+
+Every pixel is the mean over a grid of places within it, so that edges are mixed as a camera mixes them. The texture comes from a projector
+of its own: what another part keeps from its light is dark. Nothing here imports the code that it judges.
+"""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tests.reference import projector as reference
+from tests.scenes.captures import write_image, write_manifest
+from tests.scenes.depth import entry_of
+
+CAMERA = reference.Device(320, 240, 420.0, (-0.08, 0.02, 0.0), (0.0006, -0.0004))
+OTHER = reference.Device(320, 240, 424.0, (-0.06, 0.01, 0.0), (-0.0005, 0.0003))
+POSE = reference.look_at((0.12, 0.004, 0.003), (0.03, 0.0, -1.0))
+PROJECTOR = reference.Device(512, 400, 520.0)
+PROJECTOR_POSE = reference.look_at((0.05, 0.06, 0.0), (0.02, 0.0, -1.0))
+SIDE = 4
+"""Places within a pixel, along each side."""
+AMBIENT = 0.03
+
+
+class Plane(NamedTuple):
+    """An endless plane."""
+
+    point: tuple[float, float, float]
+    normal: tuple[float, float, float]
+    albedo: float = 0.6
+
+    def hit(self, origin, rays):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = (np.array(self.point) - origin) @ np.array(self.normal, float) / (rays @ np.array(self.normal, float))
+        return np.where(t > 1e-9, t, np.inf)
+
+
+class Sphere(NamedTuple):
+    """A sphere."""
+
+    centre: tuple[float, float, float]
+    radius: float
+    albedo: float = 0.6
+
+    def hit(self, origin, rays):
+        off = np.array(self.centre) - origin
+        a, b = (rays**2).sum(axis=-1), rays @ off
+        root = b**2 - a * (off @ off - self.radius**2)
+        t = (b - np.sqrt(np.maximum(root, 0))) / a
+        return np.where((root > 0) & (t > 1e-9), t, np.inf)
+
+
+class Rectangle(NamedTuple):
+    """A rectangle that faces the camera: x and y from, to, at a depth."""
+
+    x: tuple[float, float]
+    y: tuple[float, float]
+    depth: float
+    albedo: float = 0.6
+
+    def hit(self, origin, rays):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = (-self.depth - origin[2]) / rays[..., 2]
+        at = origin + np.where(np.isfinite(t), t, 0)[..., None] * rays
+        inside = (at[..., 0] >= self.x[0]) & (at[..., 0] <= self.x[1]) & (at[..., 1] >= self.y[0]) & (at[..., 1] <= self.y[1])
+        return np.where(inside & (t > 1e-9), t, np.inf)
+
+
+Part = Plane | Sphere | Rectangle
+
+
+class View(NamedTuple):
+    """What a camera sees."""
+
+    images: np.ndarray  # [patterns, rows, cols] float64, linear, without noise
+    depth: np.ndarray  # [rows, cols] float64 metres at the centre of each pixel; NaN where nothing is
+    part: np.ndarray  # [rows, cols] int, index of the part that is seen there
+    points: np.ndarray  # [rows, cols, 3] float64, in the frame of the reference camera
+
+
+def dots(seed: int, *, cell: int = 3, fill: float = 0.5) -> np.ndarray:
+    """[rows, cols] random squares of the projector, of `cell` pixels, 0 or 1."""
+    rng = np.random.default_rng(seed)
+    top, left = rng.integers(0, cell, 2)
+    squares = (rng.random((PROJECTOR.height // cell + 2, PROJECTOR.width // cell + 2)) < fill).astype(float)
+    return np.kron(squares, np.ones((cell, cell)))[top:top + PROJECTOR.height, left:left + PROJECTOR.width]
+
+
+def grid_of_dots(period: int = 8) -> np.ndarray:
+    """[rows, cols] the same dot again and again."""
+    rows, cols = np.indices((PROJECTOR.height, PROJECTOR.width))
+    return ((rows % period < period // 2) & (cols % period < period // 2)).astype(float)
+
+
+def first(parts, origin, rays):
+    """[...] distance along each ray to the first part, and its index."""
+    distances = np.stack([part.hit(origin, rays) for part in parts])
+    nearest = distances.argmin(axis=0)
+    return np.take_along_axis(distances, nearest[None], axis=0)[0], nearest
+
+
+def render(parts: list[Part], textures: list[np.ndarray], camera: reference.Device = CAMERA, pose: np.ndarray | None = None, *,
+           side: int = SIDE) -> View:
+    """What a camera at `pose` (camera_from_other; None: the reference) sees of the parts under each texture."""
+    pose = np.eye(4) if pose is None else pose
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    origin, albedo = pose[:3, 3], np.array([part.albedo for part in parts])
+    images = np.zeros((len(textures), camera.height, camera.width))
+    for down in range(side):
+        for across in range(side):
+            uv = np.stack([u + (across + 0.5) / side, v + (down + 0.5) / side], axis=-1)
+            images += shade(parts, textures, origin, reference.rays(camera, uv) @ pose[:3, :3].T, albedo)
+    rays = reference.rays(camera, np.stack([u + 0.5, v + 0.5], axis=-1))
+    t, part = first(parts, origin, rays @ pose[:3, :3].T)
+    depth = np.where(np.isfinite(t), t, np.nan)
+    return View(images / side**2, depth, part, origin + depth[..., None] * (rays @ pose[:3, :3].T))
+
+
+def shade(parts, textures, origin, rays, albedo):
+    """[patterns, rows, cols] radiance along rays."""
+    t, part = first(parts, origin, rays)
+    seen = np.isfinite(t)
+    points = origin + np.where(seen, t, 0)[..., None] * rays
+    away = points - PROJECTOR_POSE[:3, 3]
+    clear = first(parts, PROJECTOR_POSE[:3, 3], away)[0] > 1 - 1e-6
+    at = reference.seen_by(PROJECTOR, PROJECTOR_POSE, points)
+    col, row = (np.floor(at[..., i]).astype(int) for i in (0, 1))
+    lit = seen & clear & (col >= 0) & (row >= 0) & (col < PROJECTOR.width) & (row < PROJECTOR.height)
+    fall = 0.5 / (away**2).sum(axis=-1)
+    found = [np.where(seen, albedo[part] * (AMBIENT + np.where(lit, fall * texture[np.where(lit, row, 0), np.where(lit, col, 0)], 0)), 0)
+             for texture in textures]
+    return np.stack(found)
+
+
+def visible_to(parts, points, pose, camera=OTHER):
+    """[rows, cols] bool: the camera at `pose` sees these points, and its image holds them."""
+    origin = pose[:3, 3]
+    clear = first(parts, origin, points - origin)[0] > 1 - 1e-4
+    uv = reference.seen_by(camera, pose, points)
+    return clear & (uv > 0).all(axis=-1) & (uv[..., 0] < camera.width) & (uv[..., 1] < camera.height)
+
+
+def recorded(image: np.ndarray, rng: np.random.Generator, *, gain: float = 1.0, read: float = 0.004, photons: float = 4000.0) -> np.ndarray:
+    """[rows, cols] uint16 of one frame with shot and read noise; `photons` at full scale."""
+    level = np.clip(gain * image, 0, None)
+    noisy = level + rng.normal(size=image.shape) * np.sqrt(read**2 + level / photons)
+    return np.rint(65535 * np.clip(noisy, 0, 1)).astype(np.uint16)
+
+
+def write_pair(folder: Path, reference_images: list[np.ndarray], other_images: list[np.ndarray], *, camera=CAMERA, other=OTHER, pose=POSE,
+               further: list[dict[str, Any]] | None = None, **changes: Any) -> Path:
+    """Write a capture of recorded frames, uint16 [rows, cols]; `further` frames come after them."""
+    frames = []
+    for index, (left, right) in enumerate(zip(reference_images, other_images, strict=True)):
+        write_image(folder / f"left_{index}.png", left)
+        write_image(folder / f"right_{index}.png", right)
+        frames.append({"image": f"left_{index}.png", "stereo": {"images": [f"right_{index}.png"]}})
+    write_manifest(folder, {
+        "schema": "relit.capture/1", "name": "pair", "camera": {"projection": "perspective", **entry_of(camera)},
+        "other_cameras": [{"name": "right", **entry_of(other), "camera_from_other": np.asarray(pose).tolist()}],
+        "frames": [*frames, *(further or [])], **changes})
+    return folder

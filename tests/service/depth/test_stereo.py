@@ -1,0 +1,146 @@
+"""relit depth on captures of two cameras under projected texture: rendered scenes with a depth in closed form, every pixel counted."""
+
+import json
+from functools import cache
+
+import numpy as np
+import pytest
+
+from kernels.status import Status
+from stage.depth_maps import DepthMaps
+from tests.reference import projector as reference
+from tests.scenes import stereo as scenes
+from tests.scenes.captures import edit_manifest
+from tests.scenes.stereo import CAMERA, OTHER, POSE, Plane, Rectangle, Sphere
+
+TILTED = Plane((0.02, 0.0, -1.15), (-0.3, 0.22, 1.0), 0.7)
+PARTS = {
+    "plane and sphere": (TILTED, Sphere((0.08, -0.04, -0.95), 0.11, 0.5)),
+    "one before the other": (Plane((0, 0, -1.3), (0.1, 0.05, 1)), Rectangle((-0.16, 0.02), (-0.12, 0.1), 0.9),
+                             Rectangle((0.1, 0.2), (-0.3, 0.05), 1.1)),
+    "thin": (Plane((0, 0, -1.1), (0, 0.1, 1)), Rectangle((-0.1, -0.096), (-0.3, 0.3), 0.9), Rectangle((0.05, 0.06), (-0.3, 0.3), 0.9)),
+    "dark and bare": (TILTED, Rectangle((-0.2, -0.05), (-0.1, 0.1), 0.95, 0.002)),
+}
+
+
+@cache
+def seen(name, textures=1, cell=3):
+    """Both views of a scene, and whether the other camera sees each pixel's place."""
+    parts = list(PARTS[name])
+    patterns = [scenes.dots(100 + i, cell=cell) for i in range(textures)]
+    left, right = (scenes.render(parts, patterns, *camera, side=3) for camera in ((CAMERA,), (OTHER, POSE)))
+    return left, right, scenes.visible_to(parts, left.points, POSE)
+
+
+def write(folder, left, right, *, seed=0, gain=1.0, swapped=False, **changes):
+    rng = np.random.default_rng(seed)
+    ours, theirs = [scenes.recorded(image, rng) for image in left], [scenes.recorded(image, rng, gain=gain) for image in right]
+    return scenes.write_pair(folder, *((theirs, ours) if swapped else (ours, theirs)), **changes)
+
+
+def solve(relit, folder, *arguments):
+    outcome = relit("depth", folder, "--out", folder / "out", *arguments)
+    assert outcome.code == 0, outcome.err
+    return DepthMaps.read(folder / "out" / "depth.exr", unsure=True), json.loads((folder / "out" / "report.json").read_text())
+
+
+def pixels_off(maps, truth):
+    """[rows, cols] error of the depth in pixels of disparity, which is f B / Z for cameras that look along one direction."""
+    with np.errstate(divide="ignore"):
+        return CAMERA.focal * np.linalg.norm(POSE[:3, 3]) * (1 / maps.depth - 1 / truth)
+
+
+def test_a_tilted_plane_and_a_sphere(relit, tmp_path):
+    left, right, visible = seen("plane and sphere")
+    maps, report = solve(relit, write(tmp_path, left.images, right.images, gain=0.6))
+    off = pixels_off(maps, left.depth)
+    wrong = maps.mask & ~(np.abs(off) < 1)
+    # the sphere bends within a window, so that its rim is refused
+    assert (maps.mask & ~wrong)[visible].mean() > 0.85 and wrong.sum() < 0.005 * maps.mask.sum()
+    assert np.sqrt(np.mean(off[maps.mask & ~wrong] ** 2)) < 0.1
+    assert report["method"] == "stereo" and report["warnings"] == []
+    facts, = report["found"]["cameras"]
+    assert facts["name"] == "right" and abs(facts["row_offset_px"]["median"]) < 0.03
+    assert abs(facts["baseline_m"] - np.linalg.norm(POSE[:3, 3])) < 1e-6
+
+
+def test_half_hidden_places_are_refused(relit, tmp_path):
+    left, right, visible = seen("one before the other")
+    maps, _ = solve(relit, write(tmp_path, left.images, right.images))
+    off = np.abs(pixels_off(maps, left.depth))
+    hidden = ~visible
+    assert hidden.mean() > 0.04  # otherwise the scene would prove nothing
+    # what is left lies within the window's reach of an edge that one camera sees half a pixel elsewhere
+    assert (maps.mask & hidden & (off > 1)).sum() < 0.02 * hidden.sum() and (maps.mask & (off > 1)).sum() < 0.005 * maps.mask.sum()
+    assert (maps.status[hidden] == Status.OCCLUDED).mean() > 0.6
+
+
+def test_a_regular_grid_of_dots_is_refused(relit, tmp_path):
+    parts, grid = list(PARTS["plane and sphere"]), [scenes.grid_of_dots(9)]
+    left, right = scenes.render(parts, grid, side=2), scenes.render(parts, grid, OTHER, POSE, side=2)
+    folder = write(tmp_path, left.images, right.images)
+    outcome = relit("depth", folder, "--out", folder / "out", "--near-m", "0.6", "--far-m", "2")
+    if outcome.code == 0:
+        maps = DepthMaps.read(folder / "out" / "depth.exr")
+        assert (maps.mask & (np.abs(pixels_off(maps, left.depth)) > 1)).mean() < 0.005
+        assert "repeats itself" in outcome.out
+    else:
+        assert "texture" in outcome.err
+
+
+def test_dark_and_bare_parts_are_refused(relit, tmp_path):
+    left, right, _ = seen("dark and bare")
+    images = [np.where(np.arange(CAMERA.width) > 240, 0.2, each) for each in (left.images, right.images)]  # bare on the right
+    maps, _ = solve(relit, write(tmp_path, *images))
+    dark = np.zeros(left.depth.shape, bool)
+    dark[4:-4, 4:-4] = (left.part == 1)[4:-4, 4:-4]
+    bare = np.s_[:, 250:]
+    assert not maps.mask[bare].any() and (maps.status[bare] == Status.LOW_MODULATION).mean() > 0.9
+    assert (maps.mask & dark & (np.abs(pixels_off(maps, left.depth)) > 1)).sum() < 0.01 * dark.sum()
+
+
+def test_an_offset_between_rows_is_told(relit, tmp_path):
+    left, right, _ = seen("plane and sphere")
+    folder = write(tmp_path, left.images, right.images)
+    data = json.loads((folder / "capture.json").read_text())
+    other = data["other_cameras"][0]
+    other["principal_px"][1] += 0.3
+    edit_manifest(folder, other_cameras=[other])
+    _, report = solve(relit, folder)
+    told = report["found"]["cameras"][0]["row_offset_px"]["median"]
+    assert abs(abs(told) - 0.3) < 0.05
+    assert any(f"{told:+.2f} px" in sentence and "calibrate the cameras again" in sentence for sentence in report["warnings"])
+
+
+def test_swapped_images_are_refused_with_a_sentence(relit, tmp_path):
+    left, right, _ = seen("plane and sphere")
+    pose = reference.look_at((0.12, 0.0, 0.0), (0.12, 0.0, -1.0))  # alike cameras, so that swapping leaves the rows in place
+    right = scenes.render(list(PARTS["plane and sphere"]), [scenes.dots(100)], CAMERA, pose, side=2)
+    folder = write(tmp_path, left.images, right.images, swapped=True, other=CAMERA, pose=pose)
+    outcome = relit("depth", folder, "--out", folder / "out")
+    assert outcome.code == 2 and "other_cameras[0]" in outcome.err and "are swapped" in outcome.err
+    assert not (folder / "out").exists()
+
+
+@pytest.mark.parametrize(("change", "says"), [
+    (lambda data: data["frames"][0]["stereo"].update(images=["right_0.png", "x.png"]), r"frames[0].stereo.images: has 2 images"),
+    (lambda data: data["frames"][0]["stereo"].update(images=["left_0.png"]), "left_0.png is already the image of frames[0]"),
+    (lambda data: data["other_cameras"][0].update(resolution=[300, 240]), "other_cameras[0].resolution says 300x240"),
+    (lambda data: data["other_cameras"].append(data["other_cameras"][0]), "right is already the name of other_cameras[0]"),
+    (lambda data: data.update(camera={"projection": "orthographic", "resolution": [320, 240]}), "needs a perspective camera"),
+])
+def test_what_is_declared_wrongly_is_named(relit, tmp_path, change, says):
+    blank = np.full((CAMERA.height, CAMERA.width), 500, np.uint16)
+    folder = scenes.write_pair(tmp_path, [blank], [blank])
+    data = json.loads((folder / "capture.json").read_text())
+    change(data)
+    edit_manifest(folder, **data)
+    outcome = relit("depth", folder, "--out", folder / "out")
+    assert outcome.code == 2 and says in outcome.err
+
+
+def test_images_without_texture_are_refused_with_a_sentence(relit, tmp_path):
+    rng = np.random.default_rng(0)
+    blank = [scenes.recorded(np.full((CAMERA.height, CAMERA.width), 0.2), rng) for _ in range(2)]
+    outcome = relit("depth", scenes.write_pair(tmp_path, blank[:1], blank[1:]), "--out", tmp_path / "out")
+    assert outcome.code == 2 and "show no texture that both see" in outcome.err
