@@ -1,4 +1,4 @@
-"""The mirror or grey ball of a capture, found in its images where the request names none."""
+"""The mirror or grey balls of a capture, found in its images where the request names none."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -10,7 +10,7 @@ from service.calibrate.results import LightCaptures
 from service.errors import RequestError
 from stage.calibration.apply import LitFrame, as_direction
 from stage.calibration.ball import Ball, BallView, project, view_ball
-from stage.calibration.ball_search import RoundOutline, find_outlines
+from stage.calibration.ball_search import find_outlines
 from stage.calibration.grey_ball import fit_brightness, fit_direction
 from stage.calibration.mirror_ball import SpotOptions, find_spot
 from stage.camera import Camera
@@ -49,6 +49,37 @@ def find_mirror_ball(captures: LightCaptures, options: SpotOptions) -> Ball:
     Raises:
         RequestError: no ball is found, or more than one.
     """
+    return _only(captures, "mirror", _mirrors(captures, options, None, None))
+
+
+def find_mirror_balls(captures: LightCaptures, options: SpotOptions, radius_m: float | None, z_m: float | None) -> list[Ball]:
+    """Find the mirror balls of a capture: all round outlines in which the bright spot is small and moves from frame to frame.
+
+    Args:
+        captures: lit by one lamp a frame.
+        options: of the search for bright spots.
+        radius_m: of every ball; None: not known.
+        z_m: camera-frame z of every centre, for an orthographic camera; None: not known.
+
+    Raises:
+        RequestError: fewer than two balls are found.
+    """
+    found = _mirrors(captures, options, radius_m, z_m)
+    if len(found.balls) < 2:
+        raise RequestError(f"{captures.source.folder}: {_counted(len(found.balls))} found in the images ({found.looked_at} round outlines "
+                           "were looked at), and near lights need two or more: name them with --ball U,V,R or --ball-mask FILE, once each")
+    return found.balls
+
+
+class _Found(NamedTuple):
+    """The balls of a capture."""
+
+    balls: list[Ball]
+    looked_at: int
+    """The number of round outlines."""
+
+
+def _mirrors(captures: LightCaptures, options: SpotOptions, radius_m: float | None, z_m: float | None) -> _Found:
     def is_mirror(ball: Ball, view: BallView, frames: list[_Seen]) -> bool:
         places = []
         for seen in frames:
@@ -60,7 +91,11 @@ def find_mirror_ball(captures: LightCaptures, options: SpotOptions) -> Ball:
             return False
         return len(frames) == 1 or float(np.hypot(*np.std(places, axis=0))) > LEAST_MOVE * ball.radius_px
 
-    return _find(captures, "mirror", is_mirror, None, None)
+    return _find(captures, is_mirror, radius_m, z_m)
+
+
+def _counted(count: int) -> str:
+    return "no mirror ball is" if count == 0 else f"{count} mirror ball is"
 
 
 def find_grey_ball(captures: LightCaptures, radius_m: float | None, z_m: float | None) -> Ball:
@@ -80,11 +115,11 @@ def find_grey_ball(captures: LightCaptures, radius_m: float | None, z_m: float |
                 residuals.append(np.inf)
         return float(np.mean(np.array(residuals) < GREY_RESIDUAL)) >= LEAST_FRAMES
 
-    return _find(captures, "grey", is_grey, radius_m, z_m)
+    return _only(captures, "grey", _find(captures, is_grey, radius_m, z_m))
 
 
-def _find(captures: LightCaptures, kind: str, is_ball: Callable[[Ball, BallView, list[_Seen]], bool], radius_m: float | None,
-          z_m: float | None) -> Ball:
+def _find(captures: LightCaptures, is_ball: Callable[[Ball, BallView, list[_Seen]], bool], radius_m: float | None,
+          z_m: float | None) -> _Found:
     camera, correction = captures.source.camera, Correction.of(captures.source)
     mean, brightest = np.zeros((camera.height, camera.width)), np.zeros((camera.height, camera.width))
     for lit in captures.lit:
@@ -101,20 +136,26 @@ def _find(captures: LightCaptures, kind: str, is_ball: Callable[[Ball, BallView,
         frame = correction.apply(lit.frame)
         for view, frames in zip(views, seen, strict=True):
             frames.append(_Seen(lit, frame.pixels[view.box], None if frame.saturated is None else frame.saturated[view.box]))
-    balls: list[tuple[RoundOutline, Ball]] = []
-    for (outline, ball), view, frames in zip(placed, views, seen, strict=True):
-        if brightest[view.box][view.inside].max(initial=0) < DARK or any(_overlap(camera, ball, other) for _, other in balls):
+    balls: list[Ball] = []
+    for (_, ball), view, frames in zip(placed, views, seen, strict=True):
+        if brightest[view.box][view.inside].max(initial=0) < DARK or any(_overlap(camera, ball, other) for other in balls):
             continue
         if is_ball(ball, view, frames):
-            balls.append((outline, ball))
+            balls.append(ball)
+    return _Found(balls, len(outlines))
+
+
+def _only(captures: LightCaptures, kind: str, found: _Found) -> Ball:
+    """Return the only ball that was found, or raise RequestError."""
     where = captures.source.folder
+    balls, camera = found.balls, captures.source.camera
     if not balls:
-        raise RequestError(f"{where}: no {kind} ball is found in the images ({len(outlines)} round outlines were looked at): name it "
+        raise RequestError(f"{where}: no {kind} ball is found in the images ({found.looked_at} round outlines were looked at): name it "
                            "with --ball U,V,R or --ball-mask FILE")
     if len(balls) > 1:
-        named = " and ".join(",".join(f"{value:.1f}" for value in (*project(camera, ball.centre), ball.radius_px)) for _, ball in balls)
+        named = " and ".join(",".join(f"{value:.1f}" for value in (*project(camera, ball.centre), ball.radius_px)) for ball in balls)
         raise RequestError(f"{where}: {len(balls)} {kind} balls are found, at {named} (U,V,R): name one of them with --ball")
-    return balls[0][1]
+    return balls[0]
 
 
 def _overlap(camera: Camera, one: Ball, other: Ball) -> bool:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.calibrate.ball_finder import find_grey_ball, find_mirror_ball
+from service.calibrate.ball_finder import find_grey_ball, find_mirror_ball, find_mirror_balls
 from service.calibrate.balls import ball_entry, balls_of, check_metric
 from service.calibrate.results import (
     LightCalibration,
@@ -19,12 +19,13 @@ from service.calibrate.results import (
     three_numbers,
     write_lights,
 )
+from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import GreyBallRequest, LightPositionsRequest, MirrorBallRequest
 from stage.calibration.apply import LitFrame, SingleLight, as_direction, as_position, lit_frames, with_brightness
-from stage.calibration.ball import BallView, view_ball
+from stage.calibration.ball import Ball, BallView, view_ball
 from stage.calibration.grey_ball import better_encoding, fit_brightness, fit_direction
-from stage.calibration.light_positions import nearest_point
+from stage.calibration.light_positions import MISSES, nearest_point
 from stage.calibration.mirror_ball import SpotOptions, find_spot
 from stage.correction import Correction
 from stage.errors import CalibrationError, ManifestError
@@ -86,12 +87,14 @@ def light_positions(request: LightPositionsRequest, progress: Progress | None = 
     timings.stage("open", 1)
     captures = open_captures(request)
     camera = captures.source.camera
-    balls = balls_of(request, camera, at_least=2, radii=request.ball_radius_m, heights=request.ball_z_m)
+    options = SpotOptions(level=request.level)
+    named = bool(request.circles or request.masks)
+    balls = (balls_of(request, camera, at_least=2, radii=request.ball_radius_m, heights=request.ball_z_m) if named
+             else _balls_in_sight(request, captures, options))
     check_metric(captures.source, balls, request.ball_radius_m)
     views = [view_ball(ball, camera) for ball in balls]
     middle = np.mean([ball.centre for ball in balls], axis=0)
     targets = _targets(captures)
-    options = SpotOptions(level=request.level)
 
     def measure(lit: LitFrame, patches: Sequence[BallPixels]) -> MeasuredLight:
         spots = []
@@ -110,8 +113,30 @@ def light_positions(request: LightPositionsRequest, progress: Progress | None = 
 
     results = leave_out_failures(captures, _measure_each(captures, views, measure, timings), drop_failed=request.drop_failed)
     timings.close()
+    missed = sum(MISSES in result.entry["flags"] for result in results)
+    if not named and 2 * missed > len(results):
+        raise CalibrationError(f"{captures.source.folder}: the reflections in the {len(balls)} round outlines that were found do not meet "
+                               f"in {missed} of {len(results)} frames: not all of them are mirror balls of this size; name the balls with "
+                               "--ball U,V,R or --ball-mask FILE")
     return write_lights("light-positions", request, captures, results, headings=("position, m", "sure to", "residual"),
                         summary={"balls": [ball_entry(ball) for ball in balls]})
+
+
+def _balls_in_sight(request: LightPositionsRequest, captures: LightCaptures, options: SpotOptions) -> list[Ball]:
+    """Find the mirror balls of a capture, all of one size and at one height.
+
+    Raises:
+        RequestError: fewer than two are found, or sizes are given without the places that they belong to.
+    """
+    for name, values in (("--ball-radius-m", request.ball_radius_m), ("--ball-z-m", request.ball_z_m)):
+        if len(values) > 1:
+            raise RequestError(f"{name}: is given {len(values)} times, and no ball is named that each belongs to: name the balls with "
+                               "--ball or --ball-mask in the same order")
+    camera = captures.source.camera
+    if camera.projection == "perspective" and not request.ball_radius_m:
+        check_metric(captures.source, [], request.ball_radius_m)
+    level = camera.surface_z_m if camera.projection == "orthographic" else None
+    return find_mirror_balls(captures, options, next(iter(request.ball_radius_m), None), next(iter(request.ball_z_m), level))
 
 
 def grey_ball(request: GreyBallRequest, progress: Progress | None = None) -> LightCalibration:

@@ -92,8 +92,8 @@ class BallOptions(LightsOptions):
     """Base of what is chosen to look at balls."""
 
     circles: Annotated[tuple[Annotated[Circle, BeforeValidator(_circle)], ...], Role.INPUT, Spelling(flag="--ball", metavar="U,V,R")] = ()
-    """Outline of a ball: centre and radius in pixels. Give one for each ball; without it and without a mask, mirror-ball and grey-ball
-    find the ball in the images."""
+    """Outline of a ball: centre and radius in pixels. Give one for each ball; without it and without a mask, the balls are found
+    in the images."""
 
 
 class MirrorBallOptions(BallOptions):

@@ -16,6 +16,10 @@ MISS_DEGREES = 1.0
 """The angle between a ray and the direction to the nearest point, seen from the ball, above which the light is flagged."""
 
 
+MISSES = "rays miss"
+"""The flag of a light whose rays do not meet."""
+
+
 class Position(NamedTuple):
     """The measured position of a near light."""
 
@@ -56,5 +60,5 @@ def nearest_point(points: np.ndarray, directions: np.ndarray, uncertainty_degree
     spread = np.radians(uncertainty_degrees) * distance
     inverse = np.linalg.inv(normal)
     covariance = inverse @ (across * (spread**2)[:, None, None]).sum(axis=0) @ inverse
-    flags = ("rays miss",) if np.degrees(np.arctan2(miss, distance)).max() > MISS_DEGREES else ()
+    flags = (MISSES,) if np.degrees(np.arctan2(miss, distance)).max() > MISS_DEGREES else ()
     return Position(position, float(np.sqrt((miss**2).mean())), math.sqrt(float(np.trace(covariance))), flags)

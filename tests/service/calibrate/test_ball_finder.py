@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from service.calibrate.lights import grey_ball, mirror_ball
+from service.calibrate.lights import grey_ball, light_positions, mirror_ball
 from service.errors import RequestError
-from service.requests.calibrate import GreyBallRequest, MirrorBallRequest
+from service.requests.calibrate import GreyBallRequest, LightPositionsRequest, MirrorBallRequest
 from tests.reference.balls import lambertian, render
 from tests.scenes.captures import angles_degrees, files_in, write_exr, write_manifest
 from tests.stage.calibration.balls import spread
@@ -104,3 +104,56 @@ def test_no_ball_is_refused(tmp_path):
         mirror_ball(MirrorBallRequest(capture=folder))
     with pytest.raises(RequestError, match="no grey ball is found"):
         grey_ball(GreyBallRequest(capture=folder))
+
+
+LAMPS = np.array([(0.3, 0.25, 0.5), (-0.35, 0.2, 0.4), (0.1, -0.3, 0.45), (-0.2, -0.2, 0.6), (0.45, 0.0, 0.35), (0.0, 0.4, 0.4)])
+BALLS = (np.array([-0.09, 0.02, 0.0]), np.array([0.10, -0.03, 0.0]))  # metres; a millimetre a pixel
+BALL_M = 0.045
+
+
+def near_lamp(lamp, brightness=4.0):
+    """A mirror that shows a lamp of 2 cm in the same room."""
+    def shade(point, normal, viewer):
+        seen = 2 * (normal * viewer).sum(-1, keepdims=True) * normal - viewer
+        way = lamp - point
+        far = np.linalg.norm(way, axis=-1)
+        off = 1 - (seen * way).sum(-1) / far
+        tiles = 0.12 + 0.06 * np.sign(np.sin(9 * seen[:, 0]) * np.sin(9 * seen[:, 2]))
+        return np.where(seen[:, 1] < -0.2, tiles, 0.05) + brightness * np.exp(-2 * off / (0.02 / far) ** 2)
+    return shade
+
+
+def two_balls(folder, radii=(BALL_M, BALL_M)):
+    random = np.random.default_rng(4)
+    for number, lamp in enumerate(LAMPS):
+        values = room(number)
+        for centre, radius in zip(BALLS, radii, strict=True):
+            image, coverage = render(near_lamp(lamp), width=WIDTH, height=HEIGHT, samples=3, centre=centre, radius=radius, pixel_size=0.001)
+            values = image + (1 - coverage) * values
+        values = np.maximum(values + 0.005 * random.normal(size=values.shape), 0)
+        write_exr(folder / f"{number:03d}.exr", np.repeat(values[..., None], 3, axis=2))
+    write_manifest(folder, {"schema": "relit.capture/1", "name": "balls",
+                            "camera": {"resolution": [WIDTH, HEIGHT], "projection": "orthographic", "pixel_size_m": 0.001},
+                            "frames": [{"image": f"{i:03d}.exr", "light": PLACEHOLDER} for i in range(len(LAMPS))]})
+    return folder
+
+
+def test_two_chrome_balls_are_found_and_give_positions(tmp_path):
+    """A tenth of a pixel of outline or spot is 0.25°, 2 mm at 0.5 m; the rays meet at 20° to 30°, which doubles it and more."""
+    folder = two_balls(tmp_path / "capture")
+    light_positions(LightPositionsRequest(capture=folder))
+    frames = json.loads((folder / "capture.json").read_text())["frames"]
+    error = np.linalg.norm([frame["light"]["position_m"] for frame in frames] - LAMPS, axis=1)
+    assert error.max() < 0.01, error
+    report = json.loads((folder / "calibration.json").read_text())["light-positions"]
+    assert len(report["balls"]) == 2
+    sigma = np.array([light["uncertainty_m"] for light in report["lights"]])
+    assert (error < 3 * sigma).all()
+
+
+def test_one_ball_does_not_place_lights(tmp_path):
+    folder = photograph(tmp_path / "capture", "orthographic", chrome)
+    before = files_in(folder)
+    with pytest.raises(RequestError, match=r"1 mirror ball is found in the images .* near lights need two or more"):
+        light_positions(LightPositionsRequest(capture=folder))
+    assert files_in(folder) == before

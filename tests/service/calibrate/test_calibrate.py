@@ -248,7 +248,9 @@ def test_saturation_is_said_and_written(relit, tmp_path):
 
 BALL = ["--ball", CIRCLE]
 BAD = {
-    "no ball": (["light-positions"], {}, "--ball, --ball-mask: 0 balls are given: this needs 2 or more"),
+    "one ball in sight": (["light-positions"], {}, "mirror ball is found in the images"),
+    "radii without balls": (["light-positions", "--ball-radius-m", "0.1", "--ball-radius-m", "0.2"], {},
+                            "--ball-radius-m: is given 2 times, and no ball is named that each belongs to"),
     "two balls": (["mirror-ball", *BALL, *BALL], {}, "2 balls are given: this needs exactly 1"),
     "one ball for positions": (["light-positions", *BALL], {}, "1 balls are given: this needs 2 or more"),
     "a ball in words": (["mirror-ball", "--ball", "middle"], {}, "--ball middle: give centre and radius in pixels"),
