@@ -33,13 +33,21 @@ class PlacedLights(NamedTuple):
     centre: np.ndarray  # [3] float64, the centre of the object: mean of the masked pixels at its mean z
 
 
-def place_lights(capture: Capture) -> PlacedLights:
-    """Return the lights of the stack of a capture, all of which must be distant or point lights.
+class LightPlaces(NamedTuple):
+    """Where distant and point lights are and what they give, one row for each frame, as `PlacedLights` has it."""
+
+    frames: tuple[int, ...]
+    """Their numbers in the manifest."""
+    place: np.ndarray  # [lights, 4] float64
+    strength: np.ndarray  # [lights, 3] float64
+    lobe: np.ndarray  # [lights, 4] float64
+
+
+def light_places(capture: Capture) -> LightPlaces:
+    """Return where the lights of the stack of a capture are, all of which must be distant or point lights.
 
     Raises:
-        ManifestError: a light is of another type, there is none, the camera has no scale, or lights stand inside or behind the
-            object.
-        ImageError: the mask is empty or unreadable.
+        ManifestError: a light is of another type, or there is none.
     """
     where = capture.folder / FILE_NAME
     lights = []
@@ -52,10 +60,6 @@ def place_lights(capture: Capture) -> PlacedLights:
             raise ManifestError(f"{where}: frames[{index}].light: is {kind}: this needs distant or point lights{hint}")
     if not lights:
         raise ManifestError(f"{where}: frames: none is lit by a distant or point light")
-    camera, mask = capture.camera, capture.mask()
-    if not camera.metric:
-        field = "surface_z_m" if camera.projection == "perspective" else "pixel_size_m"
-        raise ManifestError(f"{where}: camera.{field}: is missing: near lights need the place of the surface in metres")
     place, strength, lobe = np.zeros((len(lights), 4)), np.zeros((len(lights), 3)), np.zeros((len(lights), 4))
     for row, (_, light) in enumerate(lights):
         if isinstance(light, DistantLight):
@@ -64,8 +68,34 @@ def place_lights(capture: Capture) -> PlacedLights:
             place[row], strength[row] = (*light.position_m, 1), light.intensity
             if light.axis is not None and light.anisotropy:
                 lobe[row] = *light.axis, light.anisotropy
+    return LightPlaces(tuple(index for index, _ in lights), place, strength, lobe)
+
+
+def distance_is_missing(capture: Capture) -> bool:
+    """Return whether a capture has near lights and a perspective camera, does not say how far the surface is, and its images may tell:
+    those of polarised pairs are not Lambertian."""
+    camera = capture.camera
+    return (camera.projection == "perspective" and camera.surface_z_m is None and bool(capture.lit_by(PointLight))
+            and not capture.is_polarised)
+
+
+def place_lights(capture: Capture) -> PlacedLights:
+    """Return the lights of the stack of a capture, all of which must be distant or point lights.
+
+    Raises:
+        ManifestError: a light is of another type, there is none, the camera has no scale, or lights stand inside or behind the
+            object.
+        ImageError: the mask is empty or unreadable.
+    """
+    where = capture.folder / FILE_NAME
+    frames, place, strength, lobe = light_places(capture)
+    camera, mask = capture.camera, capture.mask()
+    if not camera.metric:
+        field = "surface_z_m" if camera.projection == "perspective" else "pixel_size_m"
+        told = " (relit solve estimates it from the images)" if distance_is_missing(capture) else ""
+        raise ManifestError(f"{where}: camera.{field}: is missing: near lights need the place of the surface in metres{told}")
     centre = camera.points(np.full(mask.shape, camera.surface_z_m or 0.0))[mask].mean(axis=0, dtype=np.float64)
-    _check_places([index for index, _ in lights], place, camera, mask, str(where))
+    _check_places(frames, place, camera, mask, str(where))
     check_pairs(capture, place)
     way = place[:, :3] - place[:, 3:] * centre
     distance = np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-12)
@@ -75,7 +105,7 @@ def place_lights(capture: Capture) -> PlacedLights:
     return PlacedLights(direction, strength * falloff * shining, place, strength, lobe, centre)
 
 
-def _check_places(frames: list[int], place: np.ndarray, camera: Camera, mask: np.ndarray, where: str) -> None:
+def _check_places(frames: tuple[int, ...], place: np.ndarray, camera: Camera, mask: np.ndarray, where: str) -> None:
     """Raise ManifestError for point lights inside the object, and when fewer than three lights stand in front of it."""
     mean_z = camera.surface_z_m or 0.0
     pixel = camera.pixel_size_m or -mean_z / min(camera.focal_px or (1.0,))

@@ -23,13 +23,15 @@ from stage.light import DistantLight, PointLight
 from stage.lighting import MEASURED_BY, check_solvable, has_placeholders, lights_from_centre
 from stage.manifest import FILE_NAME, Frame
 from stage.orientation import TURNS, UPRIGHT
-from stage.point_lights import PlacedLights, place_lights
+from stage.point_lights import PlacedLights, distance_is_missing, place_lights
 from stage.projector import Projector
 from stage.radiance import clipping_sentences
 from stage.tof.frames import check_frames, read_frame
 
 SHOWN = ("frames", "lights", "near lights", "not seen")
 """The facts that stand below a picture."""
+FAR_UNKNOWN = "camera.surface_z_m is missing: relit solve estimates how far the surface is"
+"""What is said of near lights whose distance to the surface nobody has measured."""
 
 
 class Inspection(NamedTuple):
@@ -94,7 +96,7 @@ def inspect(request: InfoRequest, progress: Progress | None = None) -> Inspectio
         facts.append(("mask", f"{int(mask.sum())} of {mask.size} pixels"))
     if capture.lit_by(PointLight):
         with suppress(StageError):
-            facts.append(("near lights", _near_lights(place_lights(capture))))
+            facts.append(("near lights", FAR_UNKNOWN if distance_is_missing(capture) else _near_lights(place_lights(capture))))
     found = Findings([], {})
     if positions is not None and not faults:
         found = findings(capture, positions, {frame.image: level.picked for frame, level in zip(frames, levels, strict=True)
@@ -140,7 +142,7 @@ def standing_faults(capture: Capture, *, readable: bool = True) -> list[str]:
         if capture.sources() and not has_placeholders(capture):
             if has_gradients(capture):
                 gradient_frames(capture)
-            else:
+            elif not distance_is_missing(capture):  # else a solve says what it finds
                 check_solvable(capture)
     except StageError as error:
         faults.append(str(error))

@@ -71,7 +71,8 @@ class CameraOptions(Options):
     pixel_size_m: Positive | None = None
     """Orthographic camera: side of a pixel on the object, metres; None: heights are in pixels."""
     surface_z_m: Finite | None = None
-    """Mean z of the object in the camera frame, metres: negative before a perspective camera. Near lights need it."""
+    """Mean z of the object in the camera frame, metres: negative before a perspective camera. None: under near lights relit solve
+    estimates it for a perspective camera; 0 for an orthographic one."""
 
 
 class ImageOptions(Options):

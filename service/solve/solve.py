@@ -15,6 +15,7 @@ from service.reporting.provenance import REPORT_FILE, metadata, report
 from service.requests.solve import MAX_SIGMA, SVBRDF_LIGHTS, Intensities, LightsKnown, Method, SolveRequest
 from service.solve import integrability
 from service.solve.diagnosis import diagnose, raise_error
+from service.solve.distance import Distance, find_distance
 from service.solve.intensities import choose_intensities
 from service.solve.methods import METHODS, Solver
 from service.solve.parts import numbered, place_solution
@@ -31,7 +32,7 @@ from stage.lighting import check_surface, distant_lights
 from stage.manifest import FILE_NAME
 from stage.maps import MAPS_FILE, SurfaceMaps
 from stage.motion.tracking import tracking_frames
-from stage.point_lights import DistantLights, PlacedLights
+from stage.point_lights import DistantLights, PlacedLights, distance_is_missing
 from stage.radiance import clipping_sentences
 from stage.stack import Stack
 
@@ -70,6 +71,8 @@ class _Opened(NamedTuple):
     """What the report says of the lights."""
     found: "UnknownLights | RefinedLights | None" = None
     """How the lights were found, where they are those of the images."""
+    distance: Distance | None = None
+    """How the distance of the surface was found, where the manifest does not say it."""
 
 
 def solve(request: SolveRequest, progress: Progress | None = None, *, sharing: SharedSolve | None = None) -> SolveResult:
@@ -85,7 +88,7 @@ def solve(request: SolveRequest, progress: Progress | None = None, *, sharing: S
         StorageError: the results cannot be written; nothing is left half-written.
     """
     timings = Timings(progress)
-    capture, method, lights, declared, solver, given, facts, found = _open(request, timings, sharing)
+    capture, method, lights, declared, solver, given, facts, found, distance = _open(request, timings, sharing)
     stack, mask = given.stack, given.mask
     solution = solver(given, lights)
     solution.facts = facts | solution.facts
@@ -97,6 +100,10 @@ def solve(request: SolveRequest, progress: Progress | None = None, *, sharing: S
     if found is not None:
         solution.warnings += found.warnings
         raise_error(solution, found.doubt(solution.normal))
+    if distance is not None:
+        solution.facts |= distance.facts
+        solution.warnings.append(distance.warning)
+        raise_error(solution, distance.normal_degrees)
     estimated = np.isin(solution.status, ESTIMATED).reshape(mask.shape)
     sigma = solution.standard_error() if solution.sigma is None else solution.sigma  # as half: an image has tens of millions of pixels
     if solution.integration is None:  # near lights have found the height with the normals
@@ -178,13 +185,19 @@ def _open(request: SolveRequest, timings: Timings, sharing: SharedSolve | None) 
     if unknown:
         _check_known(capture)
         check_surface(capture)
+    tracking = tracking_frames(capture, to=request.align_to) if request.aligned else None
+    distance = None
+    if method in (Method.LAMBERT, Method.ROBUST, Method.SVBRDF) and distance_is_missing(capture):
+        timings.stage("distance", len(capture.sources()))
+        distance = find_distance(capture, open_stack(capture, cache=request.cache, tracking=tracking,
+                                                     progress=lambda done, _: timings.advance(done)), chosen[0])
+        capture = distance.capture
     lights = distant_lights(capture) if unknown else METHODS[method].read_lights(capture, *balls)
     solver = METHODS[method].solvers.get(type(lights))
     if solver is None:  # only extended lights can be missing here: every method takes distant and near ones
         raise ManifestError(f"{capture.folder / FILE_NAME}: frames[].light: some are extended: --method svbrdf solves these, "
                             f"{method} needs lights of one direction each")
     mask = capture.mask()
-    tracking = tracking_frames(capture, to=request.align_to) if request.aligned else None
     pairs = None
     timings.stage("ingest", len(capture.sources()))
     stack = open_stack(capture, cache=request.cache, tracking=tracking, progress=lambda done, _: timings.advance(done))
@@ -201,13 +214,13 @@ def _open(request: SolveRequest, timings: Timings, sharing: SharedSolve | None) 
     if request.lights is not LightsKnown.DECLARED:
         timings.stage("lights", 1)
         found = _find_lights(request.lights, given, lights, capture)
-        return _Opened(capture, method, found.lights, found.lights, solver, given, found.facts, found)
+        return _Opened(capture, method, found.lights, found.lights, solver, given, found.facts, found, distance)
     used: Any = lights
     facts: dict[str, Any] = {}
     if isinstance(lights, DistantLights) and given.refine_intensities:
         timings.stage("intensities", 1)
         used, facts = choose_intensities(given, lights)
-    return _Opened(capture, method, used, lights, solver, given, facts)
+    return _Opened(capture, method, used, lights, solver, given, facts, distance=distance)
 
 
 def _check_known(capture: Capture) -> None:

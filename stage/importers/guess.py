@@ -155,10 +155,11 @@ def _near_lights(folder: Folder) -> Guess | None:
         camera = next((other for other in folder.with_suffix(".mat", ".yml", ".yaml", ".xml") if other != path
                        and set(CAMERA_MATRIX) & set(_arrays_of(other))), None)
         words = ["near-lights", folder.path, "--lights", path, *(["--camera", camera] if camera else []), "--axes", "right,down,away",
-                 "--unit-m", "0.001", *chosen, "--surface-z-m", "Z"]
+                 "--unit-m", "0.001", *chosen]
         return _made("images under LEDs, as near_ps has them", f"{path} holds as many positions of lights as there are images", words,
                      folder.path, solve=True, assumed=("axes and millimetres are those of near_ps",
-                                          "Z is the mean z of the object in metres, negative, such as -0.5", *_encoding(folder)))
+                                          "nothing says how far the object is: relit solve estimates it; --surface-z-m gives it",
+                                          *_encoding(folder)))
     return None
 
 

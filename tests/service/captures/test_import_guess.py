@@ -83,7 +83,7 @@ def kinect(folder):
 
 
 LAYOUTS = {
-    "diligent": (diligent, {}), "lp": (lp, {}), "relightlab": (relightlab, {}), "near-lights": (near_ps, {"Z": "-0.5"}),
+    "diligent": (diligent, {}), "lp": (lp, {}), "relightlab": (relightlab, {}), "near-lights": (near_ps, {}),
     "olat": (table, {}), "scanner": (slstudio, {}), "opencv-gray": (opencv_gray, {}),
     "phase": (phase, {"WIDTHxHEIGHT": "128x96", "P1,P2,P3": "16,18,21"}), "tof": (tof, {"HZ": "60e6"}),
     "photos": (write_images, {}), "histogram": (spad, {"SECONDS": "1e-9"}), "kinect": (kinect, {}),

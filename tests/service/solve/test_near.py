@@ -137,10 +137,12 @@ def test_a_camera_without_scale_is_refused_in_one_sentence(relit, tmp_path):
     near_lights.write(tmp_path, PERSPECTIVE, lamps(PERSPECTIVE, 6, RADII))
     camera = json.loads((tmp_path / "capture.json").read_text())["camera"]
     edit_manifest(tmp_path, camera={key: value for key, value in camera.items() if key != "surface_z_m"})
-    for command in (["info", tmp_path], ["solve", tmp_path, "--out", tmp_path / "out"]):
-        outcome = relit(*command)
-        assert outcome.code == 2
-        assert outcome.err.count("camera.surface_z_m: is missing: near lights need the place of the surface in metres") == 1
+    outcome = relit("basis", tmp_path, "--out", tmp_path / "out.ptm")
+    assert outcome.code == 2
+    words = "camera.surface_z_m: is missing: near lights need the place of the surface in metres (relit solve estimates it from the images)"
+    assert outcome.err.count(words) == 1
+    outcome = relit("info", tmp_path)
+    assert outcome.code == 0 and "camera.surface_z_m is missing: relit solve estimates how far the surface is" in outcome.out
 
 
 def test_relight_takes_near_lights_as_the_centre_sees_them_and_says_so(relit, tmp_path):

@@ -1,0 +1,65 @@
+"""The distance of a surface under near lights, which the manifest does not give: found with its σ, or refused."""
+
+import json
+
+import numpy as np
+import pytest
+
+from stage.maps import SurfaceMaps
+from tests.scenes import near_lights
+from tests.scenes.captures import angles_degrees
+from tests.scenes.near_lights import lamps
+
+DOME = near_lights.dome(40, perspective=True)
+DEPTH = -DOME.camera["surface_z_m"]
+RNG = np.random.default_rng(3)
+
+
+def capture(folder, lights, told=None, scene=DOME):
+    near_lights.write(folder, scene, lights, told=told)
+    path = folder / "capture.json"
+    manifest = json.loads(path.read_text())
+    del manifest["camera"]["surface_z_m"]
+    path.write_text(json.dumps(manifest))
+    return folder
+
+
+def solved(relit, folder, *options):
+    outcome = relit("solve", folder, "--out", folder / "out", "--method", "robust", "--device", "cpu", *options)
+    assert (outcome.code, outcome.err) == (0, "")
+    return outcome.out, json.loads((folder / "out" / "report.json").read_text()), SurfaceMaps.read(folder / "out" / "maps.exr")
+
+
+@pytest.mark.parametrize(("radii", "count"), [(1.5, 16), (3.0, 8), (6.0, 12)])
+def test_the_distance_is_found(relit, tmp_path, radii, count):
+    """The coarse grid follows the ripples with chords: within half a per cent, and within what the report says."""
+    out, report, maps = solved(relit, capture(tmp_path / "c", lamps(DOME, count, radii)))
+    found = report["found"]["distance"]
+    assert found["surface_z_m"] == pytest.approx(-DEPTH, rel=0.005)
+    assert abs(found["surface_z_m"] + DEPTH) < 2 * found["sigma_m"] < 0.08 * DEPTH
+    assert "camera.surface_z_m: is missing, and was taken as" in out
+    angle = angles_degrees(maps.normal, DOME.normal)[maps.mask]
+    assert angle.mean() < max(0.3, found["sigma_of_normals_degrees"])
+    assert np.abs(maps.height - DOME.points[..., 2])[maps.mask].mean() < found["sigma_m"]
+
+
+def test_lights_that_are_not_where_they_are_said_to_be(relit, tmp_path):
+    """Places off by 2 % of their distance and intensities by 3 %: the error stays within what the report says."""
+    lights = lamps(DOME, 12, 3.0)
+    told = [lamp._replace(position=lamp.position + RNG.normal(0, 0.006, 3), strength=lamp.strength * np.exp(RNG.normal(0, 0.03)))
+            for lamp in lights]
+    _, report, _ = solved(relit, capture(tmp_path / "c", lights, told))
+    found = report["found"]["distance"]
+    assert abs(found["surface_z_m"] + DEPTH) < 2 * found["sigma_m"]
+
+
+def test_images_that_do_not_tell_it_are_refused(relit, tmp_path):
+    """Lights in another order than the images; and too few lights."""
+    lights = lamps(DOME, 8, 2.0)
+    folder = capture(tmp_path / "c", lights, lights[::-1])
+    outcome = relit("solve", folder, "--out", folder / "out")
+    assert outcome.code == 2 and "camera.surface_z_m: is missing, and the images" in outcome.err and "tell it" in outcome.err
+    assert not (folder / "out").exists()
+    folder = capture(tmp_path / "few", lights[:4])
+    outcome = relit("solve", folder, "--out", folder / "out")
+    assert outcome.code == 2 and "the images of 4 lights do not tell it (5 or more do)" in outcome.err
