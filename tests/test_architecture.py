@@ -12,7 +12,7 @@ import pytest
 HOME = Path(__file__).resolve().parents[1]
 ROOTS = ("stage", "kernels", "service")
 PRODUCTS = tuple(f"service.{name}" for name in (
-    "solve", "depth", "boards", "light", "calibrate", "basis", "captures", "demo", "export", "viewing", "joining", "scans"))
+    "solve", "depth", "boards", "light", "calibrate", "basis", "captures", "demo", "export", "viewing", "joining", "scans", "sequences"))
 """Where stage and kernels meet: captures go in, results come out."""
 WRITERS = ("service.asset", "service.usd", "service.gltf")
 """Meshes and textures of solved maps, and the formats that they are written in."""

@@ -7,6 +7,7 @@ import typer
 from service.cli.printing import counted, print_warnings
 from service.cli.progress import ProgressBar
 from service.cli.request_commands import Given, local_command
+from service.cli.sequences import check_single, print_sequence
 from service.errors import RequestError
 from service.requests.depth import DepthRequest
 from service.requests.patterns import CodeOptions, PatternsRequest, PlanRequest
@@ -30,8 +31,17 @@ def register(app: typer.Typer) -> None:
 
 
 def _depth(request: DepthRequest) -> None:
+    from stage.sequence import is_sequence
+
+    if is_sequence(request.capture):
+        from service.sequences.run import depth_sequence
+
+        with ProgressBar() as bar:
+            print_sequence(depth_sequence(request, bar))
+        return
     from service.depth.depth import depth
 
+    check_single(request)
     with ProgressBar() as bar:
         result = depth(request, bar)
     if result.points_path is None:

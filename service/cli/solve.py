@@ -5,6 +5,7 @@ import typer
 from service.cli.printing import counted, print_warnings
 from service.cli.progress import ProgressBar
 from service.cli.request_commands import local_command
+from service.cli.sequences import check_single, print_sequence
 from service.requests.basis import BasisRequest
 from service.requests.export import ExportRequest
 from service.requests.join import JoinRequest
@@ -20,8 +21,17 @@ def register(app: typer.Typer) -> None:
 
 
 def _solve(request: SolveRequest) -> None:
+    from stage.sequence import is_sequence
+
+    if is_sequence(request.capture):
+        from service.sequences.run import solve_sequence
+
+        with ProgressBar() as bar:
+            print_sequence(solve_sequence(request, bar))
+        return
     from service.solve.solve import solve
 
+    check_single(request)
     with ProgressBar() as bar:
         result = solve(request, bar)
     print(f"maps     {result.maps_path}")

@@ -11,13 +11,13 @@ from service.light.schedule import ScheduledFrame
 from service.requests.relight import RelightRequest
 from stage.capture import Capture
 from stage.colour_spaces import linear_space
-from stage.errors import storage
 from stage.ingest import Ingest
 from stage.light import PointLight
 from stage.lighting import lights_from_centre
 from stage.manifest import FILE_NAME, read_manifest
 from stage.motion.tracking import tracking_frames
 from stage.point_lights import DistantLights
+from stage.sequence import is_sequence, read_sequence
 
 
 class OpenedCapture(NamedTuple):
@@ -38,22 +38,19 @@ def time_steps(path: Path) -> list[Path]:
     """Return the capture folders that frames are made from.
 
     Args:
-        path: a capture, or a folder without capture.json whose sub-folders have one.
+        path: a capture, or a sequence: a sequence.json, its folder, or a folder without capture.json whose sub-folders have one.
 
     Returns:
-        The captures in order of name; the path alone where it is no sequence.
+        The captures in the order of the file, else in order of name; the path alone where it is no sequence.
 
     Raises:
         RequestError: two captures differ in resolution or colour space.
         ManifestError: a capture.json is wrong; names the field.
         StorageError: a folder cannot be read.
     """
-    with storage("read", path):
-        if path.name == FILE_NAME or not path.is_dir() or (path / FILE_NAME).exists():
-            return [path]
-        folders = sorted(folder for folder in path.iterdir() if (folder / FILE_NAME).is_file())
-    if not folders:
+    if not is_sequence(path):
         return [path]
+    folders = [step.folder for step in read_sequence(path).steps]
     first = read_manifest(folders[0] / FILE_NAME)
     for folder in folders[1:]:
         manifest = read_manifest(folder / FILE_NAME)

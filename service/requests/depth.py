@@ -94,8 +94,12 @@ class DepthRequest(DepthOptions, Request):
     """Depth from projected patterns, a laser, time of flight, or several cameras under projected texture."""
 
     capture: Annotated[Path, Role.INPUT, CAPTURE]
-    """Folder with a capture.json."""
+    """Folder with a capture.json; or a sequence: a folder of such folders, one a time step, with a sequence.json or in order of name."""
     out: Annotated[Path, Role.OUTPUT]
     """Folder for depth.exr, points.ply and report.json."""
     tof: TofOptions = TofOptions()
     """How time of flight is solved, with the camera's calibration; `near_m` and `far_m` are ranges along the ray there."""
+    temporal: Annotated[bool, Role.RUN] = True
+    """Of a sequence: join the estimates of consecutive steps where they agree within their standard deviations."""
+    frame_rate: Annotated[Positive | None, Role.RUN] = None
+    """Of a sequence without a sequence.json: its steps per second; None: 24."""

@@ -64,7 +64,7 @@ class SolveRequest(SolveOptions, Request):
     """Normals, albedo and height of a light-stage capture."""
 
     capture: Annotated[Path, Role.INPUT, CAPTURE]
-    """Folder with a capture.json."""
+    """Folder with a capture.json; or a sequence: a folder of such folders, one a time step, with a sequence.json or in order of name."""
     out: Annotated[Path, Role.OUTPUT]
     """Folder for maps.exr and report.json."""
     device: Annotated[Line | None, Role.MACHINE] = None
@@ -72,3 +72,7 @@ class SolveRequest(SolveOptions, Request):
     device, else the CPU."""
     reference_ball: Annotated[Path | None, Role.INPUT, Spelling(metavar="CAPTURE")] = None
     """Capture of a ball of the object's material under the same lights, for the method reference."""
+    temporal: Annotated[bool, Role.RUN] = True
+    """Of a sequence: join the estimates of consecutive steps where they agree within their standard deviations."""
+    frame_rate: Annotated[Positive | None, Role.RUN] = None
+    """Of a sequence without a sequence.json: its steps per second; None: 24."""

@@ -97,6 +97,18 @@ def choose_intensities(given: SolveInput, lights: DistantLights) -> ChosenIntens
     return ChosenIntensities(lights._replace(irradiance=lights.irradiance * factor[:, None]), {"light_intensities": facts})
 
 
+def lambertian_misfit(given: SolveInput, lights: DistantLights) -> float:
+    """Return how far diffuse reflection under these lights is from the readings of pixels spread over the object.
+
+    Args:
+        given: the images.
+        lights: lights of the stack.
+    """
+    inside = np.flatnonzero(given.mask)
+    radiance, usable = given.stack.pick_radiance(inside[evenly(len(inside), PIXELS)])
+    return fit_lambertian(grey_readings(radiance, lights.irradiance), usable, lights.direction).misfit()
+
+
 def _declared(lights: DistantLights, why: str, gain: float | None = None) -> ChosenIntensities:
     found = {} if gain is None else {"left_out_gain": round(gain, 4)}
     return ChosenIntensities(lights, {"light_intensities": {"used": "declared", "why": why, **found}})

@@ -37,6 +37,7 @@ from stage.radiance import clipping_sentences
 from stage.stack import Stack
 
 if TYPE_CHECKING:
+    from service.solve.lights_over_time import LightsOverTime
     from service.solve.polarised import Separated
     from service.solve.refined_lights import RefinedLights
     from service.solve.unknown_lights import UnknownLights
@@ -75,20 +76,22 @@ class _Opened(NamedTuple):
     """How the distance of the surface was found, where the manifest does not say it."""
 
 
-def solve(request: SolveRequest, progress: Progress | None = None, *, sharing: SharedSolve | None = None) -> SolveResult:
+def solve(request: SolveRequest, progress: Progress | None = None, *, sharing: SharedSolve | None = None,
+          over_time: "LightsOverTime | None" = None) -> SolveResult:
     """Solve a capture, and write its maps and a report.
 
     Args:
         request: the capture, the method and the folder of the results.
         progress: told how far the work is.
         sharing: the part of this process where several share the solve; the others call `help_solve`.
+        over_time: what the captures of a sequence share; None: the capture is no step of one.
 
     Raises:
         StageError, KernelError: the input is wrong; nothing is written.
         StorageError: the results cannot be written; nothing is left half-written.
     """
     timings = Timings(progress)
-    capture, method, lights, declared, solver, given, facts, found, distance = _open(request, timings, sharing)
+    capture, method, lights, declared, solver, given, facts, found, distance = _open(request, timings, sharing, over_time)
     stack, mask = given.stack, given.mask
     solution = solver(given, lights)
     solution.facts = facts | solution.facts
@@ -169,7 +172,7 @@ def help_solve(request: SolveRequest, progress: Progress, sharing: SharedSolve) 
     opened.solver(opened.given, opened.lights)
 
 
-def _open(request: SolveRequest, timings: Timings, sharing: SharedSolve | None) -> _Opened:
+def _open(request: SolveRequest, timings: Timings, sharing: SharedSolve | None, over_time: "LightsOverTime | None" = None) -> _Opened:
     """Open the capture of a request and read its images into a stack."""
     chosen = devices.resolve_all(request.device)
     timings.stage("open", 1)
@@ -219,7 +222,7 @@ def _open(request: SolveRequest, timings: Timings, sharing: SharedSolve | None) 
     facts: dict[str, Any] = {}
     if isinstance(lights, DistantLights) and given.refine_intensities:
         timings.stage("intensities", 1)
-        used, facts = choose_intensities(given, lights)
+        used, facts = choose_intensities(given, lights) if over_time is None else over_time.choose(given, lights)
     return _Opened(capture, method, used, lights, solver, given, facts, distance=distance)
 
 

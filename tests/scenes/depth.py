@@ -27,19 +27,20 @@ class Scene(NamedTuple):
     shaded: np.ndarray  # [rows, cols] bool: the sphere keeps the projector's light off it
 
 
-def make_scene(*, sphere: bool = True, camera: reference.Device = CAMERA, pose: np.ndarray = POSE) -> Scene:
+def make_scene(*, sphere: bool = True, camera: reference.Device = CAMERA, pose: np.ndarray = POSE,
+               centre: tuple[float, float, float] = CENTRE) -> Scene:
     """The scene; without the sphere the plane alone."""
     rays = reference.pixel_rays(camera)
     depth = reference.plane_depth(rays, PLANE, NORMAL)
     if sphere:
-        depth = np.fmin(depth, reference.sphere_depth(rays, CENTRE, RADIUS))
+        depth = np.fmin(depth, reference.sphere_depth(rays, centre, RADIUS))
     points = rays * depth[..., None]
     u = np.arange(camera.width) / camera.width
     albedo = np.stack([0.5 + 0.3 * u, np.full_like(u, 0.5), 0.8 - 0.3 * u], axis=-1) * np.ones((camera.height, 1, 1))
     to = pose[:3, 3] - points
-    clear = np.isnan(reference.sphere_depth(-to, np.array(CENTRE) - pose[:3, 3], RADIUS * 0.999)) if sphere else np.ones(depth.shape, bool)
-    on_sphere = np.linalg.norm(points - CENTRE, axis=-1) < RADIUS * 1.001
-    facing = (to * (points - CENTRE)).sum(axis=-1) > 0
+    clear = np.isnan(reference.sphere_depth(-to, np.array(centre) - pose[:3, 3], RADIUS * 0.999)) if sphere else np.ones(depth.shape, bool)
+    on_sphere = np.linalg.norm(points - centre, axis=-1) < RADIUS * 1.001
+    facing = (to * (points - centre)).sum(axis=-1) > 0
     return Scene(depth, points, reference.seen_by(PROJECTOR, pose, points), albedo, np.where(on_sphere & sphere, ~facing, ~clear))
 
 
@@ -109,9 +110,9 @@ BLACK_WHITE = [{"code": "black"}, {"code": "white"}]
 
 
 def write_patterns(folder: Path, scene: Scene, patterns: list[dict[str, Any]], *, suffix: str = "png", noise: float = 0.0,
-                   level: float = 0.8, gamma: float = 1.0, **changes: Any) -> Path:
+                   level: float = 0.8, gamma: float = 1.0, seed: int = 7, **changes: Any) -> Path:
     """A capture of these patterns: 16-bit PNG, or float EXR, with ambient light and noise."""
-    rng = np.random.default_rng(7)
+    rng = np.random.default_rng(seed)
     frames = []
     for number, pattern in enumerate(patterns):
         light = shown(pattern, scene.uv) ** gamma

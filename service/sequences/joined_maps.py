@@ -1,0 +1,172 @@
+"""Solved maps of consecutive steps, joined: normals, albedo, lobes and height of pixels whose steps agree."""
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from stage.maps import SurfaceMaps
+from stage.temporal.agreement import agree, noise_share
+from stage.temporal.recursion import Track, advance, begin
+
+LEAST_ALBEDO = 0.02
+"""Albedo below which its noise is that of this albedo."""
+ALBEDO_NOISE = 2.0
+"""Relative noise of albedo over that of the normals, in radians, up to which differences between neighbours count as noise."""
+LARGEST_GAIN = 0.25
+"""Change of the brightness of all lights between two steps that is taken for one."""
+GAIN_SPREAD = 0.5
+"""What is left of the changes of albedo, over the change of all, in a change of the brightness of all lights."""
+GAIN_SIGMAS = 4.0
+"""Least change of the brightness in its standard errors."""
+LEAST_GAIN_PIXELS = 256
+"""Least number of pixels at rest that tell of the brightness of all lights."""
+LAYERS = (("specular", 0.004), ("roughness", 0.01))
+"""Further layers that are joined, each where it agrees too, with its least standard deviation: the step of its fit."""
+
+
+@dataclass
+class MapsJoiner:
+    """The recursive mean of solved maps, step by step."""
+
+    anchored: bool
+    """Whether the height has no place of its own, as under distant lights: the part at rest then keeps its height."""
+    _before: SurfaceMaps | None = None
+    _gain: float = 1.0
+    _normal: Track | None = None
+    _albedo: Track | None = None
+    _height: Track | None = None
+    _others: dict[str, Track] = field(default_factory=dict)
+
+    def join(self, alone: SurfaceMaps) -> tuple[SurfaceMaps, dict[str, Any]]:
+        """Return the maps of a step joined with those before, and what the report says.
+
+        Args:
+            alone: of the step alone.
+        """
+        assert alone.normal is not None and alone.sigma is not None
+        sigma = np.radians(alone.sigma.astype(np.float32))
+        if self._before is None or self._normal is None:
+            self._begin(alone, sigma, np.ones_like(sigma), {})
+            self._before = alone
+            return alone, {"joined_pixels": 0, "steps_joined": {"median": 1.0, "most": 1}}
+        before = self._before
+        both = alone.mask & before.mask & (self._normal.count > 0)
+        assert before.normal is not None and before.sigma is not None
+        declared = sigma**2 + np.radians(before.sigma.astype(np.float32)) ** 2
+        share = noise_share(alone.normal - before.normal, declared, both, 2)
+        if (self._normal.count[both] == 1).all():  # only now is known how much of the first step is noise
+            self._begin(before, np.radians(before.sigma.astype(np.float32)), share, {})
+        new = begin(alone.normal, sigma, share, alone.mask)
+        rest = agree(new.mean - self._normal.mean, new.noise + self._normal.noise, both, 2)
+        gain = self._gain_of(alone, rest)
+        albedo, shares = self._albedo_of(alone, before, both, new.noise, gain)
+        if albedo is not None and self._albedo is not None:
+            for channel in range(3):  # what a light does to all channels is in the noise of each
+                apart = (albedo.mean - self._albedo.mean)[..., channel : channel + 1]
+                rest = agree(apart, (albedo.noise + self._albedo.noise) / 3, both & rest, 1)
+            self._albedo = advance(self._albedo, albedo, rest)
+        self._normal = advance(self._normal, new, rest, unit=True)
+        changed: dict[str, Any] = {"normal": self._normal.mean, "sigma": np.degrees(self._normal.sigma)}
+        if self._albedo is not None:
+            changed["diffuse_albedo"] = self._albedo.mean
+        for name, least in LAYERS:
+            if (layer := self._layer(name, least, alone, before, rest)) is not None:
+                changed[name] = layer
+        height, offset = self._height_of(alone, rest)
+        if height is not None:
+            changed["height"] = height
+        self._before, self._gain = alone, gain
+        kept = alone.mask
+        joined = replace(alone, **{name: np.where(kept if values.ndim == 2 else kept[..., None], values, getattr(alone, name))
+                                   for name, values in changed.items() if getattr(alone, name) is not None})
+        count = self._normal.count[kept]
+        return joined, {
+            "joined_pixels": int(np.count_nonzero(rest)), "compared_pixels": int(np.count_nonzero(both)),
+            "steps_joined": {"median": float(np.median(count)) if len(count) else 0.0, "most": int(count.max(initial=0))},
+            "noise_share": {"normal": _middle(share, both), **shares}, "brightness": round(gain, 5),
+            **({} if offset is None else {"height_offset": float(f"{offset:.6g}")})}
+
+    def _begin(self, maps: SurfaceMaps, sigma: np.ndarray, share: np.ndarray, shares: dict[str, float]) -> None:
+        assert maps.normal is not None
+        self._normal = begin(maps.normal, sigma, share, maps.mask)
+        if maps.diffuse_albedo is not None:
+            relative = np.sqrt(self._normal.noise / 2)
+            self._albedo = begin(maps.diffuse_albedo, relative * _level(maps.diffuse_albedo), np.ones_like(sigma), maps.mask)
+        if maps.height is not None:
+            self._height = begin(maps.height[..., None], sigma, np.ones_like(sigma), maps.mask)
+        for name, least in LAYERS:
+            values = getattr(maps, name)
+            if values is not None:
+                self._others[name] = begin(_deep(values), np.full(sigma.shape, least, np.float32), np.ones_like(sigma), maps.mask)
+
+    def _gain_of(self, alone: SurfaceMaps, rest: np.ndarray) -> float:
+        """Return the brightness of all lights over that of the first step, 1 where nothing tells that it has changed."""
+        if alone.diffuse_albedo is None or self._albedo is None or np.count_nonzero(rest) < LEAST_GAIN_PIXELS:
+            return 1.0
+        now, then = (values[rest].mean(axis=-1).astype(np.float64) for values in (alone.diffuse_albedo, self._albedo.mean))
+        told = then > LEAST_ALBEDO
+        if np.count_nonzero(told) < LEAST_GAIN_PIXELS:
+            return 1.0
+        change = np.log(np.maximum(now[told], 1e-6) / then[told])
+        middle = float(np.median(change))
+        spread = 1.4826 * float(np.median(np.abs(change - middle)))
+        sure = abs(middle) > GAIN_SIGMAS * spread / np.sqrt(len(change)) and spread < GAIN_SPREAD * abs(middle)
+        return float(np.exp(middle)) if sure and abs(middle) < LARGEST_GAIN else 1.0
+
+    def _albedo_of(self, alone: SurfaceMaps, before: SurfaceMaps, both: np.ndarray, noise: np.ndarray,
+                   gain: float) -> tuple[Track | None, dict[str, float]]:
+        """Return the albedo of the step at the brightness of the steps before, with the noise that neighbours tell."""
+        if alone.diffuse_albedo is None or before.diffuse_albedo is None or self._albedo is None:
+            return None, {}
+        values, earlier = alone.diffuse_albedo / gain, before.diffuse_albedo / self._gain
+        level = _level(values)
+        share = noise_share(values - earlier, 2 * level**2, both, 3)
+        most = ALBEDO_NOISE**2 * float(np.median(noise[both])) / 2 if both.any() else 1.0
+        share = np.minimum(share, max(most, 1e-8))
+        if (self._albedo.count[both] == 1).all():
+            self._albedo = begin(earlier, _level(earlier), share, before.mask)
+        new = begin(values, level, share, alone.mask)
+        return replace(new, constant=np.zeros_like(new.constant)), {"albedo_relative": _middle(np.sqrt(share), both)}
+
+    def _layer(self, name: str, least: float, alone: SurfaceMaps, before: SurfaceMaps, rest: np.ndarray) -> np.ndarray | None:
+        """Return a further layer, joined where it agrees too."""
+        now, earlier, track = getattr(alone, name), getattr(before, name), self._others.get(name)
+        if now is None or earlier is None or track is None:
+            return None
+        values = _deep(now)
+        spread = np.abs(values - _deep(earlier)).max(axis=-1)[rest]
+        sigma = max(least, 1.4826 * float(np.median(spread)) / np.sqrt(2)) if len(spread) else least
+        new = begin(values, np.full(rest.shape, sigma, np.float32), np.ones(rest.shape, np.float32), alone.mask)
+        same = rest & (np.abs(values - track.mean).max(axis=-1) <= 3 * np.sqrt(new.noise + np.maximum(track.noise, least**2)))
+        self._others[name] = advance(replace(track, noise=np.maximum(track.noise, sigma**2 / np.maximum(track.count, 1))), new, same)
+        mean = self._others[name].mean
+        return mean if now.ndim == 3 else mean[..., 0]
+
+    def _height_of(self, alone: SurfaceMaps, rest: np.ndarray) -> tuple[np.ndarray | None, float | None]:
+        """Return the height, joined with that of the steps before; under distant lights in the place of the part at rest."""
+        if alone.height is None or self._height is None:
+            return None, None
+        if not self.anchored:
+            return None, None
+        offset = float(np.median(alone.height[rest] - self._height.mean[rest][:, 0])) if rest.any() else 0.0
+        height = np.where(alone.mask, alone.height - offset, 0)
+        flat = np.ones(rest.shape, np.float32)
+        new = begin(height[..., None], flat, flat, alone.mask)  # as often joined as the normals, so that every step weighs the same
+        self._height = advance(replace(self._height, noise=1 / np.maximum(self._height.count, 1).astype(np.float32)), new, rest)
+        return self._height.mean[..., 0], offset
+
+
+def _level(albedo: np.ndarray) -> np.ndarray:
+    """Return [rows, cols] the length of an albedo, at least that of LEAST_ALBEDO, to which its noise is relative."""
+    return np.asarray(np.maximum(np.linalg.norm(albedo.astype(np.float32), axis=-1), LEAST_ALBEDO))
+
+
+def _deep(values: np.ndarray) -> np.ndarray:
+    """Return [rows, cols, k] of a layer with or without channels."""
+    return np.asarray((values if values.ndim == 3 else values[..., None]).astype(np.float32))
+
+
+def _middle(values: np.ndarray, where: np.ndarray) -> float:
+    """Return the median of some pixels, with four digits."""
+    return float(f"{np.median(values[where]):.4g}") if where.any() else 0.0

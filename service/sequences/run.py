@@ -1,0 +1,200 @@
+"""A solve or a depth of a sequence: its steps one after another, each joined with those before, and a report over all of them."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from service.depth.depth import depth
+from service.errors import RequestError
+from service.reporting.progress import Progress, Timings
+from service.reporting.provenance import REPORT_FILE, report
+from service.requests.depth import DepthRequest
+from service.requests.solve import Intensities, LightsKnown, SolveRequest
+from service.sequences.joined_depth import DepthJoiner, moved_points
+from service.sequences.joined_maps import MapsJoiner
+from service.sequences.steps import ALONE, StepProgress, capture_digest, check_outputs, do_step, step_report
+from service.solve.lights_over_time import LightsOverTime
+from service.solve.solve import solve
+from stage.capture import Capture
+from stage.depth_maps import DEPTH_FILE, DepthMaps
+from stage.errors import ResultError
+from stage.files import write_text
+from stage.light import PointLight
+from stage.maps import MAPS_FILE, SurfaceMaps
+from stage.ply import POINTS_FILE, read_ply, write_ply
+from stage.sequence import SEQUENCE_FILE, Sequence, TimeStep, check_alike, is_sequence, read_sequence, write_sequence
+
+UNTIMED = "the steps are folders in order of name, taken at {:g} a second: a sequence.json says the rate and times"
+"""What the report says of a sequence without a file."""
+
+
+class SequenceResult(NamedTuple):
+    """What was made of a sequence."""
+
+    sequence_path: Path
+    report_path: Path
+    names: tuple[str, ...]
+    kept: int
+    """Steps that were done before."""
+    joined: float
+    """Share of the pixels with an estimate in two consecutive steps that agreed, over all steps."""
+    solved: int
+    """Pixels of all steps."""
+    warnings: tuple[str, ...]
+
+
+class _Step(NamedTuple):
+    """What one step has come to."""
+
+    facts: dict[str, Any]
+    solved: int
+    warnings: list[str]
+
+
+def solve_sequence(request: SolveRequest, progress: Progress | None = None) -> SequenceResult:
+    """Solve every capture of a sequence, and join what agrees from step to step.
+
+    Args:
+        request: its `capture` is the sequence, its `out` the folder for a folder of each step.
+        progress: told of every stage of every step.
+
+    Raises:
+        RequestError: lights are to be found from the images of each step, or results would lie in a capture.
+        StageError, KernelError: bad input; the steps before are whole.
+        StorageError: the results cannot be written; nothing is left half-written.
+    """
+    if request.lights is not LightsKnown.DECLARED:
+        raise RequestError(f"--lights {request.lights}: each step of a sequence would find lights of its own, and the surfaces would not "
+                           "fit each other: measure the lights once (relit calibrate), and write them into every step")
+    sequence, manifests = _open(request)
+    near = any(isinstance(frame.light, PointLight) for manifest in manifests for frame in manifest.frames)
+    joiner = MapsJoiner(anchored=not near)
+    lights = LightsOverTime(shared=request.intensities is Intensities.CHOSEN)
+
+    def one(step: TimeStep, folder: Path, told: StepProgress) -> tuple[_Step, bool]:
+        there = _step_request(request, step, folder)
+
+        def work() -> dict[str, Any]:
+            solve(there, told, over_time=lights)
+            return lights.left()
+
+        left, was_done = do_step(there.out, capture_digest(step.folder, there, lights.plain()), work)
+        lights.take(left)
+        alone = SurfaceMaps.read(there.out / MAPS_FILE, unsure=True)
+        facts: dict[str, Any] = {}
+        if request.temporal:
+            if alone.normal is None or alone.sigma is None:
+                raise ResultError(f"{there.out / MAPS_FILE}: has no normals with their standard errors: delete the folder and run again")
+            joined, facts = joiner.join(alone)
+            joined.write(folder / MAPS_FILE)
+        return _finish(request, step, folder, there.out, alone.mask, facts), was_done
+
+    return _run(request, sequence, progress, one, MAPS_FILE)
+
+
+def depth_sequence(request: DepthRequest, progress: Progress | None = None) -> SequenceResult:
+    """Measure the depth of every capture of a sequence, and join what agrees from step to step.
+
+    Args:
+        request: as for solve_sequence.
+        progress: told of every stage of every step.
+
+    Raises:
+        as solve_sequence; ResultError: a step is decoded and cannot be triangulated.
+    """
+    sequence, _ = _open(request)
+    joiner = DepthJoiner()
+
+    def one(step: TimeStep, folder: Path, told: StepProgress) -> tuple[_Step, bool]:
+        there = _step_request(request, step, folder)
+
+        def work() -> dict[str, Any]:
+            depth(there, told)
+            return {}
+
+        _, was_done = do_step(there.out, capture_digest(step.folder, there, None), work)
+        alone = DepthMaps.read(there.out / DEPTH_FILE, unsure=True)
+        facts: dict[str, Any] = {}
+        if request.temporal:
+            joined, facts = joiner.join(alone)
+            cloud = moved_points(read_ply(there.out / POINTS_FILE), alone, joined)
+            joined.write(folder / DEPTH_FILE)
+            write_ply(cloud, folder / POINTS_FILE, comments=tuple(f"{key} {value}" for key, value in joined.provenance.items()))
+        return _finish(request, step, folder, there.out, alone.mask, facts), was_done
+
+    return _run(request, sequence, progress, one, DEPTH_FILE)
+
+
+def _open(request: SolveRequest | DepthRequest) -> tuple[Sequence, list[Any]]:
+    assert is_sequence(request.capture)
+    sequence = read_sequence(request.capture, frames_per_second=request.frame_rate)
+    manifests = check_alike(sequence)
+    check_outputs(request.out, sequence)
+    return sequence, manifests
+
+
+def _step_request(request: Any, step: TimeStep, folder: Path) -> Any:
+    """Return the request of one step."""
+    Capture.open(step.folder, request.pixels)
+    changes: dict[str, Any] = {"capture": step.folder, "out": folder / ALONE if request.temporal else folder, "frame_rate": None,
+                               "temporal": True}
+    if request.cache is not None:
+        changes["cache"] = request.cache / step.name
+    return request.model_copy(update=changes)
+
+
+def _finish(request: Any, step: TimeStep, folder: Path, alone: Path, mask: np.ndarray, facts: dict[str, Any]) -> _Step:
+    """Write the report of a joined step, and return what the report of the sequence says of it."""
+    found = step_report(alone)
+    pixels, warnings = found.get("pixels", {}), [str(sentence) for sentence in found.get("warnings", [])]
+    if request.temporal:
+        write_text(folder / REPORT_FILE, report(
+            request.model_copy(update={"capture": step.folder}),
+            inputs=found.get("inputs", {}), method=found.get("method"), joined=facts, alone=f"{ALONE}/{REPORT_FILE}", warnings=warnings,
+            pixels=pixels))
+    told = {"name": step.name, "time_s": round(step.time_s, 6), "method": found.get("method"),
+            "pixels": {"mask": pixels.get("mask", 0), "solved": int(np.count_nonzero(mask))}, **facts}
+    return _Step(told, int(np.count_nonzero(mask)), warnings)
+
+
+def _run(request: Any, sequence: Sequence, progress: Progress | None, one: Callable[..., tuple[_Step, bool]],
+         result: str) -> SequenceResult:
+    """Do the steps, and write what is said of all."""
+    timings = Timings(progress)
+    rows: list[dict[str, Any]] = []
+    warnings: list[str] = [] if sequence.timed or request.frame_rate is not None else [UNTIMED.format(sequence.frames_per_second)]
+    kept = solved = agreed = compared = 0
+    methods: dict[str, str] = {}
+    for number, step in enumerate(sequence.steps, start=1):
+        found, was_done = one(step, request.out / step.name, StepProgress(timings, number, len(sequence.steps)))
+        rows.append(found.facts | {"done_before": was_done})
+        kept += was_done
+        solved += found.solved
+        agreed += found.facts.get("joined_pixels", 0)
+        compared += found.facts.get("compared_pixels", 0)
+        methods.setdefault(str(found.facts["method"]), step.name)
+        warnings += [f"{step.name}: {sentence}" for sentence in found.warnings]
+    if len(methods) > 1:
+        warnings.append("the steps are not of one method: " + ", ".join(f"{method} from {name} on" for method, name in methods.items())
+                        + ": give the method")
+    write_sequence(_with_results(sequence, request.out), request.out / SEQUENCE_FILE)
+    report_path = request.out / REPORT_FILE
+    write_text(report_path, report(
+        request,
+        inputs={"sequence": str(request.capture), "steps": len(rows), "frames_per_second": sequence.frames_per_second},
+        result=result,
+        joined=request.temporal,
+        steps=rows,
+        warnings=warnings,
+        timings_s=timings.close(),
+    ))
+    return SequenceResult(request.out / SEQUENCE_FILE, report_path, tuple(step.name for step in sequence.steps), kept,
+                          agreed / compared if compared else 0.0, solved, tuple(warnings))
+
+
+def _with_results(sequence: Sequence, out: Path) -> Sequence:
+    """Return the sequence of the results."""
+    return sequence._replace(steps=tuple(step._replace(folder=out / step.name) for step in sequence.steps))
+

@@ -1,0 +1,125 @@
+"""The steps of a sequence done one after another: each whole or not at all, and not again where it is done."""
+
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from service.errors import RequestError
+from service.reporting.progress import Progress
+from service.reporting.provenance import REPORT_FILE, requested, versions
+from service.requests.base import Request
+from stage.capture import Capture
+from stage.errors import ResultError
+from stage.files import write_text
+from stage.fingerprint import Fingerprints, digest
+from stage.ingest import CACHE_FOLDER
+from stage.manifest import FILE_NAME
+from stage.sequence import Sequence
+
+ALONE = "alone"
+"""The folder, in that of a step, of what was found from the step alone."""
+DONE_FILE = "step.json"
+"""What says that a step is done, and from what; written last."""
+DONE_SCHEMA = "relit.step/1"
+
+
+class StepProgress:
+    """The progress of one step, whose stages are named after it."""
+
+    def __init__(self, inner: Progress | None, number: int, count: int) -> None:
+        """Args: inner: is told; number: of the step, from 1; count: of all steps."""
+        self._inner, self._place = inner, f"{number}/{count}"
+
+    def stage(self, name: str, total: int) -> None:
+        """Begin a stage."""
+        if self._inner is not None:
+            self._inner.stage(f"{self._place} {name}", total)
+
+    def advance(self, done: int) -> None:
+        """Pass the finished steps on."""
+        if self._inner is not None:
+            self._inner.advance(done)
+
+
+def check_outputs(out: Path, sequence: Sequence) -> None:
+    """Check that no result of a step would lie in a capture.
+
+    Raises:
+        RequestError: it would.
+    """
+    folders = {step.folder.resolve() for step in sequence.steps}
+    for step in sequence.steps:
+        if (out / step.name).resolve() in folders:
+            raise RequestError(f"--out {out}: {step.name} in it is a capture of the sequence: choose another folder")
+
+
+def capture_digest(folder: Path, request: Request, shared: object) -> str:
+    """Return a hash of everything that the result of a step follows from.
+
+    Args:
+        folder: of its capture.
+        request: of the step.
+        shared: what other steps have given it, as plain data.
+
+    Raises:
+        StageError: the capture is wrong; names file and field.
+    """
+    capture = Capture.open(folder)
+    names = sorted({name for _, name in capture.files()})
+    hashes = Fingerprints(capture.folder, capture.folder / CACHE_FOLDER / "files.json").of(names)
+    content = {"files": [hashes[name] for name in names], "names": names, "manifest": digest(capture.folder / FILE_NAME),
+               "options": {name: value for name, value in requested(request).items() if name != "capture"}, "versions": versions(),
+               "shared": shared}
+    return hashlib.blake2b(json.dumps(content, sort_keys=True, default=str).encode(), digest_size=16).hexdigest()
+
+
+def done(folder: Path, content: str) -> dict[str, Any] | None:
+    """Return what a step that is done has left for others, or None where it is not done, or not from this content.
+
+    Args:
+        folder: of its result.
+        content: of capture_digest.
+    """
+    try:
+        found = json.loads((folder / DONE_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return None
+    if not isinstance(found, dict) or found.get("schema") != DONE_SCHEMA or found.get("content") != content:
+        return None
+    left = found.get("left")
+    return left if isinstance(left, dict) and (folder / REPORT_FILE).is_file() else None
+
+
+def do_step(folder: Path, content: str, work: Callable[[], dict[str, Any]]) -> tuple[dict[str, Any], bool]:
+    """Do a step unless it is done.
+
+    Args:
+        folder: of its result.
+        content: of capture_digest.
+        work: does it, and returns what it leaves for others, as plain data.
+
+    Returns:
+        What it leaves for others, and whether it was done before.
+    """
+    left = done(folder, content)
+    if left is not None:
+        return left, True
+    (folder / DONE_FILE).unlink(missing_ok=True)
+    left = work()
+    write_text(folder / DONE_FILE, json.dumps({"schema": DONE_SCHEMA, "content": content, "left": left}) + "\n")
+    return left, False
+
+
+def step_report(folder: Path) -> dict[str, Any]:
+    """Return the report of a step that is done.
+
+    Raises:
+        ResultError: it cannot be read.
+    """
+    try:
+        found = json.loads((folder / REPORT_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ResultError(f"{folder / REPORT_FILE}: cannot be read: delete the folder and run again") from error
+    return found if isinstance(found, dict) else {}

@@ -1,0 +1,95 @@
+"""Whether two estimates of a pixel, taken one after the other, are of one surface at rest, and how much of their error is noise.
+
+Nothing is known of the motion of a subject, so that nothing is carried along it. Two estimates agree where their difference is no more
+than noise explains: at the pixel, and in the mean over the pixels around it, which shows a motion of a fraction of the noise. A mean of
+estimates that pass is not further from the truth than the last one alone: what motion may add is less than what the mean takes away.
+
+How much of a standard deviation is noise is measured. Errors that are the same in every step, as those of lights or of a model, are in σ
+too, but do not differ between steps. The difference of two steps less that of its neighbours is noise, whatever moves, as far as the
+motion is alike at neighbouring pixels.
+"""
+
+import numpy as np
+
+MEDIANS = {1: 0.4549, 2: 0.6931, 3: 0.7887}
+"""Median of χ² over its degrees of freedom, by these."""
+LIMITS = {1: 12.12, 2: 7.60, 3: 5.91}
+"""Its quantile of 99.95 %, over the degrees of freedom."""
+RADII = (1, 3, 7)
+"""Radii in pixels of the squares over which differences are averaged."""
+LEAST_AROUND = 0.5
+"""Least part of the pixels in the second square that agree by themselves."""
+LEAST_PIXELS = 64
+"""Least number of pixels from which a share of noise is measured."""
+BINS = 4
+"""Parts of the pixels, by size of σ, for each of which the share of noise is measured."""
+LEAST_SHARE, MOST_SHARE = 1e-4, 2.0
+"""Bounds of the share: above the second, motion and not noise differs between neighbours."""
+
+
+def noise_share(difference: np.ndarray, variance: np.ndarray, both: np.ndarray, freedom: int) -> np.ndarray:
+    """Return which part of a variance is noise that differs from step to step.
+
+    Args:
+        difference: [rows, cols, k] of two steps.
+        variance: [rows, cols] of the difference as the steps declare it: the mean of its squared length.
+        both: [rows, cols] bool, where both steps have an estimate.
+        freedom: in how many directions the difference can point.
+
+    Returns:
+        [rows, cols] float32, LEAST_SHARE to MOST_SHARE; 1 where too few pixels tell.
+    """
+    share = np.ones(both.shape, np.float32)
+    inner = np.zeros_like(both)
+    inner[1:-1, 1:-1] = both[1:-1, 1:-1] & both[:-2, 1:-1] & both[2:, 1:-1] & both[1:-1, :-2] & both[1:-1, 2:]
+    if np.count_nonzero(inner) < LEAST_PIXELS:
+        return share
+    apart, spread = np.zeros_like(difference), np.ones_like(variance)
+    apart[1:-1, 1:-1] = difference[1:-1, 1:-1] - _beside(difference) / 4
+    spread[1:-1, 1:-1] = variance[1:-1, 1:-1] + _beside(variance) / 16
+    ratio = ((apart**2).sum(axis=-1) / np.maximum(spread, 1e-30))[inner]
+    size = variance[inner]
+    edges = np.quantile(size, np.linspace(0, 1, BINS + 1)[1:-1]) if len(ratio) >= BINS * LEAST_PIXELS else np.zeros(0)
+    number, everywhere = np.searchsorted(edges, size), np.searchsorted(edges, variance)
+    for part in range(len(edges) + 1):
+        inside = ratio[number == part]
+        if len(inside) >= LEAST_PIXELS:
+            share[everywhere == part] = np.clip(np.median(inside) / MEDIANS[freedom], LEAST_SHARE, MOST_SHARE)
+        else:
+            share[everywhere == part] = np.clip(np.median(ratio) / MEDIANS[freedom], LEAST_SHARE, MOST_SHARE)
+    return share
+
+
+def agree(difference: np.ndarray, variance: np.ndarray, both: np.ndarray, freedom: int) -> np.ndarray:
+    """Return where a difference is no more than noise, at the pixel and in the mean around it.
+
+    Args:
+        difference, both, freedom: as for noise_share.
+        variance: [rows, cols] of noise alone.
+
+    Returns:
+        [rows, cols] bool.
+    """
+    limit = LIMITS[freedom]
+    found = both & ((difference**2).sum(axis=-1) <= limit * variance)
+    found &= _window(found, RADII[1]) >= LEAST_AROUND * _window(both, RADII[1])  # among pixels that disagree, one agrees by chance
+    for radius in RADII:  # over the pixels that pass so far, so that what moves fast does not keep the part at rest around it apart
+        total = np.stack([_window(np.where(found, difference[..., k], 0), radius) for k in range(difference.shape[-1])], axis=-1)
+        found = found & ((total**2).sum(axis=-1) <= limit * _window(np.where(found, variance, 0), radius))
+    return found
+
+
+def _beside(values: np.ndarray) -> np.ndarray:
+    """Return the sum of the four neighbours of every inner pixel."""
+    return np.asarray(values[:-2, 1:-1] + values[2:, 1:-1] + values[1:-1, :-2] + values[1:-1, 2:])
+
+
+def _window(values: np.ndarray, radius: int) -> np.ndarray:
+    """Return the sum over a square around each pixel, [rows, cols] float64."""
+    total = values.astype(np.float64)
+    for axis in (0, 1):
+        padded = np.pad(total, [(radius + 1, radius) if a == axis else (0, 0) for a in (0, 1)])
+        running = padded.cumsum(axis=axis)
+        width = 2 * radius + 1
+        total = np.take(running, range(width, running.shape[axis]), axis) - np.take(running, range(running.shape[axis] - width), axis)
+    return total
