@@ -63,7 +63,7 @@ class Capture:
     """The number of pixels in which a value was set to 0, by the names of the images that were read so far."""
 
     doubts: tuple[str, ...] = ()
-    """A sentence for each thing that the files say and the manifest does not heed."""
+    """A sentence for each thing that the files say and the manifest does not heed, and for each that an import assumed."""
 
     @classmethod
     def open(cls, path: str | Path, pixels: PixelChoices = AS_RECORDED) -> "Capture":
@@ -87,6 +87,7 @@ class Capture:
                 raise ManifestError(f"{folder}: holds no {FILE_NAME}: see `relit import` for data laid out another way")
         capture = cls(folder, read_manifest(folder / FILE_NAME), pixels)
         capture = capture._exposed(capture._check_files())
+        capture = replace(capture, doubts=(*capture.doubts, *capture.manifest.assumed))
         return capture if pixels.crop is None else capture._part(pixels.crop)
 
     @property

@@ -39,6 +39,7 @@ EXAMPLES: dict[type[Strict], tuple[Example, ...]] = {
         "frames": [{"image": "000.png", "light": _DISTANT}],
     }, {
         "schema": SCHEMA, "name": "statue", "color_space": "srgb_texture", "camera": _ORTHOGRAPHIC, "exposure_from": "exif",
+        "assumed": ["color_space: the images have 8 bits and were taken as sRGB"],
         "color_matrix": [[1.62, -0.55, -0.07], [-0.2, 1.58, -0.38], [0.03, -0.48, 1.45]],
         "frames": [{"image": "000.jpg", "light": _DISTANT}],
     }, {

@@ -191,7 +191,7 @@ def _open(request: SolveRequest, timings: Timings, sharing: SharedSolve | None, 
     tracking = tracking_frames(capture, to=request.align_to) if request.aligned else None
     distance = None
     alone = over_time is None and not capture.is_polarised  # steps would find distances of their own; pairs are no lights of their own
-    if alone and method in (Method.LAMBERT, Method.ROBUST, Method.SVBRDF) and distance_is_missing(capture):
+    if alone and not unknown and method in (Method.LAMBERT, Method.ROBUST, Method.SVBRDF) and distance_is_missing(capture):
         timings.stage("distance", len(capture.sources()))
         distance = find_distance(capture, open_stack(capture, cache=request.cache, tracking=tracking,
                                                      progress=lambda done, _: timings.advance(done)), chosen[0])

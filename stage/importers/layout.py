@@ -98,6 +98,19 @@ def color_space_of(path: Path) -> ColorSpaceName:
     return "srgb_texture" if eight_bit else "lin_rec709_scene"
 
 
+def assumed_encoding(space: ColorSpaceName, told: ColorSpaceName | None = None) -> list[str]:
+    """Return the entry `assumed` of a manifest: a sentence where 8-bit images are taken as sRGB though nobody has said it.
+
+    Args:
+        space: that the manifest has.
+        told: that was asked for; None: `color_space_of` has found it.
+    """
+    if told is not None or space != "srgb_texture":
+        return []
+    return ["color_space: the images have 8 bits and were taken as sRGB, which the files do not say: many cameras for measurements are "
+            "linear, which is lin_rec709_scene"]
+
+
 def place_images(source: Path, destination: Path, names: Sequence[str]) -> None:
     """Put files of `source` into `destination` as hard links when the file system allows it, otherwise as copies.
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from stage.errors import ManifestError, storage
-from stage.importers.layout import color_space_of, image_resolution, write_capture
+from stage.importers.layout import assumed_encoding, color_space_of, image_resolution, write_capture
 from stage.manifest import SCHEMA
 from stage.text import name_fault
 
@@ -45,10 +45,12 @@ def import_folder(source: Path, destination: Path) -> Path:
     first = folder / frames[0]["image"]
     resolution = image_resolution(first)
     mask = "mask.png" if (folder / "mask.png").exists() else None
+    space = color_space_of(first)
     return write_capture({
         "schema": SCHEMA,
         "name": path.stem,
-        "color_space": color_space_of(first),
+        "color_space": space,
+        "assumed": assumed_encoding(space),
         "camera": {"projection": "orthographic", "resolution": resolution},
         "mask": mask,
         "irradiance_scale": "relative",

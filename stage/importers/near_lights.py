@@ -9,7 +9,7 @@ import numpy as np
 from stage.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError
 from stage.importers.axes import Axes, camera_from_table, describe
-from stage.importers.layout import Imported, color_space_of, image_resolution, write_capture
+from stage.importers.layout import Imported, assumed_encoding, color_space_of, image_resolution, write_capture
 from stage.importers.light_rig import LightRig, read_camera_matrix, read_rig
 from stage.importers.light_table import LightTable
 from stage.importers.olat import find_table, match
@@ -49,7 +49,7 @@ def import_folder(source: Path, destination: Path, *, axes: Axes, unit_m: float,
     frames += [{"image": chosen.ambient, "light": {"type": "off"}}] if chosen.ambient else []
     written = write_capture({
         "schema": SCHEMA, "name": source.resolve().name, "color_space": space, "camera": view.entry(resolution), "mask": chosen.mask,
-        "irradiance_scale": "relative", "frames": frames,
+        "irradiance_scale": "relative", "assumed": assumed_encoding(space, color_space), "frames": frames,
     }, path, destination, folder=source)
     far = np.linalg.norm(positions, axis=1)
     ahead = int((positions[:, 2] < 0).sum())

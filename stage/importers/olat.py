@@ -8,7 +8,7 @@ import numpy as np
 from stage.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError, storage
 from stage.importers.axes import Axes, camera_from_table, describe
-from stage.importers.layout import Imported, color_space_of, image_resolution, natural_order, write_capture
+from stage.importers.layout import Imported, assumed_encoding, color_space_of, image_resolution, natural_order, write_capture
 from stage.importers.light_table import SUFFIXES, LightTable, Run, read_light_table, read_strengths
 from stage.importers.view import Selected, Selection, View, select
 from stage.manifest import FILE_NAME, SCHEMA
@@ -53,7 +53,7 @@ def import_folder(source: Path, destination: Path, *, axes: Axes, to_light: bool
     frames += [{"image": chosen.ambient, "light": {"type": "off"}}] if chosen.ambient else []
     written = write_capture({
         "schema": SCHEMA, "name": source.resolve().name, "color_space": space, "camera": view.entry(image_resolution(source / names[0])),
-        "mask": chosen.mask, "irradiance_scale": "relative", "frames": frames,
+        "mask": chosen.mask, "irradiance_scale": "relative", "assumed": assumed_encoding(space, color_space), "frames": frames,
     }, path, destination, folder=source)
     behind = int((directions[:, 2] < 0).sum())
     return Imported(written, (

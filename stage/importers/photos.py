@@ -5,7 +5,7 @@ from typing import Any
 
 from stage.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError
-from stage.importers.layout import Imported, color_space_of, image_resolution, write_capture
+from stage.importers.layout import Imported, assumed_encoding, color_space_of, image_resolution, write_capture
 from stage.importers.view import Selection, View, select
 from stage.light import PLACEHOLDER
 from stage.lighting import MEASURED_BY
@@ -40,7 +40,7 @@ def import_folder(source: Path, destination: Path, *, selection: Selection | Non
     frames += [{"image": chosen.ambient, "light": {"type": "off"}}] if chosen.ambient else []
     written = write_capture({
         "schema": SCHEMA, "name": source.resolve().name, "color_space": space, "camera": view.entry(image_resolution(source / names[0])),
-        "mask": chosen.mask, "irradiance_scale": "relative", "frames": frames,
+        "mask": chosen.mask, "irradiance_scale": "relative", "assumed": assumed_encoding(space, color_space), "frames": frames,
     }, source, destination, folder=source)
     return Imported(written, (
         ("lights", f"{len(names)} placeholders, {names[0]} to {names[-1]}: relit solve --lights unknown finds them from the images; "

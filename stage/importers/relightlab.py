@@ -16,7 +16,7 @@ import numpy as np
 
 from stage import inputs
 from stage.errors import ManifestError, storage
-from stage.importers.layout import Imported, color_space_of, image_resolution, write_capture
+from stage.importers.layout import Imported, assumed_encoding, color_space_of, image_resolution, write_capture
 from stage.importers.view import Selection, select
 from stage.manifest import SCHEMA
 from stage.text import name_fault
@@ -76,7 +76,8 @@ def import_folder(source: Path, destination: Path | None) -> Imported:
               for name, vector, power in zip(names, vectors, strength, strict=True)]
     space, mask = color_space_of(folder / names[0]), select(folder, Selection()).mask
     written = write_capture({"schema": SCHEMA, "name": path.stem, "color_space": space, "camera": camera, "mask": mask,
-                             "irradiance_scale": "relative", "frames": frames}, path, destination or folder, folder=folder)
+                             "irradiance_scale": "relative", "assumed": assumed_encoding(space),
+                             "frames": frames}, path, destination or folder, folder=folder)
     crop = ("crop", f"{path} crops the images; the capture has them whole") if data.get("crop") else None
     return Imported(written, tuple(fact for fact in (
         ("lights", f"{len(names)} {'near' if near else 'far'} lights from {path}, " + (

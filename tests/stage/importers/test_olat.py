@@ -191,3 +191,13 @@ def test_a_manifest_that_is_replaced_by_another_is_kept(folder):
     lights_of(folder, folder / "table.txt")  # the same again keeps what was kept
     assert (folder / "capture.previous.json").read_bytes() == own
     assert (folder / "capture.json").read_bytes() == made
+
+
+def test_what_is_assumed_of_the_encoding_is_kept_in_the_manifest(folder):
+    (folder / "lights.txt").write_text(TEXTS["lights.txt"])
+    import_folder(folder, folder, axes=OURS, to_light=True)
+    capture = Capture.open(folder)
+    assert capture.manifest.assumed[0].startswith("color_space: the images have 8 bits and were taken as sRGB")
+    assert capture.doubts == capture.manifest.assumed  # so that info and reports repeat it
+    import_folder(folder, folder, axes=OURS, to_light=True, color_space="lin_rec709_scene")
+    assert Capture.open(folder).manifest.assumed == ()
