@@ -36,7 +36,7 @@ def _compare_kernel(first: int, number: int, count: int, reach: float, views: wp
                 reading = read_view(views[other], away, image_point(views[other], away), inverse, sigma, normal, cell)
                 if reading.known and wp.dot(reading.normal, own) > SAME_SIDE and wp.abs(reading.distance) < reach:
                     distance[i, other] = reading.distance
-                    expected[i, other] = wp.sqrt(reading.sigma * reading.sigma + along * along * cosine * cosine)
+                    expected[i, other] = wp.sqrt(reading.variance + along * along * cosine * cosine)
 
 
 def compare_views(views: ViewArrays, number: int, pixels: Any, *, reach: float, device: str) -> tuple[Any, Any]:

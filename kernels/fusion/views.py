@@ -126,7 +126,9 @@ def upload_views(images: Sequence[RangeImage], origin: np.ndarray, *, device: st
         planes["inverse"].append(np.divide(1.0, image.depth, out=np.zeros((rows, cols), dtype=np.float32), where=used).ravel())
         planes["sigma"].append(np.where(used, image.sigma, 0).astype(np.float32).ravel())
         planes["normal"].append(np.asarray(image.normal, dtype=np.float32).reshape(-1, 3))
-        planes["cell"].append(image.cell.astype(np.uint8).ravel())
+        cell = image.cell.astype(np.uint8)
+        cell[-1], cell[:, -1] = 0, 0  # their neighbours are not here
+        planes["cell"].append(cell.ravel())
         planes["clear"].append(image.clear.astype(np.float32).ravel())
         reach = np.where(used, image.depth + TRUNCATION_SIGMAS / LEAST_COSINE * image.sigma, 0)
         tiles = _farthest(np.maximum(reach, image.clear))

@@ -1,16 +1,18 @@
-"""relit register: the poses of many scans of one object."""
+"""relit register and fuse: the poses of many scans of one object, and the surface of all."""
 
 import typer
 
 from service.cli.printing import print_warnings
 from service.cli.progress import ProgressBar
 from service.cli.request_commands import local_command
+from service.requests.fuse import FuseRequest
 from service.requests.register import RegisterRequest
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     local_command(app, "register", _register)
+    local_command(app, "fuse", _fuse)
 
 
 def _register(request: RegisterRequest) -> None:
@@ -28,3 +30,19 @@ def _register(request: RegisterRequest) -> None:
     print_warnings(result.warnings)
     if result.joined < result.scans:
         raise typer.Exit(1)
+
+
+def _fuse(request: FuseRequest) -> None:
+    from service.scans.fuse import fuse
+
+    with ProgressBar() as bar:
+        result = fuse(request, bar)
+    facts = result.facts
+    print(f"mesh     {result.mesh_path}")
+    print(f"report   {result.report_path}")
+    fused = sum(scan["fused"] for scan in facts["scans"])
+    print(f"surface  {facts['vertices']} vertices, {facts['faces']} faces at voxels of {1e3 * facts['voxel_m']:.4g} mm, from {fused} of "
+          f"{len(facts['scans'])} scans; σ {1e3 * facts['sigma_m']['median']:.3g} mm in the median")
+    holes = facts["holes"]
+    print(f"holes    {holes['count']}, {1e3 * holes['open_length_m']:.4g} mm around; {holes['closed_share']:.1%} of the surface is there")
+    print_warnings(result.warnings)

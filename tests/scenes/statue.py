@@ -3,9 +3,15 @@
 It has round parts, a foot with sharp edges, a blade of 2 mm, an arm that hides the body behind it, and a slot of 6 mm.
 """
 
+import json
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+
+from stage.camera import Camera
+from stage.depth_maps import DepthMaps
+from stage.ply import PointCloud, write_ply
 
 SIGMA = 2.5e-4
 """Standard deviation of every depth, metres."""
@@ -104,3 +110,33 @@ def turntable(count: int = 18, side: tuple[int, int] = (240, 180), *, sigma: flo
     heights = (0.1, 1.1, -0.5)
     return [shoot(place(2 * np.pi * k / count, heights[k % 3], range_m), side, focal, sigma=sigma, seed=seed + k, scene=scene)
             for k in range(count)]
+
+
+def write_scans(folder: Path, shots: list[Shot], *, sigma: float = SIGMA, poses: list[np.ndarray | None] | None = None,
+                coloured: bool = False) -> Path:
+    """Write range images as results of `relit depth` with a scan-set.json, and return the file; a pose of None is left out."""
+    entries = []
+    for number, shot in enumerate(shots):
+        rows, cols = shot.side
+        camera = Camera(projection="perspective", resolution=(cols, rows), focal_px=(shot.focal, shot.focal))
+        maps = DepthMaps(camera=camera, mask=shot.mask, depth=shot.depth.astype(np.float32),
+                         sigma=np.full(shot.side, sigma, dtype=np.float32))
+        place = folder / f"scan{number}"
+        maps.write(place / "depth.exr")
+        if coloured:
+            points = camera.points(-shot.depth)[shot.mask]
+            world = points @ shot.world_from_camera[:3, :3].T + shot.world_from_camera[:3, 3]
+            write_ply(PointCloud(points, colour_of(world)), place / "points.ply")
+        entry = {"name": f"view {number}", "path": place.name}
+        pose = shot.world_from_camera if poses is None else poses[number]
+        if pose is not None:
+            entry["scan_to_world"] = pose.tolist()
+        entries.append(entry)
+    file = folder / "scan-set.json"
+    file.write_text(json.dumps({"schema": "relit.scan-set/1", "name": "statue", "scans": entries}))
+    return file
+
+
+def colour_of(points: np.ndarray) -> np.ndarray:
+    """Display-encoded colours that vary slowly over space."""
+    return np.rint(127.5 + 100 * np.sin(9 * points + [0, 1, 2])).astype(np.uint8)

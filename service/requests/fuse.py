@@ -1,0 +1,38 @@
+"""What `relit fuse` takes."""
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+
+from service.requests.base import Choice, DeviceRequest, Options, Role, Spelling
+from stage.model import Positive
+
+
+class Misplaced(Choice):
+    """What becomes of scans that lie beside the surface of the others."""
+
+    LEAVE_OUT = "leave-out", "fuse the others, and say which were left out"
+    KEEP = "keep", "fuse them all the same"
+
+
+class FuseOptions(Options):
+    """How scans are fused."""
+
+    voxel_m: Positive | None = None
+    """Side of a voxel, metres. None: half the distance between neighbouring pixels, or the noise of a pixel if that is larger."""
+    misplaced: Misplaced = Misplaced.LEAVE_OUT
+    """What becomes of scans that lie beside the surface of the others by more than their σ explain."""
+    texture_faces: Annotated[int, Field(ge=100, le=2_000_000)] = 30_000
+    """Most faces of the textured mesh of asset.usdc; mesh.ply has all."""
+    texture_px: Annotated[int, Field(ge=64, le=16384)] = 2048
+    """Side of the texture images in pixels."""
+
+
+class FuseRequest(FuseOptions, DeviceRequest):
+    """Fuse the scans of a set, whose poses are known, into one surface."""
+
+    scan_set: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="SCAN_SET")]
+    """A scan-set.json with poses, as `relit register` writes it, or its folder."""
+    out: Annotated[Path, Role.OUTPUT]
+    """Folder for mesh.ply, asset.usdc and report.json."""

@@ -1,0 +1,163 @@
+"""Scans as the range images that fusion takes: cells of pixels on one surface, what was seen to be empty, and layers to blend."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from kernels.fusion.views import RangeImage
+from service.errors import RequestError
+from stage.camera import Camera
+from stage.colour import convert
+from stage.depth_breaks import connected
+from stage.depth_normals import depth_normals
+from stage.maps import SurfaceMaps
+from stage.scans.scan import Scan
+
+STEEPEST = float(np.tan(np.radians(70.0)))
+"""Largest slope of a cell of four pixels against the line of sight: what is steeper may be an edge beside what lies behind it."""
+STEP_SIGMAS = 4.0 * np.sqrt(2.0)
+"""Difference of two depths, in standard deviations of one, that noise explains."""
+CLEAR_PIXELS = 2
+"""Pixels around a pixel that must all lie behind a point before the point counts as seen to be empty: edges are blurred that far."""
+FEATHER_PIXELS = 12.0
+"""Distance from the edge of the valid pixels over which the weight of a view in blended colours rises to its full value."""
+ESTIMATED_SHARE = 0.01
+"""Weight of a normal that was fitted to depths beside one of solved maps: where any view has maps, these decide."""
+NORMAL_RADIUS_PX = 2
+"""Radius of the neighbourhood that a normal of a range image is fitted to: 25 pixels."""
+NORMAL, COLOUR, ALBEDO, SPECULAR, ROUGHNESS = "normal", "colour", "diffuse_albedo", "specular", "roughness"
+WIDTHS = {NORMAL: 3, COLOUR: 3, ALBEDO: 3, SPECULAR: 3, ROUGHNESS: 1}
+"""Channels of each layer; behind each but the normal follows one that says where a scan has it, 1 or 0."""
+
+
+class PreparedScan(NamedTuple):
+    """A scan as a range image, with its arrays in files that are mapped into memory."""
+
+    name: str
+    image: RangeImage
+    camera: Camera
+    layers: np.ndarray  # [rows, cols, C] float32, as `channels` orders them
+    feather: np.ndarray  # [rows, cols] float32, 0…1
+    photometric: bool
+
+
+def channels(names: tuple[str, ...]) -> dict[str, slice]:
+    """Return where the channels of each layer are, its values without that which says where it is known."""
+    places, first = {}, 0
+    for name in names:
+        places[name] = slice(first, first + WIDTHS[name])
+        first += WIDTHS[name] + (name != NORMAL)
+    return places
+
+
+def layers_of(scan: Scan) -> set[str]:
+    """Return the layers that a scan has.
+
+    Raises:
+        ResultError, ImageError: its maps cannot be read.
+    """
+    found = {NORMAL}
+    if scan.colours is not None:
+        found.add(COLOUR)
+    if scan.maps is not None:
+        maps = SurfaceMaps.read(scan.maps, layers=(ALBEDO, SPECULAR, ROUGHNESS))
+        found |= {name for name in (ALBEDO, SPECULAR, ROUGHNESS) if getattr(maps, name) is not None}
+    return found
+
+
+def prepare_scan(scan: Scan, folder: Path, names: tuple[str, ...], where: str) -> PreparedScan:
+    """Return a scan as a range image, with its arrays in files of a folder.
+
+    Args:
+        scan: with a pose and the camera of a range image.
+        folder: exists; files in it are named after the scan's number.
+        names: the layers, of which those that the scan lacks are 0.
+        where: what messages begin with.
+
+    Raises:
+        RequestError: the scan is no range image of a perspective camera.
+    """
+    assert scan.pose is not None
+    if scan.camera is None or scan.pixels is None:
+        raise RequestError(f"{where}: is a set of points: fusion needs range images (depth results), whose lines of sight say what is empty")
+    camera = scan.camera
+    if camera.projection != "perspective" or camera.focal_px is None:
+        raise RequestError(f"{where}: its camera is orthographic: fusion takes perspective cameras")
+    depth = scan.image(-scan.points[:, 2]).astype(np.float32)
+    mask = depth > 0
+    along = scan.points.astype(np.float64)
+    sigma = scan.image((scan.sigma * -along[:, 2] / np.linalg.norm(along, axis=1)).astype(np.float32))  # of the depth, not along the line
+    maps = None if scan.maps is None else SurfaceMaps.read(scan.maps)
+    if maps is not None and maps.height is not None and maps.height_sigma is not None:  # depth and normals have been joined
+        joined = mask & maps.mask & (maps.height_sigma > 0) & (maps.height < 0)
+        depth, sigma = np.where(joined, -maps.height, depth), np.where(joined, maps.height_sigma, sigma)
+    estimated = scan.normals is None or scan.normals_source == "photometric"
+    normal = depth_normals(depth, mask, camera, sigma=sigma, radius=NORMAL_RADIUS_PX) if estimated else scan.image(_given(scan))
+    usable = mask & (np.abs(normal).sum(axis=-1) > 0)
+    cell = surface_cells(depth, usable, camera, sigma)
+    around = np.ones((2 * CLEAR_PIXELS + 1,) * 2, np.uint8)
+    clear = cv2.erode(np.where(mask, depth - STEP_SIGMAS * sigma, 0), around, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    inside = cv2.distanceTransform(np.pad(cell, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
+    feather = np.clip(inside / FEATHER_PIXELS, 0, 1).astype(np.float32)
+    distortion = camera.distortion
+    layers = _layers(scan, maps, normal, names)
+
+    def stored(name: str, values: np.ndarray) -> Any:
+        path = folder / f"{name}.npy"
+        np.save(path, values)
+        return np.load(path, mmap_mode="r")
+
+    image = RangeImage(stored("depth", depth), stored("sigma", sigma), stored("normal", normal), stored("cell", cell), stored("clear", clear),
+                       np.linalg.inv(scan.pose), camera.focal_px, camera.principal_point,
+                       (0.0,) * 5 if distortion is None else (*distortion.k, *distortion.p))
+    return PreparedScan(scan.name, image, camera, stored("layers", layers), stored("feather", feather), scan.normals_source == "photometric")
+
+
+def surface_cells(depth: np.ndarray, mask: np.ndarray, camera: Camera, sigma: np.ndarray) -> np.ndarray:
+    """Return [rows, cols] bool, whether a pixel and its neighbours to the right, below and across show one surface.
+
+    Args:
+        depth: [rows, cols] metres. mask: [rows, cols] bool. sigma: [rows, cols] metres, of the depth.
+    """
+    assert camera.focal_px is not None
+    right, down, across, back = (connected(np.where(mask, depth, 1), mask, camera, offset, sigma=sigma)
+                                 for offset in ((0, 1), (1, 0), (1, 1), (1, -1)))
+    cell = np.zeros(depth.shape, dtype=bool)
+    corners = np.stack([depth[:-1, :-1], depth[:-1, 1:], depth[1:, :-1], depth[1:, 1:]])
+    noise = np.maximum.reduce([sigma[:-1, :-1], sigma[:-1, 1:], sigma[1:, :-1], sigma[1:, 1:]])
+    gentle = np.ptp(corners, axis=0) <= STEEPEST * corners.min(axis=0) / min(camera.focal_px) + STEP_SIGMAS * noise
+    cell[:-1, :-1] = right[:-1, :-1] & right[1:, :-1] & down[:-1, :-1] & down[:-1, 1:] & across[:-1, :-1] & back[:-1, 1:] & gentle
+    return cell
+
+
+def _given(scan: Scan) -> np.ndarray:
+    assert scan.normals is not None
+    return scan.normals
+
+
+def _layers(scan: Scan, maps: SurfaceMaps | None, normal: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
+    """Return the layers of a scan, each but the normal followed by where it is known."""
+    planes: list[np.ndarray] = []
+    known: np.ndarray
+    values: np.ndarray | None
+    for name in names:
+        if name == NORMAL:
+            known = np.zeros(normal.shape[:2], dtype=bool) if maps is None or maps.normal is None else maps.mask & maps.normal.any(axis=-1)
+            solved = normal if maps is None or maps.normal is None else maps.normal
+            planes.append(np.where(known[..., None], solved, np.float32(ESTIMATED_SHARE) * normal).astype(np.float32))
+            continue
+        values, known = None, np.zeros(normal.shape[:2], dtype=bool)
+        if name == COLOUR and scan.colours is not None:
+            values = convert(scan.image(scan.colours).astype(np.float32) / 255, "srgb_rec709_scene", "lin_rec709_scene")
+            known = scan.image(np.ones(len(scan.points), dtype=bool))
+        elif name != COLOUR and maps is not None and (layer := getattr(maps, name)) is not None:
+            values, known = layer.reshape(*normal.shape[:2], -1).astype(np.float32), maps.mask
+            if WIDTHS[name] == 3 and maps.color_space != "lin_rec709_scene":
+                values = convert(values, maps.color_space, "lin_rec709_scene")
+        if values is None:
+            planes.append(np.zeros((*normal.shape[:2], WIDTHS[name] + 1), dtype=np.float32))
+        else:
+            planes.append(np.concatenate([np.where(known[..., None], values, 0), known[..., None]], axis=-1).astype(np.float32))
+    return np.concatenate(planes, axis=-1)

@@ -1,0 +1,1 @@
+"""Meshes of triangles: their files and their holes."""

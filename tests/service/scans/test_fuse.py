@@ -1,0 +1,100 @@
+"""relit fuse: from a scan set to a mesh, measured against the closed form of the statue; all vertices count."""
+
+import json
+
+import numpy as np
+import pytest
+
+from service.errors import RequestError
+from service.requests.fuse import FuseRequest
+from service.scans.fuse import fuse
+from stage.scans.ply_points import read_ply_points
+from tests.scenes.statue import SIGMA, colour_of, distance, shoot, turntable, write_scans
+from tests.service.scans.mesh_files import read_faces
+
+VOXEL = 4e-3
+OFF = 5e-3
+"""By how far one scan is put beside its place."""
+
+
+@pytest.fixture(scope="module")
+def shots():
+    return turntable(18, (160, 120))
+
+
+@pytest.fixture(scope="module")
+def fused(tmp_path_factory, shots):
+    folder = tmp_path_factory.mktemp("statue")
+    return fuse(FuseRequest(scan_set=write_scans(folder, shots, coloured=True), out=folder / "out", voxel_m=VOXEL, device="cpu"))
+
+
+def test_the_fused_statue_is_better_than_its_scans(fused):
+    ply = read_ply_points(fused.mesh_path)
+    error = distance(ply.points)
+    assert np.median(np.abs(error)) <= 0.15e-3  # pixels of 7.5 mm see chords; the noise of one scan is 0.25 mm
+    assert np.percentile(np.abs(error), 90) < 2 * SIGMA + 1e-3  # edges are as sharp as pixels
+    assert abs(np.median(error)) < 0.1e-3
+    assert all(scan["fused"] for scan in fused.facts["scans"]) and not [w for w in fused.warnings if "pose" in w]
+    faces = read_faces(fused.mesh_path)
+    assert faces.max() == len(ply.points) - 1 and len(faces) == fused.facts["faces"]
+    assert fused.facts["holes"]["edges_of_more_than_two_faces"] == 0
+
+
+def test_vertices_have_the_colours_of_the_places_that_they_show(fused):
+    ply = read_ply_points(fused.mesh_path)
+    assert ply.colours is not None and ply.normals is not None
+    off = np.abs(ply.colours.astype(int) - colour_of(ply.points)).max(axis=1)
+    assert np.percentile(off, 95) < 12  # over a pixel of 7.5 mm the colour changes by 7 of 255
+    step = 1e-3
+    gradient = np.stack([distance(ply.points + step * axis) - distance(ply.points - step * axis) for axis in np.eye(3)], axis=1)
+    gradient /= np.linalg.norm(gradient, axis=1, keepdims=True)
+    assert np.median((ply.normals * gradient).sum(axis=1)) > np.cos(np.radians(5))  # 25 pixels with .25 mm of noise give 1°, bends more
+
+
+def test_the_report_lists_the_holes_and_what_was_seen(fused):
+    facts = json.loads(fused.report_path.read_text())
+    holes = facts["holes"]
+    assert holes["count"] > 0 and holes["longest"][0]["length_m"] >= holes["longest"][-1]["length_m"]
+    below = [hole for hole in holes["longest"] if hole["centre_m"][1] < -0.45]  # the foot stands on the table
+    assert max(hole["length_m"] for hole in below) > 0.5
+    assert facts["area_share_seen_by"]["1"] > facts["area_share_seen_by"]["5"] > 0
+    assert {scan["name"] for scan in facts["scans"]} == {f"view {k}" for k in range(18)}
+    assert all(0.3 < scan["residual_median_sigmas"] < 1.2 for scan in facts["scans"])
+
+
+def test_a_scan_at_a_wrong_place_is_left_out_and_named(tmp_path, shots):
+    poses = [shot.world_from_camera.copy() for shot in shots]
+    poses[4][:3, 3] += OFF * poses[4][:3, 0]
+    file = write_scans(tmp_path, shots, poses=poses)
+    result = fuse(FuseRequest(scan_set=file, out=tmp_path / "out", voxel_m=VOXEL, device="cpu"))
+    about = [warning for warning in result.warnings if "its pose is wrong" in warning]
+    assert len(about) == 1 and about[0].startswith("scan view 4: lies ") and "left out" in about[0]
+    assert [scan["name"] for scan in result.facts["scans"] if not scan["fused"]] == ["view 4"]
+    found = result.facts["scans"][4]["displacement_m"]
+    assert 0.2 * OFF < found < OFF  # along the normals, of which only those to the side are moved
+
+
+def test_bad_input_is_refused_in_a_sentence(tmp_path, shots):
+    def refused(words, **changes):
+        with pytest.raises(RequestError, match=words):
+            fuse(FuseRequest(out=tmp_path / "out", device="cpu", **changes))
+
+    file = write_scans(tmp_path, shots[:2], poses=[shots[0].world_from_camera, None])
+    refused(r"scans\[1\] \(view 1\): scan_to_world is missing: run relit register first", scan_set=file)
+    pair = [shots[0], shoot(shots[0].world_from_camera, shots[0].side, shots[0].focal, seed=5)]
+    refused("the poses contradict each other: run relit register first",
+            scan_set=write_scans(tmp_path, pair, poses=[pair[0].world_from_camera, pair[0].world_from_camera @ _moved(OFF)]))
+    points = tmp_path / "points"
+    points.mkdir()
+    data = json.loads(write_scans(points, shots[:1], coloured=True).read_text())
+    data["scans"][0]["path"] += "/points.ply"
+    data["scans"][0]["sigma_m"] = SIGMA
+    (points / "scan-set.json").write_text(json.dumps(data))
+    refused(r"scans\[0\] \(view 0\): is a set of points: fusion needs range images", scan_set=points)
+    assert not (tmp_path / "out").exists()
+
+
+def _moved(by: float) -> np.ndarray:
+    pose = np.eye(4)
+    pose[2, 3] = by
+    return pose
