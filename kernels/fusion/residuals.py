@@ -11,8 +11,8 @@ from kernels.fusion.integrate import EMPTY, SURFACE, Volume, voxel_number
 from kernels.fusion.views import View, ViewArrays, line_of_sight
 
 ELSEWHERE, FUSED, LOST, REFUSED = 0, 1, 2, 3
-"""What became of a pixel: it lies in another brick, or in no cell; it has a distance to the fused surface; no voxels were measured all around
-it; or other views saw its place to be empty."""
+"""What became of a pixel: it lies in another brick, or in no cell; it has a distance to the fused surface; no voxels were measured all
+around it; or other views saw its place to be empty."""
 
 
 @wp.kernel(enable_backward=False)

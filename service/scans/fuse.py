@@ -114,8 +114,8 @@ def _prepared(file: Path, scan_set: ScanSet, work: Path, timings: Timings) -> tu
         scan = read_scan(file, scan_set, number)
         prepared = prepare_scan(scan, folder, names, f"{file}: scans[{number}] ({scan.name})")
         if np.count_nonzero(prepared.image.cell) < LEAST_PIXELS:
-            raise RequestError(f"{file}: scans[{number}] ({scan.name}): has {np.count_nonzero(prepared.image.cell)} pixels whose neighbours "
-                               "show the same surface: its pixels are too far apart or too noisy to be fused")
+            raise RequestError(f"{file}: scans[{number}] ({scan.name}): has {np.count_nonzero(prepared.image.cell)} pixels whose "
+                               "neighbours show the same surface: its pixels are too far apart or too noisy to be fused")
         scans.append(prepared)
         timings.advance(1)
     return scans, names
@@ -144,7 +144,8 @@ def triangle_mesh(surface: Surface, names: tuple[str, ...]) -> TriangleMesh:
     return TriangleMesh(surface.points.astype(np.float32), surface.normals, surface.sigma, surface.seen, colours, surface.faces)
 
 
-def _facts(scans: list[PreparedScan], used: list[int], placings: list[Placing], surface: Surface, holes: Holes, voxel: float) -> dict[str, Any]:
+def _facts(scans: list[PreparedScan], used: list[int], placings: list[Placing], surface: Surface, holes: Holes,
+           voxel: float) -> dict[str, Any]:
     """Return what the report says."""
     tallies = dict(zip(used, surface.tallies, strict=True))
     area = face_areas(surface.points, surface.faces)
@@ -200,5 +201,5 @@ def _fusion_warnings(facts: dict[str, Any]) -> Iterator[str]:
             yield (f"scan {scan['name']}: {share:.0%} of its pixels are not on the fused surface ({scan['seen_through_share']:.0%} because "
                    "other scans saw their places to be empty): a part may be thinner than two voxels, or the pose wrong")
         if scan["residual_median_sigmas"] > FAR_SIGMAS:
-            yield (f"scan {scan['name']}: its pixels lie {scan['residual_median_sigmas']:.2g} of their σ from the fused surface in the median, "
-                   "where 0.67 is expected: its σ is too small, or its pose wrong")
+            yield (f"scan {scan['name']}: its pixels lie {scan['residual_median_sigmas']:.2g} of their σ from the fused surface in the "
+                   "median, where 0.67 is expected: its σ is too small, or its pose wrong")

@@ -77,14 +77,15 @@ def _compared(scans: list[PreparedScan], number: int, pixels: np.ndarray, reach:
     return distance, expected
 
 
-def _placing(points: np.ndarray, normals: np.ndarray, distance: np.ndarray, expected: np.ndarray, left_out: set[int], voxel: float) -> Placing:
+def _placing(points: np.ndarray, normals: np.ndarray, distance: np.ndarray, expected: np.ndarray, left_out: set[int],
+             voxel: float) -> Placing:
     """Return how a scan lies to those that are not left out."""
     known = expected > 0
     known[:, sorted(left_out)] = False
     seen = known.any(axis=1)
     if np.count_nonzero(seen) < LEAST_COMMON:
         return Placing(int(seen.sum()), 0.0, 0.0, 0.0, False)
-    offset = np.ma.median(np.ma.masked_array(distance[seen], ~known[seen]), axis=1).filled(0).astype(np.float64)
+    offset = np.nanmedian(np.where(known[seen], distance[seen], np.nan), axis=1).astype(np.float64)
     sigma = float(np.median(expected[seen][known[seen]]))
     place, normal = points[seen] - points[seen].mean(axis=0), normals[seen]
     rows = np.concatenate([np.cross(place, normal), normal], axis=1)

@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 
 from kernels.fusion.views import RangeImage
@@ -13,6 +12,7 @@ from stage.colour import convert
 from stage.depth_breaks import connected
 from stage.depth_normals import depth_normals
 from stage.maps import SurfaceMaps
+from stage.mask_border import distance
 from stage.scans.scan import Scan
 
 STEEPEST = float(np.tan(np.radians(70.0)))
@@ -81,7 +81,8 @@ def prepare_scan(scan: Scan, folder: Path, names: tuple[str, ...], where: str) -
     """
     assert scan.pose is not None
     if scan.camera is None or scan.pixels is None:
-        raise RequestError(f"{where}: is a set of points: fusion needs range images (depth results), whose lines of sight say what is empty")
+        raise RequestError(f"{where}: is a set of points: fusion needs range images (depth results), whose lines of sight say what "
+                           "is empty")
     camera = scan.camera
     if camera.projection != "perspective" or camera.focal_px is None:
         raise RequestError(f"{where}: its camera is orthographic: fusion takes perspective cameras")
@@ -97,10 +98,8 @@ def prepare_scan(scan: Scan, folder: Path, names: tuple[str, ...], where: str) -
     normal = depth_normals(depth, mask, camera, sigma=sigma, radius=NORMAL_RADIUS_PX) if estimated else scan.image(_given(scan))
     usable = mask & (np.abs(normal).sum(axis=-1) > 0)
     cell = surface_cells(depth, usable, camera, sigma)
-    around = np.ones((2 * CLEAR_PIXELS + 1,) * 2, np.uint8)
-    clear = cv2.erode(np.where(mask, depth - STEP_SIGMAS * sigma, 0), around, borderType=cv2.BORDER_CONSTANT, borderValue=0)
-    inside = cv2.distanceTransform(np.pad(cell, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
-    feather = np.clip(inside / FEATHER_PIXELS, 0, 1).astype(np.float32)
+    clear = _least_around(np.where(mask, depth - STEP_SIGMAS * sigma, 0))
+    feather = np.clip(distance(np.pad(~cell, 1, constant_values=True))[1:-1, 1:-1] / FEATHER_PIXELS, 0, 1).astype(np.float32)
     distortion = camera.distortion
     layers = _layers(scan, maps, normal, names)
 
@@ -109,10 +108,19 @@ def prepare_scan(scan: Scan, folder: Path, names: tuple[str, ...], where: str) -
         np.save(path, values)
         return np.load(path, mmap_mode="r")
 
-    image = RangeImage(stored("depth", depth), stored("sigma", sigma), stored("normal", normal), stored("cell", cell), stored("clear", clear),
-                       np.linalg.inv(scan.pose), camera.focal_px, camera.principal_point,
+    image = RangeImage(stored("depth", depth), stored("sigma", sigma), stored("normal", normal), stored("cell", cell),
+                       stored("clear", clear), np.linalg.inv(scan.pose), camera.focal_px, camera.principal_point,
                        (0.0,) * 5 if distortion is None else (*distortion.k, *distortion.p))
-    return PreparedScan(scan.name, image, camera, stored("layers", layers), stored("feather", feather), scan.normals_source == "photometric")
+    return PreparedScan(scan.name, image, camera, stored("layers", layers), stored("feather", feather),
+                        scan.normals_source == "photometric")
+
+
+def _least_around(values: np.ndarray) -> np.ndarray:
+    """Return the least value within CLEAR_PIXELS of each pixel, 0 beyond the image."""
+    for axis in (0, 1):
+        wide = np.pad(values, [(CLEAR_PIXELS, CLEAR_PIXELS) if each == axis else (0, 0) for each in (0, 1)])
+        values = np.lib.stride_tricks.sliding_window_view(wide, 2 * CLEAR_PIXELS + 1, axis=axis).min(axis=-1)
+    return values
 
 
 def surface_cells(depth: np.ndarray, mask: np.ndarray, camera: Camera, sigma: np.ndarray) -> np.ndarray:

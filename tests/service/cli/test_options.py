@@ -16,6 +16,7 @@ from service.requests import (
     demo,
     depth,
     export,
+    fuse,
     gauge_board,
     imports_tof,
     inspect,
@@ -38,7 +39,7 @@ from service.requests.options import build, help_text, options_of, typed, values
 
 COMMANDS: dict[str, list[type[Options]]] = {
     "solve": [solve.SolveRequest], "export": [export.ExportRequest], "inspect": [inspect.InspectRequest],
-    "join": [join.JoinRequest], "register": [register.RegisterRequest],
+    "join": [join.JoinRequest], "register": [register.RegisterRequest], "fuse": [fuse.FuseRequest],
     "depth": [depth.DepthRequest], "scan": [scan.ScanRequest],
     "separate": [separate.SeparateRequest], "inspect-board": [inspect_board.InspectBoardRequest],
     "gauge-board": [gauge_board.GaugeBoardRequest],

@@ -12,8 +12,8 @@ import service
 from stage.capture import Capture
 from tests.scenes.captures import edit_manifest, make_scene, write_capture, write_exr, write_image
 
-COMMANDS = ["demo", "import", "info", "calibrate", "solve", "depth", "separate", "inspect-board", "join", "register", "relight", "basis",
-            "view", "export", "inspect", "doctor", "bench", "serve", "worker", "keys"]
+COMMANDS = ["demo", "import", "info", "calibrate", "solve", "depth", "separate", "inspect-board", "join", "register", "fuse", "relight",
+            "basis", "view", "export", "inspect", "doctor", "bench", "serve", "worker", "keys"]
 ROOT = Path(service.__file__).parents[1]
 
 

@@ -4,6 +4,7 @@ import json
 import re
 from pathlib import Path
 
+from service.requests.fuse import FuseRequest
 from service.requests.options import options_of
 from service.requests.register import RegisterRequest
 from stage.scans.records import ScanSet
@@ -18,4 +19,5 @@ def test_the_json_is_read():
 
 def test_the_options_of_the_table_exist():
     named = set(re.findall(r"^\| `(--[a-z-]+)", DOCS, re.MULTILINE))
-    assert named == {"--poses", "--turntable", "--reference"} and named <= {option.flag for option in options_of(RegisterRequest)}
+    assert named == {"--poses", "--turntable", "--reference", "--voxel-m", "--misplaced"}
+    assert named <= {option.flag for request in (RegisterRequest, FuseRequest) for option in options_of(request)}
