@@ -21,6 +21,7 @@ from stage.correction import Correction
 from stage.errors import storage
 from stage.ingest import CACHE_FOLDER
 from stage.manifest import Frame
+from stage.pattern_exposures import JoinedExposures
 
 MEMORY_BYTES = 256 << 20
 """The most bytes of planes that are kept in memory; larger planes lie in a scratch file."""
@@ -36,6 +37,9 @@ class Planes:
 
     values: np.ndarray  # [frames, rows, channels, cols] float32, linear radiance; channels 1 (grey) or 3
     saturated: np.ndarray | None  # [frames, rows, cols] bool; None when the manifest gives no saturation
+    exposure: np.ndarray | None = None
+    """[rows, cols] float32, the light that each pixel has gathered, over that of the longest; None: all alike. Bands of the frames are
+    multiplied by it, so that one noise model holds for all pixels."""
 
     def bands(self, bytes_per_pixel: int = 0) -> Iterator[slice]:
         """Yield ranges of rows that cover the image, each small enough for BAND_BYTES.
@@ -49,7 +53,7 @@ class Planes:
             yield slice(top, min(top + step, rows))
 
     def band(self, rows: slice, frames: Sequence[int] | None = None) -> np.ndarray:
-        """Return some frames of a range of rows.
+        """Return some frames of a range of rows, each pixel times its exposure.
 
         Args:
             rows: the range.
@@ -59,13 +63,15 @@ class Planes:
             [frames, channels, pixels] float32, a copy.
         """
         part = self.values[list(frames) if frames is not None else slice(None), rows]
+        if self.exposure is not None:
+            part = part * self.exposure[None, rows, None, :]
         count, height, channels, cols = part.shape
         return np.ascontiguousarray(np.moveaxis(part, 2, 1)).reshape(count, channels, height * cols)
 
 
 @contextmanager
 def frame_planes(capture: Capture, frames: Sequence[Frame], *, colour: bool, cache: Path | None = None,
-                 progress: Callable[[int], None] | None = None) -> Iterator[Planes]:
+                 progress: Callable[[int], None] | None = None, joined: JoinedExposures | None = None) -> Iterator[Planes]:
     """Decode and correct frames on a thread pool, and yield planes that exist until the block ends.
 
     Args:
@@ -74,20 +80,22 @@ def frame_planes(capture: Capture, frames: Sequence[Frame], *, colour: bool, cac
         colour: True keeps three channels, False weighs them with GREY_WEIGHTS.
         cache: the folder for the scratch file; None stands for `.relit` in the folder of the capture. No file is left in it.
         progress: called after every frame with the count of frames that have been read.
+        joined: how each frame is joined of several exposures; None: they are read as they are.
 
     Raises:
         ImageError: a frame is unreadable or holds impossible values; the message names the file.
         StorageError: the scratch file cannot be written.
     """
-    correction = Correction.of(capture)
+    read_frame = Correction.of(capture).apply if joined is None else joined.read
+    marked = joined is not None or capture.manifest.saturation is not None
     width, height = capture.camera.resolution
     shape = (len(frames), height, 3 if colour else 1, width)
     with scratch_arrays(4 * int(np.prod(shape)), capture, cache) as allocate:
         values = allocate(shape, np.float32)
-        saturated = allocate((len(frames), height, width), np.bool_) if capture.manifest.saturation is not None else None
+        saturated = allocate((len(frames), height, width), np.bool_) if marked else None
 
         def read(index: int) -> None:
-            radiance = correction.apply(frames[index])
+            radiance = read_frame(frames[index])
             pixels = radiance.pixels if colour else radiance.pixels @ np.array(GREY_WEIGHTS, np.float32)[:, None]
             values[index] = np.moveaxis(pixels, 2, 1)
             if saturated is not None:
@@ -98,7 +106,7 @@ def frame_planes(capture: Capture, frames: Sequence[Frame], *, colour: bool, cac
             for done, _ in enumerate(pool.map(read, range(len(frames))), start=1):
                 if progress is not None:
                     progress(done)
-        yield Planes(values, saturated)
+        yield Planes(values, saturated, None if joined is None else joined.exposure)
 
 
 @contextmanager

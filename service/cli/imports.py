@@ -9,6 +9,7 @@ from service.cli.request_commands import local_command
 from service.requests.captures import (
     CameraOptions,
     DiligentImport,
+    ExposureOrder,
     GrayImport,
     ImageOptions,
     LpImport,
@@ -178,7 +179,8 @@ def _pattern_images(images: PatternImageOptions, rig: RigOptions) -> "PatternIma
     from stage.importers.patterns import PatternImages
 
     return PatternImages(projector=rig.projector, images=images.images, mask=images.mask, white=images.white, black=images.black,
-                         calibration=rig.calibration, unit_m=rig.unit_m, color_space=images.color_space)
+                         calibration=rig.calibration, unit_m=rig.unit_m, color_space=images.color_space, exposures_s=images.exposures_s,
+                         patterns_first=images.exposure_order is ExposureOrder.PATTERN)
 
 
 def _view(request: CameraOptions) -> "View":

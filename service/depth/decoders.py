@@ -183,10 +183,10 @@ def stripe_decoder(axis: AxisCodes) -> AxisDecoder | None:
     def decode(readings: Readings, noise: NoiseModel) -> Decoded:
         found = _decode_stripes(code, axis, readings, noise)
         if edges and inverses is not None:
-            found = refine_edges(found, readings.grey, code.frames, inverses, columns=readings.columns, down=axis.axis == "row",
+            found = refine_edges(found, readings.alike, code.frames, inverses, columns=readings.columns, down=axis.axis == "row",
                                  extent=axis.extent, stripe_px=code.stripe_px, noise=noise)
         if confirmed and inverses is not None:
-            found = confirm_stripes(found, readings.grey, code.frames, inverses, columns=readings.columns, stripe_px=code.stripe_px,
+            found = confirm_stripes(found, readings.alike, code.frames, inverses, columns=readings.columns, stripe_px=code.stripe_px,
                                     noise=noise)
         return found
 
@@ -230,7 +230,7 @@ def _unwrapped(name: str, axis: AxisCodes, waves: Sequence[PhaseCode | Modulated
     def decode(readings: Readings, noise: NoiseModel) -> Decoded:
         stripes = _decode_stripes(numbering, axis, readings, noise)
         if inverses is not None:
-            stripes = refine_edges(stripes, readings.grey, numbering.frames, inverses, columns=readings.columns, down=axis.axis == "row",
+            stripes = refine_edges(stripes, readings.alike, numbering.frames, inverses, columns=readings.columns, down=axis.axis == "row",
                                    extent=axis.extent, stripe_px=numbering.stripe_px, noise=noise)
         return unwrap_by_code(wrapped(readings, noise), stripes, stripe_px=numbering.stripe_px, extent=axis.extent)
 

@@ -27,6 +27,7 @@ from stage.colour_spaces import is_linear
 from stage.correction import Correction
 from stage.errors import ManifestError
 from stage.manifest import FILE_NAME, Frame
+from stage.pattern_exposures import JoinedExposures, exposure_series
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected, collect
 from stage.patterns.kary import KaryCode
@@ -85,13 +86,21 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
     projector = check_projector(capture) if missing is None else None
     if missing is not None:
         _refuse_depth_options(request, missing)
-    frames = [frame for frame in capture.manifest.frames if frame.pattern is not None]
+    taken = [frame for frame in capture.manifest.frames if frame.pattern is not None]
+    series = exposure_series(capture, taken)
+    frames = taken if series is None else list(series.shown)
     shown = pattern_projector(capture, frames)
     codes = read_codes(capture, frames, shown, refine=request.refine)
+    joined = None
+    if series is not None:
+        timings.stage("exposures", len(frames))
+        joined = JoinedExposures(capture, series, timings.advance)
     timings.stage("frames", len(frames))
-    with frame_planes(capture, frames, colour=codes.colour, cache=request.cache, progress=timings.advance) as planes:
-        full = full_scale(planes, capture, frames)
-        noise = NoiseModel(request.read_noise * full, request.photon_gain * full)
+    with frame_planes(capture, frames, colour=codes.colour, cache=request.cache, progress=timings.advance, joined=joined) as planes:
+        full = full_scale(planes, capture, frames) if joined is None else joined.full_scale
+        # joined frames add up what the read noise of several has left
+        reads = 1 if series is None else len(series.times_s)
+        noise = NoiseModel(request.read_noise * full * reads**0.5, request.photon_gain * full)
         warnings, codes = _checked(planes, mask, codes, shown, projector, capture, frames, noise, device, request)
         coordinates = Coordinates.empty(mask.shape, columns=codes.columns is not None, rows=codes.rows is not None)
         if projector is None:
@@ -101,13 +110,17 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
                 timings.advance(band.stop)
         else:
             solution, right = _bands(planes, mask, codes, coordinates, projector, capture, noise, device, request, timings)
-    facts = {"full_scale": float(f"{full:.6g}"), "frames": len(frames),
+        if planes.exposure is not None:
+            coordinates.amplitude /= planes.exposure
+    facts = {"full_scale": float(f"{full:.6g}"), "frames": len(taken),
              "codes": {decoder.axis: decoder.name for decoder in (codes.columns, codes.rows) if decoder is not None},
              "unused": list(codes.unused)}
+    if series is not None and joined is not None:
+        facts |= {"exposures_s": list(series.times_s), "pixels_of_exposures": list(joined.counts)}
     spanned = request.near_m is not None or request.far_m is not None  # which may be what refuses all depths
     if projector is not None and (spanned or solution.estimated.any() or not np.isin(coordinates.status(), SOLVED).any()):
         conclude(solution, right, mask, request, warnings)
-        solution.colour = scene_colour(capture, frames, codes.collected)
+        solution.colour = scene_colour(capture, frames, codes.collected, joined)
         solution.facts |= facts
         return solution
     reason = missing or f"no decoded pixel has a depth ({_refused(solution, mask)}"
@@ -184,7 +197,8 @@ def read_codes(capture: Capture, frames: list[Frame], projector: PatternProjecto
         ManifestError: a code is incomplete; names the file.
     """
     try:
-        collect([frame.pattern for frame in capture.manifest.frames])  # so that what is wrong is said with the manifest's numbers
+        if len(frames) == sum(frame.pattern is not None for frame in capture.manifest.frames):
+            collect([frame.pattern for frame in capture.manifest.frames])  # so that what is wrong is said with the manifest's numbers
         collected = collect([frame.pattern for frame in frames])
         columns, unused_columns = choose_decoder(collected, "column", projector, refine=refine)
         rows, unused_rows = choose_decoder(collected, "row", projector, refine=refine)
@@ -250,7 +264,8 @@ def decoded_bands(planes: Planes, decoders: Sequence[AxisDecoder | None], noise:
         around = slice(max(band.start - halo, 0), min(band.stop + halo, height))
         values = planes.band(around)
         saturated = None if planes.saturated is None else planes.saturated[:, around].reshape(len(values), -1)
-        readings = Readings.of(values, saturated, width, made, device=device)
+        exposure = None if planes.exposure is None else planes.exposure[around].reshape(-1)
+        readings = Readings.of(values, saturated, width, made, device=device, exposure=exposure)
         decoded = [None if decoder is None else decoder.decode(readings, noise) for decoder in decoders]
         if around != band:
             first, count = (band.start - around.start) * width, (band.stop - band.start) * width
@@ -280,7 +295,7 @@ def full_scale(planes: Planes, capture: Capture, frames: list[Frame]) -> float:
     return max(float(max(np.percentile(frame.reshape(-1)[::every], SCALE_PERCENTILE) for frame in planes.values)), 1e-12)
 
 
-def scene_colour(capture: Capture, frames: list[Frame], collected: Collected) -> np.ndarray | None:
+def scene_colour(capture: Capture, frames: list[Frame], collected: Collected, joined: JoinedExposures | None = None) -> np.ndarray | None:
     """Return what the scene looks like, [rows, cols, 3] linear: the white frame, else a bit and its inverse, which add up to even light,
     else the mean of a wave over its shifts.
 
@@ -298,5 +313,5 @@ def scene_colour(capture: Capture, frames: list[Frame], collected: Collected) ->
             parts = {number: 1.0 for step in code.frames for number in step}
     if not parts:
         return None
-    correction = Correction.of(capture)
-    return np.asarray(np.sum([weight * correction.apply(frames[number]).pixels for number, weight in parts.items()], axis=0))
+    read = Correction.of(capture).apply if joined is None else joined.read
+    return np.asarray(np.sum([weight * read(frames[number]).pixels for number, weight in parts.items()], axis=0))

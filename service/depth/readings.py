@@ -75,9 +75,17 @@ class Readings(NamedTuple):
     """Number of pixels of an image row; the band consists of whole rows."""
     made: tuple[int, int] | None = None
     """White and black that are made of phases, as indices of `grey`; None if none are."""
+    radiance: Band | None = None
+    """The grey frames without the exposures of the pixels, where these differ; None: `grey` is."""
+
+    @property
+    def alike(self) -> Band:
+        """Return grey frames whose neighbouring pixels can be compared, as the edges of stripes between them need."""
+        return self.grey if self.radiance is None else self.radiance
 
     @classmethod
-    def of(cls, values: np.ndarray, saturated: np.ndarray | None, columns: int, made: EvenLight | None, *, device: str) -> "Readings":
+    def of(cls, values: np.ndarray, saturated: np.ndarray | None, columns: int, made: EvenLight | None, *, device: str,
+           exposure: np.ndarray | None = None) -> "Readings":
         """Upload the frames of a band.
 
         Args:
@@ -86,15 +94,17 @@ class Readings(NamedTuple):
             columns: pixels of an image row.
             made: how white and black are made; None to leave them out.
             device: where.
+            exposure: [pixels] by which the values were multiplied; None: all by the same.
         """
         grey = values[:, 0] if values.shape[1] == 1 else np.tensordot(values, np.array(GREY_WEIGHTS, np.float32), ([1], [0]))
         bits = None if saturated is None else saturated_bits(saturated)
         colour = upload(values, bits, device=device) if values.shape[1] > 1 else None
+        radiance = None if exposure is None else upload(np.ascontiguousarray(grey / exposure), bits, device=device)
         if made is None:
-            return cls(upload(np.ascontiguousarray(grey), bits, device=device), colour, columns)
+            return cls(upload(np.ascontiguousarray(grey), bits, device=device), colour, columns, radiance=radiance)
         count = len(grey)
         grey = np.concatenate([grey, *(frame[None] for frame in made.white_and_black(grey))])
         if saturated is not None:
             cut = saturated[list(made.frames)].any(axis=0, keepdims=True)
             bits = saturated_bits(np.concatenate([saturated, cut, cut]))
-        return cls(upload(grey, bits, device=device), colour, columns, (count, count + 1))
+        return cls(upload(grey, bits, device=device), colour, columns, (count, count + 1), radiance)

@@ -170,6 +170,13 @@ class RigOptions(Options):
     """Metres in one unit of the translation in `calibration`, such as 0.001 for millimetres."""
 
 
+class ExposureOrder(Choice):
+    """How the images of several exposures follow each other."""
+
+    EXPOSURE = "exposure", "each pattern at all exposures, then the next pattern"
+    PATTERN = "pattern", "all patterns at one exposure, then at the next"
+
+
 class PatternImageOptions(Options):
     """Which images of the folder are frames of patterns."""
 
@@ -183,6 +190,10 @@ class PatternImageOptions(Options):
     """Image under a black projection; None: the one with the word black in its name, if there is one."""
     color_space: ColorSpaceName = "lin_rec709_scene"
     """Colour space of the images: those of most scanners are linear."""
+    exposures_s: Annotated[tuple[Positive, ...] | None, Commas, Spelling(metavar="S,S,…")] = None
+    """Exposure times in seconds at which every pattern was taken, in the order of the images; None: one, which is not needed."""
+    exposure_order: ExposureOrder = ExposureOrder.EXPOSURE
+    """What changes first from image to image where there are several exposures."""
 
 
 class Inverses(Choice):

@@ -33,6 +33,18 @@ class PatternImages:
     unit_m: float = 1.0
     """The metres in one unit of the translation in `calibration`."""
     color_space: ColorSpaceName = LINEAR
+    exposures_s: tuple[float, ...] | None = None
+    """The exposure times at which every pattern was taken; None: one."""
+    patterns_first: bool = False
+    """Whether all patterns were taken at one exposure before the next; else each pattern at all exposures."""
+
+    def exposed(self, entries: Sequence[Entry]) -> list[tuple[Entry, float | None]]:
+        """Return each image's pattern and exposure time, in the order of the images."""
+        if self.exposures_s is None:
+            return [(entry, None) for entry in entries]
+        if self.patterns_first:
+            return [(entry, time) for time in self.exposures_s for entry in entries]
+        return [(entry, time) for entry in entries for time in self.exposures_s]
 
 
 def import_gray(source: Path, destination: Path, *, pictures: PatternImages, gray: GrayStack) -> Imported:
@@ -154,10 +166,16 @@ def _write(source: Path, destination: Path, pictures: PatternImages, entries: li
             raise ManifestError(f"--{code} {given}: {code} is in --sequence already: give one of both")
     taken = {mask, *even.values(), *(name for name, _ in extra)}
     frames = [name for name in names if name not in taken and (pictures.images is None or fnmatch(name, pictures.images))]
-    if len(frames) != len(entries):
+    exposed, times = pictures.exposed(entries), pictures.exposures_s
+    if len(frames) != len(exposed):
         shown = f" ({frames[0]} to {frames[-1]})" if frames else ""
-        raise ManifestError(f"{source}: has {len(frames)} images{shown} where these options have {len(entries)} patterns: "
+        at = "" if times is None else f" at {len(times)} exposures"
+        raise ManifestError(f"{source}: has {len(frames)} images{shown} where these options have {len(entries)} patterns{at}: "
                             f"{describe(entries)}")
+    beside = [*(name for name, _ in extra), *even.values()]
+    if times is not None and beside:
+        raise ManifestError(f"{source}: {beside[0]} was taken at one exposure, and --exposures-s says that every pattern was taken at "
+                            f"{len(times)}: put white, black and the Gray code into the sequence")
     resolution = image_resolution(source / frames[0])
     data: dict[str, Any] = {"schema": SCHEMA, "name": source.resolve().name, "color_space": pictures.color_space, "mask": mask,
                             "camera": {"projection": "orthographic", "resolution": list(resolution)},
@@ -166,10 +184,15 @@ def _write(source: Path, destination: Path, pictures: PatternImages, entries: li
         data |= camera_and_projector(pictures.calibration, resolution, pictures.projector, pictures.unit_m)
         if shifted:
             data["projector"]["principal_px"] = [value - 0.5 for value in data["projector"]["principal_px"]]
-    pairs = [*zip(frames, entries, strict=True), *extra, *((name, {"code": code}) for code, name in even.items())]
-    data["frames"] = [{"image": name, "pattern": pattern} for name, pattern in pairs]
+    pairs = [*extra, *((name, {"code": code}) for code, name in even.items())]
+    data["frames"] = [{"image": name, "pattern": pattern, **({} if time is None else {"exposure_s": time})}
+                      for name, (pattern, time) in zip(frames, exposed, strict=True)]
+    data["frames"] += [{"image": name, "pattern": pattern} for name, pattern in pairs]
     written = write_capture(data, pictures.calibration or source, destination, folder=source)
     facts = [("frames", f"{len(frames)} images in their order, {frames[0]} to {frames[-1]}"), ("patterns", describe(entries))]
+    if times is not None:
+        order = "all patterns at one of them before the next" if pictures.patterns_first else "each pattern at all of them"
+        facts.append(("exposed", f"{', '.join(f'{time:g}' for time in times)} s, {order}"))
     if extra:
         facts.append(("Gray", f"{len(extra)} images in their order, {extra[0][0]} to {extra[-1][0]}: {describe([e for _, e in extra])}"))
     facts += [(code, name) for code, name in even.items()]
