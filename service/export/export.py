@@ -8,6 +8,7 @@ from typing import NamedTuple, get_args
 from service.asset.errors import AssetError
 from service.asset.repair import repair_heights
 from service.errors import RequestError
+from service.export.sequence import export_sequence, is_result_sequence
 from service.export.surroundings import content_hashes, open_surroundings, refuse_surroundings
 from service.gltf.asset import AssetReport as InGltf
 from service.gltf.asset import write_asset as write_gltf_asset
@@ -57,6 +58,10 @@ def export(request: ExportRequest, progress: Progress | None = None) -> Exported
     """
     suffix = _check_suffix(request.out)
     timings = Timings(progress)
+    if is_result_sequence(request.maps):
+        written, told = export_sequence(request, timings)
+        timings.close()
+        return Exported(request.out, told, {f"{written.steps} steps": (written.vertices, written.faces)})
     timings.stage("read", 1)
     warnings: list[str] = []
     sizes: dict[str, tuple[int, int]] = {}

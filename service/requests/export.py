@@ -53,7 +53,7 @@ class ExportRequest(ExportOptions):
     """A USD or glTF asset of solved maps with their material, or of a depth with its colours."""
 
     maps: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="DIR")]
-    """Folder with maps.exr or depth.exr, or the file."""
+    """Folder with maps.exr or depth.exr, or the file; or the results of a sequence, which become a .usdc or .usdz with time samples."""
     out: Annotated[Path, Role.OUTPUT]
     """The asset: .usdz, .usda, .usdc or .glb (binary glTF)."""
     rig: Annotated[Path | None, Role.INPUT, Spelling(metavar="CAPTURE")] = None

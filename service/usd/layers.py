@@ -224,7 +224,7 @@ class AssetLayers:
             describe_root(root, name=description.name, identifier=self._identifier, version=description.version,
                           provenance=description.provenance)
         if (posed or file == self._interface_file) and description.camera.world_from_camera is not None:
-            root.AddTransformOp().Set(_matrix(description.camera.world_from_camera, description.unit_m))
+            root.AddTransformOp().Set(pose_matrix(description.camera.world_from_camera, description.unit_m))
         return usd_stage
 
 
@@ -284,7 +284,7 @@ def _set_times(usd_stage: Usd.Stage, first: float, last: float) -> None:
     usd_stage.SetFramesPerSecond(FRAME_RATE)
 
 
-def _matrix(world_from_camera: tuple[tuple[float, ...], ...], unit_m: float) -> Gf.Matrix4d:
+def pose_matrix(world_from_camera: tuple[tuple[float, ...], ...], unit_m: float) -> Gf.Matrix4d:
     """Return a column-vector transform in metres as USD's row-vector transform in scene units."""
     matrix = np.array(world_from_camera, dtype=np.float64)
     matrix[:3, 3] /= unit_m

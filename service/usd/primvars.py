@@ -23,14 +23,14 @@ def set_primvar(prim: UsdGeom.Gprim, name: str, kind: Sdf.ValueTypeName, values:
     """
     interpolation = UsdGeom.Tokens.constant if len(values) == 1 else UsdGeom.Tokens.vertex
     primvar = UsdGeom.PrimvarsAPI(prim).CreatePrimvar(name, kind, interpolation)
-    first, index = _distinct(values)
+    first, index = distinct(values)
     repeated = len(first) < len(values)
     primvar.Set(_ARRAYS[kind].FromNumpy(np.ascontiguousarray(values[first] if repeated else values, dtype=np.float32)))
     if repeated:
         primvar.SetIndices(Vt.IntArray.FromNumpy(index.astype(np.int32)))
 
 
-def _distinct(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def distinct(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return where each different value stands first, and for each value the number of the one that it equals."""
     columns = values.reshape(len(values), -1).T
     key = np.zeros(len(values), dtype=np.int64)
