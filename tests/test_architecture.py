@@ -91,8 +91,8 @@ def test_a_library_lives_in_its_places(library, homes):
     assert {i.importer for i in IMPORTS if top(i.target) == library and not under(i.importer, *homes)} == set()
 
 
-def test_opencv_lives_where_motion_is_tracked_rigs_calibrated_distances_measured_and_avif_and_camera_raw_decoded():
-    allowed = "stage.motion", "stage.calibration", "stage.mask_border", "stage.avif", "stage.camera_raw"
+def test_opencv_lives_where_motion_is_tracked_rigs_calibrated_distances_measured_and_avif_camera_raw_and_video_decoded():
+    allowed = "stage.motion", "stage.calibration", "stage.mask_border", "stage.avif", "stage.camera_raw", "stage.importers.video"
     assert {i.importer for i in IMPORTS if top(i.target) == "cv2" and not under(i.importer, *allowed)} == set()
 
 

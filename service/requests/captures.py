@@ -190,6 +190,8 @@ class PatternImageOptions(Options):
     """Image under a black projection; None: the one with the word black in its name, if there is one."""
     color_space: ColorSpaceName = "lin_rec709_scene"
     """Colour space of the images: those of most scanners are linear."""
+    video_frames: Annotated[Line | None, Spelling(metavar="FIRST-LAST[:STEP]")] = None
+    """Frames of the video that SRC is, counted from 0, such as 12-600:6 where each pattern was shown for six frames; None: all."""
     exposures_s: Annotated[tuple[Positive, ...] | None, Commas, Spelling(metavar="S,S,…")] = None
     """Exposure times in seconds at which every pattern was taken, in the order of the images; None: one, which is not needed."""
     exposure_order: ExposureOrder = ExposureOrder.EXPOSURE

@@ -11,6 +11,7 @@ from stage.errors import ManifestError
 from stage.importers.layout import Imported, image_names, image_resolution, write_capture
 from stage.importers.procam_file import camera_and_projector, projector_size
 from stage.importers.sequences import Entry, GrayStack, PhaseStack, describe, gray_entries
+from stage.importers.video import VideoFrames
 from stage.importers.view import MASK_WORDS, only_image
 from stage.manifest import SCHEMA
 
@@ -35,6 +36,8 @@ class PatternImages:
     color_space: ColorSpaceName = LINEAR
     exposures_s: tuple[float, ...] | None = None
     """The exposure times at which every pattern was taken; None: one."""
+    video: VideoFrames | None = None
+    """The video that the images were unpacked from; None: they are photographs."""
     patterns_first: bool = False
     """Whether all patterns were taken at one exposure before the next; else each pattern at all exposures."""
 
@@ -179,7 +182,8 @@ def _write(source: Path, destination: Path, pictures: PatternImages, entries: li
     resolution = image_resolution(source / frames[0])
     data: dict[str, Any] = {"schema": SCHEMA, "name": source.resolve().name, "color_space": pictures.color_space, "mask": mask,
                             "camera": {"projection": "orthographic", "resolution": list(resolution)},
-                            "projector": {"resolution": list(pictures.projector)}}
+                            "projector": {"resolution": list(pictures.projector)},
+                            "assumed": [] if pictures.video is None else list(pictures.video.assumed)}
     if pictures.calibration is not None:
         data |= camera_and_projector(pictures.calibration, resolution, pictures.projector, pictures.unit_m)
         if shifted:
@@ -190,6 +194,8 @@ def _write(source: Path, destination: Path, pictures: PatternImages, entries: li
     data["frames"] += [{"image": name, "pattern": pattern} for name, pattern in pairs]
     written = write_capture(data, pictures.calibration or source, destination, folder=source)
     facts = [("frames", f"{len(frames)} images in their order, {frames[0]} to {frames[-1]}"), ("patterns", describe(entries))]
+    if pictures.video is not None:
+        facts.insert(0, ("video", pictures.video.sentence))
     if times is not None:
         order = "all patterns at one of them before the next" if pictures.patterns_first else "each pattern at all of them"
         facts.append(("exposed", f"{', '.join(f'{time:g}' for time in times)} s, {order}"))
