@@ -13,6 +13,7 @@ from kernels.stereo.probe import probe
 from kernels.stereo.refine import refine
 from kernels.structured.frames import NoiseModel
 from stage.stereo.frames import RectifiedFrames
+from stage.stereo.neighbourhood import WINDOW_REACH, bend, contrast
 from stage.stereo.row_offset import row_offsets
 
 VOLUME_BYTES = 192 << 20
@@ -59,11 +60,13 @@ LEAST_NEAR = 0.25
 """Least contrast of these pixels, relative to that of the whole window. With less, what matched is the texture of another part."""
 SMOOTHED_NOISE = 0.375
 """Standard deviation of white noise after the binomial filter 1 2 1 along rows and columns: the root of the sum of its squared weights."""
-NOISE_FACTOR, ALIAS_FACTOR = 1.77, 0.2
+NOISE_FACTOR, ALIAS_FACTOR = 1.9, 0.22
 """σ is that of the least squares fit with the misfit f of the window replaced by the root of (NOISE_FACTOR f)² + ALIAS_FACTOR². The first
 accounts for neighbours that share their noise after smoothing and resampling, the second for edges of texture that pixels undersample,
 which two cameras see differently and no residual shows. Fitted on a rendered plane at noise from none to 2 % of full scale with one and
 four frames; the scenes of the tests are others."""
+BEND_SIGMAS, BEND_DOUBT = 0.6, 0.5
+"""A bend counts as far as it exceeds this many σ, so that noise is not taken for one; and this part of what is taken off is added to σ."""
 SURE_LEAD = 0.3
 """Lead from which nothing is left to doubt."""
 SAMPLED_ROWS = 400
@@ -186,38 +189,17 @@ def _match_rows(images: RectifiedFrames, rows: slice, labels: Labels, noise: Noi
     inside &= np.take_along_axis(right_seen, np.clip(column, 0, right.shape[2] - 1), axis=1)
     uncertain = (misfit > MOST_MISFIT) | (centre > MOST_CENTRE) | (np.abs(disparity - start) > MOST_JUMP_PX)
     uncertain |= np.hypot(slope_x, slope_y) > MOST_SLOPE
-    texture = _contrast(left)
-    near = _contrast(left, NEAR_REACH)
+    texture = contrast(left, WINDOW_REACH)
+    near = contrast(left, NEAR_REACH)
     uncertain |= near < LEAST_NEAR * texture
     status = np.select(
         [~images.left_seen[rows], near < LEAST_CONTRAST * noisy, ~inside, (label == 0) | (label == labels.count(device) - 1),
          disagreement > 1, lead < LEAST_LEAD, ~found | uncertain],
         [Status.UNSOLVED, Status.LOW_MODULATION, Status.OCCLUDED, Status.OUT_OF_RANGE, Status.OCCLUDED, Status.UNDECIDED, Status.UNSURE],
         Status.OK).astype(np.uint8)
+    above = bend(disparity, status == Status.OK)
+    above *= np.maximum(0, 1 - (BEND_SIGMAS * sigma / np.maximum(np.abs(above), 1e-9)) ** 2)
+    disparity, sigma = disparity - above, np.hypot(sigma, BEND_DOUBT * above)
     kept = found & np.isin(status, (Status.OK, Status.UNSURE))
     disparity, slope_x, slope_y, sigma = (np.where(kept, values, 0).astype(np.float32) for values in (disparity, slope_x, slope_y, sigma))
     return Disparity(disparity, slope_x, slope_y, sigma, lead, texture, status, np.zeros(0, np.float32))
-
-
-def _contrast(images: np.ndarray, reach: int = 4) -> np.ndarray:
-    """Return the standard deviation of the readings in a square around each pixel, root mean square over the frames: [rows, cols] float32.
-
-    Args:
-        images: [frames, rows, cols] float32.
-        reach: half side of the square.
-    """
-    total = np.zeros(images.shape[1:], np.float64)
-    for image in images:
-        mean, square = (_box_mean(values, reach) for values in (image.astype(np.float64), image.astype(np.float64) ** 2))
-        total += np.maximum(square - mean**2, 0)
-    return np.sqrt(total / len(images)).astype(np.float32)
-
-
-def _box_mean(values: np.ndarray, reach: int) -> np.ndarray:
-    """Return the mean in a square around each pixel; borders are continued."""
-    size = 2 * reach + 1
-    for axis in (0, 1):
-        padded = np.pad(values, [(reach + 1, reach) if a == axis else (0, 0) for a in (0, 1)], mode="edge")
-        total = np.moveaxis(np.cumsum(padded, axis=axis), axis, 0)
-        values = np.moveaxis((total[size:] - total[:-size]) / size, 0, axis)
-    return values
