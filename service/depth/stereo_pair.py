@@ -60,11 +60,11 @@ LEAST_NEAR = 0.25
 """Least contrast of these pixels, relative to that of the whole window. With less, what matched is the texture of another part."""
 SMOOTHED_NOISE = 0.375
 """Standard deviation of white noise after the binomial filter 1 2 1 along rows and columns: the root of the sum of its squared weights."""
-NOISE_FACTOR, ALIAS_FACTOR = 1.9, 0.22
-"""σ is that of the least squares fit with the misfit f of the window replaced by the root of (NOISE_FACTOR f)² + ALIAS_FACTOR². The first
-accounts for neighbours that share their noise after smoothing and resampling, the second for edges of texture that pixels undersample,
-which two cameras see differently and no residual shows. Fitted on a rendered plane at noise from none to 2 % of full scale with one and
-four frames; the scenes of the tests are others."""
+NOISE_FACTOR, ALIAS_FACTOR, FLOOR_PX = 2.0, 0.06, 0.018
+"""σ² is that of the least squares fit with the misfit f of the window replaced by the root of (NOISE_FACTOR f)² + ALIAS_FACTOR², and
+FLOOR_PX² in addition. The first accounts for neighbours that share their noise after smoothing and resampling, the second for edges of
+texture that pixels undersample, the floor for interpolation, which further frames do not average out. Fitted on rendered planes at noise
+from none to 2 % of full scale with one and four frames; the scenes of the tests are others."""
 BEND_SIGMAS, BEND_DOUBT = 0.6, 0.5
 """A bend counts as far as it exceeds this many σ, so that noise is not taken for one; and this part of what is taken off is added to σ."""
 SURE_LEAD = 0.3
@@ -181,7 +181,8 @@ def _match_rows(images: RectifiedFrames, rows: slice, labels: Labels, noise: Noi
     disparity, slope_x, slope_y, sigma, misfit, centre, _ = (array.numpy() for array in fine)
     found = sigma > 0
     with np.errstate(divide="ignore", invalid="ignore"):
-        sigma = np.where(found, sigma / misfit * np.hypot(NOISE_FACTOR * misfit, ALIAS_FACTOR), 0).astype(np.float32)
+        scaled = sigma / misfit * np.hypot(NOISE_FACTOR * misfit, ALIAS_FACTOR)
+        sigma = np.where(found, np.hypot(scaled, FLOOR_PX), 0).astype(np.float32)
     level = np.maximum(left.mean(axis=0), 0)
     noisy = SMOOTHED_NOISE * np.sqrt(noise.read**2 + noise.gain * level)
     column = np.arange(start.shape[1]) - np.rint(start).astype(int)

@@ -124,12 +124,17 @@ def shade(parts, textures, origin, rays, albedo):
     points = origin + np.where(seen, t, 0)[..., None] * rays
     away = points - PROJECTOR_POSE[:3, 3]
     clear = first(parts, PROJECTOR_POSE[:3, 3], away)[0] > 1 - 1e-6
-    at = reference.seen_by(PROJECTOR, PROJECTOR_POSE, points)
+    at = reference.seen_by(PROJECTOR, PROJECTOR_POSE, points) - 0.5
+    lit = seen & clear & (at >= 0).all(axis=-1) & (at[..., 0] < PROJECTOR.width - 1) & (at[..., 1] < PROJECTOR.height - 1)
+    at = np.where(lit[..., None], at, 0)
     col, row = (np.floor(at[..., i]).astype(int) for i in (0, 1))
-    lit = seen & clear & (col >= 0) & (row >= 0) & (col < PROJECTOR.width) & (row < PROJECTOR.height)
+    right, down = at[..., 0] - col, at[..., 1] - row
     fall = 0.5 / (away**2).sum(axis=-1)
-    found = [np.where(seen, albedo[part] * (AMBIENT + np.where(lit, fall * texture[np.where(lit, row, 0), np.where(lit, col, 0)], 0)), 0)
-             for texture in textures]
+    found = []
+    for texture in textures:  # interpolated: a projector's pixels are as wide as they are apart, and never sharper
+        shown = ((1 - down) * ((1 - right) * texture[row, col] + right * texture[row, col + 1])
+                 + down * ((1 - right) * texture[row + 1, col] + right * texture[row + 1, col + 1]))
+        found.append(np.where(seen, albedo[part] * (AMBIENT + np.where(lit, fall * shown, 0)), 0))
     return np.stack(found)
 
 
