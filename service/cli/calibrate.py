@@ -1,4 +1,4 @@
-"""relit calibrate KIND: lights, dark frame, flat field and saturation, projector and camera, time of flight from images."""
+"""relit calibrate KIND: lights, dark frame, flat field and saturation, projector and cameras, time of flight from images."""
 
 from typing import TYPE_CHECKING
 
@@ -17,6 +17,7 @@ from service.requests.calibrate import (
     ProcamRequest,
     ResponseRequest,
     SaturationRequest,
+    StereoRequest,
     TofCalibrationRequest,
     WhiteBalanceRequest,
 )
@@ -34,11 +35,11 @@ VIEW_ROWS = 40
 def register(app: typer.Typer) -> None:
     """Add the command and its kinds."""
     kinds = typer.Typer(name="calibrate", no_args_is_help=True,
-                        help="Lights, projector and camera, dark frame, flat field, colours and saturation from images; with residuals.")
+                        help="Lights, projector and cameras, dark frame, flat field, colours and saturation from images; with residuals.")
     for name, function in (("mirror-ball", _mirror_ball), ("light-positions", _light_positions), ("grey-ball", _grey_ball),
                            ("intensity", _intensity), ("dark", _dark), ("flat-field", _flat_field), ("saturation", _saturation),
                            ("white-balance", _white_balance),
-                           ("procam", _procam), ("response", _response), ("tof", _tof)):
+                           ("procam", _procam), ("stereo", _stereo), ("response", _response), ("tof", _tof)):
         local_command(kinds, name, function)
     app.add_typer(kinds)
 
@@ -125,6 +126,18 @@ def _procam(request: ProcamRequest) -> None:
     print(f"report   {result.report_path}")
     print(f"error    {result.rms_px:.3f} px RMS, baseline {result.baseline_m:.4f} m")
     print_table([("view", "camera, px", "projector, px", "remark"), *result.rows[:VIEW_ROWS]])
+
+
+def _stereo(request: StereoRequest) -> None:
+    from service.calibrate.stereo import stereo
+
+    with ProgressBar() as bar:
+        result = stereo(request, bar)
+    for path in result.manifest_paths:
+        print(f"capture  {path}")
+    print(f"report   {result.report_path}")
+    print(f"error    {result.summary}")
+    print_table([("frame", "other camera", "camera, px", "other, px", "remark"), *result.rows[:VIEW_ROWS]])
 
 
 def _response(request: ResponseRequest) -> None:

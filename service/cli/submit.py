@@ -37,6 +37,7 @@ from service.requests.jobs import (
     ScanJob,
     ShadeJob,
     SolveJob,
+    StereoCalibrationJob,
     TofCalibrationJob,
     ViewJob,
 )
@@ -52,7 +53,8 @@ JOBS: dict[str, type[JobRequest]] = {"solve": SolveJob, "depth": DepthJob, "reli
                                      "calibrate-mirror-ball": MirrorBallJob, "calibrate-light-positions": LightPositionsJob,
                                      "calibrate-grey-ball": GreyBallJob, "calibrate-intensity": IntensityJob, "calibrate-dark": DarkJob,
                                      "calibrate-flat-field": FlatFieldJob, "calibrate-saturation": SaturationJob,
-                                     "calibrate-procam": ProcamJob, "calibrate-response": ResponseJob, "calibrate-tof": TofCalibrationJob}
+                                     "calibrate-procam": ProcamJob, "calibrate-stereo": StereoCalibrationJob,
+                                     "calibrate-response": ResponseJob, "calibrate-tof": TofCalibrationJob}
 REGISTERED = "server:"
 SOURCES = "Give a path of this machine, which is uploaded; an identifier, {prefix}_…; or server:/path, which is registered."
 

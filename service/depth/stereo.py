@@ -97,7 +97,7 @@ def solve_stereo(capture: Capture, mask: np.ndarray, request: DepthRequest, devi
             if abs(offset) > ROW_OFFSET_PX:
                 warnings.append(f"other_cameras[{index}]: the rows of {other.name} lie {offset:+.2f} px from those of the camera (median "
                                 f"over {len(disparity.row_offset)} places): depths may be off by as much disparity; calibrate the cameras "
-                                "again")
+                                "again (relit calibrate stereo)")
         facts["cameras"].append(told)
         found.append(_triangulated(disparity, geometry, capture, request))
     solution = _joined(found, frames, capture, mask)

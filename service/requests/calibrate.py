@@ -234,6 +234,24 @@ class ProcamRequest(ProcamOptions, Request):
     """Another capture of the same rig, whose manifest is written too; may be repeated."""
 
 
+class StereoOptions(Options):
+    """What is known of the chessboard that several cameras see."""
+
+    board: Annotated[tuple[Corners, Corners], BeforeValidator(_board), Spelling(metavar="9x6")]
+    """Inner corners of the chessboard, across and down."""
+    square_m: Annotated[Positive, AfterValidator(_square)]
+    """Side of a square in metres."""
+
+
+class StereoRequest(StereoOptions, Options):
+    """Several cameras and their poses from a chessboard that they see at the same moments."""
+
+    capture: Annotated[Path, Role.INPUT, CAPTURE]
+    """Folder with a capture.json, each of whose stereo frames shows the board in another pose."""
+    apply_to: Annotated[tuple[Path, ...], Role.INPUT, Spelling(metavar="CAPTURE")] = ()
+    """Another capture of the same cameras, whose manifest is written too; may be repeated."""
+
+
 class ResponseOptions(Options):
     """What the images of evenly grey projections show."""
 

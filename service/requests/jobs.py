@@ -16,6 +16,7 @@ from service.requests.calibrate import (
     MirrorBallOptions,
     ProcamOptions,
     ResponseOptions,
+    StereoOptions,
 )
 from service.requests.depth import DepthOptions
 from service.requests.export import AssetFormat, ExportOptions
@@ -284,6 +285,18 @@ class ProcamJob(JobRequest):
     options: ProcamOptions
 
 
+class StereoCalibrationJob(JobRequest):
+    """Several cameras and their poses from a chessboard that they see at the same moments: ID.capture.json for each capture,
+    calibration.json."""
+
+    kind: Literal["calibrate-stereo"]
+    capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
+    """The capture, each of whose stereo frames shows the board in another pose."""
+    apply_to: Annotated[tuple[CaptureId, ...], Field(max_length=MOST_CAPTURES), Role.INPUT, Spelling(metavar="CAPTURE")] = ()
+    """Another capture of the same cameras, whose manifest is written too; may be repeated."""
+    options: StereoOptions
+
+
 class ResponseJob(JobRequest):
     """The projector's light at each level (its gamma), from images of evenly grey projections: capture.json, calibration.json."""
 
@@ -307,7 +320,7 @@ class TofCalibrationJob(JobRequest):
 
 OneJob = (SolveJob | DepthJob | JoinJob | RelightJob | ShadeJob | ExportJob | ViewJob | PipelineJob | BasisJob | ScanJob
           | InspectBoardJob | PatternsJob | MirrorBallJob | LightPositionsJob | GreyBallJob | IntensityJob | DarkJob | FlatFieldJob
-          | SaturationJob | ProcamJob | ResponseJob | TofCalibrationJob)
+          | SaturationJob | ProcamJob | StereoCalibrationJob | ResponseJob | TofCalibrationJob)
 UserJob = Annotated[OneJob, Field(discriminator="kind")]
 """Every kind of job that the API accepts."""
 AnyJob = Annotated[CheckJob | OneJob, Field(discriminator="kind")]

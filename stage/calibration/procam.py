@@ -162,7 +162,7 @@ def calibrate(views: Sequence[BoardView], board: tuple[int, int], square_m: floa
         raise CalibrationError(f"the poses of the board do not determine the devices ({str(error.err).strip().lower()}): "
                                "tilt it differently from view to view") from error
     pose = camera_from_projector(rotation, translation.ravel())
-    lenses = [_lens(k, d, rms) for k, d, rms in ((camera_k, camera_d, camera_rms), (projector_k, projector_d, projector_rms))]
+    lenses = [lens_of(k, d, rms) for k, d, rms in ((camera_k, camera_d, camera_rms), (projector_k, projector_d, projector_rms))]
     for lens, size, what in zip(lenses, (camera_size, projector_size), ("camera", "projector"), strict=True):
         if not (np.isfinite(lens.focal).all() and 0.1 < max(lens.focal) / max(size) < 100):
             raise CalibrationError(f"the focal length of the {what} comes out as {lens.focal[0]:.3g} px: the poses do not determine it, "
@@ -181,5 +181,6 @@ def _spacing(grid: np.ndarray) -> float:
     return float(np.median(np.concatenate([np.linalg.norm(np.diff(grid, axis=axis), axis=-1).ravel() for axis in (0, 1)])))
 
 
-def _lens(k: np.ndarray, d: np.ndarray, rms: float) -> Lens:
+def lens_of(k: np.ndarray, d: np.ndarray, rms: float) -> Lens:
+    """Return a lens from OpenCV's camera matrix and distortion vector."""
     return Lens((float(k[0, 0]), float(k[1, 1])), (float(k[0, 2]), float(k[1, 2])), distortion_of(d), float(rms))

@@ -1,8 +1,8 @@
 """The other cameras of a manifest, and the images that they took beside a frame."""
 
-from typing import Annotated
+from typing import Annotated, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from stage.camera import Camera, Distortion
 from stage.frames import Transform
@@ -16,14 +16,21 @@ class OtherCamera(Strict):
     """The name of the camera, for reports and messages."""
     resolution: Resolution
     """The size of every image of this camera."""
-    focal_px: tuple[Positive, Positive]
-    """The focal lengths along u and v."""
+    focal_px: tuple[Positive, Positive] | None = None
+    """The focal lengths along u and v; None, and `camera_from_other` too, before `relit calibrate stereo` has measured them."""
     principal_px: tuple[float, float] | None = None
     """The principal point, as of the camera; None: the centre of the image."""
     distortion: Distortion | None = None
     """The lens distortion; None: none."""
-    camera_from_other: Transform
-    """The place of this camera in the camera frame, with the translation in metres; it looks along its own -z."""
+    camera_from_other: Transform | None = None
+    """The place of this camera in the camera frame, with the translation in metres; it looks along its own -z. None: not measured yet."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.focal_px is None) != (self.camera_from_other is None):
+            given, missing = ("focal_px", "camera_from_other") if self.camera_from_other is None else ("camera_from_other", "focal_px")
+            raise ValueError(f"{missing} is missing beside {given}: give both, or neither before relit calibrate stereo measures them")
+        return self
 
     @property
     def camera(self) -> Camera:

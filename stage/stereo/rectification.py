@@ -117,8 +117,12 @@ def rectify(reference: Camera, other: OtherCamera, *, where: str) -> Rectificati
         where: the file and the field of the other camera, for messages.
 
     Raises:
-        ManifestError: the cameras stand at one place or implausibly far apart, one behind the other, or look in different directions.
+        ManifestError: the other camera is not calibrated; the cameras stand at one place or implausibly far apart, one behind the other,
+            or look in different directions.
     """
+    if other.camera_from_other is None:
+        raise ManifestError(f"{where}: {other.name} has no focal_px and no camera_from_other: depth needs its lens and pose; "
+                            "relit calibrate stereo measures them")
     pose = np.array(other.camera_from_other, dtype=np.float64)
     centre = OPENCV_FROM_CAMERA @ pose[:3, 3]
     baseline = float(np.linalg.norm(centre))

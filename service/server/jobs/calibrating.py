@@ -17,6 +17,7 @@ from service.requests.jobs import (
     ProcamJob,
     ResponseJob,
     SaturationJob,
+    StereoCalibrationJob,
     TofCalibrationJob,
 )
 from service.server.jobs.measuring import Intake
@@ -29,7 +30,8 @@ TOF_FILE = "tof.json"
 
 def can_run(request: JobRequest) -> bool:
     """Return whether a job calibrates."""
-    return isinstance(request, CalibrationJob | DarkJob | FlatFieldJob | SaturationJob | ProcamJob | ResponseJob | TofCalibrationJob)
+    return isinstance(request, CalibrationJob | DarkJob | FlatFieldJob | SaturationJob | ProcamJob | StereoCalibrationJob | ResponseJob
+                      | TofCalibrationJob)
 
 
 def run(request: JobRequest, out: Path, intake: Intake, *, device: str, cache: Path, progress: Progress) -> None:
@@ -47,6 +49,8 @@ def run(request: JobRequest, out: Path, intake: Intake, *, device: str, cache: P
         _lights(request, out, intake, progress)
     elif isinstance(request, ProcamJob):
         _procam(request, out, intake, device, cache, progress)
+    elif isinstance(request, StereoCalibrationJob):
+        _stereo(request, out, intake, progress)
     elif isinstance(request, ResponseJob):
         _response(request, out, intake, progress)
     elif isinstance(request, TofCalibrationJob):
@@ -98,6 +102,15 @@ def _procam(request: ProcamJob, out: Path, intake: Intake, device: str, cache: P
     names = (*request.captures, *request.apply_to)
     procam(ProcamRequest(captures=tuple(map(intake, request.captures)), apply_to=tuple(map(intake, request.apply_to)), device=device,
                          cache=cache / request.captures[0], **dict(request.options)), progress,
+           manifest_paths=[out / f"{name}.{FILE_NAME}" for name in names])
+
+
+def _stereo(request: StereoCalibrationJob, out: Path, intake: Intake, progress: Progress) -> None:
+    from service.calibrate.stereo import stereo
+    from service.requests.calibrate import StereoRequest
+
+    names = request.capture, *request.apply_to
+    stereo(StereoRequest(capture=intake(request.capture), apply_to=tuple(map(intake, request.apply_to)), **dict(request.options)), progress,
            manifest_paths=[out / f"{name}.{FILE_NAME}" for name in names])
 
 

@@ -35,6 +35,7 @@ from service.requests.jobs import (
     ScanJob,
     ShadeJob,
     SolveJob,
+    StereoCalibrationJob,
     TofCalibrationJob,
 )
 from service.requests.light_keys import LightKeys
@@ -45,7 +46,7 @@ CAPTURE_JOBS: dict[str, type[JobRequest]] = {
     "relight": RelightJob, "basis": BasisJob, "calibrate-mirror-ball": MirrorBallJob,
     "calibrate-light-positions": LightPositionsJob, "calibrate-grey-ball": GreyBallJob, "calibrate-intensity": IntensityJob,
     "calibrate-dark": DarkJob, "calibrate-flat-field": FlatFieldJob, "calibrate-saturation": SaturationJob, "calibrate-procam": ProcamJob,
-    "calibrate-response": ResponseJob, "calibrate-tof": TofCalibrationJob,
+    "calibrate-stereo": StereoCalibrationJob, "calibrate-response": ResponseJob, "calibrate-tof": TofCalibrationJob,
 }
 """Jobs that begin with a capture, by kind."""
 MAPS_JOBS: dict[str, type[JobRequest]] = {"export": ExportJob, "shade": ShadeJob, "join": JoinJob}
@@ -62,7 +63,8 @@ TITLES = {"solve": "Solve normals and materials", "pipeline": "Solve, export and
           "calibrate-grey-ball": "Calibrate the brightness of lights: a grey ball",
           "calibrate-intensity": "Calibrate the brightness of lights: the object itself", "calibrate-dark": "Calibrate the dark frame",
           "calibrate-flat-field": "Calibrate the flat field", "calibrate-saturation": "Calibrate the saturation",
-          "calibrate-procam": "Calibrate camera and projector", "calibrate-response": "Calibrate the response of the projector",
+          "calibrate-procam": "Calibrate camera and projector", "calibrate-stereo": "Calibrate several cameras",
+          "calibrate-response": "Calibrate the response of the projector",
           "calibrate-tof": "Calibrate a time-of-flight camera"}
 IDENTIFIERS = {pattern(CAPTURE): "capture", pattern(ENVIRONMENT): "environment", pattern(JOB): "job"}
 """What the identifiers of a pattern name."""

@@ -58,7 +58,8 @@ COMMANDS: dict[str, list[type[Options]]] = {
     "calibrate intensity": [calibrate.IntensityRequest], "calibrate dark": [calibrate.DarkRequest],
     "calibrate flat-field": [calibrate.FlatFieldRequest], "calibrate saturation": [calibrate.SaturationRequest],
     "calibrate white-balance": [calibrate.WhiteBalanceRequest],
-    "calibrate procam": [calibrate.ProcamRequest], "calibrate response": [calibrate.ResponseRequest],
+    "calibrate procam": [calibrate.ProcamRequest],
+    "calibrate stereo": [calibrate.StereoRequest], "calibrate response": [calibrate.ResponseRequest],
     "calibrate tof": [calibrate.TofCalibrationRequest],
     "submit solve": [jobs.SolveJob], "submit depth": [jobs.DepthJob], "submit relight": [jobs.RelightJob], "submit shade": [jobs.ShadeJob],
     "submit export": [jobs.ExportJob], "submit view": [jobs.ViewJob], "submit pipeline": [jobs.PipelineJob],
@@ -68,6 +69,7 @@ COMMANDS: dict[str, list[type[Options]]] = {
     "submit calibrate-grey-ball": [jobs.GreyBallJob], "submit calibrate-intensity": [jobs.IntensityJob],
     "submit calibrate-dark": [jobs.DarkJob], "submit calibrate-flat-field": [jobs.FlatFieldJob],
     "submit calibrate-saturation": [jobs.SaturationJob], "submit calibrate-procam": [jobs.ProcamJob],
+    "submit calibrate-stereo": [jobs.StereoCalibrationJob],
     "submit calibrate-response": [jobs.ResponseJob], "submit calibrate-tof": [jobs.TofCalibrationJob],
     "farm template relight": [relight.RelightRequest], "farm template shade": [shade.ShadeRequest],
 }

@@ -15,12 +15,14 @@ CAPTURE, JOB = "cap_0123456789abcdefghjk", "job_0123456789abcdefghjk"
 REQUIRED = {
     "calibrate-dark": {"capture": CAPTURE, "images": ["0.exr"]}, "calibrate-flat-field": {"capture": CAPTURE, "images": ["0.exr"]},
     "calibrate-response": {"capture": CAPTURE, "images": ["0.exr", "1.exr", "2.exr"]},
+    "calibrate-stereo": {"capture": CAPTURE, "options": {"board": "9x6", "square_m": 0.025}},
     "calibrate-procam": {"captures": [CAPTURE], "options": {"board": "9x6", "square_m": 0.025}},
     "join": {"maps": JOB, "depth": JOB},
     "patterns": {"options": {"code": "gray", "projector": "64x32"}},
 }
 """What a job must have beside a capture, where it must."""
-TYPED = {"calibrate-procam": {"captures": [CAPTURE], "board": "9x6", "square_m": 0.025},
+TYPED = {"calibrate-stereo": {"capture": CAPTURE, "board": "9x6", "square_m": 0.025},
+         "calibrate-procam": {"captures": [CAPTURE], "board": "9x6", "square_m": 0.025},
          "patterns": {"code": "gray", "projector": "64x32"}}
 
 

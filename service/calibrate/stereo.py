@@ -1,0 +1,147 @@
+"""Calibration of several cameras from a chessboard that they see at the same moments, with the error of each view."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from service.calibrate.results import digits, write_results
+from service.reporting.progress import Progress, Timings
+from service.requests.calibrate import StereoRequest
+from stage.calibration.procam import Lens, find_corners
+from stage.calibration.stereo import SharedView, StereoPose, alike_order, calibrate_lens, calibrate_pose
+from stage.camera import Camera
+from stage.capture import Capture
+from stage.colour import GREY_WEIGHTS, linearise
+from stage.errors import ManifestError
+from stage.manifest import FILE_NAME, Manifest
+from stage.stereo.other_camera import OtherCamera
+
+MOST_ERROR_PX = 0.5
+"""Error of a view, root mean square, from which it is remarked on."""
+
+
+class StereoResult(NamedTuple):
+    """The files that were written, and the errors of the views."""
+
+    manifest_paths: tuple[Path, ...]
+    report_path: Path
+    """Beside the first manifest; each manifest has one."""
+    rows: list[tuple[str, ...]]
+    """Frame, other camera, error of the first camera, of the other, remark."""
+    summary: str
+    """Error and baseline of each other camera."""
+
+
+class BoardFrame(NamedTuple):
+    """The corners that each camera sees in one frame; None where it does not see them all."""
+
+    name: str
+    corners: tuple[np.ndarray | None, ...]  # [corners, 2] of the first camera and of each other one
+
+
+def stereo(request: StereoRequest, progress: Progress | None = None, *, manifest_paths: Sequence[Path] | None = None) -> StereoResult:
+    """Calibrate several cameras, and write them to the manifests.
+
+    Args:
+        request: the capture of the board, and those that are written too.
+        progress: told how far the work is.
+        manifest_paths: the manifest to write for the capture, then for each of `apply_to`; None: their own.
+
+    Raises:
+        StageError: the input is wrong, or too few views show the board; nothing is written.
+    """
+    timings = Timings(progress)
+    timings.stage("open", 1)
+    capture = Capture.open(request.capture)
+    targets = [capture, *(Capture.open(path) for path in request.apply_to)]
+    frames = [frame for frame in capture.manifest.frames if frame.stereo is not None]
+    if not frames:
+        raise ManifestError(f"{capture.folder / FILE_NAME}: frames: none has stereo images: give one frame for each pose of the board, "
+                            "with the images of all cameras")
+    for target in targets:
+        _check_cameras(target, capture)
+    timings.stage("views", len(frames))
+    found: list[BoardFrame] = []
+    for frame in frames:
+        assert frame.stereo is not None  # chosen so
+        names = frame.image, *frame.stereo.images
+        found.append(BoardFrame(frame.image, tuple(_corners(capture, name, request.board) for name in names)))
+        timings.advance(len(found))
+    timings.stage("fit", 1)
+    cameras = capture.manifest.other_cameras
+    named = [(capture.camera.resolution, "the camera"), *((other.resolution, other.name) for other in cameras)]
+    lenses = [calibrate_lens([corners for frame in found if (corners := frame.corners[number]) is not None], request.board,
+                             request.square_m, size, name) for number, (size, name) in enumerate(named)]
+    shared = [[SharedView(frame.name, first, alike_order(first, theirs)) for frame in found
+               if (first := frame.corners[0]) is not None and (theirs := frame.corners[number]) is not None]
+              for number in range(1, len(named))]
+    poses = [calibrate_pose(views, request.board, request.square_m, lenses[0], lens, capture.camera.resolution, other.name)
+             for views, lens, other in zip(shared, lenses[1:], cameras, strict=True)]
+    timings.close()
+    paths = tuple(target.folder / FILE_NAME for target in targets) if manifest_paths is None else tuple(manifest_paths)
+    return _write(request, targets, paths, lenses, poses, shared)
+
+
+def _check_cameras(target: Capture, capture: Capture) -> None:
+    """Refuse a capture of other cameras.
+
+    Raises:
+        ManifestError: names the field.
+    """
+    theirs, ours = ([(other.name, other.resolution) for other in each.manifest.other_cameras] for each in (target, capture))
+    if theirs != ours:
+        raise ManifestError(f"{target.folder / FILE_NAME}: other_cameras: differ in name or resolution from those of {capture.folder}: one "
+                            "calibration is for the same cameras")
+    if target.camera.resolution != capture.camera.resolution:
+        raise ManifestError(f"{target.folder / FILE_NAME}: camera.resolution: differs from that of {capture.folder}: one calibration is "
+                            "for the same cameras")
+
+
+def _corners(capture: Capture, name: str, board: tuple[int, int]) -> np.ndarray | None:
+    """Return the corners of the board in an image, None where they are not all found."""
+    linear = linearise(capture.recorded_whole(name), capture.manifest.color_space)
+    return find_corners(linear @ np.array(GREY_WEIGHTS, np.float32), board)
+
+
+def _write(request: StereoRequest, targets: list[Capture], paths: tuple[Path, ...], lenses: list[Lens], poses: list[StereoPose],
+           shared: list[list[SharedView]]) -> StereoResult:
+    cameras = targets[0].manifest.other_cameras
+    rows: list[tuple[str, ...]] = []
+    entries: list[dict[str, Any]] = []
+    for other, lens, pose, views in zip(cameras, lenses[1:], poses, shared, strict=True):
+        errors = list(zip(pose.first_error_px, pose.other_error_px, strict=True))
+        rows += [(view.name, other.name, f"{first:.3f}", f"{second:.3f}", "stands out" if max(first, second) > MOST_ERROR_PX else "")
+                 for view, (first, second) in zip(views, errors, strict=True)]
+        entries.append({"name": other.name, **_entry(lens), "rms_px": float(f"{pose.rms_px:.4g}"), "baseline_m": _baseline(pose),
+                        "views": [{"frame": view.name, "camera_px": float(f"{first:.4g}"), "other_px": float(f"{second:.4g}")}
+                                  for view, (first, second) in zip(views, errors, strict=True)]})
+    section = {"capture": str(request.capture), "camera": _entry(lenses[0]), "other_cameras": entries}
+    reports = [write_results("stereo", request, _updated(target.manifest, lenses, poses), path, section)
+               for target, path in zip(targets, paths, strict=True)]
+    summary = ", ".join(f"{other.name}: {pose.rms_px:.3f} px RMS, baseline {_baseline(pose):.4f} m"
+                        for other, pose in zip(cameras, poses, strict=True))
+    return StereoResult(paths, reports[0], rows, summary)
+
+
+def _baseline(pose: StereoPose) -> float:
+    return float(f"{np.linalg.norm(pose.camera_from_other[:3, 3]):.6g}")
+
+
+def _updated(manifest: Manifest, lenses: list[Lens], poses: list[StereoPose]) -> Manifest:
+    """Return the manifest with all cameras; the camera's place in the world and the height of its surface stay."""
+    old, first = manifest.camera, lenses[0]
+    surface = old.surface_z_m if old.projection == "perspective" else None
+    camera = Camera(projection="perspective", resolution=old.resolution, focal_px=first.focal, principal_px=first.principal,
+                    distortion=first.distortion, surface_z_m=surface, world_from_camera=old.world_from_camera)
+    others = tuple(OtherCamera.model_validate({
+        "name": other.name, "resolution": other.resolution, "focal_px": lens.focal, "principal_px": lens.principal,
+        "distortion": lens.distortion, "camera_from_other": pose.camera_from_other.tolist()})
+        for other, lens, pose in zip(manifest.other_cameras, lenses[1:], poses, strict=True))
+    return manifest.model_copy(update={"camera": camera, "other_cameras": others})
+
+
+def _entry(lens: Lens) -> dict[str, Any]:
+    return {"focal_px": digits(lens.focal), "principal_px": digits(lens.principal), "k": digits(lens.distortion.k),
+            "p": digits(lens.distortion.p), "rms_alone_px": float(f"{lens.rms_px:.4g}")}
