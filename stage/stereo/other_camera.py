@@ -17,7 +17,7 @@ class OtherCamera(Strict):
     resolution: Resolution
     """The size of every image of this camera."""
     focal_px: tuple[Positive, Positive] | None = None
-    """The focal lengths along u and v; None, and `camera_from_other` too, before `relit calibrate stereo` has measured them."""
+    """The focal lengths along u and v. None: not measured yet, and `camera_from_other` neither; `relit calibrate stereo` measures both."""
     principal_px: tuple[float, float] | None = None
     """The principal point, as of the camera; None: the centre of the image."""
     distortion: Distortion | None = None
