@@ -216,6 +216,10 @@ def read_mask_values(path: str | Path, resolution: tuple[int, int]) -> np.ndarra
     return np.clip(np.nan_to_num(values, nan=0.0), 0, 1)
 
 
+PNG_ROWS = 256
+"""Rows of a PNG that are handed to its writer at one time: they bound its memory."""
+
+
 def write_png(path: Path, codes: np.ndarray, *, srgb: bool) -> None:
     """Write a PNG file; `replacing` makes it appear whole or not at all.
 
@@ -234,7 +238,11 @@ def write_png(path: Path, codes: np.ndarray, *, srgb: bool) -> None:
     output = oiio.ImageOutput.create(str(path))
     if output is None:
         raise OSError(f"{path.name}: {oiio.geterror()}")
-    if not (output.open(str(path), spec) and output.write_image(pixels) and output.close()):
+    written = output.open(str(path), spec)
+    for first in range(0, rows, PNG_ROWS):  # the writer copies what it is given
+        last = min(first + PNG_ROWS, rows)
+        written = written and output.write_scanlines(first, last, 0, pixels[first:last])
+    if not (written and output.close()):
         raise OSError(f"{path.name}: {output.geterror() or 'the PNG writer gave up'}")
     try:
         with inputs.opened(path) as source:

@@ -97,14 +97,17 @@ def write_textures(maps: SurfaceMaps, mesh: SurfaceMesh, folder: Path, *, look: 
         known = maps.mask & np.isfinite(values if values.ndim == 2 else values.sum(axis=-1))
         if look is not None and name in ("base_color", "metallic"):
             known &= look.known
-        if name == "normal":
-            values, known = tangent_space(values, known, mesh)
         space = DATA_SPACE if name not in COLOURS else linear_space(maps.color_space) if storage is TextureFormat.EXR else DISPLAY_SPACE
         if storage is TextureFormat.EXR:
+            if name == "normal":
+                values, known = tangent_space(values, known, mesh)
             return _write_exr(folder / f"{name}.exr", values, known, space, reach)
-        dtype = _PNG_TYPES[storage] if name in COLOURS else np.uint16
-        codes, clipped = encode(values, known, maps.color_space if name in COLOURS else None, dtype)
-        write_png(folder / f"{name}.png", bleed(codes, known, reach=reach), srgb=name in COLOURS)
+        if name == "normal":
+            codes, known, clipped = encode_normals(values, known, mesh, np.uint16)
+        else:
+            colour = name in COLOURS
+            codes, clipped = encode(values, known, maps.color_space if colour else None, _PNG_TYPES[storage] if colour else np.uint16)
+        write_png(folder / f"{name}.png", bleed(codes, known, reach=reach, in_place=True), srgb=name in COLOURS)
         return Texture(f"{name}.png", space, clipped)
 
     return side_by_side({name: partial(write, name, source) for name in NAMES if (source := sources.get(name)) is not None}, progress)
@@ -191,31 +194,51 @@ def to_display(values: np.ndarray, color_space: str) -> np.ndarray:
 
 def tangent_space(normal: np.ndarray, known: np.ndarray, mesh: SurfaceMesh) -> tuple[np.ndarray, np.ndarray]:
     """Return normals [rows, cols, 3] as 0…1 in the tangent space of the mesh, and where they are known."""
-    frames = TangentFrames(mesh, (known.shape[0], known.shape[1]))
     encoded, covered = np.empty(normal.shape, dtype=np.float32), np.empty_like(known)
+    for rows, values, there in _tangent_bands(normal, known, mesh):
+        encoded[rows], covered[rows] = values, there
+    return encoded, covered
+
+
+def encode_normals(normal: np.ndarray, known: np.ndarray, mesh: SurfaceMesh,
+                   dtype: type[np.unsignedinteger[Any]]) -> tuple[np.ndarray, np.ndarray, int]:
+    """Return the codes [rows, cols, 3] of normals in the tangent space of the mesh, 0 where they are not known; where they are known; and
+    the count of clipped pixels."""
+    codes, covered, clipped = np.empty(normal.shape, dtype=dtype), np.empty_like(known), 0
+    for rows, values, there in _tangent_bands(normal, known, mesh):
+        codes[rows], more = quantise(np.where(there[..., None], values, 0), there, dtype)
+        covered[rows], clipped = there, clipped + more
+    return codes, covered, clipped
+
+
+def _tangent_bands(normal: np.ndarray, known: np.ndarray, mesh: SurfaceMesh) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
+    """Yield rows, their normals as 0…1 in the tangent space of the mesh, and where these are known."""
+    frames = TangentFrames(mesh, (known.shape[0], known.shape[1]))
     for start in range(0, len(known), BAND_ROWS):
         rows = slice(start, min(start + BAND_ROWS, len(known)))
         frame = frames.of_rows(rows.start, rows.stop)
         vectors = np.where(known[rows][..., None], normal[rows], 0)
         length = np.linalg.norm(vectors, axis=-1)
-        covered[rows] = known[rows] & frame.covered & (length > 0)
-        unit = np.where(covered[rows][..., None], vectors, 0) / np.where(covered[rows], length, 1)[..., None]
-        encoded[rows] = frame.express(unit) / 2 + 0.5
-    return encoded, covered
+        covered = known[rows] & frame.covered & (length > 0)
+        unit = np.where(covered[..., None], vectors, 0) / np.where(covered, length, 1)[..., None]
+        yield rows, frame.express(unit) / 2 + 0.5, covered
 
 
-def bleed(values: np.ndarray, known: np.ndarray, *, reach: int) -> np.ndarray:
+def bleed(values: np.ndarray, known: np.ndarray, *, reach: int, in_place: bool = False) -> np.ndarray:
     """Fill unknown texels from their known neighbours, ring by ring, so that filtering a texture does not darken its border.
 
     Args:
         values: [rows, cols] or [rows, cols, channels], integers or floats.
         known: [rows, cols] bool; known texels are returned as they are.
         reach: number of rings; texels beyond get the mean of the known ones, for the coarse mip levels.
+        in_place: whether `values` are changed.
 
     Returns:
-        A new array like `values`, of the same type; zero throughout when nothing is known.
+        `values` or a new array like it, of the same type; zero throughout when nothing is known.
     """
-    filled = (values[..., None] if values.ndim == 2 else values).copy()
+    filled = values[..., None] if values.ndim == 2 else values
+    if not in_place:
+        filled = filled.copy()
     rows, cols, channels = filled.shape
     done, inside = np.pad(known, 1), np.pad(np.ones_like(known), 1)
     ring = np.argwhere(_dilated(done) & inside & ~done) - 1

@@ -14,7 +14,7 @@ import numpy as np
 from service.asset.errors import AssetError
 from service.asset.mesh import SurfaceMesh
 from service.asset.metallic import MetallicLook
-from service.asset.textures import BLEED_TEXELS, DATA_SPACE, DISPLAY_SPACE, Texture, bleed, encode, side_by_side, tangent_space
+from service.asset.textures import BLEED_TEXELS, DATA_SPACE, DISPLAY_SPACE, Texture, bleed, encode, encode_normals, side_by_side
 from service.requests.export import TextureFormat
 from stage.images import write_png
 from stage.maps import SurfaceMaps
@@ -56,7 +56,7 @@ def write_textures(maps: SurfaceMaps, mesh: SurfaceMesh, folder: Path, *, look: 
     data: type[np.unsignedinteger[Any]] = np.uint8 if storage is TextureFormat.PNG8 else np.uint16
 
     def write(name: str, codes: np.ndarray, known: np.ndarray, clipped: int) -> Texture:
-        write_png(folder / f"{name}.png", bleed(codes, known, reach=reach), srgb=name == BASE_COLOR)
+        write_png(folder / f"{name}.png", bleed(codes, known, reach=reach, in_place=True), srgb=name == BASE_COLOR)
         return Texture(f"{name}.png", DISPLAY_SPACE if name == BASE_COLOR else DATA_SPACE, clipped)
 
     def write_base_color(look: MetallicLook) -> Texture:
@@ -71,8 +71,7 @@ def write_textures(maps: SurfaceMaps, mesh: SurfaceMesh, folder: Path, *, look: 
         return write(METALLIC_ROUGHNESS, np.stack([red, green, blue], axis=-1), known, clipped)
 
     def write_normal(normal: np.ndarray) -> Texture:
-        encoded, known = tangent_space(normal, maps.mask & np.isfinite(normal.sum(axis=-1)), mesh)
-        codes, clipped = encode(encoded, known, None, data)
+        codes, known, clipped = encode_normals(normal, maps.mask & np.isfinite(normal.sum(axis=-1)), mesh, data)
         return write(NORMAL, codes, known, clipped)
 
     writers: dict[str, Callable[[], Texture]] = {}
