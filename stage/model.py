@@ -11,7 +11,7 @@ from stage.text import name_fault
 class Strict(BaseModel):
     """A frozen model in which an unknown key and a number that is not finite are errors."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
 
 
 def _unit(vector: tuple[float, float, float]) -> tuple[float, float, float]:

@@ -1,5 +1,6 @@
 """The `relit` program: its commands, and one place that turns errors into a sentence and an exit code."""
 
+import importlib
 import io
 import os
 import signal
@@ -9,37 +10,46 @@ from typing import Annotated
 import typer
 from typer.exceptions import TyperException
 
-from service.cli import (
-    backup,
-    boards,
-    calibrate,
-    captures,
-    demo,
-    depth,
-    doctor,
-    farm,
-    imports,
-    inspect,
-    jobs,
-    keys,
-    light,
-    scans,
-    server,
-    solve,
-    submit,
-    view,
-)
-
-app = typer.Typer(name="relit", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
-                  help="Active-illumination captures to normals, materials, depth, USD assets and relit frames.")
-for module in (demo, imports, captures, calibrate, solve, inspect, depth, boards, scans, light, view, doctor, server, submit, jobs, keys,
-               backup, farm):
-    module.register(app)
+COMMANDS: dict[str, tuple[str, ...]] = {
+    "demo": ("demo", "bench"),
+    "imports": ("import",),
+    "captures": ("info",),
+    "calibrate": ("calibrate",),
+    "solve": ("solve", "export", "basis", "join"),
+    "inspect": ("inspect",),
+    "depth": ("depth", "separate", "scan", "simulate", "patterns"),
+    "boards": ("inspect-board", "gauge-board"),
+    "scans": ("register", "fuse"),
+    "light": ("relight", "shade"),
+    "view": ("view",),
+    "doctor": ("doctor",),
+    "server": ("serve", "worker"),
+    "submit": ("submit",),
+    "jobs": ("jobs",),
+    "keys": ("keys", "audit"),
+    "backup": ("backup", "restore"),
+    "farm": ("farm",),
+}
+"""The modules of service.cli in the order of the help, and the commands that each registers. A command that is missing here is found by
+loading all modules."""
 
 BAD_INPUT, INTERRUPTED = 2, 130
+BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
+"""The variables by which NumPy's linear algebra is told its number of threads. Without them it has one: kernels divide the large work among
+the cores, and matrices of some hundred rows cost more to divide than to solve."""
 
 
-@app.callback(invoke_without_command=True)
+def program(wanted: str | None = None) -> typer.Typer:
+    """Return the program; where `wanted` is a command, only those of its module: to import the others takes as long as a short run."""
+    app = typer.Typer(name="relit", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
+                      help="Active-illumination captures to normals, materials, depth, USD assets and relit frames.")
+    app.callback(invoke_without_command=True)(_root)
+    beside = [module for module, names in COMMANDS.items() if wanted in names]
+    for module in beside or COMMANDS:
+        importlib.import_module(f"service.cli.{module}").register(app)
+    return app
+
+
 def _root(version: Annotated[bool, typer.Option("--version", help="Print the version and exit.", is_eager=True)] = False) -> None:
     if version:
         from service import __version__
@@ -52,9 +62,11 @@ def main() -> None:
     """Run the program; exit 2 with one sentence on bad input, 130 when interrupted."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # paths may hold bytes that are not text
+    if not any(name in os.environ for name in BLAS_THREADS):  # numpy is not imported yet
+        os.environ[BLAS_THREADS[0]] = "1"
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # whoever ends us gets the same tidy end as one who types Ctrl-C
     try:
-        code = app(standalone_mode=False)  # so that wrong options, too, are one sentence
+        code = program(next(iter(sys.argv[1:]), None))(standalone_mode=False)  # so that wrong options, too, are one sentence
         if code == INTERRUPTED:  # what typer makes of KeyboardInterrupt
             print("relit: interrupted; results that are there are whole, run again to finish", file=sys.stderr)
         sys.exit(code)

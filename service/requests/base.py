@@ -109,7 +109,7 @@ class Choice(StrEnum):
 class Options(BaseModel):
     """Base of every model; unknown fields are refused."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True, defer_build=True)
 
 
 class DeviceRequest(Options):

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from kernels.photometric.light_factors import untold
 from kernels.photometric.samples import evenly
+from kernels.photometric.untold_factors import untold
 from service.solve.solution import SolveInput
 from stage.calibration.semi_calibrated import fit_grey_intensities
 from stage.consistency.explanations import grey_readings

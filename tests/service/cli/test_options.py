@@ -8,7 +8,7 @@ import pytest
 from pydantic import BaseModel
 from typer.main import get_command
 
-from service.cli.main import app
+from service.cli.main import program
 from service.requests import (
     basis,
     calibrate,
@@ -83,6 +83,9 @@ KINDS = {"solve": jobs.SolveJob, "depth": jobs.DepthJob, "relight": jobs.Relight
          "view": jobs.ViewJob}
 
 
+PROGRAM = program()
+
+
 class Shown(NamedTuple):
     """What a command says about an option."""
 
@@ -92,7 +95,7 @@ class Shown(NamedTuple):
 
 
 def parameters(name: str) -> dict[str, Any]:
-    command: Any = get_command(app)
+    command: Any = get_command(PROGRAM)
     for word in name.split():
         command = command.commands[word]
     return {parameter.name: parameter for parameter in command.params}
@@ -194,7 +197,7 @@ def commands(group: Any, words: tuple[str, ...] = ()) -> Any:
         yield from commands(command, (*words, name)) if hasattr(command, "commands") else [((*words, name), command)]
 
 
-@pytest.mark.parametrize("words", [words for words, _ in commands(get_command(app))], ids=" ".join)
+@pytest.mark.parametrize("words", [words for words, _ in commands(get_command(PROGRAM))], ids=" ".join)
 def test_a_help_shows_every_word(relit, monkeypatch, words):
     """Brackets too, which the markup of the help would take for a style."""
     monkeypatch.setenv("COLUMNS", "4000")  # so that no cell is wrapped

@@ -7,13 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.main import get_command
 
 import service
+from service.cli.main import BLAS_THREADS, COMMANDS, program
 from stage.capture import Capture
 from tests.scenes.captures import edit_manifest, make_scene, write_capture, write_exr, write_image
 
-COMMANDS = ["demo", "import", "info", "calibrate", "solve", "depth", "separate", "inspect-board", "join", "register", "fuse", "relight",
-            "basis", "view", "export", "inspect", "doctor", "bench", "serve", "worker", "keys"]
+SHOWN = ["demo", "import", "info", "calibrate", "solve", "depth", "separate", "inspect-board", "join", "register", "fuse", "relight",
+         "basis", "view", "export", "inspect", "doctor", "bench", "serve", "worker", "keys"]
 ROOT = Path(service.__file__).parents[1]
 
 
@@ -24,11 +26,11 @@ def test_version(relit):
 def test_help_names_every_command(relit):
     outcome = relit("--help")
     assert outcome.code == 0
-    assert all(f" {name} " in outcome.out for name in COMMANDS)
+    assert all(f" {name} " in outcome.out for name in SHOWN)
     assert relit().code == 2  # nothing asked: the same help, and not a success
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", SHOWN)
 def test_help_of_each_command(relit, command):
     outcome = relit(command, "--help")
     assert (outcome.code, outcome.err) == (0, "")
@@ -188,3 +190,19 @@ def test_a_reader_that_goes_away_is_no_traceback():
                           cwd=ROOT, timeout=60)
     os.close(writer)
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("module", COMMANDS)
+def test_a_command_is_in_the_module_that_is_loaded_for_it(module):
+    """A command that the table does not name is found too, by loading all modules."""
+    for name in COMMANDS[module]:
+        assert name in get_command(program(name)).commands
+
+
+@pytest.mark.parametrize(("given", "expected"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "3"}, "3"), ({"OMP_NUM_THREADS": "2"}, None)])
+def test_linear_algebra_has_one_thread_unless_the_user_says_otherwise(relit, monkeypatch, given, expected):
+    for name in BLAS_THREADS:
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(os, "environ", {**os.environ, **given})
+    relit("--version")
+    assert os.environ.get("OPENBLAS_NUM_THREADS") == expected
