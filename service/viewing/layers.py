@@ -29,6 +29,7 @@ MEANINGS = {
     Status.FLYING: "A mixture of two surfaces, taken out by a filter that was asked for.",
     Status.MULTIPATH: "Frequencies or codes disagree: light came over several ways.",
     Status.UNSURE: "Estimated, but less surely than was asked for.",
+    Status.OCCLUDED: "One camera sees this place and the other does not, so that there is nothing to triangulate.",
 }
 """What each status means to a person who looks at a pixel."""
 REGIMES = {1: "Lambertian", 2: "glossy", 3: "mirror", 4: "mixture of diffuse and specular"}

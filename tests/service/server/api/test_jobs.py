@@ -239,7 +239,7 @@ def test_bodies_are_json_and_no_larger_than_json_has_to_be(client):
 def test_a_job_that_fails_says_why_and_is_tried_again(server, client, dome):
     job = submit(client, kind="depth", capture=dome)  # has lights, and no patterns
     failed = finish(server, client, job, "failed")
-    assert "none has a pattern with a code, a laser or tof" in failed["error"] and "\n" not in failed["error"]
+    assert "none has a pattern with a code, a laser, tof or stereo" in failed["error"] and "\n" not in failed["error"]
     refused(client.post(f"/v1/jobs/{job['id']}/resume"), 409, "is failed, not cancelled")
     refused(client.post(f"/v1/jobs/{job['id']}/cancel"), 409, "is failed: it has ended")
     again = client.post(f"/v1/jobs/{job['id']}/retry")
