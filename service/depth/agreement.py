@@ -37,6 +37,8 @@ ADVICE = {
     Status.UNDECIDED: "noise, or stripes finer than the camera resolves: use more light, or wider stripes",
     Status.OUT_OF_RANGE: "the code and the geometry contradict each other: check the frames' patterns, projector.camera_from_projector and "
                          "whether the projected image is mirrored",
+    Status.OCCLUDED: "the second camera does not see what this one sees: move the cameras closer together, and check that both captures "
+                     "are of the same patterns",
     Status.ILL_POSED: "the projected coordinate hardly changes with depth: project columns from beside the camera, rows from above it",
     Status.UNSURE: "neighbours contradict each other, as in mirrors and where frames are declared wrongly: check the frames' patterns",
 }

@@ -21,6 +21,7 @@ from service.depth.points import point_cloud
 from service.depth.solution import DepthSolution
 from service.depth.stereo import solve_stereo
 from service.depth.tof import solve_tof
+from service.depth.two_cameras import solve_two_cameras
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, metadata, report
@@ -100,7 +101,10 @@ def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResul
     if request.normals and capture.camera.projection != "perspective":
         raise RequestError("--normals: needs a perspective camera, that of the capture is orthographic")
     mask = capture.mask()
-    solution = KINDS[using].solve(capture, mask, request, device, timings)
+    if request.beside is not None and using is not Ranging.PATTERN:
+        raise RequestError(f"--beside {request.beside}: is for projected patterns, and {using} frames are measured")
+    solution = (KINDS[using].solve(capture, mask, request, device, timings) if request.beside is None else
+                solve_two_cameras(capture, request.beside, mask, request, device, timings))
     least = solution.least_confidence if request.least_confidence is None else request.least_confidence
     content = content_of(capture)
     calibration = request.tof.calibration

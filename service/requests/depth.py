@@ -97,6 +97,9 @@ class DepthRequest(DepthOptions, Request):
     """Folder with a capture.json; or a sequence: a folder of such folders, one a time step, with a sequence.json or in order of name."""
     out: Annotated[Path, Role.OUTPUT]
     """Folder for depth.exr, points.ply and report.json."""
+    beside: Annotated[Path | None, Role.INPUT, Spelling(metavar="CAPTURE")] = None
+    """Capture of a second camera under the same patterns of the same projector, which need not be calibrated: columns and rows tell which
+    of its pixels sees the same place, and both cameras are triangulated by their `world_from_camera`."""
     tof: TofOptions = TofOptions()
     """How time of flight is solved, with the camera's calibration; `near_m` and `far_m` are ranges along the ray there."""
     temporal: Annotated[bool, Role.RUN] = True

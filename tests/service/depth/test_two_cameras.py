@@ -1,0 +1,109 @@
+"""Two cameras under one projector that nobody has calibrated: depth by the cameras alone, where both see the same place of it."""
+
+import json
+
+import numpy as np
+import pytest
+
+from stage.depth_maps import DepthMaps
+from tests.reference import projector as reference
+from tests.scenes.captures import edit_manifest
+from tests.scenes.depth import (
+    CAMERA,
+    CENTRE,
+    NORMAL,
+    PLANE,
+    POSE,
+    PROJECTOR,
+    RADIUS,
+    Scene,
+    gray_patterns,
+    make_scene,
+    phase_patterns,
+    write_patterns,
+)
+
+SECOND = reference.Device(100, 76, 150.0, (-0.1, 0.02, 0.0), (0.0, 0.001))
+PLACE = reference.look_at((-0.28, 0.05, 0.03), (0.02, 0.0, -1.4))  # of the second camera in the frame of the first
+PATTERNS = [{"code": "white"}, {"code": "black"}, *gray_patterns("column", stripe=4, inverse=False), *phase_patterns("column", 8.0),
+            *gray_patterns("row", stripe=4, inverse=False), *phase_patterns("row", 8.0)]
+
+
+def seen_from(camera, pose):
+    """The sphere before the plane, seen by a camera elsewhere; points in the frame of the first."""
+    rays = reference.pixel_rays(camera) @ pose[:3, :3].T
+    at = pose[:3, 3]
+    depth = np.fmin(reference.plane_depth(rays, np.array(PLANE) - at, NORMAL), reference.sphere_depth(rays, np.array(CENTRE) - at, RADIUS))
+    points = rays * depth[..., None] + at
+    to = POSE[:3, 3] - points
+    clear = np.isnan(reference.sphere_depth(-to, np.array(CENTRE) - POSE[:3, 3], RADIUS * 0.999))
+    on_sphere = np.linalg.norm(points - CENTRE, axis=-1) < RADIUS * 1.001
+    facing = (to * (points - CENTRE)).sum(axis=-1) > 0
+    shaded = np.where(on_sphere, ~facing, ~clear)
+    return Scene(depth, points, reference.seen_by(PROJECTOR, POSE, points), np.full((*depth.shape, 3), 0.6), shaded)
+
+
+def two_captures(folder, noise=0.0):
+    first, second = make_scene(), seen_from(SECOND, PLACE)
+    size = {"resolution": [PROJECTOR.width, PROJECTOR.height]}
+    for name, scene, camera, pose in (("first", first, CAMERA, None), ("second", second, SECOND, PLACE)):
+        write_patterns(folder / name, scene, PATTERNS, noise=noise, camera=camera)
+        described = json.loads((folder / name / "capture.json").read_text())["camera"]
+        edit_manifest(folder / name, projector=size, camera=described | ({} if pose is None else {"world_from_camera": pose.tolist()}))
+    return first
+
+
+def measured(relit, folder, *options):
+    outcome = relit("depth", folder / "first", "--beside", folder / "second", "--out", folder / "out", "--device", "cpu", *options)
+    assert (outcome.code, outcome.err) == (0, "")
+    return DepthMaps.read(folder / "out" / "depth.exr"), json.loads((folder / "out" / "report.json").read_text())
+
+
+@pytest.mark.parametrize(("noise", "most"), [(0.0, 1e-3), (0.004, 4e-3)])
+def test_depth_is_that_of_the_cameras(relit, tmp_path, noise, most):
+    """The projector of the manifests has a size and nothing else. Of 1.4 m, planes through 5 × 5 pixels of a sphere are off by
+    1 mm, at its rim by a centimetre."""
+    first = two_captures(tmp_path, noise)
+    maps, report = measured(relit, tmp_path)
+    error = np.abs(maps.depth - first.depth)[maps.mask]
+    assert np.median(error) < most and np.quantile(error, 0.99) < 10 * most, (np.median(error), np.quantile(error, 0.99))
+    places = reference.seen_by(SECOND, PLACE, first.points)
+    inside = ((places > 3) & (places < np.array([SECOND.width, SECOND.height]) - 3)).all(axis=-1) & ~first.shaded
+    lit = ((first.uv > 1) & (first.uv < np.array([PROJECTOR.width, PROJECTOR.height]) - 1)).all(axis=-1)
+    assert (maps.mask & inside & lit).sum() > 0.8 * (inside & lit).sum()
+    if noise:
+        ratio = (maps.depth - first.depth)[maps.mask] / maps.sigma[maps.mask]
+        assert 0.4 < np.sqrt(np.median(ratio**2)) / 0.6745 < 1.5
+    assert report["found"]["beside"]["residual_px"]["median"] < 0.3
+    assert "two cameras" in report["method"] and "decoded_only" not in report["found"]
+
+
+def test_what_the_second_camera_does_not_see_has_no_depth(relit, tmp_path):
+    """The sphere hides a part of the plane from the second camera; no other part is taken for it."""
+    first = two_captures(tmp_path)
+    maps, _ = measured(relit, tmp_path)
+    way = first.points - PLACE[:3, 3]
+    hidden = reference.sphere_depth(way, np.array(CENTRE) - PLACE[:3, 3], RADIUS * 1.02) < 0.98
+    assert hidden.sum() > 40
+    wrong = maps.mask & hidden & (np.abs(maps.depth - first.depth) > 0.02)
+    assert wrong.sum() <= 0.02 * hidden.sum()
+
+
+def test_what_is_missing_is_named(relit, tmp_path):
+    two_captures(tmp_path)
+    command = ["depth", tmp_path / "first", "--beside", tmp_path / "second", "--out", tmp_path / "out"]
+    second = tmp_path / "second" / "capture.json"
+    good = second.read_text()
+    camera = json.loads(good)["camera"]
+    edit_manifest(tmp_path / "second", camera={key: value for key, value in camera.items() if key != "world_from_camera"})
+    outcome = relit(*command)
+    assert outcome.code == 2 and "second/capture.json: camera.world_from_camera: is missing: two cameras are triangulated" in outcome.err
+    edit_manifest(tmp_path / "second", camera={**camera, "world_from_camera": np.eye(4).tolist()})
+    outcome = relit(*command)
+    assert outcome.code == 2 and "camera.world_from_camera: the second camera stands 0 m from the camera" in outcome.err
+    second.write_text(good)
+    kept = [frame for frame in json.loads(good)["frames"] if frame["pattern"].get("axis") != "row"]
+    edit_manifest(tmp_path / "second", frames=kept)
+    outcome = relit(*command)
+    assert outcome.code == 2 and "second has a code of one axis alone: two cameras need columns and rows" in outcome.err
+    assert not (tmp_path / "out").exists()
