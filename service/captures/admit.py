@@ -151,9 +151,11 @@ def _check_manifest_files(folder: Path) -> None:
 
 def _check_places(step: Path, manifest: Manifest, folder: Path, max_pixels: int) -> None:
     """Check that every file that the manifest names lies in the folder, links followed, and is not too large."""
-    width, height = manifest.camera.resolution
-    if width * height > max_pixels:
-        raise ImageError(f"{step / FILE_NAME}: camera.resolution: {width}x{height} is more than {max_pixels} pixels")
+    named = [("camera", manifest.camera.resolution), *((f"other_cameras[{index}]", other.resolution)
+                                                       for index, other in enumerate(manifest.other_cameras))]
+    for camera, (width, height) in named:
+        if width * height > max_pixels:
+            raise ImageError(f"{step / FILE_NAME}: {camera}.resolution: {width}x{height} is more than {max_pixels} pixels")
     capture = Capture(step, manifest)
     for field, name in capture.files():
         path = capture.file(name)

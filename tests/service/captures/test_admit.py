@@ -7,7 +7,7 @@ import pytest
 
 from service.captures.admit import admit_capture, admit_environment, environment_file, recheck_capture
 from stage.errors import ImageError, ManifestError
-from tests.scenes.captures import edit_manifest, make_scene, write_capture, write_exr, write_manifest
+from tests.scenes.captures import edit_manifest, make_scene, write_capture, write_exr, write_image, write_manifest
 from tests.service.recording import Recording
 
 SCENE = make_scene(size=16, lights=4)
@@ -103,3 +103,17 @@ def test_an_environment_is_one_lat_long_image(tmp_path):
     path.rename(folder / "sky.png")
     with pytest.raises(ImageError, match=r"\.exr or \.hdr"):
         admit_environment(folder, max_pixels=1000)
+
+
+def test_the_images_of_other_cameras_count_too(tmp_path):
+    pixels = np.zeros((4, 6), np.uint16)
+    pose = [[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    write_image(tmp_path / "left.png", pixels)
+    write_image(tmp_path / "right.png", np.zeros((8, 6), np.uint16))
+    write_manifest(tmp_path, {
+        "schema": "relit.capture/1", "name": "pair", "camera": {"projection": "perspective", "resolution": [6, 4], "focal_px": [9, 9]},
+        "other_cameras": [{"name": "right", "resolution": [6, 8], "focal_px": [9, 9], "camera_from_other": pose}],
+        "frames": [{"image": "left.png", "stereo": {"images": ["right.png"]}}]})
+    admit_capture(tmp_path, max_pixels=48)
+    with pytest.raises(ImageError, match=r"other_cameras\[0\].resolution: 6x8 is more than 47 pixels"):
+        admit_capture(tmp_path, max_pixels=47)
