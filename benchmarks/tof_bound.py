@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.tof_accuracy import COLS, ROWS, SEED, solved_maps
+from stage.spread import MAD_TO_SIGMA
 from stage.tof.bound import range_bound_m
 from stage.tof.simulate import HistogramCamera, TofScene
 from tests.reference import tof as scenes
@@ -15,7 +16,6 @@ FAR_M = (11.3, 11.7)
 GOALS_MM = {1.0: 20, 0.2: 46}
 """The goals for the median error in mm, by part of the full light."""
 FIFTHS = 5
-MAD_TO_SIGMA = 1.4826
 
 
 class Light(NamedTuple):

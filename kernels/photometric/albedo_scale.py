@@ -14,6 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from kernels.spread import MAD_TO_SIGMA
+
 LEAST_COSINE_BEHIND = 0.1
 """A light this far behind the tangent plane (cosine below its negative) does not reach a pixel, whose normal may be wrong by 5°."""
 LEAST_COSINE_CAST = 0.2
@@ -88,7 +90,7 @@ def fit_albedo_scale(ratio: np.ndarray, arriving: np.ndarray, cosine: np.ndarray
             return None
         residual = y - stray - scale * x
         dim = x <= np.median(x)
-        floor = NOISE_FLOOR + 1.4826 * float(np.median(np.abs(residual[dim])))
+        floor = NOISE_FLOOR + MAD_TO_SIGMA * float(np.median(np.abs(residual[dim])))
         variance = floor**2 + (RELATIVE_NOISE * scale * x) ** 2
         weight = 1 / (variance * (1 + residual**2 / (CUTOFF**2 * variance)))
         design = np.stack([x, np.ones_like(x)], axis=1)

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from kernels.spread import MAD_TO_SIGMA
+
 FIT_ROUNDS, GROSS = 5, 4.0
 """Rounds in which lights off by more than this many standard deviations are left out of the fit of the part that no object can tell: one
 wrong light must not bend all others."""
@@ -38,6 +40,6 @@ def _robust_fit(design: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, flo
     for _ in range(FIT_ROUNDS):
         found = np.linalg.lstsq(design[used], values[used], rcond=None)[0]
         residual = values - design @ found
-        spread = 1.4826 * float(np.median(np.abs(residual))) + 1e-9
+        spread = MAD_TO_SIGMA * float(np.median(np.abs(residual))) + 1e-9
         used = np.abs(residual) <= GROSS * spread
     return found, spread

@@ -19,6 +19,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.spread import MAD_TO_SIGMA
 from kernels.surface.conjugate import Convergence
 from kernels.surface.fragments import CELLS_AT_ONCE, Fragments, cut
 from kernels.surface.grid import EdgeWeights, Grid, Walk, end_cell, first_cell, run
@@ -36,8 +37,6 @@ NOISE_LOOPS = 2.0
 """Least loop sum that breaks edges, in standard deviations of the loops' noise."""
 SAMPLES = 1 << 18
 """Number of loops from which the noise is estimated."""
-MAD_TO_SIGMA = 1.4826
-"""Ratio of the standard deviation of Gaussian values to the median of their magnitudes."""
 
 _TRUST = wp.constant(wp.float32(LEAST_TRUST))
 

@@ -8,6 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from kernels.spread import MAD_TO_SIGMA
+
 POISSON = (0.7, 1.4)
 """Dispersions that are taken for counts of photons: the estimate is within a fifth of the truth where it is given at all."""
 BLOCK_COUNTS = 100.0
@@ -27,8 +29,6 @@ NEAR_PAIRS, NEAR_BINS = 2, 2
 """Pairs and bins to each side of a pair and a bin that tell whether there is a return."""
 NEAR_PART, NEAR_SIGMAS = 0.03, 3.0
 """Part of the height of their highest bins, and standard deviations of all their bins, above the lower of which they do."""
-NORMAL_MAD = 1.4826
-"""Standard deviation of a normal distribution over the median distance from its median."""
 STEP_VALUES = 50
 """Fewest non-zero counts of which a common step counts as evidence."""
 STEP_TOLERANCE = 1e-3
@@ -108,7 +108,7 @@ def _is_background(total: np.ndarray) -> np.ndarray:
     """Return where the pairs on both sides of a pair have no return, [pair, bin]; the pair's own noise has no part in it."""
     summed = _box(_box(total, NEAR_PAIRS, 0), NEAR_BINS, 1) - _box(total, NEAR_BINS, 1)
     level = np.median(summed, axis=1, keepdims=True)
-    noise = NEAR_SIGMAS * NORMAL_MAD * np.median(np.abs(summed - level), axis=1, keepdims=True)
+    noise = NEAR_SIGMAS * MAD_TO_SIGMA * np.median(np.abs(summed - level), axis=1, keepdims=True)
     height = NEAR_PART * (summed.max(axis=1, keepdims=True) - level)
     return np.asarray(summed <= level + np.where(noise > 0, np.minimum(noise, height), height))
 

@@ -11,6 +11,7 @@ from service.depth.stripe_curves import PEAKS, Chosen, choose_curves
 from service.depth.stripe_map import StripeSamples
 from stage.camera import Camera
 from stage.ranging import LaserPlane
+from stage.spread import MAD_TO_SIGMA
 
 NOISE_SAMPLE = 200_000
 """Number of pixels from which the noise of a frame is estimated."""
@@ -46,7 +47,7 @@ def stripe_signal(radiance: np.ndarray, mask: np.ndarray) -> Signal:
     inside = radiance[..., channel][mask]
     few = inside[:: max(1, len(inside) // NOISE_SAMPLE)]
     middle = float(np.median(few))
-    noise = max(1.4826 * float(np.median(np.abs(few - middle))), 1e-6 * float(inside.max()), 1e-12)
+    noise = max(MAD_TO_SIGMA * float(np.median(np.abs(few - middle))), 1e-6 * float(inside.max()), 1e-12)
     return Signal(np.where(mask, radiance[..., channel] - middle, 0), channel, noise)
 
 

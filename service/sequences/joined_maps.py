@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from stage.maps import SurfaceMaps
+from stage.spread import MAD_TO_SIGMA
 from stage.temporal.agreement import agree, noise_share
 from stage.temporal.recursion import Track, advance, begin
 
@@ -110,7 +111,7 @@ class MapsJoiner:
             return 1.0
         change = np.log(np.maximum(now[told], 1e-6) / then[told])
         middle = float(np.median(change))
-        spread = 1.4826 * float(np.median(np.abs(change - middle)))
+        spread = MAD_TO_SIGMA * float(np.median(np.abs(change - middle)))
         sure = abs(middle) > GAIN_SIGMAS * spread / np.sqrt(len(change)) and spread < GAIN_SPREAD * abs(middle)
         return float(np.exp(middle)) if sure and abs(middle) < LARGEST_GAIN else 1.0
 
@@ -136,7 +137,7 @@ class MapsJoiner:
             return None
         values = _deep(now)
         spread = np.abs(values - _deep(earlier)).max(axis=-1)[rest]
-        sigma = max(least, 1.4826 * float(np.median(spread)) / np.sqrt(2)) if len(spread) else least
+        sigma = max(least, MAD_TO_SIGMA * float(np.median(spread)) / np.sqrt(2)) if len(spread) else least
         new = begin(values, np.full(rest.shape, sigma, np.float32), np.ones(rest.shape, np.float32), alone.mask)
         same = rest & (np.abs(values - track.mean).max(axis=-1) <= 3 * np.sqrt(new.noise + np.maximum(track.noise, least**2)))
         self._others[name] = advance(replace(track, noise=np.maximum(track.noise, sigma**2 / np.maximum(track.count, 1))), new, same)

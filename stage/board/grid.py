@@ -9,6 +9,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from stage.camera import Camera
+from stage.spread import MAD_TO_SIGMA
 
 BLOCK_PX = 16
 """The side of the blocks, in pixels, in which errors that neighbouring pixels share are told from noise."""
@@ -185,7 +186,7 @@ def robust_sigma(values: np.ndarray) -> float:
     """Return 1.4826 times the median absolute deviation from the median, which is σ of a normal distribution; 0 of no values."""
     if values.size == 0:
         return 0.0
-    return float(1.4826 * np.median(np.abs(values - np.median(values))))
+    return float(MAD_TO_SIGMA * np.median(np.abs(values - np.median(values))))
 
 
 def blocks_of(values: np.ndarray, side: int = BLOCK_PX) -> np.ndarray:

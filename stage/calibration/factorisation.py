@@ -13,8 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stage.consistency.lambertian import CAUCHY, SHADOW, TO_SIGMA, bright_readings, fit_lambertian
+from stage.consistency.lambertian import CAUCHY, SHADOW, bright_readings, fit_lambertian
 from stage.errors import CalibrationError
+from stage.spread import MAD_TO_SIGMA
 
 ROUNDS = 40
 """Rounds of alternating least squares; the lights move by less than a thousandth after them."""
@@ -77,7 +78,7 @@ def factorise(readings: np.ndarray, usable: np.ndarray, start: np.ndarray | None
         lights = _least_squares(scaled.T, weight.T, surface.T).T
         model = lights @ surface
         residual = np.where(lit, scaled - model, 0)
-        spread = TO_SIGMA * float(np.median(np.abs(residual[lit]))) + LEAST_SPREAD
+        spread = MAD_TO_SIGMA * float(np.median(np.abs(residual[lit]))) + LEAST_SPREAD
         weight = lit / (1 + (residual / (CAUCHY * spread)) ** 2)
         weight = np.where(model > BEHIND, weight, BEHIND_WEIGHT * weight)
     if spread - LEAST_SPREAD > LARGEST_MISFIT:
@@ -119,7 +120,7 @@ def integrable(b: np.ndarray, right: np.ndarray, up: np.ndarray) -> np.ndarray:
     for _ in range(INTEGRABLE_ROUNDS):
         _, values, vectors = np.linalg.svd(equations * weight[:, None], full_matrices=False)
         residual = equations @ vectors[-1]
-        spread = TO_SIGMA * float(np.median(np.abs(residual))) + 1e-12
+        spread = MAD_TO_SIGMA * float(np.median(np.abs(residual))) + 1e-12
         weight = 1 / np.sqrt(1 + (residual / (2 * spread)) ** 2)
     if values[4] < CLEAR * values[5]:
         raise CalibrationError("the surface is too flat, or its images too noisy: many lights explain them alike")

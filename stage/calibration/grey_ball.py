@@ -16,6 +16,7 @@ from stage.calibration.ball import BallView
 from stage.consistency.encodings import other_readings
 from stage.errors import CalibrationError
 from stage.light import DistantLight, PointLight
+from stage.spread import MAD_TO_SIGMA
 
 MIN_COSINE = 0.15
 """The least cosine between light and normal: near the attached shadow a small error of direction is a large error of shading."""
@@ -179,6 +180,6 @@ def _check_count(count: int) -> None:
 
 def _cauchy(residual: np.ndarray, sample: np.ndarray | None = None) -> np.ndarray:
     """Return the Cauchy weights of residuals [n] or [n, channels], scaled by the median absolute value of `sample` or the residuals."""
-    spread = 1.4826 * np.median(np.abs(residual if sample is None else sample), axis=0)
+    spread = MAD_TO_SIGMA * np.median(np.abs(residual if sample is None else sample), axis=0)
     floor = 1e-12 * np.abs(residual).max(axis=0) + 1e-300  # exact readings have no scatter
     return 1 / (1 + (residual / (WEIGHT_SCALE * spread + floor)) ** 2)

@@ -14,6 +14,7 @@ import numpy as np
 
 from stage.calibration.ball import Ball, BallView
 from stage.errors import CalibrationError
+from stage.spread import MAD_TO_SIGMA
 
 RIM_COSINE = 0.1
 """The least cosine between normal and line of sight of a pixel that is searched: pixels at the outline mix in background."""
@@ -129,7 +130,7 @@ def _uncertainty_degrees(ball: Ball, cosine: float, count: int) -> float:
 def _noise_ceiling(values: np.ndarray) -> float:
     """Return a level above the noise of the ball, and raise CalibrationError when no pixel is brighter."""
     peak, median = float(values.max()), float(np.median(values))
-    spread = 1.4826 * float(np.median(np.abs(values - median)))  # the standard deviation, were it noise alone
+    spread = MAD_TO_SIGMA * float(np.median(np.abs(values - median)))  # the standard deviation, were it noise alone
     if peak <= 0 or peak <= median + PROMINENCE * spread or peak < MIN_CONTRAST * median:
         raise CalibrationError("there is no bright spot on the ball")
     return median + PROMINENCE * spread

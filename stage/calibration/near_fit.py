@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stage.consistency.lambertian import CAUCHY, LEAST_SPREAD, SHADOW, TO_SIGMA, bright_readings, median_of
+from stage.consistency.lambertian import CAUCHY, LEAST_SPREAD, SHADOW, bright_readings, median_of
+from stage.spread import MAD_TO_SIGMA
 
 ROUNDS = 3
 """Rounds of re-weighting."""
@@ -58,6 +59,6 @@ def fit_near(readings: np.ndarray, usable: np.ndarray, lamps: NearLamps, points:
         gram += (1e-9 * np.trace(gram, axis1=1, axis2=2) + 1e-200)[:, None, None] * np.eye(3)
         vector = np.linalg.solve(gram, np.einsum("lpa,lp->pa", weighted, relative)[:, :, None])[:, :, 0]
         residual = np.where(lit, np.clip(relative - np.einsum("lpa,pa->lp", lit_by, vector), -LARGEST, LARGEST), 0)
-        spread = TO_SIGMA * median_of(np.abs(residual), lit) + LEAST_SPREAD
+        spread = MAD_TO_SIGMA * median_of(np.abs(residual), lit) + LEAST_SPREAD
         weight = lit / (1 + (residual / (CAUCHY * spread)) ** 2)
     return NearFit((vector / np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-300)).T, residual, lit)

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from stage.calibration.factorisation import factorise
-from stage.consistency.lambertian import TO_SIGMA
 from stage.errors import CalibrationError
+from stage.spread import MAD_TO_SIGMA
 
 LEAST_LIGHTS = 12
 """Fewer lights leave more than 0.6 of independent errors."""
@@ -60,7 +60,7 @@ def refine_directions(readings: np.ndarray, usable: np.ndarray, directions: np.n
     found = factorise(readings, usable, directions)
     lights = _closest(found.lights, directions, with_strength=False)
     strength = np.log(np.linalg.norm(lights, axis=1))
-    if TO_SIGMA * float(np.median(np.abs(strength - np.median(strength)))) < RIGHT_STRENGTH:
+    if MAD_TO_SIGMA * float(np.median(np.abs(strength - np.median(strength)))) < RIGHT_STRENGTH:
         lights = _closest(found.lights, directions, with_strength=True)
     length = np.linalg.norm(lights, axis=1)
     direction = lights / length[:, None]
@@ -86,6 +86,6 @@ def _closest(lights: np.ndarray, directions: np.ndarray, *, with_strength: bool)
         norm = np.linalg.norm(turned, axis=1, keepdims=True)
         length = np.full_like(length, np.median(norm)) if with_strength else norm
         residual = np.linalg.norm(turned / norm - directions, axis=1)
-        sigma = max(TO_SIGMA * float(np.median(residual)), LEAST_SIGMA)
+        sigma = max(MAD_TO_SIGMA * float(np.median(residual)), LEAST_SIGMA)
         weight = 1 / np.sqrt(1 + (residual / (OUTLIER * sigma)) ** 2)[:, None]
     return lights @ matrix

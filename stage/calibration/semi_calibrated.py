@@ -15,6 +15,7 @@ import numpy as np
 
 from stage.calibration.grey_ball import WEIGHT_SCALE
 from stage.errors import CalibrationError
+from stage.spread import MAD_TO_SIGMA
 
 MIN_LIGHTS = 4
 """The least count of lights: each gives two equations for the eight unknowns of the ambiguity."""
@@ -185,7 +186,7 @@ def _weights(reading: np.ndarray, lit: np.ndarray, e: np.ndarray, directions: np
     model, length = directions @ b, np.maximum(np.linalg.norm(b, axis=0), TINY)
     chosen = bright & (model > SHADOW * length)
     relative = np.where(chosen, scaled - model, 0) / length
-    spread = 1.4826 * np.median(np.abs(relative[chosen])) if chosen.any() else 1.0
+    spread = MAD_TO_SIGMA * np.median(np.abs(relative[chosen])) if chosen.any() else 1.0
     weight = chosen / (1 + (relative / (WEIGHT_SCALE * spread + 1e-9)) ** 2)
     weight[:, (weight > 0.1).sum(axis=0) < MIN_LIGHTS] = 0  # three readings fit any brightness
     return weight

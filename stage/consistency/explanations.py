@@ -14,8 +14,9 @@ from stage.calibration.semi_calibrated import TINY, fit_intensities
 from stage.colour import GREY_WEIGHTS
 from stage.colour_spaces import is_linear
 from stage.consistency.encodings import other_readings
-from stage.consistency.lambertian import SHADOW, TO_SIGMA, Fit, bright_readings, fit_lambertian, median_of
+from stage.consistency.lambertian import SHADOW, Fit, bright_readings, fit_lambertian, median_of
 from stage.errors import CalibrationError
+from stage.spread import MAD_TO_SIGMA
 
 PIXELS = 600
 """Number of pixels, spread over the object, on which explanations are compared: three times as many change no misfit by a tenth."""
@@ -233,11 +234,11 @@ def _free_directions(sample: Sample, given: Fit) -> Explanation | None:
         lights = _least_squares(readings.T, weight.T, surface.T).T
         surface = _least_squares(readings, weight, lights)
         residual = np.where(lit, readings - lights @ surface, 0)
-        spread = TO_SIGMA * float(np.median(np.abs(residual[lit]))) + 1e-4
+        spread = MAD_TO_SIGMA * float(np.median(np.abs(residual[lit]))) + 1e-4
         weight = lit / (1 + (residual / (3 * spread)) ** 2)
-    free = TO_SIGMA * float(np.median(np.abs(residual[lit])))
+    free = MAD_TO_SIGMA * float(np.median(np.abs(residual[lit])))
     scaled = np.abs(given.residual) * np.linalg.norm(given.vector, axis=0) / top
-    misfit = TO_SIGMA * float(np.median(scaled[lit]))
+    misfit = MAD_TO_SIGMA * float(np.median(scaled[lit]))
     if misfit < LEAST_LEFT or not _explains(free, misfit, TIMES_FREE):
         return None
     halves = [fit_lambertian(readings[part::2], sample.usable[part::2], sample.directions[part::2]) for part in (0, 1)]

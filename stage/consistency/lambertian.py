@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stage.spread import MAD_TO_SIGMA
+
 SHADOW = 0.1
 """A reading below this part of the bright readings of its pixel is in shadow, or grazed, and is not compared."""
 BRIGHT_END = 0.9
@@ -17,8 +19,6 @@ CAUCHY = 1.5
 """Scale of the Cauchy weights in standard deviations of the pixel's residual, as in stage.calibration.grey_ball."""
 LEAST_SPREAD = 0.01
 """Least standard deviation that the weights assume, relative to |b|: half rounding and eight-bit images are below it."""
-TO_SIGMA = 1.4826
-"""Standard deviation of normal errors over their median absolute value."""
 SPARE = 2
 """Readings above the three unknowns that a pixel needs to have a misfit."""
 
@@ -48,7 +48,7 @@ class Fit(NamedTuple):
     def misfit(self) -> float:
         """Return the robust standard deviation of the residuals of pixels with readings to spare; NaN without any."""
         chosen = self.lit & self.spare
-        return TO_SIGMA * float(np.median(np.abs(self.residual[chosen]))) if chosen.any() else np.nan
+        return MAD_TO_SIGMA * float(np.median(np.abs(self.residual[chosen]))) if chosen.any() else np.nan
 
 
 def fit_lambertian(readings: np.ndarray, usable: np.ndarray, directions: np.ndarray, rounds: int = ROUNDS) -> Fit:
@@ -68,7 +68,7 @@ def fit_lambertian(readings: np.ndarray, usable: np.ndarray, directions: np.ndar
         gram += (1e-9 * np.trace(gram, axis1=1, axis2=2) + 1e-200)[:, None, None] * np.eye(3)  # pixels of no reading get 0
         vector = np.linalg.solve(gram, ((weight * readings).T @ directions)[:, :, None])[:, :, 0].T
         residual = np.where(lit, readings - directions @ vector, 0) / np.maximum(np.linalg.norm(vector, axis=0), 1e-300)
-        spread = TO_SIGMA * median_of(np.abs(residual), lit) + LEAST_SPREAD
+        spread = MAD_TO_SIGMA * median_of(np.abs(residual), lit) + LEAST_SPREAD
         weight = lit / (1 + (residual / (CAUCHY * spread)) ** 2)
     return Fit(vector, residual, lit)
 

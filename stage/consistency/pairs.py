@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stage.spread import MAD_TO_SIGMA
 from stage.stack import Stack
 
 PIXELS = 8192
@@ -109,7 +110,8 @@ class _Noise(NamedTuple):
         if len(second) < BINS:
             return cls(np.zeros(1), np.zeros(1))
         parts = np.array_split(np.argsort(brightness), BINS)
-        return cls(np.array([brightness[part].mean() for part in parts]), np.array([1.4826 * np.median(second[part]) for part in parts]))
+        return cls(np.array([brightness[part].mean() for part in parts]),
+                   np.array([MAD_TO_SIGMA * np.median(second[part]) for part in parts]))
 
     def at(self, brightness: np.ndarray) -> np.ndarray:
         """Return the standard deviation at a brightness; above the brightest bin it grows as its square root, as photon noise does."""
@@ -149,7 +151,7 @@ def _shift(crossed: np.ndarray, along: np.ndarray, usable: np.ndarray) -> float:
                 break
             found = np.linalg.solve(normal, columns.T @ (weight * difference))
             off = difference - columns @ found
-            spread = max(1.4826 * float(np.median(np.abs(off))), 1e-12)
+            spread = max(MAD_TO_SIGMA * float(np.median(np.abs(off))), 1e-12)
             weight = 1 / (1 + (off / (2 * spread)) ** 2)
         else:
             # neighbours within the blur are not independent

@@ -13,11 +13,10 @@ import numpy as np
 from stage.scans.cloud import Cloud
 from stage.scans.coarse import ALIKE
 from stage.scans.rigid import applied, moved
+from stage.spread import MAD_TO_SIGMA
 
 TUKEY = 4.685
 """Distances beyond this many standard deviations count nothing. Source: Tukey's biweight, 95 % efficient on normal noise."""
-MAD = 1.4826
-"""The standard deviation of normal noise in median absolute deviations."""
 STEPS = 12
 """The most steps at one reach."""
 STILL = 0.02
@@ -145,11 +144,11 @@ def _match(a: Cloud, b: Cloud, pose: np.ndarray, reach: float) -> _Matches | Non
     seen_b = _dots(b.directions[of] @ pose[:3, :3].T, normal) * b.sigma[of]
     seen_a = _dots(a.directions[at], normal) * a.sigma[at]
     sigma = np.sqrt(seen_a**2 + seen_b**2 + (0.05 * np.minimum(a.sigma[at], b.sigma[of])) ** 2)  # grazing rays: never 0
-    ratio = MAD * float(np.median(np.abs(across) / sigma))
+    ratio = MAD_TO_SIGMA * float(np.median(np.abs(across) / sigma))
     weight = np.maximum(1 - (across / (TUKEY * max(ratio, 1.0) * sigma)) ** 2, 0) ** 2
     # 16 neighbours that lie about a spacing away tilt a plane by a quarter of σ over the spacing
     tilt = max(ratio, 1.0) * np.hypot(a.sigma[at] / a.spacing[at], b.sigma[of] / b.spacing[of]) / 4
-    scale = MAD * float(np.median(np.abs(across)))
+    scale = MAD_TO_SIGMA * float(np.median(np.abs(across)))
     return _Matches(at, of, placed[keep], normal, across, sigma, weight, tilt, scale, ratio, seen_a, seen_b)
 
 
