@@ -32,6 +32,8 @@ from stage.errors import CalibrationError, ManifestError
 from stage.light import DistantLight, PointLight
 from stage.manifest import FILE_NAME
 
+ANALYSER_GAIN = 2.0
+"""Irradiance of a light over what a matt ball behind an analyser shows of it: its light has no polarisation left, half passes."""
 READERS = 4
 """Images that are decoded at the same time: bounds the memory."""
 
@@ -179,8 +181,9 @@ def grey_ball(request: GreyBallRequest, progress: Progress | None = None) -> Lig
         if other is not None:
             flags = [f"color_space: {declared} is declared, but as {other[0]} the shading of the ball fits to {100 * other[1]:.1f} %, as "
                      f"declared to {100 * found.residual:.1f} %"]
-        entry |= {"scale": digits(found.scale), "residual": round(found.residual, 5), "pixels": found.pixels, "flags": flags}
-        return MeasuredLight(with_brightness(light, found.scale), entry, (), found.residual)
+        scale = found.scale * (ANALYSER_GAIN if light.polarization != "none" else 1)
+        entry |= {"scale": digits(scale), "residual": round(found.residual, 5), "pixels": found.pixels, "flags": flags}
+        return MeasuredLight(with_brightness(light, scale), entry, (), found.residual)
 
     results = leave_out_failures(captures, _measure_each(captures, [view], measure, timings), drop_failed=request.drop_failed)
     timings.close()

@@ -115,7 +115,7 @@ def write_lights(kind: str, request: Options, captures: LightCaptures, results: 
     if relative is not None:
         manifest = manifest.model_copy(update={"irradiance_scale": "relative" if relative else "absolute"})
     lights = [{"frame": lit.number, "image": lit.frame.image, **result.entry,
-               "was": lit.light.model_dump(mode="json", exclude_none=True)}
+               "was": lit.light.model_dump(mode="json", exclude_defaults=True)}
               for lit, result in zip(captures.lit, results, strict=True)]
     measured = [(lit, result) for lit, result in zip(captures.lit, results, strict=True) if result.light is not None]
     dropped = len(results) - len(measured)

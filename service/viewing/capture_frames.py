@@ -25,6 +25,8 @@ WHITE_PERCENTILE = 99.0
 """The percentile of the object's brightest channel that is shown as white."""
 DARK_SHARE = 0.01
 """A pixel counts as dark where its brightest channel is below this share of white."""
+POLARISER = {"none": "", "cross": ", crossed polariser", "parallel": ", parallel polariser"}
+"""What the label of a light says of the polariser of the camera."""
 
 
 class FrameImage(NamedTuple):
@@ -142,9 +144,9 @@ def kind_of(frame: Frame) -> str:
 def label_of(frame: Frame) -> str:
     """Return what lit a frame, in a few words."""
     if isinstance(frame.light, DistantLight):
-        return f"distant light, {_angles(np.array(frame.light.direction))}"
+        return f"distant light, {_angles(np.array(frame.light.direction))}{POLARISER[frame.light.polarization]}"
     if isinstance(frame.light, PointLight):
-        return "near light at {:.3g}, {:.3g}, {:.3g} m".format(*frame.light.position_m)
+        return "near light at {:.3g}, {:.3g}, {:.3g} m".format(*frame.light.position_m) + POLARISER[frame.light.polarization]
     if frame.stereo is not None:
         return f"texture, {1 + len(frame.stereo.images)} cameras"
     source = getattr(frame, kind_of(frame))

@@ -61,12 +61,13 @@ def moment(place: float | None, *, other: bool = False, size: int = SIZE) -> Mom
     return Moment(normal / np.linalg.norm(normal, axis=-1, keepdims=True), height * PIXEL_M, albedo, moving)
 
 
-def write_step(folder: Path, scene: Moment, *, seed: int, noise: float = 0.01, brightness: float = 1.0, **changes: object) -> Path:
-    """Write the capture of a step, with noise of this part of the brightest value."""
+def write_step(folder: Path, scene: Moment, *, seed: int, noise: float = 0.01, brightness: float | np.ndarray = 1.0,
+               **changes: object) -> Path:
+    """Write the capture of a step, with noise of this part of the brightest value; its lights are this much brighter than they say."""
     random, frames = np.random.default_rng(seed), []
     size = len(scene.normal)
     for index, direction in enumerate(directions()):
-        image = brightness * scene.albedo * np.maximum(scene.normal @ direction, 0)[..., None]
+        image = np.broadcast_to(brightness, LIGHTS)[index] * scene.albedo * np.maximum(scene.normal @ direction, 0)[..., None]
         image = image + noise * random.normal(size=image.shape) * np.sqrt(image + 0.02) + PEDESTAL
         write_exr(folder / f"{index:02d}.exr", image)
         light = {"type": "distant", "direction": direction.tolist(), "irradiance": [np.pi] * 3}

@@ -174,6 +174,17 @@ def test_grey_ball_writes_irradiance(relit, tmp_path):
     assert Capture.open(folder).manifest.irradiance_scale == "relative"
 
 
+def test_a_ball_behind_an_analyser_shows_half_of_the_irradiance(relit, tmp_path):
+    """Of a crossed and of a parallel one alike, because a matt ball keeps no polarisation; each frame keeps what it says of it."""
+    lights = [{**PLACEHOLDER, "direction": direction.tolist(), "polarization": kind} for direction in DIRECTIONS
+              for kind in ("cross", "parallel")]
+    folder = write(tmp_path / "ball", [image / 2 for image in grey_images() for _ in range(2)], lights)
+    assert relit("calibrate", "grey-ball", folder, "--ball", CIRCLE, "--albedo", "0.5").code == 0
+    found = lights_of(folder)
+    assert [light.polarization for light in found] == ["cross", "parallel"] * len(DIRECTIONS)
+    assert np.allclose([light.irradiance for light in found], np.repeat(1 + np.arange(len(DIRECTIONS)), 2)[:, None], rtol=0.01)
+
+
 def test_grey_ball_gives_directions_too(relit, tmp_path):
     folder = write(tmp_path / "ball", grey_images())
     outcome = relit("calibrate", "grey-ball", folder, "--ball", CIRCLE, "--refine-direction", "--albedo", "0.5,0.5,0.25")

@@ -16,7 +16,7 @@ from stage.maps import SurfaceMaps
 from stage.ply import read_ply
 from tests.scenes import depth as depths
 from tests.scenes.captures import angles_degrees, edit_manifest, files_in
-from tests.scenes.sequence import SIZE, moment, write_sequence, write_step
+from tests.scenes.sequence import LIGHTS, SIZE, moment, write_sequence, write_step
 
 STEPS, NOISE = 7, 0.02
 PLACES = [12 + 40 * step / (STEPS - 1) for step in range(STEPS)]
@@ -123,6 +123,24 @@ def test_a_change_of_all_lights_is_taken_out(tmp_path):
     joined, alone = maps_of(tmp_path / "out", 1)
     ratio = [np.median(maps.diffuse_albedo / moment(None).albedo) for maps in (joined, alone)]
     assert ratio[1] - ratio[0] == pytest.approx(0.03, abs=0.005)
+
+
+def test_intensities_of_the_first_step_are_those_of_all(tmp_path):
+    """Lights that are 10 % off in every step; in the last other lights are, which the images contradict."""
+    random = np.random.default_rng(5)
+    off, other = (np.exp(0.1 * random.normal(size=LIGHTS)) for _ in range(2))
+    for step, strengths in enumerate((off, off, other)):
+        write_step(tmp_path / "in" / f"step{step:02d}", moment(None), seed=step, noise=0.005, brightness=strengths)
+    solve_sequence(request(tmp_path))
+    used = [json.loads((tmp_path / "out" / f"step{step:02d}" / "alone" / "report.json").read_text())["found"]["light_intensities"]
+            for step in range(3)]
+    assert used[0]["used"] == "estimated" and used[1] == {"used": "those of the first step"}
+    assert used[2]["used"] == "estimated" and used[2]["over_time"].startswith("its own: the images contradict")
+    apart = [np.median(angles_degrees(next(maps_of(tmp_path / "out", step)).normal, moment(None).normal)) for step in range(3)]
+    assert max(apart) < 1
+    left = json.loads((tmp_path / "out" / "step00" / "alone" / "step.json").read_text())["left"]["lights"]["factor"]
+    assert np.allclose(left / np.mean(left), off / off.mean(), rtol=0.02)
+    assert solve_sequence(request(tmp_path)).kept == 3
 
 
 def test_steps_that_are_done_are_not_solved_again(tmp_path, monkeypatch):
