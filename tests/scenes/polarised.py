@@ -59,6 +59,29 @@ def polarised_scene(size: int = 32, lights: int = 40) -> PolarisedScene:
     return PolarisedScene(surface, material, albedo, f0, roughness, directions, np.array(diffuse), np.array(specular))
 
 
+def with_two_beckmann_lobes(scene: PolarisedScene) -> PolarisedScene:
+    """The same dome under a coat of two lobes that no GGX lobe is (Beckmann's distribution, roughness² 0.45 and 0.12), and without a metal."""
+    albedo = np.where(scene.of("metal")[..., None], 0.15, scene.albedo)
+    diffuse, specular = [], []
+    for direction in scene.directions:
+        lit = microfacet.diffuse(scene.surface.normal, direction, VIEW)[..., None] * scene.surface.mask[..., None]
+        diffuse.append(IRRADIANCE * albedo * lit)
+        coat = _beckmann(scene.surface.normal, direction, 0.45, 0.08) + _beckmann(scene.surface.normal, direction, 0.12, 0.03)
+        specular.append(IRRADIANCE * np.repeat((coat * scene.surface.mask)[..., None], 3, axis=-1))
+    return scene._replace(albedo=albedo, diffuse=np.array(diffuse), specular=np.array(specular))
+
+
+def _beckmann(normal: np.ndarray, light: np.ndarray, alpha: float, f0: float) -> np.ndarray:
+    """BRDF · n·l of a lobe with Beckmann's distribution (Walter et al. 2007, equation 25), else as `microfacet.specular`."""
+    half = microfacet.unit(light + VIEW)
+    nl, nv, hv = (normal * light).sum(-1), (normal * VIEW).sum(-1), (half * VIEW).sum(-1)
+    nh = np.maximum((normal * half).sum(-1), 1e-6)
+    density = np.exp((1 - 1 / nh**2) / alpha**2) / (np.pi * alpha**2 * nh**4)
+    lit = nl > 1e-9
+    masking = 1 / (1 + microfacet.smith_lambda(np.where(lit, nl, 1.0), alpha) + microfacet.smith_lambda(nv, alpha))
+    return np.where(lit, density * masking * (f0 + (1 - f0) * (1 - hv) ** 5) / (4 * nv), 0.0)
+
+
 def write_polarised(folder: Path, scene: PolarisedScene, *, leak: float = 0.0, declared: float | None = None, noise: float = 0.0,
                     exposures: tuple[float, ...] = (), seed: int = 0, **changes: object) -> Path:
     """Write a cross and a parallel image of every light, with noise of σ² = noise² (L² + 0.01 L_white L) that may fall below zero."""

@@ -15,7 +15,7 @@ from stage.errors import ManifestError
 from tests.reference import microfacet
 from tests.scenes import near_lights
 from tests.scenes.captures import angles_degrees, edit_manifest, write_exr, write_image, write_manifest
-from tests.scenes.polarised import MATERIALS, polarised_scene, write_plain, write_polarised
+from tests.scenes.polarised import MATERIALS, polarised_scene, with_two_beckmann_lobes, write_plain, write_polarised
 
 SCENE = polarised_scene(size=28, lights=40)
 NOISE, LEAK = 0.01, 0.02
@@ -92,6 +92,20 @@ def test_svbrdf_is_as_good_as_without_polarisers(found, plain):
     without = solved(plain)[0].maps
     for name in MATERIALS:
         assert error(found[0].maps, name).mean() < 1.5 * error(without, name).mean() + 0.05, name
+
+
+@pytest.mark.parametrize("method", [Method.SVBRDF, Method.ROBUST])
+def test_highlights_that_the_model_does_not_know_are_left_out(tmp_path, method):
+    """Errors of the normals and of albedo, with pairs and without: measured are 0.08° for 0.48° and 0.002 for 0.11 at the least."""
+    scene = with_two_beckmann_lobes(SCENE)
+    with_pairs, without = (solved(write(tmp_path / name, scene, noise=NOISE, **options), method)[0].maps for name, write, options in
+                           (("pairs", write_polarised, {"leak": LEAK, "declared": LEAK}), ("plain", write_plain, {})))
+    inside = scene.surface.mask
+    apart = [angles_degrees(maps.normal, scene.surface.normal)[inside] for maps in (with_pairs, without)]
+    assert apart[0].mean() < 0.25 and apart[0].mean() < 0.25 * apart[1].mean()
+    assert np.mean(apart[0] > 3 * with_pairs.sigma[inside].astype(float)) < 0.02
+    off = [np.abs(maps.diffuse_albedo.astype(float) / scene.albedo - 1)[inside].mean() for maps in (with_pairs, without)]
+    assert off[0] < 0.01 and off[0] < 0.1 * off[1]
 
 
 def test_relighting_adds_both_images_of_a_pair(tmp_path, leaking, plain):
