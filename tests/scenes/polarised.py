@@ -60,7 +60,7 @@ def polarised_scene(size: int = 32, lights: int = 40) -> PolarisedScene:
 
 
 def with_two_beckmann_lobes(scene: PolarisedScene) -> PolarisedScene:
-    """The same dome under a coat of two lobes that no GGX lobe is (Beckmann's distribution, roughness² 0.45 and 0.12), and without a metal."""
+    """The same dome under a coat of two lobes that no GGX lobe is (Beckmann's distribution, α 0.45 and 0.12), and without a metal."""
     albedo = np.where(scene.of("metal")[..., None], 0.15, scene.albedo)
     diffuse, specular = [], []
     for direction in scene.directions:
