@@ -12,6 +12,7 @@ from service.requests.calibrate import (
     FlatFieldRequest,
     GreyBallRequest,
     IntensityRequest,
+    LaserPlanesRequest,
     LightPositionsRequest,
     MirrorBallRequest,
     ProcamRequest,
@@ -39,7 +40,8 @@ def register(app: typer.Typer) -> None:
     for name, function in (("mirror-ball", _mirror_ball), ("light-positions", _light_positions), ("grey-ball", _grey_ball),
                            ("intensity", _intensity), ("dark", _dark), ("flat-field", _flat_field), ("saturation", _saturation),
                            ("white-balance", _white_balance),
-                           ("procam", _procam), ("stereo", _stereo), ("response", _response), ("tof", _tof)):
+                           ("procam", _procam), ("stereo", _stereo), ("laser-planes", _laser_planes),
+                           ("response", _response), ("tof", _tof)):
         local_command(kinds, name, function)
     app.add_typer(kinds)
 
@@ -138,6 +140,17 @@ def _stereo(request: StereoRequest) -> None:
     print(f"report   {result.report_path}")
     print(f"error    {result.summary}")
     print_table([("frame", "other camera", "camera, px", "other, px", "remark"), *result.rows[:VIEW_ROWS]])
+
+
+def _laser_planes(request: LaserPlanesRequest) -> None:
+    from service.calibrate.laser_planes import laser_planes
+
+    with ProgressBar() as bar:
+        result = laser_planes(request, bar)
+    for path in result.manifest_paths:
+        print(f"capture  {path}")
+    print(f"report   {result.report_path}")
+    print_table([("frame", "tilt sure to", "residual", "points"), *result.rows[:LIGHT_ROWS]])
 
 
 def _response(request: ResponseRequest) -> None:

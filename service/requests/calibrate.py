@@ -252,6 +252,19 @@ class StereoRequest(StereoOptions, Options):
     """Another capture of the same cameras, whose manifest is written too; may be repeated."""
 
 
+class LaserPlanesRequest(DeviceRequest):
+    """The planes of a laser from its stripes on a chessboard in two poses or more, before a calibrated camera."""
+
+    captures: Annotated[tuple[Path, ...], Field(min_length=2), Role.INPUT, POSES]
+    """Folders with a capture.json, one for each pose of the board: a frame without the laser, and the same laser frames in each."""
+    board: Annotated[tuple[Corners, Corners], BeforeValidator(_board), Spelling(metavar="9x6")]
+    """Inner corners of the chessboard, across and down."""
+    square_m: Annotated[Positive, AfterValidator(_square)]
+    """Side of a square in metres."""
+    apply_to: Annotated[tuple[Path, ...], Role.INPUT, Spelling(metavar="CAPTURE")] = ()
+    """Another capture under the same laser planes in the same order, whose manifest is written too; may be repeated."""
+
+
 class ResponseOptions(Options):
     """What the images of evenly grey projections show."""
 

@@ -58,6 +58,7 @@ COMMANDS: dict[str, list[type[Options]]] = {
     "calibrate intensity": [calibrate.IntensityRequest], "calibrate dark": [calibrate.DarkRequest],
     "calibrate flat-field": [calibrate.FlatFieldRequest], "calibrate saturation": [calibrate.SaturationRequest],
     "calibrate white-balance": [calibrate.WhiteBalanceRequest],
+    "calibrate laser-planes": [calibrate.LaserPlanesRequest],
     "calibrate procam": [calibrate.ProcamRequest],
     "calibrate stereo": [calibrate.StereoRequest], "calibrate response": [calibrate.ResponseRequest],
     "calibrate tof": [calibrate.TofCalibrationRequest],

@@ -1,0 +1,137 @@
+"""Calibration of the planes of a laser from poses of a chessboard on which its stripes are seen."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from kernels import device as devices
+from kernels.status import Status
+from kernels.structured.stripe import find_stripe
+from service.calibrate.results import digits, write_results
+from service.depth.stripes import stripe_signal
+from service.reporting.progress import Progress, Timings
+from service.requests.calibrate import LaserPlanesRequest
+from stage.calibration.laser_plane import LightPlane, board_plane, fit_light_plane, inside_board
+from stage.calibration.procam import find_corners
+from stage.capture import Capture
+from stage.colour import GREY_WEIGHTS
+from stage.correction import Correction
+from stage.errors import CalibrationError, ManifestError
+from stage.manifest import FILE_NAME, Frame
+from stage.patterns.base import UniformPattern
+from stage.ranging import LaserPlane
+from stage.triangulation_check import check_perspective
+
+
+class LaserPlanes(NamedTuple):
+    """The files that were written, and the planes."""
+
+    manifest_paths: tuple[Path, ...]
+    report_path: Path
+    """Beside the first manifest; each manifest has one."""
+    rows: list[tuple[str, ...]]
+    """Frame, tilt, residual and number of points of each plane, the least sure first."""
+
+
+def laser_planes(request: LaserPlanesRequest, progress: Progress | None = None) -> LaserPlanes:
+    """Measure the plane of each laser frame, and write it to the manifests.
+
+    Raises:
+        StageError, KernelError: the input is wrong, or a plane is not determined; nothing is written.
+    """
+    timings = Timings(progress)
+    device = devices.resolve(request.device)
+    timings.stage("open", 1)
+    captures = [Capture.open(path) for path in request.captures]
+    others = [Capture.open(path) for path in request.apply_to]
+    count = len(_laser_frames(captures[0]))
+    for capture in (*captures, *others):
+        where = f"{capture.folder / FILE_NAME}: "
+        check_perspective(capture)
+        if len(_laser_frames(capture)) != count:
+            raise ManifestError(f"{where}frames: {len(_laser_frames(capture))} have a laser plane, those of {captures[0].folder} {count}: "
+                                "each capture needs the same planes in the same order")
+        if capture.camera != captures[0].camera:
+            raise ManifestError(f"{where}camera: differs from that of {captures[0].folder}: planes are in the frame of one camera")
+    if not count:
+        raise ManifestError(f"{captures[0].folder / FILE_NAME}: frames: none has a laser plane: give each a placeholder, such as "
+                            '{"type": "plane", "point_m": [0, 0, 0], "normal": [1, 0, 0]}')
+    stripes: list[list[np.ndarray]] = [[] for _ in range(count)]
+    boards = []
+    timings.stage("boards", len(captures))
+    for number, capture in enumerate(captures, start=1):
+        plane_rms, found = _stripes_on_board(capture, request, device)
+        boards.append({"capture": str(capture.folder), "rms_px": round(plane_rms, 4), "stripes": sum(len(one) > 0 for one in found)})
+        for index, points in enumerate(found):
+            if len(points):
+                stripes[index].append(points)
+        timings.advance(number)
+    planes = []
+    for index, frame in enumerate(_laser_frames(captures[0])):
+        try:
+            planes.append(fit_light_plane(stripes[index]))
+        except CalibrationError as error:
+            raise CalibrationError(f"{captures[0].folder}: frames of {frame.image}: {error}") from error
+    timings.close()
+    return _write(request, [*captures, *others], planes, boards)
+
+
+def _laser_frames(capture: Capture) -> list[Frame]:
+    return [frame for frame in capture.manifest.frames if isinstance(frame.laser, LaserPlane)]
+
+
+def _stripes_on_board(capture: Capture, request: LaserPlanesRequest, device: str) -> tuple[float, list[np.ndarray]]:
+    """Return how well the pose of the board fits, pixels, and the points of each stripe on it, [n, 3] metres; none where it is not seen."""
+    correction = Correction.of(capture)
+    even = {frame.pattern.code: frame for frame in capture.manifest.frames if isinstance(frame.pattern, UniformPattern)}
+    black = correction.apply(even["black"]).pixels if "black" in even else np.float32(0)
+    shown = correction.apply(even["white"]).pixels if "white" in even else correction.ambient if correction.ambient is not None else black
+    if not isinstance(shown, np.ndarray):
+        raise ManifestError(f"{capture.folder / FILE_NAME}: frames: none shows the board without the laser: add one under a white "
+                            'projection, or under the light of the room, {"type": "off"}')
+    corners = find_corners(shown @ np.array(GREY_WEIGHTS, np.float32), request.board)
+    if corners is None:
+        raise CalibrationError(f"{capture.folder}: the board of {request.board[0]}x{request.board[1]} inner corners is not found")
+    plane = board_plane(corners, request.board, request.square_m, capture.camera)
+    inside = inside_board(corners, request.board, shown.shape[:2])
+    found = []
+    # squares would shift the middle of a stripe that runs along their edges: it is divided by what the board looks like
+    albedo = np.where(inside, np.maximum(shown @ np.array(GREY_WEIGHTS, np.float32), 0), 0).astype(np.float32)
+    for frame in _laser_frames(capture):
+        signal = stripe_signal(correction.apply(frame).pixels - black, inside)
+        best = np.zeros((0, 2))
+        for along in ("row", "column"):
+            stripe = find_stripe(np.ascontiguousarray(signal.values), along=along, noise=signal.noise, device=device, albedo=albedo)
+            centre, status = stripe.centre.numpy(), stripe.status.numpy()
+            lines = np.flatnonzero(status == Status.OK)
+            places = np.stack([centre[lines], lines + 0.5], axis=1).astype(np.float64)
+            places = places if along == "row" else places[:, ::-1]
+            if len(places) > len(best):
+                best = places
+        found.append(plane.meet(capture.camera, best[:, 0], best[:, 1]))
+    return plane.rms_px, found
+
+
+def _write(request: LaserPlanesRequest, targets: list[Capture], planes: list[LightPlane], boards: list[dict[str, object]]) -> LaserPlanes:
+    entries = [{"point_m": digits(plane.point), "normal": digits(plane.normal), "residual_m": float(f"{plane.residual_m:.3g}"),
+                "sigma_degrees": float(f"{plane.sigma_degrees:.3g}"), "points": plane.points} for plane in planes]
+    reports = []
+    for target in targets:
+        waiting = iter(planes)
+        frames = []
+        for frame in target.manifest.frames:
+            if isinstance(frame.laser, LaserPlane):
+                plane = next(waiting)
+                (px, py, pz), (nx, ny, nz) = digits(plane.point), digits(plane.normal)
+                laser = LaserPlane(type="plane", point_m=(px, py, pz), normal=(nx, ny, nz))
+                frame = frame.model_copy(update={"laser": laser})
+            frames.append(frame)
+        reports.append(write_results("laser-planes", request, target.manifest.model_copy(update={"frames": tuple(frames)}),
+                                     target.folder / FILE_NAME, {"boards": boards, "planes": entries}))
+    order = sorted(range(len(planes)), key=lambda index: planes[index].sigma_degrees, reverse=True)
+    names = [frame.image for frame in _laser_frames(targets[0])]
+    rows: list[tuple[str, ...]] = [
+        (names[index], f"{planes[index].sigma_degrees:.3f}°", f"{1000 * planes[index].residual_m:.3f} mm", str(planes[index].points))
+        for index in order]
+    return LaserPlanes(tuple(target.folder / FILE_NAME for target in targets), reports[0], rows)

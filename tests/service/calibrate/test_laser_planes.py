@@ -1,0 +1,115 @@
+"""Laser planes from their stripes on a chessboard: planes within their σ, and a scan that is right with them."""
+
+import json
+from itertools import islice
+
+import numpy as np
+import pytest
+
+from stage.capture import Capture
+from stage.depth_maps import DepthMaps
+from tests.reference import projector as reference
+from tests.scenes.captures import edit_manifest, write_exr, write_manifest
+from tests.scenes.depth import entry_of
+from tests.stage.calibration.test_procam import BOARD, CAMERA, SQUARE, board_image, poses
+
+PLANES = [(np.array((0.25, 0.0, 0.0)), np.array((np.cos(angle), 0.05, np.sin(angle)))) for angle in np.radians((-13, -15.5, -18))]
+WIDTH = 0.0025
+PLACEHOLDER = {"type": "plane", "point_m": [0, 0, 0], "normal": [1, 0, 0]}
+POSES = list(islice(poses(8), 4))
+
+
+def unit(vector):
+    return vector / np.linalg.norm(vector)
+
+
+def photograph(folder, points, albedo, noise=0.002):
+    """Frames of each plane on a surface, and one under the light of the room."""
+    random = np.random.default_rng(5)
+    frames = []
+    for number, plane in enumerate([*PLANES, None]):
+        glow = 0.0 if plane is None else 0.6 * np.exp(-(((points - plane[0]) @ unit(plane[1])) ** 2) / (2 * WIDTH**2))
+        image = albedo * (0.2 + glow)
+        image = image + random.normal(0, noise, image.shape)
+        write_exr(folder / f"{number}.exr", np.repeat(np.maximum(image, 0)[..., None], 3, axis=2))
+        frames.append({"image": f"{number}.exr", **({"light": {"type": "off"}} if plane is None else {"laser": PLACEHOLDER})})
+    write_manifest(folder, {"schema": "relit.capture/1", "name": "board", "camera": {"projection": "perspective", **entry_of(CAMERA)},
+                            "frames": frames})
+    return folder
+
+
+def boards(folder, chosen=POSES):
+    rays = reference.pixel_rays(CAMERA)
+    found = []
+    for number, pose in enumerate(chosen):
+        normal = pose[:3, 2]
+        points = rays * (pose[:3, 3] @ normal / (rays @ normal))[..., None]
+        found.append(photograph(folder / f"pose{number}", points, board_image(pose)))
+    return found
+
+
+def calibrated(relit, folders, *options):
+    return relit("calibrate", "laser-planes", *folders, "--board", f"{BOARD[0]}x{BOARD[1]}", "--square-m", SQUARE, "--device", "cpu",
+                 *options)
+
+
+def test_planes_are_found_and_measure_an_object(relit, tmp_path):
+    """Corners are off by 0.1 px, the board by a part of a millimetre: planes by tenths of a degree, depths by millimetres."""
+    folders = boards(tmp_path)
+    rays = reference.pixel_rays(CAMERA)
+    truth = reference.plane_depth(rays, (0.0, 0.0, -0.95), (0.1, 0.05, 1.0))
+    scan = photograph(tmp_path / "scan", rays * truth[..., None], np.full(truth.shape, 0.5))
+    outcome = calibrated(relit, folders, "--apply-to", scan)
+    assert (outcome.code, outcome.err) == (0, ""), outcome.err
+    report = json.loads((folders[0] / "calibration.json").read_text())["laser-planes"]
+    found = [frame.laser for frame in Capture.open(scan).manifest.frames if frame.laser is not None]
+    for laser, entry, (point, normal) in zip(found, report["planes"], PLANES, strict=True):
+        off = np.degrees(np.arccos(min(1.0, abs(np.array(laser.normal) @ unit(normal)))))
+        assert off < 0.5 and off < 5 * entry["sigma_degrees"] + 0.1, (off, entry)
+        assert abs((np.array(laser.point_m) - point) @ unit(normal)) < 0.002
+    assert relit("depth", scan, "--out", tmp_path / "out", "--device", "cpu").code == 0
+    maps = DepthMaps.read(tmp_path / "out" / "depth.exr")
+    error = np.abs(maps.depth - truth)[maps.mask]
+    assert maps.mask.sum() > 300 and np.median(error) < 0.004 and np.quantile(error, 0.95) < 0.01
+
+
+def test_what_does_not_determine_planes_is_refused(relit, tmp_path):
+    folders = boards(tmp_path)
+    before = [(folder / "capture.json").read_bytes() for folder in folders]
+    same = boards(tmp_path / "same", [POSES[0], POSES[0]])
+    outcome = calibrated(relit, same)
+    assert outcome.code == 2 and "its stripes lie so close to one line" in outcome.err
+    frames = json.loads(before[1])["frames"]
+    edit_manifest(folders[1], frames=frames[1:])
+    outcome = calibrated(relit, folders)
+    assert outcome.code == 2 and "pose1/capture.json: frames: 2 have a laser plane, those of" in outcome.err
+    edit_manifest(folders[1], frames=frames[:3])
+    outcome = calibrated(relit, folders)
+    assert outcome.code == 2 and "frames: none shows the board without the laser" in outcome.err
+    (folders[1] / "capture.json").write_bytes(before[1])
+    outcome = calibrated(relit, folders[:2], "--board", "5x5")
+    assert outcome.code == 2 and "the board of 5x5 inner corners is not found" in outcome.err
+    outcome = calibrated(relit, folders[:1])
+    assert outcome.code == 2
+    assert [(folder / "capture.json").read_bytes() for folder in folders] == before
+    assert not any((folder / "calibration.json").exists() for folder in folders)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.3])
+def test_a_plane_from_points(tilt):
+    """Boards whose poses are off by half a millimetre, and a tenth of the points of another light."""
+    from stage.calibration.laser_plane import fit_light_plane
+
+    random = np.random.default_rng(2)
+    normal = unit(np.array((1.0, tilt, 0.4)))
+    along, across = unit(np.cross(normal, (0, 0, 1.0))), None
+    across = np.cross(normal, along)
+    stripes = []
+    for distance in (0.8, 0.95, 1.1, 1.25):
+        points = distance * across + along * random.uniform(-0.1, 0.1, 200)[:, None]
+        points += random.normal(0, 1e-4, points.shape) + random.normal(0, 5e-4, 3)
+        points[:20] += random.uniform(-0.1, 0.1, (20, 3))
+        stripes.append(points)
+    found = fit_light_plane(stripes)
+    off = np.degrees(np.arccos(min(1.0, abs(found.normal @ normal))))
+    assert off < 0.1 and off < 3 * found.sigma_degrees < 3  # the other light widens σ
