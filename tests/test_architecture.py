@@ -85,7 +85,8 @@ def test_a_layer_imports_only_its_own_libraries(layer, allowed):
     ("pxr", ["service.usd"]), ("pygltflib", ["service.gltf"]), ("typer", ["service.cli"]), ("rich", ["service.cli"]),
     ("fastapi", ["service.server.api", "service.server.pages"]), ("jinja2", ["service.server.pages"]), ("dbos", ["service.server.jobs"]),
     ("laspy", ["stage.las"]), ("small_gicp", ["stage.scans.neighbours"]), ("rawpy", ["stage.camera_raw"]),
-    ("fast_simplification", ["service.asset.levels"]), ("MaterialX", ["service.asset.openpbr"]),
+    ("fast_simplification", ["service.asset.levels", "service.asset.unwrap"]), ("xatlas", ["service.asset.unwrap"]),
+    ("MaterialX", ["service.asset.openpbr"]),
 ])
 def test_a_library_lives_in_its_places(library, homes):
     assert {i.importer for i in IMPORTS if top(i.target) == library and not under(i.importer, *homes)} == set()
@@ -174,7 +175,7 @@ def test_no_cycles():
 @pytest.mark.parametrize("arguments", [["--help"], ["solve", "--help"], ["relight", "--help"]])
 def test_the_command_line_starts_without_heavy_libraries(arguments):
     heavy = ("warp", "pxr", "OpenEXR", "OpenImageIO", "numpy", "cv2", "MaterialX", "pygltflib", "fast_simplification", "laspy", "rawpy",
-             "small_gicp")
+             "small_gicp", "xatlas")
     code = ("import sys, service.cli.main\n"
             f"sys.argv[1:] = {arguments!r}\n"
             "try: service.cli.main.main()\n"

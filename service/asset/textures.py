@@ -67,8 +67,23 @@ class Texture(NamedTuple):
     clipped_pixels: int  # masked pixels with a channel that had to be cut to 0…1
 
 
+class TangentNormals(NamedTuple):
+    """Normals in the tangent space of a mesh, where the caller has them already."""
+
+    values: np.ndarray  # [rows, cols, 3] float32, 0…1: (n + 1)/2
+    known: np.ndarray  # [rows, cols] bool
+
+
+class BakedImages(NamedTuple):
+    """Images over the texture of a mesh whose vertices no pixel carries."""
+
+    maps: SurfaceMaps  # colours and roughness; its camera is a placeholder with the size of the texture
+    normal: TangentNormals
+    seen_share: float  # of the covered texels that a scan shows
+
+
 def write_textures(maps: SurfaceMaps, mesh: SurfaceMesh, folder: Path, *, look: MetallicLook | None = None,
-                   storage: TextureFormat = TextureFormat.PNG16,
+                   storage: TextureFormat = TextureFormat.PNG16, tangent: TangentNormals | None = None,
                    progress: Callable[[str, float], None] = lambda name, done: None) -> dict[str, Texture]:
     """Write the images that the materials of solved maps use.
 
@@ -77,6 +92,7 @@ def write_textures(maps: SurfaceMaps, mesh: SurfaceMesh, folder: Path, *, look: 
         folder: exists.
         look: of these maps, for `base_color` and `metallic`; an object without metal has no `metallic`.
         storage: 8 bits are kept for colours alone: normals and roughness would show their steps in highlights, and have 16.
+        tangent: the normals in the tangent space of the mesh; None: those of the maps, whose pixels carry the vertices of the mesh.
         progress: is called before each image is waited for, with its name and the part that is done, 0…1.
 
     Returns:
@@ -86,7 +102,7 @@ def write_textures(maps: SurfaceMaps, mesh: SurfaceMesh, folder: Path, *, look: 
         AssetError: the colour space of the maps has no known conversion to Rec.709.
         OSError, StorageError: a file cannot be written.
     """
-    sources: dict[str, np.ndarray | None] = {"roughness": maps.roughness, "normal": maps.normal}
+    sources: dict[str, np.ndarray | None] = {"roughness": maps.roughness, "normal": maps.normal if tangent is None else tangent.values}
     if look is not None:
         sources |= {"base_color": look.base_color, "metallic": look.metallic if look.metallic.any() else None}
     if maps.specular is not None or look is None:  # of a Lambertian surface the base colour is the albedo
@@ -100,10 +116,13 @@ def write_textures(maps: SurfaceMaps, mesh: SurfaceMesh, folder: Path, *, look: 
         space = DATA_SPACE if name not in COLOURS else linear_space(maps.color_space) if storage is TextureFormat.EXR else DISPLAY_SPACE
         if storage is TextureFormat.EXR:
             if name == "normal":
-                values, known = tangent_space(values, known, mesh)
+                values, known = tangent_space(values, known, mesh) if tangent is None else tangent
             return _write_exr(folder / f"{name}.exr", values, known, space, reach)
-        if name == "normal":
+        if name == "normal" and tangent is None:
             codes, known, clipped = encode_normals(values, known, mesh, np.uint16)
+        elif name == "normal" and tangent is not None:
+            known = tangent.known
+            codes, clipped = encode(tangent.values, known, None, np.uint16)
         else:
             colour = name in COLOURS
             codes, clipped = encode(values, known, maps.color_space if colour else None, _PNG_TYPES[storage] if colour else np.uint16)

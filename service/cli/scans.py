@@ -39,6 +39,8 @@ def _fuse(request: FuseRequest) -> None:
         result = fuse(request, bar)
     facts = result.facts
     print(f"mesh     {result.mesh_path}")
+    if result.asset_path is not None:
+        print(f"asset    {result.asset_path}")
     print(f"report   {result.report_path}")
     fused = sum(scan["fused"] for scan in facts["scans"])
     print(f"surface  {facts['vertices']} vertices, {facts['faces']} faces at voxels of {1e3 * facts['voxel_m']:.4g} mm, from {fused} of "

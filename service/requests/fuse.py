@@ -23,8 +23,10 @@ class FuseOptions(Options):
     """Side of a voxel, metres. None: half the distance between neighbouring pixels, or the noise of a pixel if that is larger."""
     misplaced: Misplaced = Misplaced.LEAVE_OUT
     """What becomes of scans that lie beside the surface of the others by more than their σ explain."""
+    texture: bool = True
+    """Whether asset.usdc is made: a mesh of fewer faces with textures of what the views show."""
     texture_faces: Annotated[int, Field(ge=100, le=2_000_000)] = 30_000
-    """Most faces of the textured mesh of asset.usdc; mesh.ply has all."""
+    """Most faces of the mesh of asset.usdc; mesh.ply has all."""
     texture_px: Annotated[int, Field(ge=64, le=16384)] = 2048
     """Side of the texture images in pixels."""
 

@@ -9,14 +9,17 @@ import numpy as np
 
 from kernels import device as devices
 from kernels.fusion.bricks import MEMORY_BOUND
+from service.asset.unwrap import textured_mesh, unwrapper
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
-from service.reporting.provenance import REPORT_FILE, report
+from service.reporting.provenance import REPORT_FILE, metadata, report
 from service.requests.fuse import FuseRequest, Misplaced
+from service.scans.bake import bake
 from service.scans.misplaced import Placing, place_scans
 from service.scans.range_images import COLOUR, WIDTHS, PreparedScan, channels, layers_of, prepare_scan
 from service.scans.read import read_scan
 from service.scans.surface import Surface, fuse_surface
+from service.usd.fused_asset import write_fused
 from stage.colour import convert
 from stage.files import write_text
 from stage.fingerprint import digest
@@ -24,7 +27,7 @@ from stage.meshes.holes import Holes, face_areas, find_holes
 from stage.meshes.mesh import TriangleMesh, write_mesh_ply
 from stage.scans.records import ScanSet, read_scan_set
 
-MESH_FILE = "mesh.ply"
+MESH_FILE, ASSET_FILE = "mesh.ply", "asset.usdc"
 LISTED_HOLES = 50
 """Holes that the report lists, the longest first."""
 LOST_SHARE = 0.05
@@ -39,6 +42,7 @@ class FuseResult(NamedTuple):
     """The files of a fusion, and what its user should know."""
 
     mesh_path: Path
+    asset_path: Path | None  # None: no texture was asked for
     report_path: Path
     facts: dict[str, Any]
     warnings: tuple[str, ...]
@@ -52,6 +56,7 @@ def fuse(request: FuseRequest, progress: Progress | None = None) -> FuseResult:
         progress: told of every stage.
 
     Raises:
+        AssetError: xatlas is not installed, and a texture is asked for.
         RequestError: a scan has no pose or is no range image, too few scans remain, or their poses contradict each other.
         ManifestError, ResultError, ImageError: the scan set or a file of it cannot be used.
         StorageError: a file cannot be read or written.
@@ -60,6 +65,8 @@ def fuse(request: FuseRequest, progress: Progress | None = None) -> FuseResult:
     device = devices.resolve(request.device)
     file, scan_set = read_scan_set(request.scan_set)
     warnings: list[str] = []
+    if request.texture:
+        unwrapper()
     with tempfile.TemporaryDirectory(prefix="relit-fuse-") as work:
         timings.stage("read", len(scan_set.scans))
         scans, names = _prepared(file, scan_set, Path(work), timings)
@@ -79,10 +86,16 @@ def fuse(request: FuseRequest, progress: Progress | None = None) -> FuseResult:
             timings.advance(int(100 * part) - done)
             done = int(100 * part)
 
-        surface = fuse_surface([scans[number] for number in used], names, voxel, device=device, progress=advance)
-    if len(surface.faces) == 0:
-        raise RequestError(f"{file}: no surface is left at voxels of {1e3 * voxel:.4g} mm: give a larger --voxel-m, of the order of the "
-                           "distance between pixels")
+        fusing = [scans[number] for number in used]
+        surface = fuse_surface(fusing, names, voxel, device=device, progress=advance)
+        if len(surface.faces) == 0:
+            raise RequestError(f"{file}: no surface is left at voxels of {1e3 * voxel:.4g} mm: give a larger --voxel-m, of the order of "
+                               "the distance between pixels")
+        baked = None
+        if request.texture:
+            timings.stage("texture", 1)
+            textured = textured_mesh(surface.points, surface.faces, most_faces=request.texture_faces, texture_px=request.texture_px)
+            baked = textured, bake(textured.mesh, fusing, names, voxel, request.texture_px, device=device)
     timings.stage("holes", 1)
     holes = find_holes(surface.points, surface.faces)
     facts = _facts(scans, used, placings, surface, holes, voxel)
@@ -90,11 +103,18 @@ def fuse(request: FuseRequest, progress: Progress | None = None) -> FuseResult:
     timings.stage("write", 1)
     mesh = triangle_mesh(surface, names)
     contents = {"scan_set": digest(file)}
+    asset_path = None
+    if baked is not None:
+        asset_path = request.out / ASSET_FILE
+        facts["texture"] = {"vertices": int(baked[0].place.max()) + 1, "faces": len(baked[0].mesh.triangles),
+                            "seen_share": round(baked[1].seen_share, 4)}
+        write_fused(baked[0], baked[1], asset_path, name=scan_set.name,
+                    provenance=metadata(request, capture=scan_set.name, inputs=contents["scan_set"]))
     write_mesh_ply(mesh, request.out / MESH_FILE, comments=(f"made by relit fuse from {scan_set.name}", "coordinates in metres"))
     report_path = request.out / REPORT_FILE
     write_text(report_path, report(request, inputs={"scan_set": str(file), "name": scan_set.name, **contents},
                                    device=devices.describe(device), timings_s=timings.close(), **facts, warnings=warnings))
-    return FuseResult(request.out / MESH_FILE, report_path, facts, tuple(warnings))
+    return FuseResult(request.out / MESH_FILE, asset_path, report_path, facts, tuple(warnings))
 
 
 def _prepared(file: Path, scan_set: ScanSet, work: Path, timings: Timings) -> tuple[list[PreparedScan], tuple[str, ...]]:

@@ -27,6 +27,14 @@ HISTOGRAM_STEP, HISTOGRAM_END = 0.05, 20.0
 NO_QUADS = np.zeros((0, 4), dtype=np.int32)
 
 
+class Watching(NamedTuple):
+    """A scan that can see a box, and the part of its image in which the box can lie."""
+
+    number: int
+    scan: PreparedScan
+    window: tuple[int, int, int, int]  # first and last row, first and last column
+
+
 class Surface(NamedTuple):
     """The fused surface."""
 
@@ -101,21 +109,20 @@ def fuse_surface(scans: list[PreparedScan], names: tuple[str, ...], voxel: float
         progress(done / len(bricks))
         corner = (int(brick[0]) * BRICK_VOXELS, int(brick[1]) * BRICK_VOXELS, int(brick[2]) * BRICK_VOXELS)
         low = origin + np.array(corner) * voxel
-        watching = [(number, window) for number, scan in enumerate(scans)
-                    if (window := _window(scan, low - 4 * voxel, low + size + 12 * voxel)) is not None]
-        views = upload_views([scans[number].image.cropped(*window) for number, window in watching], origin, device=device)
+        watching = watching_views(scans, low - 4 * voxel, low + size + 12 * voxel)
+        views = upload_views([scan.image.cropped(*window) for _, scan, window in watching], origin, device=device)
         found = find_blocks(views, voxel, corner, device=device)
         volume = integrate(found, views)
         triangles = extract(volume)
         blocks += found.count
-        for place, (number, window) in enumerate(watching):
-            image = scans[number].image
+        for place, (number, scan, window) in enumerate(watching):
+            image = scan.image
             box = slice(window[0], window[1]), slice(window[2], window[3])
             distance, fate = residuals(volume, views, place)
             tallies[number].add(distance, np.asarray(image.sigma[box]).ravel(), fate)
         if len(triangles.faces) == 0:
             continue
-        values, normals, seen = _shown(triangles, [(scans[number], window) for number, window in watching], views, names, voxel, device)
+        values, normals, seen = _shown(triangles, watching, views, names, voxel, device)
         for name, given in (("points", triangles.points.astype(np.float64) + origin), ("normals", normals), ("sigma", triangles.sigma),
                             ("seen", seen), ("values", values), ("edge", triangles.edge),
                             ("faces", triangles.faces.astype(np.int64) + count)):
@@ -181,19 +188,26 @@ def _window(scan: PreparedScan, low: np.ndarray, high: np.ndarray) -> tuple[int,
     return box if box[1] - box[0] > 1 and box[3] - box[2] > 1 else None
 
 
-def upload_layers(watching: list[tuple[PreparedScan, tuple[int, int, int, int]]], device: str) -> tuple[Any, Any]:
+def watching_views(scans: list[PreparedScan], low: np.ndarray, high: np.ndarray) -> list[Watching]:
+    """Return the scans that can see a box of the world from its lowest to its highest corner, [3] metres."""
+    found = ((number, scan, _window(scan, low, high)) for number, scan in enumerate(scans))
+    return [Watching(number, scan, window) for number, scan, window in found if window is not None]
+
+
+def upload_layers(watching: list[Watching], device: str) -> tuple[Any, Any]:
     """Return the layers and the feathers of windows of scans on the device, one after another."""
     layers, feathers = [], []
-    for scan, (top, bottom, left, right) in watching:
+    for _, scan, (top, bottom, left, right) in watching:
         layers.append(np.asarray(scan.layers[top:bottom, left:right]).reshape(-1, scan.layers.shape[-1]))
         feathers.append(np.asarray(scan.feather[top:bottom, left:right]).reshape(-1, 1))
     return tuple(wp.array(np.concatenate(planes), dtype=float, device=device) for planes in (layers, feathers))  # type: ignore[return-value]
 
 
-def _shown(triangles: Any, watching: list[tuple[PreparedScan, tuple[int, int, int, int]]], views: ViewArrays, names: tuple[str, ...],
+def _shown(triangles: Any, watching: list[Watching], views: ViewArrays, names: tuple[str, ...],
            voxel: float, device: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the blended layers behind the normal, the normals, and how many views see each vertex of a brick."""
-    of_faces = vertex_normals(triangles.points, NO_QUADS, triangles.faces)
+    with np.errstate(invalid="ignore"):  # faces of one vertex may cancel each other
+        of_faces = np.nan_to_num(vertex_normals(triangles.points, NO_QUADS, triangles.faces))
     layers, feathers = upload_layers(watching, device)
     shown = gather(views, layers, feathers, *(wp.array(values, dtype=kind, device=device) for values, kind in (
         (triangles.points, wp.vec3), (of_faces, wp.vec3), (triangles.sigma, float))), vectors=3, slack=voxel, device=device)

@@ -46,7 +46,7 @@ class Description(NamedTuple):
     """What the layers of an asset say about it."""
 
     name: str  # free text; the root prim is named after it
-    camera: Camera  # its world_from_camera becomes the root's transform
+    camera: Camera | None  # its world_from_camera becomes the root's transform; None: the asset is in the world frame
     provenance: Mapping[str, str]  # kept in assetInfo, and in customLayerData of every layer, with the camera
     unit_m: float = 1.0  # metres of a scene unit
     version: str = FIRST_VERSION  # of the asset, for assetInfo
@@ -218,13 +218,15 @@ class AssetLayers:
         usd_stage.GetRootLayer().documentation = (
             f"{description.name}: a measured surface, exported by Relit. Camera frame: "
             "+x right, +y up, +z towards the viewer. Where it comes from is in customLayerData.")
-        for key, value in sorted({**description.provenance, "relit:camera": description.camera.model_dump_json()}.items()):
+        camera = {} if description.camera is None else {"relit:camera": description.camera.model_dump_json()}
+        for key, value in sorted({**description.provenance, **camera}.items()):
             usd_stage.SetMetadataByDictKey("customLayerData", key, value)
         if file == self._interface_file:
             describe_root(root, name=description.name, identifier=self._identifier, version=description.version,
                           provenance=description.provenance)
-        if (posed or file == self._interface_file) and description.camera.world_from_camera is not None:
-            root.AddTransformOp().Set(pose_matrix(description.camera.world_from_camera, description.unit_m))
+        pose = None if description.camera is None else description.camera.world_from_camera
+        if (posed or file == self._interface_file) and pose is not None:
+            root.AddTransformOp().Set(pose_matrix(pose, description.unit_m))
         return usd_stage
 
 

@@ -6,6 +6,7 @@ Source: OpenUSD: UsdGeom (meshes, primvars).
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 from pxr import Sdf, Usd, UsdGeom, Vt
 
 from service.asset.mesh import SurfaceMesh
@@ -49,16 +50,28 @@ def level_name(number: int) -> str:
 
 def define_mesh(usd_stage: Usd.Stage, path: Sdf.Path, mesh: SurfaceMesh) -> UsdGeom.Mesh:
     """Define the polygons with normals and texture coordinates."""
-    usd_mesh = UsdGeom.Mesh.Define(usd_stage, path)
-    usd_mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-    usd_mesh.CreateDoubleSidedAttr(True)
-    usd_mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(mesh.points))
-    usd_mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(mesh.face_counts))
-    usd_mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(mesh.face_indices))
-    usd_mesh.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(mesh.extent))
-    usd_mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(mesh.normals))
-    usd_mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    usd_mesh = define_polygons(usd_stage, path, mesh.points, mesh.normals, mesh.face_counts, mesh.face_indices)
     coordinates = UsdGeom.PrimvarsAPI(usd_mesh).CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray,
                                                               UsdGeom.Tokens.vertex)
     coordinates.Set(Vt.Vec2fArray.FromNumpy(mesh.st))
+    return usd_mesh
+
+
+def define_polygons(usd_stage: Usd.Stage, path: Sdf.Path, points: np.ndarray, normals: np.ndarray, counts: np.ndarray,
+                    indices: np.ndarray) -> UsdGeom.Mesh:
+    """Define polygons with normals.
+
+    Args:
+        points: [V, 3] float32. normals: [V, 3] float32.
+        counts: [F] corners of each face. indices: vertex numbers of all corners.
+    """
+    usd_mesh = UsdGeom.Mesh.Define(usd_stage, path)
+    usd_mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    usd_mesh.CreateDoubleSidedAttr(True)
+    usd_mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
+    usd_mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(counts))
+    usd_mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(indices.astype(np.int32)))
+    usd_mesh.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)])))
+    usd_mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals))
+    usd_mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     return usd_mesh

@@ -11,6 +11,7 @@ import numpy as np
 
 from stage.camera import Camera
 from stage.depth_maps import DepthMaps
+from stage.maps import SurfaceMaps
 from stage.ply import PointCloud, write_ply
 
 SIGMA = 2.5e-4
@@ -113,21 +114,24 @@ def turntable(count: int = 18, side: tuple[int, int] = (240, 180), *, sigma: flo
 
 
 def write_scans(folder: Path, shots: list[Shot], *, sigma: float = SIGMA, poses: list[np.ndarray | None] | None = None,
-                coloured: bool = False) -> Path:
+                coloured: bool = False, maps: list[SurfaceMaps] | None = None) -> Path:
     """Write range images as results of `relit depth` with a scan-set.json, and return the file; a pose of None is left out."""
     entries = []
     for number, shot in enumerate(shots):
         rows, cols = shot.side
         camera = Camera(projection="perspective", resolution=(cols, rows), focal_px=(shot.focal, shot.focal))
-        maps = DepthMaps(camera=camera, mask=shot.mask, depth=shot.depth.astype(np.float32),
+        depth = DepthMaps(camera=camera, mask=shot.mask, depth=shot.depth.astype(np.float32),
                          sigma=np.full(shot.side, sigma, dtype=np.float32))
         place = folder / f"scan{number}"
-        maps.write(place / "depth.exr")
+        depth.write(place / "depth.exr")
         if coloured:
             points = camera.points(-shot.depth)[shot.mask]
             world = points @ shot.world_from_camera[:3, :3].T + shot.world_from_camera[:3, 3]
             write_ply(PointCloud(points, colour_of(world)), place / "points.ply")
         entry = {"name": f"view {number}", "path": place.name}
+        if maps is not None:
+            maps[number].write(place / "maps.exr")
+            entry["maps"] = f"{place.name}/maps.exr"
         pose = shot.world_from_camera if poses is None else poses[number]
         if pose is not None:
             entry["scan_to_world"] = pose.tolist()

@@ -1,10 +1,12 @@
 """relit fuse: from a scan set to a mesh, measured against the closed form of the statue; all vertices count."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
 
+from service.asset.errors import AssetError
 from service.errors import RequestError
 from service.requests.fuse import FuseRequest
 from service.scans.fuse import fuse
@@ -25,7 +27,7 @@ def shots():
 @pytest.fixture(scope="module")
 def fused(tmp_path_factory, shots):
     folder = tmp_path_factory.mktemp("statue")
-    return fuse(FuseRequest(scan_set=write_scans(folder, shots, coloured=True), out=folder / "out", voxel_m=VOXEL, device="cpu"))
+    return fuse(FuseRequest(scan_set=write_scans(folder, shots, coloured=True), out=folder / "out", voxel_m=VOXEL, texture=False, device="cpu"))
 
 
 def test_the_fused_statue_is_better_than_its_scans(fused):
@@ -66,7 +68,7 @@ def test_a_scan_at_a_wrong_place_is_left_out_and_named(tmp_path, shots):
     poses = [shot.world_from_camera.copy() for shot in shots]
     poses[4][:3, 3] += OFF * poses[4][:3, 0]
     file = write_scans(tmp_path, shots, poses=poses)
-    result = fuse(FuseRequest(scan_set=file, out=tmp_path / "out", voxel_m=VOXEL, device="cpu"))
+    result = fuse(FuseRequest(scan_set=file, out=tmp_path / "out", voxel_m=VOXEL, texture=False, device="cpu"))
     about = [warning for warning in result.warnings if "its pose is wrong" in warning]
     assert len(about) == 1 and about[0].startswith("scan view 4: lies ") and "left out" in about[0]
     assert [scan["name"] for scan in result.facts["scans"] if not scan["fused"]] == ["view 4"]
@@ -74,11 +76,13 @@ def test_a_scan_at_a_wrong_place_is_left_out_and_named(tmp_path, shots):
     assert 0.2 * OFF < found < OFF  # along the normals, of which only those to the side are moved
 
 
-def test_bad_input_is_refused_in_a_sentence(tmp_path, shots):
+def test_bad_input_is_refused_in_a_sentence(tmp_path, shots, monkeypatch):
     def refused(words, **changes):
-        with pytest.raises(RequestError, match=words):
-            fuse(FuseRequest(out=tmp_path / "out", device="cpu", **changes))
+        with pytest.raises((RequestError, AssetError), match=words):
+            fuse(FuseRequest(out=tmp_path / "out", device="cpu", **{"texture": False, **changes}))
 
+    monkeypatch.setitem(sys.modules, "xatlas", None)
+    refused(r"needs xatlas: pip install 'relit\[scans\]', or give --no-texture", scan_set=write_scans(tmp_path, shots[:1]), texture=True)
     file = write_scans(tmp_path, shots[:2], poses=[shots[0].world_from_camera, None])
     refused(r"scans\[1\] \(view 1\): scan_to_world is missing: run relit register first", scan_set=file)
     pair = [shots[0], shoot(shots[0].world_from_camera, shots[0].side, shots[0].focal, seed=5)]

@@ -1,0 +1,101 @@
+"""The textures of a fused surface: what the views show at each texel, blended from those that see it best."""
+
+import numpy as np
+import warp as wp
+
+from kernels.fusion.bricks import BRICK_VOXELS
+from kernels.fusion.gather import gather
+from kernels.fusion.rasterise import rasterise
+from kernels.fusion.views import upload_views
+from service.asset.mesh import SurfaceMesh
+from service.asset.tangent import vertex_tangents
+from service.asset.textures import BakedImages, TangentNormals
+from service.scans.range_images import ALBEDO, COLOUR, NORMAL, ROUGHNESS, SPECULAR, PreparedScan, channels
+from service.scans.surface import Watching, upload_layers, watching_views
+from stage.camera import Camera
+from stage.maps import SurfaceMaps
+
+SLACK_VOXELS = 3.0
+"""Distance, in voxels, by which the simplified mesh may lie off the surface that a view measured and still show it."""
+
+
+def bake(mesh: SurfaceMesh, scans: list[PreparedScan], names: tuple[str, ...], voxel: float, px: int, *, device: str) -> BakedImages:
+    """Blend the layers of scans over the texture of a mesh.
+
+    Args:
+        mesh: with texture coordinates; world frame.
+        scans: that were fused.
+        names: their layers.
+        voxel: side of a voxel of the fusion, metres.
+        px: side of the texture.
+        device: where to compute.
+    """
+    texels = np.stack([mesh.st[:, 0], 1 - mesh.st[:, 1]], axis=-1).astype(np.float64) * px
+    face, weights = rasterise(texels, mesh.triangles, px, px, device=device)
+    covered = face >= 0
+    corners = mesh.triangles[face[covered]]
+
+    def between(values: np.ndarray) -> np.ndarray:
+        return np.einsum("nk,nkx->nx", weights, values[corners])
+
+    points, normals = between(mesh.points.astype(np.float64)), _unit(between(mesh.normals))
+    values, known = _gathered(points, normals, scans, names, voxel, device)
+    place = channels(names)
+
+    def image(name: str) -> tuple[np.ndarray, np.ndarray]:
+        columns, alpha = values[:, place[name]], values[:, place[name].stop]
+        there = known & (alpha > 0)
+        picture, mask = np.zeros((px, px, columns.shape[1]), dtype=np.float32), np.zeros((px, px), dtype=bool)
+        picture[covered] = np.where(there[:, None], columns / np.where(there, alpha, 1)[:, None], 0)
+        mask[covered] = there
+        return picture, mask
+
+    base = ALBEDO if ALBEDO in names else COLOUR
+    layers = {name: image(name) for name in (base, SPECULAR, ROUGHNESS) if name in names}
+    mask = layers[base][1] if base in layers else np.zeros((px, px), dtype=bool)
+    maps = SurfaceMaps(
+        camera=Camera(projection="orthographic", resolution=(px, px), pixel_size_m=1.0), mask=mask,
+        diffuse_albedo=layers[base][0] if base in layers else None, specular=layers[SPECULAR][0] if SPECULAR in layers else None,
+        roughness=layers[ROUGHNESS][0][..., 0] if ROUGHNESS in layers else None)
+    shown = values[:, place[NORMAL]]
+    known &= np.linalg.norm(shown, axis=1) > 0
+    tangent = between(vertex_tangents(mesh))
+    tangent = _unit(tangent - normals * np.einsum("nx,nx->n", tangent, normals)[:, None])
+    a, b, c = (mesh.st[corners[:, k]].astype(np.float64) for k in range(3))
+    turn = np.sign((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])  # −1 in a mirrored chart
+    bitangent = np.cross(normals, tangent) * turn[:, None]
+    unit = _unit(np.where(known[:, None], shown, normals))
+    local = np.stack([np.einsum("nx,nx->n", axis, unit) for axis in (tangent, bitangent, normals)], axis=-1)
+    normal, normal_known = np.zeros((px, px, 3), dtype=np.float32), np.zeros((px, px), dtype=bool)
+    normal[covered] = local / 2 + 0.5
+    normal_known[covered] = known & tangent.any(axis=1)
+    return BakedImages(maps, TangentNormals(normal, normal_known), float(known.mean()) if len(known) else 0.0)
+
+
+def _gathered(points: np.ndarray, normals: np.ndarray, scans: list[PreparedScan], names: tuple[str, ...], voxel: float,
+              device: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the blended layers [n, C] at points, and where a view shows one, brick by brick."""
+    size = BRICK_VOXELS * voxel
+    brick, number = np.unique(np.floor(points / size).astype(np.int64), axis=0, return_inverse=True)
+    width = channels(names)[names[-1]].stop + (names[-1] != NORMAL)
+    values, known = np.zeros((len(points), width), dtype=np.float32), np.zeros(len(points), dtype=bool)
+    order = np.argsort(number.ravel(), kind="stable")
+    bounds = np.searchsorted(number.ravel()[order], np.arange(len(brick) + 1))
+    for k in range(len(brick)):
+        chosen = order[bounds[k]:bounds[k + 1]]
+        low = brick[k] * size
+        watching: list[Watching] = watching_views(scans, low - 4 * voxel, low + size + 4 * voxel)
+        if not watching:
+            continue
+        views = upload_views([scan.image.cropped(*window) for _, scan, window in watching], low, device=device)
+        layers, feathers = upload_layers(watching, device)
+        shown = gather(views, layers, feathers, wp.array((points[chosen] - low).astype(np.float32), dtype=wp.vec3, device=device),
+                       wp.array(normals[chosen].astype(np.float32), dtype=wp.vec3, device=device),
+                       wp.zeros(len(chosen), dtype=float, device=device), vectors=3, slack=SLACK_VOXELS * voxel, device=device)
+        values[chosen], known[chosen] = shown.values.numpy(), shown.weight.numpy() > 0
+    return values, known
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.asarray(vectors / np.where(length > 0, length, 1))
