@@ -27,7 +27,8 @@ def shots():
 @pytest.fixture(scope="module")
 def fused(tmp_path_factory, shots):
     folder = tmp_path_factory.mktemp("statue")
-    return fuse(FuseRequest(scan_set=write_scans(folder, shots, coloured=True), out=folder / "out", voxel_m=VOXEL, texture=False, device="cpu"))
+    file = write_scans(folder, shots, coloured=True)
+    return fuse(FuseRequest(scan_set=file, out=folder / "out", voxel_m=VOXEL, texture=False, device="cpu"))
 
 
 def test_the_fused_statue_is_better_than_its_scans(fused):
