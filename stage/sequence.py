@@ -50,6 +50,8 @@ class SequenceFile(Strict):
                                  "time")
         names = [Path(step.path).name for step in self.steps]
         for number, name in enumerate(names):
+            if name in ("", ".."):
+                raise ValueError(f"steps[{number}].path: is {self.steps[number].path}: name the folder, after which results are named")
             if names.index(name) != number:
                 raise ValueError(f"steps[{number}].path: ends in {name} as that of steps[{names.index(name)}]: results are named after it")
         return self

@@ -52,6 +52,8 @@ def test_what_is_written_is_read(folder):
     ([{"path": "a", "time_s": 1}, {"path": "b", "time_s": 1}], r"steps\[1\].time_s: is 1, the step before has 1"),
     ([{"path": "a"}, {"path": "x/a"}], r"steps\[1\].path: ends in a as that of steps\[0\]"),
     ([{"path": "a", "speed": 1}], "speed"),
+    ([{"path": ".."}], r"steps\[0\].path: is ..: name the folder"),
+    ([{"path": "."}], r"steps\[0\].path: is .: name the folder"),
 ])
 def test_faults_of_the_file_are_named(folder, steps, words):
     write(folder, steps=steps)
