@@ -3,7 +3,7 @@
     python -m benchmarks.trust [--data DIR] [--only MODULE ...]
 
 `--data` is a folder with the real captures of docs/figures.md; what needs them, or Mitsuba, is left out where it is missing. With `--only`
-the table is printed and nothing is written.
+the rows of these modules are written anew, and the picture stays.
 """
 
 import argparse
@@ -99,6 +99,20 @@ def row(trial: Trial) -> str:
     return f"{line}\n| *{note}* | | | | | | | | |" if note else line
 
 
+def renewed(before: str, rows: list[str]) -> str:
+    """Return the page with the rows of some trials replaced, each with the sentence under it; what has no row yet is left out."""
+    found = {row.split("|")[1]: row for row in rows}
+    lines: list[str] = []
+    inside = False  # a trial whose old sentence goes
+    for line in before.split("\n"):
+        name = line.split("|")[1] if line.startswith("| ") else ""
+        if inside and name.startswith(" *"):
+            continue
+        inside = name in found
+        lines.append(found.pop(name) if inside else line)
+    return "\n".join(lines)
+
+
 def picture(trials: list[Trial]) -> np.ndarray:
     """Return the risk–coverage curves, [rows, cols, 3] uint8: error of the pixels kept against the fraction kept, surest first.
 
@@ -144,7 +158,9 @@ def main() -> None:
         trials.append(trial)
         rows.append(row(trial))
         print(rows[-1], flush=True)
-    if not options.only:
+    if options.only:
+        write_text(TABLE, renewed(TABLE.read_text(encoding="utf-8"), rows[1:]))
+    else:
         write_text(TABLE, HEAD + "\n".join(rows) + "\n\n" + CAPTION)
         cv2.imwrite(str(PICTURE), picture(trials), [cv2.IMWRITE_PNG_COMPRESSION, 9])
 

@@ -158,7 +158,8 @@ def gather(environment: np.ndarray, rotations: np.ndarray, lights: int,
         amounts = [np.repeat(environment[band.texel_row, :, channel].astype(np.float64), band.across, axis=1)
                    * band.solid_angle[:, None] for channel in range(3)]
         for turn in shared_turns(rotations, len(band.azimuth)):
-            parts = list(split(turn.rotation, band))
+            parts = [part._replace(light=part.light.astype(np.intp), share=np.ascontiguousarray(part.share))
+                     for part in split(turn.rotation, band)]  # as they are read for every frame
             for part in parts:
                 areas[list(turn.frames)] += np.bincount(part.light, weights=solid_angle[part.sample] * part.share, minlength=lights)
             for frame, columns in zip(turn.frames, turn.columns, strict=True):
