@@ -24,7 +24,7 @@ REACH = 4
 """Half side of the window: 9 × 9 pixels."""
 CENTRE = 1
 """Half side of the middle of the window, whose differences tell whether the pixel itself belongs to the plane."""
-STEPS = 3
+STEPS = 2
 """Gauss-Newton steps."""
 NEAR_PX = 1.25
 """Pixels take part whose disparity lies this near to the plane."""
