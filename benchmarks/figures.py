@@ -1,6 +1,6 @@
 """Write docs/figures.md: every figure in it is measured here. A section whose data is not at hand keeps what it said before.
 
-    python -m benchmarks.figures [--data DIR] [--glossy DIR] [--relighting DIR] [--rig DIR] [--large DIR] [--only NAME ...]
+    python -m benchmarks.figures [--data DIR] [--glossy DIR] [--relighting DIR] [--rig DIR] [--large DIR] [--megapixels N] [--only NAME ...]
 """
 
 import argparse
@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks.ablation import ablation_table
 from benchmarks.accuracy import SolveError, compare, diligent_errors, read_truth, sample_errors
-from benchmarks.large import large_table
+from benchmarks.large import FRAMES, LIGHTS, MEGAPIXELS, large_table
 from benchmarks.left_out import left_out_table
 from benchmarks.materials import material_table
 from benchmarks.relighting import relighting_table
@@ -171,7 +171,7 @@ def _measure(*arguments: str) -> tuple[float, float]:
 
 def memory(given: argparse.Namespace) -> list[str] | None:
     """Measure the stages and the peak memory of a large capture."""
-    return None if given.large is None else large_table(given.large)
+    return None if given.large is None else large_table(given.large, given.megapixels, given.lights, given.frames)
 
 
 SECTIONS: dict[str, tuple[str, Section]] = {
@@ -209,6 +209,9 @@ def main() -> None:
                                                            "two_parts and figure of samples/make_parts.py")
     parser.add_argument("--rig", type=Path, help="folder with the sets of samples/make_rig.py")
     parser.add_argument("--large", type=Path, help="folder where about 60 GB may be written and are removed again")
+    parser.add_argument("--megapixels", type=float, default=MEGAPIXELS, help="of --large")
+    parser.add_argument("--lights", type=int, default=LIGHTS, help="of --large")
+    parser.add_argument("--frames", type=int, default=FRAMES, help="of --large")
     parser.add_argument("--only", nargs="+", choices=SECTIONS, help="sections to measure (default: all)")
     given = parser.parse_args()
     before = TARGET.read_text(encoding="utf-8") if TARGET.exists() else ""

@@ -142,14 +142,26 @@ def measure(command: str, folder: Path, method: str, frames: int) -> list[Stage]
     return [Stage(*values) for values in json.loads(done.stdout.splitlines()[-1])]
 
 
+def head(width: int, height: int, lights: int, frames: int, method: str) -> list[str]:
+    """Return the lines above the rows of the table."""
+    return [f"{width} × {height} pixels ({width * height / 1e6:.1f} megapixels), {lights} lights, no mask, `{method}`, {frames} frames "
+            f"(DWAA), {os.cpu_count()} cores. The peak is the resident memory of the process, mapped files included.", "",
+            "| command | stage | seconds | peak, GiB |", "|---|---|---|---|"]
+
+
+def rows(stages: list[Stage]) -> list[str]:
+    """Return the rows of a command's stages, and one of them all."""
+    command, seconds, peak = stages[0].command, sum(stage.seconds for stage in stages), max(stage.peak_gib for stage in stages)
+    return [*(f"| `{command}` | {stage.name} | {stage.seconds:.1f} | {stage.peak_gib:.2f} |" for stage in stages),
+            f"| `{command}` | **all** | **{seconds:.0f}** | **{peak:.2f}** |"]
+
+
 def large_table(folder: Path, megapixels: float = MEGAPIXELS, lights: int = LIGHTS, frames: int = FRAMES,
                 method: str = "robust") -> list[str]:
     """Return the table as lines of Markdown; the folder is empty again afterwards."""
     height = round(math.sqrt(1e6 * megapixels / ASPECT))
     width = round(1e6 * megapixels / height)
-    lines = [f"{width} × {height} pixels ({width * height / 1e6:.1f} megapixels), {lights} lights, no mask, `{method}`, {frames} frames "
-             f"(DWAA), {os.cpu_count()} cores. The peak is the resident memory of the process, mapped files included.", "",
-             "| command | stage | seconds | peak, GiB |", "|---|---|---|---|"]
+    lines = head(width, height, lights, frames, method)
     work = folder / "relit-large"
     try:
         # in a process of its own: the peak memory of a process is never below that of the one that started it
@@ -157,13 +169,9 @@ def large_table(folder: Path, megapixels: float = MEGAPIXELS, lights: int = LIGH
                         "make_capture(Path(sys.argv[1]), *map(int, sys.argv[2:]))", str(work / "capture"), str(width), str(height),
                         str(lights)], check=True)
         for command in COMMANDS:
-            stages = measure(command, work, method, frames)
-            for stage in stages:
-                lines.append(f"| `{command}` | {stage.name} | {stage.seconds:.1f} | {stage.peak_gib:.2f} |")
-                print(lines[-1], flush=True)
-            seconds, peak = sum(stage.seconds for stage in stages), max(stage.peak_gib for stage in stages)
-            lines.append(f"| `{command}` | **all** | **{seconds:.0f}** | **{peak:.2f}** |")
-            print(lines[-1], flush=True)
+            found = rows(measure(command, work, method, frames))
+            print("\n".join(found), flush=True)
+            lines += found
     finally:
         shutil.rmtree(work, ignore_errors=True)
     return lines
