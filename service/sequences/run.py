@@ -1,5 +1,6 @@
 """A solve or a depth of a sequence: its steps one after another, each joined with those before, and a report over all of them."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,6 +27,8 @@ from stage.maps import MAPS_FILE, SurfaceMaps
 from stage.ply import POINTS_FILE, read_ply, write_ply
 from stage.sequence import SEQUENCE_FILE, Sequence, TimeStep, check_alike, is_sequence, read_sequence, write_sequence
 
+FIGURES = re.compile(r"\d[\d.]*")
+"""What differs between sentences of steps that say the same."""
 UNTIMED = "the steps are folders in order of name, taken at {:g} a second: a sequence.json says the rate and times"
 """What the report says of a sequence without a file."""
 
@@ -167,6 +170,7 @@ def _run(request: Any, sequence: Sequence, progress: Progress | None, one: Calla
     warnings: list[str] = [] if sequence.timed or request.frame_rate is not None else [UNTIMED.format(sequence.frames_per_second)]
     kept = solved = agreed = compared = 0
     methods: dict[str, str] = {}
+    said: dict[str, list[str]] = {}
     for number, step in enumerate(sequence.steps, start=1):
         found, was_done = one(step, request.out / step.name, StepProgress(timings, number, len(sequence.steps)))
         rows.append(found.facts | {"done_before": was_done})
@@ -175,7 +179,10 @@ def _run(request: Any, sequence: Sequence, progress: Progress | None, one: Calla
         agreed += found.facts.get("joined_pixels", 0)
         compared += found.facts.get("compared_pixels", 0)
         methods.setdefault(str(found.facts["method"]), step.name)
-        warnings += [f"{step.name}: {sentence}" for sentence in found.warnings]
+        for sentence in found.warnings:
+            said.setdefault(FIGURES.sub("", sentence), []).append(f"{step.name}: {sentence}")
+    warnings += [first if not others else f"{first} (and {len(others)} more of {len(rows)} steps, with other figures)"
+                 for first, *others in said.values()]
     if len(methods) > 1:
         warnings.append("the steps are not of one method: " + ", ".join(f"{method} from {name} on" for method, name in methods.items())
                         + ": give the method")

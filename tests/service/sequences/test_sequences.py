@@ -196,6 +196,14 @@ def test_the_command_says_what_it_made(tmp_path, relit):
     assert "taken at 24 a second" in outcome.out
 
 
+def test_a_warning_of_many_steps_is_said_once(tmp_path):
+    """A flat relief whose steps all warn of the height, each of another place."""
+    write_sequence(tmp_path / "in", [8, 10, 12], noise=NOISE, size=24)
+    result = solve_sequence(request(tmp_path, max_sigma=1e-3))
+    said = [sentence for sentence in result.warnings if "no pixel is solved" in sentence]
+    assert len(said) == 1 and said[0].startswith("step00: ") and said[0].endswith("(and 2 more of 3 steps, with other figures)")
+
+
 @pytest.fixture(scope="module")
 def spheres(tmp_path_factory):
     """A sphere that moves before a plane, under phases that a Gray code numbers."""
