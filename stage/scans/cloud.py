@@ -8,8 +8,9 @@ import numpy as np
 from stage.scans.neighbours import Neighbours
 from stage.scans.scan import Scan
 
-NEIGHBOURS = 16
-"""The number of neighbours that a normal is fitted to."""
+NEIGHBOURS, FEW_NEIGHBOURS = 16, 8
+"""The number of neighbours that a normal is fitted to, and with which poses are fitted again, to see what the
+choice does to them."""
 OFF_CENTRE = 0.3
 """A point is on a border if the mean of its neighbours lies this part of their distance to one side."""
 SPACING_NEIGHBOUR = 4
@@ -24,6 +25,7 @@ class Cloud:
 
     points: np.ndarray  # [n, 3] float64 metres
     normals: np.ndarray  # [n, 3] float64, unit, towards the camera
+    near_normals: np.ndarray  # [n, 3] the same of fewer neighbours
     directions: np.ndarray  # [n, 3] float64, unit, from the camera
     sigma: np.ndarray  # [n] float64 metres along the line of sight
     spacing: np.ndarray  # [n] float64 metres to the neighbours
@@ -57,15 +59,23 @@ def prepared(scan: Scan, *, cell_m: float, most: int, threads: int = 1) -> Cloud
     tree = Neighbours(thinned.points, threads=threads)
     index, distance = tree.nearest(thinned.points, NEIGHBOURS + 1)
     around = thinned.points[index] - thinned.points[:, None]
-    mean = around.mean(axis=1)
-    spread, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around) / index.shape[1] - mean[:, :, None] * mean[:, None, :])
-    normals = axes[:, :, 0] * np.where(np.einsum("ni,ni->n", axes[:, :, 0], thinned.directions) > 0, -1.0, 1.0)[:, None]
+    normals, spread, mean = _planes(around, thinned.directions)
+    near_normals, _, _ = _planes(around[:, :FEW_NEIGHBOURS + 1], thinned.directions)
     off = np.linalg.norm(mean - normals * np.einsum("ni,ni->n", mean, normals)[:, None], axis=1)
     spacing = distance[:, min(SPACING_NEIGHBOUR, distance.shape[1] - 1)]
     border = (off > OFF_CENTRE * distance[:, -1]) | (spread[:, 1] < 0.05 * spread[:, 2])
     sample = np.random.default_rng(0).permutation(len(thinned.points))[:most]
-    return Cloud(points=thinned.points, normals=normals, directions=thinned.directions, sigma=thinned.sigma, spacing=spacing, border=border,
-                 tree=tree, sample=np.sort(sample))
+    return Cloud(points=thinned.points, normals=normals, near_normals=near_normals, directions=thinned.directions, sigma=thinned.sigma,
+                 spacing=spacing, border=border, tree=tree, sample=np.sort(sample))
+
+
+def _planes(around: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the normals [n, 3] of neighbours [n, k, 3], their variances along three directions [n, 3], and their mean [n, 3]."""
+    mean = around.mean(axis=1)
+    products = around.transpose(0, 2, 1) @ around / around.shape[1]
+    spread, axes = np.linalg.eigh(products - mean[:, :, None] * mean[:, None, :])
+    normals = axes[:, :, 0]
+    return normals * np.where((normals * directions).sum(axis=1) > 0, -1.0, 1.0)[:, None], spread, mean
 
 
 def _thin(scan: Scan, cell: float) -> _Thinned:

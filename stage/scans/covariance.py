@@ -28,6 +28,10 @@ def covariances(solved: Solved, pairs: Sequence[Pair], edges: Sequence[Edge]) ->
     place = {number: 6 * k for k, number in enumerate(order)}
     spread = np.zeros((6 * len(order), 6 * len(order)))
     onto = [_onto(edge, solved, place) for edge in edges]
+    for pair, weight, jacobian in zip(pairs, solved.weights, onto, strict=True):
+        assert pair.fit is not None
+        pull = jacobian.T @ (weight * pair.fit.information @ pair.fit.doubt)
+        spread += np.outer(pull, pull)
     for number in order:
         of_scan = [k for k, pair in enumerate(pairs) if number in (pair.a, pair.b)]
         if not of_scan:
@@ -66,7 +70,8 @@ def _shares(pair: Pair, number: int, weight: float) -> np.ndarray:
     assert pair.fit is not None
     rows = pair.fit.rows
     index, sigma = (rows.at, -rows.sigma_a) if number == pair.a else (rows.of, rows.sigma_b)
-    values = rows.gradient * sigma[:, None] * (weight / max(pair.fit.ratio, 1.0))
+    onto_graph = weight * pair.fit.information @ np.linalg.pinv(pair.fit.normal, rcond=1e-12, hermitian=True)  # by way of the pair's pose
+    values = (rows.gradient * (sigma * max(pair.fit.ratio, 1.0) * pair.fit.together)[:, None]) @ onto_graph.T
     size = int(index.max()) + 1
     return np.stack([np.bincount(index, column, minlength=size) for column in values.T], axis=1)
 

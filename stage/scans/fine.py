@@ -19,8 +19,13 @@ TUKEY = 4.685
 """Distances beyond this many standard deviations count nothing. Source: Tukey's biweight, 95 % efficient on normal noise."""
 STEPS = 12
 """The most steps at one reach."""
-STILL = 0.02
-"""Steps end when the scan moves by less than this part of the median σ of its distances divided by the root of their number."""
+STILL, NEARLY_STILL = 0.1, 0.2
+"""Steps end when the scan moves by less than this part of the standard error of the mean distance; at all reaches but the last, of the
+standard deviation of the distances."""
+FEW = 3000
+"""The most points that are matched at all reaches but the last."""
+BLOCK = 6.0
+"""The side of the blocks within which errors may be alike, in distances of neighbouring points."""
 LEAST_MATCHES = 30
 """The fewest matches that a pose of six numbers is fitted to."""
 
@@ -30,10 +35,13 @@ class Fit(NamedTuple):
 
     pose: np.ndarray  # [4, 4] a_from_b
     pivot: np.ndarray  # [3] metres, frame of a: the mean of the matched points, about which rotations count
-    information: np.ndarray  # [6, 6] of rotation vector (radians) and translation (metres), frame of a, if distances were independent
-    noise: np.ndarray  # [6, 6] the part of `information` that noise in the normals alone would make
+    doubt: np.ndarray  # [6] a motion about the pivot by which the pose may be wrong beside the noise; its square is in `information`
+    information: np.ndarray  # [6, 6] of rotation vector (radians) and translation (metres), frame of a
+    normal: np.ndarray  # [6, 6] the matrix of the normal equations of `rows`
+    noise: np.ndarray  # [6, 6] the part of it that noise in the normals alone would make
     residual: float  # metres: the robust standard deviation of the distances
     ratio: float  # the robust standard deviation of the distances in units of their σ
+    together: float  # by which factor errors of neighbours that are alike widen σ of the pose
     scale: float  # by how much b would have to grow about the pivot, as a part of its size
     scale_sigma: float
     rows: "Rows"
@@ -63,9 +71,11 @@ def fit(a: Cloud, b: Cloud, start: np.ndarray, reaches: list[float]) -> Fit | No
     """
     pose = start
     found: _Matches | None = None
+    few = b.sample[::max(1, -(-len(b.sample) // FEW))]
     for reach in reaches:
+        last = reach == reaches[-1]
         for _ in range(STEPS):
-            found = _match(a, b, pose, reach)
+            found = _match(a, b, pose, reach, b.sample if last else few)
             if found is None:
                 return None
             system = _system(found)
@@ -75,16 +85,18 @@ def fit(a: Cloud, b: Cloud, start: np.ndarray, reaches: list[float]) -> Fit | No
                 return None
             pose = moved(step, system.pivot, pose)
             size = float(np.sqrt(np.sum((found.placed - system.pivot) ** 2) / len(found.placed)))
-            if float(np.linalg.norm(step[:3])) * size + float(np.linalg.norm(step[3:])) < STILL * found.scale / np.sqrt(len(found.at)):
+            enough = STILL * found.scale / np.sqrt(len(found.at)) if last else NEARLY_STILL * found.scale
+            if float(np.linalg.norm(step[:3])) * size + float(np.linalg.norm(step[3:])) < enough:
                 break
-    if found is None or (found := _match(a, b, pose, reaches[-1])) is None:
+    if found is None or (found := _match(a, b, pose, reaches[-1], b.sample)) is None:
         return None
-    return _result(found, pose)
+    return _result(a, found, pose)
 
 
-def _result(found: "_Matches", pose: np.ndarray) -> Fit:
+def _result(a: Cloud, found: "_Matches", pose: np.ndarray) -> Fit:
     system = _system(found)
-    squared = max(found.ratio, 1.0) ** 2
+    together = _together(found, system, BLOCK * float(np.median(a.spacing)))
+    squared = max(found.ratio, 1.0) ** 2 * together**2
     local = found.placed - system.pivot
     grow = _dots(local, found.normal)
     weight = found.weight / found.sigma**2
@@ -96,8 +108,28 @@ def _result(found: "_Matches", pose: np.ndarray) -> Fit:
     left = float(weight @ grow**2 - cross @ solved[:, 0])
     scale = -float(weight @ (grow * found.distance) - cross @ solved[:, 1]) / left if left > 0 else 0.0
     rows = Rows(found.at, found.of, system.weighted.astype(np.float32), found.sigma_a.astype(np.float32), found.sigma_b.astype(np.float32))
-    return Fit(pose, system.pivot, system.information / squared, system.noise / squared, found.scale, found.ratio, scale,
-               float(np.sqrt(squared / left)) if left > 0 else float("inf"), rows, int((found.weight > 0).sum()))
+    scale_sigma = float(np.sqrt(squared / left)) if left > 0 else float("inf")
+    return Fit(pose=pose, pivot=system.pivot, doubt=np.zeros(6), information=system.information / squared, normal=system.information,
+               noise=system.noise, residual=found.scale, ratio=found.ratio, together=together, scale=scale,
+               scale_sigma=scale_sigma, rows=rows, matches=int((found.weight > 0).sum()))
+
+
+def _together(found: "_Matches", system: "_System", block_m: float) -> float:
+    """Return by which factor distances that are alike in a block of the surface widen the σ of the pose, at least 1.
+
+    Source: Liang and Zeger, "Longitudinal data analysis using generalized linear models", Biometrika 73, 1986: sums over blocks in place of
+    single errors.
+    """
+    local = np.floor((found.placed - found.placed.min(axis=0)) / block_m).astype(np.int64)
+    size = local.max(axis=0) + 1
+    _, block = np.unique(local @ np.array([1, size[0], size[0] * size[1]]), return_inverse=True)
+    pulls = system.weighted * found.distance[:, None]
+    sums = np.stack([np.bincount(block, column) for column in pulls.T], axis=1)
+    single = pulls.T @ pulls
+    units = 1 / np.sqrt(np.maximum(np.diag(single), np.finfo(np.float64).tiny))
+    single, blocks = single * np.outer(units, units), (sums.T @ sums) * np.outer(units, units)
+    factor = float(np.trace(np.linalg.pinv(single, rcond=1e-9, hermitian=True) @ blocks)) / 6
+    return float(np.sqrt(max(factor, 1.0)))
 
 
 class _Matches(NamedTuple):
@@ -127,20 +159,20 @@ def _dots(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return (one * other) @ np.ones(3)
 
 
-def _match(a: Cloud, b: Cloud, pose: np.ndarray, reach: float) -> _Matches | None:
-    placed = applied(pose, b.points[b.sample])
+def _match(a: Cloud, b: Cloud, pose: np.ndarray, reach: float, sample: np.ndarray) -> _Matches | None:
+    placed = applied(pose, b.points[sample])
     index, apart = a.tree.nearest(placed)
     index, apart = index[:, 0], apart[:, 0]
-    turned = b.normals[b.sample] @ pose[:3, :3].T
+    turned = b.normals[sample] @ pose[:3, :3].T
     alike = _dots(turned, a.normals[index])
     normal = turned + a.normals[index]
     normal /= np.maximum(np.sqrt(_dots(normal, normal)), 1e-12)[:, None]
     across = _dots(placed - a.points[index], normal)
     beside = np.sqrt(np.maximum(apart**2 - across**2, 0))
-    keep = (apart < reach) & (alike > ALIKE) & ~a.border[index] & ~b.border[b.sample] & (beside < 1.5 * a.spacing[index])
+    keep = (apart < reach) & (alike > ALIKE) & ~a.border[index] & ~b.border[sample] & (beside < 1.5 * a.spacing[index])
     if keep.sum() < LEAST_MATCHES:
         return None
-    at, of, normal, across = index[keep], b.sample[keep], normal[keep], across[keep]
+    at, of, normal, across = index[keep], sample[keep], normal[keep], across[keep]
     seen_b = _dots(b.directions[of] @ pose[:3, :3].T, normal) * b.sigma[of]
     seen_a = _dots(a.directions[at], normal) * a.sigma[at]
     sigma = np.sqrt(seen_a**2 + seen_b**2 + (0.05 * np.minimum(a.sigma[at], b.sigma[of])) ** 2)  # grazing rays: never 0

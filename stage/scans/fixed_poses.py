@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stage.scans.pairs import Pair, PairState, prepare, refine
-from stage.scans.registration import CELLS_ACROSS, extent_of, overlap_of
+from stage.scans.registration import CELLS_ACROSS, START_CELLS, extent_of, overlap_of
 from stage.scans.rigid import inverse, step_between
 from stage.scans.scan import Scan
 
@@ -47,7 +47,7 @@ def check_fixed(scans: Sequence[Scan], poses: Sequence[np.ndarray], *, threads: 
         def one(numbers: tuple[int, int]) -> Pair:
             a, b = (ready[k] for k in numbers)
             start = inverse(poses[numbers[0]]) @ poses[numbers[1]]
-            if overlap_of(a, b, start, cell) < least_overlap:
+            if overlap_of(a, b, start, START_CELLS * cell) < least_overlap:
                 return Pair(*numbers, PairState.NO_POSE, None, 0.0, 0.0, "do not overlap at the poses that are given")
             return refine(a, b, start, numbers=numbers, cell_m=cell, least_overlap=least_overlap)
 

@@ -1,7 +1,7 @@
 """Registration of two scans: poses that are tried, and whether what they leave is one surface, seen twice, in one way alone."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -23,8 +23,8 @@ ROUGH_POINTS, FINE_POINTS = 3000, 12_000
 """The most points of a scan that are matched at either scale."""
 CONTRADICTED = 0.05
 """The largest part of the points in sight that may lie where the other camera saw through: borders and mixed pixels."""
-ROUGH_CONTRADICTED = 0.25
-"""The same of a rough pose."""
+MATCHED_CONTRADICTED, ROUGH_CONTRADICTED = 0.4, 0.25
+"""The same of a pose from matched features, and after its fit at the rough scale."""
 BEND = 0.12
 """The largest residual as a part of the spacing of the points, whatever σ is: what the bend of the surface between points makes."""
 ROUGH_BEND = 0.15
@@ -36,8 +36,9 @@ NOT_DETERMINED, WEAK = 10.0, 60.0
 A vase has 4 about its axis; the statue of tests/scenes has 140 and more at overlaps above a tenth."""
 SHIFTS = (0.1, -0.1, 0.3)
 """By how much, in parts of the size of the scans, a scan is moved along a weak direction to try it out."""
-AS_GOOD = 1.15
-"""Another pose fits as well if its residual is at most this many times that of the best, and its overlap that part of it at the least."""
+AS_GOOD, LEAST_ALIKE, MORE_CONTRADICTED = 1.15, 0.6, 0.01
+"""Another pose fits as well if its residual is at most this many times that of the best, its overlap that part of it at the least, and not
+this much more of it is contradicted."""
 
 
 SCALE_SIGMAS, SCALE_LEAST, SCALE_MOST = 5.0, 0.001, 0.2
@@ -127,6 +128,8 @@ def _settled(a: Prepared, b: Prepared, poses: list[np.ndarray], cell_m: float) -
     """Yield the poses after a fit at the rough scale, each once, without those that the free space contradicts."""
     seen: list[np.ndarray] = []
     for pose in poses:
+        if _part(both_sights(a.image, b.image, a.rough.points, b.rough.points, pose, cell_m)) > MATCHED_CONTRADICTED:
+            continue
         found = fit(a.rough, b.rough, pose, [4 * cell_m, 2 * cell_m])
         if found is None or any(is_near(found.pose, other, b.rough.middle, cell_m) for other in seen):
             continue
@@ -176,7 +179,17 @@ def _judged(a: Prepared, b: Prepared, start: np.ndarray, numbers: tuple[int, int
         state, reason = PairState.CONTRADICTED, f"{part:.0%} of the points in sight lie where the other camera saw through"
     elif overlap < least_overlap:
         state, reason = PairState.LITTLE_OVERLAP, f"only {overlap:.1%} of the smaller surface is matched"
+    if state is PairState.JOINED:
+        found = _doubted(a.fine, b.fine, found, 1.5 * spacing)
     return Pair(*numbers, state, found, overlap, part, reason)
+
+
+def _doubted(a: Cloud, b: Cloud, found: Fit, reach: float) -> Fit:
+    """Return a fit with what another choice of the normals does to its pose, which is about what the spacing of the points does."""
+    other = fit(replace(a, normals=a.near_normals), replace(b, normals=b.near_normals), found.pose, [reach])
+    doubt = np.zeros(6) if other is None else step_between(other.pose @ inverse(found.pose), found.pivot)
+    pull = found.information @ doubt
+    return found._replace(doubt=doubt, information=found.information - np.outer(pull, pull) / (1 + doubt @ pull))
 
 
 def _tried_out(a: Prepared, b: Prepared, best: Pair, cell_m: float, least_overlap: float) -> Pair:
@@ -184,7 +197,7 @@ def _tried_out(a: Prepared, b: Prepared, best: Pair, cell_m: float, least_overla
     assert best.fit is not None
     size = float(np.sqrt(((b.rough.points - b.rough.middle) ** 2).sum(axis=1).mean()))
     units = np.array([1 / size] * 3 + [1.0] * 3)  # a step of length 1 moves points by about 1 m
-    values, axes = np.linalg.eigh(best.fit.information * np.outer(units, units))
+    values, axes = np.linalg.eigh(best.fit.normal * np.outer(units, units))
     for value, axis in zip(values, axes.T, strict=True):
         alone = float(axis @ (best.fit.noise * np.outer(units, units)) @ axis)
         step = units * axis
@@ -209,7 +222,8 @@ def _slides(a: Prepared, b: Prepared, best: Pair, step: np.ndarray, cell_m: floa
 
 def _as_good(pair: Pair, best: Pair) -> bool:
     assert pair.fit is not None and best.fit is not None
-    return (pair.state is PairState.JOINED and pair.fit.ratio <= AS_GOOD * best.fit.ratio and pair.overlap >= best.overlap / AS_GOOD / 1.5)
+    return (pair.state is PairState.JOINED and pair.fit.ratio <= AS_GOOD * best.fit.ratio and pair.overlap >= LEAST_ALIKE * best.overlap
+            and pair.contradicted <= best.contradicted + MORE_CONTRADICTED)
 
 
 def _same(pair: Pair, other: Pair, b: Prepared, cell_m: float) -> bool:

@@ -21,8 +21,8 @@ from stage.scans.turntable import angle_of, freedom, turned_pose
 
 CELLS_ACROSS = 60
 """The extent of a scan in cells of the rough scale: some 1500 cells of a surface are occupied."""
-NEAR_CELLS = 2.0
-"""Points of two scans overlap, at starts that are right to a few cells, if they are this many cells apart."""
+START_CELLS, NEAR_CELLS = 2.0, 1.0
+"""Points of two scans overlap, at starts or at poses that were found, if they are at most this many cells apart."""
 ROUNDS = 2
 """How often pairs that the poses predict to overlap are looked for."""
 Advance = Callable[[float], None]
@@ -85,8 +85,9 @@ def register(scans: Sequence[Scan], starts: Sequence[np.ndarray | None], options
         advance(0.15)
         pairs = _pairs(ready, starts, cell, options, pool, lambda done: advance(0.15 + 0.6 * done))
         solved, kept = _solved(len(scans), pairs, starts, options, table)
+        tried: set[tuple[int, int]] = set()
         for _ in range(ROUNDS):
-            found = _predicted(ready, pairs, solved, cell, options, pool)
+            found = _predicted(ready, pairs, tried, solved, cell, options, pool)
             if not found:
                 break
             pairs |= found
@@ -116,12 +117,12 @@ def extent_of(scan: Scan) -> float:
     return float(np.linalg.norm(high - low))
 
 
-def overlap_of(a: Prepared, b: Prepared, pose: np.ndarray, cell_m: float) -> float:
-    """Return which part of the smaller of two scans lies near the other at a pose a_from_b that is right to a cell or two."""
+def overlap_of(a: Prepared, b: Prepared, pose: np.ndarray, near_m: float) -> float:
+    """Return which part of the smaller of two scans lies within a distance of the other at a pose a_from_b, facing the same way."""
     placed = applied(pose, b.rough.points)
     index, distance = a.rough.tree.nearest(placed)
     facing = np.einsum("ni,ni->n", b.rough.normals @ pose[:3, :3].T, a.rough.normals[index[:, 0]]) > 0.5
-    return float(((distance[:, 0] < NEAR_CELLS * cell_m) & facing).sum() / min(len(a.rough.points), len(b.rough.points)))
+    return float(((distance[:, 0] < near_m) & facing).sum() / min(len(a.rough.points), len(b.rough.points)))
 
 
 def _pairs(ready: dict[int, Prepared], starts: Sequence[np.ndarray | None], cell: float, options: RegistrationOptions,
@@ -132,7 +133,7 @@ def _pairs(ready: dict[int, Prepared], starts: Sequence[np.ndarray | None], cell
         first, second = (starts[k] for k in numbers)
         if first is not None and second is not None:
             start = inverse(first) @ second
-            if overlap_of(a, b, start, cell) < options.least_overlap:
+            if overlap_of(a, b, start, START_CELLS * cell) < options.least_overlap:
                 return Pair(*numbers, PairState.NO_POSE, None, 0.0, 0.0, "do not overlap at the poses that are given")
             pair = refine(a, b, start, numbers=numbers, cell_m=cell, least_overlap=options.least_overlap)
             if pair.state in (PairState.JOINED, PairState.AMBIGUOUS):
@@ -147,9 +148,19 @@ def _pairs(ready: dict[int, Prepared], starts: Sequence[np.ndarray | None], cell
     return found
 
 
-def _predicted(ready: dict[int, Prepared], pairs: dict[tuple[int, int], Pair], solved: Solved | None, cell: float,
-               options: RegistrationOptions, pool: ThreadPoolExecutor) -> dict[tuple[int, int], Pair]:
-    """Return further joined pairs, of scans that overlap at the poses that were found."""
+def _predicted(ready: dict[int, Prepared], pairs: dict[tuple[int, int], Pair], tried: set[tuple[int, int]], solved: Solved | None,
+               cell: float, options: RegistrationOptions, pool: ThreadPoolExecutor) -> dict[tuple[int, int], Pair]:
+    """Return further joined pairs, of scans that overlap at the poses that were found.
+
+    Args:
+        ready: the scans.
+        pairs: what became of each pair.
+        tried: pairs that this function tried before, to which it adds.
+        solved: the poses; None: there are none.
+        cell: side of the cells of the rough scale, metres.
+        options: how.
+        pool: for several pairs at a time.
+    """
     if solved is None:
         return {}
     poses = solved.poses
@@ -157,12 +168,14 @@ def _predicted(ready: dict[int, Prepared], pairs: dict[tuple[int, int], Pair], s
     def again(numbers: tuple[int, int]) -> Pair | None:
         a, b = (ready[k] for k in numbers)
         pose = inverse(poses[numbers[0]]) @ poses[numbers[1]]
-        if overlap_of(a, b, pose, cell) < options.least_overlap:
+        if overlap_of(a, b, pose, NEAR_CELLS * cell) < options.least_overlap:
             return None
+        tried.add(numbers)
         pair = refine(a, b, pose, numbers=numbers, cell_m=cell, least_overlap=options.least_overlap)
         return pair if pair.state is PairState.JOINED else None
 
-    numbers = [ab for ab, pair in pairs.items() if pair.state is not PairState.JOINED and ab[0] in poses and ab[1] in poses]
+    numbers = [ab for ab, pair in pairs.items()
+               if pair.state is not PairState.JOINED and ab[0] in poses and ab[1] in poses and ab not in tried]
     return {(pair.a, pair.b): pair for pair in pool.map(again, numbers) if pair is not None}
 
 
