@@ -79,7 +79,7 @@ def timed(scans: list[Scan], starts: list[np.ndarray | None], table: Turntable |
 
 
 def by_open3d(python: str, scans: list[Scan]) -> tuple[dict[int, np.ndarray], float]:
-    """Register the same points with Open3D in another interpreter; its seconds are those of all processors in registration alone."""
+    """Register the same points with Open3D in another interpreter; the seconds are those of all processors, without reading."""
     with tempfile.TemporaryDirectory() as name:
         file = Path(name) / "scans.npz"
         np.savez(file, **{f"{number:03d}": scan.points for number, scan in enumerate(scans)})
