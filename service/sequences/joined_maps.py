@@ -11,7 +11,7 @@ from stage.temporal.agreement import agree, noise_share
 from stage.temporal.recursion import Track, advance, begin
 
 LEAST_ALBEDO = 0.02
-"""Albedo below which its noise is that of this albedo."""
+"""Reflectance below which the noise of albedo is that of this reflectance."""
 ALBEDO_NOISE = 2.0
 """Relative noise of albedo over that of the normals, in radians, up to which differences between neighbours count as noise."""
 LARGEST_GAIN = 0.25
@@ -93,7 +93,7 @@ class MapsJoiner:
         self._normal = begin(maps.normal, sigma, share, maps.mask)
         if maps.diffuse_albedo is not None:
             relative = np.sqrt(self._normal.noise / 2)
-            self._albedo = begin(maps.diffuse_albedo, relative * _level(maps.diffuse_albedo), np.ones_like(sigma), maps.mask)
+            self._albedo = begin(maps.diffuse_albedo, relative * _level(maps), np.ones_like(sigma), maps.mask)
         if maps.height is not None:
             self._height = begin(maps.height[..., None], sigma, np.ones_like(sigma), maps.mask)
         for name, least in LAYERS:
@@ -121,12 +121,12 @@ class MapsJoiner:
         if alone.diffuse_albedo is None or before.diffuse_albedo is None or self._albedo is None:
             return None, {}
         values, earlier = alone.diffuse_albedo / gain, before.diffuse_albedo / self._gain
-        level = _level(values)
+        level = _level(alone)
         share = noise_share(values - earlier, 2 * level**2, both, 3)
         most = ALBEDO_NOISE**2 * float(np.median(noise[both])) / 2 if both.any() else 1.0
         share = np.minimum(share, max(most, 1e-8))
         if (self._albedo.count[both] == 1).all():
-            self._albedo = begin(earlier, _level(earlier), share, before.mask)
+            self._albedo = begin(earlier, _level(before), share, before.mask)
         new = begin(values, level, share, alone.mask)
         return replace(new, constant=np.zeros_like(new.constant)), {"albedo_relative": _middle(np.sqrt(share), both)}
 
@@ -158,9 +158,11 @@ class MapsJoiner:
         return self._height.mean[..., 0], offset
 
 
-def _level(albedo: np.ndarray) -> np.ndarray:
-    """Return [rows, cols] the length of an albedo, at least that of LEAST_ALBEDO, to which its noise is relative."""
-    return np.asarray(np.maximum(np.linalg.norm(albedo.astype(np.float32), axis=-1), LEAST_ALBEDO))
+def _level(maps: SurfaceMaps) -> np.ndarray:
+    """Return [rows, cols] the length of albedo and F0, at least LEAST_ALBEDO, to which the noise of albedo is relative: that of a metal is
+    what its lobe leaves."""
+    both = [np.linalg.norm(layer.astype(np.float32), axis=-1) for layer in (maps.diffuse_albedo, maps.specular) if layer is not None]
+    return np.asarray(np.maximum(sum(both), LEAST_ALBEDO))
 
 
 def _deep(values: np.ndarray) -> np.ndarray:
