@@ -72,7 +72,7 @@ def line(case: str, method: str, views: list[View], poses: dict[int, np.ndarray]
 
 
 def timed(scans: list[Scan], starts: list[np.ndarray | None], table: Turntable | None = None) -> tuple[Registration, float]:
-    """Register, and return the seconds of all processors together, which the load of the machine changes little."""
+    """Register, and return the seconds of all processors together, which the load of the machine hardly changes."""
     began = time.process_time()
     found = register(scans, starts, RegistrationOptions(threads=os.cpu_count() or 1), table=table)
     return found, time.process_time() - began
@@ -90,7 +90,8 @@ def by_open3d(python: str, scans: list[Scan]) -> tuple[dict[int, np.ndarray], fl
 
 def table(rows: int, open3d: str | None) -> str:
     """Return the table in Markdown."""
-    lines = ["| scans | method | joined | place, RMS | largest | turn, RMS | largest | processor time |", "|---|---|---|---|---|---|---|---|"]
+    lines = ["| scans | method | joined | place, RMS | largest | turn, RMS | largest | processor time |",
+             "|---|---|---|---|---|---|---|---|"]
     every = [see(figure, pose(20.0 * k), rows=rows, sigma=0.25 * MM, seed=k) for k in range(18)]
     read = scans_of(every)
     camera = inverse(pose(0.0))
