@@ -20,6 +20,7 @@ from stage.importers.light_table import read_light_table
 from stage.importers.opencv_gray import gray_order
 from stage.importers.procam_file import PROJECTOR_MATRIX, projector_size
 from stage.importers.raw_arrays import ArrayFiles
+from stage.importers.video import is_video
 from stage.importers.view import AMBIENT_WORDS, MASK_WORDS, refuse_twins, words_of
 from stage.manifest import FILE_NAME
 from stage.mat_file import read_mat_arrays
@@ -82,7 +83,8 @@ def guess(source: Path) -> Guess:
     pictures = tuple(name for name in image_names(source) if not words_of(name) & (MASK_WORDS | AMBIENT_WORDS))
     refuse_twins(source, pictures)
     folder = Folder(source, names, pictures)
-    for look in (_diligent, _relightlab, _lp, _kinect, _near_lights, _table, _scanner, _gray, _phase, _correlations, _histograms, _photos):
+    for look in (_diligent, _relightlab, _lp, _kinect, _near_lights, _table, _scanner, _gray, _phase, _correlations, _histograms, _video,
+                 _photos):
         if (found := look(folder)) is not None:
             return found
     suffixes = Counter(Path(name).suffix.lower() for name in names)
@@ -282,6 +284,18 @@ def _histograms(folder: Folder) -> Guess | None:
                          ["histogram", folder.path, "--arrays", name, "--bin-s", "SECONDS"], folder.path, solve=False,
                          assumed=("SECONDS is the width of a bin", f"the last of the three, {bins}, counts the bins: else --bins first"))
     return None
+
+
+def _video(folder: Folder) -> Guess | None:
+    videos = [name for name in folder.names if is_video(Path(name))]
+    if len(videos) != 1 or folder.pictures:
+        return None
+    path = folder.path / videos[0]
+    frames = path.with_name(f"{path.stem}-frames")
+    return _made("a video, perhaps of projected patterns", f"it has {videos[0]} and no images", [
+        "gray", path, frames, "--projector", "WIDTHxHEIGHT", "--video-frames", "FIRST-LAST:STEP"], frames, solve=False, assumed=(
+            "WIDTHxHEIGHT is the projector in pixels, FIRST-LAST:STEP are the frames with one pattern each, counted from 0",
+            "a Gray code of columns and rows with inverses, then white and black: else --sequence, --inverses, or relit import phase"))
 
 
 def _photos(folder: Folder) -> Guess | None:

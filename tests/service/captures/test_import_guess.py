@@ -115,6 +115,13 @@ def test_the_printed_command_makes_the_capture(relit, tmp_path, layout):
     assert then[:3] == ["relit", "solve" if lit else "depth", str(folder)]
 
 
+def test_a_video_is_taken_for_one_of_patterns(relit, tmp_path):
+    (tmp_path / "scan.mp4").write_bytes(b"its frames are not looked at")
+    outcome = relit("import", "guess", tmp_path)
+    assert outcome.code == 0 and f"run      relit import gray {tmp_path}/scan.mp4 {tmp_path}/scan-frames --projector" in outcome.out
+    assert f"then     relit depth {tmp_path}/scan-frames" in outcome.out
+
+
 def test_what_is_no_layout_and_what_is_a_capture(relit, tmp_path):
     (tmp_path / "thesis.pdf").write_bytes(b"%PDF")
     write_image(tmp_path / "photo.jpg", np.zeros((4, 4, 3), np.uint8))
