@@ -319,7 +319,7 @@ def test_columns_from_above_are_said(relit, tmp_path):
 
 def test_frames_of_another_kind(relit, tmp_path):
     write_patterns(tmp_path, SCENE, BLACK_WHITE)
-    fails(relit, tmp_path, "none has a pattern with a code, a laser or tof")
+    fails(relit, tmp_path, "none has a pattern with a code, a laser, tof or stereo")
     write_patterns(tmp_path, SCENE, [*gray_patterns("column"), *BLACK_WHITE])
     fails(relit, tmp_path, "none has a laser, which --using asks for", "--using", "laser")
     edit_frame(tmp_path, 15, pattern=None, laser={"type": "ray", "origin_m": [0.2, 0, 0], "direction": [0, 0, -1]})
