@@ -20,10 +20,13 @@ UNKNOWN = {"name": "right", "resolution": [OTHER.width, OTHER.height]}
 
 @pytest.fixture(scope="module")
 def board(tmp_path_factory):
-    """A capture with seven poses of the board, of cameras that nobody has calibrated."""
-    folder = tmp_path_factory.mktemp("board")
+    return write_board(tmp_path_factory.mktemp("board"), 7)
+
+
+def write_board(folder, poses):
+    """A capture with some poses of the board, of cameras that nobody has calibrated."""
     frames = []
-    for number, pose in enumerate(boards.poses(7)):
+    for number, pose in enumerate(boards.poses(poses)):
         images = boards.board_image(pose), boards.board_image(np.linalg.inv(POSE) @ pose, OTHER)
         for name, image in zip(("left", "right"), images, strict=True):
             write_image(folder / f"{name}_{number}.png", np.rint(65535 * image).astype(np.uint16))
