@@ -137,6 +137,7 @@ def write_scans(folder: Path, shots: list[Shot], *, sigma: float = SIGMA, poses:
             entry["scan_to_world"] = pose.tolist()
         entries.append(entry)
     file = folder / "scan-set.json"
+    file.parent.mkdir(exist_ok=True)
     file.write_text(json.dumps({"schema": "relit.scan-set/1", "name": "statue", "scans": entries}))
     return file
 
