@@ -32,10 +32,10 @@ SIDE = BRICK + 1
 """Blocks along each side of the array of a brick."""
 BRICK_VOXELS = BRICK * BLOCK
 """Voxels along each side of a brick."""
-VOXEL_BYTES = 23
-"""Bytes of one voxel in every array of a brick together."""
+VOXEL_BYTES = 27
+"""Bytes of one voxel in every array of a brick together: of Volume, and what `extract` counts and numbers."""
 MEMORY_BOUND = SIDE**3 * VOXELS * VOXEL_BYTES
-"""Most bytes on the device that the voxels of a brick can take: every block exists."""
+"""Most bytes on the device that the voxels of a brick can take, where every block exists; the triangles come on top."""
 
 STEP_BLOCKS = 0.5
 """Distance, in blocks, of the points on the line of sight and across it whose blocks are marked."""
