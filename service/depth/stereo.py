@@ -37,6 +37,13 @@ ROWS_AT_ONCE = 256
 """Rows of the camera that are triangulated at one time."""
 REFUSED_SHARE = 0.5
 """Share of refused pixels from which the capture as a whole is doubted."""
+CHANCE_SHARE = 0.03
+"""Share of the pixels with texture that must have a depth for any to be believed. Images that have nothing to do with each other leave one
+in a hundred by chance."""
+DOUBTED = 0.1
+"""Factor of the confidence of depths that are not believed."""
+ENOUGH = 200
+"""Pixels with texture from which their share tells something."""
 ADVICE = {
     Status.LOW_MODULATION: "the texture is not seen there: more light, a longer exposure, or a coarser pattern",
     Status.UNDECIDED: "the texture repeats itself or is too noisy: project random dots in place of a grid, or several different patterns",
@@ -102,6 +109,8 @@ def solve_stereo(capture: Capture, mask: np.ndarray, request: DepthRequest, devi
         found.append(_triangulated(disparity, geometry, capture, request))
     solution = _joined(found, frames, capture, mask)
     solution.facts |= facts
+    if request.least_confidence is None:
+        warnings += _chance(solution, mask)
     solution.warnings += [*warnings, *_doubts(solution, mask)]
     return solution
 
@@ -207,7 +216,7 @@ def _joined(found: list[PairDepth], frames: list[Frame], capture: Capture, mask:
                              colour=_scene_colour(frames, capture))
     confidence = solution.confidence_map()
     assert confidence is not None  # it follows from sigma
-    solution.confidence = (confidence * sure).astype(np.float32)
+    solution.confidence = (confidence * np.where(status == Status.UNSURE, DOUBTED, 1.0) * sure).astype(np.float32)
     return solution
 
 
@@ -215,6 +224,19 @@ def _scene_colour(frames: list[Frame], capture: Capture) -> np.ndarray:
     """Return the mean of the frames of the camera, [rows, cols, 3] linear: many patterns together light a scene evenly."""
     correction = Correction.of(capture)
     return np.asarray(sum(correction.apply(frame).pixels for frame in frames) / len(frames))
+
+
+def _chance(solution: DepthSolution, mask: np.ndarray) -> list[str]:
+    """Believe no depth where hardly any of the pixels with texture has one, and say so."""
+    textured = mask & ~np.isin(solution.status, (Status.UNSOLVED, Status.LOW_MODULATION))
+    solved, count = mask & solution.solved, int(textured.sum())
+    if not solved.any() or count < ENOUGH or solved.sum() >= CHANCE_SHARE * count:
+        return []
+    assert solution.confidence is not None  # `_joined` sets it
+    solution.status[solved] = Status.UNSURE
+    solution.confidence[solved] *= DOUBTED
+    return [f"frames: only {100 * solved.sum() / count:.1f} % of the {count} pixels with texture match, as in images that have nothing to "
+            "do with each other: no depth is trusted"]
 
 
 def _doubts(solution: DepthSolution, mask: np.ndarray) -> list[str]:

@@ -80,12 +80,11 @@ def test_a_regular_grid_of_dots_is_refused(relit, tmp_path):
     left, right = scenes.render(parts, grid, side=2), scenes.render(parts, grid, OTHER, POSE, side=2)
     folder = write(tmp_path, left.images, right.images)
     outcome = relit("depth", folder, "--out", folder / "out", "--near-m", "0.6", "--far-m", "2")
-    if outcome.code == 0:
-        maps = DepthMaps.read(folder / "out" / "depth.exr")
-        assert (maps.mask & (np.abs(pixels_off(maps, left.depth)) > 1)).mean() < 0.005
-        assert "repeats itself" in outcome.out
-    else:
-        assert "texture" in outcome.err
+    assert outcome.code in (0, 1) and "repeats itself" in outcome.out
+    maps = DepthMaps.read(folder / "out" / "depth.exr")
+    assert (maps.mask & (np.abs(pixels_off(maps, left.depth)) > 1)).mean() < 0.005
+    outcome = relit("depth", folder, "--out", folder / "none")  # and no range can be found in it
+    assert outcome.code == 2 and "a repeating pattern does not tell depth" in outcome.err
 
 
 def test_dark_and_bare_parts_are_refused(relit, tmp_path):
@@ -144,3 +143,18 @@ def test_images_without_texture_are_refused_with_a_sentence(relit, tmp_path):
     blank = [scenes.recorded(np.full((CAMERA.height, CAMERA.width), 0.2), rng) for _ in range(2)]
     outcome = relit("depth", scenes.write_pair(tmp_path, blank[:1], blank[1:]), "--out", tmp_path / "out")
     assert outcome.code == 2 and "show no texture that both see" in outcome.err
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_images_of_other_moments_give_no_depth(relit, tmp_path, mirrored):
+    """One pixel in a hundred matches by chance, where the range of depths is given."""
+    left, right, _ = seen("plane and sphere")
+    parts = list(PARTS["plane and sphere"])
+    images = right.images[:, :, ::-1] if mirrored else scenes.render(parts, [scenes.dots(500)], OTHER, POSE, side=2).images
+    folder = write(tmp_path, left.images, images)
+    outcome = relit("depth", folder, "--out", folder / "out")
+    assert outcome.code == 2 and "show no texture that both see" in outcome.err
+    outcome = relit("depth", folder, "--out", folder / "out", "--near-m", 0.6, "--far-m", 2)
+    assert outcome.code == 1 and "no depth is trusted" in outcome.out
+    maps = DepthMaps.read(folder / "out" / "depth.exr", unsure=True)
+    assert not maps.mask.any() and maps.confidence.max() <= 0.1
