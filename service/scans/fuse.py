@@ -15,7 +15,7 @@ from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, metadata, report
 from service.requests.fuse import FuseRequest, Misplaced
 from service.scans.bake import bake
-from service.scans.misplaced import Placing, place_scans
+from service.scans.misplaced import LEAST_COMMON, Placing, place_scans
 from service.scans.range_images import COLOUR, WIDTHS, PreparedScan, channels, layers_of, prepare_scan
 from service.scans.read import read_scan
 from service.scans.surface import Surface, fuse_surface
@@ -208,8 +208,8 @@ def _placing_warnings(scans: list[PreparedScan], placings: list[Placing], choice
             end = "it was left out" if choice is Misplaced.LEAVE_OUT else "it was fused all the same, and the surface is doubled there"
             yield (f"scan {scan.name}: lies {1e3 * placing.displacement_m:.3g} mm beside the surface of the others, whose noise explains "
                    f"{1e3 * placing.sigma_m:.2g} mm: its pose is wrong, and {end}")
-        elif placing.compared == 0 and len(scans) > 1:
-            yield f"scan {scan.name}: has no surface in common with another scan, so that nothing tells whether its pose is right"
+        elif placing.compared < LEAST_COMMON and len(scans) > 1:
+            yield f"scan {scan.name}: has next to no surface in common with the others, so that nothing tells whether its pose is right"
 
 
 def _fusion_warnings(facts: dict[str, Any]) -> Iterator[str]:

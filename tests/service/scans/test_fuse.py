@@ -80,6 +80,15 @@ def test_a_scan_at_a_wrong_place_is_left_out_and_named(tmp_path, shots):
     assert 0.2 * OFF < found < OFF  # along the normals, of which only those to the side are moved
 
 
+def test_a_scan_without_overlap_is_named(tmp_path, shots):
+    poses = [shot.world_from_camera.copy() for shot in shots[:3]]
+    poses[2][0, 3] += 3.0
+    file = write_scans(tmp_path, shots[:3], poses=poses)
+    result = fuse(FuseRequest(scan_set=file, out=tmp_path / "out", voxel_m=VOXEL, texture=False, device="cpu"))
+    assert [warning for warning in result.warnings if "in common" in warning] == [
+        "scan view 2: has next to no surface in common with the others, so that nothing tells whether its pose is right"]
+
+
 def test_bad_input_is_refused_in_a_sentence(tmp_path, shots, monkeypatch):
     def refused(words, **changes):
         with pytest.raises((RequestError, AssetError), match=words):
