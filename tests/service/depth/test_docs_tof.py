@@ -31,7 +31,8 @@ def test_the_json_is_read():
 
 
 @pytest.mark.parametrize("command", ["depth", "scan"])
-def test_the_commands_have_the_options(command, relit):
+def test_the_commands_have_the_options(command, relit, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")  # so that no name of an option is cut
     shown = relit(command, "--help").out
     used = {option for line in DOCS.splitlines() if line.startswith(f"relit {command}") for option in re.findall(r"--[a-z-]+", line)}
     assert used

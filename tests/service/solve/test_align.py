@@ -53,7 +53,7 @@ def test_the_report_and_the_maps_say_that_frames_were_aligned(relit, tmp_path):
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     unaligned = {"capture": str(tmp_path), "method": "lambert", "reference_ball": None, "align": False, "align_to": None,
                  "crop": None, "clip_negative": False, "lights": "declared", "intensities": "chosen", "max_sigma": None,
-                 "least_confidence": None}
+                 "least_confidence": None, "temporal": True, "frame_rate": None}
     assert report["options"] == unaligned | {"align": True}
     assert report["inputs"]["content"].startswith("aligned-") and report["inputs"]["frames"] == 8
     assert report["motion"]["reference"] == "05.exr" and len(report["motion"]["intervals"]) == 2

@@ -148,7 +148,8 @@ def paths_in(kind: object) -> set[str]:
 
 
 def test_no_request_of_the_api_has_a_path_of_the_server():
-    assert paths_in(DepthRequest) == {"DepthRequest.cache", "DepthRequest.capture", "DepthRequest.out", "TofOptions.calibration"}
+    assert paths_in(DepthRequest) == {
+        "DepthRequest.beside", "DepthRequest.cache", "DepthRequest.capture", "DepthRequest.out", "TofOptions.calibration"}
     for body in (UserJob, NewCapture, NewEnvironment, Priority):
         assert len(list(models_in(body))) >= 1 and paths_in(body) == set()
 
