@@ -12,33 +12,37 @@ from service.cli.progress import ProgressBar
 from service.cli.request_commands import Given, command
 from service.cli.service_options import CancelOption, KeyOption, ResultsOption, ServerOption, WaitOption, connected
 from service.cli.waiting import make_folder, wait_for
+from service.requests.calibration_jobs import (
+    DarkJob,
+    FlatFieldJob,
+    GreyBallJob,
+    IntensityJob,
+    LightPositionsJob,
+    MirrorBallJob,
+    ProcamJob,
+    ResponseJob,
+    SaturationJob,
+    StereoCalibrationJob,
+    TofCalibrationJob,
+)
 from service.requests.frame_range import frame_numbers
 from service.requests.identifiers import ALPHABET, CAPTURE, ENVIRONMENT, LENGTH, pattern
+from service.requests.job import JobRequest
 from service.requests.jobs import (
     DEFAULT_SERVER,
     BasisJob,
-    DarkJob,
     DepthJob,
     ExportJob,
-    FlatFieldJob,
-    GreyBallJob,
+    FuseJob,
     InspectBoardJob,
-    IntensityJob,
-    JobRequest,
     JoinJob,
-    LightPositionsJob,
-    MirrorBallJob,
     PatternsJob,
     PipelineJob,
-    ProcamJob,
+    RegisterJob,
     RelightJob,
-    ResponseJob,
-    SaturationJob,
     ScanJob,
     ShadeJob,
     SolveJob,
-    StereoCalibrationJob,
-    TofCalibrationJob,
     ViewJob,
 )
 from service.requests.light_keys import LightKeys
@@ -49,7 +53,8 @@ if TYPE_CHECKING:
 
 JOBS: dict[str, type[JobRequest]] = {"solve": SolveJob, "depth": DepthJob, "relight": RelightJob, "shade": ShadeJob, "export": ExportJob,
                                      "view": ViewJob, "pipeline": PipelineJob, "basis": BasisJob, "scan": ScanJob, "patterns": PatternsJob,
-                                     "inspect-board": InspectBoardJob, "join": JoinJob,
+                                     "inspect-board": InspectBoardJob, "join": JoinJob, "register": RegisterJob,
+                                     "fuse": FuseJob,
                                      "calibrate-mirror-ball": MirrorBallJob, "calibrate-light-positions": LightPositionsJob,
                                      "calibrate-grey-ball": GreyBallJob, "calibrate-intensity": IntensityJob, "calibrate-dark": DarkJob,
                                      "calibrate-flat-field": FlatFieldJob, "calibrate-saturation": SaturationJob,

@@ -1,29 +1,33 @@
 """The jobs of the service: options as on the command line, with identifiers of captures and jobs in place of paths."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field, TypeAdapter
+from pydantic import Field, TypeAdapter, model_validator
 
-from service.requests.base import CAPTURE, Options, Role, Spelling
+from service.requests.base import CAPTURE, Role, Spelling
 from service.requests.basis import BasisOptions
-from service.requests.calibrate import (
-    IMAGES,
-    LEAST_GREYS,
-    POSES,
-    GreyBallOptions,
-    IntensityOptions,
-    LightPositionsOptions,
-    MirrorBallOptions,
-    ProcamOptions,
-    ResponseOptions,
-    StereoOptions,
+from service.requests.calibration_jobs import (
+    DarkJob,
+    FlatFieldJob,
+    GreyBallJob,
+    IntensityJob,
+    LightPositionsJob,
+    MirrorBallJob,
+    ProcamJob,
+    ResponseJob,
+    SaturationJob,
+    StereoCalibrationJob,
+    TofCalibrationJob,
 )
 from service.requests.depth import DepthOptions
 from service.requests.export import AssetFormat, ExportOptions
+from service.requests.fuse import FuseOptions
 from service.requests.identifiers import CaptureId, EnvironmentId, JobId
 from service.requests.inspect_board import InspectBoardOptions
+from service.requests.job import JobRequest
 from service.requests.light_keys import LightKeys
 from service.requests.patterns import PatternsOptions
+from service.requests.register import RegisterOptions
 from service.requests.relight import RelightOptions
 from service.requests.scan import ScanOptions
 from service.requests.shade import ShadeOptions
@@ -37,17 +41,8 @@ DEFAULT_SERVER = f"http://127.0.0.1:{DEFAULT_PORT}"
 
 MAPS = Spelling(argument=True, metavar="JOB")
 KEYS = Spelling(metavar="FILE")
-MOST_CAPTURES = 100
-"""The most captures that one field of a job names."""
-
-
-class JobRequest(Options):
-    """Base of every job."""
-
-    name: Annotated[str, Field(max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$"), Role.RUN, Spelling(flag="--job-name", metavar="TEXT")] = ""
-    """Name of the job, shown in lists; it need not be unique."""
-    priority: Annotated[int, Field(ge=0, le=100), Role.RUN] = 50
-    """0 to 100: jobs of higher priority are done first, those of equal priority in the order of submission."""
+MOST_SCANS = 500
+"""The most depths that one job registers."""
 
 
 class CheckJob(JobRequest):
@@ -132,6 +127,34 @@ class JoinJob(JobRequest):
     """The job that decoded the depth, by the same camera from the same place."""
 
 
+class RegisterJob(JobRequest):
+    """The poses of depths of one object, taken from several places: scan-set.json, report.json."""
+
+    kind: Literal["register"]
+    depths: Annotated[tuple[JobId, ...], Field(min_length=2, max_length=MOST_SCANS), Role.INPUT, Spelling(argument=True, metavar="JOB...")]
+    """The jobs that decoded the depths. Their identifiers are the names of the scans; `world_from_camera` of a capture starts its pose."""
+    solves: Annotated[tuple[JobId, ...], Field(max_length=MOST_SCANS), Role.INPUT, Spelling(metavar="JOB")] = ()
+    """The jobs that solved (or joined) maps by the same cameras, one for each depth in its order, or none; may be repeated."""
+    options: RegisterOptions = RegisterOptions()
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.solves and len(self.solves) != len(self.depths):
+            raise ValueError(f"solves: has {len(self.solves)} jobs for {len(self.depths)} depths: give one for each, or none")
+        if len(set(self.depths)) < len(self.depths):
+            raise ValueError("depths: names a job twice")
+        return self
+
+
+class FuseJob(JobRequest):
+    """One mesh of registered depths: mesh.ply, asset.usdc with its textures, report.json."""
+
+    kind: Literal["fuse"]
+    registered: Annotated[JobId, Role.INPUT, Spelling(argument=True, metavar="JOB")]
+    """The job that registered the depths."""
+    options: FuseOptions = FuseOptions()
+
+
 class ViewJob(JobRequest):
     """What a browser needs to show a capture and its maps: view.json, view.bin, thumbnails.jpg."""
 
@@ -199,128 +222,9 @@ class PatternsJob(JobRequest):
     options: PatternsOptions
 
 
-class CalibrationJob(JobRequest):
-    """Base of the jobs that measure lights: capture.json with the lights, calibration.json."""
-
-    capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
-    """The capture with the calibration images; its distant and point lights may be placeholders."""
-    apply_to: Annotated[CaptureId | None, Role.INPUT, Spelling(metavar="CAPTURE")] = None
-    """Another capture under the same lights in the same order, whose manifest is written; None: the capture itself."""
-
-
-class BallJob(CalibrationJob):
-    """Base of the jobs that look at balls."""
-
-    masks: Annotated[tuple[Line, ...], Role.INPUT, Spelling(flag="--ball-mask", metavar="NAME")] = ()
-    """Name of a mask image of a ball in the capture's folder, in place of `ball`. Give one for each ball."""
-
-
-class MirrorBallJob(BallJob):
-    """Directions of far lights from one mirror ball: capture.json, calibration.json."""
-
-    kind: Literal["calibrate-mirror-ball"]
-    options: MirrorBallOptions = MirrorBallOptions()
-
-
-class LightPositionsJob(BallJob):
-    """Positions of near lights from two or more mirror balls: capture.json, calibration.json."""
-
-    kind: Literal["calibrate-light-positions"]
-    options: LightPositionsOptions = LightPositionsOptions()
-
-
-class GreyBallJob(BallJob):
-    """Brightness of each light from one grey ball: capture.json, calibration.json."""
-
-    kind: Literal["calibrate-grey-ball"]
-    options: GreyBallOptions = GreyBallOptions()
-
-
-class IntensityJob(CalibrationJob):
-    """Brightness of lights of known direction from images of the object itself: capture.json, calibration.json."""
-
-    kind: Literal["calibrate-intensity"]
-    options: IntensityOptions = IntensityOptions()
-
-
-class DarkJob(JobRequest):
-    """Mean of images with the lens covered: dark.exr, capture.json that names it, calibration.json."""
-
-    kind: Literal["calibrate-dark"]
-    capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
-    """The capture that the images lie in and belong to."""
-    images: Annotated[tuple[Line, ...], Field(min_length=1), Role.INPUT, IMAGES]
-    """Names of the images in the capture's folder, of its resolution and encoding, at the exposure of its frames."""
-
-
-class FlatFieldJob(JobRequest):
-    """Mean of images of an evenly lit white card: flat.exr, capture.json that names it, calibration.json."""
-
-    kind: Literal["calibrate-flat-field"]
-    capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
-    """The capture that the images lie in and belong to."""
-    images: Annotated[tuple[Line, ...], Field(min_length=1), Role.INPUT, IMAGES]
-    """Names of the images in the capture's folder, of its resolution and encoding."""
-    dark_images: Annotated[tuple[Line, ...], Role.INPUT, Spelling(flag="--dark", metavar="NAME")] = ()
-    """Name of a dark image at the exposure of the white card; may be repeated. Without it the dark frame of the capture is used."""
-
-
-class SaturationJob(JobRequest):
-    """The level at which the readings of the frames saturate: capture.json with it, calibration.json."""
-
-    kind: Literal["calibrate-saturation"]
-    capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
-    """The capture."""
-
-
-class ProcamJob(JobRequest):
-    """Camera, projector and their pose from a chessboard under projected columns and rows: ID.capture.json for each capture,
-    calibration.json."""
-
-    kind: Literal["calibrate-procam"]
-    captures: Annotated[tuple[CaptureId, ...], Field(min_length=1, max_length=MOST_CAPTURES), Role.INPUT, POSES]
-    """The captures, one for each pose of the board."""
-    apply_to: Annotated[tuple[CaptureId, ...], Field(max_length=MOST_CAPTURES), Role.INPUT, Spelling(metavar="CAPTURE")] = ()
-    """Another capture of the same rig, whose manifest is written too; may be repeated."""
-    options: ProcamOptions
-
-
-class StereoCalibrationJob(JobRequest):
-    """Several cameras and their poses from a chessboard that they see at the same moments: ID.capture.json for each capture,
-    calibration.json."""
-
-    kind: Literal["calibrate-stereo"]
-    capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
-    """The capture, each of whose stereo frames shows the board in another pose."""
-    apply_to: Annotated[tuple[CaptureId, ...], Field(max_length=MOST_CAPTURES), Role.INPUT, Spelling(metavar="CAPTURE")] = ()
-    """Another capture of the same cameras, whose manifest is written too; may be repeated."""
-    options: StereoOptions
-
-
-class ResponseJob(JobRequest):
-    """The projector's light at each level (its gamma), from images of evenly grey projections: capture.json, calibration.json."""
-
-    kind: Literal["calibrate-response"]
-    capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
-    """The capture: the images lie in its folder, its camera took them, its projector gets the response."""
-    images: Annotated[tuple[Line, ...], Field(min_length=LEAST_GREYS), Role.INPUT, IMAGES]
-    """Names of the images of evenly grey projections in the capture's folder."""
-    options: ResponseOptions = ResponseOptions()
-
-
-class TofCalibrationJob(JobRequest):
-    """Wiggling, scale, offset and drift of a time-of-flight camera from captures of a flat target at known distances: tof.json."""
-
-    kind: Literal["calibrate-tof"]
-    capture: Annotated[CaptureId, Role.INPUT, Spelling(argument=True, metavar="SWEEP")]
-    """A folder with the captures of the sweep, each in a folder of its own, and the relit.tof-sweep/1 file."""
-    sweep: Annotated[Line, Role.INPUT, Spelling(metavar="NAME")] = "sweep.json"
-    """Name of the relit.tof-sweep/1 file in the folder."""
-
-
-OneJob = (SolveJob | DepthJob | JoinJob | RelightJob | ShadeJob | ExportJob | ViewJob | PipelineJob | BasisJob | ScanJob
-          | InspectBoardJob | PatternsJob | MirrorBallJob | LightPositionsJob | GreyBallJob | IntensityJob | DarkJob | FlatFieldJob
-          | SaturationJob | ProcamJob | StereoCalibrationJob | ResponseJob | TofCalibrationJob)
+OneJob = (SolveJob | DepthJob | JoinJob | RegisterJob | FuseJob | RelightJob | ShadeJob | ExportJob | ViewJob | PipelineJob | BasisJob
+          | ScanJob | InspectBoardJob | PatternsJob | MirrorBallJob | LightPositionsJob | GreyBallJob | IntensityJob | DarkJob
+          | FlatFieldJob | SaturationJob | ProcamJob | StereoCalibrationJob | ResponseJob | TofCalibrationJob)
 UserJob = Annotated[OneJob, Field(discriminator="kind")]
 """Every kind of job that the API accepts."""
 AnyJob = Annotated[CheckJob | OneJob, Field(discriminator="kind")]

@@ -11,7 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, TypeAda
 from pydantic_core import CoreSchema, core_schema
 
 from service.requests.identifiers import JobId
-from service.requests.jobs import CheckJob, JobRequest, UserJob
+from service.requests.job import JobRequest
+from service.requests.jobs import CheckJob, UserJob
 from service.server.api.context import (
     FOR_WORK,
     IdempotencyKey,

@@ -5,7 +5,19 @@ from collections.abc import Sequence
 import sqlalchemy as sa
 
 from service.requests.frame_range import frame_numbers
-from service.requests.jobs import CheckJob, ExportJob, InspectBoardJob, JobRequest, JoinJob, PipelineJob, RelightJob, ShadeJob, ViewJob
+from service.requests.job import JobRequest
+from service.requests.jobs import (
+    CheckJob,
+    ExportJob,
+    FuseJob,
+    InspectBoardJob,
+    JoinJob,
+    PipelineJob,
+    RegisterJob,
+    RelightJob,
+    ShadeJob,
+    ViewJob,
+)
 from service.requests.relight import RelightOptions
 from service.server import telemetry
 from service.server.api.context import Service, require_quota
@@ -62,6 +74,11 @@ def inputs_of(service: Service, project: str, request: JobRequest) -> list[str]:
         _require_results(service, project, "maps", request.maps, SOLVES)
         _require_results(service, project, "depth", request.depth, ("depth",))
         read += [request.maps, request.depth]
+    if isinstance(request, RegisterJob):
+        read += _require_scans(service, project, request)
+    if isinstance(request, FuseJob):
+        row = _require_results(service, project, "registered", request.registered, ("register",))
+        read += [request.registered, *_require_scans(service, project, RegisterJob.model_validate(row["request"]))]
     if isinstance(request, InspectBoardJob) and request.golden is not None:
         _require_results(service, project, "golden", request.golden, (request.kind,))
         read.append(request.golden)
@@ -101,7 +118,16 @@ def _require_ready(service: Service, project: str, field: str, identifier: str) 
         raise ApiError("conflict", f"{field}: {identifier} is {row['state']}, not ready")
 
 
-def _require_results(service: Service, project: str, field: str, identifier: str, kinds: Sequence[str]) -> None:
+def _require_scans(service: Service, project: str, request: RegisterJob) -> list[str]:
+    """Return the identifiers of the jobs whose results are registered, or refuse if one of them is not there any more."""
+    for number, identifier in enumerate(request.depths):
+        _require_results(service, project, f"depths[{number}]", identifier, ("depth",))
+    for number, identifier in enumerate(request.solves):
+        _require_results(service, project, f"solves[{number}]", identifier, (*SOLVES, "join"))
+    return [*request.depths, *request.solves]
+
+
+def _require_results(service: Service, project: str, field: str, identifier: str, kinds: Sequence[str]) -> sa.RowMapping:
     row = jobs.find(service.database, identifier, project)
     if row is None:
         raise ApiError("not-found", f"{field}: {identifier} is not in this project")
@@ -109,3 +135,4 @@ def _require_results(service: Service, project: str, field: str, identifier: str
         raise ApiError("invalid", f"{field}: {identifier} is a {row['request']['kind']} job: give one of {', '.join(kinds)}")
     if row["state"] != states.SUCCEEDED:
         raise ApiError("conflict", f"{field}: {identifier} is {row['state']}, not succeeded")
+    return row

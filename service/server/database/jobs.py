@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import sqlalchemy as sa
 
 from service.requests.identifiers import JOB, new_id
-from service.requests.jobs import JobRequest
+from service.requests.job import JobRequest
 from service.server.database import job_log
 from service.server.database.engine import Database, storable
 from service.server.database.tables import intakes, job_inputs, jobs, newest_first

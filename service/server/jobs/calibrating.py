@@ -4,14 +4,13 @@ from pathlib import Path
 from typing import Any
 
 from service.reporting.progress import Progress
-from service.requests.jobs import (
+from service.requests.calibration_jobs import (
     BallJob,
     CalibrationJob,
     DarkJob,
     FlatFieldJob,
     GreyBallJob,
     IntensityJob,
-    JobRequest,
     LightPositionsJob,
     MirrorBallJob,
     ProcamJob,
@@ -20,6 +19,7 @@ from service.requests.jobs import (
     StereoCalibrationJob,
     TofCalibrationJob,
 )
+from service.requests.job import JobRequest
 from service.server.jobs.measuring import Intake
 from service.server.jobs.named_files import file_within, files_within
 from stage.manifest import FILE_NAME

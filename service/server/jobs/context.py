@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from service.errors import RequestError
-from service.requests.jobs import ANY_JOB, JobRequest
+from service.requests.job import JobRequest
+from service.requests.jobs import ANY_JOB
 from service.server.database.engine import Database
 from service.server.jobs.queue import JobQueue
 from service.server.settings import Settings

@@ -5,7 +5,8 @@ from pathlib import Path
 
 from service.reporting.progress import Progress
 from service.requests.basis import BasisKind
-from service.requests.jobs import BasisJob, JobRequest, PatternsJob, ScanJob
+from service.requests.job import JobRequest
+from service.requests.jobs import BasisJob, PatternsJob, ScanJob
 
 BASIS = "basis"
 """Name of the file of a basis, without its suffix."""

@@ -12,7 +12,8 @@ from dbos import DBOS, DBOSClient, DBOSPortableJSONSerializer
 from dbos._schemas import SCHEMA_PLACEHOLDER
 from dbos._schemas.system_database import SystemSchema
 
-from service.requests.jobs import CheckJob, JobRequest
+from service.requests.job import JobRequest
+from service.requests.jobs import CheckJob
 from service.server.database import jobs, tables
 from service.server.database.engine import Database
 from service.server.database.jobs import Claim

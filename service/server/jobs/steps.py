@@ -14,16 +14,18 @@ from service.requests.jobs import (
     CheckJob,
     DepthJob,
     ExportJob,
+    FuseJob,
     InspectBoardJob,
     JoinJob,
     PipelineJob,
+    RegisterJob,
     RelightJob,
     ShadeJob,
     SolveJob,
     ViewJob,
 )
 from service.server.database import intakes, quotas
-from service.server.jobs import calibrating, measuring
+from service.server.jobs import calibrating, measuring, scan_sets
 from service.server.jobs.context import Job, WorkerContext
 from service.server.jobs.named_files import file_within
 from service.server.jobs.pieces import JobPieces
@@ -81,6 +83,12 @@ def _steps_of(job: Job, context: WorkerContext) -> list[JobStep]:
         return [JobStep("depth", lambda progress: _depth(job, request, context, progress))]
     if isinstance(request, JoinJob):
         return [JobStep("join", lambda progress: _join(job, request, context, progress))]
+    if isinstance(request, RegisterJob):
+        return [JobStep("register", lambda progress: scan_sets.register(
+            request, job.id, _out(job, context), lambda other: job_maps(job, other, context, progress), progress))]
+    if isinstance(request, FuseJob):
+        return [JobStep("fuse", lambda progress: scan_sets.fuse(
+            request, job.id, _out(job, context), lambda other: job_maps(job, other, context, progress), context.device, progress))]
     if isinstance(request, ShadeJob):
         return [JobStep("shade", lambda progress: _shade(job, request, context, progress))]
     if isinstance(request, ExportJob):

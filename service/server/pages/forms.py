@@ -12,31 +12,35 @@ from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel
 
 from service.requests.base import Choice, Commas, Role
-from service.requests.identifiers import CAPTURE, ENVIRONMENT, JOB, pattern
-from service.requests.jobs import (
-    BasisJob,
+from service.requests.calibration_jobs import (
     DarkJob,
-    DepthJob,
-    ExportJob,
     FlatFieldJob,
     GreyBallJob,
-    InspectBoardJob,
     IntensityJob,
-    JobRequest,
-    JoinJob,
     LightPositionsJob,
     MirrorBallJob,
-    PatternsJob,
-    PipelineJob,
     ProcamJob,
-    RelightJob,
     ResponseJob,
     SaturationJob,
+    StereoCalibrationJob,
+    TofCalibrationJob,
+)
+from service.requests.identifiers import CAPTURE, ENVIRONMENT, JOB, pattern
+from service.requests.job import JobRequest
+from service.requests.jobs import (
+    BasisJob,
+    DepthJob,
+    ExportJob,
+    FuseJob,
+    InspectBoardJob,
+    JoinJob,
+    PatternsJob,
+    PipelineJob,
+    RegisterJob,
+    RelightJob,
     ScanJob,
     ShadeJob,
     SolveJob,
-    StereoCalibrationJob,
-    TofCalibrationJob,
 )
 from service.requests.light_keys import LightKeys
 from service.requests.options import Option, help_text, places_of, typed
@@ -49,14 +53,16 @@ CAPTURE_JOBS: dict[str, type[JobRequest]] = {
     "calibrate-stereo": StereoCalibrationJob, "calibrate-response": ResponseJob, "calibrate-tof": TofCalibrationJob,
 }
 """Jobs that begin with a capture, by kind."""
-MAPS_JOBS: dict[str, type[JobRequest]] = {"export": ExportJob, "shade": ShadeJob, "join": JoinJob}
+MAPS_JOBS: dict[str, type[JobRequest]] = {"export": ExportJob, "shade": ShadeJob, "join": JoinJob, "register": RegisterJob,
+                                         "fuse": FuseJob}
 """Jobs that begin with the maps of another job, by kind."""
 FREE_JOBS: dict[str, type[JobRequest]] = {"patterns": PatternsJob}
 """Jobs that read nothing, by kind."""
 TITLES = {"solve": "Solve normals and materials", "pipeline": "Solve, export and relight", "depth": "Decode depth",
           "scan": "Turn shots of a scanning laser into points",
           "inspect-board": "Inspect a board", "relight": "Relight frames", "basis": "Reduce to a few coefficient images",
-          "join": "Join with a depth of the same view", "patterns": "Draw patterns to project", "export": "Export an asset",
+          "join": "Join with a depth of the same view", "register": "Find the poses of several depths",
+          "fuse": "Fuse registered depths into one mesh", "patterns": "Draw patterns to project", "export": "Export an asset",
           "shade": "Shade one picture",
           "calibrate-mirror-ball": "Calibrate light directions: one mirror ball",
           "calibrate-light-positions": "Calibrate light positions: two or more mirror balls",
@@ -80,8 +86,8 @@ class Field(NamedTuple):
     label: str
     help: str
     control: str
-    """checkbox, select, number, text, lines (several values, one a line), captures (several identifiers, one a line), json, or the kind of
-    thing that an identifier names: capture, environment, job."""
+    """checkbox, select, number, text, lines (several values, one a line), captures or jobs (several identifiers, one a line), json, or the
+    kind of thing that an identifier names: capture, environment, job."""
     value_type: str
     """Type in JSON: boolean, integer, number, string, strings (one a line), json; integers, numbers or words, typed with commas between."""
     flag: str

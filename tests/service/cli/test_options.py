@@ -12,6 +12,7 @@ from service.cli.main import program
 from service.requests import (
     basis,
     calibrate,
+    calibration_jobs,
     captures,
     demo,
     depth,
@@ -66,12 +67,14 @@ COMMANDS: dict[str, list[type[Options]]] = {
     "submit export": [jobs.ExportJob], "submit view": [jobs.ViewJob], "submit pipeline": [jobs.PipelineJob],
     "submit basis": [jobs.BasisJob], "submit scan": [jobs.ScanJob], "submit patterns": [jobs.PatternsJob],
     "submit inspect-board": [jobs.InspectBoardJob], "submit join": [jobs.JoinJob],
-    "submit calibrate-mirror-ball": [jobs.MirrorBallJob], "submit calibrate-light-positions": [jobs.LightPositionsJob],
-    "submit calibrate-grey-ball": [jobs.GreyBallJob], "submit calibrate-intensity": [jobs.IntensityJob],
-    "submit calibrate-dark": [jobs.DarkJob], "submit calibrate-flat-field": [jobs.FlatFieldJob],
-    "submit calibrate-saturation": [jobs.SaturationJob], "submit calibrate-procam": [jobs.ProcamJob],
-    "submit calibrate-stereo": [jobs.StereoCalibrationJob],
-    "submit calibrate-response": [jobs.ResponseJob], "submit calibrate-tof": [jobs.TofCalibrationJob],
+    "submit register": [jobs.RegisterJob], "submit fuse": [jobs.FuseJob],
+    "submit calibrate-mirror-ball": [calibration_jobs.MirrorBallJob],
+    "submit calibrate-light-positions": [calibration_jobs.LightPositionsJob],
+    "submit calibrate-grey-ball": [calibration_jobs.GreyBallJob], "submit calibrate-intensity": [calibration_jobs.IntensityJob],
+    "submit calibrate-dark": [calibration_jobs.DarkJob], "submit calibrate-flat-field": [calibration_jobs.FlatFieldJob],
+    "submit calibrate-saturation": [calibration_jobs.SaturationJob], "submit calibrate-procam": [calibration_jobs.ProcamJob],
+    "submit calibrate-stereo": [calibration_jobs.StereoCalibrationJob],
+    "submit calibrate-response": [calibration_jobs.ResponseJob], "submit calibrate-tof": [calibration_jobs.TofCalibrationJob],
     "farm template relight": [relight.RelightRequest], "farm template shade": [shade.ShadeRequest],
 }
 OWN = {

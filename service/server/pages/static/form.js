@@ -58,7 +58,7 @@ async function fill(select) {
   const kind = select.dataset.lists;
   if (kind === "job") {
     for await (const job of listing("/v1/jobs?state=succeeded", "jobs")) {
-      if (["solve", "pipeline", "depth", "join"].includes(job.request.kind)) {
+      if (["solve", "pipeline", "depth", "join", "register"].includes(job.request.kind)) {
         select.append(element("option", { value: job.id }, `${job.request.name || job.request.kind} · ${job.id}`));
       }
     }

@@ -9,6 +9,7 @@ import { titleOf } from "./jobs_table.js";
 const identifier = byId("main").dataset.identifier;
 const ENDED = ["succeeded", "failed", "cancelled"];
 const MAPS = ["maps.exr", "depth.exr"];
+const BEGIN_WITH = { export: MAPS, shade: ["maps.exr"], join: ["maps.exr"], register: ["depth.exr"], fuse: ["scan-set.json"] }; // kinds of jobs
 let logged = "";
 
 function present(job) {
@@ -73,7 +74,10 @@ async function presentResults(job) {
   offer("look", solved, `/maps/${identifier}`);
   offer("asset", job.state === "succeeded" && names.some((name) => /^asset\.(usdz|glb)$/.test(name)), `/asset/${identifier}`);
   offer("light", job.request.capture !== undefined && job.request.kind !== "depth", `/light/${job.request.capture}`);
-  if (solved && byId("work").hidden) {
+  const forms = [...byId("work").querySelectorAll("form[data-kind]")];
+  const fitting = job.state === "succeeded" ? forms.filter(({ dataset }) => BEGIN_WITH[dataset.kind].some((name) => names.includes(name))) : [];
+  if (fitting.length > 0 && byId("work").hidden) {
+    forms.forEach((form) => show(form.closest(".job-form"), fitting.includes(form)));
     show(byId("work"), true);
     enableForms(byId("work"), identifier);
   }

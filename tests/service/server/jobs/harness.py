@@ -16,7 +16,8 @@ import sqlalchemy as sa
 from dbos import DBOSClient, WorkflowStatus
 
 from service.requests.identifiers import CAPTURE, ENVIRONMENT, new_id
-from service.requests.jobs import ANY_JOB, JobRequest, RelightJob
+from service.requests.job import JobRequest
+from service.requests.jobs import ANY_JOB, RelightJob
 from service.requests.relight import RelightOptions
 from service.server.database import intakes, jobs, workers
 from service.server.database.engine import connect

@@ -5,19 +5,20 @@ import copy
 import pytest
 
 from service.requests.base import Role
-from service.requests.jobs import ANY_JOB, ProcamJob, RelightJob, SolveJob
+from service.requests.calibration_jobs import ProcamJob
+from service.requests.jobs import ANY_JOB, RelightJob, SolveJob
 from service.requests.options import build, options_of
 from service.server.pages.forms import CAPTURE_JOBS, FREE_JOBS, MAPS_JOBS, Form, form_of
 
 KINDS = CAPTURE_JOBS | MAPS_JOBS | FREE_JOBS
-CAPTURE, JOB = "cap_0123456789abcdefghjk", "job_0123456789abcdefghjk"
+CAPTURE, JOB, OTHER = "cap_0123456789abcdefghjk", "job_0123456789abcdefghjk", "job_1123456789abcdefghjk"
 
 REQUIRED = {
     "calibrate-dark": {"capture": CAPTURE, "images": ["0.exr"]}, "calibrate-flat-field": {"capture": CAPTURE, "images": ["0.exr"]},
     "calibrate-response": {"capture": CAPTURE, "images": ["0.exr", "1.exr", "2.exr"]},
     "calibrate-stereo": {"capture": CAPTURE, "options": {"board": "9x6", "square_m": 0.025}},
     "calibrate-procam": {"captures": [CAPTURE], "options": {"board": "9x6", "square_m": 0.025}},
-    "join": {"maps": JOB, "depth": JOB},
+    "join": {"maps": JOB, "depth": JOB}, "register": {"depths": [JOB, OTHER]}, "fuse": {"registered": JOB},
     "patterns": {"options": {"code": "gray", "projector": "64x32"}},
 }
 """What a job must have beside a capture, where it must."""

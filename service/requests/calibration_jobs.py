@@ -1,0 +1,144 @@
+"""The jobs that measure lights, cameras and projectors: `relit calibrate`, with identifiers of captures in place of paths."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from service.requests.base import CAPTURE, Role, Spelling
+from service.requests.calibrate import (
+    IMAGES,
+    LEAST_GREYS,
+    POSES,
+    GreyBallOptions,
+    IntensityOptions,
+    LightPositionsOptions,
+    MirrorBallOptions,
+    ProcamOptions,
+    ResponseOptions,
+    StereoOptions,
+)
+from service.requests.identifiers import CaptureId
+from service.requests.job import JobRequest
+from stage.model import Line
+
+MOST_CAPTURES = 100
+"""The most captures that one field of a job names."""
+
+
+class CalibrationJob(JobRequest):
+    """Base of the jobs that measure lights: capture.json with the lights, calibration.json."""
+
+    capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
+    """The capture with the calibration images; its distant and point lights may be placeholders."""
+    apply_to: Annotated[CaptureId | None, Role.INPUT, Spelling(metavar="CAPTURE")] = None
+    """Another capture under the same lights in the same order, whose manifest is written; None: the capture itself."""
+
+
+class BallJob(CalibrationJob):
+    """Base of the jobs that look at balls."""
+
+    masks: Annotated[tuple[Line, ...], Role.INPUT, Spelling(flag="--ball-mask", metavar="NAME")] = ()
+    """Name of a mask image of a ball in the capture's folder, in place of `ball`. Give one for each ball."""
+
+
+class MirrorBallJob(BallJob):
+    """Directions of far lights from one mirror ball: capture.json, calibration.json."""
+
+    kind: Literal["calibrate-mirror-ball"]
+    options: MirrorBallOptions = MirrorBallOptions()
+
+
+class LightPositionsJob(BallJob):
+    """Positions of near lights from two or more mirror balls: capture.json, calibration.json."""
+
+    kind: Literal["calibrate-light-positions"]
+    options: LightPositionsOptions = LightPositionsOptions()
+
+
+class GreyBallJob(BallJob):
+    """Brightness of each light from one grey ball: capture.json, calibration.json."""
+
+    kind: Literal["calibrate-grey-ball"]
+    options: GreyBallOptions = GreyBallOptions()
+
+
+class IntensityJob(CalibrationJob):
+    """Brightness of lights of known direction from images of the object itself: capture.json, calibration.json."""
+
+    kind: Literal["calibrate-intensity"]
+    options: IntensityOptions = IntensityOptions()
+
+
+class DarkJob(JobRequest):
+    """Mean of images with the lens covered: dark.exr, capture.json that names it, calibration.json."""
+
+    kind: Literal["calibrate-dark"]
+    capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
+    """The capture that the images lie in and belong to."""
+    images: Annotated[tuple[Line, ...], Field(min_length=1), Role.INPUT, IMAGES]
+    """Names of the images in the capture's folder, of its resolution and encoding, at the exposure of its frames."""
+
+
+class FlatFieldJob(JobRequest):
+    """Mean of images of an evenly lit white card: flat.exr, capture.json that names it, calibration.json."""
+
+    kind: Literal["calibrate-flat-field"]
+    capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
+    """The capture that the images lie in and belong to."""
+    images: Annotated[tuple[Line, ...], Field(min_length=1), Role.INPUT, IMAGES]
+    """Names of the images in the capture's folder, of its resolution and encoding."""
+    dark_images: Annotated[tuple[Line, ...], Role.INPUT, Spelling(flag="--dark", metavar="NAME")] = ()
+    """Name of a dark image at the exposure of the white card; may be repeated. Without it the dark frame of the capture is used."""
+
+
+class SaturationJob(JobRequest):
+    """The level at which the readings of the frames saturate: capture.json with it, calibration.json."""
+
+    kind: Literal["calibrate-saturation"]
+    capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
+    """The capture."""
+
+
+class ProcamJob(JobRequest):
+    """Camera, projector and their pose from a chessboard under projected columns and rows: ID.capture.json for each capture,
+    calibration.json."""
+
+    kind: Literal["calibrate-procam"]
+    captures: Annotated[tuple[CaptureId, ...], Field(min_length=1, max_length=MOST_CAPTURES), Role.INPUT, POSES]
+    """The captures, one for each pose of the board."""
+    apply_to: Annotated[tuple[CaptureId, ...], Field(max_length=MOST_CAPTURES), Role.INPUT, Spelling(metavar="CAPTURE")] = ()
+    """Another capture of the same rig, whose manifest is written too; may be repeated."""
+    options: ProcamOptions
+
+
+class StereoCalibrationJob(JobRequest):
+    """Several cameras and their poses from a chessboard that they see at the same moments: ID.capture.json for each capture,
+    calibration.json."""
+
+    kind: Literal["calibrate-stereo"]
+    capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
+    """The capture, each of whose stereo frames shows the board in another pose."""
+    apply_to: Annotated[tuple[CaptureId, ...], Field(max_length=MOST_CAPTURES), Role.INPUT, Spelling(metavar="CAPTURE")] = ()
+    """Another capture of the same cameras, whose manifest is written too; may be repeated."""
+    options: StereoOptions
+
+
+class ResponseJob(JobRequest):
+    """The projector's light at each level (its gamma), from images of evenly grey projections: capture.json, calibration.json."""
+
+    kind: Literal["calibrate-response"]
+    capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
+    """The capture: the images lie in its folder, its camera took them, its projector gets the response."""
+    images: Annotated[tuple[Line, ...], Field(min_length=LEAST_GREYS), Role.INPUT, IMAGES]
+    """Names of the images of evenly grey projections in the capture's folder."""
+    options: ResponseOptions = ResponseOptions()
+
+
+class TofCalibrationJob(JobRequest):
+    """Wiggling, scale, offset and drift of a time-of-flight camera from captures of a flat target at known distances: tof.json."""
+
+    kind: Literal["calibrate-tof"]
+    capture: Annotated[CaptureId, Role.INPUT, Spelling(argument=True, metavar="SWEEP")]
+    """A folder with the captures of the sweep, each in a folder of its own, and the relit.tof-sweep/1 file."""
+    sweep: Annotated[Line, Role.INPUT, Spelling(metavar="NAME")] = "sweep.json"
+    """Name of the relit.tof-sweep/1 file in the folder."""

@@ -1,0 +1,85 @@
+"""Registration and fusion as jobs: the depths that other jobs have decoded become one mesh."""
+
+import json
+
+import numpy as np
+import pytest
+
+from tests.reference import projector as reference
+from tests.scenes.depth import BLACK_WHITE, POSE, PROJECTOR, Scene, gray_patterns, phase_patterns, write_patterns
+from tests.service.server.api.test_jobs import NOBODY, finish, made_by, refused, submit
+from tests.service.server.api.test_measuring import upload
+
+CAMERA = reference.Device(96, 72, 140.0)
+ASIDE_M = 0.1
+"""By how much the camera of the second view stands to the right."""
+
+
+def height(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Distance of a surface from the plane of the camera, whose bumps are nowhere alike."""
+    return 1.4 + 0.09 * np.sin(9 * x + 4 * y * y) * np.cos(8 * y - 1) + 0.06 * np.sin(13 * y + 6 * x * x + 2) - 0.12 * np.exp(
+        -((x - 0.15) ** 2 + (y - 0.1) ** 2) / 0.01)
+
+
+def seen_from(aside_m: float) -> tuple[Scene, np.ndarray]:
+    """The view of a camera that stands aside, and the projector as it sees it; no part of the surface hides another."""
+    rays = reference.pixel_rays(CAMERA)
+    depth = np.full(rays.shape[:2], 1.4)
+    for _ in range(60):  # damped: along a ray the surface changes by less than the ray does
+        points = rays * (depth / -rays[..., 2])[..., None]
+        depth = 0.5 * depth + 0.5 * height(points[..., 0] + aside_m, points[..., 1])
+    points = rays * (depth / -rays[..., 2])[..., None]
+    pose = POSE.copy()
+    pose[0, 3] -= aside_m
+    albedo = np.full((*depth.shape, 3), 0.6)
+    return Scene(depth, points, reference.seen_by(PROJECTOR, pose, points), albedo, np.zeros(depth.shape, dtype=bool)), pose
+
+
+@pytest.fixture(scope="module")
+def depths(tmp_path_factory, server, client) -> list[str]:
+    """The jobs that decoded two views of one surface."""
+    jobs = []
+    for number, aside in enumerate((0.0, ASIDE_M)):
+        folder = tmp_path_factory.mktemp("view")
+        scene, pose = seen_from(aside)
+        write_patterns(folder, scene, [*gray_patterns("column", stripe=8), *phase_patterns("column", 16.0), *BLACK_WHITE],
+                       noise=0.001, camera=CAMERA, pose=pose)
+        files = {path.name: path.read_bytes() for path in folder.iterdir()}
+        jobs.append(submit(client, kind="depth", capture=upload(server, client, files)["id"], name=f"view {number}"))
+    return [finish(server, client, job)["id"] for job in jobs]
+
+
+@pytest.fixture(scope="module")
+def registered(server, client, depths) -> str:
+    return finish(server, client, submit(client, kind="register", depths=depths, options={"reference": depths[0]}))["id"]
+
+
+def test_depths_are_placed_and_named_by_their_jobs(client, server, depths, registered):
+    assert made_by(client, {"id": registered}) == {"scan-set.json", "report.json"}
+    found = client.get(f"/v1/jobs/{registered}/results/scan-set.json").json()
+    assert [(scan["name"], scan["path"]) for scan in found["scans"]] == [(job, job) for job in depths]
+    pose = np.array(found["scans"][1]["scan_to_world"])
+    assert np.abs(pose[:3, 3] - [ASIDE_M, 0, 0]).max() < 5e-3  # metres: half of the distance between two pixels on the surface
+    assert np.degrees(np.arccos(np.clip((np.trace(pose[:3, :3]) - 1) / 2, -1, 1))) < 0.5
+    report = client.get(f"/v1/jobs/{registered}/results/report.json").json()
+    assert str(server.data) not in json.dumps(report) and "/relit-scans-" not in json.dumps(report)
+
+
+def test_registered_depths_become_one_mesh(client, server, depths, registered):
+    job = submit(client, kind="fuse", registered=registered, options={"texture_px": 128, "texture_faces": 1000})
+    finish(server, client, job)
+    assert made_by(client, job) >= {"mesh.ply", "asset.usdc", "report.json"}
+    report = client.get(f"/v1/jobs/{job['id']}/results/report.json").json()
+    assert [scan["name"] for scan in report["scans"]] == depths and all(scan["fused"] for scan in report["scans"])
+    assert str(server.data) not in json.dumps(report) and "/relit-scans-" not in json.dumps(report)
+
+
+def test_what_cannot_be_registered_or_fused_is_refused(client, depths, registered):
+    def ask(**request):
+        return client.post("/v1/jobs", json=request)
+
+    refused(ask(kind="register", depths=[depths[0], registered]), 422, f"depths[1]: {registered} is a register job: give one of depth")
+    refused(ask(kind="register", depths=[depths[0], NOBODY]), 404, "depths[1]: ")
+    refused(ask(kind="register", depths=[depths[0], depths[0]]), 422, "names a job twice")
+    refused(ask(kind="register", depths=depths, solves=[depths[0]]), 422, "has 1 jobs for 2 depths")
+    refused(ask(kind="fuse", registered=depths[0]), 422, "is a depth job: give one of register")
