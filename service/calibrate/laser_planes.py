@@ -1,5 +1,6 @@
 """Calibration of the planes of a laser from poses of a chessboard on which its stripes are seen."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -34,8 +35,14 @@ class LaserPlanes(NamedTuple):
     """Frame, tilt, residual and number of points of each plane, the least sure first."""
 
 
-def laser_planes(request: LaserPlanesRequest, progress: Progress | None = None) -> LaserPlanes:
+def laser_planes(request: LaserPlanesRequest, progress: Progress | None = None, *,
+                 manifest_paths: Sequence[Path] | None = None) -> LaserPlanes:
     """Measure the plane of each laser frame, and write it to the manifests.
+
+    Args:
+        request: the captures of the board, and those that are written too.
+        progress: told how far the work is.
+        manifest_paths: the manifest to write for each capture, then for each of `apply_to`; None: their own.
 
     Raises:
         StageError, KernelError: the input is wrong, or a plane is not determined; nothing is written.
@@ -74,7 +81,9 @@ def laser_planes(request: LaserPlanesRequest, progress: Progress | None = None) 
         except CalibrationError as error:
             raise CalibrationError(f"{captures[0].folder}: frames of {frame.image}: {error}") from error
     timings.close()
-    return _write(request, [*captures, *others], planes, boards)
+    targets = [*captures, *others]
+    paths = tuple(target.folder / FILE_NAME for target in targets) if manifest_paths is None else tuple(manifest_paths)
+    return _write(request, targets, paths, planes, boards)
 
 
 def _laser_frames(capture: Capture) -> list[Frame]:
@@ -113,11 +122,12 @@ def _stripes_on_board(capture: Capture, request: LaserPlanesRequest, device: str
     return plane.rms_px, found
 
 
-def _write(request: LaserPlanesRequest, targets: list[Capture], planes: list[LightPlane], boards: list[dict[str, object]]) -> LaserPlanes:
+def _write(request: LaserPlanesRequest, targets: list[Capture], paths: tuple[Path, ...], planes: list[LightPlane],
+           boards: list[dict[str, object]]) -> LaserPlanes:
     entries = [{"point_m": digits(plane.point), "normal": digits(plane.normal), "residual_m": float(f"{plane.residual_m:.3g}"),
                 "sigma_degrees": float(f"{plane.sigma_degrees:.3g}"), "points": plane.points} for plane in planes]
     reports = []
-    for target in targets:
+    for target, path in zip(targets, paths, strict=True):
         waiting = iter(planes)
         frames = []
         for frame in target.manifest.frames:
@@ -128,10 +138,10 @@ def _write(request: LaserPlanesRequest, targets: list[Capture], planes: list[Lig
                 frame = frame.model_copy(update={"laser": laser})
             frames.append(frame)
         reports.append(write_results("laser-planes", request, target.manifest.model_copy(update={"frames": tuple(frames)}),
-                                     target.folder / FILE_NAME, {"boards": boards, "planes": entries}))
+                                     path, {"boards": boards, "planes": entries}))
     order = sorted(range(len(planes)), key=lambda index: planes[index].sigma_degrees, reverse=True)
     names = [frame.image for frame in _laser_frames(targets[0])]
     rows: list[tuple[str, ...]] = [
         (names[index], f"{planes[index].sigma_degrees:.3f}°", f"{1000 * planes[index].residual_m:.3f} mm", str(planes[index].points))
         for index in order]
-    return LaserPlanes(tuple(target.folder / FILE_NAME for target in targets), reports[0], rows)
+    return LaserPlanes(paths, reports[0], rows)

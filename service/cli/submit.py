@@ -17,6 +17,7 @@ from service.requests.calibration_jobs import (
     FlatFieldJob,
     GreyBallJob,
     IntensityJob,
+    LaserPlanesJob,
     LightPositionsJob,
     MirrorBallJob,
     ProcamJob,
@@ -24,6 +25,7 @@ from service.requests.calibration_jobs import (
     SaturationJob,
     StereoCalibrationJob,
     TofCalibrationJob,
+    WhiteBalanceJob,
 )
 from service.requests.frame_range import frame_numbers
 from service.requests.identifiers import ALPHABET, CAPTURE, ENVIRONMENT, LENGTH, pattern
@@ -59,7 +61,8 @@ JOBS: dict[str, type[JobRequest]] = {"solve": SolveJob, "depth": DepthJob, "reli
                                      "calibrate-grey-ball": GreyBallJob, "calibrate-intensity": IntensityJob, "calibrate-dark": DarkJob,
                                      "calibrate-flat-field": FlatFieldJob, "calibrate-saturation": SaturationJob,
                                      "calibrate-procam": ProcamJob, "calibrate-stereo": StereoCalibrationJob,
-                                     "calibrate-response": ResponseJob, "calibrate-tof": TofCalibrationJob}
+                                     "calibrate-response": ResponseJob, "calibrate-tof": TofCalibrationJob,
+                                     "calibrate-white-balance": WhiteBalanceJob, "calibrate-laser-planes": LaserPlanesJob}
 REGISTERED = "server:"
 SOURCES = "Give a path of this machine, which is uploaded; an identifier, {prefix}_…; or server:/path, which is registered."
 

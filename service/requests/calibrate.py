@@ -194,13 +194,17 @@ class FlatFieldRequest(FramesRequest):
     """A dark image at the exposure of the white card; may be repeated. Without it the dark frame of the capture is used."""
 
 
-class WhiteBalanceRequest(FramesRequest):
-    """The colours of the capture from a grey or white card in its light: white balance, and the colours of the sensor of camera raw."""
+class WhiteBalanceOptions(Options):
+    """How colours follow from a grey or white card."""
 
     region: Annotated[CropBox | None, Commas, Spelling(metavar="X,Y,W,H")] = None
     """Part of the images that the card fills: first column, first row, width and height in pixels; None: all of it."""
     sensor_colors: bool = False
     """Keep the primaries of the sensor of camera raw files, in place of those of `color_space`: balance white alone."""
+
+
+class WhiteBalanceRequest(WhiteBalanceOptions, FramesRequest):
+    """The colours of the capture from a grey or white card in its light: white balance, and the colours of the sensor of camera raw."""
 
 
 class SaturationRequest(ManifestRequest):
@@ -212,13 +216,18 @@ class SaturationRequest(ManifestRequest):
     """Set `saturation` in the manifest, in place of only printing it; `out` sets it too."""
 
 
-class ProcamOptions(Options):
-    """What is known of the chessboard and the projector."""
+class BoardOptions(Options):
+    """What is known of the chessboard."""
 
     board: Annotated[tuple[Corners, Corners], BeforeValidator(_board), Spelling(metavar="9x6")]
     """Inner corners of the chessboard, across and down."""
     square_m: Annotated[Positive, AfterValidator(_square)]
     """Side of a square in metres."""
+
+
+class ProcamOptions(BoardOptions):
+    """What is known of the chessboard and the projector."""
+
     projector: Annotated[tuple[Count, Count] | None, WidthHeight, Spelling(metavar="1280x800")] = None
     """Width and height of the projector in pixels; None: as in the manifests."""
     drop_outliers: bool = False
@@ -234,16 +243,7 @@ class ProcamRequest(ProcamOptions, Request):
     """Another capture of the same rig, whose manifest is written too; may be repeated."""
 
 
-class StereoOptions(Options):
-    """What is known of the chessboard that several cameras see."""
-
-    board: Annotated[tuple[Corners, Corners], BeforeValidator(_board), Spelling(metavar="9x6")]
-    """Inner corners of the chessboard, across and down."""
-    square_m: Annotated[Positive, AfterValidator(_square)]
-    """Side of a square in metres."""
-
-
-class StereoRequest(StereoOptions, Options):
+class StereoRequest(BoardOptions):
     """Several cameras and their poses from a chessboard that they see at the same moments."""
 
     capture: Annotated[Path, Role.INPUT, CAPTURE]
@@ -252,15 +252,11 @@ class StereoRequest(StereoOptions, Options):
     """Another capture of the same cameras, whose manifest is written too; may be repeated."""
 
 
-class LaserPlanesRequest(DeviceRequest):
+class LaserPlanesRequest(BoardOptions, DeviceRequest):
     """The planes of a laser from its stripes on a chessboard in two poses or more, before a calibrated camera."""
 
     captures: Annotated[tuple[Path, ...], Field(min_length=2), Role.INPUT, POSES]
     """Folders with a capture.json, one for each pose of the board: a frame without the laser, and the same laser frames in each."""
-    board: Annotated[tuple[Corners, Corners], BeforeValidator(_board), Spelling(metavar="9x6")]
-    """Inner corners of the chessboard, across and down."""
-    square_m: Annotated[Positive, AfterValidator(_square)]
-    """Side of a square in metres."""
     apply_to: Annotated[tuple[Path, ...], Role.INPUT, Spelling(metavar="CAPTURE")] = ()
     """Another capture under the same laser planes in the same order, whose manifest is written too; may be repeated."""
 

@@ -9,13 +9,14 @@ from service.requests.calibrate import (
     IMAGES,
     LEAST_GREYS,
     POSES,
+    BoardOptions,
     GreyBallOptions,
     IntensityOptions,
     LightPositionsOptions,
     MirrorBallOptions,
     ProcamOptions,
     ResponseOptions,
-    StereoOptions,
+    WhiteBalanceOptions,
 )
 from service.requests.identifiers import CaptureId
 from service.requests.job import JobRequest
@@ -91,6 +92,17 @@ class FlatFieldJob(JobRequest):
     """Name of a dark image at the exposure of the white card; may be repeated. Without it the dark frame of the capture is used."""
 
 
+class WhiteBalanceJob(JobRequest):
+    """Colours from a grey or white card: capture.json with `color_matrix`, calibration.json."""
+
+    kind: Literal["calibrate-white-balance"]
+    capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
+    """The capture that the images lie in and belong to."""
+    images: Annotated[tuple[Line, ...], Field(min_length=1), Role.INPUT, IMAGES]
+    """Names of the images of the card in the capture's folder, of its resolution and encoding."""
+    options: WhiteBalanceOptions = WhiteBalanceOptions()
+
+
 class SaturationJob(JobRequest):
     """The level at which the readings of the frames saturate: capture.json with it, calibration.json."""
 
@@ -120,7 +132,18 @@ class StereoCalibrationJob(JobRequest):
     """The capture, each of whose stereo frames shows the board in another pose."""
     apply_to: Annotated[tuple[CaptureId, ...], Field(max_length=MOST_CAPTURES), Role.INPUT, Spelling(metavar="CAPTURE")] = ()
     """Another capture of the same cameras, whose manifest is written too; may be repeated."""
-    options: StereoOptions
+    options: BoardOptions
+
+
+class LaserPlanesJob(JobRequest):
+    """The planes of a laser from its stripes on a chessboard in two poses or more: ID.capture.json for each capture, calibration.json."""
+
+    kind: Literal["calibrate-laser-planes"]
+    captures: Annotated[tuple[CaptureId, ...], Field(min_length=2, max_length=MOST_CAPTURES), Role.INPUT, POSES]
+    """The captures, one for each pose of the board: a frame without the laser, and the same laser frames in each."""
+    apply_to: Annotated[tuple[CaptureId, ...], Field(max_length=MOST_CAPTURES), Role.INPUT, Spelling(metavar="CAPTURE")] = ()
+    """Another capture under the same laser planes in the same order, whose manifest is written too; may be repeated."""
+    options: BoardOptions
 
 
 class ResponseJob(JobRequest):

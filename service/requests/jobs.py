@@ -11,6 +11,7 @@ from service.requests.calibration_jobs import (
     FlatFieldJob,
     GreyBallJob,
     IntensityJob,
+    LaserPlanesJob,
     LightPositionsJob,
     MirrorBallJob,
     ProcamJob,
@@ -18,6 +19,7 @@ from service.requests.calibration_jobs import (
     SaturationJob,
     StereoCalibrationJob,
     TofCalibrationJob,
+    WhiteBalanceJob,
 )
 from service.requests.depth import DepthOptions
 from service.requests.export import AssetFormat, ExportOptions
@@ -224,7 +226,8 @@ class PatternsJob(JobRequest):
 
 OneJob = (SolveJob | DepthJob | JoinJob | RegisterJob | FuseJob | RelightJob | ShadeJob | ExportJob | ViewJob | PipelineJob | BasisJob
           | ScanJob | InspectBoardJob | PatternsJob | MirrorBallJob | LightPositionsJob | GreyBallJob | IntensityJob | DarkJob
-          | FlatFieldJob | SaturationJob | ProcamJob | StereoCalibrationJob | ResponseJob | TofCalibrationJob)
+          | FlatFieldJob | WhiteBalanceJob | LaserPlanesJob | SaturationJob | ProcamJob | StereoCalibrationJob | ResponseJob
+          | TofCalibrationJob)
 UserJob = Annotated[OneJob, Field(discriminator="kind")]
 """Every kind of job that the API accepts."""
 AnyJob = Annotated[CheckJob | OneJob, Field(discriminator="kind")]

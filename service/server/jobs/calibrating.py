@@ -11,6 +11,7 @@ from service.requests.calibration_jobs import (
     FlatFieldJob,
     GreyBallJob,
     IntensityJob,
+    LaserPlanesJob,
     LightPositionsJob,
     MirrorBallJob,
     ProcamJob,
@@ -18,6 +19,7 @@ from service.requests.calibration_jobs import (
     SaturationJob,
     StereoCalibrationJob,
     TofCalibrationJob,
+    WhiteBalanceJob,
 )
 from service.requests.job import JobRequest
 from service.server.jobs.measuring import Intake
@@ -31,7 +33,7 @@ TOF_FILE = "tof.json"
 def can_run(request: JobRequest) -> bool:
     """Return whether a job calibrates."""
     return isinstance(request, CalibrationJob | DarkJob | FlatFieldJob | SaturationJob | ProcamJob | StereoCalibrationJob | ResponseJob
-                      | TofCalibrationJob)
+                      | TofCalibrationJob | WhiteBalanceJob | LaserPlanesJob)
 
 
 def run(request: JobRequest, out: Path, intake: Intake, *, device: str, cache: Path, progress: Progress) -> None:
@@ -51,6 +53,10 @@ def run(request: JobRequest, out: Path, intake: Intake, *, device: str, cache: P
         _procam(request, out, intake, device, cache, progress)
     elif isinstance(request, StereoCalibrationJob):
         _stereo(request, out, intake, progress)
+    elif isinstance(request, LaserPlanesJob):
+        _laser_planes(request, out, intake, device, progress)
+    elif isinstance(request, WhiteBalanceJob):
+        _white_balance(request, out, intake, progress)
     elif isinstance(request, ResponseJob):
         _response(request, out, intake, progress)
     elif isinstance(request, TofCalibrationJob):
@@ -112,6 +118,25 @@ def _stereo(request: StereoCalibrationJob, out: Path, intake: Intake, progress: 
     names = request.capture, *request.apply_to
     stereo(StereoRequest(capture=intake(request.capture), apply_to=tuple(map(intake, request.apply_to)), **dict(request.options)), progress,
            manifest_paths=[out / f"{name}.{FILE_NAME}" for name in names])
+
+
+def _laser_planes(request: LaserPlanesJob, out: Path, intake: Intake, device: str, progress: Progress) -> None:
+    from service.calibrate.laser_planes import laser_planes
+    from service.requests.calibrate import LaserPlanesRequest
+
+    names = (*request.captures, *request.apply_to)
+    laser_planes(LaserPlanesRequest(captures=tuple(map(intake, request.captures)), apply_to=tuple(map(intake, request.apply_to)),
+                                    device=device, **dict(request.options)), progress,
+                 manifest_paths=[out / f"{name}.{FILE_NAME}" for name in names])
+
+
+def _white_balance(request: WhiteBalanceJob, out: Path, intake: Intake, progress: Progress) -> None:
+    from service.calibrate.white_balance import white_balance
+    from service.requests.calibrate import WhiteBalanceRequest
+
+    capture = intake(request.capture)
+    white_balance(WhiteBalanceRequest(capture=capture, images=files_within(capture, request.images, "images"), out=out / FILE_NAME,
+                                      **dict(request.options)), progress)
 
 
 def _response(request: ResponseJob, out: Path, intake: Intake, progress: Progress) -> None:

@@ -17,6 +17,7 @@ from service.requests.calibration_jobs import (
     FlatFieldJob,
     GreyBallJob,
     IntensityJob,
+    LaserPlanesJob,
     LightPositionsJob,
     MirrorBallJob,
     ProcamJob,
@@ -24,6 +25,7 @@ from service.requests.calibration_jobs import (
     SaturationJob,
     StereoCalibrationJob,
     TofCalibrationJob,
+    WhiteBalanceJob,
 )
 from service.requests.identifiers import CAPTURE, ENVIRONMENT, JOB, pattern
 from service.requests.job import JobRequest
@@ -51,6 +53,7 @@ CAPTURE_JOBS: dict[str, type[JobRequest]] = {
     "calibrate-light-positions": LightPositionsJob, "calibrate-grey-ball": GreyBallJob, "calibrate-intensity": IntensityJob,
     "calibrate-dark": DarkJob, "calibrate-flat-field": FlatFieldJob, "calibrate-saturation": SaturationJob, "calibrate-procam": ProcamJob,
     "calibrate-stereo": StereoCalibrationJob, "calibrate-response": ResponseJob, "calibrate-tof": TofCalibrationJob,
+    "calibrate-white-balance": WhiteBalanceJob, "calibrate-laser-planes": LaserPlanesJob,
 }
 """Jobs that begin with a capture, by kind."""
 MAPS_JOBS: dict[str, type[JobRequest]] = {"export": ExportJob, "shade": ShadeJob, "join": JoinJob, "register": RegisterJob,
@@ -71,7 +74,8 @@ TITLES = {"solve": "Solve normals and materials", "pipeline": "Solve, export and
           "calibrate-flat-field": "Calibrate the flat field", "calibrate-saturation": "Calibrate the saturation",
           "calibrate-procam": "Calibrate camera and projector", "calibrate-stereo": "Calibrate several cameras",
           "calibrate-response": "Calibrate the response of the projector",
-          "calibrate-tof": "Calibrate a time-of-flight camera"}
+          "calibrate-tof": "Calibrate a time-of-flight camera",
+          "calibrate-white-balance": "Calibrate colours: a grey card", "calibrate-laser-planes": "Calibrate the planes of a laser"}
 IDENTIFIERS = {pattern(CAPTURE): "capture", pattern(ENVIRONMENT): "environment", pattern(JOB): "job"}
 """What the identifiers of a pattern name."""
 

@@ -75,6 +75,8 @@ COMMANDS: dict[str, list[type[Options]]] = {
     "submit calibrate-saturation": [calibration_jobs.SaturationJob], "submit calibrate-procam": [calibration_jobs.ProcamJob],
     "submit calibrate-stereo": [calibration_jobs.StereoCalibrationJob],
     "submit calibrate-response": [calibration_jobs.ResponseJob], "submit calibrate-tof": [calibration_jobs.TofCalibrationJob],
+    "submit calibrate-white-balance": [calibration_jobs.WhiteBalanceJob],
+    "submit calibrate-laser-planes": [calibration_jobs.LaserPlanesJob],
     "farm template relight": [relight.RelightRequest], "farm template shade": [shade.ShadeRequest],
 }
 OWN = {

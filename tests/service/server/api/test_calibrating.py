@@ -8,20 +8,25 @@ import numpy as np
 import pytest
 
 from service.calibrate.images import dark, flat_field, saturation
+from service.calibrate.laser_planes import laser_planes
 from service.calibrate.procam import procam
 from service.calibrate.response import response
 from service.calibrate.tof import calibrate_tof
+from service.calibrate.white_balance import white_balance
 from service.requests.calibrate import (
     DarkRequest,
     FlatFieldRequest,
+    LaserPlanesRequest,
     ProcamRequest,
     ResponseRequest,
     SaturationRequest,
     TofCalibrationRequest,
+    WhiteBalanceRequest,
 )
 from tests.reference import tof
 from tests.scenes.captures import make_scene, write_capture, write_exr, write_manifest
 from tests.service.calibrate.test_calibrate_tof import cw, sweep
+from tests.service.calibrate.test_laser_planes import boards as laser_boards
 from tests.service.calibrate.test_procam import write_view
 from tests.service.depth.test_tof import pulsed_frames
 from tests.service.server.api.conftest import SAMPLES
@@ -85,7 +90,7 @@ def greys(folder: Path = Path()) -> list[str]:
     return [str(folder / f"grey{number}.exr") for number in range(len(LEVELS))]
 
 
-@pytest.mark.parametrize("kind", ["dark", "flat-field", "saturation", "response"])
+@pytest.mark.parametrize("kind", ["dark", "flat-field", "white-balance", "saturation", "response"])
 def test_results_are_those_of_the_command(server, client, sensor, uploaded, tmp_path, kind):
     here = Path(shutil.copytree(sensor, tmp_path / "cap"))
     darks, whites = ("dark0.exr", "dark1.exr"), ("cards/white0.exr", "cards/white1.exr")
@@ -97,6 +102,9 @@ def test_results_are_those_of_the_command(server, client, sensor, uploaded, tmp_
         case "flat-field":
             fields, files = {"images": whites, "dark_images": darks[:1]}, files | {"flat.exr"}
             flat_field(FlatFieldRequest(capture=here, images=tuple(here / name for name in whites), dark_images=(here / darks[0],)))
+        case "white-balance":
+            fields = {"images": whites[:1], "options": {"region": [4, 0, 8, 16]}}
+            white_balance(WhiteBalanceRequest(capture=here, images=(here / whites[0],), region=(4, 0, 8, 16)))
         case "saturation":
             saturation(SaturationRequest(capture=here, write=True))
         case "response":
@@ -156,6 +164,21 @@ def test_a_rig_from_registered_poses(server, client, registered, tmp_path):
     assert before == {path: path.read_bytes() for path in registered.glob("pose*/*.json")}
     assert client.delete(f"/v1/captures/{ids[1]}").status_code in (204, 409)  # whichever it is, the results stay
     assert client.get(f"/v1/jobs/{job['id']}/results/{ids[1]}.capture.json").status_code == 200
+
+
+def test_the_planes_of_a_laser(server, client, tmp_path):
+    folders = laser_boards(tmp_path)
+    ids = [sent(server, client, folder) for folder in folders]
+    board = {"board": "x".join(map(str, boards.BOARD)), "square_m": boards.SQUARE}
+    job = submit(client, kind="calibrate-laser-planes", captures=ids[:3], apply_to=ids[3:], options=board)
+    finish(server, client, job)
+    laser_planes(LaserPlanesRequest(captures=tuple(folders[:3]), apply_to=tuple(folders[3:]), device="cpu", **board))
+    assert made_by(client, job) == {"calibration.json", *(f"{identifier}.capture.json" for identifier in ids)}
+    for identifier, folder in zip(ids, folders, strict=True):
+        found = client.get(f"/v1/jobs/{job['id']}/results/{identifier}.capture.json").json()
+        same(found, json.loads((folder / "capture.json").read_text()))
+    report = client.get(f"/v1/jobs/{job['id']}/results/calibration.json").json()["laser-planes"]
+    assert [board["capture"] for board in report["boards"]] == ids[:3]
 
 
 @pytest.mark.parametrize(("fields", "words"), [

@@ -19,10 +19,13 @@ REQUIRED = {
     "calibrate-stereo": {"capture": CAPTURE, "options": {"board": "9x6", "square_m": 0.025}},
     "calibrate-procam": {"captures": [CAPTURE], "options": {"board": "9x6", "square_m": 0.025}},
     "join": {"maps": JOB, "depth": JOB}, "register": {"depths": [JOB, OTHER]}, "fuse": {"registered": JOB},
+    "calibrate-white-balance": {"capture": CAPTURE, "images": ["0.exr"]},
+    "calibrate-laser-planes": {"captures": [CAPTURE, CAPTURE], "options": {"board": "9x6", "square_m": 0.025}},
     "patterns": {"options": {"code": "gray", "projector": "64x32"}},
 }
 """What a job must have beside a capture, where it must."""
-TYPED = {"calibrate-stereo": {"capture": CAPTURE, "board": "9x6", "square_m": 0.025},
+TYPED = {"calibrate-laser-planes": {"captures": [CAPTURE, CAPTURE], "board": "9x6", "square_m": 0.025},
+         "calibrate-stereo": {"capture": CAPTURE, "board": "9x6", "square_m": 0.025},
          "calibrate-procam": {"captures": [CAPTURE], "board": "9x6", "square_m": 0.025},
          "patterns": {"code": "gray", "projector": "64x32"}}
 
