@@ -73,6 +73,9 @@ class DepthJob(JobRequest):
     """The capture."""
     tof_calibration: Annotated[Line | None, Role.INPUT, Spelling(metavar="NAME")] = None
     """Name of a relit.tof/1 file in the capture's folder."""
+    beside: Annotated[CaptureId | None, Role.INPUT, Spelling(metavar="CAPTURE")] = None
+    """Capture of a second camera under the same patterns of the same projector, which need not be calibrated: both cameras are triangulated
+    by their `world_from_camera`."""
     options: DepthOptions = DepthOptions()
 
 

@@ -61,7 +61,7 @@ def inputs_of(service: Service, project: str, request: JobRequest) -> list[str]:
         ApiError: one of them does not exist or is not ready.
     """
     read = []
-    for field in ("capture", "captures", "environment", "reference_ball", "rig", "apply_to"):
+    for field in ("capture", "captures", "environment", "reference_ball", "beside", "rig", "apply_to"):
         value = getattr(request, field, None)
         for identifier in value if isinstance(value, tuple) else () if value is None else (value,):
             _require_ready(service, project, field, identifier)

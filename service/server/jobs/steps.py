@@ -179,8 +179,9 @@ def _depth(job: Job, request: DepthJob, context: WorkerContext, progress: Progre
     capture = _intake(job, request.capture, context, progress)
     calibration = None if request.tof_calibration is None else file_within(capture, request.tof_calibration, "tof_calibration")
     options = dict(request.options) | {"tof": TofOptions(calibration=calibration, **dict(request.options.tof))}
-    depth(DepthRequest(capture=capture, out=_out(job, context), device=context.device, cache=context.cache / request.capture, **options),
-          progress)
+    beside = None if request.beside is None else _intake(job, request.beside, context, progress)
+    depth(DepthRequest(capture=capture, beside=beside, out=_out(job, context), device=context.device,
+                       cache=context.cache / request.capture, **options), progress)
 
 
 def _inspect_board(job: Job, request: InspectBoardJob, context: WorkerContext, progress: Progress) -> None:

@@ -6,9 +6,11 @@ import numpy as np
 
 from service.calibrate.stereo import stereo
 from service.requests.calibrate import StereoRequest
+from stage.depth_maps import DepthMaps
 from tests.scenes import stereo as scenes
 from tests.scenes.stereo import OTHER, POSE, Plane
 from tests.service.calibrate.test_calibrate_stereo import write_board
+from tests.service.depth.test_two_cameras import two_captures
 from tests.service.server.api.test_calibrating import sent
 from tests.service.server.api.test_jobs import finish, made_by, refused, submit
 
@@ -44,3 +46,16 @@ def test_depth_of_two_cameras(server, client, tmp_path):
     assert {"depth.exr", "points.ply", "report.json"} <= made_by(client, job)
     report = client.get(f"/v1/jobs/{job['id']}/results/report.json").json()
     assert report["method"] == "stereo" and report["pixels"]["ok"] > 0.8 * report["pixels"]["mask"]
+
+
+def test_depth_beside_a_second_camera_under_one_projector(server, client, tmp_path):
+    truth = two_captures(tmp_path)
+    first, second = (sent(server, client, tmp_path / name) for name in ("first", "second"))
+    job = submit(client, kind="depth", capture=first, beside=second)
+    finish(server, client, job)
+    (tmp_path / "depth.exr").write_bytes(client.get(f"/v1/jobs/{job['id']}/results/depth.exr").raise_for_status().content)
+    found = DepthMaps.read(tmp_path / "depth.exr")
+    assert np.median(np.abs(found.depth - truth.depth)[found.mask]) < 1e-3  # metres, as of the command
+    report = client.get(f"/v1/jobs/{job['id']}/results/report.json").json()
+    assert report["found"]["beside"]["residual_px"]["median"] < 0.3 and str(server.data) not in json.dumps(report)
+    refused(client.post("/v1/jobs", json={"kind": "depth", "capture": first, "beside": "cap_0123456789abcdefghjk"}), 404, "beside: ")
