@@ -12,57 +12,16 @@ from service.cli.progress import ProgressBar
 from service.cli.request_commands import Given, command
 from service.cli.service_options import CancelOption, KeyOption, ResultsOption, ServerOption, WaitOption, connected
 from service.cli.waiting import make_folder, wait_for
-from service.requests.calibration_jobs import (
-    DarkJob,
-    FlatFieldJob,
-    GreyBallJob,
-    IntensityJob,
-    LaserPlanesJob,
-    LightPositionsJob,
-    MirrorBallJob,
-    ProcamJob,
-    ResponseJob,
-    SaturationJob,
-    StereoCalibrationJob,
-    TofCalibrationJob,
-    WhiteBalanceJob,
-)
 from service.requests.frame_range import frame_numbers
 from service.requests.identifiers import ALPHABET, CAPTURE, ENVIRONMENT, LENGTH, pattern
 from service.requests.job import JobRequest
-from service.requests.jobs import (
-    DEFAULT_SERVER,
-    BasisJob,
-    DepthJob,
-    ExportJob,
-    FuseJob,
-    InspectBoardJob,
-    JoinJob,
-    PatternsJob,
-    PipelineJob,
-    RegisterJob,
-    RelightJob,
-    ScanJob,
-    ShadeJob,
-    SolveJob,
-    ViewJob,
-)
+from service.requests.jobs import DEFAULT_SERVER, JOBS
 from service.requests.light_keys import LightKeys
 from service.requests.options import Option, help_text, options_of
 
 if TYPE_CHECKING:
     from service.client import Client
 
-JOBS: dict[str, type[JobRequest]] = {"solve": SolveJob, "depth": DepthJob, "relight": RelightJob, "shade": ShadeJob, "export": ExportJob,
-                                     "view": ViewJob, "pipeline": PipelineJob, "basis": BasisJob, "scan": ScanJob, "patterns": PatternsJob,
-                                     "inspect-board": InspectBoardJob, "join": JoinJob, "register": RegisterJob,
-                                     "fuse": FuseJob,
-                                     "calibrate-mirror-ball": MirrorBallJob, "calibrate-light-positions": LightPositionsJob,
-                                     "calibrate-grey-ball": GreyBallJob, "calibrate-intensity": IntensityJob, "calibrate-dark": DarkJob,
-                                     "calibrate-flat-field": FlatFieldJob, "calibrate-saturation": SaturationJob,
-                                     "calibrate-procam": ProcamJob, "calibrate-stereo": StereoCalibrationJob,
-                                     "calibrate-response": ResponseJob, "calibrate-tof": TofCalibrationJob,
-                                     "calibrate-white-balance": WhiteBalanceJob, "calibrate-laser-planes": LaserPlanesJob}
 REGISTERED = "server:"
 SOURCES = "Give a path of this machine, which is uploaded; an identifier, {prefix}_…; or server:/path, which is registered."
 

@@ -165,3 +165,8 @@ class TofCalibrationJob(JobRequest):
     """A folder with the captures of the sweep, each in a folder of its own, and the relit.tof-sweep/1 file."""
     sweep: Annotated[Line, Role.INPUT, Spelling(metavar="NAME")] = "sweep.json"
     """Name of the relit.tof-sweep/1 file in the folder."""
+
+
+AnyCalibration = (MirrorBallJob | LightPositionsJob | GreyBallJob | IntensityJob | DarkJob | FlatFieldJob | SaturationJob | ProcamJob
+                  | StereoCalibrationJob | ResponseJob | TofCalibrationJob | WhiteBalanceJob | LaserPlanesJob)
+"""Every kind of job that calibrates."""

@@ -1,26 +1,12 @@
 """The jobs of the service: options as on the command line, with identifiers of captures and jobs in place of paths."""
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal, Self, get_args
 
 from pydantic import Field, TypeAdapter, model_validator
 
 from service.requests.base import CAPTURE, Role, Spelling
 from service.requests.basis import BasisOptions
-from service.requests.calibration_jobs import (
-    DarkJob,
-    FlatFieldJob,
-    GreyBallJob,
-    IntensityJob,
-    LaserPlanesJob,
-    LightPositionsJob,
-    MirrorBallJob,
-    ProcamJob,
-    ResponseJob,
-    SaturationJob,
-    StereoCalibrationJob,
-    TofCalibrationJob,
-    WhiteBalanceJob,
-)
+from service.requests.calibration_jobs import AnyCalibration
 from service.requests.depth import DepthOptions
 from service.requests.export import AssetFormat, ExportOptions
 from service.requests.fuse import FuseOptions
@@ -227,11 +213,11 @@ class PatternsJob(JobRequest):
     options: PatternsOptions
 
 
-OneJob = (SolveJob | DepthJob | JoinJob | RegisterJob | FuseJob | RelightJob | ShadeJob | ExportJob | ViewJob | PipelineJob | BasisJob
-          | ScanJob | InspectBoardJob | PatternsJob | MirrorBallJob | LightPositionsJob | GreyBallJob | IntensityJob | DarkJob
-          | FlatFieldJob | WhiteBalanceJob | LaserPlanesJob | SaturationJob | ProcamJob | StereoCalibrationJob | ResponseJob
-          | TofCalibrationJob)
+OneJob = (SolveJob | DepthJob | RelightJob | ShadeJob | ExportJob | ViewJob | PipelineJob | BasisJob | ScanJob | PatternsJob
+          | InspectBoardJob | JoinJob | RegisterJob | FuseJob | AnyCalibration)
 UserJob = Annotated[OneJob, Field(discriminator="kind")]
 """Every kind of job that the API accepts."""
+JOBS: dict[str, type[JobRequest]] = {get_args(model.model_fields["kind"].annotation)[0]: model for model in get_args(OneJob)}
+"""The same by `kind`."""
 AnyJob = Annotated[CheckJob | OneJob, Field(discriminator="kind")]
 ANY_JOB: TypeAdapter[CheckJob | OneJob] = TypeAdapter(AnyJob)

@@ -5,6 +5,7 @@ from typing import Any
 
 from service.reporting.progress import Progress
 from service.requests.calibration_jobs import (
+    AnyCalibration,
     BallJob,
     CalibrationJob,
     DarkJob,
@@ -32,8 +33,7 @@ TOF_FILE = "tof.json"
 
 def can_run(request: JobRequest) -> bool:
     """Return whether a job calibrates."""
-    return isinstance(request, CalibrationJob | DarkJob | FlatFieldJob | SaturationJob | ProcamJob | StereoCalibrationJob | ResponseJob
-                      | TofCalibrationJob | WhiteBalanceJob | LaserPlanesJob)
+    return isinstance(request, AnyCalibration)
 
 
 def run(request: JobRequest, out: Path, intake: Intake, *, device: str, cache: Path, progress: Progress) -> None:

@@ -12,54 +12,25 @@ from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel
 
 from service.requests.base import Choice, Commas, Role
-from service.requests.calibration_jobs import (
-    DarkJob,
-    FlatFieldJob,
-    GreyBallJob,
-    IntensityJob,
-    LaserPlanesJob,
-    LightPositionsJob,
-    MirrorBallJob,
-    ProcamJob,
-    ResponseJob,
-    SaturationJob,
-    StereoCalibrationJob,
-    TofCalibrationJob,
-    WhiteBalanceJob,
-)
 from service.requests.identifiers import CAPTURE, ENVIRONMENT, JOB, pattern
 from service.requests.job import JobRequest
-from service.requests.jobs import (
-    BasisJob,
-    DepthJob,
-    ExportJob,
-    FuseJob,
-    InspectBoardJob,
-    JoinJob,
-    PatternsJob,
-    PipelineJob,
-    RegisterJob,
-    RelightJob,
-    ScanJob,
-    ShadeJob,
-    SolveJob,
-)
+from service.requests.jobs import JOBS
 from service.requests.light_keys import LightKeys
 from service.requests.options import Option, help_text, places_of, typed
 
-CAPTURE_JOBS: dict[str, type[JobRequest]] = {
-    "solve": SolveJob, "pipeline": PipelineJob, "depth": DepthJob, "scan": ScanJob, "inspect-board": InspectBoardJob,
-    "relight": RelightJob, "basis": BasisJob, "calibrate-mirror-ball": MirrorBallJob,
-    "calibrate-light-positions": LightPositionsJob, "calibrate-grey-ball": GreyBallJob, "calibrate-intensity": IntensityJob,
-    "calibrate-dark": DarkJob, "calibrate-flat-field": FlatFieldJob, "calibrate-saturation": SaturationJob, "calibrate-procam": ProcamJob,
-    "calibrate-stereo": StereoCalibrationJob, "calibrate-response": ResponseJob, "calibrate-tof": TofCalibrationJob,
-    "calibrate-white-balance": WhiteBalanceJob, "calibrate-laser-planes": LaserPlanesJob,
-}
+
+def _kinds(*names: str) -> dict[str, type[JobRequest]]:
+    return {name: JOBS[name] for name in names}
+
+
+CAPTURE_JOBS = _kinds(
+    "solve", "pipeline", "depth", "scan", "inspect-board", "relight", "basis", "calibrate-mirror-ball", "calibrate-light-positions",
+    "calibrate-grey-ball", "calibrate-intensity", "calibrate-dark", "calibrate-flat-field", "calibrate-saturation", "calibrate-procam",
+    "calibrate-stereo", "calibrate-response", "calibrate-tof", "calibrate-white-balance", "calibrate-laser-planes")
 """Jobs that begin with a capture, by kind."""
-MAPS_JOBS: dict[str, type[JobRequest]] = {"export": ExportJob, "shade": ShadeJob, "join": JoinJob, "register": RegisterJob,
-                                         "fuse": FuseJob}
+MAPS_JOBS = _kinds("export", "shade", "join", "register", "fuse")
 """Jobs that begin with the maps of another job, by kind."""
-FREE_JOBS: dict[str, type[JobRequest]] = {"patterns": PatternsJob}
+FREE_JOBS = _kinds("patterns")
 """Jobs that read nothing, by kind."""
 TITLES = {"solve": "Solve normals and materials", "pipeline": "Solve, export and relight", "depth": "Decode depth",
           "scan": "Turn shots of a scanning laser into points",
