@@ -9,7 +9,7 @@ import numpy as np
 from kernels import device as devices
 from kernels.status import Status
 from kernels.structured.stripe import find_stripe
-from service.calibrate.results import digits, write_results
+from service.calibrate.results import digits, manifests_to_replace, write_results
 from service.depth.stripes import stripe_signal
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import LaserPlanesRequest
@@ -82,7 +82,7 @@ def laser_planes(request: LaserPlanesRequest, progress: Progress | None = None, 
             raise CalibrationError(f"{captures[0].folder}: frames of {frame.image}: {error}") from error
     timings.close()
     targets = [*captures, *others]
-    paths = tuple(target.folder / FILE_NAME for target in targets) if manifest_paths is None else tuple(manifest_paths)
+    paths = manifests_to_replace(targets, manifest_paths)
     return _write(request, targets, paths, planes, boards)
 
 

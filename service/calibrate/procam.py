@@ -9,7 +9,7 @@ import numpy as np
 from kernels import device as devices
 from kernels.status import SOLVED
 from kernels.structured.frames import NoiseModel
-from service.calibrate.results import digits, write_results
+from service.calibrate.results import digits, manifests_to_replace, write_results
 from service.depth.decoders import PatternProjector
 from service.depth.patterns import decoded_bands, full_scale, read_codes, scene_colour
 from service.reporting.progress import Progress, Timings
@@ -89,7 +89,7 @@ def procam(request: ProcamRequest, progress: Progress | None = None, *, manifest
         remarks[view.name] = "its error stands out: see --drop-outliers"
     timings.close()
     targets = [*captures, *others]
-    paths = tuple(capture.folder / FILE_NAME for capture in targets) if manifest_paths is None else tuple(manifest_paths)
+    paths = manifests_to_replace(targets, manifest_paths)
     return _write(request, targets, paths, found, views, remarks, size)
 
 

@@ -143,6 +143,11 @@ def write_results(kind: str, request: Options, manifest: Manifest, manifest_path
     return path
 
 
+def manifests_to_replace(captures: Iterable[Capture], chosen: Sequence[Path] | None) -> tuple[Path, ...]:
+    """Return the manifest to write for each capture: those that are chosen, one for each; None: their own."""
+    return tuple(capture.folder / FILE_NAME for capture in captures) if chosen is None else tuple(chosen)
+
+
 def digits(values: Iterable[float]) -> list[float]:
     """Return numbers for the report, rounded to the six digits that a measurement may have."""
     return [float(f"{value:.6g}") for value in values]

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from service.calibrate.results import digits, write_results
+from service.calibrate.results import digits, manifests_to_replace, write_results
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import StereoRequest
 from stage.calibration.procam import Lens, find_corners
@@ -80,7 +80,7 @@ def stereo(request: StereoRequest, progress: Progress | None = None, *, manifest
     poses = [calibrate_pose(views, request.board, request.square_m, lenses[0], lens, capture.camera.resolution, other.name)
              for views, lens, other in zip(shared, lenses[1:], cameras, strict=True)]
     timings.close()
-    paths = tuple(target.folder / FILE_NAME for target in targets) if manifest_paths is None else tuple(manifest_paths)
+    paths = manifests_to_replace(targets, manifest_paths)
     return _write(request, targets, paths, lenses, poses, shared)
 
 

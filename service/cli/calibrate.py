@@ -1,5 +1,7 @@
 """relit calibrate KIND: lights, dark frame, flat field and saturation, projector and cameras, time of flight from images."""
 
+from collections.abc import Iterable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
@@ -101,9 +103,8 @@ def _saturation(request: SaturationRequest) -> None:
         result = saturation(request, bar)
     print(f"level    {result.level:g}")
     print("readings " + ", ".join(f"{count} {name}" for count, name in zip(result.counts, ("red", "green", "blue"), strict=True)))
-    if result.manifest_path is not None:
-        print(f"capture  {result.manifest_path}")
-        print(f"report   {result.report_path}")
+    if result.manifest_path is not None and result.report_path is not None:
+        _print_files((result.manifest_path,), result.report_path)
 
 
 def _white_balance(request: WhiteBalanceRequest) -> None:
@@ -111,8 +112,7 @@ def _white_balance(request: WhiteBalanceRequest) -> None:
 
     with ProgressBar() as bar:
         result = white_balance(request, bar)
-    print(f"capture  {result.manifest_path}")
-    print(f"report   {result.report_path}")
+    _print_files((result.manifest_path,), result.report_path)
     print("gains    " + ", ".join(f"{gain:.4f} {name}" for gain, name in zip(result.gains, ("red", "green", "blue"), strict=True)))
     for row in result.matrix:
         print("matrix   " + " ".join(f"{value:9.5f}" for value in row))
@@ -123,9 +123,7 @@ def _procam(request: ProcamRequest) -> None:
 
     with ProgressBar() as bar:
         result = procam(request, bar)
-    for path in result.manifest_paths:
-        print(f"capture  {path}")
-    print(f"report   {result.report_path}")
+    _print_files(result.manifest_paths, result.report_path)
     print(f"error    {result.rms_px:.3f} px RMS, baseline {result.baseline_m:.4f} m")
     print_table([("view", "camera, px", "projector, px", "remark"), *result.rows[:VIEW_ROWS]])
 
@@ -135,9 +133,7 @@ def _stereo(request: StereoRequest) -> None:
 
     with ProgressBar() as bar:
         result = stereo(request, bar)
-    for path in result.manifest_paths:
-        print(f"capture  {path}")
-    print(f"report   {result.report_path}")
+    _print_files(result.manifest_paths, result.report_path)
     print(f"error    {result.summary}")
     print_table([("frame", "other camera", "camera, px", "other, px", "remark"), *result.rows[:VIEW_ROWS]])
 
@@ -147,9 +143,7 @@ def _laser_planes(request: LaserPlanesRequest) -> None:
 
     with ProgressBar() as bar:
         result = laser_planes(request, bar)
-    for path in result.manifest_paths:
-        print(f"capture  {path}")
-    print(f"report   {result.report_path}")
+    _print_files(result.manifest_paths, result.report_path)
     print_table([("frame", "tilt sure to", "residual", "points"), *result.rows[:LIGHT_ROWS]])
 
 
@@ -177,10 +171,15 @@ def _tof(request: TofCalibrationRequest) -> None:
     print(f"error    {1000 * result.before_m:.2f} mm before, {1000 * result.after_m:.2f} mm after, RMS over {result.steps} steps")
 
 
+def _print_files(manifest_paths: Iterable[Path], report_path: Path) -> None:
+    for path in manifest_paths:
+        print(f"capture  {path}")
+    print(f"report   {report_path}")
+
+
 def _print_lights(result: "LightCalibration") -> None:
     """Print where the results are, and the lights that are least sure."""
-    print(f"capture  {result.manifest_path}")
-    print(f"report   {result.report_path}")
+    _print_files((result.manifest_path,), result.report_path)
     print(f"lights   {result.summary}")
     print_table([result.headings, *result.rows[:LIGHT_ROWS]])
     if len(result.rows) > LIGHT_ROWS:
@@ -189,5 +188,4 @@ def _print_lights(result: "LightCalibration") -> None:
 
 def _print_image(name: str, result: "ImageCalibration") -> None:
     print(f"{name:<8} {result.image_path}")
-    print(f"capture  {result.manifest_path}")
-    print(f"report   {result.report_path}")
+    _print_files((result.manifest_path,), result.report_path)
