@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.file_mutations import write_between
 from kernels.surface.joined import join_depth
 from tests.scenes.joined import MM, degrees_between, drifting, see
 
@@ -52,9 +53,7 @@ def main() -> None:
     if arguments.write is None:
         print(made)
         return
-    text = arguments.write.read_text(encoding="utf-8")
-    before, after = text.partition(START)[0], text.partition(END)[2]
-    arguments.write.write_text(f"{before}{START}\n{made}\n{END}{after}", encoding="utf-8")
+    write_between(arguments.write, START, END, made)
 
 
 if __name__ == "__main__":

@@ -10,6 +10,8 @@ from stage.files import replacing
 
 POINTS_FILE = "points.ply"
 POSITION, NORMAL, COLOUR, INTENSITY = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue"), ("intensity",)
+TYPES = {np.dtype("<f4"): "float", np.dtype("<u2"): "ushort", np.dtype("u1"): "uchar"}
+"""The names of the types that are written."""
 MAX_HEADER = 1 << 16
 """The bytes within which the header of a file must end."""
 
@@ -44,12 +46,25 @@ def write_ply(cloud: PointCloud, path: str | Path, *, comments: tuple[str, ...] 
         if columns is not None:
             for column, name in enumerate(names):
                 values[name] = columns[:, column]
-    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {' '.join(text.split())}" for text in comments),
-             f"element vertex {len(values)}",
-             *(f"property {'uchar' if kind[name] == np.uint8 else 'float'} {name}" for name in kind.names or ()), "end_header"]
     with replacing(path) as temporary, open(temporary, "wb") as stream:
-        stream.write(("\n".join(lines) + "\n").encode("ascii", "replace"))
+        stream.write(header(kind, len(values), comments))
         values.tofile(stream)
+
+
+def header(vertex: np.dtype, count: int, comments: tuple[str, ...], faces: int | None = None) -> bytes:
+    """Return the header of a binary PLY file.
+
+    Args:
+        vertex: the type of a vertex, whose fields are float32, uint16 or uint8.
+        count: the number of vertices.
+        comments: one line each.
+        faces: the number of faces, lists of int32 vertex numbers behind the vertices; None: the file has none.
+    """
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {' '.join(text.split())}" for text in comments),
+             f"element vertex {count}", *(f"property {TYPES[vertex[name]]} {name}" for name in vertex.names or ())]
+    if faces is not None:
+        lines += [f"element face {faces}", "property list uchar int vertex_indices"]
+    return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii", "replace")
 
 
 def read_ply(path: str | Path) -> PointCloud:

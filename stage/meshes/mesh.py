@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stage.files import replacing
-from stage.ply import COLOUR, NORMAL, POSITION
+from stage.ply import COLOUR, NORMAL, POSITION, header
 
 BATCH = 1 << 20
 """The number of entries that are written together, which bounds the memory."""
@@ -39,13 +39,8 @@ def write_mesh_ply(mesh: TriangleMesh, path: str | Path, *, comments: tuple[str,
     """
     coloured = COLOUR if mesh.colours is not None else ()
     kind = np.dtype([*((name, "<f4") for name in (*POSITION, *NORMAL, "sigma")), ("seen", "<u2"), *((name, "u1") for name in coloured)])
-    types = {"f": "float", "u": "ushort"}
-    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {' '.join(text.split())}" for text in comments),
-             f"element vertex {len(mesh.points)}",
-             *(f"property {'uchar' if name in COLOUR else types[kind[name].kind]} {name}" for name in kind.names or ()),
-             f"element face {len(mesh.faces)}", "property list uchar int vertex_indices", "end_header"]
     with replacing(path) as temporary, open(temporary, "wb") as stream:
-        stream.write(("\n".join(lines) + "\n").encode("ascii", "replace"))
+        stream.write(header(kind, len(mesh.points), comments, faces=len(mesh.faces)))
         for start in range(0, len(mesh.points), BATCH):
             part = slice(start, start + BATCH)
             values = np.empty(len(mesh.points[part]), dtype=kind)
