@@ -17,11 +17,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from benchmarks.file_mutations import write_between
 from service.scans.read import read_scan
 from stage.depth_maps import DepthMaps
 from stage.scans.records import ScanEntry, ScanSet, Turntable
 from stage.scans.registration import Registration, RegistrationOptions, register
-from stage.scans.rigid import applied, inverse, moved, step_between
+from stage.scans.rigid import about, applied, inverse, moved, step_between
 from stage.scans.scan import Scan
 from stage.scans.turntable import turned_pose
 from tests.scenes.turntable import MM, View, figure, pose, see
@@ -130,9 +131,7 @@ def trials(count: int, rows: int) -> str:
                 covariance = found.covariances[number]
                 off = step_between(placed @ inverse(views[number].world_from_scan), placed[:3, 3])
                 squares.append(off @ np.linalg.solve(covariance, off))
-                x, y, z = applied(placed, np.array([[0, 0, -2.0]]))[0] - placed[:3, 3]
-                shift = np.eye(6)
-                shift[3:, :3] = -np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+                shift = about(applied(placed, np.array([[0, 0, -2.0]]))[0] - placed[:3, 3])
                 middle, spread = shift @ off, shift @ covariance @ shift.T
                 places.append(np.linalg.norm(middle[3:]) / np.sqrt(np.trace(spread[3:, 3:])))
                 turns.append(np.linalg.norm(middle[:3]) / np.sqrt(np.trace(spread[:3, :3])))
@@ -158,9 +157,7 @@ def main() -> None:
     if arguments.write is None:
         print(made)
         return
-    text = arguments.write.read_text(encoding="utf-8")
-    before, after = text.partition(START)[0], text.partition(END)[2]
-    arguments.write.write_text(f"{before}{START}\n{made}\n{END}{after}", encoding="utf-8")
+    write_between(arguments.write, START, END, made)
 
 
 if __name__ == "__main__":

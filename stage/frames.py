@@ -5,6 +5,7 @@ continuous from the top-left corner of the image, u right and v down: the centre
 """
 
 import math
+from collections.abc import Sequence
 from typing import Annotated
 
 import numpy as np
@@ -63,6 +64,12 @@ def rotation_about_y(degrees: float) -> np.ndarray:
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
 
 
+def cross_matrix(vector: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Return the matrix [3, 3] whose product with a vector is the cross product of the given one [3] with it."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
 def rotation_about(axis: tuple[float, float, float], degrees: float) -> np.ndarray:
     """Return the rotation about an axis through the origin by an angle, positive by the right-hand rule.
 
@@ -76,9 +83,7 @@ def rotation_about(axis: tuple[float, float, float], degrees: float) -> np.ndarr
     Source: Rodrigues' formula.
     """
     c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-    x, y, z = axis
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return c * np.eye(3) + s * cross + (1 - c) * np.outer(axis, axis)
+    return c * np.eye(3) + s * cross_matrix(axis) + (1 - c) * np.outer(axis, axis)
 
 
 def fibonacci_sphere(count: int) -> np.ndarray:

@@ -15,6 +15,7 @@ from stage.result_metadata import result_file
 from stage.scans.planes import LocalPlanes, local_planes, robust_scatter
 from stage.scans.ply_points import PlyPoints, read_ply_points
 from stage.scans.records import UNITS_M, ScanEntry, ScanSet
+from stage.scans.rigid import nearest_rigid
 from stage.scans.scan import Scan
 
 NORMAL_RADIUS_PX = 2
@@ -66,14 +67,6 @@ def read_scan(file: Path, scans: ScanSet, number: int) -> Scan:
     if not (path / DEPTH_FILE).is_file() and not (path.is_file() and path.suffix.lower() == ".exr"):
         raise ManifestError(f"{where}: path: {path} is neither a folder with a {DEPTH_FILE} nor a PLY file")
     return _range_image(path / DEPTH_FILE if path.is_dir() else path, entry, where, file.parent, pose, covariance)
-
-
-def nearest_rigid(pose: np.ndarray) -> np.ndarray:
-    """Return the rigid transform [4, 4] nearest to one whose rotation was typed with few digits."""
-    u, _, vt = np.linalg.svd(pose[:3, :3])
-    rigid = pose.copy()
-    rigid[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    return rigid
 
 
 def _range_image(path: Path, entry: ScanEntry, where: str, home: Path, pose: np.ndarray | None, covariance: np.ndarray | None) -> Scan:

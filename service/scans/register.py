@@ -21,7 +21,7 @@ from stage.scans.pairs import Pair, PairState
 from stage.scans.pose_graph import REFUSED
 from stage.scans.records import SCAN_SET_FILE, ScanEntry, ScanSet, read_scan_set, write_scan_set
 from stage.scans.registration import Registration, RegistrationOptions, register
-from stage.scans.rigid import applied
+from stage.scans.rigid import about, applied
 from stage.scans.scan import Scan
 from stage.scans.turntable import turned_pose
 
@@ -157,9 +157,7 @@ def _entry(entry: ScanEntry, home: Path, out: Path, pose: np.ndarray | None, cov
 
 def _spread(scan: Scan, pose: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
     """Return the standard deviation of the place of the scan's middle, metres, and of its rotation, degrees; roots of sums over axes."""
-    x, y, z = applied(pose, scan.points.mean(axis=0, dtype=np.float64)[None])[0] - pose[:3, 3]
-    shift = np.eye(6)
-    shift[3:, :3] = -np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    shift = about(applied(pose, scan.points.mean(axis=0, dtype=np.float64)[None])[0] - pose[:3, 3])
     own = shift @ covariance @ shift.T
     return float(np.sqrt(max(np.trace(own[3:, 3:]), 0))), float(np.degrees(np.sqrt(max(np.trace(own[:3, :3]), 0))))
 

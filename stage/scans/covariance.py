@@ -10,6 +10,7 @@ import numpy as np
 
 from stage.scans.pairs import Pair
 from stage.scans.pose_graph import Edge, Solved, adjoint
+from stage.scans.rigid import about
 
 
 def covariances(solved: Solved, pairs: Sequence[Pair], edges: Sequence[Edge]) -> dict[int, np.ndarray]:
@@ -47,9 +48,7 @@ def covariances(solved: Solved, pairs: Sequence[Pair], edges: Sequence[Edge]) ->
     total *= max(solved.factor, 1.0) ** 2 if np.isfinite(solved.factor) else 1.0
     out = {}
     for number in order:
-        shift = np.eye(6)
-        x, y, z = solved.poses[number][:3, 3] - solved.centre
-        shift[3:, :3] = -np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        shift = about(solved.poses[number][:3, 3] - solved.centre)
         k = place[number]
         own = shift @ total[k:k + 6, k:k + 6] @ shift.T
         out[number] = (own + own.T) / 2

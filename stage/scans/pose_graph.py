@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stage.scans.rigid import applied, inverse, screwed, step_between
+from stage.scans.rigid import about, applied, inverse, screwed, step_between
 
 SHRINK = 1.6
 """By which factor μ shrinks from round to round."""
@@ -99,12 +99,8 @@ def solve(edges: Sequence[Edge], start: dict[int, np.ndarray], *, fixed: int, fr
 
 def adjoint(edge: Edge, pose_a: np.ndarray, centre: np.ndarray) -> np.ndarray:
     """Return what a small motion about the centre does at the pivot of a pair, in the frame of its scan a: [6, 6]."""
-    x, y, z = applied(pose_a, edge.pivot[None])[0] - centre
-    out = np.zeros((6, 6))
-    turn = pose_a[:3, :3].T
-    out[:3, :3] = out[3:, 3:] = turn
-    out[3:, :3] = -turn @ np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return out
+    turn = np.kron(np.eye(2), pose_a[:3, :3].T)
+    return turn @ about(applied(pose_a, edge.pivot[None])[0] - centre)
 
 
 def _basis(order: list[int], fixed: int, freedoms: dict[int, np.ndarray], centre: np.ndarray) -> np.ndarray:

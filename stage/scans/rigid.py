@@ -2,12 +2,13 @@
 
 import numpy as np
 
+from stage.frames import cross_matrix
+
 
 def exponential(rotation: np.ndarray) -> np.ndarray:
     """Return the rotation matrix [3, 3] of a rotation vector [3] in radians. Source: Rodrigues' formula."""
     angle = float(np.linalg.norm(rotation))
-    x, y, z = rotation
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    cross = cross_matrix(rotation)
     if angle < 1e-8:
         return np.eye(3) + cross + cross @ cross / 2
     return np.eye(3) + np.sin(angle) / angle * cross + (1 - np.cos(angle)) / angle**2 * cross @ cross
@@ -53,8 +54,7 @@ def screwed(twist: np.ndarray, pivot: np.ndarray, pose: np.ndarray) -> np.ndarra
         Murray, Li and Sastry, A Mathematical Introduction to Robotic Manipulation, CRC 1994, equation 2.36.
     """
     angle = float(np.linalg.norm(twist[:3]))
-    x, y, z = twist[:3]
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    cross = cross_matrix(twist[:3])
     if angle < 1e-6:
         along = np.eye(3) + cross / 2
     else:
@@ -65,6 +65,17 @@ def screwed(twist: np.ndarray, pivot: np.ndarray, pose: np.ndarray) -> np.ndarra
 def step_between(motion: np.ndarray, pivot: np.ndarray) -> np.ndarray:
     """Return the rotation vector about a pivot and the translation [6] of a rigid motion [4, 4]: the inverse of `moved`."""
     return np.concatenate([logarithm(motion[:3, :3]), motion[:3, :3] @ pivot + motion[:3, 3] - pivot])
+
+
+def about(offset: np.ndarray) -> np.ndarray:
+    """Return what takes a small motion [6] (rotation vector, translation) about one pivot to the same motion about another: [6, 6].
+
+    Args:
+        offset: [3] from the first pivot to the second.
+    """
+    out = np.eye(6)
+    out[3:, :3] = -cross_matrix(offset)
+    return out
 
 
 def inverse(pose: np.ndarray) -> np.ndarray:
@@ -78,6 +89,14 @@ def inverse(pose: np.ndarray) -> np.ndarray:
 def applied(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return points [n, 3] under a rigid transform [4, 4]."""
     return points @ pose[:3, :3].T + pose[:3, 3]
+
+
+def nearest_rigid(pose: np.ndarray) -> np.ndarray:
+    """Return the rigid transform [4, 4] nearest to one whose rotation was typed with few digits."""
+    u, _, vt = np.linalg.svd(pose[:3, :3])
+    rigid = pose.copy()
+    rigid[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return rigid
 
 
 def rigid_between(source: np.ndarray, target: np.ndarray, weights: np.ndarray) -> np.ndarray:
