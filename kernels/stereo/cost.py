@@ -48,6 +48,26 @@ class Margins(NamedTuple):
         return cls(max(0, labels.highest) + pack, max(0, last - right_columns) + pack)
 
 
+class CensusPair(NamedTuple):
+    """The census of both images, the right one with the columns around it to which labels lead."""
+
+    left: wp.array  # [frames, rows, cols …] uint64
+    right: wp.array  # [frames, rows, margin + right cols + margin] uint64
+    seen: wp.array  # [rows, margin + right cols + margin] uint8, 0 in the margins and where the right camera sees nothing
+    start: int
+    """The column of `right` that the first label of the pixel in column 0 leads to."""
+
+
+def census_pair(left: np.ndarray, right: np.ndarray, seen: np.ndarray, labels: Labels, *, device: str) -> CensusPair:
+    """Return the census of both images; the arguments are those of `matching_cost`."""
+    margins = Margins.of(left.shape[2], right.shape[2], labels, device)
+    left_bits = census(left, device=device)
+    right_bits = census(right, before=margins.before, after=margins.after, device=device)
+    held = np.zeros(right_bits.shape[1:], np.uint8)
+    held[:, margins.before:margins.before + right.shape[2]] = seen
+    return CensusPair(left_bits, right_bits, wp.array(held, dtype=wp.uint8, device=device), margins.before - labels.highest)
+
+
 def matching_cost(left: np.ndarray, right: np.ndarray, seen: np.ndarray, labels: Labels, *, device: str) -> wp.array:
     """Return the cost of each label at each pixel.
 
@@ -62,17 +82,11 @@ def matching_cost(left: np.ndarray, right: np.ndarray, seen: np.ndarray, labels:
         [rows, cols, packs] packs of uint8: `SCALE` units for each differing bit, the mean over the frames.
     """
     frames, rows, cols = left.shape
-    margins = Margins.of(cols, right.shape[2], labels, device)
-    left_bits = census(left, device=device)
-    right_bits = census(right, before=margins.before, after=margins.after, device=device)
-    held = np.zeros(right_bits.shape[1:], np.uint8)
-    held[:, margins.before:margins.before + right.shape[2]] = seen
-    held_bits = wp.array(held, dtype=wp.uint8, device=device)
+    bits = census_pair(left, right, seen, labels, device=device)
     pack = devices.pack_width(device)
     volume = new_array((rows, cols, labels.packs), pack_type(pack, wp.uint8), device, cleared=False)
     devices.launch(_kernel(pack), rows * cols,
-                   [left_bits, sliding(right_bits), sliding(held_bits), cols, margins.before - labels.highest, SCALE / frames], [volume],
-                   device=device)
+                   [bits.left, sliding(bits.right), sliding(bits.seen), cols, bits.start, SCALE / frames], [volume], device=device)
     return volume
 
 

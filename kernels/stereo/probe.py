@@ -12,9 +12,8 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import once
 from kernels.packs import new_array, pack_type
-from kernels.stereo.census import census
 from kernels.stereo.choice import APART, SPREAD
-from kernels.stereo.cost import CHANCE, SCALE, Labels, Margins
+from kernels.stereo.cost import CHANCE, SCALE, Labels, census_pair
 from kernels.stereo.paths import FAR
 from kernels.stereo.windows import sliding
 
@@ -41,18 +40,13 @@ def probe(left: np.ndarray, right: np.ndarray, seen: np.ndarray, labels: Labels,
         Arrays on the device, not synchronised on CUDA.
     """
     frames, rows, cols = left.shape
-    margins = Margins.of(cols, right.shape[2], labels, device)
-    left_bits = census(left, device=device)
-    right_bits = census(right, before=margins.before, after=margins.after, device=device)
-    held = np.zeros(right_bits.shape[1:], np.uint8)
-    held[:, margins.before:margins.before + right.shape[2]] = seen
-    held_bits = wp.array(held, dtype=wp.uint8, device=device)
+    bits = census_pair(left, right, seen, labels, device=device)
     shape = max(1, rows // step), max(1, cols // step)
     found = Probe(new_array(shape, wp.int32, device, cleared=True), new_array(shape, wp.float32, device, cleared=True))
     pack = devices.pack_width(device)
     devices.launch(_probe_kernel(pack), shape[0] * shape[1],
-                   [left_bits, sliding(right_bits), sliding(held_bits), rows, cols, labels.packs, margins.before - labels.highest, step,
-                    SCALE / frames], list(found), device=device)
+                   [bits.left, sliding(bits.right), sliding(bits.seen), rows, cols, labels.packs, bits.start, step, SCALE / frames],
+                   list(found), device=device)
     return found
 
 

@@ -13,7 +13,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, GetJsonSchemaHandle
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
-from stage.model import Count, Line, NotNegativeCount
+from stage.model import Count, Line, NotNegativeCount, Positive
 from stage.pixels import Crop, PixelChoices
 
 
@@ -124,6 +124,15 @@ class Request(DeviceRequest):
 
     cache: Annotated[Path | None, Role.MACHINE] = None
     """Folder for the image stack; None: .relit in the capture's folder."""
+
+
+class SequenceRequest(Request):
+    """Base of the requests that take a capture, or a sequence of captures."""
+
+    temporal: Annotated[bool, Role.RUN] = True
+    """Join the estimates of consecutive steps of a sequence where they agree within their standard deviations."""
+    frame_rate: Annotated[Positive | None, Role.RUN] = None
+    """Steps per second of a sequence without a sequence.json; None: 24."""
 
 
 class PixelOptions(Options):

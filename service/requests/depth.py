@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator
 
-from service.requests.base import CAPTURE, Choice, Commas, Options, PixelOptions, Request, Role, Spelling
+from service.requests.base import CAPTURE, Choice, Commas, Options, PixelOptions, Role, SequenceRequest, Spelling
 from stage.model import Finite, Fraction, NotNegative, Positive
 
 
@@ -90,7 +90,7 @@ class DepthOptions(PixelOptions):
     """Write normals (nx, ny, nz) into points.ply too."""
 
 
-class DepthRequest(DepthOptions, Request):
+class DepthRequest(DepthOptions, SequenceRequest):
     """Depth from projected patterns, a laser, time of flight, or several cameras under projected texture."""
 
     capture: Annotated[Path, Role.INPUT, CAPTURE]
@@ -102,7 +102,3 @@ class DepthRequest(DepthOptions, Request):
     of its pixels sees the same place, and both cameras are triangulated by their `world_from_camera`."""
     tof: TofOptions = TofOptions()
     """How time of flight is solved, with the camera's calibration; `near_m` and `far_m` are ranges along the ray there."""
-    temporal: Annotated[bool, Role.RUN] = True
-    """Of a sequence: join the estimates of consecutive steps where they agree within their standard deviations."""
-    frame_rate: Annotated[Positive | None, Role.RUN] = None
-    """Of a sequence without a sequence.json: its steps per second; None: 24."""

@@ -5,7 +5,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from service.requests.base import CAPTURE, Choice, Request, Role, Spelling, StackOptions
+from service.requests.base import CAPTURE, Choice, Role, SequenceRequest, Spelling, StackOptions
 from stage.model import Fraction, Line, Positive
 
 SVBRDF_LIGHTS = 12
@@ -60,7 +60,7 @@ class SolveOptions(StackOptions):
     None: any."""
 
 
-class SolveRequest(SolveOptions, Request):
+class SolveRequest(SolveOptions, SequenceRequest):
     """Normals, albedo and height of a light-stage capture."""
 
     capture: Annotated[Path, Role.INPUT, CAPTURE]
@@ -72,7 +72,3 @@ class SolveRequest(SolveOptions, Request):
     device, else the CPU."""
     reference_ball: Annotated[Path | None, Role.INPUT, Spelling(metavar="CAPTURE")] = None
     """Capture of a ball of the object's material under the same lights, for the method reference."""
-    temporal: Annotated[bool, Role.RUN] = True
-    """Of a sequence: join the estimates of consecutive steps where they agree within their standard deviations."""
-    frame_rate: Annotated[Positive | None, Role.RUN] = None
-    """Of a sequence without a sequence.json: its steps per second; None: 24."""
