@@ -16,7 +16,7 @@ from service.reporting.provenance import REPORT_FILE, metadata, report
 from service.requests.fuse import FuseRequest, Misplaced
 from service.scans.bake import bake
 from service.scans.misplaced import LEAST_COMMON, Placing, place_scans
-from service.scans.range_images import COLOUR, WIDTHS, PreparedScan, channels, layers_of, prepare_scan
+from service.scans.range_images import COLOUR, WIDTHS, PreparedScan, channels, prepare_scan, with_layers
 from service.scans.read import read_scan
 from service.scans.surface import Surface, fuse_surface
 from service.usd.fused_asset import write_fused
@@ -118,27 +118,23 @@ def fuse(request: FuseRequest, progress: Progress | None = None) -> FuseResult:
 
 
 def _prepared(file: Path, scan_set: ScanSet, work: Path, timings: Timings) -> tuple[list[PreparedScan], tuple[str, ...]]:
-    """Return the scans as range images, whose arrays lie in files of a folder, and their layers."""
-    found: set[str] = set()
-    for number in range(len(scan_set.scans)):
-        scan = read_scan(file, scan_set, number)
-        if scan.pose is None:
-            raise RequestError(f"{file}: scans[{number}] ({scan.name}): scan_to_world is missing: run relit register first, and fuse the "
-                               "scan-set.json that it writes")
-        found |= layers_of(scan)
-    names = tuple(name for name in WIDTHS if name in found)
+    """Return the scans as range images, whose arrays lie in files of a folder, and the layers that any of them has."""
     scans = []
     for number in range(len(scan_set.scans)):
         folder = work / str(number)
         folder.mkdir()
         scan = read_scan(file, scan_set, number)
-        prepared = prepare_scan(scan, folder, names, f"{file}: scans[{number}] ({scan.name})")
+        if scan.pose is None:
+            raise RequestError(f"{file}: scans[{number}] ({scan.name}): scan_to_world is missing: run relit register first, and fuse the "
+                               "scan-set.json that it writes")
+        prepared = prepare_scan(scan, folder, f"{file}: scans[{number}] ({scan.name})")
         if np.count_nonzero(prepared.image.cell) < LEAST_PIXELS:
             raise RequestError(f"{file}: scans[{number}] ({scan.name}): has {np.count_nonzero(prepared.image.cell)} pixels whose "
                                "neighbours show the same surface: its pixels are too far apart or too noisy to be fused")
         scans.append(prepared)
         timings.advance(1)
-    return scans, names
+    names = tuple(name for name in WIDTHS if any(name in scan.names for scan in scans))
+    return [with_layers(scan, names, work / str(number)) for number, scan in enumerate(scans)], names
 
 
 def _voxel(scans: list[PreparedScan]) -> float:

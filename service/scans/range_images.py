@@ -1,5 +1,6 @@
 """Scans as the range images that fusion takes: cells of pixels on one surface, what was seen to be empty, and layers to blend."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,6 +39,7 @@ class PreparedScan(NamedTuple):
     name: str
     image: RangeImage
     camera: Camera
+    names: tuple[str, ...]  # of the layers
     layers: np.ndarray  # [rows, cols, C] float32, as `channels` orders them
     feather: np.ndarray  # [rows, cols] float32, 0…1
     photometric: bool
@@ -52,28 +54,12 @@ def channels(names: tuple[str, ...]) -> dict[str, slice]:
     return places
 
 
-def layers_of(scan: Scan) -> set[str]:
-    """Return the layers that a scan has.
-
-    Raises:
-        ResultError, ImageError: its maps cannot be read.
-    """
-    found = {NORMAL}
-    if scan.colours is not None:
-        found.add(COLOUR)
-    if scan.maps is not None:
-        maps = SurfaceMaps.read(scan.maps, layers=(ALBEDO, SPECULAR, ROUGHNESS))
-        found |= {name for name in (ALBEDO, SPECULAR, ROUGHNESS) if getattr(maps, name) is not None}
-    return found
-
-
-def prepare_scan(scan: Scan, folder: Path, names: tuple[str, ...], where: str) -> PreparedScan:
-    """Return a scan as a range image, with its arrays in files of a folder.
+def prepare_scan(scan: Scan, folder: Path, where: str) -> PreparedScan:
+    """Return a scan as a range image with the layers that it has, its arrays in files of a folder.
 
     Args:
         scan: with a pose and the camera of a range image.
-        folder: exists; files in it are named after the scan's number.
-        names: the layers, of which those that the scan lacks are 0.
+        folder: exists.
         where: what messages begin with.
 
     Raises:
@@ -101,18 +87,33 @@ def prepare_scan(scan: Scan, folder: Path, names: tuple[str, ...], where: str) -
     clear = _least_around(np.where(mask, depth - STEP_SIGMAS * sigma, 0))
     feather = np.clip(distance(np.pad(~cell, 1, constant_values=True))[1:-1, 1:-1] / FEATHER_PIXELS, 0, 1).astype(np.float32)
     distortion = camera.distortion
-    layers = _layers(scan, maps, normal, names)
-
-    def stored(name: str, values: np.ndarray) -> Any:
-        path = folder / f"{name}.npy"
-        np.save(path, values)
-        return np.load(path, mmap_mode="r")
-
+    layers = _layers(scan, maps, normal)
+    stored = partial(_stored, folder)
     image = RangeImage(stored("depth", depth), stored("sigma", sigma), stored("normal", normal), stored("cell", cell),
                        stored("clear", clear), np.linalg.inv(scan.pose), camera.focal_px, camera.principal_point,
                        (0.0,) * 5 if distortion is None else (*distortion.k, *distortion.p))
-    return PreparedScan(scan.name, image, camera, stored("layers", layers), stored("feather", feather),
-                        scan.normals_source == "photometric")
+    return PreparedScan(scan.name, image, camera, tuple(layers), stored("layers", np.concatenate(list(layers.values()), axis=-1)),
+                        stored("feather", feather), scan.normals_source == "photometric")
+
+
+def with_layers(scan: PreparedScan, names: tuple[str, ...], folder: Path) -> PreparedScan:
+    """Return a scan with these layers, of which those that it lacks are 0, in a file of a folder."""
+    if scan.names == names:
+        return scan
+    own = channels(scan.names)
+    planes = []
+    for name in names:
+        count = WIDTHS[name] + (name != NORMAL)
+        planes.append(scan.layers[..., own[name].start:own[name].start + count] if name in own
+                      else np.zeros((*scan.layers.shape[:2], count), dtype=np.float32))
+    return scan._replace(names=names, layers=_stored(folder, "all_layers", np.concatenate(planes, axis=-1)))
+
+
+def _stored(folder: Path, name: str, values: np.ndarray) -> Any:
+    """Return an array in a file that is mapped into memory."""
+    path = folder / f"{name}.npy"
+    np.save(path, values)
+    return np.load(path, mmap_mode="r")
 
 
 def _least_around(values: np.ndarray) -> np.ndarray:
@@ -145,27 +146,24 @@ def _given(scan: Scan) -> np.ndarray:
     return scan.normals
 
 
-def _layers(scan: Scan, maps: SurfaceMaps | None, normal: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
-    """Return the layers of a scan, each but the normal followed by where it is known."""
-    planes: list[np.ndarray] = []
-    known: np.ndarray
-    values: np.ndarray | None
-    for name in names:
-        if name == NORMAL:
-            known = np.zeros(normal.shape[:2], dtype=bool) if maps is None or maps.normal is None else maps.mask & maps.normal.any(axis=-1)
-            solved = normal if maps is None or maps.normal is None else maps.normal
-            planes.append(np.where(known[..., None], solved, np.float32(ESTIMATED_SHARE) * normal).astype(np.float32))
-            continue
-        values, known = None, np.zeros(normal.shape[:2], dtype=bool)
-        if name == COLOUR and scan.colours is not None:
-            values = convert(scan.image(scan.colours).astype(np.float32) / 255, "srgb_rec709_scene", "lin_rec709_scene")
-            known = scan.image(np.ones(len(scan.points), dtype=bool))
-        elif name != COLOUR and maps is not None and (layer := getattr(maps, name)) is not None:
-            values, known = layer.reshape(*normal.shape[:2], -1).astype(np.float32), maps.mask
+def _layers(scan: Scan, maps: SurfaceMaps | None, normal: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the layers of a scan by name, in the order of WIDTHS, each but the normal followed by where it is known."""
+    shape = normal.shape[:2]
+    known: np.ndarray = np.zeros(shape, dtype=bool) if maps is None or maps.normal is None else maps.mask & maps.normal.any(axis=-1)
+    solved = normal if maps is None or maps.normal is None else maps.normal
+    found = {NORMAL: np.where(known[..., None], solved, np.float32(ESTIMATED_SHARE) * normal).astype(np.float32)}
+    if scan.colours is not None:
+        colours = convert(scan.image(scan.colours).astype(np.float32) / 255, "srgb_rec709_scene", "lin_rec709_scene")
+        found[COLOUR] = _masked(colours, scan.image(np.ones(len(scan.points), dtype=bool)))
+    for name in (ALBEDO, SPECULAR, ROUGHNESS):
+        if maps is not None and (layer := getattr(maps, name)) is not None:
+            values = layer.reshape(*shape, -1).astype(np.float32)
             if WIDTHS[name] == 3 and maps.color_space != "lin_rec709_scene":
                 values = convert(values, maps.color_space, "lin_rec709_scene")
-        if values is None:
-            planes.append(np.zeros((*normal.shape[:2], WIDTHS[name] + 1), dtype=np.float32))
-        else:
-            planes.append(np.concatenate([np.where(known[..., None], values, 0), known[..., None]], axis=-1).astype(np.float32))
-    return np.concatenate(planes, axis=-1)
+            found[name] = _masked(values, maps.mask)
+    return found
+
+
+def _masked(values: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Return values that are 0 where they are not known, followed by where they are, [rows, cols, C + 1] float32."""
+    return np.concatenate([np.where(known[..., None], values, 0), known[..., None]], axis=-1).astype(np.float32)
