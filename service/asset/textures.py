@@ -111,22 +111,21 @@ def write_textures(maps: SurfaceMaps, mesh: SurfaceMesh, folder: Path, *, look: 
 
     def write(name: str, values: np.ndarray) -> Texture:
         known = maps.mask & np.isfinite(values if values.ndim == 2 else values.sum(axis=-1))
+        if name == "normal" and tangent is not None:
+            known = tangent.known
         if look is not None and name in ("base_color", "metallic"):
             known &= look.known
         space = DATA_SPACE if name not in COLOURS else linear_space(maps.color_space) if storage is TextureFormat.EXR else DISPLAY_SPACE
         if storage is TextureFormat.EXR:
-            if name == "normal":
-                values, known = tangent_space(values, known, mesh) if tangent is None else tangent
+            if name == "normal" and tangent is None:
+                values, known = tangent_space(values, known, mesh)
             return _write_exr(folder / f"{name}.exr", values, known, space, reach)
+        colour = name in COLOURS
         if name == "normal" and tangent is None:
             codes, known, clipped = encode_normals(values, known, mesh, np.uint16)
-        elif name == "normal" and tangent is not None:
-            known = tangent.known
-            codes, clipped = encode(tangent.values, known, None, np.uint16)
         else:
-            colour = name in COLOURS
             codes, clipped = encode(values, known, maps.color_space if colour else None, _PNG_TYPES[storage] if colour else np.uint16)
-        write_png(folder / f"{name}.png", bleed(codes, known, reach=reach, in_place=True), srgb=name in COLOURS)
+        write_png(folder / f"{name}.png", bleed(codes, known, reach=reach, in_place=True), srgb=colour)
         return Texture(f"{name}.png", space, clipped)
 
     return side_by_side({name: partial(write, name, source) for name in NAMES if (source := sources.get(name)) is not None}, progress)
