@@ -46,7 +46,7 @@ def scans_of(views: list[View]) -> list[Scan]:
             maps = DepthMaps(camera=view.camera, mask=view.mask, depth=view.depth, sigma=view.sigma)
             maps.write(file.parent / str(number) / "depth.exr")
         entries = tuple(ScanEntry(name=str(number), path=str(number)) for number in range(len(views)))
-        scans = ScanSet(schema="relit.scan-set/1", name="figure", scans=entries)  # type: ignore[call-arg]
+        scans = ScanSet(schema="relit.scan-set/1", name="figure", scans=entries)
         return [read_scan(file, scans, number) for number in range(len(views))]
 
 

@@ -42,15 +42,15 @@ class Share(NamedTuple):
     """What became of the pixels of one scene."""
 
     visible: float
-    """Right within a pixel, of the pixels whose place both cameras see."""
+    """Part of the pixels whose place both cameras see that are right within a pixel."""
     refused: float
-    """Without a depth, of all pixels."""
+    """Part of all pixels that have no depth."""
     wrong: float
-    """Off by a pixel or more, of the pixels with a depth."""
+    """Part of the pixels with a depth that are off by a pixel or more."""
     rms_px: float
-    """Of the right ones."""
+    """Root mean square error of the pixels that are right."""
     within: tuple[float, float]
-    """Of the right ones, those within σ and 2σ; NaN without a σ."""
+    """Parts of the right pixels whose error is within σ and 2σ; NaN without a σ."""
 
 
 def pair_of(parts: list[scenes.Part], textures: int) -> tuple[RectifiedFrames, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

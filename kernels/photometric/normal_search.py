@@ -20,7 +20,7 @@ class Found(NamedTuple):
 
     best: Descent
     survey: Survey | None
-    """Of the pixels that may have another mode; None: no pixel may."""
+    """The survey of the pixels that may have another mode; None: no pixel may."""
 
 
 def find_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse, options: SearchOptions | None = None,

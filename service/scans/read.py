@@ -153,7 +153,7 @@ def _kept(ply: PlyPoints) -> PlyPoints:
     if ply.sigma is None:
         return ply
     there = np.isfinite(ply.sigma) & (ply.sigma > 0)
-    return PlyPoints(*(None if values is None else values[there] for values in ply))  # type: ignore[arg-type]
+    return ply._replace(**{name: values[there] for name, values in ply._asdict().items() if values is not None})
 
 
 def _sigma(measured: np.ndarray | None, entry: ScanEntry, points: np.ndarray, planes: LocalPlanes | None, where: str) -> _Sigma:

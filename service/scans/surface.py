@@ -200,7 +200,7 @@ def upload_layers(watching: list[Watching], device: str) -> tuple[Any, Any]:
     for _, scan, (top, bottom, left, right) in watching:
         layers.append(np.asarray(scan.layers[top:bottom, left:right]).reshape(-1, scan.layers.shape[-1]))
         feathers.append(np.asarray(scan.feather[top:bottom, left:right]).reshape(-1, 1))
-    return tuple(wp.array(np.concatenate(planes), dtype=float, device=device) for planes in (layers, feathers))  # type: ignore[return-value]
+    return (wp.array(np.concatenate(layers), dtype=float, device=device), wp.array(np.concatenate(feathers), dtype=float, device=device))
 
 
 def _shown(triangles: Any, watching: list[Watching], views: ViewArrays, names: tuple[str, ...],

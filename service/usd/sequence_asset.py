@@ -51,7 +51,7 @@ class SequenceSizes(NamedTuple):
 
     steps: int
     vertices: int
-    """Of the largest step."""
+    """Vertices of the step that has most."""
     faces: int
 
 

@@ -27,7 +27,8 @@ SWAPPED_TIMES = 3.0
 LARGEST_SHIFT, SHIFT_SIGMAS = 0.5, 8.0
 """Shift in pixels of a pair that does not fit, and how many standard errors it is at least."""
 LEAST_PERCENT, FALLING_PART = 10.0, 0.7
-"""Of the pixels that a shift makes darkest, this percentage of all, more than this part is darker: noise alone makes it one half."""
+"""A shift is believed if, among this percentage of the pixels, those that it makes darkest, more than this part is darker; noise makes it
+one half."""
 SCALES = (1.0, 4.0)
 """Standard deviations in pixels of the blurs at which shifts are looked for: the wider shows shifts of several pixels."""
 BINS = 4

@@ -24,7 +24,7 @@ class FixedPoses(NamedTuple):
     off: dict[tuple[int, int], tuple[float, float]]
     """By how much the best pose of each joined pair differs from the given one: metres at the overlap, and degrees."""
     wrong: dict[tuple[int, int], tuple[float, float]]
-    """Of these, the ones that noise does not explain."""
+    """The part of `off` that noise does not explain."""
 
 
 def check_fixed(scans: Sequence[Scan], poses: Sequence[np.ndarray], *, threads: int, cell_m: float | None, least_overlap: float,

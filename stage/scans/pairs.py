@@ -67,7 +67,7 @@ class Pair(NamedTuple):
     b: int
     state: PairState
     fit: Fit | None
-    """Of the best pose; None: none was found."""
+    """What the best pose leaves; None: no pose was found."""
     overlap: float
     """Part of the smaller scan's surface that is matched."""
     contradicted: float
@@ -84,7 +84,7 @@ class Prepared:
     features: np.ndarray
     image: DepthRange | None
     area: float
-    """Of the surface that is seen, square metres, up to a factor that all scans share."""
+    """Area of the surface that is seen, square metres, up to a factor that all scans share."""
 
     @property
     def spacing(self) -> float:

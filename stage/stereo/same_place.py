@@ -1,4 +1,4 @@
-"""Where a second camera sees the places of a projector that the first one sees, from the coordinates that both have decoded.
+"""Finds where a second camera sees the places of a projector that the first one sees, from the coordinates that both have decoded.
 
 Each pixel of the second camera has decoded a column and a row; in the neighbourhood of a pixel they are nearly linear in the image. A
 plane is fitted to each there, and the place at which both have the wanted values is where that pixel and the slopes of the planes say.
