@@ -64,6 +64,17 @@ def exposure_series(capture: Capture, frames: Sequence[Frame]) -> ExposureSeries
     return ExposureSeries(tuple(group[0] for group in taken), taken)
 
 
+def frames_shown(capture: Capture) -> tuple[list[Frame], ExposureSeries | None]:
+    """Return one frame of each pattern of a capture, and the series that they are joined from, where there is one.
+
+    Raises:
+        ManifestError: as `exposure_series`.
+    """
+    taken = [frame for frame in capture.manifest.frames if frame.pattern is not None]
+    series = exposure_series(capture, taken)
+    return (taken if series is None else list(series.shown)), series
+
+
 def _differ(one: Frame, other: Frame) -> bool:
     a, b = one.exposure_s or 0.0, other.exposure_s or 0.0
     return abs(a - b) > SAME * max(a, b)

@@ -22,6 +22,7 @@ from stage.colour import GREY_WEIGHTS
 from stage.errors import CalibrationError, ManifestError
 from stage.manifest import FILE_NAME, Manifest
 from stage.model import Resolution
+from stage.pattern_exposures import JoinedExposures, frames_shown
 from stage.planes import frame_planes
 from stage.projector import Projector
 
@@ -95,13 +96,14 @@ def procam(request: ProcamRequest, progress: Progress | None = None, *, manifest
 
 def view_of(capture: Capture, size: Resolution, request: ProcamRequest, device: str) -> BoardView | str:
     """Return the corners of the board as camera and projector see them, or a sentence that says why there are none."""
-    frames = [frame for frame in capture.manifest.frames if frame.pattern is not None]
+    frames, series = frames_shown(capture)
     codes = read_codes(capture, frames, PatternProjector(size))
     columns, rows = codes.columns, codes.rows
     if columns is None or rows is None:
         raise ManifestError(f"{capture.folder / FILE_NAME}: frames: no {'column' if columns is None else 'row'} code: "
                             "calibration needs columns and rows")
-    scene = scene_colour(capture, frames, codes.collected)
+    joined = None if series is None else JoinedExposures(capture, series)
+    scene = scene_colour(capture, frames, codes.collected, joined)
     if scene is None:
         raise ManifestError(f"{capture.folder / FILE_NAME}: frames: no white frame, no inverses and no phases: "
                             "the board must be seen evenly lit")
@@ -111,9 +113,10 @@ def view_of(capture: Capture, size: Resolution, request: ProcamRequest, device: 
     shape = (capture.camera.height, capture.camera.width)
     u, v, decoded = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, bool)
     options = DepthRequest.model_fields
-    with frame_planes(capture, frames, colour=codes.colour, cache=request.cache) as planes:
-        full = full_scale(planes, capture, frames)
-        noise = NoiseModel(options["read_noise"].default * full, options["photon_gain"].default * full)
+    with frame_planes(capture, frames, colour=codes.colour, cache=request.cache, joined=joined) as planes:
+        full = full_scale(planes, capture, frames) if joined is None else joined.full_scale
+        reads = 1 if series is None else len(series.times_s)
+        noise = NoiseModel(options["read_noise"].default * full * reads**0.5, options["photon_gain"].default * full)
         for band, axes in decoded_bands(planes, (columns, rows), noise, device):
             part = u[band].shape
             count = part[0] * part[1]

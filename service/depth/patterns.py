@@ -27,7 +27,7 @@ from stage.colour_spaces import is_linear
 from stage.correction import Correction
 from stage.errors import ManifestError
 from stage.manifest import FILE_NAME, Frame
-from stage.pattern_exposures import JoinedExposures, exposure_series
+from stage.pattern_exposures import JoinedExposures, frames_shown
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected, collect
 from stage.patterns.kary import KaryCode
@@ -86,9 +86,7 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
     projector = check_projector(capture) if missing is None else None
     if missing is not None:
         _refuse_depth_options(request, missing)
-    taken = [frame for frame in capture.manifest.frames if frame.pattern is not None]
-    series = exposure_series(capture, taken)
-    frames = taken if series is None else list(series.shown)
+    frames, series = frames_shown(capture)
     shown = pattern_projector(capture, frames)
     codes = read_codes(capture, frames, shown, refine=request.refine)
     joined = None
@@ -98,9 +96,8 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
     timings.stage("frames", len(frames))
     with frame_planes(capture, frames, colour=codes.colour, cache=request.cache, progress=timings.advance, joined=joined) as planes:
         full = full_scale(planes, capture, frames) if joined is None else joined.full_scale
-        # joined frames add up what the read noise of several has left
         reads = 1 if series is None else len(series.times_s)
-        noise = NoiseModel(request.read_noise * full * reads**0.5, request.photon_gain * full)
+        noise = NoiseModel(request.read_noise * full * reads**0.5, request.photon_gain * full)  # joined frames add up their read noise
         warnings, codes = _checked(planes, mask, codes, shown, projector, capture, frames, noise, device, request)
         coordinates = Coordinates.empty(mask.shape, columns=codes.columns is not None, rows=codes.rows is not None)
         if projector is None:
@@ -112,7 +109,7 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
             solution, right = _bands(planes, mask, codes, coordinates, projector, capture, noise, device, request, timings)
         if planes.exposure is not None:
             coordinates.amplitude /= planes.exposure
-    facts = {"full_scale": float(f"{full:.6g}"), "frames": len(taken),
+    facts = {"full_scale": float(f"{full:.6g}"), "frames": len(frames) * reads,
              "codes": {decoder.axis: decoder.name for decoder in (codes.columns, codes.rows) if decoder is not None},
              "unused": list(codes.unused)}
     if series is not None and joined is not None:

@@ -4,6 +4,7 @@ The way of the data: the frames of one sinusoid in each axis (`choose_sinusoids`
 holds the equations and their source → the mean over the axes → a check against the white frame → the files.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,11 +23,12 @@ from service.requests.separate import SeparateRequest
 from stage import exr
 from stage.capture import Capture
 from stage.colour_spaces import linear_space
-from stage.correction import Correction
+from stage.correction import Correction, Radiance
 from stage.errors import ManifestError
 from stage.files import write_text
 from stage.light import OffLight
-from stage.manifest import FILE_NAME
+from stage.manifest import FILE_NAME, Frame
+from stage.pattern_exposures import JoinedExposures, frames_shown
 from stage.patterns.base import Axis
 from stage.patterns.codes import Collected, collect
 from stage.patterns.phase import FULL_STEPS, PhaseCode
@@ -53,7 +55,7 @@ class Sinusoid(NamedTuple):
 
     axis: Axis
     frames: tuple[int, ...]
-    """Indices into the capture's frames."""
+    """Indices into the frames of patterns, one for each pattern."""
     shifts: tuple[float, ...]
     """The shift of each frame in turns."""
 
@@ -94,8 +96,10 @@ def separate(request: SeparateRequest, progress: Progress | None = None) -> Sepa
     device = devices.resolve(request.device)
     timings.stage("open", 1)
     capture = Capture.open(request.capture, request.pixels)
-    frames = capture.manifest.frames
+    frames, series = frames_shown(capture)
     try:
+        if series is None:
+            collect([frame.pattern for frame in capture.manifest.frames])  # so that what is wrong is said with the manifest's numbers
         collected = collect([frame.pattern for frame in frames])
         period_px, sinusoids = choose_sinusoids(collected, request.period_px)
     except ManifestError as error:
@@ -103,13 +107,17 @@ def separate(request: SeparateRequest, progress: Progress | None = None) -> Sepa
     if request.black_level and collected.black is not None:
         raise RequestError(f"--black-level {request.black_level:g}: the capture has a black frame, which holds that light already: "
                            "leave the option out")
-    light = _separate_frames(capture, collected, sinusoids, period_px, request, device, timings)
+    joined = None
+    if series is not None:
+        timings.stage("exposures", len(frames))
+        joined = JoinedExposures(capture, series, timings.advance)
+    light = _separate_frames(capture, frames, joined, collected, sinusoids, period_px, request, device, timings)
     mask, solved = capture.mask(), light.status == OK
     counts = {name: int((light.status[mask] == code).sum()) for name, code in (("ok", OK), ("saturated", Status.SATURATED))}
     if not solved.any():
         raise ManifestError(f"{capture.folder}: no pixel is separated ({counts['saturated']} saturated): expose the phase frames for less")
     total = (light.direct + light.indirect).sum(axis=-1)
-    ratio = _sum_over_white(capture, collected, total, solved)
+    ratio = _sum_over_white(Correction.of(capture).apply if joined is None else joined.read, frames, collected, total, solved)
     if ratio is not None and abs(ratio - 1) > SUM_TOLERANCE:
         raise ManifestError(f"{capture.folder}: direct and global light add up to {ratio:.2f} of the white frame: the patterns must be "
                             "linear in light (relit patterns --gamma, color_space), and ambient light needs a black or an off frame")
@@ -130,7 +138,9 @@ def separate(request: SeparateRequest, progress: Progress | None = None) -> Sepa
         method=METHOD,
         found={"period_px": period_px, "axes": [sinusoid.axis for sinusoid in sinusoids],
                "frames": sum(len(sinusoid.frames) for sinusoid in sinusoids), "ambient": _ambient(capture, collected),
-               "sum_over_white": None if ratio is None else float(f"{ratio:.5g}")},
+               "sum_over_white": None if ratio is None else float(f"{ratio:.5g}"),
+               **({} if series is None or joined is None else {"exposures_s": list(series.times_s),
+                                                               "pixels_of_exposures": list(joined.counts)})},
         device=devices.describe(device),
         timings_s=timings.close(),
         pixels={"mask": int(mask.sum()), **counts},
@@ -171,8 +181,9 @@ def choose_sinusoids(collected: Collected, wanted_px: float | None) -> tuple[flo
     return period_px, tuple(found[period_px])
 
 
-def _separate_frames(capture: Capture, collected: Collected, sinusoids: tuple[Sinusoid, ...], period_px: float, request: SeparateRequest,
-                     device: str, timings: Timings) -> LightParts:
+def _separate_frames(capture: Capture, frames: list[Frame], joined: JoinedExposures | None, collected: Collected,
+                     sinusoids: tuple[Sinusoid, ...], period_px: float, request: SeparateRequest, device: str,
+                     timings: Timings) -> LightParts:
     """Read the frames and separate them band by band; the parts are the mean over the axes."""
     black = () if collected.black is None else (collected.black,)
     used = [*(number for sinusoid in sinusoids for number in sinusoid.frames), *black]
@@ -180,8 +191,8 @@ def _separate_frames(capture: Capture, collected: Collected, sinusoids: tuple[Si
     mask = capture.mask()
     light = LightParts(np.zeros((*mask.shape, 3), np.float32), np.zeros((*mask.shape, 3), np.float32), np.zeros(mask.shape, np.uint8))
     timings.stage("frames", len(used))
-    with frame_planes(capture, [capture.manifest.frames[number] for number in used], colour=True, cache=request.cache,
-                      progress=timings.advance) as planes:
+    with frame_planes(capture, [frames[number] for number in used], colour=True, cache=request.cache, progress=timings.advance,
+                      joined=joined) as planes:
         timings.stage("separate", len(mask))
         for band in planes.bands(BYTES_PER_PIXEL):
             bits = None if planes.saturated is None else saturated_bits(planes.saturated[:, band].reshape(len(used), -1))
@@ -194,20 +205,22 @@ def _separate_frames(capture: Capture, collected: Collected, sinusoids: tuple[Si
             light.status[band] = np.where(mask[band], worst, int(Status.UNSOLVED))
             for whole, arrays in ((light.direct, [part.direct for part in parts]), (light.indirect, [part.indirect for part in parts])):
                 mean = np.mean([array.numpy()[:, :pixels] for array in arrays], axis=0).reshape(3, *shape)
+                if planes.exposure is not None:
+                    mean /= planes.exposure[band]
                 whole[band] = np.where((light.status[band] == OK)[..., None], np.moveaxis(mean, 0, -1), 0)
             timings.advance(band.stop)
     return light
 
 
-def _sum_over_white(capture: Capture, collected: Collected, total: np.ndarray, solved: np.ndarray) -> float | None:
+def _sum_over_white(read: Callable[[Frame], Radiance], frames: list[Frame], collected: Collected, total: np.ndarray,
+                    solved: np.ndarray) -> float | None:
     """Return the median of direct and global light together over the white frame; None without one, or if nothing is lit."""
     if collected.white is None:
         return None
-    correction = Correction.of(capture)
-    white = correction.apply(capture.manifest.frames[collected.white])
+    white = read(frames[collected.white])
     light = white.pixels
     if collected.black is not None:
-        light = light - correction.apply(capture.manifest.frames[collected.black]).pixels
+        light = light - read(frames[collected.black]).pixels
     lit = _lit(light.sum(axis=-1), solved if white.saturated is None else solved & ~white.saturated)
     return float(np.median(total[lit] / light.sum(axis=-1)[lit])) if lit.any() else None
 

@@ -11,6 +11,7 @@ import pytest
 from stage import exr
 from stage.capture import Capture
 from stage.depth_maps import DepthMaps
+from stage.images import read_pixels
 from tests.reference import projector as reference
 from tests.scenes.captures import edit_manifest, write_image, write_manifest
 from tests.scenes.depth import BLACK_WHITE
@@ -129,6 +130,32 @@ def test_poses_with_phases_alone_calibrate(relit, rig, tmp_path):
     report = json.loads((copies[0] / "calibration.json").read_text())["procam"]
     assert len(report["views"]) == 5 and report["rms_px"] < 0.3  # as with a white frame
     assert np.abs(np.array(Capture.open(copies[0]).manifest.projector.focal_px) / PROJECTOR.focal - 1).max() < 0.01
+
+
+def test_poses_at_several_exposures_calibrate(relit, rig, tmp_path):
+    """Taken again at a fifth of the time and at three times it, where white clips: joined, the board is seen as at one good exposure."""
+    folders, _ = rig
+    copies = []
+    for folder in folders:
+        frames = []
+        for frame in json.loads((folder / "capture.json").read_text())["frames"]:
+            image = read_pixels(folder / frame["image"])
+            for time in (0.02, 0.3):
+                name = f"{time:g}_{frame['image']}"
+                write_image(tmp_path / folder.name / name, np.rint(65535 * np.minimum(image * (time / 0.1), 1)).astype(np.uint16))
+                frames.append({"image": name, "pattern": frame["pattern"], "exposure_s": time})
+        copies.append(tmp_path / folder.name)
+        write_manifest(copies[-1], {"schema": "relit.capture/1", "name": "board", "frames": frames, "saturation": 0.999,
+                                    "camera": {"projection": "orthographic", "resolution": [CAMERA.width, CAMERA.height]}})
+    words = "--board", "9x6", "--square-m", 0.03, "--projector", "256x192"
+    outcome = relit("calibrate", "procam", *copies, *words)
+    assert (outcome.code, outcome.err) == (0, ""), outcome.err
+    report = json.loads((copies[0] / "calibration.json").read_text())["procam"]
+    assert len(report["views"]) == 5 and report["rms_px"] < 0.3  # as at one exposure
+    assert np.abs(np.array(Capture.open(copies[0]).manifest.projector.focal_px) / PROJECTOR.focal - 1).max() < 0.01
+    edit_manifest(copies[1], frames=json.loads((copies[1] / "capture.json").read_text())["frames"][1:])
+    outcome = relit("calibrate", "procam", *copies, *words)
+    assert outcome.code == 2 and "every pattern needs all exposures" in outcome.err
 
 
 def test_response_is_written_into_the_projector(relit, tmp_path):

@@ -75,6 +75,33 @@ def test_known_light_comes_back(relit, tmp_path, patterns):
         assert report["found"]["sum_over_white"] == pytest.approx(1, abs=1e-5)
 
 
+def test_light_of_several_exposures_comes_back(relit, tmp_path):
+    """The long exposure clips the bright half of the pixels, the short one has a fortieth of its noise in the dark half: each reading
+    has noise of a thousandth of full scale, and the error of the parts is that of the sum of the exposures that a pixel takes."""
+    write(tmp_path, [*phases(), WHITE, BLACK])
+    frames, random = [], np.random.default_rng(4)
+    dim = np.where(np.arange(ROWS)[:, None, None] < ROWS // 2, 1.0, 0.02)
+    for frame in json.loads((tmp_path / "capture.json").read_text())["frames"]:
+        image, _ = exr.read(tmp_path / frame["image"])
+        image = np.stack([image[channel] for channel in "RGB"], axis=-1) * dim
+        for time in (0.5, 20.0):
+            name = f"{time:g}_{frame['image']}"
+            recorded = image * time + 0.05 + random.normal(0, 0.001, image.shape)  # on a pedestal, which the dark image takes away
+            write_exr(tmp_path / name, np.minimum(recorded, 1.0))
+            frames.append({"image": name, "pattern": frame["pattern"], "exposure_s": time})
+    write_exr(tmp_path / "dark.exr", np.full((ROWS, COLS, 3), 0.05))
+    edit_manifest(tmp_path, frames=frames, saturation=0.99, dark="dark.exr")
+    direct, indirect, channels, _, report = solve(relit, tmp_path)
+    truth = known()
+    assert (channels["mask.Y"] == 1).all() and report["found"]["exposures_s"] == [0.5, 20.0]
+    assert report["found"]["pixels_of_exposures"] == [ROWS * COLS, ROWS * COLS // 2]
+    for rows, sigma in ((slice(0, ROWS // 2), 0.001 / 0.5), (slice(ROWS // 2, ROWS), 0.001 * 2**0.5 / 20.5)):
+        for found, true in zip((direct, indirect), truth, strict=True):
+            error = (found - true * dim)[rows]
+            # twice the mean and twice the amplitude of four readings, less twice the black one: √(1 + 2 + 4) times the noise of a reading
+            assert np.sqrt((error**2).mean()) < 7**0.5 * 1.15 * sigma, rows
+
+
 def test_the_black_level_of_the_paper(relit, tmp_path):
     write(tmp_path, phases(), leak=0.04)
     direct, indirect, _, _, report = solve(relit, tmp_path, "--black-level", 0.04)
