@@ -15,6 +15,8 @@ OFF_CENTRE = 0.3
 """A point is on a border if the mean of its neighbours lies this part of their distance to one side."""
 SPACING_NEIGHBOUR = 4
 """The spacing is the distance to the neighbour of this number: on a square grid the fourth is one step away."""
+MOST_POINTS = 250_000
+"""The most points that are kept of a scan; cells grow until no more are left."""
 NOISE_CELLS = 3.0
 """Points are averaged in cells of this many σ: with closer points normals would be those of the noise."""
 
@@ -39,10 +41,12 @@ class Cloud:
         return self.points.mean(axis=0)
 
 
-class _Thinned(NamedTuple):
-    points: np.ndarray
-    directions: np.ndarray
-    sigma: np.ndarray
+class Thinned(NamedTuple):
+    """Points of a scan, one for each cell of a grid that holds some."""
+
+    points: np.ndarray  # [n, 3] float64 metres
+    directions: np.ndarray  # [n, 3] float64, unit, from the camera
+    sigma: np.ndarray  # [n] float64 metres
 
 
 def prepared(scan: Scan, *, cell_m: float, most: int, threads: int = 1) -> Cloud:
@@ -54,8 +58,17 @@ def prepared(scan: Scan, *, cell_m: float, most: int, threads: int = 1) -> Cloud
         most: the most points that are matched with other scans; they are drawn evenly, and always the same.
         threads: for the search of neighbours.
     """
+    points, directions, variance = scan.points.astype(np.float64), scan.directions(), scan.sigma.astype(np.float64) ** 2
     cell = max(cell_m, NOISE_CELLS * float(np.median(scan.sigma)))
-    thinned = _thin(scan, cell)
+    thinned = thin(points, directions, variance, cell)
+    while len(thinned.points) > MOST_POINTS:
+        cell *= max(1.02, float(np.sqrt(len(thinned.points) / MOST_POINTS)))
+        thinned = thin(points, directions, variance, cell)
+    return cloud_of(thinned, most=most, threads=threads)
+
+
+def cloud_of(thinned: Thinned, *, most: int, threads: int = 1) -> Cloud:
+    """Return points with their normals, spacing and borders; arguments as of `prepared`."""
     tree = Neighbours(thinned.points, threads=threads)
     index, distance = tree.nearest(thinned.points, NEIGHBOURS + 1)
     around = thinned.points[index] - thinned.points[:, None]
@@ -78,9 +91,15 @@ def _planes(around: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.
     return normals * np.where((normals * directions).sum(axis=1) > 0, -1.0, 1.0)[:, None], spread, mean
 
 
-def _thin(scan: Scan, cell: float) -> _Thinned:
-    """Return the means of the points in cells, with the σ of the means."""
-    points = scan.points.astype(np.float64)
+def thin(points: np.ndarray, directions: np.ndarray, variance: np.ndarray, cell: float) -> Thinned:
+    """Return the means of points in cells, with the σ of the means.
+
+    Args:
+        points: [n, 3] metres.
+        directions: [n, 3] unit, from the camera.
+        variance: [n] square metres, along the directions.
+        cell: side of the cells, metres.
+    """
     index = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
     size = index.max(axis=0) + 1
     _, of_point, count = np.unique(index @ np.array([1, size[0], size[0] * size[1]]), return_inverse=True, return_counts=True)
@@ -89,6 +108,6 @@ def _thin(scan: Scan, cell: float) -> _Thinned:
         return np.bincount(of_point, values, minlength=len(count)) / count
 
     averaged = np.stack([mean(column) for column in points.T], axis=1)
-    directions = np.stack([mean(column) for column in scan.directions().T], axis=1)
-    directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
-    return _Thinned(averaged, directions, np.sqrt(mean(scan.sigma.astype(np.float64) ** 2) / count))
+    middle = np.stack([mean(column) for column in directions.T], axis=1)
+    middle /= np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), 1e-12)
+    return Thinned(averaged, middle, np.sqrt(mean(variance) / count))

@@ -4,22 +4,34 @@ A point that several pairs use has one error, so that pairs are not independent:
 added up (the sandwich estimator; Huber, "The behavior of maximum likelihood estimates under nonstandard conditions", 1967).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from stage.scans.fine import Rows
 from stage.scans.pairs import Pair
 from stage.scans.pose_graph import Edge, Solved, adjoint
 from stage.scans.rigid import about
 
+BATCH_POINTS = 1 << 14
+"""Points of a scan whose shares are in memory at one time."""
 
-def covariances(solved: Solved, pairs: Sequence[Pair], edges: Sequence[Edge]) -> dict[int, np.ndarray]:
+
+def rows_of(pair: Pair) -> Rows:
+    """Return the matched points of a pair that has them in memory."""
+    assert pair.fit is not None and pair.fit.rows is not None
+    return pair.fit.rows
+
+
+def covariances(solved: Solved, pairs: Sequence[Pair], edges: Sequence[Edge], rows: Callable[[Pair], Rows] = rows_of
+                ) -> dict[int, np.ndarray]:
     """Return the covariance of the pose of each scan.
 
     Args:
         solved: the poses.
         pairs: with their fits, in the order of the edges.
         edges: those that `solved` was found from.
+        rows: returns the matched points of a pair.
 
     Returns:
         [6, 6] of each scan: of a small rotation (radians, about the world's axes through the origin of the scan), then of a translation
@@ -37,11 +49,13 @@ def covariances(solved: Solved, pairs: Sequence[Pair], edges: Sequence[Edge]) ->
         of_scan = [k for k, pair in enumerate(pairs) if number in (pair.a, pair.b)]
         if not of_scan:
             continue
-        shares = [_shares(pairs[k], number, float(solved.weights[k])) for k in of_scan]
-        most = max(map(len, shares))
-        every = np.concatenate([np.pad(share, ((0, most - len(share)), (0, 0))) for share in shares], axis=1)
+        shares = [_shares(pairs[k], number, float(solved.weights[k]), rows(pairs[k])) for k in of_scan]
+        square = np.zeros((6 * len(of_scan), 6 * len(of_scan)))
+        for first in range(0, 1 + max(int(index.max()) for index, _ in shares), BATCH_POINTS):
+            every = np.concatenate([_of_points(first, *share) for share in shares], axis=1)
+            square += every.T @ every
         together = np.concatenate([onto[k] for k in of_scan])
-        spread += together.T @ (every.T @ every) @ together
+        spread += together.T @ square @ together
     basis = solved.basis
     inverse = np.linalg.pinv(basis.T @ solved.hessian @ basis + solved.held, hermitian=True)
     total = basis @ inverse @ (basis.T @ spread @ basis + solved.held) @ inverse @ basis.T
@@ -64,13 +78,15 @@ def _onto(edge: Edge, solved: Solved, place: dict[int, int]) -> np.ndarray:
     return out
 
 
-def _shares(pair: Pair, number: int, weight: float) -> np.ndarray:
-    """Return what the noise of each point of a scan adds to the gradient of a pair, [point, 6]; points that it does not use have 0."""
+def _shares(pair: Pair, number: int, weight: float, rows: Rows) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points of a scan that a pair uses, [k], and what the noise of each adds to its gradient, [k, 6]."""
     assert pair.fit is not None
-    rows = pair.fit.rows
     index, sigma = (rows.at, -rows.sigma_a) if number == pair.a else (rows.of, rows.sigma_b)
     onto_graph = weight * pair.fit.information @ np.linalg.pinv(pair.fit.normal, rcond=1e-12, hermitian=True)  # by way of the pair's pose
-    values = (rows.gradient * (sigma * max(pair.fit.ratio, 1.0) * pair.fit.together)[:, None]) @ onto_graph.T
-    size = int(index.max()) + 1
-    return np.stack([np.bincount(index, column, minlength=size) for column in values.T], axis=1)
+    return index, (rows.gradient * (sigma * max(pair.fit.ratio, 1.0) * pair.fit.together)[:, None]) @ onto_graph.T
 
+
+def _of_points(first: int, index: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the sums of the values of each point of a batch, [BATCH_POINTS, 6]; points without any have 0."""
+    inside = (index >= first) & (index < first + BATCH_POINTS)
+    return np.stack([np.bincount(index[inside] - first, column, minlength=BATCH_POINTS) for column in values[inside].T], axis=1)

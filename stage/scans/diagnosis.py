@@ -1,6 +1,6 @@
 """Why a scan could not be joined: whether it fits mirrored or in another unit; and scans whose scale is not that of the others."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -25,21 +25,21 @@ def odd_scans(extents: Sequence[float]) -> set[int]:
     return {number for number, extent in enumerate(extents) if not 1 / ODD < extent / middle < ODD}
 
 
-def why_alone(scan: Scan, others: Sequence[tuple[Scan, Prepared]], *, extent: float, others_extent: float, cell_m: float,
+def why_alone(scan: Scan, others: Sequence[Callable[[], Prepared]], *, extent: float, others_extent: float, cell_m: float,
               least_overlap: float) -> str | None:
     """Return what makes a scan fit others, as words after its name, or None if neither a mirror nor another unit does.
 
     Args:
         scan: the scan that could not be joined.
-        others: scans that could, as they are and prepared.
+        others: return the scans that could, prepared.
         extent, others_extent: metres.
         cell_m: side of the cells of the rough scale, metres.
         least_overlap: the least part of the smaller of two scans that must be matched.
     """
     def fits(changed: Scan) -> bool:
         ready = prepare(changed, cell_m=cell_m)
-        return any(search(other, ready, numbers=(0, 1), cell_m=cell_m, least_overlap=least_overlap).state is PairState.JOINED
-                   for _, other in others[:MOST_TRIED])
+        return any(search(other(), ready, numbers=(0, 1), cell_m=cell_m, least_overlap=least_overlap).state is PairState.JOINED
+                   for other in others[:MOST_TRIED])
 
     ratio = others_extent / extent
     for factor, words in FACTORS.items():

@@ -44,7 +44,7 @@ class Fit(NamedTuple):
     together: float  # by which factor errors of neighbours that are alike widen σ of the pose
     scale: float  # by how much b would have to grow about the pivot, as a part of its size
     scale_sigma: float
-    rows: "Rows"
+    rows: "Rows | None"  # None: they are kept elsewhere
     matches: int  # with a weight above 0
 
 

@@ -7,8 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stage.scans.extent import CELLS_ACROSS, extent_of
+from stage.scans.pair_tasks import NOT_THERE, START_CELLS, overlap_of
 from stage.scans.pairs import Pair, PairState, prepare, refine
-from stage.scans.registration import CELLS_ACROSS, START_CELLS, extent_of, overlap_of
 from stage.scans.rigid import inverse, step_between
 from stage.scans.scan import Scan
 
@@ -48,7 +49,7 @@ def check_fixed(scans: Sequence[Scan], poses: Sequence[np.ndarray], *, threads: 
             a, b = (ready[k] for k in numbers)
             start = inverse(poses[numbers[0]]) @ poses[numbers[1]]
             if overlap_of(a, b, start, START_CELLS * cell) < least_overlap:
-                return Pair(*numbers, PairState.NO_POSE, None, 0.0, 0.0, "do not overlap at the poses that are given")
+                return Pair(*numbers, PairState.NO_POSE, None, 0.0, 0.0, NOT_THERE)
             return refine(a, b, start, numbers=numbers, cell_m=cell, least_overlap=least_overlap)
 
         numbers = list(combinations(range(len(scans)), 2))

@@ -4,15 +4,21 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stage.camera import Camera
 from stage.scans.rigid import applied, inverse
 from stage.scans.scan import Scan
 
+MOST_PIXELS = 1 << 19
+"""Most pixels that are kept of a range image. Of a larger one squares of pixels are taken together, each with its nearest and farthest."""
+
 
 class DepthRange(NamedTuple):
-    """The nearest and farthest depth around each pixel of a range image."""
+    """The nearest and farthest depth around each pixel of a range image, or around each square of pixels."""
 
-    scan: Scan
-    nearest: np.ndarray  # [rows, cols] metres; 0 where any of the nine pixels has no depth
+    camera: Camera
+    step: int
+    """Side of a square in pixels."""
+    nearest: np.ndarray  # [rows, cols] float32 metres, of squares; 0 where any pixel of the square or around it has no depth
     farthest: np.ndarray  # [rows, cols]
 
 
@@ -38,9 +44,20 @@ def depth_range(scan: Scan) -> DepthRange | None:
     rows, cols = depth.shape
     views = [(padded[i:i + rows, j:j + cols], known[i:i + rows, j:j + cols]) for i in range(3) for j in range(3)]
     inner = np.logical_and.reduce([seen for _, seen in views])
-    low = np.minimum.reduce([values for values, _ in views])
-    high = np.maximum.reduce([values for values, _ in views])
-    return DepthRange(scan, np.where(inner, low, 0), np.where(inner, high, 0))
+    low = np.where(inner, np.minimum.reduce([values for values, _ in views]), 0)
+    high = np.where(inner, np.maximum.reduce([values for values, _ in views]), 0)
+    step = max(1, int(np.ceil(np.sqrt(depth.size / MOST_PIXELS))))
+    return DepthRange(scan.camera, step, _of_squares(low, step, np.minimum), _of_squares(high, step, np.maximum))
+
+
+def _of_squares(values: np.ndarray, step: int, least: np.ufunc) -> np.ndarray:
+    """Return the least or largest of the values of each square of `step` pixels; beyond the border values are 0."""
+    if step == 1:
+        return values
+    rows, cols = (-(-side // step) for side in values.shape)
+    padded = np.zeros((rows * step, cols * step), dtype=values.dtype)
+    padded[:values.shape[0], :values.shape[1]] = values
+    return np.asarray(least.reduce(padded.reshape(rows, step, cols, step), axis=(1, 3)))
 
 
 def sight(image: DepthRange, points: np.ndarray, pose: np.ndarray, tolerance: np.ndarray | float) -> Sight:
@@ -52,15 +69,14 @@ def sight(image: DepthRange, points: np.ndarray, pose: np.ndarray, tolerance: np
         pose: [4, 4] from the frame of the points to that of the image.
         tolerance: [n] metres: how far before the surface a point may lie without a contradiction.
     """
-    camera = image.scan.camera
-    assert camera is not None
+    camera = image.camera
     placed = applied(pose, points)
     front = placed[:, 2] < 0 if camera.projection == "perspective" else np.ones(len(placed), dtype=bool)
     placed = np.where(front[:, None], placed, [0.0, 0.0, -1.0])
     u, v = camera.image_coordinates(placed)
     col, row = (np.clip(np.floor(np.nan_to_num(x)), -1, 2**30).astype(np.int64) for x in (u, v))
     inside = front & (col >= 0) & (row >= 0) & (col < camera.width) & (row < camera.height)
-    at = np.where(inside, row, 0), np.where(inside, col, 0)
+    at = np.where(inside, row, 0) // image.step, np.where(inside, col, 0) // image.step
     near, far = image.nearest[at], image.farthest[at]
     judged = inside & (near != 0)
     depth = -placed[:, 2]

@@ -1,28 +1,33 @@
-"""Registration of many scans: which pairs belong together, the poses that fit all of them, and which scans cannot be joined."""
+"""Registration of many scans: which pairs belong together, the poses that fit all of them, and which scans cannot be joined.
+
+Scans are needed one or two at a time. Who calls says where they are in the meantime, and where pairs are registered: by threads that share
+the memory, or by several workers that share a disk.
+"""
 
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from stage.errors import ScanError
-from stage.scans.covariance import covariances
-from stage.scans.diagnosis import odd_scales, odd_scans, why_alone
-from stage.scans.pairs import Pair, PairState, Prepared, prepare, refine, search
+from stage.scans.candidates import ALL_PAIRS, PARTNERS, Outline, Overlaps, likeness, most_alike, outline_of, overlapping
+from stage.scans.covariance import covariances, rows_of
+from stage.scans.diagnosis import odd_scales, why_alone
+from stage.scans.extent import CELLS_ACROSS, cells_of, extent_of, usual_extent
+from stage.scans.fine import Rows
+from stage.scans.pair_tasks import NEAR_CELLS, NOT_THERE, START_CELLS, PairTask, register_pair
+from stage.scans.pairs import Pair, PairState, Prepared, prepare
 from stage.scans.pose_graph import REFUSED, Edge, Solved, solve
 from stage.scans.records import Turntable
-from stage.scans.rigid import applied, inverse
+from stage.scans.rigid import inverse
 from stage.scans.scan import Scan
 from stage.scans.tree import joined_groups, tree_poses
 from stage.scans.turntable import angle_of, freedom, turned_pose
 
-CELLS_ACROSS = 60
-"""The extent of a scan in cells of the rough scale: some 1500 cells of a surface are occupied."""
-START_CELLS, NEAR_CELLS = 2.0, 1.0
-"""Points of two scans overlap, at starts or at poses that were found, if they are at most this many cells apart."""
 ROUNDS = 2
 """How often pairs that the poses predict to overlap are looked for."""
 Advance = Callable[[float], None]
@@ -40,6 +45,25 @@ class RegistrationOptions:
     """The scan whose pose is fixed; None: the first with a start, or the first."""
     threads: int = 1
     """Pairs that are registered at one time."""
+
+
+class ScanWork(Protocol):
+    """Where scans and pairs are made and kept."""
+
+    def outlines(self, cells: dict[int, float], advance: Advance) -> dict[int, Outline]:
+        """Prepare scans at rough scales with cells of these sides, metres, and return their outlines."""
+
+    def ready(self, number: int) -> Prepared:
+        """Return a scan that was prepared."""
+
+    def pairs(self, tasks: Sequence[PairTask], cells: dict[int, float], least_overlap: float, advance: Advance) -> list[Pair]:
+        """Register pairs of prepared scans; they may be without their rows."""
+
+    def rows(self, pair: Pair) -> Rows:
+        """Return the matched points of a pair."""
+
+    def scan(self, number: int) -> Scan:
+        """Return a scan as it was read."""
 
 
 class Registration(NamedTuple):
@@ -63,7 +87,7 @@ class Registration(NamedTuple):
 
 def register(scans: Sequence[Scan], starts: Sequence[np.ndarray | None], options: RegistrationOptions, *,
              table: Turntable | None = None, advance: Advance = lambda done: None) -> Registration:
-    """Find the poses of scans of one object.
+    """Find the poses of scans of one object, all of which are in memory.
 
     Args:
         scans: two or more.
@@ -75,108 +99,172 @@ def register(scans: Sequence[Scan], starts: Sequence[np.ndarray | None], options
     Raises:
         ScanError: no two scans can be joined.
     """
-    extents = [extent_of(scan) for scan in scans]
-    odd = odd_scans(extents)
-    usual = float(np.median([extent for number, extent in enumerate(extents) if number not in odd]))
-    cell = options.cell_m or usual / CELLS_ACROSS
     with ThreadPoolExecutor(options.threads) as pool:
-        used = [number for number in range(len(scans)) if number not in odd]
-        ready = dict(zip(used, pool.map(lambda number: prepare(scans[number], cell_m=cell), used), strict=True))
-        advance(0.15)
-        pairs = _pairs(ready, starts, cell, options, pool, lambda done: advance(0.15 + 0.6 * done))
-        solved, kept = _solved(len(scans), pairs, starts, options, table)
-        tried: set[tuple[int, int]] = set()
+        return register_by(_InMemory(scans, pool), [scan.name for scan in scans], [extent_of(scan) for scan in scans], starts, options,
+                           table=table, advance=advance)
+
+
+def register_by(work: ScanWork, names: Sequence[str], extents: Sequence[float], starts: Sequence[np.ndarray | None],
+                options: RegistrationOptions, *, table: Turntable | None = None, advance: Advance = lambda done: None) -> Registration:
+    """Find the poses of scans of one object.
+
+    Args:
+        work: makes and keeps what is needed of scans and pairs.
+        names: of the scans, for messages.
+        extents: of the scans, as `extent_of` returns it.
+        starts, options, table, advance: as of `register`.
+
+    Raises:
+        ScanError: no two scans can be joined.
+    """
+    count = len(names)
+    cells = dict(cells_of(extents, starts, options.cell_m))
+    usual = usual_extent(extents)
+    outlines = work.outlines(cells, lambda done: advance(0.15 * done))
+
+    def registered(tasks: Sequence[PairTask], least: float, most: float) -> dict[tuple[int, int], Pair]:
+        done = work.pairs(tasks, cells, options.least_overlap, lambda part: advance(least + (most - least) * part))
+        return {(pair.a, pair.b): pair for pair in done}
+
+    pairs = _first_pairs(outlines, starts, count, options, registered)
+    solved, kept = _solved(count, pairs, starts, options, table)
+    tried: set[tuple[int, int]] = set()
+    advance(0.75)
+    unlike = _untried(outlines, starts, pairs)
+    while True:
         for _ in range(ROUNDS):
-            found = _predicted(ready, pairs, tried, solved, cell, options, pool)
+            found = _predicted(outlines, pairs, tried, solved, count, options, registered)
             if not found:
                 break
             pairs |= found
-            solved, kept = _solved(len(scans), pairs, starts, options, table)
-        advance(0.9)
+            solved, kept = _solved(count, pairs, starts, options, table)
+        further = most_alike(unlike, _groups(count, pairs))
+        if not further:
+            break
+        for pair in further:
+            del unlike[pair]
+        pairs |= registered([PairTask(a, b, None, 0.0, True) for a, b in further], 0.75, 0.9)
+        solved, kept = _solved(count, pairs, starts, options, table)
+    advance(0.9)
     joined = solved.poses if solved is not None else {}
-    basis = sorted(joined) or used[:1]
+    common = options.cell_m or usual / CELLS_ACROSS
+    alike = [number for number in sorted(cells) if cells[number] == common]
+    basis = [number for number in alike if number in joined] or alike[:1]
     alone = {}
-    for number in sorted(set(range(len(scans))) - set(basis)):
-        others = [(scans[other], ready[other]) for other in sorted(basis, key=lambda other: abs(other - number))]
-        words = why_alone(scans[number], others, extent=extents[number], others_extent=usual, cell_m=cell,
+    for number in sorted(set(range(count)) - set(joined or basis)):
+        others = [partial(work.ready, other) for other in sorted(basis, key=lambda other: abs(other - number))]
+        words = why_alone(work.scan(number), others, extent=extents[number], others_extent=usual, cell_m=common,
                           least_overlap=options.least_overlap)
-        alone[number] = words or _refusal(number, scans, pairs.values())
+        alone[number] = words or _refusal(number, names, pairs.values())
     advance(1.0)
     if solved is None:
-        raise ScanError(*(f"{scans[number].name}: {words}" for number, words in alone.items()))
+        raise ScanError(*(f"{names[number]}: {words}" for number, words in alone.items()))
     if options.reference is not None and options.reference not in joined:
-        raise ScanError(f"{scans[options.reference].name}: is the reference, but {alone[options.reference]}")
+        raise ScanError(f"{names[options.reference]}: is the reference, but {alone[options.reference]}")
     weights = {(pair.a, pair.b): float(weight) for pair, weight in zip(kept, solved.weights, strict=True)}
-    return Registration(joined, covariances(solved, kept, [edge_of(pair) for pair in kept]), _reference(joined, starts, options),
-                        tuple(pairs.values()), alone, odd_scales(kept, list(joined)), weights, solved.factor, cell)
+    return Registration(joined, covariances(solved, kept, [edge_of(pair) for pair in kept], work.rows), _reference(joined, starts, options),
+                        tuple(pairs.values()), alone, odd_scales(kept, list(joined)), weights, solved.factor, common)
 
 
-def extent_of(scan: Scan) -> float:
-    """Return the diagonal of the box around nearly all points of a scan, metres."""
-    low, high = np.percentile(scan.points, (1, 99), axis=0)
-    return float(np.linalg.norm(high - low))
+class _InMemory:
+    """Scans in memory, and threads that register pairs of them."""
+
+    def __init__(self, scans: Sequence[Scan], pool: ThreadPoolExecutor) -> None:
+        self._scans, self._pool = scans, pool
+        self._ready: dict[int, Prepared] = {}
+
+    def outlines(self, cells: dict[int, float], advance: Advance) -> dict[int, Outline]:
+        made = self._pool.map(lambda number: prepare(self._scans[number], cell_m=cells[number]), cells)
+        for done, (number, ready) in enumerate(zip(cells, made, strict=True)):
+            self._ready[number] = ready
+            advance((done + 1) / len(cells))
+        return {number: outline_of(ready, cells[number]) for number, ready in self._ready.items()}
+
+    def ready(self, number: int) -> Prepared:
+        return self._ready[number]
+
+    def pairs(self, tasks: Sequence[PairTask], cells: dict[int, float], least_overlap: float, advance: Advance) -> list[Pair]:
+        found = []
+        for pair in self._pool.map(lambda task: register_pair(task, self._ready[task.a], self._ready[task.b],
+                                                              cell_m=(cells[task.a], cells[task.b]), least_overlap=least_overlap), tasks):
+            found.append(pair)
+            advance(len(found) / len(tasks))
+        return found
+
+    def rows(self, pair: Pair) -> Rows:
+        return rows_of(pair)
+
+    def scan(self, number: int) -> Scan:
+        return self._scans[number]
 
 
-def overlap_of(a: Prepared, b: Prepared, pose: np.ndarray, near_m: float) -> float:
-    """Return which part of the smaller of two scans lies within a distance of the other at a pose a_from_b, facing the same way."""
-    placed = applied(pose, b.rough.points)
-    index, distance = a.rough.tree.nearest(placed)
-    facing = np.einsum("ni,ni->n", b.rough.normals @ pose[:3, :3].T, a.rough.normals[index[:, 0]]) > 0.5
-    return float(((distance[:, 0] < near_m) & facing).sum() / min(len(a.rough.points), len(b.rough.points)))
+Registered = Callable[[Sequence[PairTask], float, float], dict[tuple[int, int], Pair]]
+"""Registers pairs; its numbers say between which parts of the whole work."""
 
 
-def _pairs(ready: dict[int, Prepared], starts: Sequence[np.ndarray | None], cell: float, options: RegistrationOptions,
-           pool: ThreadPoolExecutor, advance: Advance) -> dict[tuple[int, int], Pair]:
-    """Return all pairs: from the starts where there are any, else searched."""
-    def one(numbers: tuple[int, int]) -> Pair:
-        a, b = (ready[k] for k in numbers)
-        first, second = (starts[k] for k in numbers)
-        if first is not None and second is not None:
-            start = inverse(first) @ second
-            if overlap_of(a, b, start, START_CELLS * cell) < options.least_overlap:
-                return Pair(*numbers, PairState.NO_POSE, None, 0.0, 0.0, "do not overlap at the poses that are given")
-            pair = refine(a, b, start, numbers=numbers, cell_m=cell, least_overlap=options.least_overlap)
-            if pair.state in (PairState.JOINED, PairState.AMBIGUOUS):
-                return pair
-        return search(a, b, numbers=numbers, cell_m=cell, least_overlap=options.least_overlap)
-
-    numbers = list(combinations(ready, 2))
-    found = {}
-    for done, pair in enumerate(pool.map(one, numbers)):
-        found[pair.a, pair.b] = pair
-        advance((done + 1) / len(numbers))
-    return found
+def _first_pairs(outlines: dict[int, Outline], starts: Sequence[np.ndarray | None], count: int, options: RegistrationOptions,
+                 registered: Registered) -> dict[tuple[int, int], Pair]:
+    """Return pairs: from the starts of both scans where they overlap there, else searched, if there are few scans."""
+    known = {number: start for number in outlines if (start := starts[number]) is not None}
+    overlaps = Overlaps(outlines, known, START_CELLS)
+    near = set(overlapping(known, overlaps, options.least_overlap, count=count, wanted=lambda a, b: True))
+    tasks, pairs = [], {}
+    for a, b in combinations(sorted(outlines), 2):
+        first, second = known.get(a), known.get(b)
+        if first is None or second is None:
+            if count <= ALL_PAIRS:
+                tasks.append(PairTask(a, b, None, 0.0, True))
+        elif (a, b) in near:
+            tasks.append(PairTask(a, b, inverse(first) @ second, START_CELLS, True))
+        elif count <= ALL_PAIRS:
+            pairs[a, b] = Pair(a, b, PairState.NO_POSE, None, 0.0, 0.0, NOT_THERE)
+    pairs |= registered(tasks, 0.15, 0.75)
+    return {pair: pairs[pair] for pair in sorted(pairs)}
 
 
-def _predicted(ready: dict[int, Prepared], pairs: dict[tuple[int, int], Pair], tried: set[tuple[int, int]], solved: Solved | None,
-               cell: float, options: RegistrationOptions, pool: ThreadPoolExecutor) -> dict[tuple[int, int], Pair]:
+def _untried(outlines: dict[int, Outline], starts: Sequence[np.ndarray | None], pairs: dict[tuple[int, int], Pair]
+             ) -> dict[tuple[int, int], float]:
+    """Return how unlike scans of pairs are that can be searched and were not."""
+    if all(starts[number] is not None for number in outlines):
+        return {}
+    return {(a, b): unlike for (a, b), unlike in likeness(outlines).items()
+            if (a, b) not in pairs and (starts[a] is None or starts[b] is None)}
+
+
+def _groups(count: int, pairs: dict[tuple[int, int], Pair]) -> dict[int, int]:
+    """Return the group of each scan, of those that pairs join."""
+    groups = joined_groups(count, [pair for pair in pairs.values() if pair.state is PairState.JOINED])
+    return {number: place for place, members in enumerate(groups) for number in members}
+
+
+def _predicted(outlines: dict[int, Outline], pairs: dict[tuple[int, int], Pair], tried: set[tuple[int, int]], solved: Solved | None,
+               count: int, options: RegistrationOptions, registered: Registered) -> dict[tuple[int, int], Pair]:
     """Return further joined pairs, of scans that overlap at the poses that were found.
 
     Args:
-        ready: the scans.
-        pairs: what became of each pair.
+        outlines: of the scans.
+        pairs: what became of each pair that was tried.
         tried: pairs that this function tried before, to which it adds.
         solved: the poses; None: there are none.
-        cell: side of the cells of the rough scale, metres.
+        count: of all scans.
         options: how.
-        pool: for several pairs at a time.
+        registered: registers pairs.
     """
     if solved is None:
         return {}
     poses = solved.poses
 
-    def again(numbers: tuple[int, int]) -> Pair | None:
-        a, b = (ready[k] for k in numbers)
-        pose = inverse(poses[numbers[0]]) @ poses[numbers[1]]
-        if overlap_of(a, b, pose, NEAR_CELLS * cell) < options.least_overlap:
-            return None
-        tried.add(numbers)
-        pair = refine(a, b, pose, numbers=numbers, cell_m=cell, least_overlap=options.least_overlap)
-        return pair if pair.state is PairState.JOINED else None
+    def wanted(a: int, b: int) -> bool:
+        pair = pairs.get((a, b))
+        return (pair is None or pair.state is not PairState.JOINED) and (a, b) not in tried
 
-    numbers = [ab for ab, pair in pairs.items()
-               if pair.state is not PairState.JOINED and ab[0] in poses and ab[1] in poses and ab not in tried]
-    return {(pair.a, pair.b): pair for pair in pool.map(again, numbers) if pair is not None}
+    near = overlapping(poses, Overlaps(outlines, poses, NEAR_CELLS), options.least_overlap, count=count, wanted=wanted)
+    if count > ALL_PAIRS:
+        joined = [number for pair in pairs.values() if pair.state is PairState.JOINED for number in (pair.a, pair.b)]
+        near = [(a, b) for a, b in near if min(joined.count(a), joined.count(b)) < PARTNERS]
+    found = registered([PairTask(a, b, inverse(poses[a]) @ poses[b], NEAR_CELLS, False) for a, b in near], 0.75, 0.9)
+    tried |= {numbers for numbers, pair in found.items() if pair.reason != NOT_THERE}
+    return {numbers: pair for numbers, pair in found.items() if pair.state is PairState.JOINED}
 
 
 def _solved(count: int, pairs: dict[tuple[int, int], Pair], starts: Sequence[np.ndarray | None], options: RegistrationOptions,
@@ -216,7 +304,7 @@ def _reference(numbers: Iterable[int], starts: Sequence[np.ndarray | None], opti
     return min(numbers, key=lambda number: (number != options.reference, starts[number] is None, number))
 
 
-def _refusal(number: int, scans: Sequence[Scan], pairs: Iterable[Pair]) -> str:
+def _refusal(number: int, names: Sequence[str], pairs: Iterable[Pair]) -> str:
     """Return why a scan could not be joined, by the pair that came nearest to it."""
     tried = [pair for pair in pairs if number in (pair.a, pair.b) and pair.state is not PairState.NO_POSE]
     if not tried:
@@ -224,7 +312,7 @@ def _refusal(number: int, scans: Sequence[Scan], pairs: Iterable[Pair]) -> str:
     ambiguous = [pair for pair in tried if pair.state is PairState.AMBIGUOUS]
     joined = [pair for pair in tried if pair.state is PairState.JOINED]
     best = max(ambiguous or joined or tried, key=lambda pair: pair.overlap)
-    other = scans[best.b if best.a == number else best.a].name
+    other = names[best.b if best.a == number else best.a]
     if best.state is PairState.JOINED:
         return f"is joined with {other} alone, and neither with the largest group of scans"
     further = ": give its turntable or pose and keep that fixed" if best.state is PairState.AMBIGUOUS else ""
