@@ -4,7 +4,7 @@ import json
 from collections.abc import Callable, Iterator
 from itertools import chain
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
 
@@ -57,6 +57,11 @@ def read_record(path: str | Path, model: type[Record], schema: str, further: Cal
     except ValidationError as error:
         found = chain(faults_of(error), further(data) if further is not None else ())
         raise ManifestError(*listed((f"{path}: {fault}" for fault in found), f"{path}: has further faults: mend these first")) from error
+
+
+def schema_of(model: type[BaseModel]) -> str:
+    """Return the value that the key `schema` of a model's files must have."""
+    return str(get_args(model.model_fields["schema_"].annotation)[0])
 
 
 def describe(error: ValidationError, name: FieldName | None = None) -> str:

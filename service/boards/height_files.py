@@ -7,7 +7,7 @@ import numpy as np
 
 from stage import exr
 from stage.board.grid import BoardGrid, HeightMap
-from stage.board.records import DESIGN_SCHEMA, BoardDesign, Region
+from stage.board.records import DESIGN_SCHEMA, REGIONS_SCHEMA, BoardDesign, BoardRegions, Region
 from stage.errors import ManifestError, ResultError
 from stage.records import read_record
 from stage.result_metadata import camera_and_provenance, result_metadata
@@ -39,14 +39,16 @@ def write_board(path: Path, heights: HeightMap, provenance: dict[str, str]) -> N
               metadata=result_metadata(heights.grid.camera(), provenance))
 
 
-def read_golden(path: Path) -> Nominal:
+def read_golden(path: Path, regions: Path | None = None) -> Nominal:
     """Read the height map of a good board.
 
     Args:
         path: a result folder of relit inspect-board, or its board.exr.
+        regions: the JSON file of the regions that are judged on it; None: there are none.
 
     Raises:
         ResultError, ImageError: the file is no height map.
+        ManifestError: the file of the regions is wrong, or one lies beyond the height map.
     """
     file = path / BOARD_FILE if path.is_dir() else path
     channels, metadata = exr.read(file)
@@ -55,7 +57,11 @@ def read_golden(path: Path) -> Nominal:
         grid = BoardGrid.of(camera)
     except ValueError as error:
         raise ResultError(f"{file}: {error}") from error
-    return Nominal(file, file.parent.name, _heights(file, channels, grid), ())
+    judged: tuple[Region, ...] = ()
+    if regions is not None:
+        judged = read_record(regions, BoardRegions, REGIONS_SCHEMA).regions
+        _check_places(regions, judged, grid)
+    return Nominal(file, file.parent.name, _heights(file, channels, grid), judged)
 
 
 def read_design(path: Path) -> Nominal:
@@ -74,13 +80,18 @@ def read_design(path: Path) -> Nominal:
         raise ManifestError(f"{path}: height_map: {design.height_map.path} has {shape[1]}x{shape[0]} pixels, resolution says "
                             f"{width}x{height}")
     grid = BoardGrid(design.height_map.pixel_m, *design.height_map.top_left_m, height, width)
-    for region in design.regions:
+    _check_places(path, design.regions, grid)
+    return Nominal(path, design.name, _heights(file, channels, grid), design.regions)
+
+
+def _check_places(path: Path, regions: tuple[Region, ...], grid: BoardGrid) -> None:
+    """Check that regions lie on the height map."""
+    for region in regions:
         (x, y), (across, down) = region.centre_m, region.size_m
         row, col = grid.place(np.array([x - across / 2, x + across / 2]), np.array([y + down / 2, y - down / 2]))
-        if min(row.min(), col.min()) < -0.6 or row.max() > height - 0.4 or col.max() > width - 0.4:
+        if min(row.min(), col.min()) < -0.6 or row.max() > grid.rows - 0.4 or col.max() > grid.cols - 0.4:
             raise ManifestError(f"{path}: regions: {region.name} lies beyond the height map, which is "
                                 f"{grid.size_m[0]:.4g} m wide and {grid.size_m[1]:.4g} m high: give lengths in metres")
-    return Nominal(path, design.name, _heights(file, channels, grid), design.regions)
 
 
 def _heights(file: Path, channels: dict[str, np.ndarray], grid: BoardGrid) -> HeightMap:

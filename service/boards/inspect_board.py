@@ -99,7 +99,7 @@ def inspect_board(request: InspectBoardRequest, progress: Progress | None = None
     warnings = [*stitched.warnings, *(judged.match.warnings if judged is not None else ())]
     timings.stage("write", 1)
     contents = {name: digest(path) for name, path in (("golden", None if nominal is None or request.golden is None else nominal.path),
-                                                      ("design", request.design)) if path is not None}
+                                                      ("regions", request.regions), ("design", request.design)) if path is not None}
     provenance = metadata(request, capture=board.scan.name, inputs=" ".join(board.contents.values()), method=METHOD, contents=contents)
     write_board(request.out / BOARD_FILE, heights, provenance)
     findings_path = None
@@ -128,7 +128,7 @@ def inspect_board(request: InspectBoardRequest, progress: Progress | None = None
 
 def _nominal(request: InspectBoardRequest) -> Nominal | None:
     if request.golden is not None:
-        return read_golden(request.golden)
+        return read_golden(request.golden, request.regions)
     return None if request.design is None else read_design(request.design)
 
 

@@ -31,10 +31,10 @@ from pathlib import Path
 from typing import Annotated, Any, Generic, Literal, get_args, get_origin
 
 import typer
-from pydantic import BaseModel, BeforeValidator, ValidationError
+from pydantic import BeforeValidator, ValidationError
 
 from service.requests.base import Options, Role
-from service.requests.options import Model, Option, build, help_text, options_of, typed, typed_name
+from service.requests.options import Model, Option, build, help_text, is_document, options_of, typed, typed_name
 
 ORDER = (Role.INPUT, Role.OUTPUT, Role.CHOICE, Role.PART, Role.RUN, Role.MACHINE)
 """The order in which the help lists options."""
@@ -175,7 +175,7 @@ def _typer_type(annotation: Any) -> Any:
         return str if any(isinstance(each, BeforeValidator) for each in constraints) else _typer_type(kind)
     if get_origin(annotation) is Literal:
         return annotation
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+    if is_document(annotation):
         return Path  # a JSON file that holds it
     return annotation if isinstance(annotation, type) and issubclass(annotation, READ_BY_TYPER) else str
 

@@ -16,8 +16,8 @@ from service.requests.frame_range import frame_numbers
 from service.requests.identifiers import ALPHABET, CAPTURE, ENVIRONMENT, LENGTH, pattern
 from service.requests.job import JobRequest
 from service.requests.jobs import DEFAULT_SERVER, JOBS
-from service.requests.light_keys import LightKeys
-from service.requests.options import Option, help_text, options_of
+from service.requests.options import Option, help_text, is_document, options_of
+from stage.records import read_record, schema_of
 
 if TYPE_CHECKING:
     from service.client import Client
@@ -48,8 +48,9 @@ def _submit(given: Given[JobRequest], server: str, key: str | None, wait: bool, 
     inputs = {option.name: prefix for option in options_of(given.model) if (prefix := _prefix(option)) and option.name in given.values}
     if "frames" in given.values:
         frame_numbers(given.values["frames"], 1)
-    if "keys" in given.values:
-        given.values["keys"] = LightKeys.read(given.values["keys"])
+    for option in options_of(given.model):
+        if is_document(option.kind) and option.name in given.values:
+            given.values[option.name] = read_record(given.values[option.name], option.kind, schema_of(option.kind))
     request = given.build(**{name: _each(given.values[name], partial(_placeholder, prefix)) for name, prefix in inputs.items()})
     with connected(server, key) as client:
         if out is not None:

@@ -49,6 +49,8 @@ class InspectBoardRequest(InspectBoardOptions, DeviceRequest):
     """Folder for board.exr, deviation.exr, findings.csv, inspection.png and report.json."""
     golden: Annotated[Path | None, Role.INPUT] = None
     """Result folder or board.exr of a good board. None: the design, or else only the height map is made."""
+    regions: Annotated[Path | None, Role.INPUT] = None
+    """Tolerance regions that are judged on the golden board (JSON, schema relit.board-regions/1). None: only the whole board is judged."""
     design: Annotated[Path | None, Role.INPUT] = None
     """Nominal height map and tolerance regions (JSON, schema relit.board-design/1)."""
     cache: Annotated[Path | None, Role.MACHINE] = None
@@ -58,4 +60,6 @@ class InspectBoardRequest(InspectBoardOptions, DeviceRequest):
     def _check(self) -> Self:
         if self.golden is not None and self.design is not None:
             raise ValueError("golden and design are both given: give one of them")
+        if self.regions is not None and self.golden is None:
+            raise ValueError("regions are given without golden: they are judged on the height map of a good board; a design has its own")
         return self

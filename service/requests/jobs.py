@@ -1,5 +1,6 @@
 """The jobs of the service: options as on the command line, with identifiers of captures and jobs in place of paths."""
 
+import re
 from typing import Annotated, Literal, Self, get_args
 
 from pydantic import Field, TypeAdapter, model_validator
@@ -10,7 +11,7 @@ from service.requests.calibration_jobs import AnyCalibration
 from service.requests.depth import DepthOptions
 from service.requests.export import AssetFormat, ExportOptions
 from service.requests.fuse import FuseOptions
-from service.requests.identifiers import CaptureId, EnvironmentId, JobId
+from service.requests.identifiers import JOB, CaptureId, EnvironmentId, JobId, pattern
 from service.requests.inspect_board import InspectBoardOptions
 from service.requests.job import JobRequest
 from service.requests.light_keys import LightKeys
@@ -21,6 +22,7 @@ from service.requests.scan import ScanOptions
 from service.requests.shade import ShadeOptions
 from service.requests.solve import SolveOptions
 from service.requests.view import ViewOptions
+from stage.board.records import BoardRegions, GaugeRuns
 from stage.model import Line
 
 DEFAULT_PORT = 8470
@@ -203,7 +205,30 @@ class InspectBoardJob(JobRequest):
     """An uploaded folder with a board.json, each of whose tiles is a capture."""
     golden: Annotated[JobId | None, Role.INPUT, Spelling(metavar="JOB")] = None
     """The job that inspected a good board, with which this one is compared. None: only the height map is made."""
+    regions: Annotated[BoardRegions | None, Role.INPUT, Spelling(metavar="FILE")] = None
+    """Tolerance regions that are judged on the golden board (JSON, schema relit.board-regions/1; docs/inspection.md)."""
     options: InspectBoardOptions = InspectBoardOptions()
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.regions is not None and self.golden is None:
+            raise ValueError("regions are given without golden: they are judged on the height map of a good board")
+        return self
+
+
+class GaugeBoardJob(JobRequest):
+    """Repeatability and reproducibility of inspections of the same boards (gauge R&R): gauge.csv, report.json."""
+
+    kind: Literal["gauge-board"]
+    study: Annotated[GaugeRuns, Role.INPUT, Spelling(argument=True, metavar="STUDY")]
+    """Which job inspected which board for which operator (JSON, schema relit.gauge-study/1; docs/inspection.md)."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        for number, run in enumerate(self.study.runs):
+            if re.fullmatch(pattern(JOB), run.result) is None:
+                raise ValueError(f"study: runs[{number}].result: is {run.result}: give the identifier of the job that inspected the board")
+        return self
 
 
 class PatternsJob(JobRequest):
@@ -214,7 +239,7 @@ class PatternsJob(JobRequest):
 
 
 OneJob = (SolveJob | DepthJob | RelightJob | ShadeJob | ExportJob | ViewJob | PipelineJob | BasisJob | ScanJob | PatternsJob
-          | InspectBoardJob | JoinJob | RegisterJob | FuseJob | AnyCalibration)
+          | InspectBoardJob | GaugeBoardJob | JoinJob | RegisterJob | FuseJob | AnyCalibration)
 UserJob = Annotated[OneJob, Field(discriminator="kind")]
 """Every kind of job that the API accepts."""
 JOBS: dict[str, type[JobRequest]] = {get_args(model.model_fields["kind"].annotation)[0]: model for model in get_args(OneJob)}

@@ -131,6 +131,11 @@ def nested(field: FieldInfo) -> type[Options] | None:
     return kind if isinstance(kind, type) and issubclass(kind, Options) else None
 
 
+def is_document(kind: Any) -> bool:
+    """Return whether the values of a type are JSON documents, each with a schema of its own, which a person gives as a file."""
+    return isinstance(kind, type) and issubclass(kind, BaseModel) and not issubclass(kind, Options)
+
+
 def role_of(field: FieldInfo) -> Role:
     """Return the role of a field."""
     return next((data for data in field.metadata if isinstance(data, Role)), Role.CHOICE)

@@ -1,5 +1,6 @@
 """The JSON files of board inspection: which tiles a board was measured in, and what a board should be."""
 
+from itertools import pairwise
 from pathlib import PurePosixPath
 from typing import Annotated, Literal, Self
 
@@ -9,6 +10,7 @@ from stage.model import Count, Finite, FirstFault, Fraction, NotNegative, Positi
 
 SCAN_FILE, SCAN_SCHEMA = "board.json", "relit.board-scan/1"
 DESIGN_SCHEMA = "relit.board-design/1"
+REGIONS_SCHEMA = "relit.board-regions/1"
 STUDY_SCHEMA = "relit.gauge-study/1"
 Place = tuple[Finite, Finite]
 """x and y in metres, board frame."""
@@ -78,6 +80,24 @@ class Region(Strict):
         return self
 
 
+def _named_once(regions: tuple[Region, ...]) -> tuple[Region, ...]:
+    names = sorted(region.name for region in regions)
+    twice = next((name for name, after in pairwise(names) if name == after), None)
+    if twice is not None:
+        raise ValueError(f"the name {twice} is given twice")
+    return regions
+
+
+NamedOnce = AfterValidator(_named_once)
+
+
+class BoardRegions(Strict):
+    """The regions of a golden board (schema relit.board-regions/1): those of a design, without its height map."""
+
+    schema_: Literal["relit.board-regions/1"] = Field(alias="schema")
+    regions: Annotated[tuple[Region, ...], Field(min_length=1), FirstFault, NamedOnce]
+
+
 class NominalMap(Strict):
     """The nominal height map of a design."""
 
@@ -97,22 +117,14 @@ class BoardDesign(Strict):
     schema_: Literal["relit.board-design/1"] = Field(alias="schema")
     name: Text
     height_map: NominalMap
-    regions: Annotated[tuple[Region, ...], FirstFault] = ()
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        names = [region.name for region in self.regions]
-        twice = next((name for at, name in enumerate(sorted(names)[1:]) if name == sorted(names)[at]), None)
-        if twice is not None:
-            raise ValueError(f"regions: the name {twice} is given twice")
-        return self
+    regions: Annotated[tuple[Region, ...], FirstFault, NamedOnce] = ()
 
 
 class GaugeRun(Strict):
     """One inspection of one board by one operator."""
 
     result: Beneath
-    """The result folder of relit inspect-board with a design that has regions, relative to the file."""
+    """The result folder of relit inspect-board with regions, relative to the file; in a job of the service, the job that inspected."""
     board: Text
     operator: Text = "operator"
     """Who, or which station, measured."""

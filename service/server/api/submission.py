@@ -10,6 +10,7 @@ from service.requests.jobs import (
     CheckJob,
     ExportJob,
     FuseJob,
+    GaugeBoardJob,
     InspectBoardJob,
     JoinJob,
     PipelineJob,
@@ -82,6 +83,8 @@ def inputs_of(service: Service, project: str, request: JobRequest) -> list[str]:
     if isinstance(request, InspectBoardJob) and request.golden is not None:
         _require_results(service, project, "golden", request.golden, (request.kind,))
         read.append(request.golden)
+    if isinstance(request, GaugeBoardJob):
+        read += _require_inspections(service, project, request)
     return read
 
 
@@ -125,6 +128,16 @@ def _require_scans(service: Service, project: str, request: RegisterJob) -> list
     for number, identifier in enumerate(request.solves):
         _require_results(service, project, f"solves[{number}]", identifier, (*SOLVES, "join"))
     return [*request.depths, *request.solves]
+
+
+def _require_inspections(service: Service, project: str, request: GaugeBoardJob) -> list[str]:
+    """Return the identifiers of the jobs that inspected the boards of a study, or refuse if one of them judged no regions."""
+    for number, run in enumerate(request.study.runs):
+        field = f"study.runs[{number}].result"
+        row = _require_results(service, project, field, run.result, ("inspect-board",))
+        if row["request"].get("regions") is None:
+            raise ApiError("invalid", f"{field}: {run.result} inspected a board without regions: give golden and regions to the job")
+    return [run.result for run in request.study.runs]
 
 
 def _require_results(service: Service, project: str, field: str, identifier: str, kinds: Sequence[str]) -> sa.RowMapping:

@@ -15,6 +15,7 @@ from service.requests.jobs import (
     DepthJob,
     ExportJob,
     FuseJob,
+    GaugeBoardJob,
     InspectBoardJob,
     JoinJob,
     PipelineJob,
@@ -25,7 +26,7 @@ from service.requests.jobs import (
     ViewJob,
 )
 from service.server.database import intakes, quotas
-from service.server.jobs import calibrating, measuring, scan_sets
+from service.server.jobs import boards, calibrating, measuring, scan_sets
 from service.server.jobs.context import Job, WorkerContext
 from service.server.jobs.named_files import file_within
 from service.server.jobs.pieces import JobPieces
@@ -94,7 +95,12 @@ def _steps_of(job: Job, context: WorkerContext) -> list[JobStep]:
     if isinstance(request, ExportJob):
         return [JobStep("export", lambda progress: _export(job, request, context, progress))]
     if isinstance(request, InspectBoardJob):
-        return [JobStep("inspect", lambda progress: _inspect_board(job, request, context, progress))]
+        return [JobStep("inspect", lambda progress: boards.inspect(
+            request, _intake(job, request.capture, context, progress), _out(job, context),
+            lambda other: job_maps(job, other, context, progress), context.device, context.cache / request.capture, progress))]
+    if isinstance(request, GaugeBoardJob):
+        return [JobStep("gauge", lambda progress: boards.gauge(
+            request, job.id, _out(job, context), lambda other: job_maps(job, other, context, progress), progress))]
     if isinstance(request, ViewJob):
         return [JobStep("view", lambda progress: _view(job, request, context, progress))]
     run = measuring.run if measuring.can_run(request) else calibrating.run if calibrating.can_run(request) else None
@@ -182,19 +188,6 @@ def _depth(job: Job, request: DepthJob, context: WorkerContext, progress: Progre
     beside = None if request.beside is None else _intake(job, request.beside, context, progress)
     depth(DepthRequest(capture=capture, beside=beside, out=_out(job, context), device=context.device,
                        cache=context.cache / request.capture, **options), progress)
-
-
-def _inspect_board(job: Job, request: InspectBoardJob, context: WorkerContext, progress: Progress) -> None:
-    from service.boards.height_files import BOARD_FILE
-    from service.boards.inspect_board import inspect_board
-    from service.requests.inspect_board import InspectBoardRequest
-
-    board = _intake(job, request.capture, context, progress)
-    golden = None
-    if request.golden is not None:
-        golden = _named(context.storage.local(layout.results(job.project, request.golden), {BOARD_FILE}, progress), request.golden)
-    inspect_board(InspectBoardRequest(board=board, out=_out(job, context), golden=golden, device=context.device,
-                                      cache=context.cache / request.capture, **dict(request.options)), progress)
 
 
 def _join(job: Job, request: JoinJob, context: WorkerContext, progress: Progress) -> None:

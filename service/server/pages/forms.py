@@ -15,8 +15,7 @@ from service.requests.base import Choice, Commas, Role
 from service.requests.identifiers import CAPTURE, ENVIRONMENT, JOB, pattern
 from service.requests.job import JobRequest
 from service.requests.jobs import JOBS
-from service.requests.light_keys import LightKeys
-from service.requests.options import Option, help_text, places_of, typed
+from service.requests.options import Option, help_text, is_document, places_of, typed
 
 
 def _kinds(*names: str) -> dict[str, type[JobRequest]]:
@@ -30,11 +29,12 @@ CAPTURE_JOBS = _kinds(
 """Jobs that begin with a capture, by kind."""
 MAPS_JOBS = _kinds("export", "shade", "join", "register", "fuse")
 """Jobs that begin with the maps of another job, by kind."""
-FREE_JOBS = _kinds("patterns")
-"""Jobs that read nothing, by kind."""
+FREE_JOBS = _kinds("patterns", "gauge-board")
+"""Jobs that begin with neither a capture nor maps, by kind."""
 TITLES = {"solve": "Solve normals and materials", "pipeline": "Solve, export and relight", "depth": "Decode depth",
           "scan": "Turn shots of a scanning laser into points",
-          "inspect-board": "Inspect a board", "relight": "Relight frames", "basis": "Reduce to a few coefficient images",
+          "inspect-board": "Inspect a board", "gauge-board": "Find how well inspections of boards repeat",
+          "relight": "Relight frames", "basis": "Reduce to a few coefficient images",
           "join": "Join with a depth of the same view", "register": "Find the poses of several depths",
           "fuse": "Fuse registered depths into one mesh", "patterns": "Draw patterns to project", "export": "Export an asset",
           "shade": "Shade one picture",
@@ -117,7 +117,7 @@ def _control(option: Option) -> tuple[str, str, tuple[tuple[str, str], ...]]:
     kind = option.kind
     if (named := IDENTIFIERS.get(option.pattern or "")) is not None:
         return (f"{named}s", "strings", ()) if option.is_repeated else (named, "string", ())
-    if kind is LightKeys:
+    if is_document(kind):
         return "json", "json", ()
     if option.is_repeated:
         return "lines", "strings", ()

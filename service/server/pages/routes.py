@@ -75,7 +75,7 @@ async def capture(capture: CaptureId) -> Response:
 
 @router.get("/jobs")
 async def jobs() -> Response:
-    """Show the jobs as they change, and the forms of the jobs that read nothing."""
+    """Show the jobs as they change, and the forms of the jobs that begin with neither a capture nor maps."""
     return _page("jobs.html", forms=[form_of(kind, model) for kind, model in FREE_JOBS.items()])
 
 

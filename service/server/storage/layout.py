@@ -12,8 +12,8 @@ from collections.abc import Container
 from service.requests.identifiers import CAPTURE, ENVIRONMENT
 
 MAPS = "maps.exr"
-SOLVED = (MAPS, "depth.exr", "points.ply", "report.json", "scan-set.json")
-"""Files of a solve, a depth or a registration that other jobs and later steps read."""
+SOLVED = (MAPS, "depth.exr", "points.ply", "report.json", "scan-set.json", "board.exr")
+"""Files of a solve, a depth, a registration or an inspection that other jobs and later steps read."""
 FRAMES = "frame.####.exr"
 PICTURE = "picture.exr"
 ASSET = "asset"

@@ -4,7 +4,7 @@ import json
 import re
 from pathlib import Path
 
-from stage.board.records import BoardDesign, BoardScan, GaugeRuns
+from stage.board.records import BoardDesign, BoardRegions, BoardScan, GaugeRuns
 
 DOCS = (Path(__file__).resolve().parents[3] / "docs" / "inspection.md").read_text(encoding="utf-8")
 
@@ -17,7 +17,8 @@ def test_the_options_exist(relit):
 
 
 def test_the_files_are_valid():
-    scan, design, study = (json.loads(text) for text in re.findall(r"```json\n(.*?)```", DOCS, re.DOTALL))
+    scan, design, regions, study = (json.loads(text) for text in re.findall(r"```json\n(.*?)```", DOCS, re.DOTALL))
     assert len(BoardScan.model_validate(scan).tiles) == 2
     assert len(GaugeRuns.model_validate(study).runs) == 2
+    assert BoardRegions.model_validate(regions).regions[0] == BoardDesign.model_validate(design).regions[0]
     assert BoardDesign.model_validate(design).regions[1].datum == "surround"

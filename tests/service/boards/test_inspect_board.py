@@ -123,6 +123,26 @@ def test_regions_of_a_design_are_decided(relit, tmp_path):
     assert refused.code == 2 and "design.json: is not of this board" in refused.err and refused.err.count("\n") == 1
 
 
+def test_regions_of_a_golden_board_are_decided(relit, tmp_path, golden):
+    """As those of a design; without a golden board there is nothing to judge them on."""
+    folder, file = board(tmp_path / "b", faulty, seed=5), tmp_path / "regions.json"
+    regions = [{"name": name, "shape": "rectangle", "centre_m": centre, "size_m": [4e-5, 4e-5], "tolerance_m": [-2e-6, 2e-6]}
+               for name, centre in (("square", SQUARE), ("good", [0.0, 4e-4]))]
+    file.write_text(json.dumps({"schema": "relit.board-regions/1", "regions": regions}))
+    outcome, rows, report = inspect(relit, folder, "--golden", golden, "--regions", file, "--tolerance-m", "1e-5")
+    assert outcome.code == 1, outcome
+    assert {row["name"]: row["verdict"] for row in rows if row["kind"] == "region"} == {"square": "fail", "good": "pass"}
+    assert "regions" in report["inputs"] and not report["defects"]  # 5 σ are within 10 µm
+    alone = relit("inspect-board", folder, "--regions", file, "--out", tmp_path / "o")
+    assert alone.code == 2 and "regions are given without golden" in alone.err
+    file.write_text(json.dumps({"schema": "relit.board-regions/1", "regions": [regions[0], regions[0]]}))
+    twice = relit("inspect-board", folder, "--golden", golden, "--regions", file, "--out", tmp_path / "o")
+    assert twice.code == 2 and "regions: the name square is given twice" in twice.err
+    file.write_text(json.dumps({"schema": "relit.board-regions/1", "regions": [regions[0] | {"centre_m": [1.0, 0.0]}]}))
+    beyond = relit("inspect-board", folder, "--golden", golden, "--regions", file, "--out", tmp_path / "o", "--device", "cpu")
+    assert beyond.code == 2 and "square lies beyond the height map" in beyond.err and not (tmp_path / "o").exists()
+
+
 @pytest.mark.parametrize(("surface", "options", "words"), [
     (domes(4e-3, 4e-3, seed=9), {}, "is not of this board: the correlation of their heights"),
     (lambda x, y: SURFACE(-x, y), {}, "the board is mirrored against it"),

@@ -66,7 +66,7 @@ COMMANDS: dict[str, list[type[Options]]] = {
     "submit solve": [jobs.SolveJob], "submit depth": [jobs.DepthJob], "submit relight": [jobs.RelightJob], "submit shade": [jobs.ShadeJob],
     "submit export": [jobs.ExportJob], "submit view": [jobs.ViewJob], "submit pipeline": [jobs.PipelineJob],
     "submit basis": [jobs.BasisJob], "submit scan": [jobs.ScanJob], "submit patterns": [jobs.PatternsJob],
-    "submit inspect-board": [jobs.InspectBoardJob], "submit join": [jobs.JoinJob],
+    "submit inspect-board": [jobs.InspectBoardJob], "submit gauge-board": [jobs.GaugeBoardJob], "submit join": [jobs.JoinJob],
     "submit register": [jobs.RegisterJob], "submit fuse": [jobs.FuseJob],
     "submit calibrate-mirror-ball": [calibration_jobs.MirrorBallJob],
     "submit calibrate-light-positions": [calibration_jobs.LightPositionsJob],

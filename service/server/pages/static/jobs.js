@@ -1,4 +1,4 @@
-/** The page of all jobs, with the forms of those that read nothing. */
+/** The page of all jobs, with the forms of those that begin with neither a capture nor maps. */
 
 import { attempt, read } from "./api.js";
 import { byId, show } from "./element.js";

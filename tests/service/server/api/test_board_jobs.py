@@ -6,10 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from service.requests.identifiers import new_id
 from tests.scenes.board import write_depth
 from tests.scenes.depth import BLACK_WHITE, gray_patterns, make_scene, phase_patterns, write_patterns
-from tests.service.server.api.test_jobs import finish, made_by, refused, submit
+from tests.service.server.api.test_jobs import NOBODY, finish, made_by, refused, submit
 from tests.service.server.api.test_measuring import upload
+
+OTHER = new_id("job")
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +44,57 @@ def test_a_board_is_compared_with_the_result_of_a_job(server, client, tile):
     assert "capture.json" in finish(server, client, depth, "failed")["error"]
     other = client.post("/v1/jobs", json={"kind": "inspect-board", "capture": board["id"], "golden": depth["id"]})
     refused(other, 422, "is a depth job: give one of inspect-board")
+
+
+REGIONS = {"schema": "relit.board-regions/1", "regions": [
+    {"name": name, "shape": "rectangle", "centre_m": [x, 0.0], "size_m": [0.2, 0.2], "tolerance_m": [-0.01, 0.01]}
+    for name, x in (("left", -0.3), ("right", 0.3))]}
+
+
+def study(*results: str, operators: int = 1) -> dict:
+    runs = [{"result": result, "board": "plane", "operator": f"station {number % operators}"} for number, result in enumerate(results)]
+    return {"schema": "relit.gauge-study/1", "name": "pads", "runs": runs}
+
+
+def test_inspections_of_regions_are_studied(server, client, tile):
+    """Two inspections of the same images: what repeats to the last bit has no repeatability to speak of."""
+    board = upload(server, client, tile)
+    golden = submit(client, kind="inspect-board", capture=board["id"])
+    finish(server, client, golden)
+    options = {"least_inspected": 0.5}
+    runs = [submit(client, kind="inspect-board", capture=board["id"], golden=golden["id"], regions=REGIONS, options=options)["id"]
+            for _ in range(2)]
+    for run in runs:
+        finish(server, client, {"id": run})
+    assert "regions.json" in made_by(client, {"id": runs[0]})
+    inspected = client.get(f"/v1/jobs/{runs[0]}/results/report.json").json()
+    assert [region["name"] for region in inspected["regions"]] == ["left", "right"]
+    assert all(abs(region["deviation_m"]) < 1e-6 for region in inspected["regions"])  # board.exr has floats, of heights of 0.1 m
+    job = submit(client, kind="gauge-board", study=study(*runs))
+    finish(server, client, job)
+    assert made_by(client, job) == {"gauge.csv", "report.json"}
+    report = client.get(f"/v1/jobs/{job['id']}/results/report.json").json()
+    assert (report["study"]["parts"], report["study"]["trials"], report["inputs"]["name"]) == (2, 2, "pads")
+    assert report["study"]["repeatability_m"] < 1e-9 and report["study"]["narrowest_tolerance_m"] == pytest.approx(0.02)
+    assert report["inputs"]["study"] == f"{job['id']}/study.json" and str(server.data) not in json.dumps(report)
+    in_use = client.post("/v1/jobs", json={"kind": "gauge-board", "study": study(golden["id"], runs[0])})
+    refused(in_use, 422, f"study.runs[0].result: {golden['id']} inspected a board without regions")
+    uneven = submit(client, kind="gauge-board", study=study(*runs, operators=2))
+    assert "2 parts and 1 trials" in finish(server, client, uneven, "failed")["error"]
+    unfit = {**REGIONS, "regions": [REGIONS["regions"][0] | {"centre_m": [30.0, 0.0]}]}
+    beyond = submit(client, kind="inspect-board", capture=board["id"], golden=golden["id"], regions=unfit, options=options)
+    error = finish(server, client, beyond, "failed")["error"]
+    assert "left lies beyond the height map" in error and str(server.data) not in error
+
+
+def test_studies_that_cannot_be(client):
+    def ask(**request):
+        return client.post("/v1/jobs", json=request)
+
+    refused(ask(kind="gauge-board", study=study("run_1", "run_2")), 422, "runs[0].result: is run_1: give the identifier of the job")
+    refused(ask(kind="gauge-board", study=study(NOBODY)), 422, "runs")
+    refused(ask(kind="gauge-board", study=study(NOBODY, OTHER)), 404, f"study.runs[0].result: {NOBODY} is not in this project")
+    refused(ask(kind="inspect-board", capture=f"cap_{'0' * 20}", regions=REGIONS), 422, "regions are given without golden")
 
 
 def test_boards_that_cannot_be(server, client, tile, tmp_path: Path):

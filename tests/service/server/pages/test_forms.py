@@ -22,6 +22,8 @@ REQUIRED = {
     "calibrate-white-balance": {"capture": CAPTURE, "images": ["0.exr"]},
     "calibrate-laser-planes": {"captures": [CAPTURE, CAPTURE], "options": {"board": "9x6", "square_m": 0.025}},
     "patterns": {"options": {"code": "gray", "projector": "64x32"}},
+    "gauge-board": {"study": {"schema": "relit.gauge-study/1", "name": "pads", "runs": [
+        {"result": JOB, "board": "A"}, {"result": OTHER, "board": "A"}]}},
 }
 """What a job must have beside a capture, where it must."""
 TYPED = {"calibrate-laser-planes": {"captures": [CAPTURE, CAPTURE], "board": "9x6", "square_m": 0.025},
