@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from service.cli.groups import make_group
 from service.cli.printing import print_table
 from service.cli.progress import ProgressBar
 from service.cli.request_commands import local_command
@@ -37,8 +38,8 @@ VIEW_ROWS = 40
 
 def register(app: typer.Typer) -> None:
     """Add the command and its kinds."""
-    kinds = typer.Typer(name="calibrate", no_args_is_help=True,
-                        help="Lights, projector and cameras, dark frame, flat field, colours and saturation from images; with residuals.")
+    kinds = make_group("calibrate",
+                       help="Lights, projector and cameras, dark frame, flat field, colours and saturation from images; with residuals.")
     for name, function in (("mirror-ball", _mirror_ball), ("light-positions", _light_positions), ("grey-ball", _grey_ball),
                            ("intensity", _intensity), ("dark", _dark), ("flat-field", _flat_field), ("saturation", _saturation),
                            ("white-balance", _white_balance),

@@ -4,6 +4,7 @@ from typing import Annotated
 
 import typer
 
+from service.cli.groups import make_group
 from service.cli.printing import counted, print_warnings
 from service.cli.progress import ProgressBar
 from service.cli.request_commands import Given, local_command
@@ -23,7 +24,7 @@ def register(app: typer.Typer) -> None:
     local_command(app, "depth", _depth)
     local_command(app, "separate", _separate)
     local_command(app, "scan", _scan)
-    kinds = typer.Typer(name="simulate", no_args_is_help=True, help="The raw frames that a time-of-flight camera would make of a depth.")
+    kinds = make_group("simulate", help="The raw frames that a time-of-flight camera would make of a depth.")
     local_command(kinds, "cw", _cw)
     local_command(kinds, "pulsed", _pulsed)
     app.add_typer(kinds)

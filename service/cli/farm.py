@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from service.cli.groups import make_group
 from service.cli.request_commands import Given, command
 from service.requests.base import Role
 from service.requests.relight import CHUNK_FRAMES, RelightRequest
@@ -29,10 +30,9 @@ TurnsOption = Annotated[int | None, typer.Option(
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
-    farm = typer.Typer(name="farm", no_args_is_help=True, help="Jobs for render farms; docs/farm.md.")
-    kinds = typer.Typer(name="template", no_args_is_help=True,
-                        help="Write an Open Job Description template whose tasks run relit relight or relit shade, with the options "
-                             "of that command.")
+    farm = make_group("farm", help="Jobs for render farms; docs/farm.md.")
+    kinds = make_group("template", help="Write an Open Job Description template whose tasks run relit relight or relit shade, with the "
+                                         "options of that command.")
     command(kinds, "relight", relight, without=OF_ONE_RUN)
     command(kinds, "shade", shade, without=OF_ONE_RUN)
     farm.add_typer(kinds)

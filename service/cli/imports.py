@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from service.cli.groups import make_group
 from service.cli.request_commands import local_command
 from service.requests.captures import (
     CameraOptions,
@@ -42,8 +43,7 @@ FolderArgument = Annotated[Path, typer.Argument(metavar="SRC", help="Folder of t
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
-    layouts = typer.Typer(name="import", no_args_is_help=True,
-                          help="Write a capture.json for files that are laid out another way; docs/captures.md shows each layout.")
+    layouts = make_group("import", help="Write a capture.json for files that are laid out another way; docs/captures.md shows each layout.")
     for name, function in (("diligent", _diligent), ("lp", _lp), ("relightlab", _relightlab), ("olat", _olat), ("photos", _photos),
                            ("near-lights", _near_lights), ("opencv-gray", _opencv_gray), ("gray", _gray), ("phase", _phase),
                            ("scanner", _scanner), ("tof", _tof), ("histogram", _histogram), ("kinect", _kinect)):

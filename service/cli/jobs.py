@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from service.cli.groups import make_group
 from service.cli.service_options import CancelOption, KeyOption, ResultsOption, ServerOption, connected
 from service.cli.waiting import download, wait_for
 from service.requests.jobs import DEFAULT_SERVER
@@ -22,8 +23,7 @@ OutOption = Annotated[Path | None, typer.Option(
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
-    group = typer.Typer(no_args_is_help=True,
-                        help="List the jobs of a service, wait for them, cancel, retry or resume them, and fetch their results.")
+    group = make_group(help="List the jobs of a service, wait for them, cancel, retry or resume them, and fetch their results.")
     group.command("list")(list_)
     for command in (show, wait, cancel, retry, resume, results):
         group.command(command.__name__)(command)

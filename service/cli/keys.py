@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
+from service.cli.groups import make_group
 from service.cli.printing import print_table
 from service.cli.request_commands import command
 from service.cli.server import ConfigOption, DataOption, settings_of
@@ -20,7 +21,7 @@ ProjectOption = Annotated[str | None, typer.Option("--project", help="List only 
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
-    group = typer.Typer(name="keys", no_args_is_help=True, help="Make, list and revoke the keys of the service.")
+    group = make_group("keys", help="Make, list and revoke the keys of the service.")
     command(group, "create", _create)
     group.command("list")(list_)
     group.command("revoke")(revoke)

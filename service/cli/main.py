@@ -10,6 +10,8 @@ from typing import Annotated
 import typer
 from typer.exceptions import TyperException
 
+from service.cli.groups import make_group
+
 COMMANDS: dict[str, tuple[str, ...]] = {
     "demo": ("demo", "bench"),
     "imports": ("import",),
@@ -41,8 +43,7 @@ the cores, and matrices of some hundred rows cost more to divide than to solve."
 
 def program(wanted: str | None = None) -> typer.Typer:
     """Return the program; where `wanted` is a command, only those of its module: to import the others takes as long as a short run."""
-    app = typer.Typer(name="relit", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
-                      help="Active-illumination captures to normals, materials, depth, USD assets and relit frames.")
+    app = make_group("relit", help="Active-illumination captures to normals, materials, depth, USD assets and relit frames.")
     app.callback(invoke_without_command=True)(_root)
     beside = [module for module, names in COMMANDS.items() if wanted in names]
     for module in beside or COMMANDS:

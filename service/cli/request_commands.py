@@ -23,7 +23,6 @@ results by the role of the field.
 """
 
 import inspect
-import re
 from collections.abc import Callable, Mapping
 from enum import Enum
 from functools import partial
@@ -113,7 +112,7 @@ def command(group: typer.Typer, name: str, function: Callable[..., None], *, wit
         signature.append(inspect.Parameter("device", inspect.Parameter.KEYWORD_ONLY, annotation=HostOption, default=None))
     run.__signature__ = inspect.Signature(signature)  # type: ignore[attr-defined]
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in signature}
-    group.command(name, help=_literal(inspect.getdoc(function) or inspect.getdoc(next(iter(models.values()))) or ""))(run)
+    group.command(name, help=inspect.getdoc(function) or inspect.getdoc(next(iter(models.values()))) or "")(run)
 
 
 def _model(annotation: Any) -> type[Options] | None:
@@ -144,7 +143,7 @@ def _parameter(option: Option, required: bool, about: str) -> inspect.Parameter:
     default = inspect.Parameter.empty if required else _default(option)
     kind = list[_typer_type(get_args(option.kind)[0])] if option.is_repeated else _typer_type(option.kind)  # type: ignore[misc]
     has_default = default not in (inspect.Parameter.empty, None)
-    shown: dict[str, Any] = {"help": _literal(about), "metavar": option.spelling.metavar, "show_default": has_default}
+    shown: dict[str, Any] = {"help": about, "metavar": option.spelling.metavar, "show_default": has_default}
     info: Any
     if option.spelling.argument:
         info = typer.Argument(**shown)
@@ -154,11 +153,6 @@ def _parameter(option: Option, required: bool, about: str) -> inspect.Parameter:
         info = typer.Option(option.flag, **shown)
     annotation = Annotated[kind if default is not None else kind | None, info]  # type: ignore[valid-type]
     return inspect.Parameter(option.name, inspect.Parameter.KEYWORD_ONLY, annotation=annotation, default=default)
-
-
-def _literal(words: str) -> str:
-    """Return words as Typer's markup shows them unchanged: `[las]` would be a style."""
-    return re.sub(r"(?=\[[a-z#/@])", r"\\", words)
 
 
 def _default(option: Option) -> Any:

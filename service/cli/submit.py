@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from service.cli.groups import make_group
 from service.cli.progress import ProgressBar
 from service.cli.request_commands import Given, command
 from service.cli.service_options import CancelOption, KeyOption, ResultsOption, ServerOption, WaitOption, connected
@@ -28,7 +29,7 @@ SOURCES = "Give a path of this machine, which is uploaded; an identifier, {prefi
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
-    group = typer.Typer(no_args_is_help=True, help="Submit work to a service, with the options of the commands that do it on this machine.")
+    group = make_group(help="Submit work to a service, with the options of the commands that do it on this machine.")
     for name, job in JOBS.items():
         command(group, name, _submission(job), words=_words)
     app.add_typer(group, name="submit")

@@ -1,0 +1,30 @@
+"""Groups of commands, whose help is plain text: option names are never cut, whatever the width of the terminal, and nothing is imported
+to draw frames."""
+
+from typing import Any
+
+import typer
+from typer.core import TyperGroup
+
+
+class _Group(TyperGroup):
+    """A group that lists its commands with their whole first sentence; Typer cuts it to one line."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        for command in self.commands.values():
+            if command.short_help is None and command.help is not None:
+                command.short_help = _first_sentence(command.help)
+        return super().list_commands(ctx)
+
+
+def make_group(name: str | None = None, *, help: str) -> typer.Typer:
+    """Return a group of commands, which shows its help when no command is given; the parameters are Typer's."""
+    return typer.Typer(name=name, cls=_Group, help=help, no_args_is_help=True, rich_markup_mode=None, add_completion=False,
+                       pretty_exceptions_enable=False)
+
+
+def _first_sentence(text: str) -> str:
+    """Return the first sentence of the first paragraph, in one line."""
+    paragraph = " ".join(text.split("\n\n")[0].split())
+    sentence, stop, _ = paragraph.partition(". ")
+    return sentence + stop.rstrip()
