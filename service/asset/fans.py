@@ -12,7 +12,8 @@ def split_fans(quads: np.ndarray, triangles: np.ndarray, vertex_count: int) -> t
     """Return faces of which those around each vertex form one fan.
 
     Args:
-        quads: [Q, 4] int32. triangles: [T, 3] int32. No edge has more than two faces.
+        quads: [Q, 4] int32. triangles: [T, 3] int32. They lie side by side in an image: no edge has more than two faces, and no other face
+            touches a vertex that a closed fan surrounds.
 
     Returns:
         The faces with new vertex numbers, and the old number of every vertex, [V'] int64; the old vertices come first.

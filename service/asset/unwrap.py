@@ -96,7 +96,10 @@ def _manifold(places: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np
 
 
 def _one_fan_a_vertex(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return faces wound alike with a vertex for each fan of faces that hang together by edges, and the old number of every vertex."""
+    """Return faces wound alike with a vertex for each fan of faces that hang together by edges, and the old number of every vertex.
+
+    `fans.split_fans` is for faces that lie side by side in an image; in space, a closed fan may touch another at its middle.
+    """
     start, end = triangles.ravel().astype(np.int64), np.roll(triangles, -1, axis=1).ravel().astype(np.int64)
     following = np.roll(np.arange(triangles.size).reshape(-1, 3), -1, axis=1).ravel()
     size = int(start.max()) + 1
