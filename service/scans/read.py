@@ -16,7 +16,7 @@ from stage.scans.planes import LocalPlanes, local_planes, robust_scatter
 from stage.scans.ply_points import PlyPoints, read_ply_points
 from stage.scans.records import UNITS_M, ScanEntry, ScanSet
 from stage.scans.rigid import nearest_rigid
-from stage.scans.scan import Scan
+from stage.scans.scan import Scan, Target
 
 NORMAL_RADIUS_PX = 2
 """Radius of the neighbourhood that a normal of a range image is fitted to: 25 pixels."""
@@ -69,6 +69,10 @@ def read_scan(file: Path, scans: ScanSet, number: int) -> Scan:
     return _range_image(path / DEPTH_FILE if path.is_dir() else path, entry, where, file.parent, pose, covariance)
 
 
+def _targets(entry: ScanEntry) -> tuple[Target, ...]:
+    return tuple(Target(target.name, np.array(target.position_m), target.sigma_m**2 * np.eye(3)) for target in entry.targets)
+
+
 def _range_image(path: Path, entry: ScanEntry, where: str, home: Path, pose: np.ndarray | None, covariance: np.ndarray | None) -> Scan:
     if entry.unit != "m":
         raise ManifestError(f"{where}: unit: is {entry.unit}, but {path.name} is in metres: leave it out")
@@ -103,7 +107,7 @@ def _range_image(path: Path, entry: ScanEntry, where: str, home: Path, pose: np.
     return Scan(name=entry.name, path=path, points=points, sigma=sigma.values, sigma_source=sigma.source,
                 normals=normals.reshape(-1, 3)[pixels], normals_source=source, colours=_colours(path, depth.mask, used),
                 confidence=None if depth.confidence is None else depth.confidence.reshape(-1)[pixels].astype(np.float32), origin=origin,
-                camera=camera, pixels=pixels, pose=pose, pose_covariance=covariance, maps=maps)
+                camera=camera, pixels=pixels, pose=pose, pose_covariance=covariance, maps=maps, targets=_targets(entry))
 
 
 def _photometric(path: Path, where: str, used: np.ndarray) -> np.ndarray:
@@ -145,7 +149,7 @@ def _point_set(path: Path, entry: ScanEntry, where: str, pose: np.ndarray | None
         normals, source = np.where(length > 0, ply.normals / np.maximum(length, 1e-30), 0).astype(np.float32), "given"
     return Scan(name=entry.name, path=path, points=points, sigma=sigma.values, sigma_source=sigma.source, normals=normals,
                 normals_source=source, colours=ply.colours, confidence=ply.confidence, origin=origin, camera=None, pixels=None, pose=pose,
-                pose_covariance=covariance, maps=None)
+                pose_covariance=covariance, maps=None, targets=_targets(entry))
 
 
 def _kept(ply: PlyPoints) -> PlyPoints:

@@ -17,12 +17,13 @@ from stage.files import write_text
 from stage.fingerprint import digest
 from stage.scans.fixed_poses import FixedPoses, check_fixed
 from stage.scans.neighbours import neighbours_are_installed
-from stage.scans.pairs import Pair, PairState
+from stage.scans.pairs import Evidence, Pair, PairState
 from stage.scans.pose_graph import REFUSED
 from stage.scans.records import SCAN_SET_FILE, ScanEntry, ScanSet, read_scan_set, write_scan_set
 from stage.scans.registration import Registration, RegistrationOptions, register
 from stage.scans.rigid import about, applied
 from stage.scans.scan import Scan
+from stage.scans.target_pairs import TargetPlace, target_places
 from stage.scans.turntable import turned_pose
 
 LOOSE = 2.0
@@ -81,7 +82,9 @@ def register_scans(request: RegisterRequest, progress: Progress | None = None) -
         fixed = check_fixed(scans, [turned_pose(table, angle) for angle in table.angles_deg], threads=_threads(request),
                             advance=timings.advance_percent, cell_m=request.cell_m, least_overlap=request.least_overlap)
         poses, covariances, alone = dict(enumerate(fixed.poses)), {}, {}
-        facts, warnings, pairs = _fixed_facts(fixed, scans), _fixed_warnings(fixed, scans), fixed.pairs
+        places = target_places({number: scan.targets for number, scan in enumerate(scans)}, poses, {})
+        facts, pairs = _fixed_facts(fixed, scans) | _target_facts(places, scans), fixed.pairs
+        warnings = _fixed_warnings(fixed, scans) + _wrong_targets(places, scans)
     else:
         options = RegistrationOptions(cell_m=request.cell_m, least_overlap=request.least_overlap, reference=reference,
                                       threads=_threads(request))
@@ -169,7 +172,8 @@ def _short(value: float) -> float:
 def _facts(found: Registration, scans: Sequence[Scan]) -> dict[str, Any]:
     return {"method": "pairs and pose graph", "reference": scans[found.reference].name, "cell_m": _short(found.cell_m),
             "loop_factor": None if not np.isfinite(found.factor) else _short(found.factor),
-            "contradicted_by_loops": [[scans[a].name, scans[b].name] for (a, b), weight in found.weights.items() if weight <= REFUSED]}
+            "contradicted_by_loops": [[scans[pair.a].name, scans[pair.b].name] for pair, weight in found.kept if weight <= REFUSED],
+            **_target_facts(found.targets, scans)}
 
 
 def _warnings(found: Registration, scans: Sequence[Scan]) -> list[str]:
@@ -177,20 +181,60 @@ def _warnings(found: Registration, scans: Sequence[Scan]) -> list[str]:
     for number, scale in found.scales.items():
         out.append(f"{scans[number].name}: is about {abs(scale - 1):.1%} {'larger' if scale > 1 else 'smaller'} than the others: "
                    "check its unit or calibration; poses do not mend a scale")
-    for (a, b), weight in found.weights.items():
+    for pair, weight in found.kept:
         if weight <= REFUSED:
-            out.append(f"{scans[a].name} and {scans[b].name}: the loops through other scans contradict their pose, which counts as nothing")
+            out.append(f"{scans[pair.a].name} and {scans[pair.b].name}: the loops through other scans contradict their pose by "
+                       f"{pair.by.value}, which counts as nothing")
+    out += _target_warnings(found, scans)
     if np.isfinite(found.factor) and found.factor > LOOSE:
         out.append(f"loops leave {found.factor:.3g} times what the noise of the pairs explains: lenses or σ may be wrong; the "
                    "covariances are multiplied by its square")
-    kept = [pair for pair in found.pairs if (pair.a, pair.b) in found.weights and pair.fit is not None]
-    worst = float(np.median([pair.fit.ratio for pair in kept if pair.fit is not None]))
-    if worst > SYSTEMATIC:
+    surfaces = [pair.fit.ratio for pair, _ in found.kept if pair.fit is not None and pair.by is Evidence.SURFACES]
+    if surfaces and (worst := float(np.median(surfaces))) > SYSTEMATIC:
         out.append(f"the surfaces of pairs lie {worst:.3g} times as far apart as σ explains (median): σ is too small, or their points "
                    "are far apart for the bend of the surface")
-    single = [number for number in found.poses if sum(number in pair for pair, weight in found.weights.items() if weight > REFUSED) == 1]
+    single = [number for number in found.poses
+              if sum(number in (pair.a, pair.b) for pair, weight in found.kept if weight > REFUSED) == 1]
     if single and len(found.poses) > 2:
         out.append(f"{', '.join(scans[number].name for number in single)}: held by one pair each, which no loop checks")
+    return out
+
+
+def _target_facts(places: Sequence[TargetPlace], scans: Sequence[Scan]) -> dict[str, Any]:
+    if not places:
+        return {}
+    return {"targets": [{
+        "name": place.name, "scans": [scans[number].name for number in place.scans],
+        "position_m": None if place.position is None else [round(float(x), 7) for x in place.position], "sigma_m": _short(place.sigma_m),
+        "elsewhere": {scans[number].name: _short(off) for number, off in place.wrong.items()}} for place in places]}
+
+
+def _target_warnings(found: Registration, scans: Sequence[Scan]) -> list[str]:
+    """Return which pairs their targets do not place, and which targets are not where the others show them."""
+    by_targets = [pair for pair in found.pairs if pair.by is Evidence.TARGETS]
+    out = [f"{scans[pair.a].name} and {scans[pair.b].name}: {pair.reason}" for pair in by_targets
+           if pair.state in (PairState.CONTRADICTED, PairState.MISFIT)]
+    for number in found.poses:
+        own = [pair for pair in by_targets if number in (pair.a, pair.b)]
+        if scans[number].targets and not any(pair.state is not PairState.LITTLE_OVERLAP for pair in own):
+            words = max(own, key=lambda pair: pair.overlap).reason if own else "no other scan shows one of them"
+            out.append(f"{scans[number].name}: its targets do not place it: {words}")
+    return out + _wrong_targets(found.targets, scans)
+
+
+def _wrong_targets(places: Sequence[TargetPlace], scans: Sequence[Scan]) -> list[str]:
+    out = []
+    for place in places:
+        if place.position is None:
+            apart = max(place.wrong.values())
+            names = ", ".join(scans[number].name for number in place.wrong)
+            out.append(f"target {place.name}: lies up to {1e3 * apart:.3g} mm apart in {names}, and nothing says in which it is right: "
+                       "it moved, or has another's name")
+            continue
+        for number, off in place.wrong.items():
+            same = place.same_as.get(number)
+            end = "it moved, or has another's name" if same is None else f"that is the place of target {same}: its name is wrong"
+            out.append(f"target {place.name}: in {scans[number].name} it lies {1e3 * off:.3g} mm from where the other scans show it: {end}")
     return out
 
 
@@ -204,8 +248,12 @@ def _scan_facts(number: int, scan: Scan, poses: dict[int, np.ndarray], spread: d
 
 def _pair_facts(pair: Pair, scans: Sequence[Scan]) -> dict[str, Any]:
     fit = pair.fit
-    facts: dict[str, Any] = {"scans": [scans[pair.a].name, scans[pair.b].name], "state": pair.state.value, "overlap": _short(pair.overlap)}
-    if fit is not None:
+    facts: dict[str, Any] = {"scans": [scans[pair.a].name, scans[pair.b].name], "by": pair.by.value,
+                             "state": pair.state.value, "overlap": _short(pair.overlap)}
+    if pair.by is Evidence.TARGETS and fit is not None:
+        facts |= {"residual_m": _short(fit.residual), "residual_in_sigma": _short(fit.ratio), "targets": fit.matches,
+                  "scale": [_short(1 + fit.scale), _short(fit.scale_sigma)]}
+    elif fit is not None:
         facts |= {"residual_m": _short(fit.residual), "residual_in_sigma": _short(fit.ratio), "matches": fit.matches,
                   "contradicted": _short(pair.contradicted), "scale": [_short(1 + fit.scale), _short(fit.scale_sigma)]}
     return facts | ({"reason": pair.reason} if pair.reason else {})

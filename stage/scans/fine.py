@@ -39,6 +39,7 @@ class Fit(NamedTuple):
     information: np.ndarray  # [6, 6] of rotation vector (radians) and translation (metres), frame of a
     normal: np.ndarray  # [6, 6] the matrix of the normal equations of `rows`
     noise: np.ndarray  # [6, 6] the part of it that noise in the normals alone would make
+    bend: np.ndarray  # [6, 6] the part that normals would make which are as wrong as the choice of their neighbours changes them
     residual: float  # metres: the robust standard deviation of the distances
     ratio: float  # the robust standard deviation of the distances in units of their σ
     together: float  # by which factor errors of neighbours that are alike widen σ of the pose
@@ -110,7 +111,7 @@ def _result(a: Cloud, found: "_Matches", pose: np.ndarray) -> Fit:
     rows = Rows(found.at, found.of, system.weighted.astype(np.float32), found.sigma_a.astype(np.float32), found.sigma_b.astype(np.float32))
     scale_sigma = float(np.sqrt(squared / left)) if left > 0 else float("inf")
     return Fit(pose=pose, pivot=system.pivot, doubt=np.zeros(6), information=system.information / squared, normal=system.information,
-               noise=system.noise, residual=found.scale, ratio=found.ratio, together=together, scale=scale,
+               noise=system.noise, bend=system.bend, residual=found.scale, ratio=found.ratio, together=together, scale=scale,
                scale_sigma=scale_sigma, rows=rows, matches=int((found.weight > 0).sum()))
 
 
@@ -141,6 +142,7 @@ class _Matches(NamedTuple):
     sigma: np.ndarray  # [k] metres
     weight: np.ndarray  # [k] 0…1
     tilt: np.ndarray  # [k] radians: standard deviation of the normals
+    bent: np.ndarray  # [k] radians: by how much normals of fewer neighbours differ
     scale: float
     ratio: float
     sigma_a: np.ndarray
@@ -152,6 +154,7 @@ class _System(NamedTuple):
     information: np.ndarray
     gradient: np.ndarray
     noise: np.ndarray
+    bend: np.ndarray
     weighted: np.ndarray
 
 
@@ -180,8 +183,10 @@ def _match(a: Cloud, b: Cloud, pose: np.ndarray, reach: float, sample: np.ndarra
     weight = np.maximum(1 - (across / (TUKEY * max(ratio, 1.0) * sigma)) ** 2, 0) ** 2
     # 16 neighbours that lie about a spacing away tilt a plane by a quarter of σ over the spacing
     tilt = max(ratio, 1.0) * np.hypot(a.sigma[at] / a.spacing[at], b.sigma[of] / b.spacing[of]) / 4
+    bent_a, bent_b = a.normals[at] - a.near_normals[at], b.normals[of] - b.near_normals[of]
+    bent = np.sqrt(_dots(bent_a, bent_a) + _dots(bent_b, bent_b))
     scale = MAD_TO_SIGMA * float(np.median(np.abs(across)))
-    return _Matches(at, of, placed[keep], normal, across, sigma, weight, tilt, scale, ratio, seen_a, seen_b)
+    return _Matches(at, of, placed[keep], normal, across, sigma, weight, tilt, bent, scale, ratio, seen_a, seen_b)
 
 
 def _system(found: _Matches) -> _System:
@@ -191,9 +196,14 @@ def _system(found: _Matches) -> _System:
     local = found.placed - pivot
     jacobian = np.concatenate([np.cross(local, found.normal), found.normal], axis=1)
     weighted = jacobian * weight[:, None]
-    off = weight * found.tilt**2
+    return _System(pivot, weighted.T @ jacobian, weighted.T @ found.distance, _turned(local, weight * found.tilt**2),
+                   _turned(local, weight * found.bent**2), weighted)
+
+
+def _turned(local: np.ndarray, off: np.ndarray) -> np.ndarray:
+    """Return the information [6, 6] that normals alone make whose components in the plane have these weighted variances [k]."""
     square = (local * off[:, None]).T @ local
-    noise = np.zeros((6, 6))  # of normals that are turned by noise: their components in the plane are tilt² each
-    noise[:3, :3] = np.trace(square) * np.eye(3) - square
-    noise[3:, 3:] = off.sum() * np.eye(3)
-    return _System(pivot, weighted.T @ jacobian, weighted.T @ found.distance, noise, weighted)
+    out = np.zeros((6, 6))
+    out[:3, :3] = np.trace(square) * np.eye(3) - square
+    out[3:, 3:] = off.sum() * np.eye(3)
+    return out

@@ -34,6 +34,10 @@ RATIO = 2.5
 NOT_DETERMINED, WEAK = 10.0, 60.0
 """A direction whose information is less than this many times what the noise of the normals makes alone is not determined, or is tried out.
 A vase has 4 about its axis; the statue of tests/scenes has 140 and more at overlaps above a tenth."""
+BENT, WEAKLY_BENT = 0.3, 1.5
+"""The same against what normals make that are as wrong as those of 8 neighbours differ from those of 16: that is too much, but grows with
+the spacing of the points and with the bend of the surface, as the error of the normals does. A vase has .1 to .2 about its axis at
+spacings of 6 to 17 mm, the statue .5 and more."""
 SHIFTS = (0.1, -0.1, 0.3)
 """By how much, in parts of the size of the scans, a scan is moved along a weak direction to try it out."""
 AS_GOOD, LEAST_ALIKE, MORE_CONTRADICTED = 1.15, 0.6, 0.01
@@ -60,6 +64,13 @@ class PairState(StrEnum):
     """Several poses fit alike: the surface is symmetric."""
 
 
+class Evidence(StrEnum):
+    """What the pose of a pair was found by."""
+
+    SURFACES = "surfaces"
+    TARGETS = "targets"
+
+
 class Pair(NamedTuple):
     """Two scans, and the pose of one against the other."""
 
@@ -69,10 +80,11 @@ class Pair(NamedTuple):
     fit: Fit | None
     """What the best pose leaves; None: no pose was found."""
     overlap: float
-    """Part of the smaller scan's surface that is matched."""
+    """Part of the smaller scan's surface that is matched; by targets, the part of the common ones that keep their distances."""
     contradicted: float
     reason: str
     """Why it was refused, in words; empty of a joined pair."""
+    by: Evidence = Evidence.SURFACES
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,9 +211,10 @@ def _tried_out(a: Prepared, b: Prepared, best: Pair, cell_m: float, least_overla
     units = np.array([1 / size] * 3 + [1.0] * 3)  # a step of length 1 moves points by about 1 m
     values, axes = np.linalg.eigh(best.fit.normal * np.outer(units, units))
     for value, axis in zip(values, axes.T, strict=True):
-        alone = float(axis @ (best.fit.noise * np.outer(units, units)) @ axis)
+        noise, bend = (float(axis @ (part * np.outer(units, units)) @ axis) for part in (best.fit.noise, best.fit.bend))
         step = units * axis
-        if value < NOT_DETERMINED * alone or (value < WEAK * alone and _slides(a, b, best, size * step, cell_m, least_overlap)):
+        weak = value < WEAK * noise or value < WEAKLY_BENT * bend
+        if value < NOT_DETERMINED * noise or value < BENT * bend or (weak and _slides(a, b, best, size * step, cell_m, least_overlap)):
             kind = "turned about an axis" if np.linalg.norm(axis[:3]) > 0.5 else "shifted along itself"
             return best._replace(state=PairState.AMBIGUOUS,
                                  reason=f"the surface looks the same when it is {kind}, so that its pose is not determined")

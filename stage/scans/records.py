@@ -35,6 +35,17 @@ Covariance = Annotated[tuple[Six, Six, Six, Six, Six, Six], AfterValidator(_cova
 then of a translation (x, y, z in metres, world)."""
 
 
+class TargetEntry(Strict):
+    """A target that a scan shows: a sphere, a coded mark or a corner, measured by whatever means."""
+
+    name: Text
+    """The name of the target, the same in every scan that shows it."""
+    position_m: Vector
+    """Where it is, metres, in the frame of the scan."""
+    sigma_m: Positive
+    """Standard deviation of each coordinate, metres."""
+
+
 class ScanEntry(Strict):
     """One scan: a range image or a set of points in the frame of the camera that took it."""
 
@@ -53,11 +64,18 @@ class ScanEntry(Strict):
     """The covariance of `scan_to_world`. None: it is not known."""
     maps: Text | None = None
     """A result folder of `relit solve` for the same camera in the same place, or its maps.exr, relative to the file. None: none."""
+    targets: Annotated[tuple[TargetEntry, ...], FirstFault] = ()
+    """Named targets that the scan shows. Scans that show three of the same targets or more are placed by them as well as by their
+    surfaces."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.pose_covariance is not None and self.scan_to_world is None:
             raise ValueError("pose_covariance: is given without scan_to_world")
+        twice = next((target.name for number, target in enumerate(self.targets)
+                      if target.name in {other.name for other in self.targets[:number]}), None)
+        if twice is not None:
+            raise ValueError(f"targets: {twice} is there twice: a scan shows a target once")
         return self
 
 

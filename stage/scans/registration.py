@@ -4,7 +4,7 @@ Scans are needed one or two at a time. Who calls says where they are in the mean
 the memory, or by several workers that share a disk.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -20,11 +20,12 @@ from stage.scans.diagnosis import odd_scales, why_alone
 from stage.scans.extent import CELLS_ACROSS, cells_of, extent_of, usual_extent
 from stage.scans.fine import Rows
 from stage.scans.pair_tasks import NEAR_CELLS, NOT_THERE, START_CELLS, PairTask, register_pair
-from stage.scans.pairs import Pair, PairState, Prepared, prepare
+from stage.scans.pairs import Evidence, Pair, PairState, Prepared, prepare
 from stage.scans.pose_graph import REFUSED, Edge, Solved, solve
 from stage.scans.records import Turntable
 from stage.scans.rigid import inverse
-from stage.scans.scan import Scan
+from stage.scans.scan import Scan, Target
+from stage.scans.target_pairs import TargetPlace, against_surfaces, pairs_by_targets, target_places
 from stage.scans.tree import joined_groups, tree_poses
 from stage.scans.turntable import angle_of, freedom, turned_pose
 
@@ -78,11 +79,13 @@ class Registration(NamedTuple):
     """Why each scan that could not be joined is not, in words after its name."""
     scales: dict[int, float]
     """The approximate scale of each joined scan whose scale is not that of the others."""
-    weights: dict[tuple[int, int], float]
-    """The weight of each joined pair in the poses, from 0 (the others contradict it) to 1."""
+    kept: tuple[tuple[Pair, float], ...]
+    """The pairs between joined scans with their weights in the poses, from 0 (the others contradict it) to 1."""
     factor: float
     """The standard deviation of what the loops leave, in units of what the information of the pairs says; NaN without loops."""
     cell_m: float
+    targets: tuple[TargetPlace, ...]
+    """The targets that two or more joined scans show."""
 
 
 def register(scans: Sequence[Scan], starts: Sequence[np.ndarray | None], options: RegistrationOptions, *,
@@ -101,11 +104,12 @@ def register(scans: Sequence[Scan], starts: Sequence[np.ndarray | None], options
     """
     with ThreadPoolExecutor(options.threads) as pool:
         return register_by(_InMemory(scans, pool), [scan.name for scan in scans], [extent_of(scan) for scan in scans], starts, options,
-                           table=table, advance=advance)
+                           table=table, targets={number: scan.targets for number, scan in enumerate(scans)}, advance=advance)
 
 
 def register_by(work: ScanWork, names: Sequence[str], extents: Sequence[float], starts: Sequence[np.ndarray | None],
-                options: RegistrationOptions, *, table: Turntable | None = None, advance: Advance = lambda done: None) -> Registration:
+                options: RegistrationOptions, *, table: Turntable | None = None, targets: Mapping[int, Sequence[Target]] | None = None,
+                advance: Advance = lambda done: None) -> Registration:
     """Find the poses of scans of one object.
 
     Args:
@@ -113,6 +117,7 @@ def register_by(work: ScanWork, names: Sequence[str], extents: Sequence[float], 
         names: of the scans, for messages.
         extents: of the scans, as `extent_of` returns it.
         starts, options, table, advance: as of `register`.
+        targets: the targets that each scan shows. None: there are none.
 
     Raises:
         ScanError: no two scans can be joined.
@@ -126,8 +131,15 @@ def register_by(work: ScanWork, names: Sequence[str], extents: Sequence[float], 
         done = work.pairs(tasks, cells, options.least_overlap, lambda part: advance(least + (most - least) * part))
         return {(pair.a, pair.b): pair for pair in done}
 
-    pairs = _first_pairs(outlines, starts, count, options, registered)
-    solved, kept = _solved(count, pairs, starts, options, table)
+    shown = {number: given for number, given in (targets or {}).items() if given}
+    targeted = pairs_by_targets({number: shown[number] for number in shown if number in cells}, work.ready)
+    pairs = _first_pairs(outlines, starts, targeted, count, options, registered)
+    targeted = {ab: pair if pair.fit is None else against_surfaces(pair, pairs.get(ab), work.ready) for ab, pair in targeted.items()}
+
+    def solve_all() -> tuple[Solved | None, list[Pair]]:
+        return _solved(count, [*pairs.values(), *targeted.values()], starts, options, table)
+
+    solved, kept = solve_all()
     tried: set[tuple[int, int]] = set()
     advance(0.75)
     unlike = _untried(outlines, starts, pairs)
@@ -137,14 +149,14 @@ def register_by(work: ScanWork, names: Sequence[str], extents: Sequence[float], 
             if not found:
                 break
             pairs |= found
-            solved, kept = _solved(count, pairs, starts, options, table)
-        further = most_alike(unlike, _groups(count, pairs))
+            solved, kept = solve_all()
+        further = most_alike(unlike, _groups(count, [*pairs.values(), *targeted.values()]))
         if not further:
             break
         for pair in further:
             del unlike[pair]
         pairs |= registered([PairTask(a, b, None, 0.0, True) for a, b in further], 0.75, 0.9)
-        solved, kept = _solved(count, pairs, starts, options, table)
+        solved, kept = solve_all()
     advance(0.9)
     joined = solved.poses if solved is not None else {}
     common = options.cell_m or usual / CELLS_ACROSS
@@ -155,15 +167,17 @@ def register_by(work: ScanWork, names: Sequence[str], extents: Sequence[float], 
         others = [partial(work.ready, other) for other in sorted(basis, key=lambda other: abs(other - number))]
         words = why_alone(work.scan(number), others, extent=extents[number], others_extent=usual, cell_m=common,
                           least_overlap=options.least_overlap)
-        alone[number] = words or _refusal(number, names, pairs.values())
+        alone[number] = (words or _refusal(number, names, pairs.values())) + _refused_targets(number, names, shown, targeted.values())
     advance(1.0)
     if solved is None:
         raise ScanError(*(f"{names[number]}: {words}" for number, words in alone.items()))
     if options.reference is not None and options.reference not in joined:
         raise ScanError(f"{names[options.reference]}: is the reference, but {alone[options.reference]}")
-    weights = {(pair.a, pair.b): float(weight) for pair, weight in zip(kept, solved.weights, strict=True)}
-    return Registration(joined, covariances(solved, kept, [edge_of(pair) for pair in kept], work.rows), _reference(joined, starts, options),
-                        tuple(pairs.values()), alone, odd_scales(kept, list(joined)), weights, solved.factor, common)
+    spread = covariances(solved, kept, [edge_of(pair) for pair in kept],
+                         lambda pair: rows_of(pair) if pair.by is Evidence.TARGETS else work.rows(pair))
+    return Registration(joined, spread, _reference(joined, starts, options), (*pairs.values(), *targeted.values()), alone,
+                        odd_scales(kept, list(joined)), tuple(zip(kept, map(float, solved.weights), strict=True)), solved.factor, common,
+                        tuple(target_places(shown, joined, spread)))
 
 
 class _InMemory:
@@ -202,16 +216,19 @@ Registered = Callable[[Sequence[PairTask], float, float], dict[tuple[int, int], 
 """Registers pairs; its numbers say between which parts of the whole work."""
 
 
-def _first_pairs(outlines: dict[int, Outline], starts: Sequence[np.ndarray | None], count: int, options: RegistrationOptions,
-                 registered: Registered) -> dict[tuple[int, int], Pair]:
-    """Return pairs: from the starts of both scans where they overlap there, else searched, if there are few scans."""
+def _first_pairs(outlines: dict[int, Outline], starts: Sequence[np.ndarray | None], targeted: dict[tuple[int, int], Pair], count: int,
+                 options: RegistrationOptions, registered: Registered) -> dict[tuple[int, int], Pair]:
+    """Return pairs by surfaces: from the pose of their targets, or the starts of both scans where they overlap there, else searched, if
+    there are few scans."""
     known = {number: start for number in outlines if (start := starts[number]) is not None}
     overlaps = Overlaps(outlines, known, START_CELLS)
     near = set(overlapping(known, overlaps, options.least_overlap, count=count, wanted=lambda a, b: True))
     tasks, pairs = [], {}
     for a, b in combinations(sorted(outlines), 2):
         first, second = known.get(a), known.get(b)
-        if first is None or second is None:
+        if (a, b) in targeted and (fit := targeted[a, b].fit) is not None:
+            tasks.append(PairTask(a, b, fit.pose, START_CELLS, True))
+        elif first is None or second is None:
             if count <= ALL_PAIRS:
                 tasks.append(PairTask(a, b, None, 0.0, True))
         elif (a, b) in near:
@@ -231,9 +248,9 @@ def _untried(outlines: dict[int, Outline], starts: Sequence[np.ndarray | None], 
             if (a, b) not in pairs and (starts[a] is None or starts[b] is None)}
 
 
-def _groups(count: int, pairs: dict[tuple[int, int], Pair]) -> dict[int, int]:
+def _groups(count: int, pairs: Sequence[Pair]) -> dict[int, int]:
     """Return the group of each scan, of those that pairs join."""
-    groups = joined_groups(count, [pair for pair in pairs.values() if pair.state is PairState.JOINED])
+    groups = joined_groups(count, [pair for pair in pairs if pair.state is PairState.JOINED])
     return {number: place for place, members in enumerate(groups) for number in members}
 
 
@@ -267,10 +284,10 @@ def _predicted(outlines: dict[int, Outline], pairs: dict[tuple[int, int], Pair],
     return {numbers: pair for numbers, pair in found.items() if pair.state is PairState.JOINED}
 
 
-def _solved(count: int, pairs: dict[tuple[int, int], Pair], starts: Sequence[np.ndarray | None], options: RegistrationOptions,
+def _solved(count: int, pairs: Sequence[Pair], starts: Sequence[np.ndarray | None], options: RegistrationOptions,
             table: Turntable | None) -> tuple[Solved | None, list[Pair]]:
     """Return the poses of the largest group of scans that pairs join without contradiction, and these pairs; None where none are joined."""
-    joined = [pair for pair in pairs.values() if pair.state is PairState.JOINED]
+    joined = [pair for pair in pairs if pair.state is PairState.JOINED]
     while True:
         group = joined_groups(count, joined)[0]
         if len(group) < 2:
@@ -317,3 +334,12 @@ def _refusal(number: int, names: Sequence[str], pairs: Iterable[Pair]) -> str:
         return f"is joined with {other} alone, and neither with the largest group of scans"
     further = ": give its turntable or pose and keep that fixed" if best.state is PairState.AMBIGUOUS else ""
     return f"against {other}, {best.reason}{further}"
+
+
+def _refused_targets(number: int, names: Sequence[str], shown: Mapping[int, Sequence[Target]], pairs: Iterable[Pair]) -> str:
+    """Return why the targets of a scan that could not be joined place it against no other, to go behind the reason of its surfaces."""
+    tried = [pair for pair in pairs if number in (pair.a, pair.b)]
+    if not tried:
+        return "; no other scan shows any of its targets" if number in shown else ""
+    best = max(tried, key=lambda pair: (pair.fit is not None, pair.overlap))
+    return f"; against {names[best.b if best.a == number else best.a]}, {best.reason}" if best.reason else ""

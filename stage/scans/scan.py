@@ -2,10 +2,19 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from stage.camera import Camera
+
+
+class Target(NamedTuple):
+    """A target that a scan shows."""
+
+    name: str
+    position: np.ndarray  # [3] metres, frame of the scan
+    covariance: np.ndarray  # [3, 3] square metres
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +45,8 @@ class Scan:
     pose_covariance: np.ndarray | None  # [6, 6] as `stage.scans.records.Covariance`; None: unknown
     maps: Path | None
     """The maps.exr of the same camera in the same place; None: there is none."""
+    targets: tuple[Target, ...] = ()
+    """Named targets that the scan shows, in its frame."""
 
     def image(self, values: np.ndarray) -> np.ndarray:
         """Return values of the points as an image: [rows, cols] or [rows, cols, k] of their type, 0 where no point is.

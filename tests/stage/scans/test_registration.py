@@ -102,6 +102,13 @@ def test_what_looks_the_same_after_a_motion_is_refused(name, known):
         registered(views, starts)
 
 
+@pytest.mark.parametrize(("rows", "sigma"), [(60, 0.25 * MM), (80, 0.25 * MM), (120, 0.02 * MM)], ids=["21 mm", "16 mm", "little noise"])
+def test_a_vase_is_refused_at_any_spacing_and_noise(rows, sigma):
+    """Points far apart for the bend have normals that are wrong by more than their noise; they must not pass for a shape."""
+    with pytest.raises(ScanError, match="surface looks the same when it is turned"):
+        registered(seen(vase, 0, 60, rows=rows, sigma=sigma))
+
+
 def test_a_handle_is_enough_where_the_start_is_near():
     views = seen(jug, 0, 30)
     rng = np.random.default_rng(1)
