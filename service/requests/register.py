@@ -48,7 +48,12 @@ class RegisterRequest(RegisterOptions):
     out: Annotated[Path, Role.OUTPUT]
     """Folder for scan-set.json with the poses, and report.json."""
     threads: Annotated[int | None, Field(ge=1), Role.MACHINE] = None
-    """Pairs that are registered at one time. None: one for each core."""
+    """Scans that are read, and pairs that are registered, at one time. None: one for each core."""
+    memory_gb: Annotated[Positive, Role.MACHINE] = 2.0
+    """Memory for scans that are read again, thinned, for further pairs, GB; each thread has two scans beside."""
+    cache: Annotated[Path | None, Role.MACHINE] = None
+    """Folder for thinned scans and registered pairs, from which a run that was interrupted goes on; it may be deleted afterwards. None: a
+    temporary folder."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -45,13 +45,14 @@ def read_scans(file: Path, scans: ScanSet) -> Iterator[Scan]:
         yield read_scan(file, scans, number)
 
 
-def read_scan(file: Path, scans: ScanSet, number: int) -> Scan:
+def read_scan(file: Path, scans: ScanSet, number: int, *, estimate_normals: bool = True) -> Scan:
     """Read one scan of a set.
 
     Args:
         file: the scan-set.json, which paths are relative to.
         scans: its content.
         number: of the scan, from 0.
+        estimate_normals: whether normals are fitted to the points where the scan has none; without them the scan has none.
 
     Raises:
         ManifestError: the scan holds no depth or points, has a unit or maps that do not fit, or no σ can be estimated.
@@ -63,17 +64,20 @@ def read_scan(file: Path, scans: ScanSet, number: int) -> Scan:
     pose = None if entry.scan_to_world is None else nearest_rigid(np.array(entry.scan_to_world, dtype=np.float64))
     covariance = None if entry.pose_covariance is None else np.array(entry.pose_covariance, dtype=np.float64)
     if path.is_file() and path.suffix.lower() == ".ply":
-        return _point_set(path, entry, where, pose, covariance)
+        return _point_set(path, entry, where, pose, covariance, estimate_normals)
     if not (path / DEPTH_FILE).is_file() and not (path.is_file() and path.suffix.lower() == ".exr"):
         raise ManifestError(f"{where}: path: {path} is neither a folder with a {DEPTH_FILE} nor a PLY file")
-    return _range_image(path / DEPTH_FILE if path.is_dir() else path, entry, where, file.parent, pose, covariance)
+    return _range_image(path / DEPTH_FILE if path.is_dir() else path, entry, where, file.parent, pose, covariance,
+                        estimate_normals)
 
 
-def _targets(entry: ScanEntry) -> tuple[Target, ...]:
+def targets_of(entry: ScanEntry) -> tuple[Target, ...]:
+    """Return the targets of a scan in its frame."""
     return tuple(Target(target.name, np.array(target.position_m), target.sigma_m**2 * np.eye(3)) for target in entry.targets)
 
 
-def _range_image(path: Path, entry: ScanEntry, where: str, home: Path, pose: np.ndarray | None, covariance: np.ndarray | None) -> Scan:
+def _range_image(path: Path, entry: ScanEntry, where: str, home: Path, pose: np.ndarray | None, covariance: np.ndarray | None,
+                 estimate_normals: bool) -> Scan:
     if entry.unit != "m":
         raise ManifestError(f"{where}: unit: is {entry.unit}, but {path.name} is in metres: leave it out")
     depth = DepthMaps.read(path)
@@ -98,16 +102,19 @@ def _range_image(path: Path, entry: ScanEntry, where: str, home: Path, pose: np.
                    else local_planes(points, origin=origin), where)
     maps = None if entry.maps is None else result_file(home / entry.maps, MAPS_FILE, command="relit solve")
     if maps is not None:
-        normals, source = _photometric(maps, where, used), "photometric"
+        normals, source = _photometric(maps, where, used).reshape(-1, 3)[pixels], "photometric"
+    elif not estimate_normals:
+        normals, source = None, "unknown"
     else:
         per_depth = np.zeros(used.size, dtype=np.float32)
         per_depth[pixels] = sigma.values / stretch
-        normals = depth_normals(depth.depth, used, camera, sigma=per_depth.reshape(used.shape), radius=NORMAL_RADIUS_PX)
+        image = depth_normals(depth.depth, used, camera, sigma=per_depth.reshape(used.shape), radius=NORMAL_RADIUS_PX)
+        normals = image.reshape(-1, 3)[pixels]
         source = "estimated"
     return Scan(name=entry.name, path=path, points=points, sigma=sigma.values, sigma_source=sigma.source,
-                normals=normals.reshape(-1, 3)[pixels], normals_source=source, colours=_colours(path, depth.mask, used),
+                normals=normals, normals_source=source, colours=_colours(path, depth.mask, used),
                 confidence=None if depth.confidence is None else depth.confidence.reshape(-1)[pixels].astype(np.float32), origin=origin,
-                camera=camera, pixels=pixels, pose=pose, pose_covariance=covariance, maps=maps, targets=_targets(entry))
+                camera=camera, pixels=pixels, pose=pose, pose_covariance=covariance, maps=maps, targets=targets_of(entry))
 
 
 def _photometric(path: Path, where: str, used: np.ndarray) -> np.ndarray:
@@ -130,7 +137,8 @@ def _colours(path: Path, mask: np.ndarray, used: np.ndarray) -> np.ndarray | Non
     return colours[used[mask]] if len(colours) == mask.sum() else None  # a laser has points between pixels
 
 
-def _point_set(path: Path, entry: ScanEntry, where: str, pose: np.ndarray | None, covariance: np.ndarray | None) -> Scan:
+def _point_set(path: Path, entry: ScanEntry, where: str, pose: np.ndarray | None, covariance: np.ndarray | None,
+               estimate_normals: bool) -> Scan:
     if entry.maps is not None:
         raise ManifestError(f"{where}: maps: {path.name} is a set of points: solved maps belong to a range image")
     ply = _kept(read_ply_points(path))
@@ -138,10 +146,13 @@ def _point_set(path: Path, entry: ScanEntry, where: str, pose: np.ndarray | None
     points = (ply.points * unit).astype(np.float32)
     origin = np.zeros(3)
     planes = None
-    if ply.normals is None or (ply.sigma is None and entry.sigma_m is None):
+    if (ply.normals is None and estimate_normals) or (ply.sigma is None and entry.sigma_m is None):
         planes = local_planes(points, origin=origin)
     sigma = _sigma(None if ply.sigma is None else ply.sigma * unit, entry, points, planes, where)
-    if ply.normals is None and planes is not None:
+    normals: np.ndarray | None
+    if ply.normals is None and not estimate_normals:
+        normals, source = None, "unknown"
+    elif ply.normals is None and planes is not None:
         normals, source = planes.normals, "estimated"
     else:
         assert ply.normals is not None
@@ -149,7 +160,7 @@ def _point_set(path: Path, entry: ScanEntry, where: str, pose: np.ndarray | None
         normals, source = np.where(length > 0, ply.normals / np.maximum(length, 1e-30), 0).astype(np.float32), "given"
     return Scan(name=entry.name, path=path, points=points, sigma=sigma.values, sigma_source=sigma.source, normals=normals,
                 normals_source=source, colours=ply.colours, confidence=ply.confidence, origin=origin, camera=None, pixels=None, pose=pose,
-                pose_covariance=covariance, maps=None, targets=_targets(entry))
+                pose_covariance=covariance, maps=None, targets=targets_of(entry))
 
 
 def _kept(ply: PlyPoints) -> PlyPoints:

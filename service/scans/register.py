@@ -1,7 +1,9 @@
 """Register a scan set: scan-set.json with the poses and their covariances, and report.json."""
 
 import os
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,20 +11,21 @@ import numpy as np
 
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
-from service.reporting.provenance import REPORT_FILE, report
+from service.reporting.provenance import REPORT_FILE, report, versions
 from service.requests.register import GivenPoses, RegisterRequest, TableUse
+from service.scans.kept_scans import KeptScans, ScanFacts, facts_of
+from service.scans.pieces import FolderPieces, SharedPieces
 from service.scans.read import read_scans
+from stage.depth_maps import DEPTH_FILE
 from stage.errors import ScanError
 from stage.files import write_text
-from stage.fingerprint import digest
 from stage.scans.fixed_poses import FixedPoses, check_fixed
 from stage.scans.neighbours import neighbours_are_installed
 from stage.scans.pairs import Evidence, Pair, PairState
 from stage.scans.pose_graph import REFUSED
 from stage.scans.records import SCAN_SET_FILE, ScanEntry, ScanSet, read_scan_set, write_scan_set
-from stage.scans.registration import Registration, RegistrationOptions, register
+from stage.scans.registration import Registration, RegistrationOptions, register_by
 from stage.scans.rigid import about, applied
-from stage.scans.scan import Scan
 from stage.scans.target_pairs import TargetPlace, target_places
 from stage.scans.turntable import turned_pose
 
@@ -49,12 +52,25 @@ class RegisterResult(NamedTuple):
     warnings: tuple[str, ...]
 
 
-def register_scans(request: RegisterRequest, progress: Progress | None = None) -> RegisterResult:
-    """Find the poses of the scans of a set.
+class _Placed(NamedTuple):
+    """Poses, and what there is to say of them."""
+
+    scans: Sequence[ScanFacts]
+    poses: dict[int, np.ndarray]
+    covariances: dict[int, np.ndarray]
+    alone: dict[int, str]
+    pairs: Sequence[Pair]
+    facts: dict[str, Any]
+    warnings: list[str]
+
+
+def register_scans(request: RegisterRequest, progress: Progress | None = None, sharing: SharedPieces | None = None) -> RegisterResult:
+    """Find the poses of the scans of a set. Scans are read one by one; what is kept of them and of pairs lies on the disk.
 
     Args:
         request: the set, and how.
         progress: told of every stage.
+        sharing: the part of this worker in a registration that others help with; None: there are no others.
 
     Raises:
         RequestError: small_gicp is not installed, or an option does not fit the set.
@@ -66,32 +82,12 @@ def register_scans(request: RegisterRequest, progress: Progress | None = None) -
         raise RequestError("scans are registered with small_gicp, which is not installed: pip install 'relit[scans]'")
     timings = Timings(progress)
     file, listed = read_scan_set(request.scan_set)
-    reference = _checked(request, file, listed)
     target = request.out / SCAN_SET_FILE
     if target.exists() and target.samefile(file):
         raise RequestError(f"--out {request.out}: would replace {file}, which is registered: give another folder")
-    timings.stage("read", len(listed.scans))
-    scans = []
-    for scan in read_scans(file, listed):
-        scans.append(scan)
-        timings.advance(len(scans))
-    timings.stage("register", 100)
-    table = listed.turntable
-    if request.turntable is TableUse.FIXED:
-        assert table is not None and table.angles_deg is not None
-        fixed = check_fixed(scans, [turned_pose(table, angle) for angle in table.angles_deg], threads=_threads(request),
-                            advance=timings.advance_percent, cell_m=request.cell_m, least_overlap=request.least_overlap)
-        poses, covariances, alone = dict(enumerate(fixed.poses)), {}, {}
-        places = target_places({number: scan.targets for number, scan in enumerate(scans)}, poses, {})
-        facts, pairs = _fixed_facts(fixed, scans) | _target_facts(places, scans), fixed.pairs
-        warnings = _fixed_warnings(fixed, scans) + _wrong_targets(places, scans)
-    else:
-        options = RegistrationOptions(cell_m=request.cell_m, least_overlap=request.least_overlap, reference=reference,
-                                      threads=_threads(request))
-        found = register(scans, _starts(request, listed, scans), options, table=table if request.turntable is TableUse.ANGLES else None,
-                         advance=timings.advance_percent)
-        poses, covariances, alone, pairs = found.poses, found.covariances, found.alone, found.pairs
-        facts, warnings = _facts(found, scans), _warnings(found, scans)
+    with _pieces(request, file, listed, sharing) as pieces:
+        placed = _placed(request, file, listed, pieces, timings)
+    scans, poses, covariances, pairs = placed.scans, placed.poses, placed.covariances, placed.pairs
     timings.stage("write", 1)
     spread = {number: _spread(scans[number], poses[number], covariance) for number, covariance in covariances.items()}
     entries = [_entry(entry, file.parent, request.out, poses.get(number), covariances.get(number))
@@ -100,15 +96,71 @@ def register_scans(request: RegisterRequest, progress: Progress | None = None) -
     report_path = request.out / REPORT_FILE
     write_scan_set(listed.model_copy(update={"scans": tuple(entries)}), target)
     write_text(report_path, report(
-        request, inputs={"scan_set": str(file), "name": listed.name, "content": {scan.name: digest(scan.path) for scan in scans}},
-        timings_s=timings.close(), **facts, scans=[_scan_facts(number, scan, poses, spread, alone, joined)
+        request, inputs={"scan_set": str(file), "name": listed.name, "content": {scan.name: scan.content for scan in scans}},
+        timings_s=timings.close(), **placed.facts, scans=[_scan_facts(number, scan, poses, spread, placed.alone, joined)
                                                    for number, scan in enumerate(scans)],
-        pairs=[_pair_facts(pair, scans) for pair in pairs], warnings=warnings))
+        pairs=[_pair_facts(pair, scans) for pair in pairs],
+        pairs_not_tried=len(scans) * (len(scans) - 1) // 2 - sum(pair.by is Evidence.SURFACES for pair in pairs), warnings=placed.warnings))
     return RegisterResult(
         target, report_path, len(poses), len(scans),
         float(np.median([pair.fit.residual for pair in joined if pair.fit is not None])) if joined else None,
         max(size for size, _ in spread.values()) if spread else None, max(turn for _, turn in spread.values()) if spread else None,
-        tuple(warnings))
+        tuple(placed.warnings))
+
+
+def help_register(request: RegisterRequest, progress: Progress, sharing: SharedPieces) -> None:
+    """Do pieces of a registration that another worker leads, and write no result.
+
+    Raises:
+        DivergedError: this worker finds something else than the worker that leads.
+    """
+    file, listed = read_scan_set(request.scan_set)
+    with _pieces(request, file, listed, sharing) as pieces:
+        _placed(request, file, listed, pieces, Timings(progress))
+
+
+@contextmanager
+def _pieces(request: RegisterRequest, file: Path, listed: ScanSet, sharing: SharedPieces | None) -> Iterator[SharedPieces]:
+    """Return the pieces of a registration: those of its workers, or files of the cache, or of a temporary folder."""
+    with ExitStack() as held:
+        pieces = sharing
+        if pieces is None:
+            folder = request.cache or Path(held.enter_context(tempfile.TemporaryDirectory(prefix="relit-register-")))
+            pieces = SharedPieces(FolderPieces(folder))
+        places = [file.parent / entry.path for entry in listed.scans]
+        files = [path for place in places for path in (place, place / DEPTH_FILE) if path.is_file()]
+        stamps = tuple((path.stat().st_size, 0 if sharing else path.stat().st_mtime_ns) for path in files)
+        pieces.identify(listed.model_dump_json(), stamps, tuple(versions().items()))
+        yield pieces
+
+
+def _placed(request: RegisterRequest, file: Path, listed: ScanSet, pieces: SharedPieces, timings: Timings) -> _Placed:
+    """Return the poses of the scans of a set."""
+    reference = _checked(request, file, listed)
+    table, threads = listed.turntable, _threads(request)
+    timings.stage("read", len(listed.scans))
+    if request.turntable is TableUse.FIXED:
+        assert table is not None and table.angles_deg is not None
+        scans = []
+        for scan in read_scans(file, listed):
+            scans.append(scan)
+            timings.advance(len(scans))
+        timings.stage("register", 100)
+        fixed = check_fixed(scans, [turned_pose(table, angle) for angle in table.angles_deg], threads=threads,
+                            advance=timings.advance_percent, cell_m=request.cell_m, least_overlap=request.least_overlap)
+        known = [facts_of(scan) for scan in scans]
+        poses = dict(enumerate(fixed.poses))
+        places = target_places({number: scan.targets for number, scan in enumerate(known)}, poses, {})
+        return _Placed(known, poses, {}, {}, fixed.pairs, _fixed_facts(fixed, known) | _target_facts(places, known),
+                       _fixed_warnings(fixed, known) + _wrong_targets(places, known))
+    kept = KeptScans(file, listed, pieces, memory_bytes=1e9 * request.memory_gb, threads=threads)
+    known = kept.facts(timings.advance)
+    timings.stage("register", 100)
+    options = RegistrationOptions(cell_m=request.cell_m, least_overlap=request.least_overlap, reference=reference, threads=threads)
+    found = register_by(kept, [scan.name for scan in known], [scan.extent_m for scan in known], _starts(request, listed, known), options,
+                        table=table if request.turntable is TableUse.ANGLES else None,
+                        targets={number: scan.targets for number, scan in enumerate(known)}, advance=timings.advance_percent)
+    return _Placed(known, found.poses, found.covariances, found.alone, found.pairs, _facts(found, known), _warnings(found, known))
 
 
 def _threads(request: RegisterRequest) -> int:
@@ -135,7 +187,7 @@ def _checked(request: RegisterRequest, file: Path, listed: ScanSet) -> int | Non
     return names.index(request.reference)
 
 
-def _starts(request: RegisterRequest, listed: ScanSet, scans: Sequence[Scan]) -> list[np.ndarray | None]:
+def _starts(request: RegisterRequest, listed: ScanSet, scans: Sequence[ScanFacts]) -> list[np.ndarray | None]:
     """Return the start of each scan: its pose, or else what the angle of the turntable says."""
     if request.poses is GivenPoses.IGNORED:
         return [None] * len(scans)
@@ -158,9 +210,9 @@ def _entry(entry: ScanEntry, home: Path, out: Path, pose: np.ndarray | None, cov
                                     "scan_to_world": rows(pose), "pose_covariance": rows(covariance)})
 
 
-def _spread(scan: Scan, pose: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
+def _spread(scan: ScanFacts, pose: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
     """Return the standard deviation of the place of the scan's middle, metres, and of its rotation, degrees; roots of sums over axes."""
-    shift = about(applied(pose, scan.points.mean(axis=0, dtype=np.float64)[None])[0] - pose[:3, 3])
+    shift = about(applied(pose, scan.middle[None])[0] - pose[:3, 3])
     own = shift @ covariance @ shift.T
     return float(np.sqrt(max(np.trace(own[3:, 3:]), 0))), float(np.degrees(np.sqrt(max(np.trace(own[:3, :3]), 0))))
 
@@ -169,14 +221,14 @@ def _short(value: float) -> float:
     return float(f"{value:.5g}")
 
 
-def _facts(found: Registration, scans: Sequence[Scan]) -> dict[str, Any]:
+def _facts(found: Registration, scans: Sequence[ScanFacts]) -> dict[str, Any]:
     return {"method": "pairs and pose graph", "reference": scans[found.reference].name, "cell_m": _short(found.cell_m),
             "loop_factor": None if not np.isfinite(found.factor) else _short(found.factor),
             "contradicted_by_loops": [[scans[pair.a].name, scans[pair.b].name] for pair, weight in found.kept if weight <= REFUSED],
             **_target_facts(found.targets, scans)}
 
 
-def _warnings(found: Registration, scans: Sequence[Scan]) -> list[str]:
+def _warnings(found: Registration, scans: Sequence[ScanFacts]) -> list[str]:
     out = [f"{scans[number].name}: has no pose: {words}" for number, words in found.alone.items()]
     for number, scale in found.scales.items():
         out.append(f"{scans[number].name}: is about {abs(scale - 1):.1%} {'larger' if scale > 1 else 'smaller'} than the others: "
@@ -200,7 +252,7 @@ def _warnings(found: Registration, scans: Sequence[Scan]) -> list[str]:
     return out
 
 
-def _target_facts(places: Sequence[TargetPlace], scans: Sequence[Scan]) -> dict[str, Any]:
+def _target_facts(places: Sequence[TargetPlace], scans: Sequence[ScanFacts]) -> dict[str, Any]:
     if not places:
         return {}
     return {"targets": [{
@@ -209,7 +261,7 @@ def _target_facts(places: Sequence[TargetPlace], scans: Sequence[Scan]) -> dict[
         "elsewhere": {scans[number].name: _short(off) for number, off in place.wrong.items()}} for place in places]}
 
 
-def _target_warnings(found: Registration, scans: Sequence[Scan]) -> list[str]:
+def _target_warnings(found: Registration, scans: Sequence[ScanFacts]) -> list[str]:
     """Return which pairs their targets do not place, and which targets are not where the others show them."""
     by_targets = [pair for pair in found.pairs if pair.by is Evidence.TARGETS]
     out = [f"{scans[pair.a].name} and {scans[pair.b].name}: {pair.reason}" for pair in by_targets
@@ -222,7 +274,7 @@ def _target_warnings(found: Registration, scans: Sequence[Scan]) -> list[str]:
     return out + _wrong_targets(found.targets, scans)
 
 
-def _wrong_targets(places: Sequence[TargetPlace], scans: Sequence[Scan]) -> list[str]:
+def _wrong_targets(places: Sequence[TargetPlace], scans: Sequence[ScanFacts]) -> list[str]:
     out = []
     for place in places:
         if place.position is None:
@@ -238,15 +290,15 @@ def _wrong_targets(places: Sequence[TargetPlace], scans: Sequence[Scan]) -> list
     return out
 
 
-def _scan_facts(number: int, scan: Scan, poses: dict[int, np.ndarray], spread: dict[int, tuple[float, float]], alone: dict[int, str],
+def _scan_facts(number: int, scan: ScanFacts, poses: dict[int, np.ndarray], spread: dict[int, tuple[float, float]], alone: dict[int, str],
                 joined: Sequence[Pair]) -> dict[str, Any]:
     sigma = spread.get(number)
-    return {"name": scan.name, "points": len(scan.points), "sigma_m": _short(float(np.median(scan.sigma))), "sigma": scan.sigma_source,
+    return {"name": scan.name, "points": scan.points, "sigma_m": _short(scan.sigma_m), "sigma": scan.sigma_source,
             "joined": number in poses, "why_not": alone.get(number), "pairs": sum(number in (pair.a, pair.b) for pair in joined),
             "pose_sigma_m": None if sigma is None else _short(sigma[0]), "pose_sigma_degrees": None if sigma is None else _short(sigma[1])}
 
 
-def _pair_facts(pair: Pair, scans: Sequence[Scan]) -> dict[str, Any]:
+def _pair_facts(pair: Pair, scans: Sequence[ScanFacts]) -> dict[str, Any]:
     fit = pair.fit
     facts: dict[str, Any] = {"scans": [scans[pair.a].name, scans[pair.b].name], "by": pair.by.value,
                              "state": pair.state.value, "overlap": _short(pair.overlap)}
@@ -259,13 +311,13 @@ def _pair_facts(pair: Pair, scans: Sequence[Scan]) -> dict[str, Any]:
     return facts | ({"reason": pair.reason} if pair.reason else {})
 
 
-def _fixed_facts(fixed: FixedPoses, scans: Sequence[Scan]) -> dict[str, Any]:
+def _fixed_facts(fixed: FixedPoses, scans: Sequence[ScanFacts]) -> dict[str, Any]:
     return {"method": "fixed turntable", "disagreement": [
         {"scans": [scans[a].name, scans[b].name], "shift_m": _short(shift), "turn_degrees": _short(turn)}
         for (a, b), (shift, turn) in fixed.off.items()]}
 
 
-def _fixed_warnings(fixed: FixedPoses, scans: Sequence[Scan]) -> list[str]:
+def _fixed_warnings(fixed: FixedPoses, scans: Sequence[ScanFacts]) -> list[str]:
     out = []
     if not fixed.off:
         out.append("no pair of scans determines its pose by its surfaces, so that nothing checks the turntable")

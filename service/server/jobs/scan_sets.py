@@ -4,17 +4,21 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from service.reporting.progress import Progress
 from service.reporting.provenance import name_place
 from service.requests.jobs import FuseJob, RegisterJob
 from stage.scans.records import SCAN_SET_FILE, ScanEntry, ScanSet, read_scan_set, write_scan_set
 
+if TYPE_CHECKING:
+    from service.scans.pieces import SharedPieces
+
 PlaceOf = Callable[[str], Path]
 """Returns the folder of this machine with the results of a job, by its identifier."""
 
 
-def register(request: RegisterJob, name: str, out: Path, place_of: PlaceOf, progress: Progress) -> None:
+def register(request: RegisterJob, name: str, out: Path, place_of: PlaceOf, progress: Progress, sharing: "SharedPieces") -> None:
     """Find the poses of the depths of other jobs.
 
     Args:
@@ -23,19 +27,34 @@ def register(request: RegisterJob, name: str, out: Path, place_of: PlaceOf, prog
         out: folder of its results; its scan-set.json names the jobs, not their folders.
         place_of: where the results of these jobs are.
         progress: told of every stage.
+        sharing: the part of this worker.
     """
     from service.requests.register import RegisterRequest
     from service.scans.register import register_scans
 
-    maps: tuple[str | None, ...] = request.solves or (None,) * len(request.depths)
-    scans = ScanSet(schema="relit.scan-set/1", name=request.name or name, scans=tuple(
-        ScanEntry(name=depth, path=depth, maps=solve) for depth, solve in zip(request.depths, maps, strict=True)))
+    scans = _listed(request, name)
     with _in_folder(scans, place_of, name) as folder:
-        done = register_scans(RegisterRequest(scan_set=folder, out=out, **dict(request.options)), progress)
+        done = register_scans(RegisterRequest(scan_set=folder, out=out, **dict(request.options)), progress, sharing)
     _, found = read_scan_set(done.scan_set_path)
     named = {entry.name: entry for entry in scans.scans}
     write_scan_set(found.model_copy(update={"scans": tuple(
         entry.model_copy(update={"path": entry.name, "maps": named[entry.name].maps}) for entry in found.scans)}), done.scan_set_path)
+
+
+def help_register(request: RegisterJob, name: str, out: Path, place_of: PlaceOf, progress: Progress, sharing: "SharedPieces") -> None:
+    """Do pieces of a registration that another worker leads; arguments as of `register`."""
+    from service.requests.register import RegisterRequest
+    from service.scans import register as product
+
+    with _in_folder(_listed(request, name), place_of, name) as folder:
+        product.help_register(RegisterRequest(scan_set=folder, out=out, **dict(request.options)), progress, sharing)
+
+
+def _listed(request: RegisterJob, name: str) -> ScanSet:
+    """Return the scan set of a job, whose paths are identifiers of jobs."""
+    maps: tuple[str | None, ...] = request.solves or (None,) * len(request.depths)
+    return ScanSet(schema="relit.scan-set/1", name=request.name or name, scans=tuple(
+        ScanEntry(name=depth, path=depth, maps=solve) for depth, solve in zip(request.depths, maps, strict=True)))
 
 
 def fuse(request: FuseJob, name: str, out: Path, place_of: PlaceOf, device: str, progress: Progress) -> None:

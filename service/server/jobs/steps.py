@@ -85,8 +85,7 @@ def _steps_of(job: Job, context: WorkerContext) -> list[JobStep]:
     if isinstance(request, JoinJob):
         return [JobStep("join", lambda progress: _join(job, request, context, progress))]
     if isinstance(request, RegisterJob):
-        return [JobStep("register", lambda progress: scan_sets.register(
-            request, job.id, _out(job, context), lambda other: job_maps(job, other, context, progress), progress))]
+        return [_register_step(job, request, context)]
     if isinstance(request, FuseJob):
         return [JobStep("fuse", lambda progress: scan_sets.fuse(
             request, job.id, _out(job, context), lambda other: job_maps(job, other, context, progress), context.device, progress))]
@@ -128,6 +127,26 @@ def job_maps(job: Job, maps: str, context: WorkerContext, progress: Progress) ->
 def _solve_step(job: Job, request: SolveJob, context: WorkerContext) -> JobStep:
     return JobStep("solve", lambda progress: _solve(job, request, context, progress),
                    help=lambda progress: _help_solve(job, request, context, progress))
+
+
+def _register_step(job: Job, request: RegisterJob, context: WorkerContext) -> JobStep:
+    def places(progress: Progress) -> Callable[[str], Path]:
+        return lambda other: job_maps(job, other, context, progress)
+
+    def run(progress: Progress) -> None:
+        from service.scans.pieces import SharedPieces
+
+        pieces = JobPieces(context, job)
+        scan_sets.register(request, job.id, _out(job, context), places(progress), progress, SharedPieces(pieces, invite=pieces.invite))
+        pieces.remove()
+
+    def help_others(progress: Progress) -> None:
+        from service.scans.pieces import SharedPieces
+
+        scan_sets.help_register(request, job.id, _out(job, context), places(progress), progress,
+                                SharedPieces(JobPieces(context, job), leads=False))
+
+    return JobStep("register", run, help=help_others)
 
 
 def _frames(job: Job, request: RelightJob, context: WorkerContext) -> list[JobStep]:

@@ -1,0 +1,149 @@
+"""Scans that are registered without being in memory: prepared once, kept as pieces, and read again for every pair."""
+
+import json
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from service.scans.pieces import SharedPieces
+from service.scans.read import read_scan, targets_of
+from stage.fingerprint import digest
+from stage.scans.candidates import Outline, outline_of
+from stage.scans.extent import extent_of
+from stage.scans.fine import Rows
+from stage.scans.pair_tasks import PairTask, register_pair
+from stage.scans.pairs import Pair, Prepared, prepare
+from stage.scans.records import ScanSet
+from stage.scans.scan import Scan, Target
+from stage.scans.stored import packed_pair, packed_scan, unpacked_pair, unpacked_rows, unpacked_scan
+
+POINT_BYTES = 250
+"""Bytes of memory that a point of a prepared scan takes, with the tree of all."""
+
+
+class ScanFacts(NamedTuple):
+    """What is kept of a scan that was read."""
+
+    name: str
+    content: str
+    """Content hash of its file."""
+    points: int
+    sigma_m: float
+    """The median."""
+    sigma_source: str
+    extent_m: float
+    middle: np.ndarray  # [3] metres, the mean of the points
+    pose: np.ndarray | None  # [4, 4] world_from_scan
+    targets: tuple[Target, ...]
+
+
+def facts_of(scan: Scan) -> ScanFacts:
+    """Return the facts of a scan."""
+    return ScanFacts(scan.name, digest(scan.path), len(scan.points), float(np.median(scan.sigma)), scan.sigma_source, extent_of(scan),
+                     scan.points.mean(axis=0, dtype=np.float64), scan.pose, scan.targets)
+
+
+class KeptScans:
+    """The scans of a set; `stage.scans.registration.ScanWork`."""
+
+    def __init__(self, file: Path, listed: ScanSet, pieces: SharedPieces, *, memory_bytes: float, threads: int) -> None:
+        """Create the scans, of which none is read yet.
+
+        Args:
+            file: the scan-set.json.
+            listed: its content.
+            pieces: where prepared scans and pairs are kept, with the run that they belong to.
+            memory_bytes: that scans read again may take, beside those that threads are at work on.
+            threads: scans and pairs at one time.
+        """
+        self._file, self._listed, self._pieces, self._threads = file, listed, pieces, threads
+        self._most, self._held = memory_bytes, 0.0
+        self._cache: OrderedDict[int, tuple[Prepared, float]] = OrderedDict()
+        self._lock = threading.Lock()
+        self._contents: tuple[str, ...] = ()
+        self._prepared: Callable[[str], bytes] | None = None
+        self._pair_files: dict[tuple[int, int], Callable[[], bytes]] = {}
+
+    def facts(self, advance: Callable[[int], None]) -> list[ScanFacts]:
+        """Read every scan once, and return what is to be known of all."""
+        names = [f"{number:05d}" for number in range(len(self._listed.scans))]
+        read = self._pieces.do("read", names, lambda piece: _packed_facts(facts_of(self.scan(int(piece)))), threads=self._threads,
+                               advance=advance)
+        facts = [_unpacked_facts(read(name), targets_of(entry)) for name, entry in zip(names, self._listed.scans, strict=True)]
+        self._contents = tuple(each.content for each in facts)
+        return facts
+
+    def outlines(self, cells: dict[int, float], advance: Callable[[float], None]) -> dict[int, Outline]:
+        """Prepare scans and return their outlines."""
+        def made(piece: str) -> bytes:
+            return packed_scan(prepare(self.scan(int(piece)), cell_m=cells[int(piece)]))
+
+        names = {number: f"{number:05d}" for number in cells}
+        self._prepared = self._pieces.do("prepare", list(names.values()), made, threads=self._threads,
+                                         follows_from=(self._contents, tuple(cells.items())),
+                                         advance=lambda done: advance(done / max(len(names), 1)))
+        return {number: outline_of(self.ready(number), cells[number]) for number in cells}
+
+    def ready(self, number: int) -> Prepared:
+        """Return a scan that was prepared."""
+        with self._lock:
+            if number in self._cache:
+                self._cache.move_to_end(number)
+                return self._cache[number][0]
+        assert self._prepared is not None
+        ready = unpacked_scan(self._prepared(f"{number:05d}"))
+        size = float(POINT_BYTES * (len(ready.fine.points) + len(ready.rough.points)))
+        size += 0 if ready.image is None else 2.0 * ready.image.nearest.nbytes
+        with self._lock:
+            if number not in self._cache:
+                self._cache[number] = ready, size
+                self._held += size
+            while self._held > self._most and len(self._cache) > 1:
+                self._held -= self._cache.popitem(last=False)[1][1]
+        return ready
+
+    def pairs(self, tasks: Sequence[PairTask], cells: dict[int, float], least_overlap: float, advance: Callable[[float], None]
+              ) -> list[Pair]:
+        """Register pairs; they are without their rows."""
+        if not tasks:
+            return []
+        by_name = {f"{task.a:05d}-{task.b:05d}": task for task in tasks}
+
+        def made(piece: str) -> bytes:
+            task = by_name[piece]
+            return packed_pair(register_pair(task, self.ready(task.a), self.ready(task.b), cell_m=(cells[task.a], cells[task.b]),
+                                             least_overlap=least_overlap))
+
+        content = self._pieces.do("pairs", list(by_name), made, threads=self._threads,
+                                  follows_from=(self._contents, least_overlap, tuple(tuple(task) for task in tasks)),
+                                  advance=lambda done: advance(done / len(by_name)))
+        found = []
+        for name, task in by_name.items():
+            found.append(unpacked_pair(content(name)))
+            self._pair_files[task.a, task.b] = partial(content, name)
+        return found
+
+    def rows(self, pair: Pair) -> Rows:
+        """Return the matched points of a pair."""
+        return unpacked_rows(self._pair_files[pair.a, pair.b]())
+
+    def scan(self, number: int) -> Scan:
+        """Read a scan; its normals are those of its file, or not there."""
+        return read_scan(self._file, self._listed, number, estimate_normals=False)
+
+
+def _packed_facts(facts: ScanFacts) -> bytes:
+    plain = facts._asdict() | {"middle": facts.middle.tolist(),
+                               "pose": None if facts.pose is None else facts.pose.tolist(), "targets": []}
+    return json.dumps(plain).encode()
+
+
+def _unpacked_facts(content: bytes, targets: tuple[Target, ...]) -> ScanFacts:
+    plain = json.loads(content)
+    return ScanFacts(**(plain | {"middle": np.array(plain["middle"]),
+                                 "pose": None if plain["pose"] is None else np.array(plain["pose"]), "targets": targets}))
