@@ -35,12 +35,19 @@ def depth_normals(depth: np.ndarray, mask: np.ndarray, camera: Camera, *, sigma:
     halo = radius * SIDE
     x, y = camera.plane_coordinates()
     normal = np.zeros((*depth.shape, 3), dtype=np.float32)
-    for top in range(0, depth.shape[0], ROWS):
-        rows = slice(max(top - halo, 0), min(top + ROWS + halo, depth.shape[0]))
-        inner = slice(top - rows.start, min(top + ROWS, depth.shape[0]) - rows.start)
-        normal[top:top + ROWS] = _fit(depth[rows], mask[rows], x[rows], y[rows], camera, None if sigma is None else sigma[rows],
-                                      radius)[inner]
+    box = bounds(mask)
+    for top in range(box[0].start, box[0].stop, ROWS):
+        bottom = min(top + ROWS, box[0].stop)
+        part = slice(max(top - halo, 0), min(bottom + halo, depth.shape[0])), box[1]
+        normal[top:bottom, box[1]] = _fit(depth[part], mask[part], x[part], y[part], camera, None if sigma is None else sigma[part],
+                                          radius)[top - part[0].start:bottom - part[0].start]
     return normal
+
+
+def bounds(mask: np.ndarray) -> tuple[slice, slice]:
+    """Return the rows and columns of the smallest box around all pixels of a mask; both empty where there is none."""
+    rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return (slice(int(rows[0]), int(rows[-1]) + 1), slice(int(cols[0]), int(cols[-1]) + 1)) if len(rows) else (slice(0, 0), slice(0, 0))
 
 
 def _fit(depth: np.ndarray, mask: np.ndarray, x: np.ndarray, y: np.ndarray, camera: Camera,

@@ -15,6 +15,7 @@ from kernels.fusion.views import (
     LEAST_COSINE,
     TILE,
     TRUNCATION_VOXELS,
+    Cell,
     View,
     ViewArrays,
     image_point,
@@ -60,62 +61,46 @@ def block_place(x: int, y: int, z: int) -> int:
     return (z * SIDE + y) * SIDE + x
 
 
-@wp.func
-def farthest_ratio(view: View, row: int, col: int) -> float:
-    """Return the length of the line of sight of a pixel for each metre of depth, without distortion."""
-    x = (float(col + view.first_col) + 0.5 - view.principal[0]) / view.focal[0]
-    y = (float(row + view.first_row) + 0.5 - view.principal[1]) / view.focal[1]
-    return wp.sqrt(1.0 + x * x + y * y)
-
-
 @wp.kernel(enable_backward=False)
-def _mark_kernel(first: int, number: int, voxel: float, corner: wp.vec3, views: wp.array(dtype=View), inverse: wp.array(dtype=float),
-                 sigma: wp.array(dtype=float), cell: wp.array(dtype=wp.uint8),
+def _mark_kernel(first: int, voxel: float, corner: wp.vec3, views: wp.array(dtype=View), cells: wp.array(dtype=Cell),
                  # outputs
                  marked: wp.array(dtype=wp.uint8)):
-    i = first + wp.tid()
-    view = views[number]
-    place = view.first + i
-    if cell[place] != wp.uint8(0):
-        row = i // view.cols
-        col = i - row * view.cols
-        below = place + view.cols
-        i00 = inverse[place]
-        i01 = inverse[place + 1]
-        i10 = inverse[below]
-        i11 = inverse[below + 1]
-        nearest = 1.0 / wp.max(wp.max(i00, i01), wp.max(i10, i11))
-        farthest = 1.0 / wp.min(wp.min(i00, i01), wp.min(i10, i11))
-        step = STEP_BLOCKS * float(BLOCK) * voxel
-        across = farthest / wp.min(view.focal[0], view.focal[1])
-        most = wp.max(across, farthest - nearest)
-        parts = int(most / step) + 1
-        largest = wp.max(wp.max(sigma[place], sigma[place + 1]), wp.max(sigma[below], sigma[below + 1]))
-        reach = truncation(largest * farthest_ratio(view, row, col), voxel)
-        half = int(reach / step) + 1
-        size = float(BLOCK) * voxel
-        margin = MARGIN_VOXELS * voxel
-        back = wp.transpose(view.rotation)
-        for a in range(parts):
-            fv = (float(a) + 0.5) / float(parts)
-            for b in range(parts):
-                fu = (float(b) + 0.5) / float(parts)
-                depth = 1.0 / ((1.0 - fv) * ((1.0 - fu) * i00 + fu * i01) + fv * ((1.0 - fu) * i10 + fu * i11))
-                ray = line_of_sight(view, float(col + view.first_col) + 0.5 + fu, float(row + view.first_row) + 0.5 + fv)
-                length = wp.length(ray)
-                for s in range(-half, half + 1):
-                    along = depth + wp.clamp(float(s) * step, -reach, reach) / length
-                    point = back * (ray * along - view.translation) - corner
-                    x0 = int(wp.floor((point[0] - margin) / size))
-                    x1 = int(wp.floor((point[0] + margin) / size))
-                    y0 = int(wp.floor((point[1] - margin) / size))
-                    y1 = int(wp.floor((point[1] + margin) / size))
-                    z0 = int(wp.floor((point[2] - margin) / size))
-                    z1 = int(wp.floor((point[2] + margin) / size))
-                    for z in range(wp.max(z0, 0), wp.min(z1, SIDE - 1) + 1):
-                        for y in range(wp.max(y0, 0), wp.min(y1, SIDE - 1) + 1):
-                            for x in range(wp.max(x0, 0), wp.min(x1, SIDE - 1) + 1):
-                                marked[block_place(x, y, z)] = wp.uint8(1)
+    cell = cells[first + wp.tid()]
+    view = views[cell.view]
+    row = (cell.place - view.first) // view.cols
+    col = cell.place - view.first - row * view.cols
+    four = cell.inverse
+    nearest = 1.0 / wp.max(wp.max(four[0], four[1]), wp.max(four[2], four[3]))
+    farthest = 1.0 / wp.min(wp.min(four[0], four[1]), wp.min(four[2], four[3]))
+    step = STEP_BLOCKS * float(BLOCK) * voxel
+    across = farthest / wp.min(view.focal[0], view.focal[1])
+    most = wp.max(across, farthest - nearest)
+    parts = int(most / step) + 1
+    reach = truncation(cell.largest, voxel)
+    half = int(reach / step) + 1
+    size = float(BLOCK) * voxel
+    margin = MARGIN_VOXELS * voxel
+    back = wp.transpose(view.rotation)
+    for a in range(parts):
+        fv = (float(a) + 0.5) / float(parts)
+        for b in range(parts):
+            fu = (float(b) + 0.5) / float(parts)
+            depth = 1.0 / ((1.0 - fv) * ((1.0 - fu) * four[0] + fu * four[1]) + fv * ((1.0 - fu) * four[2] + fu * four[3]))
+            ray = line_of_sight(view, float(col + view.first_col) + 0.5 + fu, float(row + view.first_row) + 0.5 + fv)
+            length = wp.length(ray)
+            for s in range(-half, half + 1):
+                along = depth + wp.clamp(float(s) * step, -reach, reach) / length
+                point = back * (ray * along - view.translation) - corner
+                x0 = int(wp.floor((point[0] - margin) / size))
+                x1 = int(wp.floor((point[0] + margin) / size))
+                y0 = int(wp.floor((point[1] - margin) / size))
+                y1 = int(wp.floor((point[1] + margin) / size))
+                z0 = int(wp.floor((point[2] - margin) / size))
+                z1 = int(wp.floor((point[2] + margin) / size))
+                for z in range(wp.max(z0, 0), wp.min(z1, SIDE - 1) + 1):
+                    for y in range(wp.max(y0, 0), wp.min(y1, SIDE - 1) + 1):
+                        for x in range(wp.max(x0, 0), wp.min(x1, SIDE - 1) + 1):
+                            marked[block_place(x, y, z)] = wp.uint8(1)
 
 
 def find_blocks(views: ViewArrays, voxel: float, corner: tuple[int, int, int], *, device: str) -> Blocks:
@@ -132,9 +117,7 @@ def find_blocks(views: ViewArrays, voxel: float, corner: tuple[int, int, int], *
     """
     marked = wp.zeros(SIDE**3, dtype=wp.uint8, device=device)
     low = wp.vec3(*(float(voxel * c) for c in corner))
-    for number, (rows, cols) in enumerate(views.shapes):
-        devices.launch(_mark_kernel, rows * cols, [number, voxel, low, views.views, views.inverse, views.sigma, views.cell], [marked],
-                       device=device, uneven=True)
+    devices.launch(_mark_kernel, len(views.cells), [voxel, low, views.views, views.cells], [marked], device=device, uneven=True)
     place = np.flatnonzero(marked.numpy()).astype(np.int32)
     index = np.full(SIDE**3, -1, dtype=np.int32)
     index[place] = np.arange(len(place), dtype=np.int32)

@@ -152,8 +152,10 @@ def extract(volume: Volume) -> Triangles:
     devices.launch(_face_kernel, count, [blocks.place, blocks.index, crossed, vertex_start, cases, face_start, triangles, edges,
                                          wp.array(EDGE_CORNER, dtype=int, device=device)], [corner_numbers], device=device)
     corners = corner_numbers.numpy()
-    used, renumbered = np.unique(corners, return_inverse=True)
-    return Triangles(points.numpy()[used], sigma.numpy()[used], edge.numpy()[used], renumbered.reshape(-1, 3).astype(np.int32))
+    used = np.zeros(vertex_count, dtype=bool)
+    used[corners] = True
+    renumbered = np.cumsum(used, dtype=np.int32) - 1
+    return Triangles(points.numpy()[used], sigma.numpy()[used], edge.numpy()[used], renumbered[corners].reshape(-1, 3))
 
 
 def _starts(counts: Any, device: str) -> tuple[Any, int]:

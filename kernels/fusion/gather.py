@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from kernels import device as devices
-from kernels.fusion.views import View, ViewArrays, image_point, read_view, to_camera
+from kernels.fusion.views import Cell, View, ViewArrays, image_point, read_view, to_camera, turned_back
 
 SHARPNESS = 4.0
 """Power of the weights: the best views win where they differ, and blend where they are about alike."""
@@ -38,10 +38,9 @@ def _bilinear(plane: wp.array2d(dtype=float), place: int, cols: int, fu: float, 
 
 
 @wp.kernel(enable_backward=False)
-def _gather_kernel(first: int, slack: float, vectors: int, views: wp.array(dtype=View), count: int, inverse: wp.array(dtype=float),
-                   sigma: wp.array(dtype=float), normal: wp.array(dtype=wp.vec3), cell: wp.array(dtype=wp.uint8),
-                   layers: wp.array2d(dtype=float), feather: wp.array2d(dtype=float), channels: int, points: wp.array(dtype=wp.vec3),
-                   normals: wp.array(dtype=wp.vec3), uncertainty: wp.array(dtype=float),
+def _gather_kernel(first: int, slack: float, vectors: int, views: wp.array(dtype=View), count: int, cell: wp.array(dtype=int),
+                   cells: wp.array(dtype=Cell), layers: wp.array2d(dtype=float), feather: wp.array2d(dtype=float), channels: int,
+                   points: wp.array(dtype=wp.vec3), normals: wp.array(dtype=wp.vec3), uncertainty: wp.array(dtype=float),
                    # outputs
                    values: wp.array2d(dtype=float), weight: wp.array(dtype=float), best: wp.array(dtype=int), seen: wp.array(dtype=int)):
     i = first + wp.tid()
@@ -57,12 +56,13 @@ def _gather_kernel(first: int, slack: float, vectors: int, views: wp.array(dtype
         there = to_camera(view, point)
         if there[2] < 0.0:
             uv = image_point(view, there)
-            reading = read_view(view, there, uv, inverse, sigma, normal, cell)
+            reading = read_view(view, there, uv, cell, cells)
             # the angle to the surface of all views, whose normals are surer than those of one
             toward = wp.transpose(view.rotation) * (-there)
             cosine = wp.dot(normals[i], toward) / wp.length(toward)
             limit = OFF_SURFACE * wp.sqrt(reading.sigma * reading.sigma + uncertainty[i] * uncertainty[i]) + slack
-            if reading.known and cosine > 0.0 and wp.abs(reading.distance) <= limit and wp.dot(reading.normal, normals[i]) > 0.0:
+            if (reading.known and cosine > 0.0 and wp.abs(reading.distance) <= limit
+                    and wp.dot(turned_back(view, reading.normal), normals[i]) > 0.0):
                 u = uv[0] - 0.5
                 v = uv[1] - 0.5
                 fu = u - wp.floor(u)
@@ -118,7 +118,6 @@ def gather(views: ViewArrays, layers: Any, feather: Any, points: Any, normals: A
     values = wp.empty((count, channels), dtype=float, device=device)
     weight = wp.empty(count, dtype=float, device=device)
     best, seen = (wp.empty(count, dtype=int, device=device) for _ in range(2))
-    devices.launch(_gather_kernel, count, [slack, vectors, views.views, views.count, views.inverse, views.sigma, views.normal, views.cell,
-                                           layers, feather, channels, points, normals, sigma], [values, weight, best, seen],
-                   device=device, uneven=True)
+    devices.launch(_gather_kernel, count, [slack, vectors, views.views, views.count, views.cell, views.cells, layers, feather, channels,
+                                           points, normals, sigma], [values, weight, best, seen], device=device, uneven=True)
     return Gathered(values, weight, best, seen)

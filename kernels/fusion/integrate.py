@@ -19,7 +19,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.fusion.bricks import BLOCK, SIDE, VOXELS, Blocks, block_place, find_watching
-from kernels.fusion.views import View, ViewArrays, image_point, read_view, to_camera, truncation
+from kernels.fusion.views import Cell, View, ViewArrays, image_point, read_view, to_camera, truncation, turned_back
 
 AGREEING = 0.85
 """Length of the weighted mean of the normals from which on all of them count: they then lie within some 45° of each other."""
@@ -88,9 +88,8 @@ def is_clear(view: View, point: wp.vec3, at: wp.vec2, reach: float, clear: wp.ar
 
 @wp.kernel(enable_backward=False)
 def _integrate_kernel(first: int, voxel: float, corner: wp.vec3i, count: int, place: wp.array(dtype=int),
-                      watched: wp.array2d(dtype=wp.int16), views: wp.array(dtype=View), inverse: wp.array(dtype=float),
-                      sigma: wp.array(dtype=float), normal: wp.array(dtype=wp.vec3), cell: wp.array(dtype=wp.uint8),
-                      clear: wp.array(dtype=float),
+                      watched: wp.array2d(dtype=wp.int16), views: wp.array(dtype=View), cell: wp.array(dtype=int),
+                      cells: wp.array(dtype=Cell), clear: wp.array(dtype=float),
                       # outputs
                       value: wp.array(dtype=float), variance: wp.array(dtype=float), state: wp.array(dtype=wp.uint8)):
     i = first + wp.tid()
@@ -115,20 +114,20 @@ def _integrate_kernel(first: int, voxel: float, corner: wp.vec3i, count: int, pl
         there = to_camera(view, point)
         if there[2] < 0.0:
             uv = image_point(view, there)
-            reading = read_view(view, there, uv, inverse, sigma, normal, cell)
+            reading = read_view(view, there, uv, cell, cells)
             reach = truncation(reading.sigma, voxel)
             if reading.known and wp.abs(reading.distance) <= reach and reading.along >= -ALONG * reach:
-                w = 1.0 / (reading.sigma * reading.sigma)
+                w = reading.weight
                 weights += w
                 total += w * reading.distance
                 spread += w * w * reading.variance
-                normals += w * reading.normal
+                normals += w * turned_back(view, reading.normal)
                 measured += 1
                 if wp.abs(reading.distance) <= near_surface(reading.sigma, voxel):
                     near += 1
                 if wp.abs(reading.distance) < nearest:
                     nearest = wp.abs(reading.distance)
-                    reference = reading.normal
+                    reference = turned_back(view, reading.normal)
             elif reading.known:
                 if reading.distance > reach:
                     empty += 1
@@ -146,11 +145,11 @@ def _integrate_kernel(first: int, voxel: float, corner: wp.vec3i, count: int, pl
             view = views[number]
             there = to_camera(view, point)
             if there[2] < 0.0:
-                reading = read_view(view, there, image_point(view, there), inverse, sigma, normal, cell)
+                reading = read_view(view, there, image_point(view, there), cell, cells)
                 reach = truncation(reading.sigma, voxel)
                 if (reading.known and wp.abs(reading.distance) <= reach and reading.along >= -ALONG * reach
-                        and wp.dot(reading.normal, reference) >= TURNED):
-                    w = 1.0 / (reading.sigma * reading.sigma)
+                        and wp.dot(turned_back(view, reading.normal), reference) >= TURNED):
+                    w = reading.weight
                     weights += w
                     total += w * reading.distance
                     spread += w * w * reading.variance
@@ -180,7 +179,6 @@ def integrate(blocks: Blocks, views: ViewArrays) -> Volume:
     state = wp.zeros(count, dtype=wp.uint8, device=device)
     if count:
         devices.launch(_integrate_kernel, count, [blocks.voxel, wp.vec3i(*blocks.corner), views.count, blocks.place,
-                                                  find_watching(blocks, views), views.views, views.inverse, views.sigma, views.normal,
-                                                  views.cell, views.clear],
+                                                  find_watching(blocks, views), views.views, views.cell, views.cells, views.clear],
                        [value, variance, state], device=device, uneven=True)
     return Volume(blocks, value, variance, state)

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
+from kernels import device as devices
 from kernels.errors import ArrayError
 
 TILE = 16
@@ -22,6 +23,8 @@ SPACING = 0.29
 by a chord, by the more the more grazing it is seen; that error does not average out."""
 UNDISTORT_ITERATIONS = 10
 """Rounds of the iteration that undoes the distortion: ordinary lenses converge to single precision in about six."""
+LEAST_NORMAL = 2.0
+"""Least length of the sum of the normals of the four pixels of a cell: shorter, they show no one surface."""
 LEAST_COSINE = 0.2
 """Smallest cosine between the normal and the line of sight at which a reading counts: 78°."""
 
@@ -70,22 +73,37 @@ class View:
     principal: wp.vec2
     radial: wp.vec3
     tangential: wp.vec2
+    distorted: bool
+
+
+@wp.struct
+class Cell:
+    """Four neighbouring pixels of one range image that show one surface, and how sure a reading between them is."""
+
+    view: int
+    place: int  # of the upper left pixel in the arrays of all pixels
+    inverse: wp.vec4  # 1 / depth, 1 / metres, of the upper left, upper right, lower left and lower right pixel
+    normal: wp.vec3  # unit, camera frame, mean of the four
+    weight: float  # 1 / square metres, inverse square of `sigma`; 0 where nothing can be read
+    sigma: float  # metres, standard deviation along the normal of the reading of one pixel, as readings are weighted
+    along: float  # square metres, variance along the normal that the depth of one pixel has
+    lateral: float  # square metres, variance along the normal that the place across the line of sight has
+    largest: float  # metres, largest standard deviation along the line of sight
 
 
 class ViewArrays(NamedTuple):
     """The range images of several views, one after another, on the device."""
 
     views: Any  # wp.array [V] of View
-    inverse: Any  # wp.array [P] 1 / depth, 1 / metres
-    sigma: Any  # wp.array [P] metres
-    normal: Any  # wp.array [P] vec3, camera frame
-    cell: Any  # wp.array [P] uint8
+    cell: Any  # wp.array [P] int32, the number of the cell whose upper left pixel each is, −1 where there is none
+    cells: Any  # wp.array [C] of Cell, in the order of their pixels
     clear: Any  # wp.array [P] metres
     farthest: Any  # wp.array [T] metres, depth behind which each tile says nothing, but for the truncation in voxels; 0: nothing at all
     count: int  # views
     pixels: int
     shapes: tuple[tuple[int, int], ...]
     first: tuple[int, ...]
+    first_cell: tuple[int, ...]  # of each view, and the number of all cells
 
 
 def upload_views(images: Sequence[RangeImage], origin: np.ndarray, *, device: str) -> ViewArrays:
@@ -100,9 +118,9 @@ def upload_views(images: Sequence[RangeImage], origin: np.ndarray, *, device: st
     Raises:
         ArrayError: arrays of one image differ in shape, or a depth or standard deviation inside a cell is not above 0.
     """
-    structs, planes = [], {name: [] for name in ("inverse", "sigma", "normal", "cell", "clear", "farthest")}
+    structs, planes = [], {name: [] for name in ("depth", "sigma", "normal", "clear", "farthest", "place", "owner")}
     first = first_tile = 0
-    starts, shapes = [], []
+    starts, shapes, first_cells = [], [], [0]
     for number, image in enumerate(images):
         rows, cols = image.depth.shape
         for name in ("sigma", "cell", "clear", "normal"):
@@ -122,26 +140,31 @@ def upload_views(images: Sequence[RangeImage], origin: np.ndarray, *, device: st
         view.translation = wp.vec3(*(float(v) for v in shift))
         view.focal, view.principal = wp.vec2(*map(float, image.focal)), wp.vec2(*map(float, image.principal))
         view.radial, view.tangential = wp.vec3(*map(float, image.distortion[:3])), wp.vec2(*map(float, image.distortion[3:]))
+        view.distorted = any(image.distortion)
         structs.append(view)
-        planes["inverse"].append(np.divide(1.0, image.depth, out=np.zeros((rows, cols), dtype=np.float32), where=used).ravel())
-        planes["sigma"].append(np.where(used, image.sigma, 0).astype(np.float32).ravel())
-        planes["normal"].append(np.asarray(image.normal, dtype=np.float32).reshape(-1, 3))
-        cell = image.cell.astype(np.uint8)
-        cell[-1], cell[:, -1] = 0, 0  # their neighbours are not here
-        planes["cell"].append(cell.ravel())
-        planes["clear"].append(image.clear.astype(np.float32).ravel())
-        reach = np.where(used, image.depth + TRUNCATION_SIGMAS / LEAST_COSINE * image.sigma, 0)
-        tiles = _farthest(np.maximum(reach, image.clear))
+        row, col = np.nonzero(image.cell[:-1, :-1])  # the neighbours of the last row and column are not here
+        for name in ("depth", "sigma", "normal", "clear"):
+            planes[name].append(np.asarray(getattr(image, name), dtype=np.float32).reshape(rows * cols, -1))
+        planes["place"].append((first + row * cols + col).astype(np.int32))
+        planes["owner"].append(np.full(len(row), number, dtype=np.int32))
+        tiles = _farthest(np.maximum(np.where(used, image.depth + TRUNCATION_SIGMAS / LEAST_COSINE * image.sigma, 0), image.clear))
         planes["farthest"].append(tiles.ravel())
         starts.append(first)
         shapes.append((rows, cols))
+        first_cells.append(first_cells[-1] + len(row))
         first += rows * cols
         first_tile += tiles.size
-    joined = {name: np.concatenate(parts) for name, parts in planes.items()}
-    return ViewArrays(wp.array(structs, dtype=View, device=device),
-                      *(wp.array(joined[name], dtype=dtype, device=device) for name, dtype in (
-                          ("inverse", float), ("sigma", float), ("normal", wp.vec3), ("cell", wp.uint8), ("clear", float),
-                          ("farthest", float))), len(structs), first, tuple(shapes), tuple(starts))
+    held = {name: wp.array(np.concatenate(planes[name]).reshape(-1, 3) if dtype is wp.vec3 else np.concatenate(planes[name]).ravel(),
+                           dtype=dtype, device=device)
+            for name, dtype in (("depth", float), ("sigma", float), ("normal", wp.vec3), ("clear", float), ("farthest", float),
+                                ("place", int), ("owner", int))}
+    views = wp.array(structs, dtype=View, device=device)
+    cell = wp.full(first, -1, dtype=int, device=device)
+    cells = wp.empty(first_cells[-1], dtype=Cell, device=device)
+    devices.launch(_cell_kernel, first_cells[-1], [views, held["place"], held["owner"], held["depth"], held["sigma"], held["normal"]],
+                   [cell, cells], device=device)
+    return ViewArrays(views, cell, cells, held["clear"], held["farthest"], len(structs), first, tuple(shapes), tuple(starts),
+                      tuple(first_cells))
 
 
 def corners_of(cell: np.ndarray) -> np.ndarray:
@@ -175,15 +198,25 @@ def to_camera(view: View, point: wp.vec3) -> wp.vec3:
 
 
 @wp.func
+def turned_back(view: View, vector: wp.vec3) -> wp.vec3:
+    """Return a vector of the camera frame of a view in the world frame."""
+    return wp.transpose(view.rotation) * vector
+
+
+@wp.func
 def image_point(view: View, point: wp.vec3) -> wp.vec2:
     """Return the image coordinates u and v of a camera-frame point in front of the camera, with the distortion of the lens."""
-    x = -point[0] / point[2]
-    y = point[1] / point[2]
-    r2 = x * x + y * y
-    radial = 1.0 + r2 * (view.radial[0] + r2 * (view.radial[1] + r2 * view.radial[2]))
-    p = view.tangential
-    u = x * radial + 2.0 * p[0] * x * y + p[1] * (r2 + 2.0 * x * x)
-    v = y * radial + p[0] * (r2 + 2.0 * y * y) + 2.0 * p[1] * x * y
+    near = 1.0 / point[2]
+    x = -point[0] * near
+    y = point[1] * near
+    u = float(x)
+    v = float(y)
+    if view.distorted:
+        r2 = x * x + y * y
+        radial = 1.0 + r2 * (view.radial[0] + r2 * (view.radial[1] + r2 * view.radial[2]))
+        p = view.tangential
+        u = x * radial + 2.0 * p[0] * x * y + p[1] * (r2 + 2.0 * x * x)
+        v = y * radial + p[0] * (r2 + 2.0 * y * y) + 2.0 * p[1] * x * y
     return wp.vec2(view.principal[0] + view.focal[0] * u, view.principal[1] + view.focal[1] * v)
 
 
@@ -195,7 +228,8 @@ def line_of_sight(view: View, u: float, v: float) -> wp.vec3:
     ideal_x = float(x)
     ideal_y = float(y)
     p = view.tangential
-    for _ in range(UNDISTORT_ITERATIONS):
+    rounds = wp.where(view.distorted, UNDISTORT_ITERATIONS, 0)
+    for _ in range(rounds):
         r2 = ideal_x * ideal_x + ideal_y * ideal_y
         radial = 1.0 + r2 * (view.radial[0] + r2 * (view.radial[1] + r2 * view.radial[2]))
         dx = ideal_x * radial + 2.0 * p[0] * ideal_x * ideal_y + p[1] * (r2 + 2.0 * ideal_x * ideal_x)
@@ -203,6 +237,45 @@ def line_of_sight(view: View, u: float, v: float) -> wp.vec3:
         ideal_x = ideal_x + x - dx
         ideal_y = ideal_y + y - dy
     return wp.vec3(ideal_x, -ideal_y, -1.0)
+
+
+@wp.kernel(enable_backward=False)
+def _cell_kernel(first: int, views: wp.array(dtype=View), place: wp.array(dtype=int), owner: wp.array(dtype=int),
+                 depth: wp.array(dtype=float), sigma: wp.array(dtype=float), normal: wp.array(dtype=wp.vec3),
+                 # outputs
+                 number: wp.array(dtype=int), cells: wp.array(dtype=Cell)):
+    i = first + wp.tid()
+    upper = place[i]
+    view = views[owner[i]]
+    lower = upper + view.cols
+    row = (upper - view.first) // view.cols
+    col = upper - view.first - row * view.cols
+    found = Cell()
+    found.view = owner[i]
+    found.place = upper
+    found.inverse = wp.vec4(1.0 / depth[upper], 1.0 / depth[upper + 1], 1.0 / depth[lower], 1.0 / depth[lower + 1])
+    ray = line_of_sight(view, float(col + view.first_col) + 1.0, float(row + view.first_row) + 1.0)
+    length = wp.length(ray)
+    found.largest = length * wp.max(wp.max(sigma[upper], sigma[upper + 1]), wp.max(sigma[lower], sigma[lower + 1]))
+    n = normal[upper] + normal[upper + 1] + normal[lower] + normal[lower + 1]
+    shared = wp.length(n)
+    found.weight = 0.0
+    if shared >= LEAST_NORMAL:
+        n = n / shared
+        toward = -wp.dot(n, ray)
+        cosine = toward / length
+        if cosine >= LEAST_COSINE:
+            one = 0.25 * (sigma[upper] + sigma[upper + 1] + sigma[lower] + sigma[lower + 1])
+            middle = 0.25 * (found.inverse[0] + found.inverse[1] + found.inverse[2] + found.inverse[3])
+            pixel = 1.0 / (middle * wp.min(view.focal[0], view.focal[1]))
+            across = pixel * pixel * (1.0 - cosine * cosine)
+            found.normal = n
+            found.along = one * one * toward * toward
+            found.lateral = LATERAL * LATERAL * across
+            found.weight = 1.0 / (found.along + SPACING * SPACING * across)
+            found.sigma = wp.sqrt(found.along + SPACING * SPACING * across)
+    cells[i] = found
+    number[upper] = i
 
 
 @wp.struct
@@ -213,57 +286,42 @@ class Reading:
     distance: float  # metres from the measured surface along its normal, positive in front of it
     along: float  # metres from the measured surface along −z of the camera, positive in front of it
     sigma: float  # metres, standard deviation of the distance of one pixel, by which it is weighted
+    weight: float  # 1 / square metres, inverse square of sigma
     variance: float  # square metres, that of the distance, which up to four pixels share
-    normal: wp.vec3  # world frame
-    cosine: float  # between the normal and the line of sight
+    normal: wp.vec3  # camera frame
 
 
 @wp.func
-def read_view(view: View, point: wp.vec3, at: wp.vec2, inverse: wp.array(dtype=float), sigma: wp.array(dtype=float),
-              normal: wp.array(dtype=wp.vec3), cell: wp.array(dtype=wp.uint8)) -> Reading:
+def cell_at(view: View, at: wp.vec2, cell: wp.array(dtype=int)) -> int:
+    """Return the number of the cell on which a point of the image of a view lies, −1 where there is none."""
+    col = int(wp.floor(at[0] - 0.5)) - view.first_col
+    row = int(wp.floor(at[1] - 0.5)) - view.first_row
+    if col < 0 or row < 0 or col >= view.cols - 1 or row >= view.rows - 1:
+        return -1
+    return cell[view.first + row * view.cols + col]
+
+
+@wp.func
+def read_view(view: View, point: wp.vec3, at: wp.vec2, cell: wp.array(dtype=int), cells: wp.array(dtype=Cell)) -> Reading:
     """Return what a view measured on the line of sight through a camera-frame point that falls on `at` of its image."""
     found = Reading()
     found.known = False
-    u = at[0] - 0.5
-    v = at[1] - 0.5
-    fu = u - wp.floor(u)
-    fv = v - wp.floor(v)
-    col = int(wp.floor(u)) - view.first_col
-    row = int(wp.floor(v)) - view.first_row
-    if col < 0 or row < 0 or col >= view.cols - 1 or row >= view.rows - 1:
+    i = cell_at(view, at, cell)
+    if i < 0:
         return found
-    place = view.first + row * view.cols + col
-    if cell[place] == wp.uint8(0):
+    found.weight = cells[i].weight
+    if found.weight == 0.0:
         return found
-    below = place + view.cols
-    w00 = (1.0 - fu) * (1.0 - fv)
-    w01 = fu * (1.0 - fv)
-    w10 = (1.0 - fu) * fv
-    w11 = fu * fv
-    n = w00 * normal[place] + w01 * normal[place + 1] + w10 * normal[below] + w11 * normal[below + 1]
-    length = wp.length(n)
-    if length < 0.5:
-        return found
-    n = n / length
-    depth = 1.0 / (w00 * inverse[place] + w01 * inverse[place + 1] + w10 * inverse[below] + w11 * inverse[below + 1])
-    s00 = sigma[place]
-    s01 = sigma[place + 1]
-    s10 = sigma[below]
-    s11 = sigma[below + 1]
-    z = -point[2]
-    toward = -wp.dot(n, point) / z
-    reach = wp.length(point) / z
-    found.cosine = toward / reach
-    if found.cosine < LEAST_COSINE:
-        return found
-    one = w00 * s00 + w01 * s01 + w10 * s10 + w11 * s11
-    shared = w00 * w00 * s00 * s00 + w01 * w01 * s01 * s01 + w10 * w10 * s10 * s10 + w11 * w11 * s11 * s11
-    pixel = depth / wp.min(view.focal[0], view.focal[1])
-    across = pixel * pixel * (1.0 - found.cosine * found.cosine)
-    found.along = depth - z
-    found.distance = found.along * toward
-    found.sigma = wp.sqrt(one * one * toward * toward + SPACING * SPACING * across)
-    found.variance = shared * toward * toward + LATERAL * LATERAL * across
-    found.normal = wp.transpose(view.rotation) * n
+    fu = at[0] - 0.5 - wp.floor(at[0] - 0.5)
+    fv = at[1] - 0.5 - wp.floor(at[1] - 0.5)
+    four = cells[i].inverse
+    upper = four[0] + fu * (four[1] - four[0])
+    lower = four[2] + fu * (four[3] - four[2])
+    found.along = 1.0 / (upper + fv * (lower - upper)) + point[2]
+    found.normal = cells[i].normal
+    found.distance = found.along * wp.dot(found.normal, point) / point[2]
+    found.sigma = cells[i].sigma
+    share = (1.0 - 2.0 * fu * (1.0 - fu)) * (1.0 - 2.0 * fv * (1.0 - fv))  # sum of the squares of the weights of the four pixels
+    found.variance = share * cells[i].along + cells[i].lateral
     found.known = True
     return found

@@ -3,7 +3,6 @@
 from typing import NamedTuple
 
 import numpy as np
-import warp as wp
 
 from kernels.fusion.compare import compare_views
 from kernels.fusion.views import upload_views
@@ -34,6 +33,14 @@ class Placing(NamedTuple):
     misplaced: bool
 
 
+class _Sample(NamedTuple):
+    """Points of one scan that are compared with the others."""
+
+    points: np.ndarray  # [n, 3] metres, world
+    normals: np.ndarray  # [n, 3] unit, world
+    variance: np.ndarray  # [n] square metres, of each point along its normal
+
+
 def place_scans(scans: list[PreparedScan], voxel: float, *, device: str) -> list[Placing]:
     """Compare every scan with the others and find those that are misplaced, the worst first taken out of the comparison of the rest.
 
@@ -47,38 +54,46 @@ def place_scans(scans: list[PreparedScan], voxel: float, *, device: str) -> list
     reach = max(REACH * extent, 10 * voxel)
     chosen = []
     for number, (there, used) in enumerate(points):
-        normal = np.asarray(scans[number].image.normal).reshape(-1, 3)[used]
+        image = scans[number].image
+        normal = np.asarray(image.normal).reshape(-1, 3)[used]
         usable = np.flatnonzero(normal.any(axis=1))
         picked = np.sort(np.random.default_rng(number).choice(usable, min(SAMPLES, len(usable)), replace=False))
-        world = np.linalg.inv(scans[number].image.camera_from_world)
-        chosen.append((there[picked], normal[picked] @ world[:3, :3].T, used[picked]))
-    distances = [_compared(scans, number, chosen[number][2], reach, device) for number in range(len(scans))]
+        world = np.linalg.inv(image.camera_from_world)
+        turned = normal[picked] @ world[:3, :3].T
+        sight = there[picked] - world[:3, 3]
+        depth = np.asarray(image.depth).ravel()[used[picked]].astype(np.float64)
+        along = np.asarray(image.sigma).ravel()[used[picked]] / depth * np.einsum("ni,ni->n", turned, sight)
+        chosen.append(_Sample(there[picked], turned, along**2))
+    distances = _compared(scans, chosen, reach, device)
     left_out: set[int] = set()
     while True:
-        placings = [_placing(*chosen[number][:2], *distances[number], left_out - {number}, voxel) for number in range(len(scans))]
+        placings = [_placing(chosen[number], *distances[number], left_out - {number}, voxel) for number in range(len(scans))]
         wrong = [number for number, placing in enumerate(placings) if placing.misplaced and number not in left_out]
         if not wrong:
             return [placing._replace(misplaced=number in left_out) for number, placing in enumerate(placings)]
         left_out.add(max(wrong, key=lambda number: placings[number].displacement_m))
 
 
-def _compared(scans: list[PreparedScan], number: int, pixels: np.ndarray, reach: float, device: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distances of pixels of a scan from every scan and their standard deviations, [n, scans] metres, 0 where there is none."""
-    distance, expected = (np.zeros((len(pixels), len(scans)), dtype=np.float32) for _ in range(2))
-    others = [other for other in range(len(scans)) if other != number]
-    while others and len(pixels):
-        batch, size = [number], scans[number].image.depth.size
-        while others and (len(batch) == 1 or size + scans[others[0]].image.depth.size <= BATCH_PIXELS):
-            size += scans[others[0]].image.depth.size
-            batch.append(others.pop(0))
-        views = upload_views([scans[each].image for each in batch], np.zeros(3), device=device)
-        found = compare_views(views, 0, wp.array(pixels.astype(np.int32), dtype=int, device=device), reach=reach, device=device)
-        distance[:, batch[1:]], expected[:, batch[1:]] = (values.numpy()[:, 1:] for values in found)
-    return distance, expected
+def _compared(scans: list[PreparedScan], chosen: list[_Sample], reach: float, device: str) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return for each scan the distances of its points from every scan and their standard deviations, [n, scans] metres, 0 where there is
+    none."""
+    found = [(np.zeros((len(each.points), len(scans)), np.float32), np.zeros((len(each.points), len(scans)), np.float32))
+             for each in chosen]
+    last = 0
+    while last < len(scans):
+        first, size = last, 0
+        while last < len(scans) and (last == first or size + scans[last].image.depth.size <= BATCH_PIXELS):
+            size += scans[last].image.depth.size
+            last += 1
+        views = upload_views([scan.image for scan in scans[first:last]], np.zeros(3), device=device)
+        for number, sample in enumerate(chosen):
+            for whole, part in zip(found[number], compare_views(
+                    views, *sample, skipped=number - first if first <= number < last else -1, reach=reach, device=device), strict=True):
+                whole[:, first:last] = part
+    return found
 
 
-def _placing(points: np.ndarray, normals: np.ndarray, distance: np.ndarray, expected: np.ndarray, left_out: set[int],
-             voxel: float) -> Placing:
+def _placing(sample: _Sample, distance: np.ndarray, expected: np.ndarray, left_out: set[int], voxel: float) -> Placing:
     """Return how a scan lies to those that are not left out."""
     known = expected > 0
     known[:, sorted(left_out)] = False
@@ -87,7 +102,7 @@ def _placing(points: np.ndarray, normals: np.ndarray, distance: np.ndarray, expe
         return Placing(int(seen.sum()), 0.0, 0.0, 0.0, False)
     offset = np.nanmedian(np.where(known[seen], distance[seen], np.nan), axis=1).astype(np.float64)
     sigma = float(np.median(expected[seen][known[seen]]))
-    place, normal = points[seen] - points[seen].mean(axis=0), normals[seen]
+    place, normal = sample.points[seen] - sample.points[seen].mean(axis=0), sample.normals[seen]
     rows = np.concatenate([np.cross(place, normal), normal], axis=1)
     scale = np.array([1 / max(np.abs(place).max(), 1e-12)] * 3 + [1.0] * 3)
     weight, fit = np.ones(len(rows)), np.zeros(len(rows))

@@ -115,11 +115,11 @@ def fuse_surface(scans: list[PreparedScan], names: tuple[str, ...], voxel: float
         volume = integrate(found, views)
         triangles = extract(volume)
         blocks += found.count
-        for place, (number, scan, window) in enumerate(watching):
-            image = scan.image
-            box = slice(window[0], window[1]), slice(window[2], window[3])
-            distance, fate = residuals(volume, views, place)
-            tallies[number].add(distance, np.asarray(image.sigma[box]).ravel(), fate)
+        distance, fate = residuals(volume, views)
+        for place, (number, scan, (top, bottom, left, right)) in enumerate(watching):
+            part = slice(views.first_cell[place], views.first_cell[place + 1])
+            box = slice(top, bottom - 1), slice(left, right - 1)
+            tallies[number].add(distance[part], np.asarray(scan.image.sigma[box])[np.asarray(scan.image.cell[box])], fate[part])
         if len(triangles.faces) == 0:
             continue
         values, normals, seen = _shown(triangles, watching, views, names, voxel, device)
@@ -167,8 +167,13 @@ def _bricks(scans: list[PreparedScan], origin: np.ndarray, voxel: float) -> np.n
         sigma = float(np.asarray(scan.image.sigma).ravel()[used].max())
         depth = float(np.asarray(scan.image.depth).ravel()[used].max())
         reach = max(TRUNCATION_VOXELS * voxel, TRUNCATION_SIGMAS * sigma / LEAST_COSINE) + 2 * voxel + depth / min(scan.image.focal)
-        for sides in np.ndindex(2, 2, 2):
-            found.append(np.unique(np.floor((points - origin + (2 * np.array(sides) - 1) * reach) / size).astype(np.int64), axis=0))
+        low, high = (np.floor((points - origin + side * reach) / size).astype(np.int64) for side in (-1, 1))
+        beyond = int((high - low).max()) + 1
+        base, count = low.min(axis=0), np.ptp(low, axis=0) + 1
+        numbers = np.ravel_multi_index(tuple(np.concatenate([low - base, high - low], axis=1).T), (*count, *[beyond] * 3))
+        ranges = np.stack(np.unravel_index(np.unique(numbers), (*count, *[beyond] * 3)), axis=1)  # few, so that each is looked at alone
+        for step in np.ndindex(*[beyond] * 3):
+            found.append(base + (ranges[:, :3] + step)[(np.array(step) <= ranges[:, 3:]).all(axis=1)])
     return np.unique(np.concatenate(found), axis=0) if found else np.zeros((0, 3), dtype=np.int64)
 
 
@@ -222,7 +227,11 @@ def _shown(triangles: Any, watching: list[Watching], views: ViewArrays, names: t
 def _welded(edge: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the vertices that are kept, [n] int64, and the faces with their numbers: those of one edge of the lattice become one."""
     shared = np.flatnonzero((edge[:, :3] % BRICK_VOXELS == 0).any(axis=1))  # others lie inside of one brick
-    _, first, number = np.unique(edge[shared], axis=0, return_index=True, return_inverse=True)
+    if len(shared) == 0:
+        return np.arange(len(edge)), faces.astype(np.int32)
+    low = edge[shared].min(axis=0)
+    names = np.ravel_multi_index(tuple((edge[shared] - low).T.astype(np.int64)), tuple(np.ptp(edge[shared], axis=0).astype(np.int64) + 1))
+    _, first, number = np.unique(names, return_index=True, return_inverse=True)
     owner = np.arange(len(edge))
     owner[shared] = shared[first][number.ravel()]
     kept = np.flatnonzero(owner == np.arange(len(edge)))

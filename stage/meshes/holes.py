@@ -30,8 +30,14 @@ class Holes(NamedTuple):
 
 def face_areas(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return the area of each face, [F] float64."""
-    corners = points[faces].astype(np.float64)
-    return np.asarray(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2)
+    return np.asarray(np.linalg.norm(area_vectors(points, faces), axis=1) / 2)
+
+
+def area_vectors(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return for each face the vector along its normal that is twice as long as the face is large, [F, 3] float64."""
+    first, second, third = (points.astype(np.float64, copy=False).T[:, corner] for corner in faces.T)
+    (ax, ay, az), (bx, by, bz) = second - first, third - first
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
 
 
 def find_holes(points: np.ndarray, faces: np.ndarray) -> Holes:
@@ -43,10 +49,13 @@ def find_holes(points: np.ndarray, faces: np.ndarray) -> Holes:
     """
     count = np.int64(max(len(points), 1))
     start, end = faces.ravel().astype(np.int64), np.roll(faces, -1, axis=1).ravel().astype(np.int64)
-    keys, first, number = np.unique(np.minimum(start, end) * count + np.maximum(start, end), return_index=True, return_counts=True)
-    del keys
-    border = first[number == 1]
-    begin, finish = start[border], end[border]
+    # each edge as its two vertices, the smaller first, and whether they have changed places: sorted, those of one edge lie side by side
+    keys = np.sort(2 * (np.minimum(start, end) * count + np.maximum(start, end)) + (start > end))
+    first = np.flatnonzero(np.diff(keys >> 1, prepend=-1))
+    number = np.diff(first, append=len(keys))
+    border = keys[first[number == 1]]
+    smaller, larger = (border >> 1) // count, (border >> 1) % count
+    begin, finish = np.where(border & 1, larger, smaller), np.where(border & 1, smaller, larger)
     lengths = np.linalg.norm(points[finish].astype(np.float64) - points[begin], axis=1)
     holes = [_hole(points, begin[chain], finish[chain], closed) for chain, closed in _chains(begin, finish)]
     return Holes(sorted(holes, key=lambda hole: -hole.length_m), float(face_areas(points, faces).sum()), len(border), float(lengths.sum()),
