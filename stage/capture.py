@@ -133,8 +133,12 @@ class Capture:
         return any(isinstance(frame.light, DistantLight | PointLight) and frame.light.polarization != "none"
                    for frame in self.manifest.frames)
 
-    def recorded(self, name: str) -> np.ndarray:
+    def recorded(self, name: str, *, keep_half: bool = False) -> np.ndarray:
         """Read the recorded values of an image that holds radiance, in the part of it that the capture is about.
+
+        Args:
+            name: of the image.
+            keep_half: True to leave half values as the file has them, too.
 
         Returns:
             [rows, cols, 3] uint8 or uint16 as the file has them, or float32; values below 0 are noise.
@@ -143,10 +147,13 @@ class Capture:
             ImageError: the file is unreadable, or a value is NaN, infinite or negative beyond the noise of the image and not to be
                 clipped; the message names the file.
         """
-        return self.part_of(self.recorded_whole(name))
+        return self.part_of(self.recorded_whole(name, keep_half=keep_half))
 
-    def recorded_whole(self, name: str) -> np.ndarray:
+    def recorded_whole(self, name: str, *, keep_half: bool = False) -> np.ndarray:
         """Read the recorded values of a whole image that holds radiance, of any size, as those of other cameras have.
+
+        Args:
+            name, keep_half: as of `recorded`.
 
         Returns:
             [rows, cols, 3] as `recorded`.
@@ -165,7 +172,7 @@ class Capture:
                 self.clipped[name] = count
         else:
             radiances.check_radiance(path, pixels, remedy=radiances.CLIP_NEGATIVE, stray=radiances.RAW_STRAY if path_is_raw(path) else 0.0)
-        return pixels.astype(np.float32, copy=False)
+        return pixels if keep_half and pixels.dtype == np.float16 else pixels.astype(np.float32, copy=False)
 
     def part_of(self, image: np.ndarray) -> np.ndarray:
         """Return the part of a whole image, [rows, cols, ...], that the capture is about."""

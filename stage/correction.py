@@ -5,9 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stage import images
+from stage import exr, images
 from stage.capture import Capture
 from stage.colour import linearise
+from stage.colour_spaces import is_linear
 from stage.errors import ImageError
 from stage.light import OffLight
 from stage.manifest import Frame
@@ -24,10 +25,10 @@ class Radiance(NamedTuple):
 
 
 class CodedRadiance(NamedTuple):
-    """Corrected pixels of one image of integers, where one integer stands for the same radiance everywhere."""
+    """Corrected pixels of one image of integers or of half values, where one code stands for the same radiance everywhere."""
 
-    codes: np.ndarray  # [rows, cols, 3] uint8 or uint16, as recorded
-    values: np.ndarray  # [256] or [65536] float32, the scene-linear radiance of each integer, which rises with it
+    codes: np.ndarray  # [rows, cols, 3] uint8 or uint16 as recorded, or the bits of half values
+    values: np.ndarray  # [256] or [65536] float32, the scene-linear radiance of each code, which rises with the integer or half value
     saturated: np.ndarray | None  # as in Radiance
 
 
@@ -91,24 +92,39 @@ class Correction:
         return Radiance(np.take(coded.values, coded.codes), coded.saturated)
 
     def coded(self, frame: Frame) -> Radiance | CodedRadiance:
-        """Read one frame and correct it, and leave integers as they are where no dark, flat or ambient frame tells pixels apart.
+        """Read one frame and correct it, and leave integers and half values as they are where `has_codes`.
 
         Raises:
             ImageError: as `apply`.
         """
         manifest = self.capture.manifest
-        recorded = self.capture.recorded(frame.image)
+        recorded = self.capture.recorded(frame.image, keep_half=True)
         saturated: np.ndarray | None = None
         limit = manifest.saturation
         if limit is None and self.full_scale and images.read_header(self.capture.file(frame.image)).integer:
             limit = FULL_SCALE
         if limit is not None:
             saturated = _any_from(limit, recorded)
-        coded = recorded.dtype.kind == "u" and manifest.color_matrix is None
-        if coded and self.dark is None and self.flat is None and self.ambient is None:
-            every = np.arange(np.iinfo(recorded.dtype).max + 1, dtype=recorded.dtype)
-            return CodedRadiance(recorded, self.corrected(every, frame), saturated)
+        if self._is_pointwise and (recorded.dtype.kind == "u" or (recorded.dtype == np.float16 and is_linear(manifest.color_space))):
+            codes = recorded if recorded.dtype.kind == "u" else recorded.view(np.uint16)
+            every = np.arange(np.iinfo(codes.dtype).max + 1, dtype=codes.dtype)
+            if recorded.dtype == np.float16:
+                every = every.view(np.float16).astype(np.float32)
+                every[~np.isfinite(every)] = 0  # which no image has
+            return CodedRadiance(codes, self.corrected(every, frame), saturated)
+        if recorded.dtype == np.float16:
+            recorded = recorded.astype(np.float32)
         return Radiance(self.corrected(recorded, frame), saturated)
+
+    def has_codes(self, frame: Frame) -> bool:
+        """Return whether a frame has integers or half values of which each stands for one radiance, as its header tells."""
+        header = images.read_header(self.capture.file(frame.image))
+        return self._is_pointwise and (header.integer or (header.half and is_linear(self.capture.manifest.color_space)))
+
+    @property
+    def _is_pointwise(self) -> bool:
+        """Whether no dark, flat or ambient frame tells pixels apart, and no matrix mixes their channels."""
+        return self.capture.manifest.color_matrix is None and self.dark is None and self.flat is None and self.ambient is None
 
     def at(self, pixels: np.ndarray) -> "Correction":
         """Return the correction of single pixels.
@@ -148,7 +164,7 @@ def _any_from(limit: float, recorded: np.ndarray) -> np.ndarray:
 
     Args:
         limit: a fraction of full scale, or a floating-point value.
-        recorded: [rows, cols, 3] uint8, uint16 or float32.
+        recorded: [rows, cols, 3] uint8, uint16, float16 or float32.
 
     Returns:
         [rows, cols] bool.
@@ -156,6 +172,10 @@ def _any_from(limit: float, recorded: np.ndarray) -> np.ndarray:
     least: np.float32 | int = np.float32(limit)
     if recorded.dtype.kind == "u":  # the first integer that stands for as much; past the last where none does
         least = int(np.searchsorted(images.fractions(recorded.dtype), least))
+    elif recorded.dtype == np.float16:  # as integers, which rise with the values above zero and are below zero with them
+        half = np.float16(min(limit, exr.HALF_MAX))
+        least = int((half if half >= least else np.nextafter(half, np.float16(np.inf))).view(np.int16))
+        recorded = recorded.view(np.int16)
     if recorded.max() < least:
         return np.zeros(recorded.shape[:2], dtype=bool)
     red, green, blue = (recorded[..., channel] >= least for channel in range(3))

@@ -43,6 +43,8 @@ class Header(NamedTuple):
     height: int
     channels: tuple[str, ...]
     metadata: dict[str, Any]
+    half: frozenset[str]
+    """The channels with half values."""
 
 
 class Part(NamedTuple):
@@ -80,14 +82,14 @@ def header_of(source: inputs.Source) -> Header:
         raise ImageError(f"{path}: is damaged or truncated: its header cannot be read")
     if start[5] & DEEP_DATA:
         raise ImageError(f"{path}: has deep data: give a flat image")
-    table = scan_header(path, stream)
+    found = scan_header(path, stream)
     try:
         with source.reopened() as same, OpenEXR.File(same, header_only=True) as file:
             parts = [dict(file.header(index)) for index in range(len(file.parts))]
         windows = [tuple(int(edge) for corner in attributes["dataWindow"] for edge in corner) for attributes in parts]
         left, top, right, bottom = windows[0]
         names = tuple(channel.name for attributes in parts for channel in attributes["channels"])
-        missing = missing_bytes(stream, table, parts)
+        missing = missing_bytes(stream, found.table, parts)
     except (RuntimeError, ValueError, TypeError, KeyError, IndexError) as error:
         raise ImageError(f"{path}: is damaged or truncated: its header cannot be read") from error
     if missing:
@@ -96,7 +98,7 @@ def header_of(source: inputs.Source) -> Header:
         raise ImageError(f"{path}: has parts with different data windows: give an image whose parts have one size")
     if (twice := next((name for name, count in Counter(names).items() if count > 1), None)) is not None:
         raise ImageError(f"{path}: has several parts with a channel {twice}: give an image with one view")
-    return Header(right - left + 1, bottom - top + 1, names, parts[0])
+    return Header(right - left + 1, bottom - top + 1, names, parts[0], found.half)
 
 
 def read(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -157,6 +159,22 @@ def write_parts(path: str | Path, parts: Sequence[Part], *, metadata: Mapping[st
     """
     if checksum:
         metadata = {**metadata, exr_checksum.ATTRIBUTE: exr_checksum.UNSET}
+    with replacing(path) as temporary:
+        encode(temporary, parts, metadata=metadata, path=path)
+        finish(temporary, path=path, checksum=checksum)
+
+
+def encode(temporary: Path, parts: Sequence[Part], *, metadata: Mapping[str, Any], path: str | Path) -> None:
+    """Encode an EXR file into a temporary file.
+
+    Args:
+        temporary: the file that is written.
+        parts, metadata: as of `write_parts`.
+        path: the file that it is for, which messages name.
+
+    Raises:
+        StorageError: the file cannot be written.
+    """
     written: list[tuple[dict[str, Any], dict[str, np.ndarray], str]] = []
     for part in parts:
         header: dict[str, Any] = {"compression": part.compression, "type": OpenEXR.scanlineimage, "colorInteropID": part.color_space}
@@ -166,20 +184,27 @@ def write_parts(path: str | Path, parts: Sequence[Part], *, metadata: Mapping[st
             header["chromaticities"] = declared
         header |= {name: value for name, value in metadata.items() if not written or name in SHARED}
         written.append((header, {name: np.ascontiguousarray(plane) for name, plane in part.channels.items()}, part.name))
-    with replacing(path) as temporary:
-        try:
-            if len(written) == 1:
-                OpenEXR.File(*written[0][:2]).write(str(temporary))
-            else:
-                OpenEXR.File([OpenEXR.Part(*part) for part in written]).write(str(temporary))
-        except RuntimeError as error:
-            raise StorageError(f"cannot write {path}: {_one_line(error)}") from error
-        try:
-            read_header(temporary)
-        except ImageError as error:
-            raise StorageError(f"cannot write {path}: the disk took only part of it") from error
-        if checksum:
-            exr_checksum.write_checksum(temporary)
+    try:
+        if len(written) == 1:
+            OpenEXR.File(*written[0][:2]).write(str(temporary))
+        else:
+            OpenEXR.File([OpenEXR.Part(*part) for part in written]).write(str(temporary))
+    except RuntimeError as error:
+        raise StorageError(f"cannot write {path}: {_one_line(error)}") from error
+
+
+def finish(temporary: Path, *, path: str | Path, checksum: bool) -> None:
+    """Check that a temporary file is whole, and put its checksum into it where one is wanted.
+
+    Raises:
+        StorageError: the disk took only part of the file; the message names `path`.
+    """
+    try:
+        read_header(temporary)
+    except ImageError as error:
+        raise StorageError(f"cannot write {path}: the disk took only part of it") from error
+    if checksum:
+        exr_checksum.write_checksum(temporary)
 
 
 SHARED = ("pixelAspectRatio", "framesPerSecond")

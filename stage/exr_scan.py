@@ -7,7 +7,7 @@ import os
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 from stage.errors import ImageError
 
@@ -21,17 +21,25 @@ SEVERAL_PARTS = 0x10
 """The bit of the second byte of the version that says that the file has several parts."""
 CHANNEL_BYTES = 16
 """The bytes of a channel behind its name: type, linearity and two sampling rates."""
+HALF = struct.pack("<i", 1)
+"""The type of a channel of half values."""
 
 
-def scan_header(path: Path, stream: BinaryIO) -> int:
+class Scan(NamedTuple):
+    """What was found in the headers of all parts."""
+
+    table: int
+    """The position of the first byte behind them: of the tables of chunk offsets."""
+    half: frozenset[str]
+    """The names of the channels with half values."""
+
+
+def scan_header(path: Path, stream: BinaryIO) -> Scan:
     """Check how much the header of an EXR file holds.
 
     Args:
         path: of the file, for messages.
         stream: the file.
-
-    Returns:
-        The position of the first byte behind the headers of all parts: of the tables of chunk offsets.
 
     Raises:
         ImageError: the header has too many attributes, parts or channels, is too long, or is cut short.
@@ -40,6 +48,7 @@ def scan_header(path: Path, stream: BinaryIO) -> int:
     head = stream.read(min(os.fstat(stream.fileno()).st_size, MAX_HEADER_BYTES))
     several = len(head) > 8 and bool(head[5] & SEVERAL_PARTS)
     at, attributes, channels = 8, 0, 0
+    half: set[str] = set()
     for part in range(MAX_PARTS + 1):
         if part == MAX_PARTS:
             raise ImageError(f"{path}: has more than {MAX_PARTS} parts")
@@ -52,7 +61,11 @@ def scan_header(path: Path, stream: BinaryIO) -> int:
             if size < 0 or end > len(head):
                 raise _broken(path, head)
             if head[name : kind - 1] == b"chlist":
-                channels += sum(1 for _ in _channels(path, head, begin, end, MAX_CHANNELS - channels))
+                for channel in _channels(path, head, begin, end, MAX_CHANNELS - channels):
+                    channels += 1
+                    kind = _name(path, head, channel)
+                    if head[kind : kind + len(HALF)] == HALF:
+                        half.add(head[channel : kind - 1].decode(errors="replace"))
             attributes += 1
             if attributes > MAX_ATTRIBUTES:
                 raise ImageError(f"{path}: has more than {MAX_ATTRIBUTES} attributes in its header")
@@ -61,8 +74,8 @@ def scan_header(path: Path, stream: BinaryIO) -> int:
         if not several:
             break
         if head[at : at + 1] == b"\0":  # an empty header ends the list of headers
-            return at + 1
-    return at
+            return Scan(at + 1, frozenset(half))
+    return Scan(at, frozenset(half))
 
 
 def _channels(path: Path, head: bytes, at: int, end: int, most: int) -> Iterator[int]:

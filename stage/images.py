@@ -34,6 +34,7 @@ class ImageHeader(NamedTuple):
     integer: bool  # integers, whose largest value a camera writes for everything brighter too
     orientation: int = UPRIGHT  # in which the pixels are recorded, a key of `stage.orientation.TURNS`; they are read upright
     exposure: Exposure = Exposure()  # as EXIF says
+    half: bool = False  # whether all colour channels hold half values
 
 
 class Decoder(Protocol):
@@ -78,7 +79,8 @@ def header_of(source: inputs.Source) -> ImageHeader:
     path, suffix = source.path, source.path.suffix.lower()
     if suffix == ".exr":
         header = exr.header_of(source)
-        return ImageHeader(header.width, header.height, len(_colour_channels(path, header.channels)), len(header.channels), False)
+        colours = _colour_channels(path, header.channels)
+        return ImageHeader(header.width, header.height, len(colours), len(header.channels), False, half=header.half.issuperset(colours))
     _check_suffix(path)
     if suffix == ".png":
         integrity.check_png(path, source.file, contents=False)
@@ -147,7 +149,7 @@ def recorded_of(source: inputs.Source) -> np.ndarray:
         planes = [channels[name] for name in _colour_channels(path, tuple(channels))]
         if any(plane.dtype == np.uint32 for plane in planes):
             raise ImageError(f"{path}: holds integer identifiers, not radiance")
-        pixels = np.stack(planes, axis=-1)
+        pixels = np.moveaxis(np.stack(planes), 0, -1)  # planar in memory: what works on values alone leaves them so
     else:
         pixels = _decoded(source, suffix)
     return np.repeat(pixels, 3, axis=-1) if pixels.shape[-1] == 1 else pixels

@@ -6,7 +6,7 @@ import math
 import os
 import threading
 import zlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,10 +32,15 @@ CACHE_FOLDER = ".relit"
 """The folder of the cache inside the folder of a capture."""
 ALIGNED = "aligned-"
 """The prefix of the keys of aligned stacks: the cache keeps one aligned stack, and one of the frames as recorded."""
-DECODE_BYTES = 1 << 30
+DECODE_BYTES = 2 << 30
 """The bytes that all images which are decoded at one time may take."""
-BYTES_PER_PIXEL, ALIGNED_BYTES_PER_PIXEL = 40, 160
-"""The bytes of a pixel while its image is corrected (half and float RGB, masks, the planes to write), and while it is warped."""
+CODED_BYTES_PER_PIXEL, BYTES_PER_PIXEL, ALIGNED_BYTES_PER_PIXEL = 20, 40, 160
+"""The bytes of a pixel while its image is looked up in a table (file, codes, a plane to write), while it is corrected (half and float RGB,
+masks, planes to write), and while it is warped."""
+LOOK_UP_CODES = 1 << 16
+"""Codes that are looked up at one time: their positions are half a megabyte, which stays in the second-level cache."""
+LARGEST_FACTOR = 126
+"""Exponents below this make a factor that is a normal float32, with which a product is exact; `ldexp` takes eight times as long."""
 FLOATING = {".exr", ".hdr"}
 """Suffixes of images without integers: no value of theirs is known to be clipped unless the capture says so."""
 TOP_EXPONENT = 15
@@ -175,9 +180,8 @@ def _build(capture: Capture, frames: list[Frame], alignment: Alignment | None, f
         def take(light: int, warp: Warp | None) -> None:
             nonlocal done
             radiance = correction.coded(frames[light]) if warp is None else warp(light, correction.apply(frames[light]))
-            planes, scale[light] = _to_half(radiance)
-            for channel in range(CHANNELS):
-                plane = np.ascontiguousarray(planes[..., channel])
+            planes, scale[light] = half_planes(radiance)
+            for channel, plane in enumerate(planes):
                 checksums[channel, light] = stack_checksums.of_plane(plane, padding)
                 _write_all(file.fileno(), plane, start + 2 * (channel * lights + light) * pixels)
             with lock:
@@ -190,7 +194,9 @@ def _build(capture: Capture, frames: list[Frame], alignment: Alignment | None, f
         batches: Iterable[tuple[Sequence[int], Warp | None]] = [(range(len(frames)), None)]
         if alignment is not None:
             batches = alignment.batches(correction)
-        bytes_per_pixel = BYTES_PER_PIXEL if alignment is None else ALIGNED_BYTES_PER_PIXEL
+        bytes_per_pixel = ALIGNED_BYTES_PER_PIXEL
+        if alignment is None:
+            bytes_per_pixel = CODED_BYTES_PER_PIXEL if correction.has_codes(frames[0]) else BYTES_PER_PIXEL
         workers = max(1, min(os.cpu_count() or 1, DECODE_BYTES // (bytes_per_pixel * math.prod(capture.image_resolution))))
         with ThreadPoolExecutor(workers, thread_name_prefix="relit-ingest") as pool:
             try:
@@ -214,23 +220,49 @@ def _build(capture: Capture, frames: list[Frame], alignment: Alignment | None, f
     return built
 
 
-def _to_half(radiance: Radiance | CodedRadiance) -> tuple[np.ndarray, float]:
-    """Return the half values of an image and the radiance of a stored 1.0, a power of two so that half images keep their bits."""
+def half_planes(radiance: Radiance | CodedRadiance) -> tuple[Iterator[np.ndarray], float]:
+    """Return the half planes of the channels of an image, [pixels] each, and the radiance of a stored 1.0, a power of two so that half
+    images keep their bits."""
+    values: np.ndarray
     if isinstance(radiance, CodedRadiance):
-        lowest, highest = int(radiance.codes.min()), int(radiance.codes.max())
-        values = np.zeros(highest + 1, dtype=np.float32)
-        values[lowest:] = radiance.values[lowest : highest + 1]
-        half, scale = _scaled(values)
-        return np.take(half, radiance.codes), scale
-    return _scaled(radiance.pixels)
+        codes, values = radiance.codes, radiance.values
+        least, most = int(codes.min()), int(codes.max())
+        # where codes are the bits of half values, `most` is the lowest value below zero if there is one, and this the highest
+        signed = int(codes.view(np.int16).max()) % len(values) if codes.dtype == np.uint16 else most
+        present = values[[least, most, signed]]
+    else:
+        codes, values = None, radiance.pixels
+        present = values
+    peak = max(float(present.max()), -float(present.min()))
+    exponent = math.frexp(peak)[1] - TOP_EXPONENT if peak else 0
+
+    def planes() -> Iterator[np.ndarray]:
+        if codes is None:
+            for channel in range(CHANNELS):
+                yield _scaled(values[..., channel], exponent).reshape(-1)
+            return
+        half = _scaled(values, exponent)
+        for channel in range(CHANNELS):
+            yield _look_up(half, codes[..., channel])
+
+    return planes(), math.ldexp(1.0, exponent)
 
 
-def _scaled(values: np.ndarray) -> tuple[np.ndarray, float]:
-    peak = max(float(values.max()), -float(values.min()))
-    if peak == 0.0:
-        return np.zeros_like(values, dtype=np.float16), 1.0
-    exponent = math.frexp(peak)[1] - TOP_EXPONENT
-    return np.ldexp(values, -exponent).astype(np.float16), math.ldexp(1.0, exponent)
+def _scaled(values: np.ndarray, exponent: int) -> np.ndarray:
+    """Return values divided by a power of two as half; those of codes that the image does not have may overflow."""
+    factor = np.float32(math.ldexp(1.0, -exponent)) if abs(exponent) < LARGEST_FACTOR else None
+    with np.errstate(over="ignore"):
+        return (np.ldexp(values, -exponent) if factor is None else values * factor).astype(np.float16)
+
+
+def _look_up(table: np.ndarray, codes: np.ndarray) -> np.ndarray:
+    """Return the entries of a table for codes, [codes], a piece at a time: NumPy makes 64-bit positions of all codes that it is given."""
+    flat = np.ascontiguousarray(codes).reshape(-1)
+    found = np.empty(len(flat), dtype=table.dtype)
+    for first in range(0, len(flat), LOOK_UP_CODES):
+        piece = slice(first, first + LOOK_UP_CODES)
+        np.take(table, flat[piece], out=found[piece], mode="clip")  # checks of the range would make a copy
+    return found
 
 
 def _write_all(descriptor: int, plane: np.ndarray, offset: int) -> None:

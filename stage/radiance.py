@@ -31,6 +31,8 @@ ROUNDING = 1e-6
 RAW_STRAY = 1e-3
 """The part of the pixels of a camera raw image that may be below the noise: sensors have dead pixels, and the colours between pixels have
 less noise than the recorded ones, so that the measured noise is below that of the latter. A wrong black level moves all dark pixels."""
+HALF_INFINITY = 0x7C00
+"""The bits of the half value infinity; NaN and values below zero have larger ones."""
 CLIP_NEGATIVE = "--clip-negative sets such values to 0"
 """What an error message says where the command has this option."""
 
@@ -47,8 +49,12 @@ def check_radiance(path: str | Path, pixels: np.ndarray, *, remedy: str = "mend 
     Raises:
         ImageError: some values are; the message counts the pixels and names the first.
     """
+    if _is_plain_half(pixels):
+        return
     check_finite(path, pixels)
     floor = noise_floor(pixels)
+    if (pixels.min(axis=(0, 1)) >= floor).all():
+        return
     negative = pixels < floor
     if negative.any() and negative.any(axis=-1).mean() > stray:
         found = _found(negative, "negative")
@@ -61,6 +67,8 @@ def check_finite(path: str | Path, pixels: np.ndarray) -> None:
     Raises:
         ImageError: some values are; the message counts the pixels and names the first.
     """
+    if _is_plain_half(pixels):
+        return
     infinite = ~np.isfinite(pixels)
     if infinite.any():
         raise ImageError(f"{path}: {_found(infinite, 'not finite (NaN or infinity)')}: mend the image")
@@ -112,6 +120,11 @@ def noise_floor(pixels: np.ndarray) -> np.ndarray:
         values = pixels[..., channel].astype(np.float32, copy=False)
         floor[channel] = -max(NOISE_SIGMAS * _noise_near_zero(values, -lowest[channel]), ROUNDING * float(values.max()))
     return floor
+
+
+def _is_plain_half(pixels: np.ndarray) -> bool:
+    """Return whether pixels are half values that are finite and not below zero: their bits are then below those of infinity."""
+    return pixels.dtype == np.float16 and pixels.size > 0 and int(pixels.view(np.uint16).max()) < HALF_INFINITY
 
 
 def _noise_near_zero(values: np.ndarray, most: float) -> float:

@@ -1,6 +1,8 @@
 """Linear frames as weighted sums of the captured images; all frames of a chunk are computed in one pass over the images."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -8,20 +10,53 @@ from kernels import packs
 from kernels.relight.many_frames import combine_batch
 from kernels.relight.one_frame import combine
 from service.requests.relight import CHUNK_FRAMES
-from stage.stack import Stack
+from stage.exr_rows import BLOCK_ROWS
+from stage.stack import PIXEL_PAD, Stack
 
 CHUNK_BYTES = 256 << 20
 """Most bytes of linear frames, in float32, in a chunk. Two chunks are in memory at one time: one is computed while the previous one is
 written."""
 
 
+BLOCK_BYTES = 512 << 20
+"""Most bytes of a block of rows: the readings of its pixels, and its linear frames. Two blocks are in memory at one time."""
+
+
+class RowBlock(NamedTuple):
+    """Rows of an image."""
+
+    first: int
+    last: int
+    """Behind the last row."""
+    pixels: slice
+    """Their pixels in the stack; those of the last rows include its padding."""
+
+
 def chunk_frames(stack: Stack) -> int:
-    """Return how many frames a chunk holds."""
+    """Return how many whole frames a chunk holds."""
     channels, _, pixels = stack.shape
     return max(1, min(CHUNK_FRAMES, CHUNK_BYTES // (4 * channels * pixels)))
 
 
-def linear_frames(stack: Stack, weights: np.ndarray, places: Sequence[int] | None, *, device: str) -> np.ndarray:
+def row_blocks(stack: Stack, width: int, pictures: int) -> Iterator[RowBlock]:
+    """Yield blocks of rows whose readings and pictures fit in memory, from the top to the bottom.
+
+    Args:
+        stack: the images.
+        width: of an image.
+        pictures: pictures of three channels that are made of the rows of a block.
+    """
+    channels, lights, _ = stack.shape
+    multiple = math.lcm(BLOCK_ROWS, PIXEL_PAD)  # whole chunks of EXR files and whole packs of pixels
+    step = max(multiple, BLOCK_BYTES // (channels * (2 * lights + 4 * pictures) * width) // multiple * multiple)
+    height = stack.pixel_count // width
+    for first in range(0, height, step):
+        last = min(first + step, height)
+        yield RowBlock(first, last, slice(first * width, stack.shape[2] if last == height else last * width))
+
+
+def linear_frames(stack: Stack, weights: np.ndarray, places: Sequence[int] | None, *, device: str,
+                  pixels: slice | None = None) -> np.ndarray:
     """Return the frames of one chunk.
 
     Args:
@@ -31,20 +66,23 @@ def linear_frames(stack: Stack, weights: np.ndarray, places: Sequence[int] | Non
             frames that are made later must be identical to the last bit. None: a single frame that is the whole job, for which a
             faster product is used.
         device: where.
+        pixels: of a block of rows; None: all.
 
     Returns:
         [frames, 3, pixels] float32 radiance in the stack's scene-linear space, unclipped.
     """
-    channels, _, pixels = stack.shape
+    channels, _, count = stack.shape
+    begin, end, _ = (pixels or slice(None)).indices(count)
     placed = weights
     if places is not None:
         placed = np.zeros((max(places) + 1, *weights.shape[1:]), dtype=np.float32)
         placed[list(places)] = weights
-    frames = np.empty((len(weights), channels, pixels), dtype=np.float32)
-    for start, stop in stack.bands(4 * channels * CHUNK_FRAMES):
+    frames = np.empty((len(weights), channels, end - begin), dtype=np.float32)
+    for start, stop in stack.bands(4 * channels * CHUNK_FRAMES) if pixels is None else [(begin, end)]:
         band = packs.upload(stack.band(start, stop), device=device)
+        place = slice(start - begin, stop - begin)
         if places is None:
-            frames[0, :, start:stop] = combine(band, weights[0]).numpy()
+            frames[0, :, place] = combine(band, weights[0]).numpy()
         else:
-            frames[:, :, start:stop] = combine_batch(band, placed).numpy()[list(places)]
-    return frames[:, :, : stack.pixel_count]
+            frames[:, :, place] = combine_batch(band, placed).numpy()[list(places)]
+    return frames[:, :, : min(end, stack.pixel_count) - begin]

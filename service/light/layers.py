@@ -50,6 +50,10 @@ class StillLayer(NamedTuple):
     is_colour: bool
     """Whether the channels are colours in the colour space of the frames; else they are data."""
 
+    def rows(self, first: int, last: int) -> "StillLayer":
+        """Return the rows from `first` until before `last`."""
+        return self._replace(channels={name: plane[first:last] for name, plane in self.channels.items()})
+
 
 def check_layers(options: PictureOptions, maps: Path | None) -> None:
     """Refuse layers that need maps where none are given, and layers of data that a lossy compression would change.

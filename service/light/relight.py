@@ -4,7 +4,7 @@ Source: light is additive, so that images under single lights sum to an image un
 "Acquiring the Reflectance Field of a Human Face", SIGGRAPH 2000, section 3.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import groupby, islice
 from pathlib import Path
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from kernels import device as devices
 from kernels.relight.environment import Weighting
 from service.light.attributes import time_attributes
 from service.light.clipping import Clipping
-from service.light.combine import chunk_frames, linear_frames
+from service.light.combine import chunk_frames, linear_frames, row_blocks
 from service.light.findings import FrameFindings, MatteFindings
 from service.light.groups import add_up, in_groups
 from service.light.guide import Guide
@@ -29,7 +29,7 @@ from service.light.write import FrameFile, FrameFormat, FrameWriter
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import metadata, report
 from service.requests.picture import Layer
-from service.requests.relight import RelightRequest
+from service.requests.relight import CHUNK_FRAMES, RelightRequest
 from stage.brackets import merge_brackets
 from stage.files import write_text
 from stage.stack import Stack
@@ -152,8 +152,9 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
     provenance = metadata(request, capture=opened.capture.name, inputs=stack.key, near_lights=opened.near_lights)
     if plan.keys is not None and plan.keys.frames_per_second is not None:
         provenance["relit:frames_per_second"] = f"{plan.keys.frames_per_second:g}"
-    size = max(1, chunk_frames(stack) // max(1, len(plan.groups)))
     alone = plan.total == 1 or plan.is_sequence  # decided from the whole range, so that --only gives bit-identical frames
+    in_rows = guide is None and not alone and chunk_frames(stack) < CHUNK_FRAMES  # a model looks at whole frames
+    size = max(1, (CHUNK_FRAMES if in_rows else chunk_frames(stack)) // max(1, len(plan.groups)))
     use = ModelUse.NONE if guide is None else ModelUse.FRAME if alone or size < RANGE_FRAMES else ModelUse.RANGE
     lighting = CaptureLighting(opened.lights, stack, plan.environments, opened.space, weighting=Weighting[request.weighting.name],
                                device=device, model=use)
@@ -168,6 +169,15 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
         findings.add_beyond(numbers, [each.share_beyond for each in light], lighting.beyond_degrees)
         findings.add_clipped(numbers, weights, clipping)
         places = None if alone else [frame.position % size for frame, _ in chunk]
+        files = [FrameFile(frame.path, 2.0**frame.scheduled.exposure_stops,
+                           {**provenance, **frame.scheduled.metadata, **time_attributes(frame.scheduled.number, plan.rate),
+                            REQUEST_ATTRIBUTE: request_hash}) for frame, request_hash in chunk]
+        groups = dict.fromkeys(plan.groups, light)  # a single one is the light of the frame
+        for name, each in zip(plan.groups, single_lights, strict=False):
+            groups[name] = list(islice(each, len(chunk)))
+        if in_rows:
+            _write_rows(files, form, weights, stack, places, groups, writer, device, timings)
+            continue
         with timings.part("product"):
             frames = linear_frames(stack, weights, places, device=device)
         colours: dict[str, np.ndarray] = {}
@@ -176,15 +186,24 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
                 specular = _guide(guide, frames, light, places, specular=bool(form.parts))
             if specular is not None:
                 colours[Layer.SPECULAR] = specular
-        if plan.groups:
+        if groups:
             with timings.part("single lights"):
-                given = [list(islice(each, len(chunk))) for each in single_lights]
-                colours |= _lights_alone(plan.groups, given, frames, stack, places, guide, device)
-        files = [FrameFile(frame.path, 2.0**frame.scheduled.exposure_stops,
-                           {**provenance, **frame.scheduled.metadata, **time_attributes(frame.scheduled.number, plan.rate),
-                            REQUEST_ATTRIBUTE: request_hash}) for frame, request_hash in chunk]
+                colours |= _lights_alone(groups, frames, stack, places, guide, device)
         with timings.part("waiting for files"):
             writer.put(files, frames, form, colours)
+
+
+def _write_rows(files: Sequence[FrameFile], form: FrameFormat, weights: np.ndarray, stack: Stack, places: Sequence[int] | None,
+                groups: Mapping[str, Sequence[FrameLight]], writer: FrameWriter, device: str, timings: Timings) -> None:
+    """Make the frames of a chunk without a model, some rows of all of them at a time: the images are read once for the whole chunk."""
+    with writer.in_rows(files, form) as put:
+        for block in row_blocks(stack, form.resolution[0], len(files) * (1 + len(groups))):
+            with timings.part("product"):
+                frames = linear_frames(stack, weights, places, device=device, pixels=block.pixels)
+            with timings.part("single lights"):
+                colours = _lights_alone(groups, frames, stack, places, None, device, block.pixels)
+            with timings.part("waiting for files"):
+                put(block.first, block.last, frames, colours)
 
 
 def _guide(guide: Guide, frames: np.ndarray, lights: Sequence[FrameLight], places: Sequence[int] | None, *,
@@ -196,14 +215,14 @@ def _guide(guide: Guide, frames: np.ndarray, lights: Sequence[FrameLight], place
     return guide.correct(frames, [each.model for each in lights if each.model is not None], specular=specular)
 
 
-def _lights_alone(names: Sequence[str], lights: Sequence[Sequence[FrameLight]], frames: np.ndarray, stack: Stack,
-                  places: Sequence[int] | None, guide: Guide | None, device: str) -> dict[str, np.ndarray]:
+def _lights_alone(groups: Mapping[str, Sequence[FrameLight]], frames: np.ndarray, stack: Stack,
+                  places: Sequence[int] | None, guide: Guide | None, device: str, pixels: slice | None = None) -> dict[str, np.ndarray]:
     """Return the frames under each light alone, which add up to the frames [frames, 3, pixels], by the names of their layers."""
-    if len(names) == 1:
-        return {names[0]: frames.copy()}
+    if len(groups) == 1:
+        return {name: frames.copy() for name in groups}
     found = {}
-    for name, light in zip(names, lights, strict=True):
-        found[name] = linear_frames(stack, np.stack([each.weights for each in light]), places, device=device)
+    for name, light in groups.items():
+        found[name] = linear_frames(stack, np.stack([each.weights for each in light]), places, device=device, pixels=pixels)
         if guide is not None:
             _guide(guide, found[name], light, places, specular=False)
     if guide is not None and found:

@@ -1,10 +1,13 @@
 """Linear frames become half EXR files with exposure, output space, matte, clipping, layers and metadata; threads write them while the next
 frames are computed."""
 
+import sys
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent import futures
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Self
@@ -15,7 +18,7 @@ from kernels import device as devices
 from service.light.attributes import camera_attributes
 from service.light.layers import StillLayer, in_parts
 from service.requests.picture import FrameCompression, Layer, PictureOptions
-from stage import exr
+from stage import exr, exr_rows
 from stage.camera import Camera
 from stage.colour import rgb_matrix
 from stage.matte import Matte
@@ -27,6 +30,8 @@ COMPRESSIONS = {FrameCompression.ZIP: exr.Compression.ZIP, FrameCompression.PIZ:
 BEAUTY_PART = "rgba"
 """The name of the part that holds the picture, as Nuke calls it."""
 ALPHA = "A"
+PutRows = Callable[[int, int, np.ndarray, Mapping[str, np.ndarray]], None]
+"""A function that takes a block of rows of frames, as `FrameWriter.in_rows` says."""
 
 
 class FrameFormat(NamedTuple):
@@ -66,6 +71,13 @@ class FrameFormat(NamedTuple):
                    tuple(layer for layer in (Layer.DIFFUSE, Layer.SPECULAR) if layer in options.aov), in_parts(options),
                    None if matte is None else matte.coverage.astype(np.float16), factor, camera_attributes(camera))
 
+    def rows(self, first: int, last: int) -> "FrameFormat":
+        """Return the format of the rows of frames from `first` until before `last`."""
+        width, _ = self.resolution
+        return self._replace(resolution=(width, last - first), layers=tuple(layer.rows(first, last) for layer in self.layers),
+                             alpha=None if self.alpha is None else self.alpha[first:last],
+                             factor=None if self.factor is None else self.factor[first * width : last * width])
+
 
 class FrameFile(NamedTuple):
     """The path, exposure and metadata of one frame."""
@@ -97,6 +109,7 @@ class FrameWriter:
         self._pool = ThreadPoolExecutor(devices.worker_count(), thread_name_prefix="relit-write")
         self._pending: list[Future[None]] = []
         self._lock = threading.Lock()
+        self._told = 0
         self.written = Written(0, 0, 0.0, 0.0)
 
     def __enter__(self) -> Self:
@@ -128,6 +141,49 @@ class FrameWriter:
         self._pending = [self._pool.submit(self._write, file, frame, {name: layer[index] for name, layer in colours.items()}, form)
                          for index, (file, frame) in enumerate(zip(files, frames, strict=True))]
 
+    @contextmanager
+    def in_rows(self, files: Sequence[FrameFile], form: FrameFormat) -> Iterator[PutRows]:
+        """Yield a function that takes a block of rows of all frames of a chunk; when the block ends, the frames become files.
+
+        The function gets the first row and the one behind the last, the frames [frames, 3, pixels] and further layers as `put` does. It
+        waits until the block before is written, then begins to write this one.
+
+        Args:
+            files: one for each frame.
+            form: the format of these frames.
+
+        Raises:
+            StorageError: a frame cannot be written; none of this chunk is left behind.
+        """
+        self.wait()
+        height, begun = form.resolution[1], self.written.frames
+        growing = [exr_rows.growing(file.path, rows=height, metadata={**form.attributes, **file.metadata}, checksum=True) for file in files]
+        opened: list[tuple[Any, exr_rows.RowFile]] = []
+
+        def put(first: int, last: int, frames: np.ndarray, colours: Mapping[str, np.ndarray]) -> None:
+            self.wait()
+            with self._lock:
+                self._tell(begun + len(files) * first // height)
+            part = form.rows(first, last)
+            self._pending = [self._pool.submit(self._append, to, file, frame, {name: layer[index] for name, layer in colours.items()}, part)
+                             for index, ((_, to), file, frame) in enumerate(zip(opened, files, frames, strict=True))]
+
+        try:
+            for each in growing:
+                opened.append((each, each.__enter__()))
+            yield put
+            self.wait()
+        except BaseException:
+            for job in self._pending:
+                job.cancel()
+            futures.wait(self._pending)
+            self._pending.clear()
+            for each, _ in opened:
+                with suppress(BaseException):  # which it raises again
+                    each.__exit__(*sys.exc_info())
+            raise
+        self._pending = [self._pool.submit(self._end, each) for each, _ in opened]
+
     def wait(self) -> None:
         """Wait until everything that was handed over is written."""
         pending, self._pending = self._pending, []
@@ -136,29 +192,58 @@ class FrameWriter:
 
     def _write(self, file: FrameFile, frame: np.ndarray, colours: Mapping[str, np.ndarray], form: FrameFormat) -> None:
         began = time.perf_counter()
-        frame = _finished(frame, file, form)
-        clipped = int(((frame > exr.HALF_MAX) | (frame < -exr.HALF_MAX)).any(axis=0).sum())
-        picture = _half(frame, form, "")
-        if form.alpha is not None:
-            picture[ALPHA] = form.alpha
-        parts = [exr.Part(BEAUTY_PART, picture, form.space, COMPRESSIONS[form.compression])]
-        layers = {name: _finished(layer, file, form) for name, layer in colours.items()}
-        if Layer.DIFFUSE in form.parts:
-            layers[Layer.DIFFUSE] = frame - layers[Layer.SPECULAR]
-        for name, layer in layers.items():
-            if name != Layer.SPECULAR or name in form.parts:
-                parts.append(exr.Part(name, _half(layer, form, f"{name}."), form.space, COMPRESSIONS[form.compression]))
-        parts += [exr.Part(layer.name, layer.channels, form.space if layer.is_colour else exr.DATA) for layer in form.layers]
+        parts, clipped = _parts(file, frame, colours, form)
         halved = time.perf_counter()
-        if not form.in_parts:
-            parts = [parts[0]._replace(channels={name: plane for part in parts for name, plane in part.channels.items()})]
         exr.write_parts(file.path, parts, metadata={**form.attributes, **file.metadata}, checksum=True)
+        self._count(1, clipped, began, halved)
+
+    def _append(self, to: exr_rows.RowFile, file: FrameFile, frame: np.ndarray, colours: Mapping[str, np.ndarray],
+                form: FrameFormat) -> None:
+        began = time.perf_counter()
+        parts, clipped = _parts(file, frame, colours, form)
+        halved = time.perf_counter()
+        to.append(parts)
+        self._count(0, clipped, began, halved)
+
+    def _end(self, growing: AbstractContextManager[exr_rows.RowFile]) -> None:
+        began = time.perf_counter()
+        growing.__exit__(None, None, None)
+        self._count(1, 0, began, began)
+
+    def _count(self, frames: int, clipped: int, began: float, halved: float) -> None:
+        """Add frames that are files, clipped pixels, and the seconds until and since `halved`."""
         ended = time.perf_counter()
         with self._lock:
             before = self.written
-            self.written = Written(before.frames + 1, before.clipped + clipped, before.half_s + halved - began,
+            self.written = Written(before.frames + frames, before.clipped + clipped, before.half_s + halved - began,
                                    before.file_s + ended - halved)
-            self._done(self.written.frames)
+            if frames:
+                self._tell(self.written.frames)
+
+    def _tell(self, frames: int) -> None:
+        """Tell the count of frames, which rows that are written have raised already; the lock is held."""
+        self._told = max(self._told, frames)
+        self._done(self._told)
+
+
+def _parts(file: FrameFile, frame: np.ndarray, colours: Mapping[str, np.ndarray], form: FrameFormat) -> tuple[list[exr.Part], int]:
+    """Return what the file of a frame holds, of the whole frame or of rows, and the number of clipped pixels."""
+    frame = _finished(frame, file, form)
+    clipped = int(((frame > exr.HALF_MAX) | (frame < -exr.HALF_MAX)).any(axis=0).sum()) if _is_beyond_half(frame) else 0
+    picture = _half(frame, form, "")
+    if form.alpha is not None:
+        picture[ALPHA] = form.alpha
+    parts = [exr.Part(BEAUTY_PART, picture, form.space, COMPRESSIONS[form.compression])]
+    layers = {name: _finished(layer, file, form) for name, layer in colours.items()}
+    if Layer.DIFFUSE in form.parts:
+        layers[Layer.DIFFUSE] = frame - layers[Layer.SPECULAR]
+    for name, layer in layers.items():
+        if name != Layer.SPECULAR or name in form.parts:
+            parts.append(exr.Part(name, _half(layer, form, f"{name}."), form.space, COMPRESSIONS[form.compression]))
+    parts += [exr.Part(layer.name, layer.channels, form.space if layer.is_colour else exr.DATA) for layer in form.layers]
+    if not form.in_parts:
+        parts = [parts[0]._replace(channels={name: plane for part in parts for name, plane in part.channels.items()})]
+    return parts, clipped
 
 
 def _finished(frame: np.ndarray, file: FrameFile, form: FrameFormat) -> np.ndarray:
@@ -172,5 +257,12 @@ def _finished(frame: np.ndarray, file: FrameFile, form: FrameFormat) -> np.ndarr
 
 def _half(frame: np.ndarray, form: FrameFormat, prefix: str) -> dict[str, np.ndarray]:
     """Return the channels as half, clipped."""
-    planes = np.clip(frame, -exr.HALF_MAX, exr.HALF_MAX).astype(np.float16).reshape(3, form.resolution[1], form.resolution[0])
+    if _is_beyond_half(frame):
+        frame = np.clip(frame, -exr.HALF_MAX, exr.HALF_MAX)
+    planes = frame.astype(np.float16).reshape(3, form.resolution[1], form.resolution[0])
     return {prefix + name: plane for name, plane in zip("RGB", planes, strict=True)}
+
+
+def _is_beyond_half(frame: np.ndarray) -> bool:
+    """Return whether a value has to be clipped, by two passes over the frame that take less than counting or clipping."""
+    return bool(frame.max() > exr.HALF_MAX or frame.min() < -exr.HALF_MAX)

@@ -116,6 +116,28 @@ def test_integers_with_the_table_of_their_radiance_are_the_corrected_pixels(tmp_
     assert np.array_equal(without.apply(frame).pixels, flat.apply(frame).pixels)
 
 
+@pytest.mark.parametrize("limit", [0.0625, 0.3, 5.0])
+def test_half_values_with_the_table_of_their_radiance_are_the_corrected_pixels(tmp_path, limit):
+    image = RNG.normal(0, 0.01, (64, 64, 3)).astype(np.float16)  # noise around zero, as after the subtraction of a dark image
+    image[:32] += np.float16(0.3)
+    image[3, 5, 1] = limit
+    write_exr(tmp_path / "000.exr", image, np.float16)
+    data = manifest_of(SCENE, mask=None, saturation=limit)
+    data["camera"]["resolution"] = [64, 64]
+    write_manifest(tmp_path, {**data, "frames": [{**data["frames"][0], "image": "000.exr", "exposure_s": 0.3}]})
+    capture = Capture.open(tmp_path)
+    frame, without = capture.sources()[0], Correction.of(capture)
+    coded = without.coded(frame)
+    assert isinstance(coded, CodedRadiance)
+    assert without.has_codes(frame)
+    flat = Correction(capture, None, np.ones((64, 64, 3), np.float32), None)  # which divides every pixel by one
+    assert isinstance(flat.coded(frame), Radiance)
+    assert np.array_equal(without.apply(frame).pixels, flat.apply(frame).pixels)
+    wanted = (image.astype(np.float32) >= np.float32(limit)).any(axis=-1)
+    assert np.array_equal(coded.saturated, wanted)
+    assert wanted[3, 5] == (np.float32(np.float16(limit)) >= np.float32(limit))
+
+
 def test_display_encoded_frames_are_linearised_dark_and_all(tmp_path):
     codes = {name: RNG.integers(low, high, (8, 8, 3)).astype(np.uint8) for name, low, high in (("000", 60, 255), ("dark", 0, 30))}
     for name, values in codes.items():
