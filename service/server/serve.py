@@ -29,7 +29,7 @@ from service.server.housekeeping import Housekeeper
 from service.server.jobs.queue import JobQueue, prepare
 from service.server.jobs.supervisor import Supervisor
 from service.server.log import logger
-from service.server.malloc import keep_freed_blocks
+from service.server.malloc import keep_freed_blocks, share_one_arena
 from service.server.permissions import keep_private
 from service.server.settings import Settings, unknown_variables
 from service.server.storage.folder import Storage
@@ -55,6 +55,7 @@ def serve(settings: Settings, *, before_answering: Callable[[str, Database, JobQ
     """
     supervisors: list[Supervisor] = []
     asked = _signals(supervisors)
+    share_one_arena()
     keep_freed_blocks()
     _configure(settings)
     limits = limits_of(settings, raise_descriptors())

@@ -160,9 +160,9 @@ class Settings(BaseSettings):
     project_quotas: Annotated[tuple[Quoted, ...], NoDecode] = ()
     """Other quotas for some projects, separated by commas: `larch:max_project_jobs=500`."""
     requests_per_second: Positive = 50.0
-    """Requests of one key a second, on average, in each API process."""
+    """Requests of one key a second, on average, over all API processes."""
     request_burst: Count = 200
-    """Requests of one key that may come at once."""
+    """Requests of one key that may come at once, over all API processes."""
     max_connections: Count | None = None
     """Connections of clients at most; without it 8192, or as many as the open files that the system allows leave room for."""
     max_address_connections: Count | None = None

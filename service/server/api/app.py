@@ -11,10 +11,12 @@ from service.server.api import document, environment_files, events, intakes, job
 from service.server.api.access import RateLimiter, RunningRequests
 from service.server.api.context import Service
 from service.server.api.metrics import Metrics
+from service.server.api.request_leases import RequestLeases
 from service.server.api.stream_leases import StreamLeases
 from service.server.api.tokens import TokenReader
 from service.server.api.watch import MAX_STREAMS, Watcher
 from service.server.database.engine import Database
+from service.server.database.rates import Rate
 from service.server.database.streams import Limits
 from service.server.jobs.queue import JobQueue
 from service.server.pages import routes as pages
@@ -44,6 +46,7 @@ def create_app(settings: Settings, database: Database, tracing: TracerProvider |
         RateLimiter(settings.requests_per_second, settings.request_burst), RunningRequests(settings.max_requests),
         draining=threading.Event(), closing=closing, watcher=Watcher(database, closing, most=min(max_streams, MAX_STREAMS)),
         leases=StreamLeases(database, Limits(settings.max_project_streams, settings.max_streams)),
+        rates=RequestLeases(database, Rate(settings.requests_per_second, settings.request_burst)),
         tokens=None if settings.oidc_issuer is None else TokenReader(settings))
     app.state.metrics, app.state.readiness = Metrics(settings, database), operations.Readiness()
     problems.install(app)

@@ -14,6 +14,7 @@ from starlette.concurrency import run_in_threadpool
 from service.requests.keys import Scope
 from service.server.api.access import RateLimiter, RunningRequests, require_local
 from service.server.api.problems import ApiError
+from service.server.api.request_leases import RequestLeases
 from service.server.api.stream_leases import StreamLeases
 from service.server.api.tokens import PROJECT_HEADER, TokenReader
 from service.server.api.watch import Watcher
@@ -48,6 +49,8 @@ class Service(NamedTuple):
     watcher: Watcher
     leases: StreamLeases
     """Count the streams of events of each key and project."""
+    rates: RequestLeases
+    """Count the requests of each key over all API processes; `limiter` counts those of this one, also while the database is away."""
     tokens: TokenReader | None = None
     """Reads the tokens of the identity provider; None: there is none."""
 
@@ -91,13 +94,16 @@ def authenticate(request: Request) -> Caller:
 
 async def authenticated(request: Request) -> Caller:
     """Return who sent the request, as `authenticate` does in another thread; a key that asks too often costs neither thread nor query."""
+    service: Service = request.app.state.service
     scheme, given = get_authorization_scheme_param(request.headers.get("Authorization"))
     if getattr(request.state, "caller", None) is None and scheme.lower() == "bearer":
-        request.app.state.service.limiter.require(given.partition(".")[0])
+        service.limiter.require(given.partition(".")[0])
+        service.rates.require(given.partition(".")[0])
     caller = await run_in_threadpool(authenticate, request)
     if not getattr(request.state, "running", False):
-        request.app.state.service.running.enter(caller.key)
+        service.running.enter(caller.key)
         request.state.running = True  # middleware.RequestLog ends it
+        await service.rates.take(caller.key or "")
     return caller
 
 

@@ -10,7 +10,7 @@ from pydantic import BaseModel
 
 from service.requests.keys import Scope
 from service.server.api.access import require_local
-from service.server.api.context import Service, ServiceDep, authenticate, bearer, has_space
+from service.server.api.context import Service, ServiceDep, authenticated, bearer, has_space
 from service.server.api.metrics import CONTENT_TYPE
 from service.server.api.problems import ApiError, responses
 from service.server.database import workers
@@ -78,12 +78,12 @@ def get_readiness(service: ServiceDep, request: Request) -> Health:
     return Health()
 
 
-def operator_of(service: ServiceDep, request: Request,
-                given: Annotated[HTTPAuthorizationCredentials | None, Security(bearer)]) -> None:
+async def operator_of(service: ServiceDep, request: Request,
+                      given: Annotated[HTTPAuthorizationCredentials | None, Security(bearer)]) -> None:
     """Refuse who may not read the metrics: a key of scope admin may, and this machine if the service listens to it only."""
     if given is None and service.settings.loopback:
         require_local(request)
-    elif not (caller := authenticate(request)).may(Scope.ADMIN):
+    elif not (caller := await authenticated(request)).may(Scope.ADMIN):
         raise ApiError("forbidden", f"the key has the scope {caller.scope}, this needs {Scope.ADMIN}")
 
 

@@ -12,7 +12,7 @@ import sqlalchemy as sa
 
 from service.requests.identifiers import JOB, new_id
 from service.requests.job import JobRequest
-from service.server.database import job_log
+from service.server.database import exclusive, job_log
 from service.server.database.engine import Database, storable
 from service.server.database.tables import intakes, job_inputs, jobs, newest_first
 from service.views.states import ACTIVE, CANCELLED, CHECKING, ENDED, FAILED, QUEUED, REFUSED, RUNNING, SUCCEEDED
@@ -117,7 +117,8 @@ def revisions(database: Database, identifiers: Sequence[str]) -> dict[str, sa.Ro
 
 
 def count_queued(connection: sa.Connection, project: str, key: str | None) -> int:
-    """Return how many jobs of a key are queued."""
+    """Return how many jobs of a key are queued; other requests of the project wait for the end of the caller's transaction."""
+    exclusive.lock(connection, exclusive.PROJECT, project)
     query = sa.select(sa.func.count()).where(jobs.c.project == project, jobs.c.state == QUEUED,
                                              jobs.c.key.is_(None) if key is None else jobs.c.key == key)
     return int(connection.execute(query).scalar_one())

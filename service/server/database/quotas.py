@@ -10,13 +10,12 @@ from typing import Any
 import sqlalchemy as sa
 
 from service.errors import RequestError
+from service.server.database import exclusive
 from service.server.database.tables import intakes, jobs, uploads
 from service.server.settings import Settings
 from service.views.states import ACTIVE, READY
 
 BYTES, CAPTURES, JOBS, PIXELS = "max_project_bytes", "max_project_captures", "max_project_jobs", "max_project_pixels"
-LOCK_SPACE = 11
-"""Seed of the hash of projects, so that these advisory locks do not coincide with those of workers."""
 
 
 class QuotaExceeded(RequestError):
@@ -44,8 +43,7 @@ def require(connection: sa.Connection, settings: Settings, quota: str, project: 
     limit = settings.quota_of(project, quota)
     if limit is None:
         return
-    if connection.dialect.name == "postgresql":  # SQLite has one writer at a time
-        connection.execute(sa.text("SELECT pg_advisory_xact_lock(hashtextextended(:name, :space))"), {"name": project, "space": LOCK_SPACE})
+    exclusive.lock(connection, exclusive.PROJECT, project)
     used = USED[quota](connection, project)
     if used + more > limit:
         raise QuotaExceeded(quota, project, limit, used, more)

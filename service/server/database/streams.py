@@ -4,20 +4,18 @@ Each process writes how many streams each key has open with it, for LEASE_S seco
 allows or refuses, and every few seconds while streams are open. The numbers of a process that has died expire by themselves.
 """
 
-import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import sqlalchemy as sa
 
+from service.server.database import exclusive
 from service.server.database.engine import Database
 from service.server.database.tables import streams
 
 LEASE_S = 20.0
 """Seconds for which the numbers of a process count after it has written them."""
-LOCK = 0x72656C6976
-"""Number of the advisory lock of PostgreSQL under which streams are counted; SQLite has one writer at a time."""
 
 
 class Holder(NamedTuple):
@@ -64,11 +62,9 @@ def record(database: Database, process: str, held: Mapping[Holder, int], asked: 
 
 def _record(connection: sa.Connection, process: str, held: Mapping[Holder, int], asked: Sequence[Holder],
             limits: Limits) -> list[str | None]:
-    now = time.time()
-    if connection.dialect.name == "postgresql":  # its clock is one for all machines
-        connection.execute(sa.text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": LOCK})
-        now = float(connection.execute(sa.select(sa.extract("epoch", sa.func.clock_timestamp()))).scalar_one())
-    # the first statement changes something, so that SQLite counts under its lock of writers; a time far ahead is of a clock that was set
+    exclusive.lock(connection, exclusive.STREAMS)
+    now = exclusive.now(connection)
+    # a time far ahead is of a clock that was set
     connection.execute(streams.delete().where(
         (streams.c.process == process) | (streams.c.until < now) | (streams.c.until > now + 2 * LEASE_S)))
     mine, answers = Counter(held), list[str | None]()

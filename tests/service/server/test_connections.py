@@ -1,5 +1,7 @@
 """Connections: clients that send no whole request, or take no answer, give way, and the others are served."""
 
+import asyncio
+import gc
 import os
 import re
 import resource
@@ -99,6 +101,24 @@ def test_a_header_has_to_come_in_time_however_slowly_its_bytes_come(monkeypatch)
                 break
             time.sleep(0.05)
         assert ended and closed(silent) and closed(kept)
+
+
+def test_a_connection_that_has_ended_waits_for_no_collector():
+    """asyncio's transports refer to themselves: the event streams of ten minutes stayed until the oldest generation was collected."""
+    with running(ConnectionLimits(20, 20)) as (port, _):
+        answered(port)  # what is made once
+        gc.collect()
+        gc.disable()
+        try:
+            for _ in range(20):
+                assert answered(port)
+            opened(port, HALF).close()
+            deadline = time.monotonic() + WAIT_S
+            while found := [each for each in gc.get_objects() if isinstance(each, asyncio.Transport) and each.is_closing()]:
+                assert time.monotonic() < deadline, found
+                time.sleep(0.02)
+        finally:
+            gc.enable()
 
 
 def test_an_address_that_takes_its_share_leaves_the_rest_to_others():

@@ -1,28 +1,23 @@
-"""Limits of event streams hold across API processes, and what a process held that died expires by itself."""
+"""Limits of event streams across processes, and what a process held that died; `test_two_apis` has them over HTTP."""
 
 import asyncio
-import re
-import signal
-import socket
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
 
 import pytest
 import sqlalchemy as sa
 from sqlalchemy.exc import OperationalError
 
-from service.requests.keys import NewKey, Scope
+from service.requests.keys import Scope
 from service.server.api import stream_leases
 from service.server.api.problems import ApiError
 from service.server.api.stream_leases import StreamLeases
-from service.server.database import keys, streams, tables
+from service.server.database import streams, tables
 from service.server.database.engine import Database, connect
 from service.server.database.keys import Caller
 from service.server.database.streams import LEASE_S, Holder, Limits
 from service.server.jobs.queue import prepare
 from service.server.settings import Settings
-from tests.service.server_process import Server, serving
 
 WAIT_S = 20.0
 LARCH, OTHER = Holder("larch", "key_a"), Holder("larch", "key_b")
@@ -147,40 +142,3 @@ async def until(holds) -> None:
     while not await asyncio.to_thread(holds):
         assert time.monotonic() < deadline
         await asyncio.sleep(0.02)
-
-
-def test_two_apis(url, tmp_path):
-    """One read key had as many streams as there were API processes, times the limit."""
-    settings = {"min_free_bytes": "0", "max_streams": "3", "max_project_streams": "5"} | ({} if url is None else {"database_url": url})
-    second_folder = tmp_path if url is None else tmp_path / "second"  # SQLite: two processes over one data folder
-    with ExitStack() as opened, serving(tmp_path, "--device", "none", **settings) as first, \
-            serving(second_folder, "--device", "none", **settings) as second:
-        database = connect(Settings(data=first.data, database_url=url).sqlalchemy_url)
-        opened.callback(database.close)
-        mine, fellow, other = (keys.create(database, NewKey(project=project, name="x", scope=Scope.READ))
-                               for project in ("larch", "larch", "birch"))
-
-        def stream(server: Server, key: str) -> tuple[int, socket.socket]:
-            connection = socket.create_connection(("127.0.0.1", int(server.url.rpartition(":")[2])), timeout=WAIT_S)
-            opened.callback(connection.close)
-            connection.sendall(f"GET /v1/events HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {key}\r\n\r\n".encode())
-            return int(re.match(rb"HTTP/1.1 (\d+)", connection.recv(4096))[1]), connection
-
-        def soon(server: Server, key: str) -> None:
-            deadline = time.monotonic() + WAIT_S
-            while stream(server, key)[0] != 200:
-                assert time.monotonic() < deadline
-                time.sleep(0.1)
-
-        held = stream(first, mine)[1]
-        assert [stream(server, mine)[0] for server in (first, second, first, second)] == [200, 200, 429, 429]
-        assert [stream(server, fellow)[0] for server in (second, first, second)] == [200, 200, 429]
-        assert stream(second, other)[0] == 200
-        held.close()
-        soon(second, mine)  # once the first has told
-        first.process.send_signal(signal.SIGKILL)
-        first.process.wait()
-        assert stream(second, mine)[0] == 429
-        database.transact(lambda connection: connection.execute(  # time passes: the living process writes its own again
-            tables.streams.update().values(until=tables.streams.c.until - 2 * LEASE_S)))
-        soon(second, mine)

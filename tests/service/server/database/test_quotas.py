@@ -1,6 +1,7 @@
 """Quotas of projects, and that two requests at once do not both take the last place."""
 
 import threading
+from contextlib import suppress
 
 import pytest
 
@@ -85,32 +86,44 @@ def test_a_project_may_have_a_quota_of_its_own(database):
     assert not allowed(database, quotas.CAPTURES, "willow", 1, **own)
 
 
-def test_two_at_once_do_not_both_take_the_last_place(database):
-    """As two API processes do: each counts what the other has not yet written."""
-    settings, outcomes = Settings(max_project_captures=1), []
+def at_once(database: Database, work) -> list[str]:
+    """Run a transaction eight times at once, as several API processes do, each of which counts what the others have not yet written."""
+    made: list[str] = []
     together = threading.Barrier(8)
-
-    def work(connection):
-        quotas.require(connection, settings, quotas.CAPTURES, "larch", 1)
-        return capture(connection, "larch")
 
     def run():
         together.wait()
-        try:
-            outcomes.append(database.transact(lambda connection: (_begin(connection), work(connection))[1]))
-        except quotas.QuotaExceeded:
-            outcomes.append(None)
-
-    def _begin(connection):
-        if database.is_sqlite:  # every route writes something before, as the idempotency token
-            connection.exec_driver_sql("BEGIN IMMEDIATE")
+        with suppress(RequestError):
+            made.append(database.transact(work))
 
     threads = [threading.Thread(target=run) for _ in range(8)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert len([made for made in outcomes if made]) == 1
+    return made
+
+
+def test_several_at_once_do_not_all_take_the_last_place(database):
+    settings = Settings(max_project_captures=1)
+
+    def work(connection):  # without an Idempotency-Key a request writes nothing before it counts
+        quotas.require(connection, settings, quotas.CAPTURES, "larch", 1)
+        return capture(connection, "larch")
+
+    assert len(at_once(database, work)) == 1
+
+
+def test_several_at_once_do_not_all_take_the_last_place_in_the_queue(database):
+    """On PostgreSQL a transaction does not see what others have not ended; `submission.require_queue` counts so."""
+    def work(connection):
+        job = jobs.insert(connection, project="larch", key="key_a", request=SolveJob(kind="solve", capture=new_id(CAPTURE)),
+                          chunk_frames=1, inputs=[])
+        if jobs.count_queued(connection, "larch", "key_a") > 3:
+            raise RequestError("too many")
+        return job
+
+    assert len(at_once(database, work)) == 3
 
 
 @pytest.mark.parametrize("given", ["larch", "larch:max_project_jobs", "larch:max_frames=1", "larch:max_project_jobs=-1",
