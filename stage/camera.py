@@ -62,8 +62,8 @@ class Camera(Strict):
     pixel_size_m: Positive | None = None
     """The side of a pixel on the object, of an orthographic camera; None: a scene of unknown scale."""
     surface_z_m: float | None = None
-    """The camera-frame z of the mean of the masked surface; a perspective camera sees z below 0. None: 0 for an orthographic camera; for
-    a perspective camera a scene of unknown scale, or under near lights what `relit solve` estimates."""
+    """The camera-frame z of the mean of the masked surface; a perspective camera sees z below 0. None: under near lights what
+    `relit solve` estimates; else 0 for an orthographic camera, and a scene of unknown scale for a perspective one."""
     world_from_camera: Transform | None = None
     """The place of the camera in the world, which assets have too; None: the world is the camera frame."""
 

@@ -72,11 +72,11 @@ def light_places(capture: Capture) -> LightPlaces:
 
 
 def distance_is_missing(capture: Capture) -> bool:
-    """Return whether a capture has near lights and a perspective camera, does not say how far the surface is, and its images may tell:
-    those of polarised pairs are not Lambertian."""
+    """Return whether a capture has near lights, does not say how far the surface is, and its images may tell: those of polarised pairs are
+    not Lambertian, and an orthographic camera needs the size of a pixel."""
     camera = capture.camera
-    return (camera.projection == "perspective" and camera.surface_z_m is None and bool(capture.lit_by(PointLight))
-            and not capture.is_polarised)
+    scaled = camera.projection == "perspective" or camera.pixel_size_m is not None
+    return scaled and camera.surface_z_m is None and bool(capture.lit_by(PointLight)) and not capture.is_polarised
 
 
 def place_lights(capture: Capture) -> PlacedLights:

@@ -72,7 +72,7 @@ class CameraOptions(Options):
     """Orthographic camera: side of a pixel on the object, metres; None: heights are in pixels."""
     surface_z_m: Finite | None = None
     """Mean z of the object in the camera frame, metres: negative before a perspective camera. None: under near lights relit solve
-    estimates it for a perspective camera; 0 for an orthographic one."""
+    estimates it; else it is 0 for an orthographic camera."""
 
 
 class ImageOptions(Options):

@@ -11,6 +11,7 @@ from tests.scenes.captures import angles_degrees
 from tests.scenes.near_lights import lamps
 
 DOME = near_lights.dome(40, perspective=True)
+FLAT = near_lights.dome(40)
 DEPTH = -DOME.camera["surface_z_m"]
 RNG = np.random.default_rng(3)
 
@@ -51,6 +52,28 @@ def test_lights_that_are_not_where_they_are_said_to_be(relit, tmp_path):
     _, report, _ = solved(relit, capture(tmp_path / "c", lights, told))
     found = report["found"]["distance"]
     assert abs(found["surface_z_m"] + DEPTH) < 2 * found["sigma_m"]
+
+
+@pytest.mark.parametrize(("radii", "count"), [(1.5, 16), (6.0, 12)])
+def test_an_orthographic_camera_sees_it_by_the_lights(relit, tmp_path, radii, count):
+    """The dome stands 0.08 m before z = 0, which is the default; depths count from the nearest light."""
+    lights = lamps(FLAT, count, radii)
+    out, report, maps = solved(relit, capture(tmp_path / "c", lights, scene=FLAT))
+    found, true = report["found"]["distance"], FLAT.camera["surface_z_m"]
+    below = max(lamp.position[2] for lamp in lights) - true
+    assert abs(found["surface_z_m"] - true) < min(2 * found["sigma_m"], 0.01 * below)
+    assert "camera.surface_z_m: is missing, and was taken as" in out
+    assert np.abs(maps.height - FLAT.points[..., 2])[maps.mask].mean() < found["sigma_m"]
+    assert angles_degrees(maps.normal, FLAT.normal)[maps.mask].mean() < max(0.3, found["sigma_of_normals_degrees"])
+
+
+def test_an_orthographic_camera_keeps_its_default_where_images_do_not_tell(relit, tmp_path):
+    lights = lamps(FLAT, 4, 3.0)
+    out, report, _ = solved(relit, capture(tmp_path / "c", lights, scene=FLAT))
+    assert "distance" not in report["found"]
+    sentence = next(one for one in report["warnings"] if "surface_z_m" in one)
+    assert "the images of 4 lights do not tell it" in sentence and "0 was taken, the default of an orthographic camera" in sentence
+    assert sentence in out and "surface is" in relit("info", tmp_path / "c").out
 
 
 def test_images_that_do_not_tell_it_are_refused(relit, tmp_path):
