@@ -1,5 +1,6 @@
 """relit import LAYOUT: make a capture of files that are laid out another way, and say how they were understood."""
 
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -8,12 +9,13 @@ import typer
 from service.cli.groups import make_group
 from service.cli.request_commands import local_command
 from service.requests.captures import (
-    CameraOptions,
     DiligentImport,
     ExposureOrder,
     GrayImport,
     ImageOptions,
     ImportRequest,
+    LaserImport,
+    LensOptions,
     LpImport,
     NearLightsImport,
     OlatImport,
@@ -46,7 +48,8 @@ def register(app: typer.Typer) -> None:
     layouts = make_group("import", help="Write a capture.json for files that are laid out another way; docs/captures.md shows each layout.")
     for name, function in (("diligent", _diligent), ("lp", _lp), ("relightlab", _relightlab), ("olat", _olat), ("photos", _photos),
                            ("near-lights", _near_lights), ("opencv-gray", _opencv_gray), ("gray", _gray), ("phase", _phase),
-                           ("scanner", _scanner), ("tof", _tof), ("histogram", _histogram), ("kinect", _kinect)):
+                           ("scanner", _scanner), ("tof", _tof), ("histogram", _histogram), ("kinect", _kinect),
+                           ("laser", _laser)):
         local_command(layouts, name, function)
     layouts.command("guess")(_guess)
     app.add_typer(layouts)
@@ -144,6 +147,14 @@ def _scanner(request: ScannerImport) -> None:
                           unit_m=request.unit_m, projector=request.projector, images=request.images))
 
 
+def _laser(request: LaserImport) -> None:
+    from stage.importers import laser
+
+    _print(laser.import_folder(request.source, request.folder, view=_view(request), camera=request.camera, planes=request.planes,
+                               form=request.form, axes=request.axes, unit_m=request.unit_m, selection=_selection(request),
+                               color_space=request.color_space))
+
+
 def _tof(request: TofImport) -> None:
     from stage.importers.tof import import_correlations
 
@@ -198,10 +209,10 @@ def _pattern_images(images: PatternImageOptions, rig: RigOptions, given: ImportR
                          patterns_first=images.exposure_order is ExposureOrder.PATTERN)
 
 
-def _view(request: CameraOptions) -> "View":
+def _view(request: LensOptions) -> "View":
     from stage.importers.view import View
 
-    return View(**{name: getattr(request, name) for name in CameraOptions.model_fields})
+    return View(**{field.name: getattr(request, field.name) for field in fields(View) if hasattr(request, field.name)})
 
 
 def _selection(request: ImageOptions) -> "Selection":

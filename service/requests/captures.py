@@ -57,8 +57,8 @@ def _four_or_five(values: tuple[float, ...]) -> tuple[float, ...]:
     return values
 
 
-class CameraOptions(Options):
-    """What is known of the camera; without a focal length it is taken to be orthographic."""
+class LensOptions(Options):
+    """What is known of a camera's lens."""
 
     focal_px: Annotated[tuple[Positive, ...] | None, Commas, AfterValidator(lambda v: v and _one_or_two(v)),
                         Spelling(metavar="F[,F]")] = None
@@ -68,6 +68,11 @@ class CameraOptions(Options):
     distortion: Annotated[tuple[Finite, ...] | None, Commas, AfterValidator(lambda v: v and _four_or_five(v)),
                           Spelling(metavar="K1,K2,P1,P2[,K3]")] = None
     """Lens distortion as OpenCV has it."""
+
+
+class CameraOptions(LensOptions):
+    """What is known of the camera; without a focal length it is taken to be orthographic."""
+
     pixel_size_m: Positive | None = None
     """Orthographic camera: side of a pixel on the object, metres; None: heights are in pixels."""
     surface_z_m: Finite | None = None
@@ -156,6 +161,38 @@ class NearLightsImport(CameraOptions, ImageOptions, ImportRequest):
 
 class RelightlabImport(ImportRequest):
     """A project of RelightLab (.relight), or its dome (.dome) beside the images; SRC may be the file."""
+
+
+class PlaneForm(Choice):
+    """What the four coefficients of a plane mean."""
+
+    ZERO = "zero", "a x + b y + c z + d = 0"
+    EQUALS = "equals", "a x + b y + c z = d"
+
+
+class LaserImport(LensOptions, ImageOptions, ImportRequest):
+    """Images of the stripe of a laser on a scene that stands still, one for each place of its plane."""
+
+    camera: Annotated[Path | None, Role.INPUT] = None
+    """File with the matrix of the camera: an OpenCV file (.yml, .xml, .json), or K of a .mat file; None: as the other options say."""
+    planes: Annotated[Path | None, Role.INPUT] = None
+    """File with the plane of each image: rows of four coefficients, or of a point and a normal (.csv, .txt, .npy, .mat), or a calibration
+    file with them; None: relit calibrate laser-planes measures them."""
+    form: PlaneForm | None = None
+    """What four coefficients of a plane mean."""
+    axes: Axes | None = None
+    """Where x, y and z of the planes point as seen by the camera, whose centre is their origin; OpenCV has right,down,away. Needed with
+    planes."""
+    unit_m: Positive | None = None
+    """Metres in one unit of the planes, such as 0.001 for millimetres. Needed with planes."""
+
+    @model_validator(mode="after")
+    def _of_the_planes(self) -> Self:
+        if self.planes is not None and (self.axes is None or self.unit_m is None):
+            raise ValueError(f"--planes {self.planes}: needs --axes, right,down,away for OpenCV's, and --unit-m, 0.001 for millimetres")
+        if self.planes is None and (self.axes is not None or self.unit_m is not None or self.form is not None):
+            raise ValueError("--axes, --unit-m and --form are those of --planes, which is not given")
+        return self
 
 
 class RigOptions(Options):

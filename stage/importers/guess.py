@@ -2,34 +2,36 @@
 
 import shlex
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from stage import images
-from stage.calibration.opencv_file import read_matrices
-from stage.errors import ManifestError, StageError, storage
+from stage.errors import ManifestError, storage
 from stage.importers import kinect
-from stage.importers.layout import color_space_of, image_names, image_resolution, natural_order
+from stage.importers.folder import Folder, Guess, arrays_of, encoding, group_of, made, spelling, tried
+from stage.importers.laser import OFF_WORDS
+from stage.importers.layout import image_names, image_resolution, natural_order
 from stage.importers.light_rig import CAMERA_MATRIX, read_rig
 from stage.importers.light_table import SUFFIXES as TABLES
 from stage.importers.light_table import read_light_table
 from stage.importers.opencv_gray import gray_order
+from stage.importers.plane_table import NAMES as PLANES
+from stage.importers.plane_table import read_planes
 from stage.importers.procam_file import PROJECTOR_MATRIX, projector_size
 from stage.importers.raw_arrays import ArrayFiles
 from stage.importers.video import is_video
 from stage.importers.view import AMBIENT_WORDS, MASK_WORDS, refuse_twins, words_of
 from stage.manifest import FILE_NAME
-from stage.mat_file import read_mat_arrays
 from stage.tof.frames import read_array
 
-T = TypeVar("T")
 PROJECTORS = ((1280, 800), (1920, 1080), (1024, 768), (1280, 720), (854, 480), (912, 1140), (800, 600), (1920, 1200), (640, 480),
               (3840, 2160))
 """Sizes of projectors, the more frequent first."""
+PLANE_WORDS, LASER_WORDS = frozenset({"plane", "planes", "laser", "lasers"}), frozenset({"laser", "stripe", "line"})
+"""Words in the names of files that hold planes, and of images of a stripe."""
 SAMPLE = 4000
 """Pixels of an image that are compared."""
 STEADY = 0.05
@@ -37,36 +39,6 @@ STEADY = 0.05
 MOST_STEPS = 16
 FEWEST_PHOTOS = 4
 """Images of one size that may be frames of one capture; fewer are likelier pictures of something."""
-
-
-class Guess(NamedTuple):
-    """What a folder seems to be."""
-
-    layout: str
-    """In words: `an object of the DiLiGenT benchmark`."""
-    reason: str
-    assumed: tuple[str, ...]
-    """What the files do not say and the command assumes."""
-    command: str
-    """The command to run; words in capitals are to be replaced."""
-    then: str
-    """The command that makes the result."""
-
-
-class Folder(NamedTuple):
-    """The names of the files in a folder."""
-
-    path: Path
-    names: tuple[str, ...]
-    pictures: tuple[str, ...]
-    """Images that are neither mask nor ambient light, in natural order."""
-
-    def with_suffix(self, *suffixes: str) -> list[Path]:
-        """Return the files with one of these suffixes, and those of the folder above after them."""
-        here = [self.path / name for name in self.names if Path(name).suffix.lower() in suffixes and name != FILE_NAME]
-        with storage("read", self.path.parent):
-            above = [path for path in sorted(self.path.absolute().parent.iterdir()) if path.suffix.lower() in suffixes and path.is_file()]
-        return [*here, *above]
 
 
 def guess(source: Path) -> Guess:
@@ -83,8 +55,8 @@ def guess(source: Path) -> Guess:
     pictures = tuple(name for name in image_names(source) if not words_of(name) & (MASK_WORDS | AMBIENT_WORDS))
     refuse_twins(source, pictures)
     folder = Folder(source, names, pictures)
-    for look in (_diligent, _relightlab, _lp, _kinect, _near_lights, _table, _scanner, _gray, _phase, _correlations, _histograms, _video,
-                 _photos):
+    for look in (_diligent, _relightlab, _lp, _kinect, _laser, _near_lights, _table, _scanner, _gray, _phase, _correlations, _histograms,
+                 _video, _photos):
         if (found := look(folder)) is not None:
             return found
     suffixes = Counter(Path(name).suffix.lower() for name in names)
@@ -92,25 +64,11 @@ def guess(source: Path) -> Guess:
     raise ManifestError(f"{source}: holds {held or 'no files'}, which is no layout that relit import knows: docs/captures.md shows them")
 
 
-def _made(layout: str, reason: str, words: list[object], source: Path, *, solve: bool, assumed: tuple[str, ...] = ()) -> Guess:
-    program = "solve" if solve else "depth"
-    return Guess(layout, reason, assumed, shlex.join(["relit", "import", *map(str, words)]),
-                 shlex.join(["relit", program, str(source), "--out", f"{source.resolve().name}-{'maps' if solve else 'depth'}"]))
-
-
-def _tried(read: Callable[[], T]) -> T | None:
-    """Return what a reader returns, or None where it refuses the file."""
-    try:
-        return read()
-    except (StageError, ValueError):
-        return None
-
-
 def _diligent(folder: Folder) -> Guess | None:
     wanted = {"filenames.txt", "light_directions.txt", "light_intensities.txt"}
     if not wanted <= set(folder.names):
         return None
-    return _made("an object of the DiLiGenT benchmark", "it has filenames.txt, light_directions.txt and light_intensities.txt",
+    return made("an object of the DiLiGenT benchmark", "it has filenames.txt, light_directions.txt and light_intensities.txt",
                  ["diligent", folder.path], folder.path, solve=True)
 
 
@@ -118,7 +76,7 @@ def _relightlab(folder: Folder) -> Guess | None:
     files = [name for suffix in (".relight", ".dome") for name in folder.names if name.lower().endswith(suffix)]
     if not files:
         return None
-    return _made("a project or a dome of RelightLab", f"it has {files[0]}", ["relightlab", folder.path / files[0], folder.path],
+    return made("a project or a dome of RelightLab", f"it has {files[0]}", ["relightlab", folder.path / files[0], folder.path],
                  folder.path, solve=True)
 
 
@@ -126,7 +84,7 @@ def _lp(folder: Folder) -> Guess | None:
     files = [name for name in folder.names if name.lower().endswith(".lp")]
     if not files:
         return None
-    return _made("images of RTI with a light list", f"it has {files[0]}", ["lp", folder.path / files[0], folder.path], folder.path,
+    return made("images of RTI with a light list", f"it has {files[0]}", ["lp", folder.path / files[0], folder.path], folder.path,
                  solve=True)
 
 
@@ -136,32 +94,60 @@ def _kinect(folder: Folder) -> Guess | None:
     if not packets or not tables:
         return None
     more = ["--packet", folder.path / packets[0]] if len(packets) > 1 else []
-    return _made("depth packets of a Kinect v2",
+    return made("depth packets of a Kinect v2",
                  f"{packets[0]} has the size of a packet of libfreenect2, and {tables[0]} that of P0 tables",
                  ["kinect", folder.path, *more, "--focal-px", "365.456", "--principal-px", "254.878,205.395"], folder.path, solve=False,
                  assumed=("the intrinsics are those of a usual device: getIrCameraParams of yours says better ones",))
 
 
+def _laser(folder: Folder) -> Guess | None:
+    lit = folder._replace(pictures=tuple(name for name in folder.pictures if not words_of(name) & OFF_WORDS))
+    if not lit.pictures:
+        return None
+    matrices = next((path for path in folder.with_suffix(".yml", ".yaml", ".xml", ".json", ".mat")
+                     if set(CAMERA_MATRIX) & set(arrays_of(path))), None)
+    camera = ["--focal-px", "FOCAL"] if matrices is None else ["--camera", matrices]
+    unknown = () if matrices is not None else ("FOCAL is the focal length of the camera in pixels",)
+    for path in folder.with_suffix(".csv", ".txt", ".npy", ".mat", ".yml", ".yaml", ".xml", ".json"):
+        if not (words_of(path.name) & PLANE_WORDS or set(PLANES) & set(arrays_of(path))):
+            continue
+        table = tried(partial(read_planes, path))
+        chosen = None if table is None else [] if table.names is not None else group_of(lit, len(table.values))
+        if table is None or chosen is None:
+            continue
+        form = ["--form", "zero"] if table.values.shape[1] == 4 else []
+        return made("images of a laser's stripe with its planes", f"{path} holds {len(table.values)} planes, as many as there are images",
+                     ["laser", folder.path, *camera, "--planes", path, *form, "--axes", "right,down,away", "--unit-m", "0.001", *chosen],
+                     folder.path, solve=False, assumed=(
+                         *unknown, "planes are in OpenCV's axes and in millimetres: the files do not say it",
+                         *(("coefficients are those of a x + b y + c z + d = 0: else --form equals",) if form else ()), *encoding(lit)))
+    if sum(bool(words_of(name) & LASER_WORDS) for name in lit.pictures) * 2 <= len(lit.pictures):
+        return None
+    found = made("images of a laser's stripe", f"its images are named as {lit.pictures[0]}", ["laser", folder.path, *camera], folder.path,
+                  solve=False, assumed=(*unknown, "nothing says where the planes of the laser are", *encoding(lit)))
+    return found._replace(then=f"relit calibrate laser-planes POSE POSE --board 9x6 --square-m METRES --apply-to {folder.path}")
+
+
 def _near_lights(folder: Folder) -> Guess | None:
     for path in folder.with_suffix(".mat", ".json"):
-        if path.suffix.lower() == ".mat" and not {"s", "phi"} <= {name.rpartition(".")[2].lower() for name in _arrays_of(path)}:
+        if path.suffix.lower() == ".mat" and not {"s", "phi"} <= {name.rpartition(".")[2].lower() for name in arrays_of(path)}:
             continue
         if path.suffix.lower() == ".json" and path.parent.absolute() != folder.path.absolute():
             continue
-        rig = _tried(partial(read_rig, path))
+        rig = tried(partial(read_rig, path))
         if rig is None or (path.suffix.lower() == ".json" and rig.anisotropy is None):
             continue
-        chosen = _group_of(folder, len(rig.positions))
+        chosen = group_of(folder, len(rig.positions))
         if chosen is None:
             continue
         camera = next((other for other in folder.with_suffix(".mat", ".yml", ".yaml", ".xml") if other != path
-                       and set(CAMERA_MATRIX) & set(_arrays_of(other))), None)
+                       and set(CAMERA_MATRIX) & set(arrays_of(other))), None)
         words = ["near-lights", folder.path, "--lights", path, *(["--camera", camera] if camera else []), "--axes", "right,down,away",
                  "--unit-m", "0.001", *chosen]
-        return _made("images under LEDs, as near_ps has them", f"{path} holds as many positions of lights as there are images", words,
+        return made("images under LEDs, as near_ps has them", f"{path} holds as many positions of lights as there are images", words,
                      folder.path, solve=True, assumed=("axes and millimetres are those of near_ps",
                                           "nothing says how far the object is: relit solve estimates it; --surface-z-m gives it",
-                                          *_encoding(folder)))
+                                          *encoding(folder)))
     return None
 
 
@@ -171,50 +157,28 @@ def _table(folder: Folder) -> Guess | None:
     for path in folder.with_suffix(*TABLES):
         if path.parent.absolute() != folder.path.absolute() and path.suffix.lower() != ".txt":
             continue
-        table = _tried(partial(read_light_table, path))
+        table = tried(partial(read_light_table, path))
         if table is None or len(table.vectors) < 3:
             continue
-        chosen = [] if table.names is not None else _group_of(folder, len(table.vectors))
+        chosen = [] if table.names is not None else group_of(folder, len(table.vectors))
         if chosen is None:
             continue
         reason = f"{path} holds {len(table.vectors)} lights" + (" with names of images" if table.names else ", as many as there are images")
         ahead = table.vectors[:, 2].mean() > 0
         axes = f"right,up,{'towards' if ahead else 'away'}"
-        return _made("images under one far light each with a table of the lights", reason,
+        return made("images under one far light each with a table of the lights", reason,
                      ["olat", folder.path, "--lights", path, "--axes", axes, "--vectors", "to-light", *chosen],
                      folder.path, solve=True, assumed=(
                          "x is right and y is up as seen by the camera, and vectors point to the light: the table does not say it",
                          f"z points {'towards the camera' if ahead else 'away from it'}, because then the lights are on its side",
-                         *_encoding(folder)))
+                         *encoding(folder)))
     return None
-
-
-def _encoding(folder: Folder) -> tuple[str, ...]:
-    """Return what is assumed of the encoding of 8-bit images."""
-    if _tried(partial(color_space_of, folder.path / folder.pictures[0])) != "srgb_texture":
-        return ()
-    return ("the images have 8 bits and are taken as sRGB: many of cameras for measurements are linear, --color-space lin_rec709_scene",)
-
-
-def _group_of(folder: Folder, count: int) -> list[str] | None:
-    """Return the option --images that selects so many images: none if it is all, those of one spelling, or None if neither is so many."""
-    if len(folder.pictures) == count:
-        return []
-    spelled = Counter(_spelling(name) for name in folder.pictures)
-    fitting = [spelling for spelling, number in spelled.items() if number == count]
-    return ["--images", fitting[0]] if len(fitting) == 1 else None
-
-
-def _spelling(name: str) -> str:
-    """Return a name with an asterisk in place of its last number: photo_*.png."""
-    stem, suffix = Path(name).stem, Path(name).suffix
-    return (stem.rstrip("0123456789") + "*" if stem[-1:].isdigit() else stem) + suffix
 
 
 def _scanner(folder: Folder) -> Guess | None:
     count = len(folder.pictures)
     for path in folder.with_suffix(".xml", ".yml", ".yaml"):
-        matrices = _arrays_of(path)
+        matrices = arrays_of(path)
         if not set(PROJECTOR_MATRIX) & set(matrices):
             continue
         size = projector_size(path)
@@ -226,7 +190,7 @@ def _scanner(folder: Folder) -> Guess | None:
         if count not in codecs:
             continue
         codec, axis = codecs[count]
-        return _made("a scan of SLStudio", f"{path} is its calibration, and {count} images are those of {codec}",
+        return made("a scan of SLStudio", f"{path} is its calibration, and {count} images are those of {codec}",
                      ["scanner", folder.path, "--calibration", path, "--codec", codec, "--axis", axis, "--unit-m", "0.001"], folder.path,
                      solve=False, assumed=("the calibration is in millimetres",))
     return None
@@ -238,7 +202,7 @@ def _gray(folder: Folder) -> Guess | None:
     if not sizes or not _steady(_sums(folder, folder.pictures[:-2], 2)):
         return None
     names = [f"{width}x{height}" for width, height in sizes]
-    return _made("a Gray code in OpenCV's order", f"{count} images, each second of which is the inverse of the one before",
+    return made("a Gray code in OpenCV's order", f"{count} images, each second of which is the inverse of the one before",
                  ["opencv-gray", folder.path, "--projector", names[0]], folder.path, solve=False,
                  assumed=(f"the projector has {' or '.join(names)} pixels: these have as many bits",))
 
@@ -247,7 +211,7 @@ def _phase(folder: Folder) -> Guess | None:
     count = len(folder.pictures)
     for steps in range(3, MOST_STEPS + 1):
         if count % steps == 0 and count > steps and _steady(_sums(folder, folder.pictures, steps)):
-            return _made("phase shifts", f"the sums of each {steps} images are alike", [
+            return made("phase shifts", f"the sums of each {steps} images are alike", [
                 "phase", folder.path, "--projector", "WIDTHxHEIGHT", "--periods", ",".join(f"P{n + 1}" for n in range(count // steps)),
                 "--steps", steps], folder.path, solve=False, assumed=(
                     "WIDTHxHEIGHT is the projector in pixels, P1 and so on are the periods in its pixels",
@@ -257,15 +221,15 @@ def _phase(folder: Folder) -> Guess | None:
 
 def _correlations(folder: Folder) -> Guess | None:
     planes = [name for name in folder.names if name.lower().endswith(".npy") and _shape(folder.path / name, 2)]
-    spelled = Counter(_spelling(name) for name in planes)
+    spelled = Counter(spelling(name) for name in planes)
     group = next((spelling for spelling, number in spelled.items() if number >= 3 and "*" in spelling), None)
     if group is None:
         return None
-    chosen = natural_order(name for name in planes if _spelling(name) == group)
+    chosen = natural_order(name for name in planes if spelling(name) == group)
     numbers = [int("".join(filter(str.isdigit, Path(name).stem.removeprefix(group.split("*")[0]))) or -1) for name in chosen]
     told = max(numbers) >= 90 and max(numbers) < 360
     phases = ",".join(map(str, numbers)) if told else ",".join(f"{360 * step / len(chosen):g}" for step in range(len(chosen)))
-    return _made("correlation images of a time-of-flight camera", f"{len(chosen)} arrays of one image each, {chosen[0]} to {chosen[-1]}",
+    return made("correlation images of a time-of-flight camera", f"{len(chosen)} arrays of one image each, {chosen[0]} to {chosen[-1]}",
                  ["tof", folder.path, "--arrays", group, "--frequencies-hz", "HZ", "--phases-deg", phases, "--signal", "minus"],
                  folder.path, solve=False, assumed=(
                      "HZ is the modulation frequency", "the images are P + Q cos(φ − δ): if ranges run backwards, --signal plus",
@@ -277,10 +241,10 @@ def _histograms(folder: Folder) -> Guess | None:
         path = folder.path / name
         if path.suffix.lower() not in (".npy", ".npz", ".mat"):
             continue
-        arrays = _tried(partial(ArrayFiles().read, path))
+        arrays = tried(partial(ArrayFiles().read, path))
         if arrays is not None and len(arrays) == 1 and arrays[0].ndim == 3 and arrays[0].dtype.kind in "fiu" and arrays[0].min() >= 0:
             rows, cols, bins = arrays[0].shape
-            return _made("photon histograms", f"{name} holds {rows} x {cols} x {bins} counts",
+            return made("photon histograms", f"{name} holds {rows} x {cols} x {bins} counts",
                          ["histogram", folder.path, "--arrays", name, "--bin-s", "SECONDS"], folder.path, solve=False,
                          assumed=("SECONDS is the width of a bin", f"the last of the three, {bins}, counts the bins: else --bins first"))
     return None
@@ -292,7 +256,7 @@ def _video(folder: Folder) -> Guess | None:
         return None
     path = folder.path / videos[0]
     frames = path.with_name(f"{path.stem}-frames")
-    return _made("a video, perhaps of projected patterns", f"it has {videos[0]} and no images", [
+    return made("a video, perhaps of projected patterns", f"it has {videos[0]} and no images", [
         "gray", path, frames, "--projector", "WIDTHxHEIGHT", "--video-frames", "FIRST-LAST:STEP"], frames, solve=False, assumed=(
             "WIDTHxHEIGHT is the projector in pixels, FIRST-LAST:STEP are the frames with one pattern each, counted from 0",
             "a Gray code of columns and rows with inverses, then white and black: else --sequence, --inverses, or relit import phase"))
@@ -301,25 +265,20 @@ def _video(folder: Folder) -> Guess | None:
 def _photos(folder: Folder) -> Guess | None:
     if len(folder.pictures) < FEWEST_PHOTOS or not _of_one_size(folder):
         return None
-    found = _made("images under lights of which nothing says where they were", f"{len(folder.pictures)} images of one size and no table",
+    found = made("images under lights of which nothing says where they were", f"{len(folder.pictures)} images of one size and no table",
                   ["photos", folder.path], folder.path, solve=True, assumed=(
-                      "each image has one far light of its own, and the camera stood still", *_encoding(folder)))
+                      "each image has one far light of its own, and the camera stood still", *encoding(folder)))
     return found._replace(then=found.then + " --lights unknown")
 
 
 def _of_one_size(folder: Folder) -> bool:
-    sizes = {_tried(partial(image_resolution, folder.path / name)) for name in folder.pictures}
+    sizes = {tried(partial(image_resolution, folder.path / name)) for name in folder.pictures}
     return len(sizes) == 1 and None not in sizes
-
-
-def _arrays_of(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of a .mat or an OpenCV file by name; none where it cannot be read."""
-    return _tried(partial(read_mat_arrays if path.suffix.lower() == ".mat" else read_matrices, path)) or {}
 
 
 def _shape(path: Path, dimensions: int) -> bool:
     """Return whether a .npy file holds real numbers in so many dimensions."""
-    found = _tried(partial(read_array, path))
+    found = tried(partial(read_array, path))
     return found is not None and found.ndim == dimensions and found.dtype.kind in "fiu" and min(found.shape) > 1
 
 

@@ -1,19 +1,17 @@
 """Import of images under near point lights (LED rigs) with a file of their positions, as near_ps has it."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from stage.colour_spaces import ColorSpaceName
-from stage.errors import ManifestError
 from stage.importers.axes import Axes, camera_from_table, describe
 from stage.importers.layout import Imported, assumed_encoding, color_space_of, image_resolution, write_capture
-from stage.importers.light_rig import LightRig, read_camera_matrix, read_rig
+from stage.importers.light_rig import LightRig, read_rig
 from stage.importers.light_table import LightTable
 from stage.importers.olat import find_table, match
-from stage.importers.view import Selection, View, select
+from stage.importers.view import Selection, View, select, view_of_file
 from stage.manifest import SCHEMA
 
 
@@ -41,7 +39,7 @@ def import_folder(source: Path, destination: Path, *, axes: Axes, unit_m: float,
     chosen = select(source, selection or Selection())
     names, matched = match(path, LightTable(rig.names, rig.positions, rig.strengths, "rows", str(path)), chosen)
     resolution = image_resolution(source / names[0])
-    view, camera_words = _view(view or View(), camera, resolution)
+    view, camera_words = view_of_file(view or View(), camera, resolution)
     space = color_space or color_space_of(source / names[0])
     matrix = camera_from_table(axes)
     positions = unit_m * rig.positions @ matrix.T
@@ -64,26 +62,6 @@ def import_folder(source: Path, destination: Path, *, axes: Axes, unit_m: float,
                      "as the file says, with an unknown factor"),
         ("colour", space + ("" if color_space else ", by the depth of the images: --color-space says another")),
         ("camera", camera_words), *chosen.facts()))
-
-
-def _view(view: View, camera: Path | None, resolution: tuple[int, int]) -> tuple[View, str]:
-    """Return the camera of a file or of the options, and words for it.
-
-    Raises:
-        ManifestError: both give it, or the principal point of the file lies outside the image.
-    """
-    if camera is None:
-        return view, view.describe()
-    if view.focal_px is not None or view.principal_px is not None or view.distortion is not None:
-        raise ManifestError(f"{camera}: --camera is given, and --focal-px, --principal-px or --distortion too: give one of both")
-    found = read_camera_matrix(camera)
-    width, height = resolution
-    if not (0 <= found.principal_px[0] <= width and 0 <= found.principal_px[1] <= height):
-        raise ManifestError(f"{camera}: its principal point is {found.principal_px[0]:g}, {found.principal_px[1]:g}, outside the images of "
-                            f"{width}x{height} pixels: it belongs to another resolution")
-    distortion = None if found.distortion is None else (*found.distortion.k[:2], *found.distortion.p, found.distortion.k[2])
-    view = replace(view, focal_px=found.focal_px, principal_px=found.principal_px, distortion=distortion)
-    return view, f"{view.describe()}, from {camera}, where the centre of the first pixel is {found.convention}"
 
 
 def _entries(rig: LightRig, positions: np.ndarray, matrix: np.ndarray) -> list[dict[str, Any]]:

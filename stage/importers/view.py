@@ -1,7 +1,7 @@
 """What an importer is told of the camera and of the images, and the entries of the manifest that follow from it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 from stage.camera_raw import path_is_raw
 from stage.errors import ManifestError
 from stage.importers.layout import image_names
+from stage.importers.light_rig import read_camera_matrix
 from stage.text import name_fault
 
 MASK_WORDS, AMBIENT_WORDS = frozenset({"mask"}), frozenset({"ambient"})
@@ -48,6 +49,26 @@ class View:
             return f"orthographic{size}: give --focal-px for a perspective camera"
         centre = "the centre of the image" if self.principal_px is None else "{:g}, {:g}".format(*self.principal_px)
         return f"perspective, focal length {' x '.join(f'{value:g}' for value in self.focal_px)} px, principal point {centre}"
+
+
+def view_of_file(view: View, camera: Path | None, resolution: tuple[int, int]) -> tuple[View, str]:
+    """Return the camera of a file or of the options, and words for it.
+
+    Raises:
+        ManifestError: both give it, or the principal point of the file lies outside the image.
+    """
+    if camera is None:
+        return view, view.describe()
+    if view.focal_px is not None or view.principal_px is not None or view.distortion is not None:
+        raise ManifestError(f"{camera}: --camera is given, and --focal-px, --principal-px or --distortion too: give one of both")
+    found = read_camera_matrix(camera)
+    width, height = resolution
+    if not (0 <= found.principal_px[0] <= width and 0 <= found.principal_px[1] <= height):
+        raise ManifestError(f"{camera}: its principal point is {found.principal_px[0]:g}, {found.principal_px[1]:g}, outside the images of "
+                            f"{width}x{height} pixels: it belongs to another resolution")
+    distortion = None if found.distortion is None else (*found.distortion.k[:2], *found.distortion.p, found.distortion.k[2])
+    view = replace(view, focal_px=found.focal_px, principal_px=found.principal_px, distortion=distortion)
+    return view, f"{view.describe()}, from {camera}, where the centre of the first pixel is {found.convention}"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,6 +9,7 @@ import pytest
 from stage.capture import Capture
 from tests.scenes import near_lights
 from tests.scenes.captures import files_in, make_scene, write_image
+from tests.service.captures.test_import_laser import as_text, write_camera, write_scan
 from tests.service.captures.test_import_patterns import BLACK, SIZES, SLSTUDIO, WHITE, U, V, gray, wave, write_calibration, write_stack
 from tests.service.captures.test_import_tof import ROWS, correlations, histograms, kinect_packet
 from tests.service.captures.test_imports import write_near_ps
@@ -77,6 +78,12 @@ def spad(folder):
     np.save(folder / "h.npy", histograms((4, 5))[1])
 
 
+def laser(folder):
+    write_scan(folder)
+    write_camera(folder.parent / "camera.yml")
+    as_text(folder)
+
+
 def kinect(folder):
     (folder / "frame.depth").write_bytes(kinect_packet(np.zeros((9, 424, 512))))
     (folder / "p0.bin").write_bytes(bytes(1302572))
@@ -87,6 +94,7 @@ LAYOUTS = {
     "olat": (table, {}), "scanner": (slstudio, {}), "opencv-gray": (opencv_gray, {}),
     "phase": (phase, {"WIDTHxHEIGHT": "128x96", "P1,P2,P3": "16,18,21"}), "tof": (tof, {"HZ": "60e6"}),
     "photos": (write_images, {}), "histogram": (spad, {"SECONDS": "1e-9"}), "kinect": (kinect, {}),
+    "laser": (laser, {}),
 }
 
 
@@ -113,6 +121,13 @@ def test_the_printed_command_makes_the_capture(relit, tmp_path, layout):
     then = shlex.split(said["then"])
     lit = layout in ("diligent", "lp", "relightlab", "near-lights", "olat", "photos")
     assert then[:3] == ["relit", "solve" if lit else "depth", str(folder)]
+
+
+def test_stripes_without_planes_are_told_by_their_names(relit, tmp_path):
+    write_scan(tmp_path / "scan")
+    outcome = relit("import", "guess", tmp_path / "scan")
+    assert outcome.code == 0 and f"run      relit import laser {tmp_path}/scan --focal-px FOCAL\n" in outcome.out
+    assert "then     relit calibrate laser-planes POSE POSE" in outcome.out and "assumed  FOCAL is the focal length" in outcome.out
 
 
 def test_a_video_is_taken_for_one_of_patterns(relit, tmp_path):

@@ -53,7 +53,7 @@ COMMANDS: dict[str, list[type[Options]]] = {
     "import photos": [captures.PhotosImport],
     "import relightlab": [captures.RelightlabImport], "import gray": [captures.GrayImport], "import phase": [captures.PhaseImport],
     "import scanner": [captures.ScannerImport], "import tof": [imports_tof.TofImport], "import histogram": [imports_tof.HistogramImport],
-    "import kinect": [imports_tof.KinectImport],
+    "import kinect": [imports_tof.KinectImport], "import laser": [captures.LaserImport],
     "keys create": [keys.NewKey], "calibrate mirror-ball": [calibrate.MirrorBallRequest],
     "calibrate light-positions": [calibrate.LightPositionsRequest], "calibrate grey-ball": [calibrate.GreyBallRequest],
     "calibrate intensity": [calibrate.IntensityRequest], "calibrate dark": [calibrate.DarkRequest],

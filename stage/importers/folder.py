@@ -1,0 +1,99 @@
+"""A folder whose layout is looked for: its names and images, and what is said of it."""
+
+import shlex
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+
+from stage.calibration.opencv_file import read_matrices
+from stage.errors import StageError, storage
+from stage.importers.layout import color_space_of
+from stage.manifest import FILE_NAME
+from stage.mat_file import read_mat_arrays
+
+T = TypeVar("T")
+
+
+class Guess(NamedTuple):
+    """What a folder seems to be."""
+
+    layout: str
+    """In words: `an object of the DiLiGenT benchmark`."""
+    reason: str
+    assumed: tuple[str, ...]
+    """What the files do not say and the command assumes."""
+    command: str
+    """The command to run; words in capitals are to be replaced."""
+    then: str
+    """The command that makes the result."""
+
+
+class Folder(NamedTuple):
+    """The names of the files in a folder."""
+
+    path: Path
+    names: tuple[str, ...]
+    pictures: tuple[str, ...]
+    """Images that are neither mask nor ambient light, in natural order."""
+
+    def with_suffix(self, *suffixes: str) -> list[Path]:
+        """Return the files with one of these suffixes, and those of the folder above after them."""
+        here = [self.path / name for name in self.names if Path(name).suffix.lower() in suffixes and name != FILE_NAME]
+        with storage("read", self.path.parent):
+            above = [path for path in sorted(self.path.absolute().parent.iterdir()) if path.suffix.lower() in suffixes and path.is_file()]
+        return [*here, *above]
+
+
+def made(layout: str, reason: str, words: list[object], source: Path, *, solve: bool, assumed: tuple[str, ...] = ()) -> Guess:
+    """Return a guess.
+
+    Args:
+        layout: what the folder seems to be.
+        reason: why.
+        words: the layout and arguments of `relit import`.
+        source: the folder of the capture.
+        solve: whether `relit solve` makes the result; else `relit depth`.
+        assumed: what the files do not say.
+    """
+    program = "solve" if solve else "depth"
+    return Guess(layout, reason, assumed, shlex.join(["relit", "import", *map(str, words)]),
+                 shlex.join(["relit", program, str(source), "--out", f"{source.resolve().name}-{'maps' if solve else 'depth'}"]))
+
+
+def tried(read: Callable[[], T]) -> T | None:
+    """Return what a reader returns, or None where it refuses the file."""
+    try:
+        return read()
+    except (StageError, ValueError):
+        return None
+
+
+def encoding(folder: Folder) -> tuple[str, ...]:
+    """Return what is assumed of the encoding of 8-bit images."""
+    if tried(partial(color_space_of, folder.path / folder.pictures[0])) != "srgb_texture":
+        return ()
+    return ("the images have 8 bits and are taken as sRGB: many of cameras for measurements are linear, --color-space lin_rec709_scene",)
+
+
+def group_of(folder: Folder, count: int) -> list[str] | None:
+    """Return the option --images that selects so many images: none if it is all, those of one spelling, or None if neither is so many."""
+    if len(folder.pictures) == count:
+        return []
+    spelled = Counter(spelling(name) for name in folder.pictures)
+    fitting = [spelling for spelling, number in spelled.items() if number == count]
+    return ["--images", fitting[0]] if len(fitting) == 1 else None
+
+
+def spelling(name: str) -> str:
+    """Return a name with an asterisk in place of its last number: photo_*.png."""
+    stem, suffix = Path(name).stem, Path(name).suffix
+    return (stem.rstrip("0123456789") + "*" if stem[-1:].isdigit() else stem) + suffix
+
+
+def arrays_of(path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of a .mat or an OpenCV file by name; none where it cannot be read."""
+    return tried(partial(read_mat_arrays if path.suffix.lower() == ".mat" else read_matrices, path)) or {}
