@@ -27,10 +27,10 @@ def write_grey(path, image):
     write_image(path, np.repeat(np.rint(image * 65535)[..., None], 3, axis=2).astype(np.uint16))
 
 
-def write_scan(folder, count=len(NORMALS), *, background=True):
+def write_scan(folder, *, background=True):
     """16-bit PNG, laser_0.png …, and one without the laser."""
     albedo = 0.5 + 0.2 * np.sin(40 * POINTS[..., 0])
-    for number, normal in enumerate(NORMALS[:count]):
+    for number, normal in enumerate(NORMALS):
         glow = np.exp(-(((POINTS - LASER) @ normal) ** 2) / (2 * 0.004**2))
         write_grey(folder / f"laser_{number}.png", albedo * (0.05 + 0.8 * glow))
     if background:
