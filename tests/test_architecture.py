@@ -93,7 +93,8 @@ def test_a_library_lives_in_its_places(library, homes):
 
 
 def test_opencv_lives_where_motion_is_tracked_rigs_calibrated_distances_measured_and_avif_camera_raw_and_video_decoded():
-    allowed = "stage.motion", "stage.calibration", "stage.mask_border", "stage.avif", "stage.camera_raw", "stage.importers.video"
+    allowed = ("stage.motion", "stage.calibration", "stage.mask_border", "stage.avif", "stage.camera_raw", "stage.importers.video",
+               "stage.scans.found_targets")
     assert {i.importer for i in IMPORTS if top(i.target) == "cv2" and not under(i.importer, *allowed)} == set()
 
 

@@ -59,7 +59,8 @@ def _albedo(given: Any) -> Any:
     return tuple(values * 3 if len(values) == 1 else values)
 
 
-def _board(given: Any) -> Any:
+def board_corners(given: Any) -> Any:
+    """Return the inner corners of a chessboard, across and down, that a text such as 9x6 names."""
     if not isinstance(given, str):
         return tuple(given) if isinstance(given, list) else given
     parts = given.lower().split("x")
@@ -219,7 +220,7 @@ class SaturationRequest(ManifestRequest):
 class BoardOptions(Options):
     """What is known of the chessboard."""
 
-    board: Annotated[tuple[Corners, Corners], BeforeValidator(_board), Spelling(metavar="9x6")]
+    board: Annotated[tuple[Corners, Corners], BeforeValidator(board_corners), Spelling(metavar="9x6")]
     """Inner corners of the chessboard, across and down."""
     square_m: Annotated[Positive, AfterValidator(_square)]
     """Side of a square in metres."""

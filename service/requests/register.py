@@ -3,9 +3,10 @@
 from pathlib import Path
 from typing import Annotated, Self
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from service.requests.base import Choice, Options, Role, Spelling
+from service.requests.calibrate import Corners, board_corners
 from stage.model import Fraction, Line, Positive
 
 
@@ -24,6 +25,13 @@ class TableUse(Choice):
     FIXED = "fixed", "axis and angles are right: nothing is moved, and the report says what the surfaces say of it"
 
 
+class Markers(Choice):
+    """The set of coded markers that lie among the scanned."""
+
+    ARUCO4, ARUCO5, ARUCO6, ARUCO7 = "aruco4", "aruco5", "aruco6", "aruco7"
+    APRILTAG16H5, APRILTAG25H9, APRILTAG36H11 = "apriltag16h5", "apriltag25h9", "apriltag36h11"
+
+
 class RegisterOptions(Options):
     """How scans are registered."""
 
@@ -38,6 +46,19 @@ class RegisterOptions(Options):
     """Least part of the smaller of two scans that must lie on the surface of the other."""
     reference: Line | None = None
     """Name of the scan whose pose stays. None: the first with a pose, or the first."""
+    markers: Markers | None = None
+    """Set of coded markers, printed and stuck around the object, that are looked for in the images of range images and used as targets.
+    None: none are looked for."""
+    board: Annotated[tuple[Corners, Corners] | None, BeforeValidator(board_corners), Spelling(metavar="9x6")] = None
+    """Inner corners of a chessboard that stands beside the object, across and down, one number odd and one even; it is looked for in the
+    images of range images and its corners are used as targets. None: none is looked for."""
+
+    @model_validator(mode="after")
+    def _board_has_ends(self) -> Self:
+        if self.board is not None and sum(self.board) % 2 == 0:
+            raise ValueError(f"board: {self.board[0]}x{self.board[1]} looks the same from both ends: of its inner corners, one number must "
+                             "be odd and the other even")
+        return self
 
 
 class RegisterRequest(RegisterOptions):

@@ -10,8 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from service.requests.register import RegisterOptions
 from service.scans.pieces import SharedPieces
-from service.scans.read import read_scan, targets_of
+from service.scans.read import read_scan
+from service.scans.targets import with_found_targets
 from stage.fingerprint import digest
 from stage.scans.candidates import Outline, outline_of
 from stage.scans.extent import extent_of
@@ -40,12 +42,17 @@ class ScanFacts(NamedTuple):
     middle: np.ndarray  # [3] metres, the mean of the points
     pose: np.ndarray | None  # [4, 4] world_from_scan
     targets: tuple[Target, ...]
+    found: int
+    """Targets that were found in its image."""
+    missed: str | None
+    """Why none was, in words after its name; None: some were, or none were looked for."""
 
 
-def facts_of(scan: Scan) -> ScanFacts:
-    """Return the facts of a scan."""
+def facts_of(scan: Scan, file: Path, listed: ScanSet, number: int, options: RegisterOptions) -> ScanFacts:
+    """Return the facts of a scan, with the targets that are listed and those that its image shows."""
+    looked = with_found_targets(scan, listed.scans[number], options, file, f"{file}: scans[{number}] ({scan.name})")
     return ScanFacts(scan.name, digest(scan.path), len(scan.points), float(np.median(scan.sigma)), scan.sigma_source, extent_of(scan),
-                     scan.points.mean(axis=0, dtype=np.float64), scan.pose, scan.targets)
+                     scan.points.mean(axis=0, dtype=np.float64), scan.pose, looked.targets, looked.found, looked.missed)
 
 
 class KeptScans:
@@ -69,12 +76,14 @@ class KeptScans:
         self._prepared: Callable[[str], bytes] | None = None
         self._pair_files: dict[tuple[int, int], Callable[[], bytes]] = {}
 
-    def facts(self, advance: Callable[[int], None]) -> list[ScanFacts]:
+    def facts(self, options: RegisterOptions, advance: Callable[[int], None]) -> list[ScanFacts]:
         """Read every scan once, and return what is to be known of all."""
+        def made(piece: str) -> bytes:
+            return _packed_facts(facts_of(self.scan(int(piece)), self._file, self._listed, int(piece), options))
+
         names = [f"{number:05d}" for number in range(len(self._listed.scans))]
-        read = self._pieces.do("read", names, lambda piece: _packed_facts(facts_of(self.scan(int(piece)))), threads=self._threads,
-                               advance=advance)
-        facts = [_unpacked_facts(read(name), targets_of(entry)) for name, entry in zip(names, self._listed.scans, strict=True)]
+        read = self._pieces.do("read", names, made, threads=self._threads, follows_from=(options.markers, options.board), advance=advance)
+        facts = [_unpacked_facts(read(name)) for name in names]
         self._contents = tuple(each.content for each in facts)
         return facts
 
@@ -139,11 +148,14 @@ class KeptScans:
 
 def _packed_facts(facts: ScanFacts) -> bytes:
     plain = facts._asdict() | {"middle": facts.middle.tolist(),
-                               "pose": None if facts.pose is None else facts.pose.tolist(), "targets": []}
+                               "pose": None if facts.pose is None else facts.pose.tolist(),
+                               "targets": [(name, place.tolist(), spread.tolist()) for name, place, spread in facts.targets]}
     return json.dumps(plain).encode()
 
 
-def _unpacked_facts(content: bytes, targets: tuple[Target, ...]) -> ScanFacts:
+def _unpacked_facts(content: bytes) -> ScanFacts:
     plain = json.loads(content)
     return ScanFacts(**(plain | {"middle": np.array(plain["middle"]),
-                                 "pose": None if plain["pose"] is None else np.array(plain["pose"]), "targets": targets}))
+                                 "pose": None if plain["pose"] is None else np.array(plain["pose"]),
+                                 "targets": tuple(Target(name, np.array(place), np.array(spread))
+                                                  for name, place, spread in plain["targets"])}))

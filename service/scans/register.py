@@ -127,7 +127,7 @@ def _pieces(request: RegisterRequest, file: Path, listed: ScanSet, sharing: Shar
         if pieces is None:
             folder = request.cache or Path(held.enter_context(tempfile.TemporaryDirectory(prefix="relit-register-")))
             pieces = SharedPieces(FolderPieces(folder))
-        places = [file.parent / entry.path for entry in listed.scans]
+        places = [file.parent / path for entry in listed.scans for path in (entry.path, entry.image) if path is not None]
         files = [path for place in places for path in (place, place / DEPTH_FILE) if path.is_file()]
         stamps = tuple((path.stat().st_size, 0 if sharing else path.stat().st_mtime_ns) for path in files)
         pieces.identify(listed.model_dump_json(), stamps, tuple(versions().items()))
@@ -148,19 +148,34 @@ def _placed(request: RegisterRequest, file: Path, listed: ScanSet, pieces: Share
         timings.stage("register", 100)
         fixed = check_fixed(scans, [turned_pose(table, angle) for angle in table.angles_deg], threads=threads,
                             advance=timings.advance_percent, cell_m=request.cell_m, least_overlap=request.least_overlap)
-        known = [facts_of(scan) for scan in scans]
+        known = [facts_of(scan, file, listed, number, request) for number, scan in enumerate(scans)]
+        missed = _missed(request, known)
         poses = dict(enumerate(fixed.poses))
         places = target_places({number: scan.targets for number, scan in enumerate(known)}, poses, {})
         return _Placed(known, poses, {}, {}, fixed.pairs, _fixed_facts(fixed, known) | _target_facts(places, known),
-                       _fixed_warnings(fixed, known) + _wrong_targets(places, known))
+                       missed + _fixed_warnings(fixed, known) + _wrong_targets(places, known))
     kept = KeptScans(file, listed, pieces, memory_bytes=1e9 * request.memory_gb, threads=threads)
-    known = kept.facts(timings.advance)
+    known = kept.facts(request, timings.advance)
+    missed = _missed(request, known)
     timings.stage("register", 100)
     options = RegistrationOptions(cell_m=request.cell_m, least_overlap=request.least_overlap, reference=reference, threads=threads)
     found = register_by(kept, [scan.name for scan in known], [scan.extent_m for scan in known], _starts(request, listed, known), options,
                         table=table if request.turntable is TableUse.ANGLES else None,
                         targets={number: scan.targets for number, scan in enumerate(known)}, advance=timings.advance_percent)
-    return _Placed(known, found.poses, found.covariances, found.alone, found.pairs, _facts(found, known), _warnings(found, known))
+    return _Placed(known, found.poses, found.covariances, found.alone, found.pairs, _facts(found, known), missed + _warnings(found, known))
+
+
+def _missed(request: RegisterRequest, scans: Sequence[ScanFacts]) -> list[str]:
+    """Return which scans show none of the marks that were looked for.
+
+    Raises:
+        RequestError: none does.
+    """
+    if (request.markers is not None or request.board is not None) and not any(scan.found for scan in scans):
+        named = [] if request.markers is None else [f"--markers {request.markers}"]
+        named += [] if request.board is None else [f"--board {request.board[0]}x{request.board[1]}"]
+        raise RequestError(f"{' and '.join(named)}: no scan shows any: {scans[0].name}: {scans[0].missed}")
+    return [f"{scan.name}: {scan.missed}" for scan in scans if scan.missed is not None]
 
 
 def _threads(request: RegisterRequest) -> int:
@@ -207,6 +222,7 @@ def _entry(entry: ScanEntry, home: Path, out: Path, pose: np.ndarray | None, cov
         return None if matrix is None else tuple(tuple(map(float, row)) for row in matrix)
 
     return entry.model_copy(update={"path": moved(entry.path), "maps": None if entry.maps is None else moved(entry.maps),
+                                    "image": None if entry.image is None else moved(entry.image),
                                     "scan_to_world": rows(pose), "pose_covariance": rows(covariance)})
 
 
@@ -294,6 +310,7 @@ def _scan_facts(number: int, scan: ScanFacts, poses: dict[int, np.ndarray], spre
                 joined: Sequence[Pair]) -> dict[str, Any]:
     sigma = spread.get(number)
     return {"name": scan.name, "points": scan.points, "sigma_m": _short(scan.sigma_m), "sigma": scan.sigma_source,
+            "targets": len(scan.targets),
             "joined": number in poses, "why_not": alone.get(number), "pairs": sum(number in (pair.a, pair.b) for pair in joined),
             "pose_sigma_m": None if sigma is None else _short(sigma[0]), "pose_sigma_degrees": None if sigma is None else _short(sigma[1])}
 

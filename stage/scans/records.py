@@ -64,6 +64,9 @@ class ScanEntry(Strict):
     """The covariance of `scan_to_world`. None: it is not known."""
     maps: Text | None = None
     """A result folder of `relit solve` for the same camera in the same place, or its maps.exr, relative to the file. None: none."""
+    image: Text | None = None
+    """A photograph by the camera of a range image from the same place, in which `relit register` looks for markers and boards, relative to
+    the file. None: the colours of the points.ply beside the depth."""
     targets: Annotated[tuple[TargetEntry, ...], FirstFault] = ()
     """Named targets that the scan shows. Scans that show three of the same targets or more are placed by them as well as by their
     surfaces."""

@@ -6,9 +6,14 @@ from functools import cache
 import numpy as np
 import pytest
 
-from stage.scans.rigid import applied, inverse
+from stage.depth_maps import DepthMaps
+from stage.images import write_png
+from stage.scans.records import read_scan_set
+from stage.scans.rigid import applied, inverse, step_between
+from stage.scans.scan import Scan
 from tests.scenes.turntable import MM, View, turntable, vase
 from tests.service.scans.test_register import off, write
+from tests.stage.scans.test_found_targets import CAMERA, POSES, look
 
 PLACES = {f"T{k}": np.array(place) for k, place in enumerate(
     [(0.4, -0.4, 0), (0.2, 0.3, 0.4), (-0.2, -0.4, 0.4), (-0.4, 0.2, -0.1), (0, 0.4, -0.4)])}
@@ -60,3 +65,42 @@ def test_a_target_is_listed_once(relit, tmp_path):
     one = {"name": "T0", "position_m": [0, 0, 1], "sigma_m": 1e-4}
     outcome = relit("register", write(tmp_path / "set", views(), s0={"targets": [one, one]}), "--out", tmp_path / "out")
     assert outcome.code == 2 and "T0 is there twice" in outcome.err
+
+
+def write_walls(folder, kind: str, *, images: bool = True):
+    """Range images of a flat wall with marks, and photographs of it by the same camera."""
+    entries = []
+    for number, pose in enumerate(POSES):
+        image, scan = look(kind, pose, seed=number)
+        assert isinstance(scan, Scan) and scan.pixels is not None
+        depth = scan.image(-scan.points[:, 2]).astype(np.float32)
+        DepthMaps(camera=CAMERA, mask=depth > 0, depth=depth, sigma=np.full(depth.shape, 2e-4, dtype=np.float32)).write(
+            folder / f"s{number}" / "depth.exr")
+        codes = np.rint(255 * np.clip(np.sqrt(image), 0, 1)).astype(np.uint8)
+        write_png(folder / f"s{number}.png", codes[..., None].repeat(3, 2), srgb=True)
+        entries.append({"name": f"s{number}", "path": f"s{number}", **({"image": f"s{number}.png"} if images else {})})
+    (folder / "scan-set.json").write_text(json.dumps({"schema": "relit.scan-set/1", "name": "wall", "scans": entries}))
+    return folder
+
+
+@pytest.mark.parametrize(("kind", "option"), [("aruco4", ("--markers", "aruco4")), ("board", ("--board", "7x6"))])
+def test_a_flat_wall_is_placed_by_the_marks_that_its_images_show(relit, tmp_path, kind, option):
+    folder = write_walls(tmp_path / "set", kind)
+    outcome = relit("register", folder, "--out", tmp_path / "out", *option)
+    assert outcome.code == 0, outcome.err
+    _, found = read_scan_set(tmp_path / "out")
+    world = np.array(found.scans[0].scan_to_world) @ inverse(POSES[0])
+    for entry, pose in zip(found.scans, POSES, strict=True):
+        step = step_between(inverse(world) @ np.array(entry.scan_to_world) @ inverse(pose), np.zeros(3))
+        assert np.linalg.norm(step[3:]) < 5e-4 and np.degrees(np.linalg.norm(step[:3])) < 0.15  # marks of a fifth of a pixel of 2 mm
+    assert (tmp_path / "out" / str(found.scans[1].image)).is_file()
+
+
+def test_marks_that_no_image_shows_and_boards_without_ends_are_refused(relit, tmp_path):
+    folder = write_walls(tmp_path / "set", "aruco4")
+    for option, words in ((("--markers", "aruco7"), "--markers aruco7: no scan shows any"), (("--board", "6"), "give two whole numbers"),
+                          (("--board", "7x7"), "looks the same from both ends")):
+        outcome = relit("register", folder, "--out", tmp_path / "out", *option)
+        assert outcome.code == 2 and words in outcome.err and not (tmp_path / "out").exists()
+    outcome = relit("register", write_walls(tmp_path / "plain", "aruco4", images=False), "--out", tmp_path / "out", "--markers", "aruco4")
+    assert outcome.code == 2 and "has neither an image nor colours" in outcome.err
