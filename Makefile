@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 WORKERS ?= $(shell $(PYTHON) -c 'import os; print(max(3, min(4, os.cpu_count() or 1)))')
 PYTEST := $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo serve test test-all clients lint bench gpu-bench manifest-page figures samples screenshots lock vendor colour-table clean
+.PHONY: demo serve test test-all clients lint bench gpu-bench manifest-page help-listing figures samples screenshots lock vendor colour-table clean
 demo: $(VENV)/installed
 	$(BIN)/relit demo
 
@@ -37,6 +37,10 @@ gpu-bench: $(VENV)/installed
 # docs/manifest.md, every field of capture.json, from the models in stage/
 manifest-page: $(VENV)/installed-dev
 	$(BIN)/python -m stage.manifest_page
+
+# service/cli/listing.json, the list of commands that `relit --help` shows, from the commands
+help-listing: $(VENV)/installed-dev
+	$(BIN)/python -m service.cli.listing
 
 # the tables of docs/figures.md; FIGURES="--data DIR --glossy DIR --large DIR" measures what needs data or space
 figures: $(VENV)/installed-dev

@@ -1,4 +1,4 @@
-"""How long `relit --help` takes: `python -m benchmarks.start`. The goal is 0.6 s on a quiet machine."""
+"""How long `relit --help` takes: `python -m benchmarks.start`. The goal is 0.4 s on a quiet machine."""
 
 import statistics
 import subprocess

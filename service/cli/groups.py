@@ -6,6 +6,9 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
+NO_COMMAND = 2
+"""The exit code where no command is given: the help is shown, and nothing was done."""
+
 
 class _Group(TyperGroup):
     """A group that lists its commands with their whole first sentence; Typer cuts it to one line."""
@@ -16,10 +19,16 @@ class _Group(TyperGroup):
                 command.short_help = _first_sentence(command.help)
         return super().list_commands(ctx)
 
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if not args and not ctx.resilient_parsing:  # before Typer makes an error of it, whose message would be the whole help
+            typer.echo(ctx.get_help(), err=True)
+            ctx.exit(NO_COMMAND)
+        return super().parse_args(ctx, args)
+
 
 def make_group(name: str | None = None, *, help: str) -> typer.Typer:
     """Return a group of commands, which shows its help when no command is given; the parameters are Typer's."""
-    return typer.Typer(name=name, cls=_Group, help=help, no_args_is_help=True, rich_markup_mode=None, add_completion=False,
+    return typer.Typer(name=name, cls=_Group, help=help, rich_markup_mode=None, add_completion=False,
                        pretty_exceptions_enable=False)
 
 

@@ -11,6 +11,7 @@ import typer
 from typer.exceptions import TyperException
 
 from service.cli.groups import make_group
+from service.cli.listing import listing_program
 
 COMMANDS: dict[str, tuple[str, ...]] = {
     "demo": ("demo", "bench"),
@@ -35,6 +36,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
 """The modules of service.cli in the order of the help, and the commands that each registers. A command that is missing here is found by
 loading all modules."""
 
+ABOUT = "Active-illumination captures to normals, materials, depth, USD assets and relit frames."
 BAD_INPUT, INTERRUPTED = 2, 130
 BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
 """The variables by which NumPy's linear algebra is told its number of threads. Without them it has one: kernels divide the large work among
@@ -43,11 +45,18 @@ the cores, and matrices of some hundred rows cost more to divide than to solve."
 
 def program(wanted: str | None = None) -> typer.Typer:
     """Return the program; where `wanted` is a command, only those of its module: to import the others takes as long as a short run."""
-    app = make_group("relit", help="Active-illumination captures to normals, materials, depth, USD assets and relit frames.")
+    app = make_group("relit", help=ABOUT)
     app.callback(invoke_without_command=True)(_root)
     beside = [module for module, names in COMMANDS.items() if wanted in names]
     for module in beside or COMMANDS:
         importlib.import_module(f"service.cli.{module}").register(app)
+    return app
+
+
+def _lister() -> typer.Typer:
+    """Return a program that can show what `program` lists, without importing the commands."""
+    app = listing_program(help=ABOUT)
+    app.callback(invoke_without_command=True)(_root)
     return app
 
 
@@ -67,7 +76,8 @@ def main() -> None:
         os.environ[BLAS_THREADS[0]] = "1"
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # whoever ends us gets the same tidy end as one who types Ctrl-C
     try:
-        code = program(next(iter(sys.argv[1:]), None))(standalone_mode=False)  # so that wrong options, too, are one sentence
+        app = _lister() if sys.argv[1:] in ([], ["--help"]) else program(next(iter(sys.argv[1:]), None))
+        code = app(standalone_mode=False)  # so that wrong options, too, are one sentence
         if code == INTERRUPTED:  # what typer makes of KeyboardInterrupt
             print("relit: interrupted; results that are there are whole, run again to finish", file=sys.stderr)
         sys.exit(code)

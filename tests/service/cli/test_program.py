@@ -1,5 +1,6 @@
 """The program itself: help, version, doctor, import and info, wrong options, and the way it ends."""
 
+import json
 import os
 import subprocess
 import sys
@@ -7,9 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer import Context
 from typer.main import get_command
 
 import service
+from service.cli.listing import LISTING, listed_commands
 from service.cli.main import BLAS_THREADS, COMMANDS, program
 from stage.capture import Capture
 from tests.scenes.captures import edit_manifest, make_scene, write_capture, write_exr, write_image
@@ -27,7 +30,17 @@ def test_help_names_every_command(relit):
     outcome = relit("--help")
     assert outcome.code == 0
     assert all(f" {name} " in outcome.out for name in SHOWN)
-    assert relit().code == 2  # nothing asked: the same help, and not a success
+    assert relit() == (2, "", outcome.out)  # nothing asked: the same help, and not a success
+
+
+def test_the_help_that_is_shown_without_loading_commands_is_theirs(relit):
+    assert json.loads(LISTING.read_text(encoding="utf-8")) == listed_commands(program()), "python -m service.cli.listing writes it"
+    command = get_command(program())
+    assert relit("--help").out == command.get_help(Context(command, info_name=Path(sys.argv[0]).name)) + "\n"
+    loaded = subprocess.run([sys.executable, "-X", "importtime", "-m", "service.cli.main", "--help"], cwd=ROOT, check=True, text=True,
+                            capture_output=True).stderr
+    assert "typer" in loaded
+    assert not any(heavy in loaded for heavy in ("pydantic", "numpy", "service.requests"))
 
 
 @pytest.mark.parametrize("command", SHOWN)
