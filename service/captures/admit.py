@@ -16,6 +16,7 @@ from stage.errors import ImageError, ManifestError, storage
 from stage.files import resolved
 from stage.manifest import FILE_NAME, Manifest, read_manifest
 from stage.records import read_record
+from stage.sequence import SEQUENCE_FILE, is_sequence, read_sequence
 from stage.tof.scan import FILE_NAME as SCAN_FILE
 from stage.tof.scan import read_scan
 
@@ -62,7 +63,7 @@ def admit_capture(folder: Path, *, max_pixels: int, progress: Progress | None = 
     timings.close()
     assert manifest is not None, "time_steps gives at least one"
     return {"captures": len(steps), "frames": frames, "resolution": list(manifest.camera.resolution), "color_space": manifest.color_space,
-            "name": manifest.name}
+            "name": manifest.name, **({"steps": len(steps)} if is_sequence(folder) else {})}
 
 
 def _admit_board(folder: Path, max_pixels: int) -> dict[str, Any]:
@@ -81,16 +82,22 @@ def _admit_board(folder: Path, max_pixels: int) -> dict[str, Any]:
     return {"captures": 0, "frames": 0, "tiles": len(scan.tiles), "name": scan.name}
 
 
-def recheck_capture(folder: Path, *, max_pixels: int) -> None:
+def recheck_capture(folder: Path, *, max_pixels: int, number: int | None = None) -> None:
     """Check again what may have changed since a capture was admitted: where its files lie, and their sizes.
 
     Opening the capture then checks everything else. A file that is changed between the two checks is not noticed.
+
+    Args:
+        folder: of the capture or of a sequence.
+        max_pixels: most pixels of an image.
+        number: of the only step of a sequence whose images are read, from 1; None: all are.
 
     Raises:
         ManifestError, ImageError, StorageError: for the reasons that `admit_capture` names.
     """
     _check_manifest_files(folder)
-    for step in time_steps(folder):
+    steps = time_steps(folder)
+    for step in steps if number is None else steps[number - 1 : number]:
         if (step / FILE_NAME).is_file():
             _check_places(step, read_manifest(step / FILE_NAME), folder, max_pixels)
 
@@ -141,12 +148,21 @@ def _check_manifest_files(folder: Path) -> None:
     with storage("read", folder):
         first = folder / FILE_NAME
         found = [first] if first.exists() or first.is_symlink() or not folder.is_dir() else sorted(folder.glob(f"*/{FILE_NAME}"))
+        if found != [first] and ((file := folder / SEQUENCE_FILE).exists() or file.is_symlink()):
+            _check_manifest_file(file, folder)
+            found = [step.folder / FILE_NAME for step in read_sequence(file).steps]
+            for number, path in enumerate(found):  # whether it exists or not: that is nobody's business
+                if (place := resolved(path)) is None or not place.is_relative_to(folder.resolve()):
+                    raise ManifestError(f"{file}: steps[{number}].path leads out of the capture's folder")
         for path in found:
-            if not path.exists():
-                continue  # opening it says so
-            _check_place(path, folder, f"{path}")
-            if (size := path.stat().st_size) > MAX_MANIFEST_BYTES:
-                raise ManifestError(f"{path}: has {size} bytes, {MAX_MANIFEST_BYTES} are read")
+            if path.exists() or path.is_symlink():  # else opening it says so
+                _check_manifest_file(path, folder)
+
+
+def _check_manifest_file(path: Path, folder: Path) -> None:
+    _check_place(path, folder, f"{path}")
+    if (size := path.stat().st_size) > MAX_MANIFEST_BYTES:
+        raise ManifestError(f"{path}: has {size} bytes, {MAX_MANIFEST_BYTES} are read")
 
 
 def _check_places(step: Path, manifest: Manifest, folder: Path, max_pixels: int) -> None:

@@ -126,13 +126,17 @@ class Request(DeviceRequest):
     """Folder for the image stack; None: .relit in the capture's folder."""
 
 
-class SequenceRequest(Request):
-    """Base of the requests that take a capture, or a sequence of captures."""
+class SequenceOptions(Options):
+    """How the steps of a sequence of captures are taken together."""
 
     temporal: Annotated[bool, Role.RUN] = True
     """Join the estimates of consecutive steps of a sequence where they agree within their standard deviations."""
     frame_rate: Annotated[Positive | None, Role.RUN] = None
     """Steps per second of a sequence without a sequence.json; None: 24."""
+
+
+class SequenceRequest(SequenceOptions, Request):
+    """Base of the requests that take a capture, or a sequence of captures."""
 
 
 class PixelOptions(Options):

@@ -5,7 +5,7 @@ from typing import Annotated, Literal, Self, get_args
 
 from pydantic import Field, TypeAdapter, model_validator
 
-from service.requests.base import CAPTURE, Role, Spelling
+from service.requests.base import CAPTURE, Role, SequenceOptions, Spelling
 from service.requests.basis import BasisOptions
 from service.requests.calibration_jobs import AnyCalibration
 from service.requests.depth import DepthOptions
@@ -43,28 +43,30 @@ class CheckJob(JobRequest):
 
 
 class SolveJob(JobRequest):
-    """Normals, reflectance and height: maps.exr, report.json."""
+    """Normals, reflectance and height: maps.exr, report.json; of a sequence those of each step, sequence.json and report.json."""
 
     kind: Literal["solve"]
     capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
-    """The capture."""
+    """The capture, or a sequence: an uploaded or registered folder of captures, one a time step (docs/sequences.md)."""
     reference_ball: Annotated[CaptureId | None, Role.INPUT, Spelling(metavar="CAPTURE")] = None
     """Capture of a ball of the object's material, for the method reference."""
     options: SolveOptions = SolveOptions()
+    sequence: SequenceOptions = SequenceOptions()
 
 
 class DepthJob(JobRequest):
-    """Depth: depth.exr, points.ply, report.json."""
+    """Depth: depth.exr, points.ply, report.json; of a sequence those of each step, sequence.json and report.json."""
 
     kind: Literal["depth"]
     capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
-    """The capture."""
+    """The capture, or a sequence: an uploaded or registered folder of captures, one a time step (docs/sequences.md)."""
     tof_calibration: Annotated[Line | None, Role.INPUT, Spelling(metavar="NAME")] = None
     """Name of a relit.tof/1 file in the capture's folder."""
     beside: Annotated[CaptureId | None, Role.INPUT, Spelling(metavar="CAPTURE")] = None
     """Capture of a second camera under the same patterns of the same projector, which need not be calibrated: both cameras are triangulated
     by their `world_from_camera`."""
     options: DepthOptions = DepthOptions()
+    sequence: SequenceOptions = SequenceOptions()
 
 
 class RelightJob(JobRequest):
@@ -165,7 +167,7 @@ class PipelineJob(JobRequest):
 
     kind: Literal["pipeline"]
     capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
-    """The capture."""
+    """The capture, or a sequence: a folder of captures, one a time step."""
     environment: Annotated[EnvironmentId | None, Role.INPUT] = None
     """Lat-long environment."""
     keys: Annotated[LightKeys | None, Role.INPUT, KEYS] = None
@@ -175,6 +177,7 @@ class PipelineJob(JobRequest):
     guided: bool = False
     """Guide the frames by the maps that were solved."""
     solve: SolveOptions = SolveOptions()
+    sequence: SequenceOptions = SequenceOptions()
     export: ExportOptions = ExportOptions()
     relight: RelightOptions = RelightOptions()
 

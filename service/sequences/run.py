@@ -7,18 +7,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from service.depth.depth import depth
-from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, report
 from service.requests.depth import DepthRequest
-from service.requests.solve import Intensities, LightsKnown, SolveRequest
+from service.requests.solve import SolveRequest
 from service.sequences.joined_depth import DepthJoiner, moved_points
 from service.sequences.joined_maps import MapsJoiner
-from service.sequences.steps import ALONE, StepProgress, capture_digest, check_outputs, do_step, step_report
-from service.solve.lights_over_time import LightsOverTime
-from service.solve.solve import solve
-from stage.capture import Capture
+from service.sequences.one_step import depth_alone, shared_lights, solve_alone
+from service.sequences.steps import ALONE, StepProgress, check_outputs, step_report
 from stage.depth_maps import DEPTH_FILE, DepthMaps
 from stage.errors import ResultError
 from stage.files import write_text
@@ -68,23 +64,13 @@ def solve_sequence(request: SolveRequest, progress: Progress | None = None) -> S
         StageError, KernelError: bad input; the steps before are whole.
         StorageError: the results cannot be written; nothing is left half-written.
     """
-    if request.lights is not LightsKnown.DECLARED:
-        raise RequestError(f"--lights {request.lights}: each step of a sequence would find lights of its own, and the surfaces would not "
-                           "fit each other: measure the lights once (relit calibrate), and write them into every step")
+    lights = shared_lights(request)
     sequence, manifests = _open(request)
     near = any(isinstance(frame.light, PointLight) for manifest in manifests for frame in manifest.frames)
     joiner = MapsJoiner(anchored=not near)
-    lights = LightsOverTime(shared=request.intensities is Intensities.CHOSEN)
 
     def one(step: TimeStep, folder: Path, told: StepProgress) -> tuple[_Step, bool]:
-        there = _step_request(request, step, folder)
-
-        def work() -> dict[str, Any]:
-            solve(there, told, over_time=lights)
-            return lights.left()
-
-        left, was_done = do_step(there.out, capture_digest(step.folder, there, lights.plain()), work)
-        lights.take(left)
+        there, was_done = solve_alone(request, step, told, lights)
         alone = SurfaceMaps.read(there.out / MAPS_FILE, unsure=True)
         facts: dict[str, Any] = {}
         if request.temporal:
@@ -111,13 +97,7 @@ def depth_sequence(request: DepthRequest, progress: Progress | None = None) -> S
     joiner = DepthJoiner()
 
     def one(step: TimeStep, folder: Path, told: StepProgress) -> tuple[_Step, bool]:
-        there = _step_request(request, step, folder)
-
-        def work() -> dict[str, Any]:
-            depth(there, told)
-            return {}
-
-        _, was_done = do_step(there.out, capture_digest(step.folder, there, None), work)
+        there, was_done = depth_alone(request, step, told)
         alone = DepthMaps.read(there.out / DEPTH_FILE, unsure=True)
         facts: dict[str, Any] = {}
         if request.temporal:
@@ -136,16 +116,6 @@ def _open(request: SolveRequest | DepthRequest) -> tuple[Sequence, list[Any]]:
     manifests = check_alike(sequence)
     check_outputs(request.out, sequence)
     return sequence, manifests
-
-
-def _step_request(request: Any, step: TimeStep, folder: Path) -> Any:
-    """Return the request of one step."""
-    Capture.open(step.folder, request.pixels)
-    changes: dict[str, Any] = {"capture": step.folder, "out": folder / ALONE if request.temporal else folder, "frame_rate": None,
-                               "temporal": True}
-    if request.cache is not None:
-        changes["cache"] = request.cache / step.name
-    return request.model_copy(update=changes)
 
 
 def _finish(request: Any, step: TimeStep, folder: Path, alone: Path, mask: np.ndarray, facts: dict[str, Any]) -> _Step:

@@ -8,7 +8,7 @@ from typing import Any
 
 from service.errors import RequestError
 from service.reporting.progress import Progress
-from service.reporting.provenance import REPORT_FILE, requested, versions
+from service.reporting.provenance import REPORT_FILE, requested, versions, with_names
 from service.requests.base import Request
 from stage.capture import Capture
 from stage.errors import ResultError
@@ -68,11 +68,12 @@ def capture_digest(folder: Path, request: Request, shared: object) -> str:
     """
     capture = Capture.open(folder)
     names = sorted({name for _, name in capture.files()})
-    hashes = Fingerprints(capture.folder, capture.folder / CACHE_FOLDER / "files.json").of(names)
+    hashes = Fingerprints(capture.folder, (request.cache or capture.folder / CACHE_FOLDER) / "files.json").of(names)
     content = {"files": [hashes[name] for name in names], "names": names, "manifest": digest(capture.folder / FILE_NAME),
                "options": {name: value for name, value in requested(request).items() if name != "capture"}, "versions": versions(),
                "shared": shared}
-    return hashlib.blake2b(json.dumps(content, sort_keys=True, default=str).encode(), digest_size=16).hexdigest()
+    text = with_names(json.dumps(content, sort_keys=True, default=str))  # folders of a service differ from machine to machine
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
 def done(folder: Path, content: str) -> dict[str, Any] | None:
@@ -82,14 +83,18 @@ def done(folder: Path, content: str) -> dict[str, Any] | None:
         folder: of its result.
         content: of capture_digest.
     """
+    found = _done_file(folder)
+    left = found.get("left")
+    return left if isinstance(left, dict) and found.get("content") == content and (folder / REPORT_FILE).is_file() else None
+
+
+def _done_file(folder: Path) -> dict[str, Any]:
+    """Return what the file of a step that is done says; nothing where there is none that can be read."""
     try:
         found = json.loads((folder / DONE_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
-        return None
-    if not isinstance(found, dict) or found.get("schema") != DONE_SCHEMA or found.get("content") != content:
-        return None
-    left = found.get("left")
-    return left if isinstance(left, dict) and (folder / REPORT_FILE).is_file() else None
+        return {}
+    return found if isinstance(found, dict) and found.get("schema") == DONE_SCHEMA else {}
 
 
 def do_step(folder: Path, content: str, work: Callable[[], dict[str, Any]]) -> tuple[dict[str, Any], bool]:
@@ -110,6 +115,16 @@ def do_step(folder: Path, content: str, work: Callable[[], dict[str, Any]]) -> t
     left = work()
     write_text(folder / DONE_FILE, json.dumps({"schema": DONE_SCHEMA, "content": content, "left": left}) + "\n")
     return left, False
+
+
+def left_by(folder: Path) -> dict[str, Any]:
+    """Return what a step that is done has left for others; nothing where its file is not there.
+
+    Args:
+        folder: of its result.
+    """
+    left = _done_file(folder).get("left")
+    return left if isinstance(left, dict) else {}
 
 
 def step_report(folder: Path) -> dict[str, Any]:

@@ -156,19 +156,20 @@ def solve(request: SolveRequest, progress: Progress | None = None, *, sharing: S
     return SolveResult(maps, maps_path, report_path, counts, tuple(solution.suspects), tuple(solution.warnings))
 
 
-def help_solve(request: SolveRequest, progress: Progress, sharing: SharedSolve) -> None:
+def help_solve(request: SolveRequest, progress: Progress, sharing: SharedSolve, *, over_time: "LightsOverTime | None" = None) -> None:
     """Do pieces of a solve that another process has begun; nothing is written but what it reads of them.
 
     Args:
         request: that of the other process, on a device of the same kind.
         progress: told how far the solve is; it ends the help by an exception.
         sharing: the part of this process.
+        over_time: as for solve.
 
     Raises:
         StageError, KernelError: the input is wrong.
         DivergedError: this process finds something else than the other.
     """
-    opened = _open(request, Timings(progress), sharing)
+    opened = _open(request, Timings(progress), sharing, over_time)
     opened.solver(opened.given, opened.lights)
 
 

@@ -4,10 +4,14 @@ from collections.abc import Sequence
 
 import sqlalchemy as sa
 
+from service.requests.base import SequenceOptions
+from service.requests.calibration_jobs import TofCalibrationJob
+from service.requests.export import AssetFormat
 from service.requests.frame_range import frame_numbers
 from service.requests.job import JobRequest
 from service.requests.jobs import (
     CheckJob,
+    DepthJob,
     ExportJob,
     FuseJob,
     GaugeBoardJob,
@@ -17,6 +21,7 @@ from service.requests.jobs import (
     RegisterJob,
     RelightJob,
     ShadeJob,
+    SolveJob,
     ViewJob,
 )
 from service.requests.relight import RelightOptions
@@ -25,11 +30,16 @@ from service.server.api.context import Service, require_quota
 from service.server.api.problems import ApiError
 from service.server.database import audit, intakes, jobs, quotas
 from service.server.database.keys import Caller
+from service.server.jobs.context import SEQUENCE
 from service.views import states
 
 QUEUE_RETRY_S = 30
 SOLVES = ("solve", "pipeline")
 """Kinds of jobs that solve maps."""
+OF_SEQUENCES = (SolveJob, DepthJob, PipelineJob, RelightJob, TofCalibrationJob)
+"""Jobs whose capture may be a sequence of captures."""
+TIME_SAMPLED: tuple[AssetFormat, ...] = ("usdz", "usdc")
+"""Formats of the asset of a sequence."""
 
 
 def submit(service: Service, caller: Caller, request: JobRequest, connection: sa.Connection, inputs: list[str]) -> str:
@@ -65,11 +75,18 @@ def inputs_of(service: Service, project: str, request: JobRequest) -> list[str]:
     for field in ("capture", "captures", "environment", "reference_ball", "beside", "rig", "apply_to"):
         value = getattr(request, field, None)
         for identifier in value if isinstance(value, tuple) else () if value is None else (value,):
-            _require_ready(service, project, field, identifier)
+            steps = intakes.time_steps(_require_ready(service, project, field, identifier))
+            if steps and not (field == "capture" and isinstance(request, OF_SEQUENCES)):
+                raise ApiError("invalid", f"{field}: {identifier} is a sequence of {steps} captures: give one capture here; "
+                                          "solve, depth, relight and pipeline take sequences")
+            if field == "capture" and isinstance(request, SolveJob | DepthJob | PipelineJob):
+                _require_sequence(request, steps)
             read.append(identifier)
     if isinstance(request, RelightJob | ShadeJob | ExportJob | ViewJob) and request.maps is not None:
         kinds = (*SOLVES, "join", *(("depth",) if isinstance(request, ExportJob | ViewJob) else ()))
-        _require_results(service, project, "maps", request.maps, kinds)
+        row = _require_results(service, project, "maps", request.maps, kinds, sequences=isinstance(request, RelightJob | ExportJob))
+        if isinstance(request, ExportJob) and SEQUENCE in row["finished_steps"]:
+            _require_format(request.format)
         read.append(request.maps)
     if isinstance(request, JoinJob):
         _require_results(service, project, "maps", request.maps, SOLVES)
@@ -86,6 +103,19 @@ def inputs_of(service: Service, project: str, request: JobRequest) -> list[str]:
     if isinstance(request, GaugeBoardJob):
         read += _require_inspections(service, project, request)
     return read
+
+
+def _require_sequence(request: SolveJob | DepthJob | PipelineJob, steps: int) -> None:
+    """Refuse options of sequences for one capture, and assets that cannot hold the steps of a sequence."""
+    if not steps and request.sequence != SequenceOptions():
+        raise ApiError("invalid", f"sequence: {request.capture} is one capture, and the options are for a sequence of them: leave them out")
+    if steps and isinstance(request, PipelineJob):
+        _require_format(request.format)
+
+
+def _require_format(given: AssetFormat) -> None:
+    if given not in TIME_SAMPLED:
+        raise ApiError("invalid", f"format: is {given}, the asset of a sequence is one of {', '.join(TIME_SAMPLED)}")
 
 
 def spelled_out(service: Service, project: str, request: JobRequest) -> JobRequest:
@@ -113,12 +143,13 @@ def _with_frames(service: Service, project: str, capture: str, options: RelightO
     return options.model_copy(update={"frames": f"{numbers[0]}-{numbers[-1]}"})
 
 
-def _require_ready(service: Service, project: str, field: str, identifier: str) -> None:
+def _require_ready(service: Service, project: str, field: str, identifier: str) -> sa.RowMapping:
     row = intakes.find(service.database, identifier, project)
     if row is None:
         raise ApiError("not-found", f"{field}: {identifier} is not in this project")
     if row["state"] != states.READY:
         raise ApiError("conflict", f"{field}: {identifier} is {row['state']}, not ready")
+    return row
 
 
 def _require_scans(service: Service, project: str, request: RegisterJob) -> list[str]:
@@ -140,7 +171,9 @@ def _require_inspections(service: Service, project: str, request: GaugeBoardJob)
     return [run.result for run in request.study.runs]
 
 
-def _require_results(service: Service, project: str, field: str, identifier: str, kinds: Sequence[str]) -> sa.RowMapping:
+def _require_results(service: Service, project: str, field: str, identifier: str, kinds: Sequence[str], *,
+                     sequences: bool = False) -> sa.RowMapping:
+    """Return a job whose results can be read; `sequences`: also those of a sequence of captures."""
     row = jobs.find(service.database, identifier, project)
     if row is None:
         raise ApiError("not-found", f"{field}: {identifier} is not in this project")
@@ -148,4 +181,7 @@ def _require_results(service: Service, project: str, field: str, identifier: str
         raise ApiError("invalid", f"{field}: {identifier} is a {row['request']['kind']} job: give one of {', '.join(kinds)}")
     if row["state"] != states.SUCCEEDED:
         raise ApiError("conflict", f"{field}: {identifier} is {row['state']}, not succeeded")
+    if SEQUENCE in row["finished_steps"] and not sequences:
+        raise ApiError("invalid", f"{field}: {identifier} is of a sequence: give the job of one capture here; export and relight take "
+                                  "sequences")
     return row

@@ -26,6 +26,13 @@ def find(database: Database, identifier: str, project: str) -> sa.RowMapping | N
     return database.row(sa.select(intakes).where(intakes.c.id == identifier, intakes.c.project == project))
 
 
+def time_steps(intake: sa.RowMapping | None) -> int:
+    """Return how many time steps a sequence of captures has; 0: the intake is no sequence, or there is none."""
+    facts = {} if intake is None else intake["facts"] or {}
+    captures = int(facts.get("captures", 0))
+    return int(facts.get("steps", captures if captures > 1 else 0))  # "steps" is not among the facts of older checks
+
+
 def latest(database: Database, project: str, kind: str, *, limit: int, before: tuple[float, str] | None = None) -> list[sa.RowMapping]:
     """Return a page of the intakes of a project, the newest first; `before` is that of `jobs.latest`."""
     query = sa.select(intakes).where(intakes.c.project == project, intakes.c.kind == kind)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from service.errors import RequestError
+from service.reporting.progress import Progress
 from service.requests.job import JobRequest
 from service.requests.jobs import ANY_JOB
 from service.server.database.engine import Database
@@ -64,3 +65,18 @@ class Job(NamedTuple):
         """Read a row of the jobs table."""
         return cls(str(row["id"]), str(row["project"]), ANY_JOB.validate_python(row["request"]), int(str(row["chunk_frames"])),
                    int(str(row["attempt"])))
+
+
+SEQUENCE = "sequence"
+"""Name of the last step of a solve or a depth of a sequence, which joins its time steps."""
+
+
+class JobStep(NamedTuple):
+    """A part of a job that is done as a whole or again."""
+
+    name: str
+    run: Callable[[Progress], None]
+    frames: int = 0
+    """Number of frames that the step makes, at the same time as other workers make those of other steps."""
+    help: Callable[[Progress], None] | None = None
+    """Does pieces of the step beside the worker that runs it; None: it cannot be divided."""

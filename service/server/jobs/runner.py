@@ -20,12 +20,12 @@ from service.server import telemetry
 from service.server.database import intakes, jobs
 from service.server.database.engine import FIRST_PAUSE_S, LONGEST_PAUSE_S, UNANSWERED, message_of
 from service.server.database.jobs import Claim
-from service.server.jobs.context import Job, WorkerContext
+from service.server.jobs.context import Job, JobStep, WorkerContext
 from service.server.jobs.helping import HelpProgress, help_with
 from service.server.jobs.pieces import JobPieces
 from service.server.jobs.progress import JobProgress, Stopped
 from service.server.jobs.queue import HELP, WORKFLOW, job_and_attempt, workflow_id
-from service.server.jobs.steps import JobStep, steps_of
+from service.server.jobs.steps import steps_of
 from service.server.log import logger
 from service.server.storage import layout
 from service.views.states import ENDED, FAILED, SUCCEEDED

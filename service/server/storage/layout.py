@@ -12,7 +12,7 @@ from collections.abc import Container
 from service.requests.identifiers import CAPTURE, ENVIRONMENT
 
 MAPS = "maps.exr"
-SOLVED = (MAPS, "depth.exr", "points.ply", "report.json", "scan-set.json", "board.exr")
+SOLVED = (MAPS, "depth.exr", "points.ply", "report.json", "sequence.json", "scan-set.json", "board.exr")
 """Files of a solve, a depth, a registration or an inspection that other jobs and later steps read."""
 FRAMES = "frame.####.exr"
 PICTURE = "picture.exr"

@@ -119,7 +119,7 @@ def in_schema(model: type[BaseModel]) -> dict[str, dict[str, Any]]:
     def visit(schema: dict[str, Any]) -> None:
         for name, property in schema["properties"].items():
             inner = document["$defs"].get(property.get("$ref", "").rpartition("/")[2], {})
-            if "properties" in inner and name in ("options", "tof"):
+            if "properties" in inner and name in ("options", "sequence", "tof"):
                 visit(inner)
             else:
                 found[name] = property

@@ -66,13 +66,13 @@ class Harness:
             process.wait()
         self.database.close()
 
-    def register(self, path: Path, kind: str) -> str:
-        """A capture or an environment that needs no check."""
+    def register(self, path: Path, kind: str, **facts: int) -> str:
+        """A capture or an environment that needs no check, of which one found these facts."""
         identifier = new_id(kind)
         self.database.transact(lambda connection: intakes.insert(
             connection, identifier=identifier, project=PROJECT, kind={CAPTURE: "capture", ENVIRONMENT: "environment"}[kind],
             name=path.name, folder=str(path.resolve())))
-        intakes.accept(self.database, identifier, {})
+        intakes.accept(self.database, identifier, facts)
         return identifier
 
     def submit(self, request: JobRequest, *, chunk_frames: int) -> str:

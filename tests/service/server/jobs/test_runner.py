@@ -7,8 +7,8 @@ from service.requests.identifiers import CAPTURE, ENVIRONMENT, new_id
 from service.server.database import jobs
 from service.server.database.jobs import Claim
 from service.server.jobs import runner as runner_module
+from service.server.jobs.context import JobStep, WorkerContext
 from service.server.jobs.runner import DONE, STOPPED, JobRunner
-from service.server.jobs.steps import JobStep, WorkerContext
 from service.server.storage import layout
 from service.server.storage.open import open_storage
 from stage.errors import StorageError

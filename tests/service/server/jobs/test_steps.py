@@ -8,7 +8,8 @@ import pytest
 from service.requests.identifiers import CAPTURE
 from service.requests.jobs import SolveJob
 from service.requests.solve import SolveOptions
-from service.server.jobs.steps import Job, WorkerContext, steps_of
+from service.server.jobs.context import Job, WorkerContext
+from service.server.jobs.steps import steps_of
 from service.server.storage.open import open_storage
 from stage import exr
 from stage.errors import StageError

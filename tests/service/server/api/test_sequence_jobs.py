@@ -1,0 +1,117 @@
+"""Sequences as jobs: an uploaded folder of captures is solved or measured step by step, exported with time samples, and relit."""
+
+import json
+from pathlib import Path
+
+import pytest
+from pxr import Usd, UsdGeom
+
+from tests.scenes import depth as depths
+from tests.scenes.sequence import write_sequence
+from tests.service.server.api.test_jobs import finish, made_by, refused, submit
+from tests.service.server.api.test_measuring import upload
+
+TIMES = [0.0, 0.1, 0.2]
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory) -> dict[str, bytes]:
+    folder = tmp_path_factory.mktemp("sequence")
+    write_sequence(folder, [None] * len(TIMES), noise=0.01, size=16, times=TIMES)
+    return files_of(folder)
+
+
+@pytest.fixture(scope="module")
+def sequence(server, client, files) -> str:
+    found = upload(server, client, files)
+    assert (found["facts"]["steps"], found["facts"]["captures"]) == (3, 3)
+    return found["id"]
+
+
+@pytest.fixture(scope="module")
+def solved(server, client, sequence) -> str:
+    return finish(server, client, submit(client, kind="solve", capture=sequence, options={"method": "lambert"}))["id"]
+
+
+def results_of(step: str, *names: str) -> set[str]:
+    return {f"{step}/{name}" for name in (*names, *(f"alone/{name}" for name in (*names, "step.json")))}
+
+
+def test_every_step_is_solved_and_joined(server, client, sequence, solved):
+    steps = set().union(*(results_of(f"step{step:02d}", "maps.exr", "report.json") for step in range(3)))
+    assert made_by(client, {"id": solved}) == {"sequence.json", "report.json", *steps}
+    written = client.get(f"/v1/jobs/{solved}/results/sequence.json").json()
+    assert [(step["path"], step["time_s"]) for step in written["steps"]] == [(f"step{step:02d}", time) for step, time in enumerate(TIMES)]
+    report = client.get(f"/v1/jobs/{solved}/results/report.json").json()
+    assert report["steps"][2]["steps_joined"]["most"] == 3 and report["inputs"]["sequence"] == sequence
+    assert str(server.data) not in json.dumps(report)
+    told = [entry["text"] for entry in client.get(f"/v1/jobs/{solved}/log").json()["entries"]]
+    assert [any(text.startswith(f"{step}/3 normals") for text in told) for step in (1, 2, 3)] == [True] * 3
+
+
+def test_the_results_become_one_asset_with_time_samples(server, client, solved, tmp_path):
+    job = submit(client, kind="export", maps=solved, format="usdc")
+    finish(server, client, job)
+    asset = tmp_path / "asset.usdc"
+    asset.write_bytes(client.get(f"/v1/jobs/{job['id']}/results/asset.usdc").raise_for_status().content)
+    stage = Usd.Stage.Open(str(asset))
+    mesh, = (prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh))
+    assert UsdGeom.Mesh(mesh).GetPointsAttr().GetTimeSamples() == pytest.approx([0, 3, 6])  # at 30 a second
+    for unfit in ("usda", "glb"):
+        refused(client.post("/v1/jobs", json={"kind": "export", "maps": solved, "format": unfit}), 422,
+                f"format: is {unfit}, the asset of a sequence is one of usdz, usdc")
+
+
+def test_a_pipeline_of_a_sequence(server, client, sequence, sky):
+    job = submit(client, kind="pipeline", capture=sequence, environment=sky, format="usdz", guided=True, solve={"method": "lambert"},
+                 sequence={"temporal": False})
+    done = finish(server, client, job)
+    assert done["request"]["relight"]["frames"] == "1-3"
+    made = made_by(client, job)
+    assert {"asset.usdz", "step02/maps.exr", "frame.0001.exr", "frame.0002.exr", "frame.0003.exr"} <= made
+    assert not any("alone" in name for name in made)
+
+
+def test_a_depth_of_a_sequence(server, client, tmp_path):
+    patterns = [*depths.BLACK_WHITE, *depths.phase_patterns("column", 16), *depths.gray_patterns("column", stripe=16)]
+    for step in range(2):
+        depths.write_patterns(tmp_path / f"s{step}", depths.make_scene(sphere=False), patterns, noise=0.01, seed=step)
+    found = upload(server, client, files_of(tmp_path))
+    job = submit(client, kind="depth", capture=found["id"], sequence={"frame_rate": 12.5})
+    finish(server, client, job)
+    made = made_by(client, job)
+    assert made == {"sequence.json", "report.json", *results_of("s0", "depth.exr", "points.ply", "report.json"),
+                    *results_of("s1", "depth.exr", "points.ply", "report.json")}
+    assert client.get(f"/v1/jobs/{job['id']}/results/sequence.json").json()["frames_per_second"] == 12.5
+
+
+def test_what_takes_one_capture_is_given_one(server, client, sequence, solved, dome, rig):
+    def ask(**request):
+        return client.post("/v1/jobs", json=request)
+
+    alone = f"{sequence} is a sequence of 3 captures: give one capture here"
+    refused(ask(kind="basis", capture=sequence), 422, f"capture: {alone}")
+    refused(ask(kind="calibrate-procam", captures=[sequence], options={"board": "9x6", "square_m": 0.03}), 422, f"captures: {alone}")
+    refused(ask(kind="solve", capture=sequence, reference_ball=sequence), 422, f"reference_ball: {alone}")
+    refused(ask(kind="solve", capture=dome, sequence={"temporal": False}), 422, f"sequence: {dome} is one capture")
+    refused(ask(kind="depth", capture=rig, sequence={"frame_rate": 12}), 422, f"sequence: {rig} is one capture")
+    refused(ask(kind="pipeline", capture=sequence, format="glb"), 422, "format: is glb, the asset of a sequence is one of usdz, usdc")
+    of_one = f"maps: {solved} is of a sequence: give the job of one capture here"
+    refused(ask(kind="shade", maps=solved), 422, of_one)
+    refused(ask(kind="solve", capture=sequence, sequence={"frame_rate": 0}), 422, "frame_rate")
+    other = submit(client, kind="solve", capture=sequence, sequence={"frame_rate": 12})
+    assert "frames_per_second: is 30, --frame-rate 12: leave one out" in finish(server, client, other, "failed")["error"]
+
+
+@pytest.mark.parametrize(("path", "words"), [
+    ("../step00", "steps[0].path leads out of the capture's folder"), ("/etc", "steps[0].path leads out of the capture's folder"),
+    ("nothing", "nothing/capture.json"),
+])
+def test_sequences_that_cannot_be(server, client, files, path, words):
+    named = json.dumps({"schema": "relit.sequence/1", "steps": [{"path": path}]}).encode()
+    found = upload(server, client, {name: files[name] for name in files if name.startswith("step00")} | {"sequence.json": named}, "refused")
+    assert words in found["problem"] and str(server.data) not in found["problem"]

@@ -1,0 +1,124 @@
+"""Jobs of sequences: each time step is a step of the job, whichever worker does it, and the results are those of the commands."""
+
+import os
+import signal
+
+import numpy as np
+import pytest
+
+from service.errors import RequestError
+from service.reporting.provenance import places_named
+from service.requests.base import SequenceOptions
+from service.requests.identifiers import CAPTURE, new_id
+from service.requests.jobs import DepthJob, SolveJob
+from service.requests.solve import SolveOptions, SolveRequest
+from service.sequences import one_step
+from service.sequences.run import solve_sequence
+from service.server.database import job_log, jobs
+from service.server.jobs.context import Job, WorkerContext
+from service.server.jobs.steps import steps_of
+from service.server.settings import Settings
+from service.server.storage.open import open_storage
+from tests.scenes.captures import files_in
+from tests.scenes.sequence import LIGHTS, moment, write_step
+from tests.service.server.jobs.harness import PROJECT, harness
+from tests.service.server.jobs.test_steps import Silent
+
+STEPS = 4
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory):
+    """A sequence whose lights are a tenth off, so that a step needs what the first has found."""
+    folder = tmp_path_factory.mktemp("registered") / "capture"
+    off = np.exp(0.1 * np.random.default_rng(5).normal(size=LIGHTS))
+    for step in range(STEPS):
+        write_step(folder / f"step{step:02d}", moment(None, size=24), seed=step, noise=0.005, brightness=off)
+    return folder
+
+
+def maps_in(folder) -> dict[str, bytes]:
+    return {name: (folder / name).read_bytes() for name in files_in(folder) if name.endswith(".exr")}
+
+
+@pytest.fixture(scope="module")
+def undisturbed(sequence, tmp_path_factory) -> dict[str, bytes]:
+    """The maps of `relit solve`."""
+    out = tmp_path_factory.mktemp("undisturbed")
+    solve_sequence(SolveRequest(capture=sequence, out=out, method="robust", device="cpu", cache=out / ".cache"))
+    return maps_in(out)
+
+
+def solve_of(harness, sequence, **options) -> Job:
+    capture = harness.register(sequence, CAPTURE, captures=STEPS, steps=STEPS)
+    request = SolveJob(kind="solve", capture=capture, options=SolveOptions(method="robust"), sequence=SequenceOptions(**options))
+    return Job(new_id("job"), PROJECT, request, 1)
+
+
+def context_of(harness, settings: Settings, sequence) -> WorkerContext:
+    return WorkerContext(harness.database, open_storage(settings), settings.data / "cache", "cpu", 4096,
+                         lambda project: (sequence.parent,))
+
+
+def run(job: Job, context: WorkerContext, name: str) -> None:
+    """What the worker does in a step."""
+    with places_named():
+        next(step for step in steps_of(job, context) if step.name == name).run(Silent())
+    context.storage.publish(f"projects/{PROJECT}/jobs/{job.id}", Silent())
+
+
+def test_machines_that_share_a_store_do_the_steps_in_turn(idle_harness, sequence, undisturbed, tmp_path, monkeypatch):
+    """Each finds what the other has left in the store, and joins without solving again."""
+    job = solve_of(idle_harness, sequence)
+    contexts = [context_of(idle_harness, Settings(data=tmp_path / name, storage_url=f"file://{tmp_path}/store"), sequence)
+                for name in ("one", "other")]
+    names = [step.name for step in steps_of(job, contexts[0])]
+    assert names == [*(f"step {number}" for number in range(1, STEPS + 1)), "sequence"]
+    solved, whole = [], one_step.solve
+    monkeypatch.setattr(one_step, "solve", lambda request, *args, **options: (solved.append(request.capture.name),
+                                                                           whole(request, *args, **options)))
+    for number, name in enumerate(names):
+        run(job, contexts[number % 2], name)
+    assert solved == [f"step{step:02d}" for step in range(STEPS)]
+    store = tmp_path / "store" / "projects" / PROJECT / "jobs" / job.id
+    assert maps_in(store) == undisturbed
+    assert {"sequence.json", "report.json", "step03/report.json", "step03/alone/report.json"} <= files_in(store)
+    assert str(tmp_path).encode() not in (store / "step03" / "alone" / "report.json").read_bytes()
+
+
+def test_without_joining_there_are_the_steps_alone(idle_harness, sequence):
+    job = solve_of(idle_harness, sequence, temporal=False, frame_rate=12.5)
+    context = context_of(idle_harness, idle_harness.settings, sequence)
+    for step in steps_of(job, context):
+        run(job, context, step.name)
+    out = idle_harness.results(job.id)
+    assert {name for name in files_in(out) if name.startswith("step01")} == {"step01/maps.exr", "step01/report.json", "step01/step.json"}
+    assert b'"frames_per_second": 12.5' in (out / "sequence.json").read_bytes()
+    assert not (sequence / "step00" / ".relit").exists()
+
+
+def test_a_sequence_that_has_lost_steps_is_one_sentence(idle_harness, sequence):
+    capture = idle_harness.register(sequence, CAPTURE, captures=STEPS + 1, steps=STEPS + 1)
+    job = Job(new_id("job"), PROJECT, DepthJob(kind="depth", capture=capture), 1)
+    with pytest.raises(RequestError, match="has 4 steps now, and had more when it was checked"):
+        run(job, context_of(idle_harness, idle_harness.settings, sequence), f"step {STEPS + 1}")
+
+
+def test_a_killed_worker_loses_one_time_step_at_most(tmp_path, sequence, undisturbed):
+    """The next goes on with the time step that was under way, and the log names each."""
+    with harness(tmp_path, takeover_s=0.5, roots=str(sequence.parent)) as made:
+        made.start()
+        made.ready(1)
+        job = made.submit(solve_of(made, sequence).request, chunk_frames=1)
+        made.until(lambda: made.row(job)["finished_steps"], "a step", every_s=0.005)
+        first = (made.results(job) / "step00" / "alone" / "maps.exr").stat()
+        os.kill(made.pid_of(made.holder(job)), signal.SIGKILL)
+        row = made.ended(job)
+        assert (row["state"], row["error"]) == (jobs.SUCCEEDED, None)
+        assert row["finished_steps"] == [*(f"step {number}" for number in range(1, STEPS + 1)), "sequence"]
+        assert maps_in(made.results(job)) == undisturbed
+        assert (made.results(job) / "step00" / "alone" / "maps.exr").stat().st_ino == first.st_ino
+        begun = [event["step"] for event in made.events() if event["event"] == "step begins" and event["job"] == job]
+        assert begun.count("step 1") == 1 and len(begun) <= STEPS + 2
+        assert {f"{number}/{STEPS} ingest, {LIGHTS} to do" for number in range(1, STEPS + 1)} <= {
+            entry["text"] for entry in job_log.read(made.database, job)}
