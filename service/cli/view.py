@@ -22,6 +22,8 @@ def _view(request: ViewRequest) -> None:
     print(f"frames   {result.frames}")
     if result.layers:
         print(f"layers   {', '.join(result.layers)}")
-    if result.terms:
-        print(f"relight  {result.terms} coefficient images, {100 * (result.relative_rms or 0):.3g} % RMS of the captured images")
+    if result.levels is not None:
+        mean, largest = result.levels
+        print(f"relight  {result.terms} coefficient images: {mean:.2g} of 255 levels off under lights that they were not made from, "
+              f"{largest:.2g} under the worst")
     print_warnings(result.findings)

@@ -15,9 +15,8 @@ class ViewOptions(StackOptions):
     """How a capture is shown."""
 
     terms: Annotated[int, Field(ge=1, le=MOST_TERMS)] | None = None
-    """Most coefficient images that the object is relit with in the browser; fewer where fewer show the captured images as well. Objects
-    with sharp highlights and shadows need about as many as there are lights. None: as many as a browser holds at the resolution of the
-    capture, and 32 at least."""
+    """Most coefficient images that the object is relit with in the browser; fewer where fewer show the object as well. More are closer to
+    `relit relight` where highlights and shadows are sharp. None: 32."""
 
 
 class ViewRequest(ViewOptions, Request):

@@ -1,6 +1,7 @@
-"""What a browser relights an object with: few coefficient images, and the coefficients of every captured image and direction.
+"""What a browser relights an object with: few coefficient images, whose coefficients differ from tile to tile.
 
-Source: the first K singular vectors give the sums of K images with the least squared error, Eckart and Young 1936 (kernels.relight.basis).
+The images of a small tile have few independent parts, so a few dozen images and a small matrix for each tile show the object as all
+captured images together do (kernels.relight.tile_basis has the method and its sources).
 """
 
 import math
@@ -9,16 +10,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kernels import packs
-from kernels.relight.basis import Basis, gram, principal, projection
+from kernels.relight.basis import gram
 from kernels.relight.beyond import reach
-from kernels.relight.many_frames import combine_batch
-from kernels.relight.residual import squared_residual
+from kernels.relight.tile_basis import light_factor, tile_bases
 from service.reporting.progress import Timings
-from service.requests.view import MOST_TERMS
 from service.viewing.block_file import BlockFile
+from service.viewing.held_out import HeldOutLights
 from service.viewing.quadrature import write_quadrature
 from service.viewing.reduction import plane_means, step_within
-from service.viewing.row_bands import row_bands
+from service.viewing.tiling import Tiling, put_together, tile_rows, tiling_of
 from service.viewing.transfer import COLS, FULL, ROWS, transfer_of
 from stage.ingest import TOP_EXPONENT
 from stage.light_basis import numbers
@@ -28,35 +28,35 @@ from stage.stack import Stack
 
 LEAST_LIGHTS = 4
 """With fewer lights there is nothing to relight with: they do not surround any direction."""
-LEAST_TERMS = 32
-"""Most coefficient images of a large capture, unless the request says otherwise: it is rather reduced than shown with fewer."""
+DEFAULT_TERMS = 32
+"""Most coefficient images, unless the request says otherwise."""
 RELATIVE_RMS = 0.005
-"""Error of the captured images, relative to them, that needs no further coefficient image: half a step of an 8-bit display."""
+"""Error of pictures, relative to each, that needs no further coefficient image: half a step of an 8-bit display."""
 MOST_VALUES = 64_000_000
 """Most values of all coefficient images in a channel, 32 images of 2 megapixels; larger images are reduced. A page keeps them as textures,
-in 400 MB."""
+in 512 MB."""
 HALF_BOUND = 2.0**15
 """Bound of the stored coefficients, which leaves room below the largest half value."""
 
 
-class Coefficients(NamedTuple):
-    """Coefficient images, reduced."""
+class TiledBasis(NamedTuple):
+    """A basis in half values, as it is stored: captured image l ≈ scale · Σₖ matrix[l, tile, k] · images[k]."""
 
+    matrix: np.ndarray  # [lights, tiles, terms, 3] float16
     images: np.ndarray  # [terms, 3, rows, cols] float16
-    relative_rms: float
-    """Root mean square of what the stored coefficients leave of the captured images, relative to these."""
+    scale: float
 
 
 def write_relighting(stack: Stack, lights: DistantLights, matte: Matte, file: BlockFile, *, most_terms: int | None,
                      device: str, timings: Timings) -> dict[str, Any]:
-    """Write basis, matte, transfer and coefficients of the captured images, and return what view.json says of them.
+    """Write basis, matte, weights and coefficients of the captured images, and return what view.json says of them.
 
     Args:
         stack: the captured images.
         lights: of the images, near ones as the object's centre sees them.
         matte: of the object; the coefficient images are premultiplied by its coverage.
         file: for the blocks.
-        most_terms: most coefficient images; None: as many as fit without reducing the images, and LEAST_TERMS at least.
+        most_terms: most coefficient images; None: DEFAULT_TERMS.
         device: where.
         timings: told of every stage.
 
@@ -64,35 +64,39 @@ def write_relighting(stack: Stack, lights: DistantLights, matte: Matte, file: Bl
         ArrayError: a light gives nothing in a channel.
         OSError: the file cannot be written.
     """
-    count = stack.light_count
     covered = np.zeros(stack.shape[2], dtype=bool)
     covered[: stack.pixel_count] = (matte.factor > 0).reshape(-1)
-    most = most_terms or max(LEAST_TERMS, min(MOST_TERMS, MOST_VALUES // matte.factor.size))
-    basis = _basis(stack, covered, most, device, timings)
-    largest = float(np.linalg.norm(2.0**TOP_EXPONENT * stack.scale))  # no pixel's radiance over all lights, nor any coefficient, is larger
-    scale = 2.0 ** math.ceil(math.log2(largest / HALF_BOUND))
+    most = min(most_terms or DEFAULT_TERMS, stack.light_count)
     timings.stage("directions", 1)
-    transfer = transfer_of(basis, lights, scale)
-    step = step_within(matte.factor.size, MOST_VALUES // basis.matrix.shape[1])
-    found = _coefficients(stack, basis, matte, covered, step, scale, device, timings)
+    transfer = transfer_of(lights)
+    products = _products(stack, covered, device, timings)
+    norm = light_factor(products, transfer.weights.astype(np.float64), transfer.solid_angle)
+    step = step_within(matte.factor.size, MOST_VALUES // most)
+    tiling = tiling_of(plane_means(matte.factor, step), lights=stack.light_count, terms=most)
+    basis = _basis(stack, matte, tiling, step, norm, products, most, timings)
+    held_out = HeldOutLights(stack, lights, transfer, covered)
+    relative_rms = _error(stack, matte, tiling, step, basis, held_out, timings)
     coverage = plane_means(matte.coverage, step)
-    captured = np.moveaxis(basis.matrix, 0, -1).swapaxes(0, 1) * scale  # [lights, terms, 3]
+    timings.stage("blocks", 1)
     return {
-        "terms": len(found.images), "rows": coverage.shape[0], "cols": coverage.shape[1], "step": step,
-        "basis": list(file.append_all(iter(found.images))),
+        "terms": len(basis.images), "rows": coverage.shape[0], "cols": coverage.shape[1], "step": step, "scale": numbers(basis.scale),
+        "basis": list(file.append_all(iter(basis.images))),
+        "tiles": {"side": tiling.side, "rows": tiling.index.shape[0], "cols": tiling.index.shape[1], "count": tiling.tile_count,
+                  "index": file.append(tiling.index)},
+        "captured": file.append(basis.matrix),
         "matte": file.append(np.rint(FULL * np.clip(coverage, 0, 1)).astype(np.uint8)),
         "directions": [COLS, ROWS],
-        "transfer": file.append(transfer.coefficients),
+        "weights": file.append(np.swapaxes(transfer.weights, 1, 2).astype(np.float32)),
         "beyond": file.append(transfer.beyond),
         "quadrature": write_quadrature(lights, file),
-        "captured": file.append(captured[:count].astype(np.float32)),
-        "relative_rms": numbers(found.relative_rms),
+        "relative_rms": numbers(relative_rms),
+        "held_out": held_out.facts(),
         "beyond_degrees": numbers(float(np.degrees(2 * reach(lights.direction)))),
     }
 
 
-def _basis(stack: Stack, covered: np.ndarray, most: int, device: str, timings: Timings) -> Basis:
-    """Return the basis with as few images as the error allows."""
+def _products(stack: Stack, covered: np.ndarray, device: str, timings: Timings) -> np.ndarray:
+    """Return [3, lights, lights] the inner products of the captured images over the object, in radiance."""
     count = stack.light_count
     products, scale = np.zeros((3, count, count)), stack.scale[:count].astype(np.float64)
     ranges = list(stack.bands())
@@ -101,35 +105,47 @@ def _basis(stack: Stack, covered: np.ndarray, most: int, device: str, timings: T
         if covered[start:stop].any():
             products += gram(packs.upload(stack.band(start, stop), device=device), covered[start:stop])[:, :count, :count]
         timings.advance(done)
-    products *= scale[:, None] * scale
-    squares = (principal(products, count).singular_values ** 2).sum(axis=0)
+    return np.asarray(products * scale[:, None] * scale)
+
+
+def _basis(stack: Stack, matte: Matte, tiling: Tiling, step: int, norm: np.ndarray, products: np.ndarray, most: int,
+           timings: Timings) -> TiledBasis:
+    """Return the basis with as few images as the error allows."""
+    count = stack.light_count
+    rows, cols = (-(-side // step) for side in matte.factor.shape)
+    mean = float(np.sqrt(np.einsum("cll->", products) / count)) or 1.0  # brings the matrices to numbers about 1
+    largest = float(np.linalg.norm(norm, ord=2, axis=(1, 2)).max() * mean * np.linalg.norm(2.0**TOP_EXPONENT * stack.scale[:count]))
+    scale = 2.0 ** math.ceil(math.log2(largest / HALF_BOUND))
+    images = np.zeros((most, 3, rows, cols), dtype=np.float16)
+    matrix = np.zeros((count, tiling.tile_count, most, 3), dtype=np.float16)
+    squares = np.zeros(count)
+    for row in tile_rows(stack, matte.factor, tiling, step, timings, "basis"):
+        found = tile_bases(row.images, norm, most)
+        squares += found.squares.sum(axis=(0, 1))
+        matrix[:, row.tiles] = found.matrix.transpose(2, 0, 3, 1) / mean
+        stored = (found.coefficients * np.float32(mean / scale)).astype(np.float16)
+        planes = put_together(stored.swapaxes(1, 2).reshape(len(stored), 3 * most, -1), row, tiling.side, cols)
+        images[:, :, row.rows] = planes.reshape(most, 3, *planes.shape[1:])
     left = np.append(np.cumsum(squares[::-1])[::-1][1:], 0)  # after 1, 2 … images
-    enough = left <= RELATIVE_RMS**2 * squares.sum()
-    return principal(products, min(int(enough.argmax()) + 1, most, count))
+    terms = min(int((left <= RELATIVE_RMS**2 * squares.sum()).argmax()) + 1, most)
+    return TiledBasis(np.ascontiguousarray(matrix[:, :, :terms]), images[:terms], scale)
 
 
-def _coefficients(stack: Stack, basis: Basis, matte: Matte, covered: np.ndarray, step: int, scale: float, device: str,
-                  timings: Timings) -> Coefficients:
-    """Return the coefficient images, premultiplied and reduced, and the error that half values and the missing images make."""
-    rows, cols = matte.factor.shape
-    terms, count = basis.matrix.shape[1], stack.light_count
-    weights = projection(basis, stack.scale / np.float32(scale))
-    gains = np.broadcast_to(stack.scale, (3, stack.shape[1]))
-    functions = np.zeros((3, stack.shape[1], terms))
-    functions[:, :count] = np.swapaxes(basis.matrix, 1, 2) * scale
-    images = np.zeros((terms, 3, -(-rows // step), -(-cols // step)), dtype=np.float16)
-    left, whole = 0.0, float((basis.singular_values**2).sum())
-    bands = list(row_bands(stack, (rows, cols), step, 3 * 16 * terms))
-    timings.stage("basis", len(bands))
-    for done, band in enumerate(bands, start=1):
-        inside = band.own & covered[band.start : band.stop]
-        if inside.any():
-            values = packs.upload(stack.band(band.start, band.stop), device=device)
-            stored = combine_batch(values, weights).numpy().astype(np.float16).astype(np.float32)
-            squares = squared_residual(values, gains, stored, functions).numpy()
-            left += float(squares[:, inside].sum(dtype=np.float64))
-            planes = stored[:, :, band.own].reshape(3 * terms, -1, cols) * matte.factor[band.rows]
-            for index, plane in enumerate(planes):
-                images[index // 3, index % 3, band.reduced] = plane_means(plane, step)
-        timings.advance(done)
-    return Coefficients(images, float(np.sqrt(left / whole)) if whole > 0 else 0.0)
+def _error(stack: Stack, matte: Matte, tiling: Tiling, step: int, basis: TiledBasis, held_out: HeldOutLights, timings: Timings) -> float:
+    """Return the root mean square of what the basis as it is stored leaves of the captured images, relative to them, and let held-out
+    lights count it."""
+    left, whole, side = 0.0, 0.0, tiling.side
+    factor = plane_means(matte.factor, step)
+    across = -(-factor.shape[1] // side) * side
+    for row in tile_rows(stack, matte.factor, tiling, step, timings, "error"):
+        stored = np.zeros((*basis.images.shape[:2], side, across), dtype=np.float32)
+        stored[:, :, : row.rows.stop - row.rows.start, : factor.shape[1]] = basis.images[:, :, row.rows]
+        inside = np.zeros((side, across), dtype=bool)
+        inside[: row.rows.stop - row.rows.start, : factor.shape[1]] = factor[row.rows] > 0
+        tiles = stored.reshape(*stored.shape[:2], side, -1, side).transpose(3, 1, 0, 2, 4)[row.columns]  # [tiles, 3, terms, side, side]
+        matrix = basis.matrix[:, row.tiles].astype(np.float32).transpose(1, 3, 0, 2)
+        shown = np.matmul(matrix, tiles.reshape(*tiles.shape[:3], -1)) * np.float32(basis.scale)
+        left += float(((row.images - shown) ** 2).sum(dtype=np.float64))
+        whole += float((row.images**2).sum(dtype=np.float64))
+        held_out.compare(row.images, shown, inside.reshape(side, -1, side).swapaxes(0, 1)[row.columns].reshape(len(row.columns), -1))
+    return float(np.sqrt(left / whole)) if whole > 0 else 0.0

@@ -1,4 +1,4 @@
-"""From light of any direction to the coefficients of a basis: a table over a lat-long grid of directions.
+"""From light of any direction to weights of the captured images: a table over a lat-long grid of directions.
 
 Each pixel of the grid is shared out over the captured lights with the weights of `relit relight` without maps. These weights are
 least-error ones that may not be negative, so those of a whole environment are close to the sum of those of its parts, and not equal.
@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kernels.relight.basis import Basis
 from kernels.relight.beyond import share_beyond
 from kernels.relight.environment import Weighting, light_weights
 from kernels.relight.sample_energy import share_samples
@@ -23,39 +22,45 @@ FULL = 255
 
 
 class Transfer(NamedTuple):
-    """The coefficients of a unit of irradiance from each direction of the grid."""
+    """The weights of the captured images for a unit of irradiance from each direction of the grid, row by row."""
 
-    coefficients: np.ndarray  # [ROWS, COLS, terms, 3] float32
+    weights: np.ndarray  # [ROWS · COLS, 3, lights] float32
+    solid_angle: np.ndarray  # [ROWS · COLS] of the pixels, in any unit
     beyond: np.ndarray  # [ROWS, COLS] uint8: 0 between the captured lights, 255 wholly beyond them
 
 
-def transfer_of(basis: Basis, lights: DistantLights, scale: float) -> Transfer:
-    """Return the table of a basis.
-
-    Args:
-        basis: of the captured images.
-        lights: of the images.
-        scale: value of a stored 1.0 of the coefficient images.
+def transfer_of(lights: DistantLights) -> Transfer:
+    """Return the table of captured lights.
 
     Raises:
         ArrayError: a light gives nothing in a channel.
     """
-    weights = np.stack([light_weights(energy[None], lights.irradiance, np.ones(len(lights.direction)))[0]
-                        for energy in _shares(lights.direction)])  # [directions, 3, lights]
-    found = np.einsum("ckl,dcl->dkc", basis.matrix * scale, weights)
+    solid_angle = np.linalg.norm(grid_directions(PARTS, unit=False), axis=-1)
+    energy = solid_angle / solid_angle.sum(axis=1, keepdims=True)
     share = share_beyond(lights.direction, grid_directions(1)[:, 0])
-    return Transfer(found.reshape(ROWS, COLS, *found.shape[1:]).astype(np.float32),
+    return Transfer(weights_of(grid_directions(PARTS), energy, lights), solid_angle.sum(axis=1),
                     np.floor(FULL * share).astype(np.uint8).reshape(ROWS, COLS))
 
 
-def _shares(direction: np.ndarray) -> np.ndarray:
-    """Return [directions, lights, 3] the energy that each light gets of one unit from each direction of the grid."""
-    given = np.zeros((ROWS * COLS, len(direction), 3))
-    solid_angle = np.linalg.norm(grid_directions(PARTS, unit=False), axis=-1)
-    for index, samples in enumerate(grid_directions(PARTS)):
-        energy = solid_angle[index, :, None] / solid_angle[index].sum()
-        given[index] = share_samples(samples, energy, direction, weighting=Weighting.KERNEL)
-    return given
+def weights_of(samples: np.ndarray, energy: np.ndarray, lights: DistantLights) -> np.ndarray:
+    """Return the weights of the captured images for white light of several kinds.
+
+    Args:
+        samples: [kinds, n, 3] unit vectors to each.
+        energy: [kinds, n] irradiance of each sample.
+        lights: the captured ones.
+
+    Returns:
+        [kinds, 3, lights] float32.
+
+    Raises:
+        ArrayError: a light gives nothing in a channel.
+    """
+    found = np.zeros((len(samples), 3, len(lights.direction)), dtype=np.float32)
+    for index, (towards, each) in enumerate(zip(samples, energy, strict=True)):
+        shared = share_samples(towards, each[:, None], lights.direction, weighting=Weighting.KERNEL)
+        found[index] = light_weights(shared.repeat(3, axis=1)[None], lights.irradiance, np.ones(len(lights.direction)))[0]
+    return found
 
 
 def grid_directions(parts: int, *, unit: bool = True) -> np.ndarray:

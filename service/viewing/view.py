@@ -52,7 +52,9 @@ class ViewResult(NamedTuple):
     frames: int
     terms: int
     """Coefficient images to relight with; 0: there are too few lights, or they cannot be used."""
-    relative_rms: float | None
+    levels: tuple[float, float] | None
+    """Mean difference of relit pictures from those of `relit relight` under lights that the images were not made from, in 255ths of the
+    display's range: mean of the lights, and largest; None: there are no coefficient images."""
     findings: tuple[str, ...]
     """What is wrong with the capture, in sentences."""
 
@@ -114,9 +116,10 @@ def view(request: ViewRequest, progress: Progress | None = None) -> ViewResult:
                                contents=contents),
     }, allow_nan=False) + "\n")
     timings.close()
-    relight = sections["relight"] or {"terms": 0, "relative_rms": None}
-    return ViewResult(target, tuple(layer["name"] for layer in sections["layers"]), len(images.images), relight["terms"],
-                      relight["relative_rms"], tuple(findings))
+    relight = sections["relight"]
+    levels = None if relight is None else (relight["held_out"]["mean_levels"], relight["held_out"]["largest_levels"])
+    return ViewResult(target, tuple(layer["name"] for layer in sections["layers"]), len(images.images),
+                      0 if relight is None else relight["terms"], levels, tuple(findings))
 
 
 def _attempt(findings: list[str], work: Callable[[], Made]) -> Made | None:

@@ -45,18 +45,34 @@ class View:
         facts = self.facts["relight"]
         return np.stack([self.block(place, "f2", 3, facts["rows"], facts["cols"]) for place in facts["basis"]]).astype(np.float64)
 
-    def lit(self, coefficients: np.ndarray) -> np.ndarray:
-        """[rows, cols, 3] the picture of coefficients [terms, 3]."""
-        return np.einsum("kcrq,kc->rqc", self.basis(), coefficients.astype(np.float64))
+    def lit(self, weights: np.ndarray) -> np.ndarray:
+        """[rows, cols, 3] the picture of weights [lights, 3] of the captured images."""
+        return self.drawn(np.einsum("ltkc,lc->tkc", self.captured(), weights))
+
+    def drawn(self, coefficients: np.ndarray) -> np.ndarray:
+        """[rows, cols, 3] the picture of coefficients [tiles, terms, 3]."""
+        facts, basis = self.facts["relight"], self.basis()
+        picture = np.zeros((facts["rows"], facts["cols"], 3))
+        side, tiles = facts["tiles"]["side"], self.tiles()
+        for row, col in np.argwhere(tiles != 0xFFFF):
+            place = np.s_[row * side : (row + 1) * side, col * side : (col + 1) * side]
+            picture[place] = np.einsum("kcrq,kc->rqc", basis[:, :, *place], coefficients[tiles[row, col]])
+        return picture
+
+    def tiles(self) -> np.ndarray:
+        """[rows of tiles, columns of tiles] index of each tile."""
+        facts = self.facts["relight"]["tiles"]
+        return self.block(facts["index"], "u2", facts["rows"], facts["cols"])
 
     def captured(self) -> np.ndarray:
-        """[lights, terms, 3] coefficients of the captured images."""
-        return self.block(self.facts["relight"]["captured"], "f4", -1, self.facts["relight"]["terms"], 3)
+        """[lights, tiles, terms, 3] float64 coefficients of the captured images."""
+        facts = self.facts["relight"]
+        return self.block(facts["captured"], "f2", -1, facts["tiles"]["count"], facts["terms"], 3).astype(np.float64) * facts["scale"]
 
-    def transfer(self) -> np.ndarray:
-        """[rows, cols, terms, 3] coefficients of a unit of irradiance from each direction of the grid."""
+    def weights(self) -> np.ndarray:
+        """[rows, cols, lights, 3] weights of the captured images for a unit of irradiance from each direction of the grid."""
         cols, rows = self.facts["relight"]["directions"]
-        return self.block(self.facts["relight"]["transfer"], "f4", rows, cols, self.facts["relight"]["terms"], 3)
+        return self.block(self.facts["relight"]["weights"], "f4", rows, cols, -1, 3).astype(np.float64)
 
     def samples(self, name: str) -> np.ndarray:
         """[rows, cols, lights, 3] float64 of `measured` or `model`, times the scale; [rows, cols, lights] uint8 of `used`."""

@@ -1,4 +1,4 @@
-"""Live relighting: coefficients that give back the captured images, and a table of directions that gives what `relit relight` gives."""
+"""Live relighting: coefficients that give back the captured images, weights of `relit relight`, and the error that is said."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def captured(directions: np.ndarray) -> np.ndarray:
 
 def rebuilt(found: View) -> np.ndarray:
     """[lights, rows, cols, 3] the images by their coefficients."""
-    return np.einsum("kcrq,lkc->lrqc", found.basis(), found.captured().astype(np.float64))
+    return np.stack([found.drawn(coefficients) for coefficients in found.captured()])
 
 
 def relative(a: np.ndarray, b: np.ndarray) -> float:
@@ -66,7 +66,7 @@ def test_a_captured_image_comes_back_with_the_error_that_is_said(folder, terms):
     assert whole[SURFACE.mask].mean() > 0.6
     error = relative(rebuilt(found)[:, whole], captured(sphere_directions(LIGHTS))[:, whole])
     assert error == pytest.approx(facts["relative_rms"], rel=0.25)  # said of all pixels, border included
-    assert terms < LIGHTS or error < 5e-3
+    assert terms < LIGHTS or error < 8e-3  # 0.5 % of pictures that count alike, however dark
 
 
 def test_no_more_images_than_the_error_needs(tmp_path):
@@ -74,12 +74,13 @@ def test_no_more_images_than_the_error_needs(tmp_path):
     write_capture(tmp_path / "cap", make_scene(size=16, lights=9))
     found = show(tmp_path)
     assert found.facts["relight"]["terms"] == 3 and found.facts["relight"]["relative_rms"] < 1e-3
+    assert found.facts["relight"]["held_out"]["largest_levels"] < 0.1  # half rounding
 
 
 def test_a_captured_light_is_a_light_from_its_direction(full):
     """At a captured light all energy goes to it; a pixel of the grid lies up to 4 degrees off, a fifth of the lights' distance."""
     directions = sphere_directions(LIGHTS)
-    grid, table = texel_directions(ROWS, COLS), full.transfer()
+    grid, table = texel_directions(ROWS, COLS), full.weights()
     images, whole = captured(directions) / 2.0, inside(full)
     for light in np.flatnonzero(directions[:, 2] > 0.6):  # the others light little of what the camera sees
         row, col = np.unravel_index((grid @ directions[light]).argmax(), (ROWS, COLS))
@@ -101,7 +102,7 @@ def test_an_environment_through_the_table_is_that_of_relight(folder, full, sky):
     channels, _ = exr.read(folder / "f.1.exr")
     wanted = np.stack([channels[c].astype(np.float64) for c in "RGB"], axis=-1)
     energy = radiance * texel_solid_angles(ROWS, COLS)[..., None]
-    frame = full.lit(np.einsum("rqc,rqkc->kc", energy, full.transfer().astype(np.float64)))
+    frame = full.lit(np.einsum("rqc,rqlc->lc", energy, full.weights()))
     assert relative(frame, wanted) < {"even": 0.005, "lamp": 0.04, "halves": 0.03}[sky]
     assert frame.sum() == pytest.approx(wanted.sum(), rel=0.02)
 
@@ -115,8 +116,8 @@ def test_the_energy_of_every_direction_is_kept(tmp_path):
                                                    mask=np.ones((8, 8), dtype=bool)))
     found = show(tmp_path)
     assert found.facts["relight"]["terms"] == 1
-    lit = np.einsum("kc,rqkc->rqc", found.basis()[:, :, 3, 3], found.transfer().astype(np.float64))
-    np.testing.assert_allclose(lit, 0.25, rtol=2e-3)  # half rounding of the one image
+    captured = found.basis()[0, :, 3, 3] * found.captured()[:, 0, 0]  # [lights, 3] of a pixel
+    np.testing.assert_allclose(np.einsum("rqlc,lc->rqc", found.weights(), captured), 0.25, rtol=2e-3)  # half rounding of the one image
 
 
 def test_light_from_beyond_the_captured_lights_is_flagged(tmp_path):
@@ -133,16 +134,57 @@ def test_light_from_beyond_the_captured_lights_is_flagged(tmp_path):
     assert ((beyond[between] > 0) & (beyond[between] < 255)).all() and between.any()
 
 
-def test_large_images_are_reduced_by_whole_factors(folder, monkeypatch):
+def test_large_images_are_reduced_by_whole_factors(folder, full, monkeypatch):
     """A pixel is then the mean of its block."""
-    whole = show(folder, terms=6)
-    monkeypatch.setattr(relighting, "MOST_VALUES", 6 * 100)
-    found = show(folder, terms=6)
+    monkeypatch.setattr(relighting, "MOST_VALUES", LIGHTS * 100)
+    found = show(folder, terms=LIGHTS)
     facts = found.facts["relight"]
     assert [facts[name] for name in ("rows", "cols", "step")] == [8, 8, 3]
-    mean = whole.basis().reshape(6, 3, 8, 3, 8, 3).mean(axis=(3, 5))
-    np.testing.assert_allclose(found.basis(), mean, atol=2e-3 * np.abs(mean).max())  # half rounding, twice
-    assert np.array_equal(found.transfer(), whole.transfer()) and facts["relative_rms"] == whole.facts["relight"]["relative_rms"]
+    mean = rebuilt(full).reshape(LIGHTS, 8, 3, 8, 3, 3).mean(axis=(2, 4))
+    assert relative(rebuilt(found), mean) < 0.012  # terms left out of both, 0.5 % of pictures that count alike
+    assert np.array_equal(found.weights(), full.weights())
+
+
+@pytest.fixture(scope="module")
+def shadowed(tmp_path_factory) -> tuple[View, np.ndarray]:
+    """Shadows that cross the object with the light, so that a whole image has as many independent parts as there are lights."""
+    folder = tmp_path_factory.mktemp("shadowed")
+    directions = sphere_directions(96)
+    directions = directions[directions[:, 2] > 0.1]
+    row, col = np.indices((48, 48)) / 48 - 0.5
+    images = np.stack([0.05 + (np.hypot(col - 0.4 * d[0], row + 0.4 * d[1]) > 0.15) * max(d[2], 0) for d in directions])
+    scene = make_scene(size=48)
+    write_capture(folder / "cap", scene._replace(directions=directions, irradiance=np.full((len(directions), 3), 2.0),
+                                                 images=images[..., None].repeat(3, axis=3), mask=np.ones((48, 48), dtype=bool)))
+    return show(folder, terms=5), images
+
+
+def test_the_basis_of_tiles_loses_less_than_the_best_of_the_whole_image(shadowed):
+    found, images = shadowed
+    singular = np.linalg.svd(images.reshape(len(images), -1), compute_uv=False)
+    best = np.sqrt((singular[5:] ** 2).sum() / (singular**2).sum())
+    assert found.facts["relight"]["terms"] == 5
+    assert found.facts["relight"]["relative_rms"] < 0.4 * best
+
+
+def test_the_error_that_is_said_is_that_under_lights_between_the_captured(shadowed):
+    """Key lights of other directions than those that are said to be tested: their errors are of the same size."""
+    found, images = shadowed
+    held = found.facts["relight"]["held_out"]
+    grid, levels = texel_directions(ROWS, COLS), []
+    for row, col in np.argwhere(grid[..., 2] > 0.3)[::23]:
+        weights = found.weights()[row, col]
+        truth, shown = np.einsum("lrq,lc->rqc", images, weights), found.lit(weights)
+        white = np.quantile(truth.max(axis=2), 0.99)
+        levels.append(255 * np.abs(encoded(truth / white) - encoded(shown / white)).mean())
+    assert held["key_lights"] == 32 and held["mean_levels"] > 0.1
+    assert 0.6 < np.mean(levels) / held["mean_levels"] < 1.6
+    assert max(levels) < 1.5 * held["largest_levels"]
+
+
+def encoded(linear: np.ndarray) -> np.ndarray:
+    clipped = np.clip(linear, 0, 1)
+    return np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
 
 
 @pytest.mark.parametrize("factor", [1e-9, 1e7])

@@ -8,13 +8,13 @@ import OpenImageIO as oiio
 import pytest
 
 from tests.service.server.pages.axe import violations
+from tests.service.server.pages.frames import pixels
 
 LOADED_MS = 120_000
 """Time for an asset to load and to be lit on a loaded machine, where the processor renders WebGL."""
 SHIFT = 0.05
 """Least shift of the brightness from the middle of the object, in its widths. A
 patch of light on one side of a ball gives a tenth or more."""
-PICTURE = """() => { const { rows, cols, pixels } = globalThis.asset.picture(); return { rows, cols, pixels: Array.from(pixels) }; }"""
 
 
 @pytest.fixture
@@ -34,6 +34,26 @@ def exported(server, solved) -> dict[str, str]:
     return jobs
 
 
+@pytest.fixture(scope="module")
+def opened(browser, server, exported):
+    """A page with the asset as glTF, which is opened once; an error of a script fails the module."""
+    page, errors = browser.new_page(base_url=server.url, viewport={"width": 640, "height": 480}), []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    open_asset(page, exported["glb"])
+    yield page
+    page.close()
+    assert errors == []
+
+
+@pytest.fixture
+def asset(opened):
+    """The page as it was opened: in the neutral room, seen from the camera, without the lights of the rig."""
+    opened.get_by_label("Lit by").select_option("room")
+    opened.get_by_role("button", name="As it was captured").click()
+    opened.get_by_label("Lights of the rig").uncheck()
+    return opened
+
+
 def open_asset(page, job: str) -> dict:
     """Open the page of an asset, and hide the lights of the rig, which are no part of it."""
     page.goto(f"/asset/{job}")
@@ -42,10 +62,15 @@ def open_asset(page, job: str) -> dict:
     return page.evaluate("() => globalThis.asset.state()")
 
 
+def shown(page) -> np.ndarray:
+    """[rows, cols, 4] uint8 what the view in 3D shows."""
+    rows = page.evaluate("() => document.querySelector('canvas.scene').height")
+    return pixels(page, "asset.picture().pixels").reshape(rows, -1, 4)
+
+
 def shift_of_light(page) -> np.ndarray:
     """How far to the right and up the brightness lies from the middle of the object, in its widths."""
-    found = page.evaluate(PICTURE)
-    picture = np.array(found["pixels"], dtype=float).reshape(found["rows"], found["cols"], 4)
+    picture = shown(page).astype(float)
     row, col = np.indices(picture.shape[:2])
     inside = picture[..., 3] > 0
     weight = picture[..., :3].sum(axis=2) * inside
@@ -75,64 +100,65 @@ def light_by(page, path) -> None:
     page.wait_for_function("(name) => globalThis.asset.state().environment === name", arg=path.name, timeout=LOADED_MS)
 
 
-@pytest.mark.parametrize("form", ["usdz", "glb"])
-def test_an_asset_is_shown(page, exported, form):
-    state = open_asset(page, exported[form])
+def test_gltf_is_shown(asset):
+    assert_shown(asset, asset.evaluate("() => globalThis.asset.state()"))
+
+
+def test_usdz_is_shown(page, exported):
+    assert_shown(page, open_asset(page, exported["usdz"]))
+
+
+def assert_shown(page, state: dict) -> None:
     assert state["triangles"] > 1000 and state["textures"] >= 2 and state["problems"] == []
-    found = page.evaluate(PICTURE)
-    picture = np.array(found["pixels"]).reshape(found["rows"], found["cols"], 4)
+    picture = shown(page)
     covered = picture[..., 3] > 0
     # the sphere around the object's box, half as wide again as the object, fills the height of the picture but for the margin
-    assert 0.4 < np.ptp(np.flatnonzero(covered.any(axis=1))) / found["rows"] < 1
+    assert 0.4 < np.ptp(np.flatnonzero(covered.any(axis=1))) / len(picture) < 1
     assert picture[..., :3][covered].mean() > 60
 
 
-def test_an_environment_lights_from_where_it_is_bright(page, exported, tmp_path):
-    open_asset(page, exported["glb"])
+def test_an_environment_lights_from_where_it_is_bright(asset, tmp_path):
     for name, direction, axis, sign in (
             ("right.exr", (1, 0, 0), 0, 1), ("left.hdr", (-1, 0, 0), 0, -1),
             ("above.hdr", (0, 1, 0), 1, 1), ("below.exr", (0, -1, 0), 1, -1)):
-        light_by(page, patch(tmp_path / name, direction))
-        assert sign * shift_of_light(page)[axis] > SHIFT, name
+        light_by(asset, patch(tmp_path / name, direction))
+        assert sign * shift_of_light(asset)[axis] > SHIFT, name
 
 
-def test_an_environment_turns_as_in_relit_relight(page, exported, tmp_path):
+def test_an_environment_turns_as_in_relit_relight(asset, tmp_path):
     """Turned by 90 degrees, what shone from the camera (+z) shines from the right (+x)."""
-    open_asset(page, exported["usdz"])
-    light_by(page, patch(tmp_path / "front.exr", (0, 0, 1)))
-    assert abs(shift_of_light(page)[0]) < SHIFT
-    page.get_by_label("Turn (degrees)").fill("90")
-    assert shift_of_light(page)[0] > SHIFT
+    light_by(asset, patch(tmp_path / "front.exr", (0, 0, 1)))
+    assert abs(shift_of_light(asset)[0]) < SHIFT
+    asset.get_by_label("Turn (degrees)").fill("90")
+    assert shift_of_light(asset)[0] > SHIFT
 
 
-def test_the_lights_of_the_rig_are_shown_and_light_the_asset(page, exported, solved):
-    open_asset(page, exported["usdz"])
+def test_the_lights_of_the_rig_are_shown_and_light_the_asset(asset, solved):
     with solved.server.client() as client:
         view = next(job["id"] for job in client.get("/v1/jobs").json()["jobs"]
                     if job["request"]["kind"] == "view" and job["request"]["capture"] == solved.capture)
         frames = client.get(f"/v1/jobs/{view}/results/view.json").json()["frames"]
     lights = [index for index, frame in enumerate(frames) if frame["kind"] == "light" and frame["direction"] is not None]
-    assert page.locator("select").first.locator("option").count() == 2 + len(lights) > 2
-    hidden = np.array(page.evaluate(PICTURE)["pixels"])
-    page.get_by_label("Lights of the rig").check()
-    assert not np.array_equal(hidden, np.array(page.evaluate(PICTURE)["pixels"]))
-    page.get_by_label("Lights of the rig").uncheck()
+    assert asset.locator("select").first.locator("option").count() == 2 + len(lights) > 2
+    hidden = shown(asset)
+    asset.get_by_label("Lights of the rig").check()
+    assert not np.array_equal(hidden, shown(asset))
+    asset.get_by_label("Lights of the rig").uncheck()
     for axis in (0, 1):
         for most in (max, min):
             index = most(lights, key=lambda at: frames[at]["direction"][axis])
-            page.get_by_label("Lit by").select_option(str(index))
-            assert np.sign(frames[index]["direction"][axis]) * shift_of_light(page)[axis] > SHIFT
+            asset.get_by_label("Lit by").select_option(str(index))
+            assert np.sign(frames[index]["direction"][axis]) * shift_of_light(asset)[axis] > SHIFT
 
 
-def test_the_keyboard_turns_it(page, exported):
-    open_asset(page, exported["glb"])
-    first = np.array(page.evaluate(PICTURE)["pixels"])
-    page.locator("canvas.scene").focus()
+def test_the_keyboard_turns_it(asset):
+    first = shown(asset)
+    asset.locator("canvas.scene").focus()
     for _ in range(4):
-        page.keyboard.press("ArrowRight")
-    assert not np.array_equal(first, np.array(page.evaluate(PICTURE)["pixels"]))
-    page.keyboard.press("0")
-    assert np.array_equal(first, np.array(page.evaluate(PICTURE)["pixels"]))
+        asset.keyboard.press("ArrowRight")
+    assert not np.array_equal(first, shown(asset))
+    asset.keyboard.press("0")
+    assert np.array_equal(first, shown(asset))
 
 
 def test_a_job_without_an_asset_that_can_be_shown_is_said(page, exported):
@@ -147,13 +173,12 @@ def test_a_damaged_asset_is_named(page, exported, form):
     page.get_by_text(f"asset.{form} cannot be opened").wait_for(timeout=LOADED_MS)
 
 
-def test_a_map_that_is_none_is_named(page, exported, tmp_path):
-    open_asset(page, exported["glb"])
+def test_a_map_that_is_none_is_named(asset, tmp_path):
     bad = tmp_path / "bad.exr"
     bad.write_bytes(b"nothing")
-    page.set_input_files("input[type=file]", bad)
-    page.get_by_text("bad.exr: cannot be read as an environment map").wait_for()
-    assert page.evaluate("() => globalThis.asset.state()")["lit"] == "room"
+    asset.set_input_files("input[type=file]", bad)
+    asset.get_by_text("bad.exr: cannot be read as an environment map").wait_for()
+    assert asset.evaluate("() => globalThis.asset.state()")["lit"] == "room"
 
 
 def test_textures_that_are_not_in_the_file_are_named(page, exported, solved, tmp_path):
@@ -179,10 +204,11 @@ def test_without_webgl_the_file_is_still_offered(page, exported):
     assert page.get_by_role("link", name="Its job").get_attribute("href") == f"/jobs/{exported['glb']}"
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_no_serious_violation(browser, server, exported, scheme):
-    page = browser.new_page(base_url=server.url, color_scheme=scheme, bypass_csp=True, viewport={"width": 390, "height": 844})
+def test_no_serious_violation(browser, server, exported):
+    page = browser.new_page(base_url=server.url, bypass_csp=True, viewport={"width": 390, "height": 844})
     open_asset(page, exported["glb"])
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
-    assert violations(page) == []
+    for scheme in ("light", "dark"):
+        page.emulate_media(color_scheme=scheme)
+        assert violations(page) == []
     page.close()

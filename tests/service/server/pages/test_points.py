@@ -8,12 +8,12 @@ import pytest
 from stage import exr
 from tests.service.server.pages.axe import violations
 from tests.service.server.pages.conftest import SAMPLES
+from tests.service.server.pages.frames import pixels
 
 LOADED_MS = 120_000
 """Time for the points to be drawn on a loaded machine, where the processor renders WebGL."""
 DIGITS = 2e-3
 """Relative error of numbers with four significant digits, and what it makes of a difference between two of them."""
-PICTURE = "() => Array.from(globalThis.cloud.picture().pixels)"
 
 
 @pytest.fixture
@@ -44,7 +44,7 @@ def cloud(page, depth):
 
 
 def picture(page) -> np.ndarray:
-    return np.array(page.evaluate(PICTURE)).reshape(-1, 4)
+    return pixels(page, "cloud.picture().pixels")
 
 
 def test_each_colouring_is_another_picture_of_the_same_points(cloud):

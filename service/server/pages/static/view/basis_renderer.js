@@ -1,6 +1,10 @@
-/** Draws the sum of coefficient images in WebGL2: one half-float texture layer for each, the coefficients in a small texture. */
+/**
+ * Draws the sum of coefficient images in WebGL2, in one pass: a half-float texture layer for each image, and a small texture of coefficients with a
+ * row for each tile of the picture (docs/view.md). Pixels without object read nothing but their coverage.
+ */
 
 import { DISPLAY_SPACE, matrixBetween } from "./colour_spaces.js";
+import { FrameTimer } from "./frame_timer.js";
 
 const VERTEX = `#version 300 es
 void main() {
@@ -10,9 +14,13 @@ void main() {
 const FRAGMENT = `#version 300 es
 precision highp float;
 precision highp sampler2DArray;
+precision highp usampler2D;
 uniform sampler2DArray basis;
 uniform sampler2D matte;
-uniform sampler2D coefficients;   // a column for each term: left of the wipe, and right of it
+uniform sampler2D coefficients;   // a column for each term; a row for each tile left of the wipe, then for each right of it
+uniform usampler2D tiles;         // index of each tile
+uniform int side;                 // of a tile, pixels
+uniform int tileCount;
 uniform int terms;
 uniform float border;             // of the wipe, in pixels
 uniform float height;
@@ -21,13 +29,17 @@ uniform mat3 rec709;              // from the working space
 uniform vec3 backdrop;            // encoded
 out vec4 colour;
 void main() {
-  vec3 sum = vec3(0.0);
   ivec2 place = ivec2(gl_FragCoord.x, height - gl_FragCoord.y);  // the first row is at the top
-  int side = gl_FragCoord.x < border ? 0 : 1;
-  for (int k = 0; k < terms; k++) {
-    sum += texelFetch(coefficients, ivec2(k, side), 0).rgb * texelFetch(basis, ivec3(place, k), 0).rgb;
-  }
   float cover = texelFetch(matte, place, 0).r;
+  if (cover == 0.0) {
+    colour = vec4(backdrop, 1.0);
+    return;
+  }
+  vec3 sum = vec3(0.0);
+  int row = int(texelFetch(tiles, place / side, 0).r) + (gl_FragCoord.x < border ? 0 : tileCount);
+  for (int k = 0; k < terms; k++) {
+    sum += texelFetch(coefficients, ivec2(k, row), 0).rgb * texelFetch(basis, ivec3(place, k), 0).rgb;
+  }
   vec3 linear = clamp(rec709 * (gain * sum), 0.0, 1.0);
   vec3 encoded = mix(12.92 * linear, 1.055 * pow(linear, vec3(1.0 / 2.4)) - 0.055, vec3(greaterThan(linear, vec3(0.0031308))));
   colour = vec4(encoded + (1.0 - cover) * backdrop, 1.0);
@@ -46,20 +58,24 @@ export class BasisRenderer {
    * @param {HTMLCanvasElement} canvas As large as the coefficient images.
    * @param {any} relight Of view.json.
    * @param {string} space Working space of the coefficient images.
+   * @param {Uint16Array} tiles Index of each tile.
    */
-  constructor(canvas, relight, space) {
+  constructor(canvas, relight, space, tiles) {
     const gl = canvas.getContext("webgl2", { antialias: false, preserveDrawingBuffer: true });
     this.#gl = gl;
     this.canvas = canvas;
     this.relight = relight;
     const program = link(gl, VERTEX, FRAGMENT);
     gl.useProgram(program);
-    const names = ["height", "basis", "matte", "coefficients", "terms", "border", "gain", "rec709", "backdrop"];
+    const names = ["height", "basis", "matte", "coefficients", "terms", "border", "gain", "rec709", "backdrop", "tiles", "side", "tileCount"];
     this.#places = Object.fromEntries(names.map((name) => [name, gl.getUniformLocation(program, name)]));
     gl.uniform1i(this.#places.basis, 0);
     gl.uniform1i(this.#places.matte, 1);
     gl.uniform1i(this.#places.coefficients, 2);
+    gl.uniform1i(this.#places.tiles, 3);
     gl.uniform1i(this.#places.terms, relight.terms);
+    gl.uniform1i(this.#places.side, relight.tiles.side);
+    gl.uniform1i(this.#places.tileCount, relight.tiles.count);
     gl.uniformMatrix3fv(this.#places.rec709, true, matrixBetween(space, DISPLAY_SPACE));
     gl.activeTexture(gl.TEXTURE0);
     gl.bindTexture(gl.TEXTURE_2D_ARRAY, gl.createTexture());
@@ -67,9 +83,14 @@ export class BasisRenderer {
     this.#sampling(gl.TEXTURE_2D_ARRAY);
     gl.activeTexture(gl.TEXTURE2);
     gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
-    gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGB32F, relight.terms, 2);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGB32F, relight.terms, 2 * relight.tiles.count);
     this.#sampling(gl.TEXTURE_2D);
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+    gl.activeTexture(gl.TEXTURE3);
+    gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.R16UI, relight.tiles.cols, relight.tiles.rows, 0, gl.RED_INTEGER, gl.UNSIGNED_SHORT, tiles);
+    this.#sampling(gl.TEXTURE_2D);
+    this.timer = new FrameTimer(gl);
   }
 
   /** Take a coefficient image: half floats [3, rows, cols]. */
@@ -98,8 +119,8 @@ export class BasisRenderer {
 
   /**
    * Draw the picture.
-   * @param {{shown: Float32Array, compared: Float32Array, border: number, gain: number, backdrop: number[]}} picture Coefficients
-   * [terms, 3] left and right of the border (0 to 1); gain; encoded colour behind the object.
+   * @param {{shown: Float32Array, compared: Float32Array|null, border: number, gain: number, backdrop: number[]}} picture Coefficients
+   * [tiles, terms, 3] left and right of the border (0 to 1; null: there is nothing right of it); gain; encoded colour behind the object.
    */
   draw({ shown, compared, border, gain, backdrop }) {
     const gl = this.#gl;
@@ -107,11 +128,12 @@ export class BasisRenderer {
     gl.viewport(0, 0, width, height);
     gl.uniform1f(this.#places.height, height);
     gl.activeTexture(gl.TEXTURE2);
-    [shown, compared].forEach((each, side) => gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, side, this.relight.terms, 1, gl.RGB, gl.FLOAT, each));
-    gl.uniform1f(this.#places.border, border * width);
+    const { terms, tiles: { count } } = this.relight;
+    [shown, compared].forEach((each, side) => each !== null && gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, side * count, terms, count, gl.RGB, gl.FLOAT, each));
+    gl.uniform1f(this.#places.border, compared === null ? width : border * width);
     gl.uniform1f(this.#places.gain, gain);
     gl.uniform3f(this.#places.backdrop, ...backdrop);
-    gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
+    this.timer.during(() => gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4));
   }
 
   /** Return the bytes [height, width, 4] of what was drawn, from the top. */

@@ -1,6 +1,6 @@
 /**
  * From light to the coefficients of a reduced basis (docs/view.md): light is shared out over the captured lights as `relit relight` does, and
- * the coefficients are those of the captured images, each times the energy of its light.
+ * the coefficients of each tile are those of the captured images, each times the energy of its light.
  *
  * Directions are those of environment maps: +y at the top, +z in the middle, +x a quarter from the left edge.
  */
@@ -25,11 +25,12 @@ class LightSum {
 export class LightModel {
   /**
    * @param {any} relight Of view.json.
-   * @param {{inverse: Float64Array, beyond: Float32Array, outside: Float32Array, captured: Float32Array}} tables Blocks of that name.
+   * @param {{inverse: Float64Array, beyond: Float32Array, outside: Float32Array, captured: Float32Array}} tables Blocks of that name, `captured` decoded.
    * @param {{direction: number[], irradiance: number[]}[]} lights All captured lights, in the order of `captured`.
    */
   constructor(relight, tables, lights) {
-    this.terms = relight.terms;
+    this.each = 3 * relight.terms * relight.tiles.count; // coefficients of a captured image
+    this.scale = relight.scale;
     [this.cols, this.rows] = relight.directions;
     this.range = relight.quadrature.range;
     this.kept = relight.quadrature.kept;
@@ -56,22 +57,26 @@ export class LightModel {
     return sum;
   }
 
-  /** Return the coefficients [terms, 3] of light. */
+  /** Return the coefficients [tiles, terms, 3] of light. */
   coefficients(sum) {
-    const found = new Float32Array(3 * this.terms);
-    for (let channel = 0; channel < 3; channel += 1) {
-      const energies = sum.outside[channel].slice();
+    const energies = sum.outside.map((outside, channel) => {
       const whole = sum.moments[channel].at(-1);
-      if (whole > 0) {
-        const weights = quadratureWeights(this.tables.inverse, this.kept.length, sum.moments[channel].map((moment) => moment / whole));
-        weights.forEach((weight, index) => { energies[index] += whole * weight; });
-      }
-      this.kept.forEach((light, index) => {
-        const weight = energies[index] / this.lights[light].irradiance[channel];
-        if (weight === 0) return;
-        for (let k = 0; k < this.terms; k += 1) found[3 * k + channel] += weight * this.tables.captured[3 * (light * this.terms + k) + channel];
-      });
-    }
+      const weights = whole > 0 ? quadratureWeights(this.tables.inverse, this.kept.length, sum.moments[channel].map((moment) => moment / whole)) : null;
+      return outside.map((energy, index) => energy + (weights === null ? 0 : whole * weights[index]));
+    });
+    const found = new Float32Array(this.each);
+    this.kept.forEach((light, index) => this.#add(found, light, energies.map((each, channel) => each[index] / this.lights[light].irradiance[channel])));
+    return found;
+  }
+
+  /** Return the coefficients [tiles, terms, 3] of a captured image. */
+  capturedImage(light) {
+    return this.#add(new Float32Array(this.each), light, [1, 1, 1]);
+  }
+
+  /** Add a captured image times a weight in each channel. */
+  #add(found, light, weights) {
+    addWeighted(found, this.tables.captured.subarray(light * this.each, (light + 1) * this.each), weights.map((weight) => weight * this.scale));
     return found;
   }
 
@@ -207,6 +212,21 @@ export class EnvironmentProfile {
         for (let at = 0; at < 3 * map.cols; at += 1) this.energy[into + at] += part * solidAngle * map.pixels[3 * row * map.cols + at];
       }
     }
+  }
+}
+
+/**
+ * Add colours times a weight in each channel to others.
+ * @param {Float32Array} found [n, 3]
+ * @param {Float32Array} colours [n, 3]
+ * @param {number[]} weights [3]
+ */
+export function addWeighted(found, colours, [red, green, blue]) {
+  if (red === 0 && green === 0 && blue === 0) return;
+  for (let at = 0; at < colours.length; at += 3) {
+    found[at] += red * colours[at];
+    found[at + 1] += green * colours[at + 1];
+    found[at + 2] += blue * colours[at + 2];
   }
 }
 

@@ -48,6 +48,7 @@ export async function mount(parent, view, { environments, load, onchange }) {
       ...lights.map((frame, index) => element("option", { value: index }, frame.image))),
     wipe: range("Where the two pictures meet", 0, 100, 1, 50),
   };
+  const speed = element("p", { class: "help", "data-shows": "speed" }, `${sizeOf(relight)}.`);
   const play = element("button", { type: "button", class: "quiet", "aria-pressed": "false" }, "Spin");
   const row = (text, each, ...more) => element("label", {}, `${text} `, each, ...more);
   const wipeRow = row("Wipe", control.wipe);
@@ -59,14 +60,15 @@ export async function mount(parent, view, { environments, load, onchange }) {
       row("Turn (degrees)", control.turn), play),
     element("fieldset", {}, element("legend", {}, "Picture"), row("Exposure (stops)", control.exposure),
       element("button", { type: "button", class: "quiet", onclick: () => { expose(); change(); } }, "Expose for this light"), row("Compare with the photograph", control.compare), wipeRow,
-      element("p", { class: "help" }, `Shown through ${VIEW_TRANSFORM}, from ${relight.terms} coefficient images, which keep the captured images within ${(100 * relight.relative_rms).toPrecision(2)} % (RMS).`)));
+      element("p", { class: "help" }, `Shown through ${VIEW_TRANSFORM}.`)),
+    element("fieldset", { class: "figures" }, element("legend", {}, "How exact, how fast"), element("p", { class: "help" }, errorOf(relight)), speed));
   parent.replaceChildren(element("div", { class: "viewer" }, element("div", { class: "stage" }, canvas, warning), panel));
 
   const { quadrature } = relight;
-  const [inverse, beyond, outside, captured] = await Promise.all([quadrature.inverse, quadrature.beyond, quadrature.outside, relight.captured].map((block) => view.block(block)));
-  const photographs = new Float32Array(captured);
-  const model = new LightModel(relight, { inverse: new Float64Array(inverse), beyond: new Float32Array(beyond), outside: new Float32Array(outside), captured: photographs }, lights);
-  const renderer = new BasisRenderer(canvas, relight, view.info.color_space);
+  const [inverse, beyond, outside, captured, index] = await Promise.all([quadrature.inverse, quadrature.beyond, quadrature.outside, relight.captured, relight.tiles.index].map((block) => view.block(block)));
+  const model = new LightModel(relight, { inverse: new Float64Array(inverse), beyond: new Float32Array(beyond), outside: new Float32Array(outside), captured: floats(captured, "float16") }, lights);
+  const tiles = new Uint16Array(index);
+  const renderer = new BasisRenderer(canvas, relight, view.info.color_space, tiles);
   const matte = new Uint8Array(await view.block(relight.matte));
   renderer.setMatte(matte);
   const unitIrradiance = Math.max(...(lights[0]?.irradiance ?? [1]));
@@ -110,9 +112,11 @@ export async function mount(parent, view, { environments, load, onchange }) {
     const sum = sumOf(now);
     const shown = model.coefficients(sum);
     const chosen = control.compare.value;
-    const compared = chosen === "" ? shown : photographs.subarray(3 * relight.terms * Number(chosen), 3 * relight.terms * (Number(chosen) + 1));
+    const compared = chosen === "" ? null : model.capturedImage(Number(chosen));
     const dark = globalThis.matchMedia("(prefers-color-scheme: dark)").matches;
-    renderer.draw({ shown, compared, border: chosen === "" ? 1 : Number(control.wipe.value) / 100, gain: 2 ** now.exposure, backdrop: dark ? [0.09, 0.09, 0.1] : [0.2, 0.2, 0.2] });
+    renderer.draw({ shown, compared, border: Number(control.wipe.value) / 100, gain: 2 ** now.exposure, backdrop: dark ? [0.09, 0.09, 0.1] : [0.2, 0.2, 0.2] });
+    const { framesPerSecond, gpuMs } = renderer.timer.figures();
+    if (framesPerSecond !== null) speed.textContent = `${sizeOf(relight)}: ${framesPerSecond.toFixed(0)} pictures a second${gpuMs === null ? "" : `, ${gpuMs.toPrecision(2)} ms each on the graphics processor`}.`;
     const share = model.shareBeyond(sum);
     warning.hidden = share < BEYOND_SHARE;
     canvas.classList.toggle("hatched", share >= BEYOND_SHARE);
@@ -122,7 +126,10 @@ export async function mount(parent, view, { environments, load, onchange }) {
   /** Set the exposure at which all but the brightest pixels of the picture are below white. */
   function expose() {
     const coefficients = model.coefficients(sumOf(state()));
-    const levels = covered.map((_, index) => Math.max(...[0, 1, 2].map((c) => terms.reduce((sum, term, k) => sum + coefficients[3 * k + c] * term[3 * index + c], 0))));
+    const levels = covered.map((place, index) => {
+      const from = 3 * relight.terms * tileOf(place, relight, tiles);
+      return Math.max(...[0, 1, 2].map((c) => terms.reduce((sum, term, k) => sum + coefficients[from + 3 * k + c] * term[3 * index + c], 0)));
+    });
     const white = levels.sort((a, b) => a - b)[Math.floor(WHITE_PERCENTILE * (levels.length - 1))];
     if (white > 0) control.exposure.value = String(Math.round(-10 * Math.log2(white)) / 10);
   }
@@ -207,6 +214,7 @@ export async function mount(parent, view, { environments, load, onchange }) {
     destroy: () => spinning !== null && cancelAnimationFrame(spinning),
     state,
     pixels: () => { draw(); return renderer.pixels(); },
+    figures: () => renderer.timer.figures(),
     set: (direction) => move(direction),
   };
 }
@@ -217,6 +225,21 @@ function spread(matte, count) {
   matte.forEach((cover, at) => { if (cover === 255) inside.push(at); });
   const step = Math.max(1, Math.floor(inside.length / count));
   return inside.filter((_, index) => index % step === 0);
+}
+
+/** Return the tile that a pixel lies in. */
+function tileOf(place, { cols, tiles: { side, cols: across } }, index) {
+  return index[Math.floor(Math.floor(place / cols) / side) * across + Math.floor((place % cols) / side)];
+}
+
+function sizeOf({ terms, rows, cols }) {
+  return `${terms} coefficient images of ${((rows * cols) / 1e6).toPrecision(2)} megapixels`;
+}
+
+/** Return what a basis leaves, as measured when it was made. */
+function errorOf({ held_out: held, relative_rms: captured }) {
+  const levels = (value) => value.toPrecision(2);
+  return `Against relit relight, under ${held.key_lights} lights that the basis was not made from: ${levels(held.mean_levels)} of 255 levels off on average, ${levels(held.largest_levels)} under the worst of them, ${levels(held.even_sky_levels)} under light from all around. It keeps the captured images within ${(100 * captured).toPrecision(2)} % (RMS). A view job with more terms is closer.`;
 }
 
 /** Return the colours [places, 3] of planes [3, pixels]. */
