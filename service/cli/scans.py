@@ -38,13 +38,17 @@ def _fuse(request: FuseRequest) -> None:
     with ProgressBar() as bar:
         result = fuse(request, bar)
     facts = result.facts
-    print(f"mesh     {result.mesh_path}")
+    if result.mesh_path is not None:
+        print(f"mesh     {result.mesh_path}")
     if result.asset_path is not None:
         print(f"asset    {result.asset_path}")
     print(f"report   {result.report_path}")
     fused = sum(scan["fused"] for scan in facts["scans"])
     print(f"surface  {facts['vertices']} vertices, {facts['faces']} faces at voxels of {1e3 * facts['voxel_m']:.4g} mm, from {fused} of "
           f"{len(facts['scans'])} scans; σ {1e3 * facts['sigma_m']['median']:.3g} mm in the median")
-    holes = facts["holes"]
-    print(f"holes    {holes['count']}, {1e3 * holes['open_length_m']:.4g} mm around; {holes['closed_share']:.1%} of the surface is there")
+    if (holes := facts.get("holes")) is None:
+        print(f"tiles    {facts['tiles']}; {facts['area_m2']:.4g} m², {facts['open_length_m']:.4g} m of borders")
+    else:
+        print(f"holes    {holes['count']}, {1e3 * holes['open_length_m']:.4g} mm around; {holes['closed_share']:.1%} of the surface is "
+              "there")
     print_warnings(result.warnings)

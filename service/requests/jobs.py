@@ -142,7 +142,7 @@ class RegisterJob(JobRequest):
 
 
 class FuseJob(JobRequest):
-    """One mesh of registered depths: mesh.ply, asset.usdc with its textures, report.json."""
+    """One mesh of registered depths: mesh.ply, asset.usdc with its textures, report.json; or site.usda and tiles."""
 
     kind: Literal["fuse"]
     registered: Annotated[JobId, Role.INPUT, Spelling(argument=True, metavar="JOB")]

@@ -11,12 +11,10 @@ from service.scans.surface import world_points
 
 SAMPLES = 3000
 """Pixels of a scan that are compared with the others."""
-BATCH_PIXELS = 1 << 25
-"""Most pixels of views that are compared at one time, which bounds the memory."""
 LEAST_COMMON = 50
 """Fewest pixels of a scan, of SAMPLES, that another must see before the place of the scan can be told."""
 REACH = 0.02
-"""Largest distance between two surfaces that are still compared, in extents of the object."""
+"""Largest distance between two surfaces that are still compared, in the median extent of the scans."""
 LARGEST_SIGMAS = 2.0
 """Displacement, in median standard deviations of the comparison, from which on a scan counts as misplaced; smaller ones harm little."""
 ROUNDS = 5
@@ -33,7 +31,7 @@ class Placing(NamedTuple):
     misplaced: bool
 
 
-class _Sample(NamedTuple):
+class Sample(NamedTuple):
     """Points of one scan that are compared with the others."""
 
     points: np.ndarray  # [n, 3] metres, world
@@ -41,59 +39,80 @@ class _Sample(NamedTuple):
     variance: np.ndarray  # [n] square metres, of each point along its normal
 
 
-def place_scans(scans: list[PreparedScan], voxel: float, *, device: str) -> list[Placing]:
+class Readings(NamedTuple):
+    """The points of all samples, one after another, that a scan sees too."""
+
+    at: np.ndarray  # [k] int64
+    distance: np.ndarray  # [k] float32 metres, from the surface of the scan
+    expected: np.ndarray  # [k] float32 metres, standard deviation of that
+
+
+def sample_of(scan: PreparedScan, number: int) -> Sample:
+    """Return points of a scan with a pose, drawn by its number."""
+    there, used = world_points(scan)
+    image = scan.image
+    normal = np.asarray(image.normal).reshape(-1, 3)[used]
+    usable = np.flatnonzero(normal.any(axis=1))
+    picked = np.sort(np.random.default_rng(number).choice(usable, min(SAMPLES, len(usable)), replace=False))
+    world = np.linalg.inv(image.camera_from_world)
+    turned = normal[picked] @ world[:3, :3].T
+    sight = there[picked] - world[:3, 3]
+    depth = np.asarray(image.depth).ravel()[used[picked]].astype(np.float64)
+    along = np.asarray(image.sigma).ravel()[used[picked]] / depth * np.einsum("ni,ni->n", turned, sight)
+    return Sample(there[picked], turned, along**2)
+
+
+def reach_of(samples: list[Sample], voxel: float) -> float:
+    """Return the distance, metres, beyond which two surfaces are not compared."""
+    return max(REACH * float(np.median([np.ptp(sample.points, axis=0).max() for sample in samples])), 10 * voxel)
+
+
+def readings_of(scan: PreparedScan, number: int, samples: list[Sample], reach: float, *, device: str) -> Readings:
+    """Return how far the points of all samples but its own lie from the surface of a scan."""
+    origin = samples[number].points.mean(axis=0)  # near the scan, so that coordinates are short in single precision
+    views = upload_views([scan.image], origin, device=device)
+    whole = Sample(*(np.concatenate(parts) for parts in zip(*samples, strict=True)))
+    distance, expected = (values[:, 0].copy() for values in compare_views(
+        views, whole.points - origin, whole.normals, whole.variance, skipped=-1, reach=reach, device=device))
+    first = sum(len(sample.points) for sample in samples[:number])
+    expected[first:first + len(samples[number].points)] = 0
+    at = np.flatnonzero(expected)
+    return Readings(at, distance[at], expected[at])
+
+
+def place_scans(samples: list[Sample], readings: list[Readings], voxel: float) -> list[Placing]:
     """Compare every scan with the others and find those that are misplaced, the worst first taken out of the comparison of the rest.
 
     Args:
-        scans: with their poses.
+        samples: of each scan.
+        readings: of each scan.
         voxel: side of a voxel, metres; displacements below half of it do no harm.
-        device: where to compute.
     """
-    points = [world_points(scan) for scan in scans]
-    extent = float(np.ptp(np.concatenate([given[0][::max(len(given[0]) // 1000, 1)] for given in points]), axis=0).max())
-    reach = max(REACH * extent, 10 * voxel)
-    chosen = []
-    for number, (there, used) in enumerate(points):
-        image = scans[number].image
-        normal = np.asarray(image.normal).reshape(-1, 3)[used]
-        usable = np.flatnonzero(normal.any(axis=1))
-        picked = np.sort(np.random.default_rng(number).choice(usable, min(SAMPLES, len(usable)), replace=False))
-        world = np.linalg.inv(image.camera_from_world)
-        turned = normal[picked] @ world[:3, :3].T
-        sight = there[picked] - world[:3, 3]
-        depth = np.asarray(image.depth).ravel()[used[picked]].astype(np.float64)
-        along = np.asarray(image.sigma).ravel()[used[picked]] / depth * np.einsum("ni,ni->n", turned, sight)
-        chosen.append(_Sample(there[picked], turned, along**2))
-    distances = _compared(scans, chosen, reach, device)
+    firsts = np.cumsum([0, *(len(sample.points) for sample in samples)])
+    ranges = [np.searchsorted(each.at, firsts) for each in readings]
+
+    def placing(number: int) -> Placing:
+        distance, expected = (np.zeros((len(samples[number].points), len(samples)), dtype=np.float32) for _ in range(2))
+        for other, (each, places) in enumerate(zip(readings, ranges, strict=True)):
+            part = slice(places[number], places[number + 1])
+            distance[each.at[part] - firsts[number], other] = each.distance[part]
+            expected[each.at[part] - firsts[number], other] = each.expected[part]
+        return _placing(samples[number], distance, expected, left_out - {number}, voxel)
+
     left_out: set[int] = set()
+    placings = [placing(number) for number in range(len(samples))]
     while True:
-        placings = [_placing(chosen[number], *distances[number], left_out - {number}, voxel) for number in range(len(scans))]
-        wrong = [number for number, placing in enumerate(placings) if placing.misplaced and number not in left_out]
+        wrong = [number for number, each in enumerate(placings) if each.misplaced and number not in left_out]
         if not wrong:
-            return [placing._replace(misplaced=number in left_out) for number, placing in enumerate(placings)]
-        left_out.add(max(wrong, key=lambda number: placings[number].displacement_m))
+            return [each._replace(misplaced=number in left_out) for number, each in enumerate(placings)]
+        worst = max(wrong, key=lambda number: placings[number].displacement_m)
+        left_out.add(worst)
+        touched = [number for number in range(len(samples)) if ranges[worst][number + 1] > ranges[worst][number]]
+        for number in touched:
+            placings[number] = placing(number)
 
 
-def _compared(scans: list[PreparedScan], chosen: list[_Sample], reach: float, device: str) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return for each scan the distances of its points from every scan and their standard deviations, [n, scans] metres, 0 where there is
-    none."""
-    found = [(np.zeros((len(each.points), len(scans)), np.float32), np.zeros((len(each.points), len(scans)), np.float32))
-             for each in chosen]
-    last = 0
-    while last < len(scans):
-        first, size = last, 0
-        while last < len(scans) and (last == first or size + scans[last].image.depth.size <= BATCH_PIXELS):
-            size += scans[last].image.depth.size
-            last += 1
-        views = upload_views([scan.image for scan in scans[first:last]], np.zeros(3), device=device)
-        for number, sample in enumerate(chosen):
-            for whole, part in zip(found[number], compare_views(
-                    views, *sample, skipped=number - first if first <= number < last else -1, reach=reach, device=device), strict=True):
-                whole[:, first:last] = part
-    return found
-
-
-def _placing(sample: _Sample, distance: np.ndarray, expected: np.ndarray, left_out: set[int], voxel: float) -> Placing:
+def _placing(sample: Sample, distance: np.ndarray, expected: np.ndarray, left_out: set[int], voxel: float) -> Placing:
     """Return how a scan lies to those that are not left out."""
     known = expected > 0
     known[:, sorted(left_out)] = False

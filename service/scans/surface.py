@@ -1,10 +1,11 @@
 """The surface of many range images, brick by brick, so that memory is bounded whatever the size of the site.
 
 The arrays of the scans lie in files that are mapped into memory. A brick takes from each view the window of pixels in which the brick can
-lie; its triangles go to the mesh at once. Bricks compute the lattice alike, so that their triangles share vertices where they meet.
+lie. Bricks compute the lattice alike, so that their triangles share vertices where they meet. What the views show at such a vertex is
+blended by the angle to the triangles around it, of which a brick has its own alone: the first brick that has the vertex decides.
 """
 
-from collections.abc import Callable
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -58,6 +59,17 @@ class Tally:
         self._counts = np.zeros(int(HISTOGRAM_END / HISTOGRAM_STEP) + 1, dtype=np.int64)
         self._squares = 0.0
 
+    def numbers(self) -> np.ndarray:
+        """Return the tally as numbers [n] float64, which `add_numbers` adds to another."""
+        return np.array([self.fused, self.lost, self.refused, self._squares, *self._counts], dtype=np.float64)
+
+    def add_numbers(self, numbers: np.ndarray) -> None:
+        """Count the pixels of another tally of the same scan."""
+        self.fused, self.lost, self.refused = (own + int(more) for own, more in zip((self.fused, self.lost, self.refused), numbers[:3],
+                                                                                    strict=True))
+        self._squares += float(numbers[3])
+        self._counts += numbers[4:].astype(np.int64)
+
     def add(self, distance: np.ndarray, sigma: np.ndarray, fate: np.ndarray) -> None:
         """Count pixels: their distances from the surface and standard deviations, metres, and what became of them."""
         there = fate == FUSED
@@ -84,63 +96,94 @@ class Tally:
         return float((np.searchsorted(np.cumsum(self._counts), self.fused / 2) + 0.5) * HISTOGRAM_STEP)
 
 
-def fuse_surface(scans: list[PreparedScan], names: tuple[str, ...], voxel: float, *, device: str,
-                 progress: Callable[[float], None] = lambda done: None) -> Surface:
-    """Fuse scans.
+class BrickSurface(NamedTuple):
+    """The surface in one brick."""
+
+    points: np.ndarray  # [V, 3] float64 metres, world
+    normals: np.ndarray  # [V, 3] float32
+    sigma: np.ndarray  # [V] float32 metres
+    seen: np.ndarray  # [V] uint16
+    values: np.ndarray  # [V, C] float32
+    edge: np.ndarray  # [V, 4] int32, the edge of the lattice on which each vertex lies
+    faces: np.ndarray  # [F, 3] int32
+    tallies: dict[int, np.ndarray]  # the numbers of the tally of each scan that can see the brick
+    blocks: int
+
+
+VERTEX = ("points", "normals", "sigma", "seen", "values")
+"""The arrays of a surface with one entry for each vertex."""
+
+
+def origin_of(centres: np.ndarray, voxel: float) -> np.ndarray:
+    """Return the world point [3] that the lattice counts from: a multiple of the voxel near the mean of points [n, 3] of all scans."""
+    return np.asarray(np.round(centres.mean(axis=0) / voxel) * voxel)
+
+
+def fuse_brick(brick: np.ndarray, watching: list[Watching], names: tuple[str, ...], voxel: float, origin: np.ndarray, *, device: str
+               ) -> BrickSurface:
+    """Fuse what lies in a brick.
 
     Args:
-        scans: at least one.
+        brick: its place [3], in bricks from the origin.
+        watching: the scans that can see `box_of` the brick.
         names: their layers.
         voxel: side of a voxel, metres.
+        origin: of the lattice, [3] metres.
         device: where to compute.
-        progress: is called with the part that is done, 0…1.
 
     Convention:
         The surface lies at the mean of the measured distances weighted by the inverse of their variances.
     """
-    size = BRICK_VOXELS * voxel
-    middle = np.mean([np.linalg.inv(scan.image.camera_from_world)[:3] @ [*_centre(scan), 1.0] for scan in scans], axis=0)
-    origin = np.round(middle / voxel) * voxel
-    bricks = _bricks(scans, origin, voxel)
-    parts: dict[str, list[np.ndarray]] = {name: [] for name in ("points", "normals", "sigma", "seen", "values", "edge", "faces")}
-    tallies = [Tally() for _ in scans]
-    count = blocks = 0
-    for done, brick in enumerate(bricks):
-        progress(done / len(bricks))
-        corner = (int(brick[0]) * BRICK_VOXELS, int(brick[1]) * BRICK_VOXELS, int(brick[2]) * BRICK_VOXELS)
-        low = origin + np.array(corner) * voxel
-        watching = watching_views(scans, low - 4 * voxel, low + size + 12 * voxel)
-        views = upload_views([scan.image.cropped(*window) for _, scan, window in watching], origin, device=device)
-        found = find_blocks(views, voxel, corner, device=device)
-        volume = integrate(found, views)
-        triangles = extract(volume)
-        blocks += found.count
-        distance, fate = residuals(volume, views)
-        for place, (number, scan, (top, bottom, left, right)) in enumerate(watching):
-            part = slice(views.first_cell[place], views.first_cell[place + 1])
-            box = slice(top, bottom - 1), slice(left, right - 1)
-            tallies[number].add(distance[part], np.asarray(scan.image.sigma[box])[np.asarray(scan.image.cell[box])], fate[part])
-        if len(triangles.faces) == 0:
-            continue
+    corner = (int(brick[0]) * BRICK_VOXELS, int(brick[1]) * BRICK_VOXELS, int(brick[2]) * BRICK_VOXELS)
+    views = upload_views([scan.image.cropped(*window) for _, scan, window in watching], origin, device=device)
+    found = find_blocks(views, voxel, corner, device=device)
+    volume = integrate(found, views)
+    triangles = extract(volume)
+    distance, fate = residuals(volume, views)
+    tallies = {}
+    for place, (number, scan, (top, bottom, left, right)) in enumerate(watching):
+        tally, part = Tally(), slice(views.first_cell[place], views.first_cell[place + 1])
+        box = slice(top, bottom - 1), slice(left, right - 1)
+        tally.add(distance[part], np.asarray(scan.image.sigma[box])[np.asarray(scan.image.cell[box])], fate[part])
+        tallies[number] = tally.numbers()
+    width = channels(names)[names[-1]].stop + (names[-1] != NORMAL) - channels(names)[NORMAL].stop
+    values, normals, seen = np.zeros((0, width), np.float32), np.zeros((0, 3), np.float32), np.zeros(0, np.uint16)
+    if len(triangles.faces):
         values, normals, seen = _shown(triangles, watching, views, names, voxel, device)
-        for name, given in (("points", triangles.points.astype(np.float64) + origin), ("normals", normals), ("sigma", triangles.sigma),
-                            ("seen", seen), ("values", values), ("edge", triangles.edge),
-                            ("faces", triangles.faces.astype(np.int64) + count)):
-            parts[name].append(given)
-        count += len(triangles.points)
-    if not count:
-        empty = [np.zeros((0, width), dtype=np.float32) for width in (3, 3, 0)]
-        return Surface(empty[0].astype(np.float64), empty[1], np.zeros(0, np.float32), np.zeros(0, np.uint16), empty[2],
-                       np.zeros((0, 3), np.int32), tallies, len(bricks), blocks)
+    return BrickSurface(triangles.points.astype(np.float64) + origin, normals, triangles.sigma, seen, values, triangles.edge,
+                        triangles.faces, tallies, found.count)
+
+
+def box_of(brick: np.ndarray, voxel: float, origin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and the highest corner [3], metres, of what the views of a brick must be asked for."""
+    low = origin + np.asarray(brick) * (BRICK_VOXELS * voxel)
+    return low - 4 * voxel, low + (BRICK_VOXELS + 12) * voxel
+
+
+def joined_surface(bricks: Iterable[BrickSurface], scans: int) -> Surface:
+    """Return the surfaces of bricks, in their order, as one; `scans` is the number of scans."""
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in (*VERTEX, "edge", "faces")}
+    tallies = [Tally() for _ in range(scans)]
+    count = blocks = total = 0
+    for brick in bricks:
+        for number, numbers in brick.tallies.items():
+            tallies[number].add_numbers(numbers)
+        blocks, total = blocks + brick.blocks, total + 1
+        if not len(brick.faces) and count:
+            continue
+        for name in parts:
+            parts[name].append(getattr(brick, name) if name != "faces" else brick.faces.astype(np.int64) + count)
+        count += len(brick.points)
     joined = {name: np.concatenate(given) for name, given in parts.items()}
     kept, faces = _welded(joined.pop("edge"), joined.pop("faces"))
-    return Surface(**{name: given[kept] for name, given in joined.items()}, faces=faces, tallies=tallies, bricks=len(bricks), blocks=blocks)
+    return Surface(**{name: given[kept] for name, given in joined.items()}, faces=faces, tallies=tallies, bricks=total, blocks=blocks)
 
 
-def _centre(scan: PreparedScan) -> np.ndarray:
-    """Return the camera-frame point at the median depth on the optical axis, [3]."""
+def centre_of(scan: PreparedScan) -> np.ndarray:
+    """Return the world point at the median depth on the optical axis of a scan, [3] metres."""
     used = corners_of(np.asarray(scan.image.cell))
-    return np.array([0.0, 0.0, -float(np.median(np.asarray(scan.image.depth)[used])) if used.any() else 0.0])
+    depth = float(np.median(np.asarray(scan.image.depth)[used])) if used.any() else 0.0
+    return np.asarray(np.linalg.inv(scan.image.camera_from_world)[:3] @ [0.0, 0.0, -depth, 1.0])
 
 
 def world_points(scan: PreparedScan) -> tuple[np.ndarray, np.ndarray]:
@@ -156,25 +199,22 @@ def world_points(scan: PreparedScan) -> tuple[np.ndarray, np.ndarray]:
     return points @ world[:3, :3].T + world[:3, 3], used
 
 
-def _bricks(scans: list[PreparedScan], origin: np.ndarray, voxel: float) -> np.ndarray:
-    """Return the bricks [n, 3] that measured surface comes near."""
+def bricks_of(scan: PreparedScan, origin: np.ndarray, voxel: float) -> np.ndarray:
+    """Return the bricks [n, 3] that the measured surface of a scan comes near."""
     size = BRICK_VOXELS * voxel
-    found = []
-    for scan in scans:
-        points, used = world_points(scan)
-        if len(points) == 0:
-            continue
-        sigma = float(np.asarray(scan.image.sigma).ravel()[used].max())
-        depth = float(np.asarray(scan.image.depth).ravel()[used].max())
-        reach = max(TRUNCATION_VOXELS * voxel, TRUNCATION_SIGMAS * sigma / LEAST_COSINE) + 2 * voxel + depth / min(scan.image.focal)
-        low, high = (np.floor((points - origin + side * reach) / size).astype(np.int64) for side in (-1, 1))
-        beyond = int((high - low).max()) + 1
-        base, count = low.min(axis=0), np.ptp(low, axis=0) + 1
-        numbers = np.ravel_multi_index(tuple(np.concatenate([low - base, high - low], axis=1).T), (*count, *[beyond] * 3))
-        ranges = np.stack(np.unravel_index(np.unique(numbers), (*count, *[beyond] * 3)), axis=1)  # few, so that each is looked at alone
-        for step in np.ndindex(*[beyond] * 3):
-            found.append(base + (ranges[:, :3] + step)[(np.array(step) <= ranges[:, 3:]).all(axis=1)])
-    return np.unique(np.concatenate(found), axis=0) if found else np.zeros((0, 3), dtype=np.int64)
+    points, used = world_points(scan)
+    if len(points) == 0:
+        return np.zeros((0, 3), dtype=np.int64)
+    sigma = float(np.asarray(scan.image.sigma).ravel()[used].max())
+    depth = float(np.asarray(scan.image.depth).ravel()[used].max())
+    reach = max(TRUNCATION_VOXELS * voxel, TRUNCATION_SIGMAS * sigma / LEAST_COSINE) + 2 * voxel + depth / min(scan.image.focal)
+    low, high = (np.floor((points - origin + side * reach) / size).astype(np.int64) for side in (-1, 1))
+    beyond = int((high - low).max()) + 1
+    base, count = low.min(axis=0), np.ptp(low, axis=0) + 1
+    numbers = np.ravel_multi_index(tuple(np.concatenate([low - base, high - low], axis=1).T), (*count, *[beyond] * 3))
+    ranges = np.stack(np.unravel_index(np.unique(numbers), (*count, *[beyond] * 3)), axis=1)  # few, so that each is looked at alone
+    return np.unique(np.concatenate([base + (ranges[:, :3] + step)[(np.array(step) <= ranges[:, 3:]).all(axis=1)]
+                                     for step in np.ndindex(*[beyond] * 3)]), axis=0)
 
 
 def _window(scan: PreparedScan, low: np.ndarray, high: np.ndarray) -> tuple[int, int, int, int] | None:

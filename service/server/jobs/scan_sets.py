@@ -12,6 +12,7 @@ from service.requests.jobs import FuseJob, RegisterJob
 from stage.scans.records import SCAN_SET_FILE, ScanEntry, ScanSet, read_scan_set, write_scan_set
 
 if TYPE_CHECKING:
+    from service.requests.fuse import FuseRequest
     from service.scans.pieces import SharedPieces
 
 PlaceOf = Callable[[str], Path]
@@ -57,23 +58,39 @@ def _listed(request: RegisterJob, name: str) -> ScanSet:
         ScanEntry(name=depth, path=depth, maps=solve) for depth, solve in zip(request.depths, maps, strict=True)))
 
 
-def fuse(request: FuseJob, name: str, out: Path, place_of: PlaceOf, device: str, progress: Progress) -> None:
+def fuse(request: FuseJob, out: Path, place_of: PlaceOf, device: str, progress: Progress, sharing: "SharedPieces") -> None:
     """Fuse the depths that another job has registered.
 
     Args:
         request: names that job.
-        name: identifier of this job.
-        out: folder of its results.
+        out: folder of the results.
         place_of: where the results of that job, and of those that it names, are.
         device: to compute on.
         progress: told of every stage.
+        sharing: the part of this worker.
     """
-    from service.requests.fuse import FuseRequest
     from service.scans.fuse import fuse as fuse_scans
+
+    with _registered(request, out, place_of, device) as given:
+        fuse_scans(given, progress, sharing)
+
+
+def help_fuse(request: FuseJob, out: Path, place_of: PlaceOf, device: str, progress: Progress, sharing: "SharedPieces") -> None:
+    """Do pieces of a fusion that another worker leads; arguments as of `fuse`."""
+    from service.scans import fuse as product
+
+    with _registered(request, out, place_of, device) as given:
+        product.help_fuse(given, progress, sharing)
+
+
+@contextmanager
+def _registered(request: FuseJob, out: Path, place_of: PlaceOf, device: str) -> Iterator["FuseRequest"]:
+    """Yield the request that fuses the scans of a registration."""
+    from service.requests.fuse import FuseRequest
 
     _, scans = read_scan_set(place_of(request.registered) / SCAN_SET_FILE)
     with _in_folder(scans, place_of, request.registered) as folder:
-        fuse_scans(FuseRequest(scan_set=folder, out=out, device=device, **dict(request.options)), progress)
+        yield FuseRequest(scan_set=folder, out=out, device=device, **dict(request.options))
 
 
 @contextmanager

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from contextlib import ExitStack
-from pathlib import Path
 
 from service.errors import RequestError
 from service.reporting.progress import Progress
@@ -24,9 +23,8 @@ from service.requests.jobs import (
     ViewJob,
 )
 from service.server.database import intakes, quotas
-from service.server.jobs import boards, calibrating, measuring, scan_sets, solving
+from service.server.jobs import boards, calibrating, measuring, scan_steps, solving
 from service.server.jobs.context import Job, JobStep, WorkerContext
-from service.server.jobs.pieces import JobPieces
 from service.server.jobs.places import environment_image, intake_folder, intake_place, job_maps, results_folder
 from service.server.storage import layout
 
@@ -64,12 +62,8 @@ def _steps_of(job: Job, context: WorkerContext) -> list[JobStep]:
         return solving.steps(job, request, context)
     if isinstance(request, JoinJob):
         return [JobStep("join", lambda progress: _join(job, request, context, progress))]
-    if isinstance(request, RegisterJob):
-        return [_register_step(job, request, context)]
-    if isinstance(request, FuseJob):
-        return [JobStep("fuse", lambda progress: scan_sets.fuse(
-            request, job.id, results_folder(job, context), lambda other: job_maps(job, other, context, progress), context.device,
-            progress))]
+    if isinstance(request, RegisterJob | FuseJob):
+        return [scan_steps.step_of(job, request, context)]
     if isinstance(request, ShadeJob):
         return [JobStep("shade", lambda progress: _shade(job, request, context, progress))]
     if isinstance(request, ExportJob):
@@ -98,27 +92,6 @@ def _steps_of(job: Job, context: WorkerContext) -> list[JobStep]:
     return [*solving.steps(job, solve, context),
             JobStep("export", lambda progress: _export(job, export, context, progress)),
             *(_frames(job, relight, context) if request.environment is not None or request.keys is not None else [])]
-
-
-def _register_step(job: Job, request: RegisterJob, context: WorkerContext) -> JobStep:
-    def places(progress: Progress) -> Callable[[str], Path]:
-        return lambda other: job_maps(job, other, context, progress)
-
-    def run(progress: Progress) -> None:
-        from service.scans.pieces import SharedPieces
-
-        pieces = JobPieces(context, job)
-        scan_sets.register(request, job.id, results_folder(job, context), places(progress), progress,
-                           SharedPieces(pieces, invite=pieces.invite))
-        pieces.remove()
-
-    def help_others(progress: Progress) -> None:
-        from service.scans.pieces import SharedPieces
-
-        scan_sets.help_register(request, job.id, results_folder(job, context), places(progress), progress,
-                                SharedPieces(JobPieces(context, job), leads=False))
-
-    return JobStep("register", run, help=help_others)
 
 
 def _frames(job: Job, request: RelightJob, context: WorkerContext) -> list[JobStep]:

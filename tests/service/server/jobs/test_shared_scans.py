@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from service.requests.fuse import FuseOptions, FuseRequest
 from service.requests.identifiers import JOB, new_id
-from service.requests.jobs import RegisterJob
+from service.requests.jobs import FuseJob, RegisterJob
 from service.requests.register import RegisterRequest
+from service.scans.fuse import fuse
 from service.scans.register import register_scans
 from service.server.database import jobs
 from service.server.storage import layout
@@ -51,6 +53,18 @@ def registered_alone(made: Harness, names: list[str], out: Path) -> Path:
     return register_scans(RegisterRequest(scan_set=file, out=out, threads=1)).scan_set_path
 
 
+def put_registered(made: Harness, names: list[str], views: list[View]) -> Path:
+    """The results of a register job with the true poses."""
+    folder = made.settings.data / layout.results(PROJECT, new_id(JOB))
+    folder.mkdir(parents=True)
+    for name in names:  # paths of a scan set are relative to it; the job finds depths by their names alone
+        (folder / name).symlink_to(folder.parent / name)
+    entries = tuple(ScanEntry(name=name, path=name, scan_to_world=tuple(tuple(map(float, row)) for row in view.world_from_scan))
+                    for name, view in zip(names, views, strict=False))
+    write_scan_set(ScanSet(schema="relit.scan-set/1", name="figure", scans=entries), folder / "scan-set.json")
+    return folder
+
+
 def start(made: Harness) -> None:
     for _ in range(WORKERS):
         made.start(PYTHONPATH=SABOTAGE, PIECES="0", TOGETHER=str(made.folder / "together"))
@@ -76,6 +90,23 @@ def test_two_workers_find_the_same_poses_as_one_process(tmp_path, views):
         assert poses_of(made.results(job) / "scan-set.json") == poses_of(alone)
         assert json.loads((made.results(job) / "report.json").read_text())["pairs"] == json.loads(
             (alone.parent / "report.json").read_text())["pairs"]
+        assert not pieces_folder(made, job).exists()
+
+
+def test_two_workers_write_the_same_tiles_as_one_process(tmp_path, views):
+    with harness(tmp_path / "service", log_level="debug") as made:
+        names = put_depths(made, views[:4])
+        registered = put_registered(made, names, views)
+        options = {"tiles": True, "voxel_m": 6e-3}
+        alone = fuse(FuseRequest(scan_set=registered, out=tmp_path / "alone", device="cpu", **options)).report_path.parent
+        start(made)
+        job = made.submit(FuseJob(kind="fuse", registered=registered.name, options=FuseOptions(**options)), chunk_frames=8)
+        row = made.ended(job)
+        assert (row["state"], row["error"], row["lost"]) == (jobs.SUCCEEDED, None, 0)
+        assert len(begun(made, job)) == WORKERS
+        tiles = {path.name: path.read_bytes() for path in (alone / "tiles").glob("*.ply")}
+        assert len(tiles) > 1 and {path.name: path.read_bytes() for path in (made.results(job) / "tiles").glob("*.ply")} == tiles
+        assert (made.results(job) / "site.usda").exists()
         assert not pieces_folder(made, job).exists()
 
 

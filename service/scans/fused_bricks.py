@@ -1,0 +1,128 @@
+"""The phases of a fusion: scans are looked at, compared with each other, and fused brick by brick; each phase in pieces that are kept.
+
+A piece reads the scans that it needs alone, so that memory is bounded whatever the number of scans and the size of the site, and several
+workers can do the pieces of one fusion.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+
+import numpy as np
+
+from kernels import device as devices
+from service.errors import RequestError
+from service.reporting.progress import Timings
+from service.requests.fuse import FuseRequest, Misplaced
+from service.scans.misplaced import Placing, Readings, place_scans, reach_of, readings_of
+from service.scans.pieces import FolderPieces, SharedPieces
+from service.scans.placing_words import placing_warnings
+from service.scans.prepared_scans import PreparedScans, ScanSummary
+from service.scans.range_images import WIDTHS, PreparedScan
+from service.scans.stored_arrays import packed, packed_brick, unpacked, unpacked_brick
+from service.scans.surface import BrickSurface, box_of, bricks_of, fuse_brick, origin_of, watching_views
+from service.solve.sharing import digest, kind_of_worker
+from stage.depth_maps import DEPTH_FILE
+from stage.scans.records import ScanSet, read_scan_set
+
+
+class FusedBricks(NamedTuple):
+    """What the phases have made."""
+
+    summaries: list[ScanSummary]
+    placings: list[Placing]
+    used: list[int]
+    """The scans that were fused."""
+    names: tuple[str, ...]  # the layers of all scans
+    voxel: float  # metres
+    places: np.ndarray  # [n, 3] int64 of each brick, in bricks from the origin, in ascending order
+    brick: Callable[[int], BrickSurface]
+    """Returns the surface of the brick of a number; its tallies are those of `used`."""
+    scan: Callable[[int], PreparedScan]
+    """Returns the scan of a place in `used`."""
+    warnings: list[str]
+
+    def bricks(self) -> Iterator[BrickSurface]:
+        """Yield the surfaces of the bricks in their order."""
+        return (self.brick(number) for number in range(len(self.places)))
+
+
+@contextmanager
+def fused_bricks(request: FuseRequest, timings: Timings, sharing: SharedPieces | None = None) -> Iterator[FusedBricks]:
+    """Fuse the scans of a set brick by brick. What is kept of scans and bricks lies on the disk until the context ends.
+
+    Args:
+        request: the scan set, and how.
+        timings: told of every phase.
+        sharing: the part of this worker in a fusion that others help with; None: there are no others.
+
+    Raises:
+        RequestError: a scan has no pose or is no range image, too few scans remain, or their poses contradict each other.
+        DivergedError: this worker does not lead, and finds something else than the worker that leads.
+        StageError, StorageError: a file cannot be used, read or written.
+    """
+    file, scan_set = read_scan_set(request.scan_set)
+    with ExitStack() as held:
+        work = Path(held.enter_context(TemporaryDirectory(prefix="relit-fuse-")))
+        pieces = sharing or SharedPieces(FolderPieces(request.cache or work / "pieces"))
+        device = devices.resolve(request.device)
+        pieces.identify(scan_set.model_dump_json(), _stamps(file, scan_set, timed=sharing is None), kind_of_worker(device))
+        (work / "scans").mkdir()
+        yield _phases(request, file, PreparedScans(file, scan_set, work / "scans"), pieces, timings, device)
+
+
+def _stamps(file: Path, scan_set: ScanSet, *, timed: bool) -> tuple[tuple[int, int], ...]:
+    places = [file.parent / path for entry in scan_set.scans for path in (entry.path, entry.maps) if path is not None]
+    files = [path for place in places for path in (place, place / DEPTH_FILE) if path.is_file()]
+    return tuple((path.stat().st_size, path.stat().st_mtime_ns if timed else 0) for path in files)
+
+
+def _phases(request: FuseRequest, file: Path, scans: PreparedScans, pieces: SharedPieces, timings: Timings, device: str) -> FusedBricks:
+    numbers = [f"{number:05d}" for number in range(len(scans))]
+    timings.stage("read", len(scans))
+    content = pieces.do("read", numbers, lambda piece: scans.summary(int(piece)).packed(), advance=timings.advance)
+    summaries = [ScanSummary.unpacked(content(piece)) for piece in numbers]
+    names = tuple(name for name in WIDTHS if any(name in summary.names for summary in summaries))
+    voxel = request.voxel_m or _voxel(summaries)
+    known = digest([np.frombuffer(summary.packed(), dtype=np.uint8) for summary in summaries])
+
+    timings.stage("compare", len(scans))
+    samples = [summary.sample for summary in summaries]
+    reach = reach_of(samples, voxel)
+    content = pieces.do("compare", numbers, lambda piece: packed(readings_of(
+        scans.prepared(int(piece)), int(piece), samples, reach, device=device)._asdict()), follows_from=(known, reach),
+        advance=timings.advance)
+    readings = [Readings(**unpacked(content(piece))) for piece in numbers]
+    placings = place_scans(samples, readings, voxel) if len(scans) > 1 else [Placing(0, 0.0, 0.0, 0.0, False)]
+    warnings = list(placing_warnings([summary.name for summary in summaries], placings, request.misplaced))
+    used = [number for number, placing in enumerate(placings) if not (placing.misplaced and request.misplaced is Misplaced.LEAVE_OUT)]
+    if 2 * len(used) < len(scans) + (len(scans) == 2) or not used:
+        raise RequestError(f"{file}: " + "; ".join(warnings) + ": the poses contradict each other: run relit register first")
+
+    timings.stage("bricks", len(used))
+    origin = origin_of(np.stack([summaries[number].centre for number in used]), voxel)
+    content = pieces.do("bricks", [numbers[number] for number in used],
+                        lambda piece: packed({"bricks": bricks_of(scans.prepared(int(piece)), origin, voxel)}),
+                        follows_from=(known, voxel, tuple(used)), advance=timings.advance)
+    places = np.unique(np.concatenate([unpacked(content(numbers[number]))["bricks"] for number in used]), axis=0)
+    outlines = [summaries[number].outline() for number in used]
+
+    def fused(piece: str) -> bytes:
+        brick = places[int(piece)]
+        watching = watching_views(outlines, *box_of(brick, voxel, origin))
+        seen = [each._replace(scan=scans.with_layers(used[each.number], names)) for each in watching]
+        return packed_brick(fuse_brick(brick, seen, names, voxel, origin, device=device))
+
+    timings.stage("fuse", max(len(places), 1))
+    content = pieces.do("fuse", [f"{number:06d}" for number in range(len(places))], fused, follows_from=(known, voxel, tuple(used), places),
+                        advance=timings.advance)
+    return FusedBricks(summaries, placings, used, names, voxel, places, lambda number: unpacked_brick(content(f"{number:06d}")),
+                       lambda place: scans.with_layers(used[place], names), warnings)
+
+
+def _voxel(summaries: list[ScanSummary]) -> float:
+    """Return half the median distance between neighbouring pixels on the surface, or the median noise where that is larger, metres."""
+    pitch, noise = ([getattr(summary, name) for summary in summaries] for name in ("pitch", "noise"))
+    return float(f"{max(np.median(pitch) / 2, np.median(noise)):.3g}")

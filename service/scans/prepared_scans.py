@@ -1,0 +1,119 @@
+"""The scans of a fusion: each is prepared when it is first asked for, and then lies in files that are mapped into memory."""
+
+import json
+import threading
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from kernels.fusion.views import RangeImage
+from service.errors import RequestError
+from service.scans.misplaced import Sample, sample_of
+from service.scans.range_images import PreparedScan, prepare_scan, with_layers
+from service.scans.read import read_scan
+from service.scans.stored_arrays import packed, unpacked
+from service.scans.surface import centre_of
+from stage.camera import Camera
+from stage.scans.records import ScanSet
+
+LEAST_PIXELS = 100
+"""Fewest pixels in cells that a scan must have."""
+
+
+class ScanSummary(NamedTuple):
+    """What a fusion needs to know of every scan."""
+
+    name: str
+    names: tuple[str, ...]  # its layers
+    pitch: float  # metres between neighbouring pixels on the surface, median
+    noise: float  # metres, standard deviation of the depth, median
+    centre: np.ndarray  # [3] metres, world
+    photometric: bool
+    camera: Camera
+    camera_from_world: np.ndarray  # [4, 4]
+    sample: Sample
+
+    def packed(self) -> bytes:
+        """Return the summary as bytes."""
+        known = {"name": self.name, "names": self.names, "photometric": self.photometric, "camera": self.camera.model_dump(mode="json")}
+        return packed({"known": np.frombuffer(json.dumps(known).encode(), dtype=np.uint8), "pitch": self.pitch, "noise": self.noise,
+                       "centre": self.centre, "camera_from_world": self.camera_from_world, **self.sample._asdict()})
+
+    @staticmethod
+    def unpacked(content: bytes) -> "ScanSummary":
+        """Return the summary of `packed`."""
+        found = unpacked(content)
+        known = json.loads(found["known"].tobytes())
+        return ScanSummary(known["name"], tuple(known["names"]), float(found["pitch"]), float(found["noise"]), found["centre"],
+                           known["photometric"], Camera.model_validate(known["camera"]), found["camera_from_world"],
+                           Sample(found["points"], found["normals"], found["variance"]))
+
+    def outline(self) -> PreparedScan:
+        """Return the scan without what it measured, to ask whether it can see a place."""
+        nothing: Any = np.broadcast_to(np.float32(0), (self.camera.height, self.camera.width))
+        assert self.camera.focal_px is not None
+        image = RangeImage(nothing, nothing, nothing, nothing, nothing, self.camera_from_world, self.camera.focal_px,
+                           self.camera.principal_point)
+        return PreparedScan(self.name, image, self.camera, self.names, nothing, nothing, self.photometric)
+
+
+class PreparedScans:
+    """The scans of a set."""
+
+    def __init__(self, file: Path, scan_set: ScanSet, folder: Path) -> None:
+        """Create the scans, of which none is read yet.
+
+        Args:
+            file: the scan-set.json.
+            scan_set: its content.
+            folder: for the arrays of the scans; exists.
+        """
+        self._file, self._scan_set, self._folder = file, scan_set, folder
+        self._prepared: dict[int, PreparedScan] = {}
+        self._complete: dict[int, PreparedScan] = {}
+        self._lock = threading.Lock()
+
+    def __len__(self) -> int:
+        """Return the number of scans."""
+        return len(self._scan_set.scans)
+
+    def prepared(self, number: int) -> PreparedScan:
+        """Return a scan with the layers that it has.
+
+        Raises:
+            RequestError: it has no pose, is no range image, or has too few pixels.
+        """
+        with self._lock:
+            if number not in self._prepared:
+                self._prepared[number] = self._read(number)
+            return self._prepared[number]
+
+    def with_layers(self, number: int, names: tuple[str, ...]) -> PreparedScan:
+        """Return a scan with these layers, of which those that it lacks are 0."""
+        prepared = self.prepared(number)
+        with self._lock:
+            if number not in self._complete:
+                self._complete[number] = with_layers(prepared, names, self._folder / str(number))
+            return self._complete[number]
+
+    def summary(self, number: int) -> ScanSummary:
+        """Return the summary of a scan."""
+        scan = self.prepared(number)
+        cell = np.asarray(scan.image.cell)
+        pitch = float(np.median(np.asarray(scan.image.depth)[cell])) / min(scan.image.focal)
+        return ScanSummary(scan.name, scan.names, pitch, float(np.median(np.asarray(scan.image.sigma)[cell])), centre_of(scan),
+                           scan.photometric, scan.camera, scan.image.camera_from_world, sample_of(scan, number))
+
+    def _read(self, number: int) -> PreparedScan:
+        folder = self._folder / str(number)
+        folder.mkdir()
+        scan = read_scan(self._file, self._scan_set, number)
+        where = f"{self._file}: scans[{number}] ({scan.name})"
+        if scan.pose is None:
+            raise RequestError(f"{where}: scan_to_world is missing: run relit register first, and fuse the scan-set.json that it writes")
+        prepared = prepare_scan(scan, folder, where)
+        if np.count_nonzero(prepared.image.cell) < LEAST_PIXELS:
+            raise RequestError(f"{where}: has {np.count_nonzero(prepared.image.cell)} pixels whose neighbours show the same surface: its "
+                               "pixels are too far apart or too noisy to be fused")
+        return prepared

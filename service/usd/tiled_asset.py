@@ -1,0 +1,88 @@
+"""A surface of many tiles in USD: a small layer that has each tile as a payload, so that a viewer loads those that it shows."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from pxr import Gf, Kind, Sdf, Usd, UsdGeom, Vt
+
+from service.usd.files import write_layer
+from service.usd.names import prim_name
+from service.usd.scene import define_polygons
+from stage.colour import convert
+from stage.meshes.mesh import TriangleMesh
+
+SITE_FILE = "site.usda"
+TILE = "Tile"
+"""The root prim of the layer of a tile."""
+
+
+class Tile(NamedTuple):
+    """A tile that was written."""
+
+    path: Path
+    low: np.ndarray  # [3] metres
+    high: np.ndarray
+
+
+def write_tile(mesh: TriangleMesh, path: Path) -> Tile:
+    """Write a mesh with the colours of its vertices as a layer, whole or not at all.
+
+    Raises:
+        StorageError: the file cannot be written.
+    """
+    def define(usd_stage: Usd.Stage) -> None:
+        _set_up(usd_stage)
+        root = UsdGeom.Xform.Define(usd_stage, Sdf.Path(f"/{TILE}"))
+        usd_stage.SetDefaultPrim(root.GetPrim())
+        counts = np.full(len(mesh.faces), 3, dtype=np.int32)
+        usd_mesh = define_polygons(usd_stage, root.GetPath().AppendChild("Mesh"), mesh.points, mesh.normals, counts, mesh.faces.ravel())
+        if mesh.colours is not None:
+            linear = convert((mesh.colours[None] / 255).astype(np.float32), "srgb_rec709_scene", "lin_rec709_scene")[0]
+            colours = usd_mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
+            colours.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(linear, dtype=np.float32)))
+
+    write_layer(path, define)
+    return Tile(path, mesh.points.min(axis=0), mesh.points.max(axis=0))
+
+
+def write_site(tiles: Sequence[Tile], path: Path, *, name: str, provenance: dict[str, str]) -> None:
+    """Write the layer that has tiles as payloads, with the extent of each, so that a viewer knows it before it loads the tile.
+
+    Args:
+        tiles: below the folder of the file.
+        path: of the file.
+        name: free text; the root prim is named after it.
+        provenance: kept with the asset.
+
+    Raises:
+        StorageError: the file cannot be written.
+    """
+    def define(usd_stage: Usd.Stage) -> None:
+        _set_up(usd_stage)
+        usd_stage.GetRootLayer().customLayerData = dict(provenance)
+        root = UsdGeom.Xform.Define(usd_stage, Sdf.Path(f"/{prim_name(name)}"))
+        Usd.ModelAPI(root.GetPrim()).SetKind(Kind.Tokens.assembly)
+        usd_stage.SetDefaultPrim(root.GetPrim())
+        for tile in tiles:
+            place = root.GetPath().AppendChild("tile_" + tile.path.stem.replace("-", "m"))
+            prim = UsdGeom.Xform.Define(usd_stage, place).GetPrim()
+            Usd.ModelAPI(prim).SetKind(Kind.Tokens.component)
+            prim.GetPayloads().AddPayload(f"./{tile.path.relative_to(path.parent).as_posix()}")
+            UsdGeom.ModelAPI.Apply(prim).SetExtentsHint(Vt.Vec3fArray([Gf.Vec3f(*map(float, tile.low)), Gf.Vec3f(*map(float, tile.high))]))
+
+    write_layer(path, define)
+
+
+def remove_other_tiles(folder: Path, tiles: Sequence[Tile]) -> None:
+    """Delete the tiles of an earlier fusion that this one does not have."""
+    kept = {tile.path.stem for tile in tiles}
+    for path in folder.iterdir():
+        if path.suffix in (".usdc", ".ply") and path.stem not in kept and path.stem.replace("-", "").replace("_", "").isdecimal():
+            path.unlink(missing_ok=True)
+
+
+def _set_up(usd_stage: Usd.Stage) -> None:
+    UsdGeom.SetStageUpAxis(usd_stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(usd_stage, 1.0)
