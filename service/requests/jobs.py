@@ -23,7 +23,7 @@ from service.requests.shade import ShadeOptions
 from service.requests.solve import SolveOptions
 from service.requests.view import ViewOptions
 from stage.board.records import BoardRegions, GaugeRuns
-from stage.model import Line
+from stage.model import Count, Line
 
 DEFAULT_PORT = 8470
 DEFAULT_SERVER = f"http://127.0.0.1:{DEFAULT_PORT}"
@@ -155,9 +155,11 @@ class ViewJob(JobRequest):
 
     kind: Literal["view"]
     capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
-    """The capture."""
+    """The capture, or a sequence of captures."""
     maps: Annotated[JobId | None, Role.INPUT, Spelling(metavar="JOB")] = None
     """A solve, pipeline or depth job of the capture, or a join of such: its maps are shown too."""
+    step: Annotated[Count | None, Role.INPUT] = None
+    """Number of the time step that is shown, from 1, where the capture is a sequence."""
     options: ViewOptions = ViewOptions()
 
 

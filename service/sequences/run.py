@@ -29,6 +29,10 @@ UNTIMED = "the steps are folders in order of name, taken at {:g} a second: a seq
 """What the report says of a sequence without a file."""
 
 
+OF_LIGHTS = ("found", "suspect_lights")
+"""What the report of a joined step repeats from that of the step alone: the lights under which its model is to be looked at."""
+
+
 class SequenceResult(NamedTuple):
     """What was made of a sequence."""
 
@@ -126,7 +130,7 @@ def _finish(request: Any, step: TimeStep, folder: Path, alone: Path, mask: np.nd
         write_text(folder / REPORT_FILE, report(
             request.model_copy(update={"capture": step.folder}),
             inputs=found.get("inputs", {}), method=found.get("method"), joined=facts, alone=f"{ALONE}/{REPORT_FILE}", warnings=warnings,
-            pixels=pixels))
+            pixels=pixels, **{name: found[name] for name in OF_LIGHTS if name in found}))
     told = {"name": step.name, "time_s": round(step.time_s, 6), "method": found.get("method"),
             "pixels": {"mask": pixels.get("mask", 0), "solved": int(np.count_nonzero(mask))}, **facts}
     return _Step(told, int(np.count_nonzero(mask)), warnings)

@@ -36,7 +36,7 @@ from service.views import states
 QUEUE_RETRY_S = 30
 SOLVES = ("solve", "pipeline")
 """Kinds of jobs that solve maps."""
-OF_SEQUENCES = (SolveJob, DepthJob, PipelineJob, RelightJob, TofCalibrationJob)
+OF_SEQUENCES = (SolveJob, DepthJob, PipelineJob, RelightJob, ViewJob, TofCalibrationJob)
 """Jobs whose capture may be a sequence of captures."""
 TIME_SAMPLED: tuple[AssetFormat, ...] = ("usdz", "usdc")
 """Formats of the asset of a sequence."""
@@ -81,10 +81,15 @@ def inputs_of(service: Service, project: str, request: JobRequest) -> list[str]:
                                           "solve, depth, relight and pipeline take sequences")
             if field == "capture" and isinstance(request, SolveJob | DepthJob | PipelineJob):
                 _require_sequence(request, steps)
+            if isinstance(request, ViewJob):
+                _require_step(request, steps)
             read.append(identifier)
     if isinstance(request, RelightJob | ShadeJob | ExportJob | ViewJob) and request.maps is not None:
         kinds = (*SOLVES, "join", *(("depth",) if isinstance(request, ExportJob | ViewJob) else ()))
-        row = _require_results(service, project, "maps", request.maps, kinds, sequences=isinstance(request, RelightJob | ExportJob))
+        of_sequences = isinstance(request, RelightJob | ExportJob) or (isinstance(request, ViewJob) and request.step is not None)
+        row = _require_results(service, project, "maps", request.maps, kinds, sequences=of_sequences)
+        if isinstance(request, ViewJob) and request.step is not None and SEQUENCE not in row["finished_steps"]:
+            raise ApiError("invalid", f"maps: {request.maps} is of one capture, and {request.capture} is a sequence: give a job of it")
         if isinstance(request, ExportJob) and SEQUENCE in row["finished_steps"]:
             _require_format(request.format)
         read.append(request.maps)
@@ -111,6 +116,14 @@ def _require_sequence(request: SolveJob | DepthJob | PipelineJob, steps: int) ->
         raise ApiError("invalid", f"sequence: {request.capture} is one capture, and the options are for a sequence of them: leave them out")
     if steps and isinstance(request, PipelineJob):
         _require_format(request.format)
+
+
+def _require_step(request: ViewJob, steps: int) -> None:
+    """Refuse a view of a sequence that names none of its time steps, and one of a capture that names one."""
+    if not steps and request.step is not None:
+        raise ApiError("invalid", f"step: {request.capture} is one capture, and no sequence: leave the step out")
+    if steps and (request.step is None or request.step > steps):
+        raise ApiError("invalid", f"step: {request.capture} is a sequence of {steps} captures: give the number of one, 1 to {steps}")
 
 
 def _require_format(given: AssetFormat) -> None:

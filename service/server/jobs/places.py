@@ -11,7 +11,7 @@ from service.server.jobs.context import Job, WorkerContext
 from service.server.storage import layout
 from stage import inputs
 from stage.files import resolved
-from stage.sequence import SEQUENCE_FILE, read_sequence
+from stage.sequence import SEQUENCE_FILE, TimeStep, read_sequence
 
 
 def results_folder(job: Job, context: WorkerContext) -> Path:
@@ -47,6 +47,22 @@ def intake_folder(job: Job, identifier: str, context: WorkerContext, progress: P
     elif root is not None:
         admit_environment(folder, max_pixels=context.max_pixels)
     return folder
+
+
+def time_step(sequence: Path, number: int) -> TimeStep:
+    """Return a time step of a sequence of captures.
+
+    Args:
+        sequence: folder of its capture.
+        number: of the step, from 1.
+
+    Raises:
+        RequestError: it has fewer steps.
+    """
+    steps = read_sequence(sequence).steps
+    if number > len(steps):
+        raise RequestError(f"{sequence}: has {len(steps)} steps now, and had more when it was checked")
+    return steps[number - 1]
 
 
 def intake_place(job: Job, identifier: str, context: WorkerContext, progress: Progress) -> tuple[Path, Path | None]:

@@ -25,7 +25,7 @@ from service.requests.jobs import (
 from service.server.database import intakes, quotas
 from service.server.jobs import boards, calibrating, measuring, scan_steps, solving
 from service.server.jobs.context import Job, JobStep, WorkerContext
-from service.server.jobs.places import environment_image, intake_folder, intake_place, job_maps, results_folder
+from service.server.jobs.places import environment_image, intake_folder, intake_place, job_maps, results_folder, time_step
 from service.server.storage import layout
 
 KEYS_FILE = "keys.json"
@@ -151,9 +151,12 @@ def _view(job: Job, request: ViewJob, context: WorkerContext, progress: Progress
     from service.requests.view import ViewRequest
     from service.viewing.view import view
 
-    view(ViewRequest(capture=intake_folder(job, request.capture, context, progress),
-                     maps=None if request.maps is None else job_maps(job, request.maps, context, progress),
-                     out=results_folder(job, context), device=context.device, cache=context.cache / request.capture,
+    capture, cache = intake_folder(job, request.capture, context, progress, request.step), context.cache / request.capture
+    maps = None if request.maps is None else job_maps(job, request.maps, context, progress)
+    if request.step is not None:
+        capture = time_step(capture, request.step).folder
+        cache, maps = cache / capture.name, None if maps is None else maps / capture.name
+    view(ViewRequest(capture=capture, maps=maps, out=results_folder(job, context), device=context.device, cache=cache,
                      **dict(request.options)), progress)
 
 

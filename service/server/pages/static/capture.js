@@ -6,6 +6,7 @@ import { mountDome } from "./dome.js";
 import { watch } from "./events.js";
 import { enableForms } from "./form.js";
 import { JobsTable } from "./jobs_table.js";
+import { chosenStep } from "./time_steps.js";
 import { openView } from "./view_jobs.js";
 
 const identifier = byId("main").dataset.identifier;
@@ -35,9 +36,10 @@ function present(capture) {
 }
 
 async function look() {
-  const { files } = await openView(identifier, null);
+  const step = await chosenStep(identifier);
+  const { files } = await openView(identifier, null, step);
   const view = await files.json("view.json");
-  show(byId("relight"), view.relight !== null);
+  show(byId("relight"), view.relight !== null && step === null);
   byId("findings").replaceChildren(...view.findings.map((finding) => element("li", {}, finding)));
   if (view.frames.length === 0) return;
   show(byId("lights"), true);

@@ -5,7 +5,7 @@ import { byId } from "./element.js";
 import { findView } from "./view_jobs.js";
 
 await attempt(async () => {
-  const view = await findView({});
+  const view = await findView({ step: null });
   location.replace(view === null ? "/captures" : `/light/${view.request.capture}`);
   byId("state").textContent = "Opening …";
 });

@@ -9,7 +9,8 @@ import { titleOf } from "./jobs_table.js";
 const identifier = byId("main").dataset.identifier;
 const ENDED = ["succeeded", "failed", "cancelled"];
 const MAPS = ["maps.exr", "depth.exr"];
-const BEGIN_WITH = { export: MAPS, shade: ["maps.exr"], join: ["maps.exr"], register: ["depth.exr"], fuse: ["scan-set.json"] }; // kinds of jobs
+const SEQUENCE = "sequence.json";
+const BEGIN_WITH = { export: [...MAPS, SEQUENCE], shade: ["maps.exr"], join: ["maps.exr"], register: ["depth.exr"], fuse: ["scan-set.json"] }; // kinds of jobs
 let logged = "";
 
 function present(job) {
@@ -70,10 +71,10 @@ async function presentResults(job) {
       element("td", {}, bytes(result.size))));
   }
   byId("results").tBodies[0].replaceChildren(...(rows.length > 0 ? rows : [element("tr", {}, element("td", { colspan: 2 }, "No files yet."))]));
-  const solved = job.state === "succeeded" && MAPS.some((name) => names.includes(name));
+  const solved = job.state === "succeeded" && [...MAPS, SEQUENCE].some((name) => names.includes(name));
   offer("look", solved, `/maps/${identifier}`);
   offer("asset", job.state === "succeeded" && names.some((name) => /^asset\.(usdz|glb)$/.test(name)), `/asset/${identifier}`);
-  offer("light", job.request.capture !== undefined && job.request.kind !== "depth", `/light/${job.request.capture}`);
+  offer("light", job.request.capture !== undefined && job.request.kind !== "depth" && !names.includes(SEQUENCE), `/light/${job.request.capture}`);
   const forms = [...byId("work").querySelectorAll("form[data-kind]")];
   const fitting = job.state === "succeeded" ? forms.filter(({ dataset }) => BEGIN_WITH[dataset.kind].some((name) => names.includes(name))) : [];
   if (fitting.length > 0 && byId("work").hidden) {

@@ -6,12 +6,14 @@ import { watch } from "./events.js";
 
 /**
  * Return the newest view of a capture or of maps that is prepared or being prepared; null: there is none.
- * @param {{capture?: string, maps?: string|null}} wanted `maps: null` asks for a view without maps, no `maps` for any.
+ * @param {{capture?: string, maps?: string|null, step?: number|null}} wanted `maps: null` asks for a view without maps, no `maps` for any;
+ *   `step` likewise for the time step of a sequence.
  */
 export async function findView(wanted) {
   for await (const job of listing("/v1/jobs?limit=500&state=succeeded&state=queued&state=running", "jobs")) {
-    const { kind, capture, maps = null } = job.request;
-    if (kind === "view" && (wanted.capture ?? capture) === capture && (wanted.maps === undefined || wanted.maps === maps)) return job;
+    const { kind, capture, maps = null, step = null } = job.request;
+    if (kind !== "view" || (wanted.capture ?? capture) !== capture) continue;
+    if ((wanted.maps === undefined || wanted.maps === maps) && (wanted.step === undefined || wanted.step === step)) return job;
   }
   return null;
 }
@@ -28,11 +30,12 @@ export async function captureOf(job) {
  * Return the files of a view, which is prepared first if it is not yet; the page shows how far that is.
  * @param {string} capture Identifier.
  * @param {string|null} maps Identifier of the job that made the maps; null: the capture alone.
+ * @param {number|null} step The time step that is shown, where the capture is a sequence.
  * @returns {Promise<{job: any, files: ReturnType<typeof resultsOf>}>}
  */
-export async function openView(capture, maps) {
-  const body = maps === null ? { kind: "view", capture } : { kind: "view", capture, maps };
-  let job = (await findView({ capture, maps })) ?? (await post("/v1/jobs", body));
+export async function openView(capture, maps, step = null) {
+  const body = { kind: "view", capture, ...(maps === null ? {} : { maps }), ...(step === null ? {} : { step }) };
+  let job = (await findView({ capture, maps, step })) ?? (await post("/v1/jobs", body));
   if (job.state !== "succeeded") {
     byId("state").textContent = "This is looked at for the first time: its view is being prepared.";
     show(byId("progress"), true);

@@ -66,6 +66,25 @@ def test_the_results_become_one_asset_with_time_samples(server, client, solved, 
                 f"format: is {unfit}, the asset of a sequence is one of usdz, usdc")
 
 
+def test_one_step_is_looked_at(server, client, sequence, solved, dome):
+    def ask(**request):
+        return client.post("/v1/jobs", json={"kind": "view", "capture": sequence, **request})
+
+    view = submit(client, kind="view", capture=sequence, maps=solved, step=2)
+    finish(server, client, view)
+    shown = client.get(f"/v1/jobs/{view['id']}/results/view.json").json()
+    assert shown["name"] == "step01" and "normal" in {layer["name"] for layer in shown["layers"]}
+    alone = submit(client, kind="view", capture=sequence, step=3)
+    finish(server, client, alone)
+    assert client.get(f"/v1/jobs/{alone['id']}/results/view.json").json()["name"] == "step02"
+    for unfit in ({}, {"step": 4}):
+        refused(ask(**unfit), 422, f"step: {sequence} is a sequence of 3 captures: give the number of one, 1 to 3")
+    refused(ask(capture=dome, step=1), 422, f"step: {dome} is one capture, and no sequence")
+    refused(ask(capture=dome, maps=solved), 422, f"maps: {solved} is of a sequence: give the job of one capture here")
+    one = finish(server, client, submit(client, kind="solve", capture=dome, options={"method": "lambert"}))["id"]
+    refused(ask(maps=one, step=1), 422, f"maps: {one} is of one capture, and {sequence} is a sequence")
+
+
 def test_a_pipeline_of_a_sequence(server, client, sequence, sky):
     job = submit(client, kind="pipeline", capture=sequence, environment=sky, format="usdz", guided=True, solve={"method": "lambert"},
                  sequence={"temporal": False})

@@ -1,0 +1,50 @@
+"""A sequence on the pages: the time step that is shown is chosen on the page of its maps, and on that of its capture."""
+
+import pytest
+
+from tests.scenes.sequence import write_sequence
+from tests.service.server.api.test_measuring import upload
+from tests.service.server.pages.axe import violations
+from tests.service.server.pages.conftest import CONTENT_MS, done
+
+STEPS = 3
+
+
+@pytest.fixture(scope="module")
+def walk(server, tmp_path_factory) -> tuple[str, str]:
+    """The capture of a sequence, and the job that solved it."""
+    folder = tmp_path_factory.mktemp("walk")
+    write_sequence(folder, [None] * STEPS, noise=0.01, size=16)
+    files = {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    with server.client() as client:
+        capture = upload(server, client, files)["id"]
+        return capture, done(server, client, {"kind": "solve", "capture": capture, "options": {"method": "lambert"}})
+
+
+def test_the_maps_of_each_step_are_looked_at(page, walk):
+    page.goto(f"/jobs/{walk[1]}")
+    page.get_by_role("link", name="Look at the maps").click()
+    page.get_by_role("heading", name="Maps of step00", level=1).wait_for(timeout=CONTENT_MS)
+    assert page.get_by_label("Time step").locator("option").all_inner_texts() == [
+        f"step{step:02d} ({step + 1} of {STEPS})" for step in range(STEPS)]
+    assert page.get_by_role("button", name="Step before").is_disabled()
+    page.get_by_label("Time step").select_option("2")
+    page.get_by_role("heading", name="Maps of step01", level=1).wait_for(timeout=CONTENT_MS)
+    assert page.url.endswith("?step=2")
+    page.get_by_role("button", name="Step after").click()
+    page.get_by_role("heading", name="Maps of step02", level=1).wait_for(timeout=CONTENT_MS)
+    page.locator("canvas.map").first.wait_for(timeout=CONTENT_MS)
+    assert page.get_by_role("button", name="Step after").is_disabled()
+    assert violations(page) == []
+
+
+def test_the_frames_of_each_step_are_on_the_page_of_the_capture(page, walk):
+    """Whose view is prepared first, as that of every capture that is opened for the first time."""
+    page.goto(f"/captures/{walk[0]}?step=2")
+    page.locator("#frames canvas").first.wait_for(timeout=CONTENT_MS)
+    assert page.get_by_label("Time step").input_value() == "2"
+    assert page.get_by_role("link", name="Light it").is_hidden()
+    page.goto(f"/jobs/{walk[1]}")
+    page.locator("#results a").first.wait_for(timeout=CONTENT_MS)
+    assert page.get_by_role("link", name="Light the capture").is_hidden()
+    page.get_by_text("Export an asset").wait_for(timeout=CONTENT_MS)
