@@ -2,8 +2,8 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-# tests of the service wait much of their time, so that three share two cores well
-WORKERS ?= $(shell $(PYTHON) -c 'import os; print(max(3, min(4, os.cpu_count() or 1)))')
+# tests of the service wait much of their time, so that four share two cores well
+WORKERS ?= 4
 PYTEST := $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 .PHONY: demo serve test test-all clients lint bench gpu-bench manifest-page help-listing figures samples screenshots lock vendor colour-table clean
