@@ -19,6 +19,7 @@ from service.requests.patterns import PatternsOptions
 from service.requests.register import RegisterOptions
 from service.requests.relight import RelightOptions
 from service.requests.scan import ScanOptions
+from service.requests.separate import SeparateOptions
 from service.requests.shade import ShadeOptions
 from service.requests.solve import SolveOptions
 from service.requests.view import ViewOptions
@@ -193,6 +194,15 @@ class BasisJob(JobRequest):
     options: BasisOptions = BasisOptions()
 
 
+class SeparateJob(JobRequest):
+    """Direct and global light of a capture under fine, shifted phase patterns: separation.exr, report.json."""
+
+    kind: Literal["separate"]
+    capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
+    """The capture."""
+    options: SeparateOptions = SeparateOptions()
+
+
 class ScanJob(JobRequest):
     """Shots of a scanning laser as one point cloud: points.ply, points.usdc, report.json."""
 
@@ -243,7 +253,7 @@ class PatternsJob(JobRequest):
     options: PatternsOptions
 
 
-OneJob = (SolveJob | DepthJob | RelightJob | ShadeJob | ExportJob | ViewJob | PipelineJob | BasisJob | ScanJob | PatternsJob
+OneJob = (SolveJob | DepthJob | RelightJob | ShadeJob | ExportJob | ViewJob | PipelineJob | BasisJob | SeparateJob | ScanJob | PatternsJob
           | InspectBoardJob | GaugeBoardJob | JoinJob | RegisterJob | FuseJob | AnyCalibration)
 UserJob = Annotated[OneJob, Field(discriminator="kind")]
 """Every kind of job that the API accepts."""

@@ -23,8 +23,10 @@ from service.requests.jobs import (
     ViewJob,
 )
 from service.server.database import intakes, quotas
-from service.server.jobs import boards, calibrating, measuring, scan_steps, solving
+from service.server.jobs import boards, scan_steps, solving
+from service.server.jobs.calibrating import CALIBRATIONS
 from service.server.jobs.context import Job, JobStep, WorkerContext
+from service.server.jobs.measuring import MEASURES, Measurement
 from service.server.jobs.places import environment_image, intake_folder, intake_place, job_maps, results_folder, time_step
 from service.server.storage import layout
 
@@ -77,11 +79,11 @@ def _steps_of(job: Job, context: WorkerContext) -> list[JobStep]:
             request, job.id, results_folder(job, context), lambda other: job_maps(job, other, context, progress), progress))]
     if isinstance(request, ViewJob):
         return [JobStep("view", lambda progress: _view(job, request, context, progress))]
-    run = measuring.run if measuring.can_run(request) else calibrating.run if calibrating.can_run(request) else None
-    if run is not None:
-        return [JobStep("measure", lambda progress: run(
-            request, results_folder(job, context), lambda capture: intake_folder(job, capture, context, progress), device=context.device,
-            cache=context.cache, progress=progress))]
+    measure = (MEASURES | CALIBRATIONS).get(type(request))
+    if measure is not None:
+        return [JobStep("measure", lambda progress: measure(request, Measurement(
+            results_folder(job, context), lambda capture: intake_folder(job, capture, context, progress), context.device, context.cache,
+            progress)))]
     if isinstance(request, RelightJob):
         return _frames(job, request, context)
     assert isinstance(request, PipelineJob), request

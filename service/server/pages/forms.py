@@ -23,9 +23,10 @@ def _kinds(*names: str) -> dict[str, type[JobRequest]]:
 
 
 CAPTURE_JOBS = _kinds(
-    "solve", "pipeline", "depth", "scan", "inspect-board", "relight", "basis", "calibrate-mirror-ball", "calibrate-light-positions",
-    "calibrate-grey-ball", "calibrate-intensity", "calibrate-dark", "calibrate-flat-field", "calibrate-saturation", "calibrate-procam",
-    "calibrate-stereo", "calibrate-response", "calibrate-tof", "calibrate-white-balance", "calibrate-laser-planes")
+    "solve", "pipeline", "depth", "scan", "inspect-board", "relight", "basis", "separate", "calibrate-mirror-ball",
+    "calibrate-light-positions", "calibrate-grey-ball", "calibrate-intensity", "calibrate-dark", "calibrate-flat-field",
+    "calibrate-saturation", "calibrate-procam", "calibrate-stereo", "calibrate-response", "calibrate-tof", "calibrate-white-balance",
+    "calibrate-laser-planes")
 """Jobs that begin with a capture, by kind."""
 MAPS_JOBS = _kinds("export", "shade", "join", "register", "fuse")
 """Jobs that begin with the maps of another job, by kind."""
@@ -35,6 +36,7 @@ TITLES = {"solve": "Solve normals and materials", "pipeline": "Solve, export and
           "scan": "Turn shots of a scanning laser into points",
           "inspect-board": "Inspect a board", "gauge-board": "Find how well inspections of boards repeat",
           "relight": "Relight frames", "basis": "Reduce to a few coefficient images",
+          "separate": "Separate direct and global light",
           "join": "Join with a depth of the same view", "register": "Find the poses of several depths",
           "fuse": "Fuse registered depths into one mesh", "patterns": "Draw patterns to project", "export": "Export an asset",
           "shade": "Shade one picture",

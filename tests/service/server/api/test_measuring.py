@@ -43,6 +43,14 @@ def test_a_basis(server, client, dome, options, file):
     assert made_by(client, job) == {file, f"{file}.json"}
 
 
+def test_a_separation(server, client, rig):
+    job = submit(client, kind="separate", capture=rig, options={"period_px": 16})
+    finish(server, client, job)
+    assert made_by(client, job) == {"separation.exr", "report.json"}
+    report = client.get(f"/v1/jobs/{job['id']}/results/report.json").json()
+    assert report["options"]["period_px"] == 16 and str(server.data) not in json.dumps(report)
+
+
 def test_a_scan(server, client):
     capture = upload(server, client, scan_files())
     assert capture["facts"]["shots"] == 90
