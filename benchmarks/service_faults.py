@@ -2,7 +2,7 @@
 
 python -m benchmarks.service_faults [--seed N] [--kills] [--sqlite | --write docs/service_faults.md]; some minutes. Without --sqlite it
 needs the server programs of PostgreSQL, and repeats the kills on SQLite; with it everything is on SQLite, without the restarts of
-PostgreSQL. With --kills there are only the kills, and --write replaces their section of the document.
+PostgreSQL. With --kills there are only the kills, and --write replaces their section of the document, which ends it.
 """
 
 import argparse
@@ -138,9 +138,9 @@ def kills(folder: Path, new_database: NewDatabase, scene: Scene, chance: random.
     """The 30 kills in one job, with the default settings: each when so many frames are there, and up to a second later."""
     order = [kind for kind, times in KILLS.items() for _ in range(times)]
     chance.shuffle(order)
-    frames = sorted(chance.randrange(FRAMES - 2 * CHUNK_FRAMES) for _ in order)
+    frames = sorted(chance.randrange(FRAMES * 3 // 4) for _ in order)
     takeovers: dict[str, list[float]] = {kind: [] for kind in KILLS}
-    with harness(folder, new_database()) as made:
+    with harness(folder, new_database(), roots=str(scene.capture.parent)) as made:
         for _ in range(WORKERS):
             made.start()
         made.ready(WORKERS)
@@ -162,7 +162,7 @@ def disturbed(folder: Path, new_database: NewDatabase, scene: Scene, kind: str, 
               disturb: Callable[[Harness, str], float | None], *, environment: dict[str, str] | None = None, **settings: float) -> Fault:
     """A job during which something happens so many times, evenly over its frames."""
     takeovers: list[float] = []
-    with harness(folder, new_database(), **settings) as made:
+    with harness(folder, new_database(), roots=str(scene.capture.parent), **settings) as made:
         for _ in range(WORKERS):
             made.start(**(environment or {}))
         made.ready(WORKERS)
@@ -223,6 +223,10 @@ def table(faults: list[Fault]) -> list[str]:
     return lines
 
 
+def of_kills(fault: Fault) -> bool:
+    return fault.kind in KILLS or fault.kind.startswith(TOGETHER)
+
+
 def processor() -> str:
     with open("/proc/cpuinfo") as file:
         return next((line.partition(":")[2].strip() for line in file if line.startswith("model name")), "unknown")
@@ -237,21 +241,19 @@ Measured on {datetime.now(UTC):%Y-%m-%d} on {os.cpu_count()} cores ({processor()
     python -m benchmarks.service_faults --write docs/service_faults.md
 
 Each row is a relight of {FRAMES} frames ({SIZE} × {SIZE}, {LIGHTS} lights, {CHUNK_FRAMES} frames in each step) with {WORKERS} workers
-on a private PostgreSQL, during which faults happen; the kills come at random moments, in random order. A frame is
+on a private PostgreSQL, during which faults happen. A frame is
 *identical* if its file equals, bit by bit, the file that `relit relight` makes undisturbed. The script fails if a frame
 is missing or different, if there is any other file (hidden ones too), if two workers had one job at the same time, if a
 job is lost or left over in the queue, or if a takeover from a killed worker takes {TAKEOVER_LIMIT_S:g} s or longer.
-All settings have their defaults, unless a row says otherwise; the kills are repeated on SQLite. `tests/service/server/jobs` has these
+All settings have their defaults, except `stall_s` in the row of SIGSTOP. `tests/service/server/jobs` has these
 faults at small size, and others: a job
 that kills its workers, a full disk, a killed API.
 
-{chr(10).join(table(faults))}
+{chr(10).join(table([fault for fault in faults if not of_kills(fault)]))}
 
 A worker that hangs is killed after `stall_s`, here {STALL_S:g} s, and its time contains that. A worker that is asked to stop, or
 whose `relit worker` is killed, first finishes its step and then returns the job to the queue, and its time contains that. When
-PostgreSQL restarts, the workers keep their jobs. A job fails that loses four workers (`max_lost` 3) without progress between them, because
-the job may be what kills them: without a new frame, a finished step, or a stage that the step had not come to. A worker that dies before
-the furthest stage of the step counts a tenth.
+PostgreSQL restarts, the workers keep their jobs.
 """
 
 
@@ -263,10 +265,14 @@ Measured on {datetime.now(UTC):%Y-%m-%d} on {os.cpu_count()} cores ({processor()
 
     python -m benchmarks.service_faults --kills --write docs/service_faults.md
 
+{sum(KILLS.values())} kills during a job of {FRAMES} frames, once on PostgreSQL and once on SQLite, at random moments and in random
+order; the rest is as above.
+
 {chr(10).join(table(faults))}
 
-Every setting has its default (`max_lost` 3). A job fails that loses four workers without progress between them: without a new frame, a
-finished step, or a stage that the step had not come to. A worker that dies before the furthest stage of the step counts a tenth.
+Every setting has its default (`max_lost` 3). A job fails that loses four workers without progress between them, because the job may be
+what kills them: without a new frame, a finished step, or a stage that the step had not come to. A worker that dies before the furthest
+stage of the step counts a tenth.
 {KILLS_END}
 """
 
@@ -303,7 +309,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                      ("PostgreSQL away for 10 s", 2, restarted(server, "fast", 10.0), {})]
         for number, (kind, times, disturb, settings) in enumerate(rows):
             faults.append(disturbed(folder / str(number), new_database, scene, kind, times, disturb, **settings))
-    section = kills_section([fault for fault in faults if fault.kind in KILLS or fault.kind.startswith(TOGETHER)], chosen.seed, load)
+    section = kills_section([fault for fault in faults if of_kills(fault)], chosen.seed, load)
     text = section if chosen.kills else document(faults, chosen.seed, time.monotonic() - began, load) + "\n" + section
     print(text)
     dead = [each for fault in faults if "SIGKILL of the worker" in fault.kind or "all workers" in fault.kind for each in fault.takeovers_s]

@@ -39,7 +39,8 @@ SETTLE_S = 60.0
 SAMPLE_S = 2.0
 TIMEOUT_S = 60.0
 HEAD = ("| clients | cores | minutes | reads | p50, ms | p99, ms | worst, ms | events | jobs | files uploaded | errors | "
-        "memory after settling, MiB | at the end | growth, MiB/min |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|---|")
+        "memory after settling, MiB | after half the time | at the end | growth, MiB/min |\n"
+        "|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|")
 
 
 class Load:
@@ -152,6 +153,7 @@ class Memory(NamedTuple):
     """Resident memory of the API process, MiB."""
 
     settled: float
+    half: float
     last: float
     per_minute: float
     """Slope of a line through what was seen since it settled."""
@@ -167,7 +169,8 @@ def watch_memory(pid: int, seconds: float) -> Memory:
     late = np.array([one for one in seen if one[0] >= min(SETTLE_S, seconds / 4)])
     tenth = max(1, len(late) // 10)
     slope = np.polyfit(late[:, 0] / 60, late[:, 1], 1)[0]
-    return Memory(float(np.median(late[:tenth, 1])), float(np.median(late[-tenth:, 1])), float(slope))
+    half = late[late[:, 0] >= seconds / 2]
+    return Memory(*(float(np.median(part[:, 1])) for part in (late[:tenth], half[:tenth], late[-tenth:])), float(slope))
 
 
 def _resident(pid: int) -> float:
@@ -199,7 +202,8 @@ def load_rows(minutes: float, clients: int, interval_s: float, uploads: int, cor
     counts = load.counts
     return [HEAD, f"| {clients} | {cores} | {minutes:g} | {len(reads)} | {np.percentile(reads, 50):.1f} | {np.percentile(reads, 99):.1f} | "
                   f"{reads.max():.0f} | {counts['events']} | {counts['jobs']} of {FRAMES} frames | {counts['files']} | "
-                  f"{sum(load.errors.values())} | {memory.settled:.1f} | {memory.last:.1f} | {memory.per_minute:+.2f} |",
+                  f"{sum(load.errors.values())} | {memory.settled:.1f} | {memory.half:.1f} | {memory.last:.1f} | "
+                  f"{memory.per_minute:+.2f} |",
             *(f"\n{count} × {error}" for error, count in load.errors.items())]
 
 

@@ -18,6 +18,7 @@ from queue import SimpleQueue
 from typing import Any, cast
 
 import uvicorn
+from anyio import to_thread
 
 from service.errors import RequestError
 from service.server import devices, log, telemetry
@@ -37,6 +38,9 @@ from service.server.storage.open import open_storage
 
 CLOSE_S = 5
 """Seconds that open requests, streams of events among them, may take to end when the service ends."""
+THREADS = 20
+"""Threads in which the API waits for the database and for files: two for each connection of the database. The 40 that anyio allows come and
+go as it happens, and take 60 KB each."""
 SIGNALS = (signal.SIGTERM, signal.SIGINT)
 SAME_S = 1.0
 """Seconds within which signals count as one: terminals, `timeout` and supervisors signal a process and its group."""
@@ -117,6 +121,7 @@ class _Server(uvicorn.Server):
     """A server without signal handlers: those of uvicorn would end it at the first signal."""
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        to_thread.current_default_thread_limiter().total_tokens = THREADS
         await super().startup(sockets)
         for listening in sockets or ():
             listening.listen(BACKLOG)  # asyncio has made it AT_ONCE, which it uses for both

@@ -15,9 +15,6 @@ from service.server.settings import Settings
 T = TypeVar("T")
 BUSY_MS = 30_000
 """Milliseconds for which a write on SQLite waits for that of another process."""
-CACHE_KIB = 512
-"""KiB of pages that a connection of SQLite keeps: with its own 2000 the ten of a process take minutes until they are full, and the system
-keeps the pages too."""
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 2.0
 UNANSWERED = (OperationalError, InterfaceError, InternalError, PoolTimeoutError)
 """Exceptions of a database that may answer later: it restarts, its disk is full, or it is locked for long."""
@@ -96,15 +93,13 @@ def connect(url: str, *, connections: int = 10) -> Database:
     Raises:
         DatabaseError: the URL is malformed or of another database.
     """
-    # the connection that was used last is used next: the caches of the others, megabytes with SQLite, are not filled too
-    pool: dict[str, Any] = {"pool_size": connections, "max_overflow": 0, "pool_timeout": 30, "pool_use_lifo": True}
     try:
         parsed = sa.make_url(url)
         if parsed.get_backend_name() == "sqlite":
-            engine = sa.create_engine(parsed, **pool)
+            engine = sa.create_engine(parsed, pool_size=connections, max_overflow=0, pool_timeout=30)
             sa.event.listen(engine, "connect", _sqlite)
         elif parsed.get_backend_name() == "postgresql":
-            engine = sa.create_engine(parsed, **pool, pool_pre_ping=True,
+            engine = sa.create_engine(parsed, pool_size=connections, max_overflow=0, pool_timeout=30, pool_pre_ping=True,
                                       connect_args={"application_name": "relit", "connect_timeout": 10, "keepalives_idle": 5,
                                                     "keepalives_interval": 2, "keepalives_count": 3})
         else:
@@ -150,7 +145,7 @@ def usable(settings: Settings) -> Iterator[None]:
 
 def _sqlite(connection: Any, _record: Any) -> None:
     connection.isolation_level = "IMMEDIATE"  # a write takes the lock at its beginning, so that none fails halfway
-    for pragma in (f"busy_timeout={BUSY_MS}", "journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", f"cache_size=-{CACHE_KIB}"):
+    for pragma in (f"busy_timeout={BUSY_MS}", "journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON"):
         connection.execute(f"PRAGMA {pragma}")
 
 

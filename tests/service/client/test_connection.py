@@ -144,7 +144,7 @@ def test_the_address_may_be_the_one_that_serve_prints(server):
     assert str(played.requests[0].url) == f"http://service.test/v1/jobs/{JOB}"
 
 
-@pytest.mark.parametrize("server", ["", "service.test", "ftp://service.test", "http://"])
+@pytest.mark.parametrize("server", ["", "service.test", "ftp://service.test", "http://", "http://service.test:x"])
 def test_an_address_that_is_none(server):
     with pytest.raises(Unreachable, match="is no URL of a service"):
         Client(server)

@@ -14,13 +14,14 @@ from contextlib import contextmanager, suppress
 import httpx2
 import pytest
 import uvicorn
+from anyio import to_thread
 
 from service.requests.keys import NewKey, Scope
 from service.server import connections
 from service.server.connections import ConnectionLimits, limits_of, raise_descriptors
 from service.server.database import keys
 from service.server.database.engine import connect
-from service.server.serve import http_server
+from service.server.serve import THREADS, http_server
 from service.server.settings import Settings
 from tests.service.server_process import serving
 
@@ -34,7 +35,8 @@ LARGE = 64 << 20
 async def app(scope, receive, send) -> None:
     if scope["type"] != "http":
         return
-    body = b"x" * LARGE if scope["path"] == "/large" else scope["client"][0].encode()
+    body = {"/large": b"x" * LARGE, "/threads": b"%d" % to_thread.current_default_thread_limiter().total_tokens}.get(
+        scope["path"], scope["client"][0].encode())
     await send({"type": "http.response.start", "status": 200, "headers": [(b"content-length", str(len(body)).encode())]})
     for begin in range(0, len(body), 1 << 20):
         await send({"type": "http.response.body", "body": body[begin : begin + (1 << 20)], "more_body": begin + (1 << 20) < len(body)})
@@ -119,6 +121,11 @@ def test_a_connection_that_has_ended_waits_for_no_collector():
                 time.sleep(0.02)
         finally:
             gc.enable()
+
+
+def test_requests_wait_in_so_many_threads_and_no_more():
+    with running(ConnectionLimits(20, 20)) as (port, _):
+        assert httpx2.get(f"http://127.0.0.1:{port}/threads", timeout=WAIT_S).content == b"%d" % THREADS
 
 
 def test_an_address_that_takes_its_share_leaves_the_rest_to_others():

@@ -9,6 +9,8 @@ import pytest
 from pydantic import ValidationError
 
 from service.errors import RequestError, sentence
+from service.server.database.engine import open_database
+from service.server.jobs.queue import prepare
 from service.server.settings import Settings, unknown_variables
 
 DOCS = Path(__file__).parents[3] / "docs" / "service.md"
@@ -68,6 +70,8 @@ def test_lists_of_the_environment(monkeypatch):
     ({"port": 65536}, "port: is 65536"), ({"port": "http"}, 'port: is "http"'), ({"max_queued": 0}, "max_queued: is 0"),
     ({"stall_s": "inf"}, "stall_s"), ({"requests_per_second": "nan"}, "requests_per_second"), ({"log_level": "loud"}, "log_level"),
     ({"devices": "cpu,none"}, "devices: none stands alone"), ({"otel_endpoint": "collector:4318"}, "otel_endpoint: collector:4318"),
+    ({"otel_endpoint": "http://collector:x"}, "otel_endpoint: http://collector:x"),
+    ({"oidc_issuer": "https://idp.studio:x"}, "oidc_issuer: https://idp.studio:x"),
     ({"retention_days": -1}, "retention_days"), ({"max_upload_bytes": "1e99"}, "max_upload_bytes"), ({"colour": 1}, "colour"),
 ])
 def test_what_cannot_be_is_refused_by_name(given, words):
@@ -146,6 +150,12 @@ def test_variables_that_are_no_settings_are_found():
     given = {"RELIT_PROT": "1", "RELIT_PORT": "1", "RELIT_CONFIG": "x", "RELIT_KEY": "x", "RELIT_SERVER": "x", "RELIT_TEST_DATA": "x",
              "RELIT_WEATHER": "1", "PATH": "x"}
     assert unknown_variables(given) == {"RELIT_PROT": "RELIT_PORT", "RELIT_WEATHER": None}
+
+
+def test_a_port_of_the_database_that_is_no_number_is_one_sentence(tmp_path):
+    settings = Settings(data=tmp_path, database_url="postgresql://relit:secret@localhost:x/relit")
+    with pytest.raises(RequestError, match=r"^database_url: is not of the form postgresql://user:password@host/name$"):
+        open_database(settings, prepare)
 
 
 @pytest.mark.parametrize(("arguments", "words"), [

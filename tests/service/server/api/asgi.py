@@ -8,8 +8,8 @@ from urllib.parse import unquote_to_bytes
 class Call:
     """One request, and what came of it so far."""
 
-    def __init__(self, app: Any, path: str, *, method: str = "GET", headers: dict[str, str] | None = None) -> None:
-        self._app, self.status, self.body = app, 0, b""
+    def __init__(self, app: Any, path: str, *, method: str = "GET", headers: dict[str, str] | None = None, sent: bytes = b"") -> None:
+        self._app, self.status, self.body, self._sent = app, 0, b"", sent
         self._left = asyncio.Event()
         self._asked = False
         given = {"host": "127.0.0.1", **(headers or {})}
@@ -31,7 +31,7 @@ class Call:
     async def _receive(self) -> dict[str, Any]:
         if not self._asked:
             self._asked = True
-            return {"type": "http.request", "body": b"", "more_body": False}
+            return {"type": "http.request", "body": self._sent, "more_body": False}
         await self._left.wait()
         return {"type": "http.disconnect"}
 

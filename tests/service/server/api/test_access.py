@@ -41,8 +41,10 @@ class Site(NamedTuple):
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    with serving(tmp_path_factory.mktemp("access"), "--device", "none", host="0.0.0.0", roots=str(SAMPLES), requests_per_second="10000",
-                 request_burst="10000", min_free_bytes="0") as server:
+    folder = tmp_path_factory.mktemp("access")
+    (folder / "of-willow" / "owl").mkdir(parents=True)
+    with serving(folder, "--device", "none", host="0.0.0.0", roots=str(SAMPLES), project_roots=f"willow={folder / 'of-willow'}",
+                 requests_per_second="10000", request_burst="10000", min_free_bytes="0") as server:
         database = connect(Settings(data=server.data).sqlalchemy_url)
         made = Site(server, database, {})
         with made.client("larch") as client:
@@ -200,6 +202,14 @@ def test_a_project_lists_and_names_nothing_of_another(site):
             nothing = client.get(f"/v1/{path}", params={"before": absent})
             assert theirs.status_code == nothing.status_code and theirs.status_code in (404, 422)
             assert in_general(theirs, {"it": site.ours[name]}) == in_general(nothing, {"it": absent})
+
+
+def test_a_project_registers_below_its_own_roots_alone(site):
+    given = {"name": "owl", "folder": str(site.server.data.parent / "of-willow" / "owl")}
+    with site.client("larch") as larch, site.client("willow") as willow:
+        refused = larch.post("/v1/captures", json=given)
+        assert (refused.status_code, refused.json()["detail"]) == (422, "folder: lies in none of the folders that the operator allows")
+        assert willow.post("/v1/captures", json=given).status_code == 201
 
 
 @pytest.mark.parametrize("job", [

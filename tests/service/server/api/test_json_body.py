@@ -3,6 +3,7 @@
 import asyncio
 import json
 import socket
+import threading
 from collections.abc import Iterator
 
 import pytest
@@ -16,6 +17,7 @@ from service.server.database import keys
 from service.server.database.engine import connect
 from service.server.jobs.queue import prepare
 from service.server.settings import Settings
+from tests.service.server.api.asgi import Call
 from tests.service.server_process import Server, serving
 
 JSON = {"Content-Type": "application/json"}
@@ -80,6 +82,32 @@ def test_bounds_are_where_they_are_said_to_be():
         parse(b"[" + deep + b"]")
     with pytest.raises(json.JSONDecodeError):
         parse(b"{")
+
+
+def test_a_body_is_parsed_while_others_are_answered(monkeypatch, tmp_path):
+    """Parsing it in the event loop kept all clients waiting."""
+    settings = Settings(data=tmp_path, anonymous=True, min_free_bytes=0)
+    database = connect(settings.sqlalchemy_url)
+    prepare(settings, database)
+    app, answered, seen = create_app(settings, database), threading.Event(), []
+
+    def slow(body: bytes) -> object:
+        seen.append(answered.wait(20))
+        return parse(body)
+
+    monkeypatch.setattr(json_body, "parse", slow)
+
+    async def follow() -> int:
+        body = b'{"name": "x"}'
+        headers = {"Content-Type": "application/json", "Content-Length": str(len(body))}
+        creating = asyncio.create_task(Call(app, "/v1/captures", method="POST", headers=headers, sent=body).run())
+        await asyncio.sleep(0.1)
+        assert (await Call(app, "/healthz").run()).status == 200
+        answered.set()
+        return (await creating).status
+
+    assert asyncio.run(follow()) == 201 and seen == [True]
+    database.close()
 
 
 def test_a_body_that_does_not_come_is_given_up(monkeypatch, tmp_path):

@@ -5,9 +5,11 @@ import os
 import numpy as np
 import pytest
 
-from service.requests.identifiers import CAPTURE
-from service.requests.jobs import SolveJob
+from service.errors import RequestError
+from service.requests.identifiers import CAPTURE, new_id
+from service.requests.jobs import CheckJob, SolveJob
 from service.requests.solve import SolveOptions
+from service.server.database import intakes
 from service.server.jobs.context import Job, WorkerContext
 from service.server.jobs.steps import steps_of
 from service.server.storage.open import open_storage
@@ -34,10 +36,13 @@ def capture(tmp_path_factory):
 
 def step_of(harness, capture, roots):
     identifier = harness.register(capture, CAPTURE)
+    return only_step(harness, SolveJob(kind="solve", capture=identifier, options=SolveOptions(method="lambert")), roots)
+
+
+def only_step(harness, request, roots, settings=None):
     context = WorkerContext(harness.database, open_storage(harness.settings), harness.settings.data / "cache", "cpu", 64,
-                            lambda project: roots)
-    job = Job("job_0123456789abcdefghjk", PROJECT, SolveJob(kind="solve", capture=identifier, options=SolveOptions(method="lambert")), 1)
-    step, = steps_of(job, context)
+                            lambda project: roots, settings=settings)
+    step, = steps_of(Job("job_0123456789abcdefghjk", PROJECT, request, 1), context)
     return step
 
 
@@ -79,3 +84,19 @@ def test_the_folder_is_closed_when_the_step_ends(idle_harness, capture):
         step.run(Silent())
     assert len(os.listdir("/proc/self/fd")) <= before + 5  # connections of the database
     assert (idle_harness.results("job_0123456789abcdefghjk") / "maps.exr").exists()
+
+
+def test_a_check_refuses_a_capture_beyond_the_pixels_of_its_project(idle_harness, capture):
+    """The capture has five images of 8 × 8."""
+    def checked(most):
+        identifier = new_id(CAPTURE)
+        idle_harness.database.transact(lambda connection: intakes.insert(
+            connection, identifier=identifier, project=PROJECT, kind="capture", name="x", folder=str(capture)))
+        only_step(idle_harness, CheckJob(kind="check", intake=identifier), (capture.parent,),
+                  idle_harness.settings.model_copy(update={"max_project_pixels": most})).run(Silent())
+        return intakes.find(idle_harness.database, identifier, PROJECT)["state"]
+
+    assert checked(320) == "ready"
+    with pytest.raises(RequestError, match=f"the project {PROJECT} has 320 of 639 pixels, and this needs 320 more"):
+        checked(639)
+    assert checked(640) == "ready"
