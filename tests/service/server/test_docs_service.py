@@ -1,5 +1,6 @@
 """docs/service.md: the walk runs as it stands, and what it says about keys, routes and metrics is so."""
 
+import configparser
 import json
 import os
 import re
@@ -16,8 +17,10 @@ import pytest
 
 from service.demo.demo import sample_folder
 from service.requests.keys import Scope
+from service.server.connections import AT_ONCE, MAX_CONNECTIONS, OWN_DESCRIPTORS
 from service.server.database.engine import connect
 from service.server.jobs.queue import JobQueue, prepare
+from service.server.permissions import PRIVATE
 from service.server.sample import show_sample
 from service.server.settings import Settings
 from service.server.storage.open import open_storage
@@ -53,6 +56,17 @@ def test_the_walk_runs(tmp_path):
     assert events[-1] == "succeeded"
     assert out.splitlines()[-1] == "report.json" and "frame.0008.exr" in out and '"maps.exr"' in out
     assert (tmp_path / "asset.usdz").stat().st_size > 1000
+
+
+def test_the_systemd_unit_leaves_room_for_all_connections_and_time_to_drain():
+    unit = configparser.ConfigParser(interpolation=None)
+    unit.optionxform = str
+    unit.read_string(re.search(r"```ini\n(.*?)```", TEXT, re.DOTALL)[1])
+    service, settings = unit["Service"], Settings()
+    assert int(service["LimitNOFILE"]) >= MAX_CONNECTIONS + AT_ONCE + OWN_DESCRIPTORS
+    assert float(service["TimeoutStopSec"]) > settings.drain_s + 15
+    assert int(service["UMask"], 8) == PRIVATE and service["KillMode"] == "mixed"  # `relit serve` itself ends its workers
+    assert service["ExecStart"].split()[1:] == ["serve", "--config", "/etc/relit.toml"]
 
 
 def test_every_scope_is_described():
